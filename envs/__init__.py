@@ -1,0 +1,3 @@
+"""Worlds that move and measure; they know nothing of estimators."""
+
+from .landmark_world import LandmarkWorldEnv as LandmarkWorldEnv

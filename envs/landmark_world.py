@@ -1,0 +1,278 @@
+"""The landmark world: a unicycle robot among landmarks, as a Gymnasium environment."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+from numpy.typing import ArrayLike, NDArray
+
+from ..sim_configs import Scenario, load_scenario, place_landmarks
+from .bearing_range_sensor import BearingRangeSensor, as_rows
+from .live_view import RENDER_MODES, LiveView, Moment
+from .noise_streams import motion_noise_rows, sensor_noise_rows, spawn_streams
+from .odometry_sensor import OdometrySensor
+from .snapshot import BeliefLike
+from .unicycle_body import UnicycleBody
+from .world_spaces import action_space, observation_space
+
+Array = NDArray[np.float64]
+Observation = dict[str, NDArray[Any]]
+
+
+class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
+    """A robot drives among point landmarks and measures its motion and the landmarks.
+
+    ## Description
+    The plant of a SLAM problem. A unicycle robot drives among N point landmarks, is
+    stopped by walls, and emits noisy odometry and bearing-range measurements; the
+    truth is told only in `info`. What is simulated is a
+    :class:`~slamgym.sim_configs.Scenario`. One step drives d = v Δt along the heading,
+    then turns by α = ω Δt.
+
+    ## Action Space
+    ``Box(float32, (2,))``: (v, ω), speed [m/s] and turn rate [rad/s], within ± the
+    limits of the robot. Actions beyond are clipped; float64 keeps its precision;
+    what is not two finite numbers is refused with a `ValueError`.
+
+    ## Observation Space
+    ``Dict`` of three arrays:
+
+    | key | shape | content |
+    |---|---|---|
+    | ``landmarks`` | (M, 2) float64 | rows (bearing in [-π, π), range) [rad, m], zeros where unseen |
+    | ``mask`` | (M,) bool | rows that hold a measurement |
+    | ``odometry`` | (2,) float64 | (d, α) as the odometry tells it [m, rad]; zeros at reset |
+
+    With identities, M = N and row i is landmark i. With identities hidden, M = N +
+    ``max_clutter``, and the measurements stand in front in random order. The
+    observation of `reset` measures from the start pose.
+
+    `info` has the same keys in `reset` and `step`: ``pose``, the true (x, y, θ) with θ
+    not wrapped; ``collision``, whether a wall held the robot back; and, with identities
+    hidden, ``landmark_ids`` (M,) int64, -1 where a row is clutter or empty.
+
+    ## Rewards
+    Always 0: the world poses no task.
+
+    ## Starting State
+    ``scenario.start``: either the true start, or the pose a filter starts from
+    (`start_estimate`), is drawn around its pose. A random layout without a seed of its
+    own places new landmarks in every episode.
+
+    ## Episode End
+    Never terminated; truncated after ``scenario.steps`` steps.
+
+    ## Arguments
+    scenario : Scenario, mapping, str or Path, default "six_landmarks"
+        A preset's name, a ``.toml`` file, a mapping of plain values, or a scenario.
+        The first three also survive in an ``EnvSpec`` written as JSON.
+    render_mode : {"human", "rgb_array"}, optional
+        Whether every moment is shown in a window, or `render` returns frames.
+    **changes
+        Fields of the scenario to replace, as in `Scenario.with_changes`.
+
+    ## Version History
+    * v0: initial version
+
+    Examples
+    --------
+    >>> import gymnasium, slamgym
+    >>> env = gymnasium.make("slamgym/LandmarkWorld-v0", sensor={"max_range": 7.0})
+    >>> observation, info = env.reset(seed=0)
+    >>> observation["mask"]
+    array([ True, False, False, False, False, False])
+    >>> observation, *_ = env.step([1.0, 0.0])
+    >>> observation["odometry"]
+    array([3., 0.])
+    """  # noqa: E501 (tables)
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": list(RENDER_MODES),
+        "render_fps": 30,
+    }
+
+    def __init__(
+        self,
+        scenario: Scenario | Mapping[str, object] | str | Path = "six_landmarks",
+        *,
+        render_mode: str | None = None,
+        **changes: object,
+    ) -> None:
+        self.scenario = load_scenario(scenario)
+        if changes:
+            self.scenario = self.scenario.with_changes(**changes)
+        self.action_space = action_space(self.scenario)
+        self.observation_space = observation_space(self.scenario)
+        self.render_mode = render_mode
+        self._view = self._make_view()
+        self._body = UnicycleBody(self.scenario.robot.radius, self.scenario.walls)
+        self._odometer = OdometrySensor(self.scenario)
+        self._sensor = BearingRangeSensor(self.scenario)
+        self._landmarks: NDArray[np.complex128] | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode, and measure from the start pose.
+
+        Parameters
+        ----------
+        seed : int >= 0, optional
+            Fixes everything random in this episode and those that follow.
+        options : dict, optional
+            There are none.
+
+        Raises
+        ------
+        ValueError
+            If an option is given.
+        """
+        if options:
+            raise ValueError(f"options must be empty, got {options!r}")
+        super().reset(seed=seed)
+        streams = spawn_streams(self.np_random)
+        self._motion_noise = motion_noise_rows(streams, self.scenario)
+        self._sensor_noise = sensor_noise_rows(streams, self.scenario)
+        landmarks = place_landmarks(self.scenario.landmarks, streams.map)
+        self._landmarks = landmarks.view(np.complex128)[:, 0]
+        self._draw_start(streams.start)
+        self._steps_left = self.scenario.steps
+        if self._view is not None:
+            self._view.begin(landmarks)
+        return self._observe(odometry=np.zeros(2), collision=False)
+
+    def step(
+        self, action: ArrayLike
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Drive and turn for one step, then measure.
+
+        Parameters
+        ----------
+        action : array_like, shape (2,)
+            (v, ω) [m/s, rad/s].
+
+        Raises
+        ------
+        ValueError
+            If the action is not two finite numbers; the world stays as it is.
+        """
+        command = self._command(action)
+        noise = self._odometer.place_noise(command, next(self._motion_noise))
+        εx, εy, εα = noise.slip
+        share = self._body.drive(command[0] + εx, εy, command[1] + εα)
+        odometry = self._odometer.read(command, share, noise.error)
+        observation, info = self._observe(odometry, collision=share < 1.0)
+        self._steps_left -= 1
+        return observation, 0.0, False, self._steps_left <= 0, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Return a frame in mode "rgb_array", else None: "human" shows every step."""
+        if self._landmarks is None:
+            raise ResetNeeded("call reset before render")
+        if self._view is None:
+            gymnasium.logger.warn("render shows nothing without a render_mode")
+            return None
+        return self._view.draw() if self.render_mode == "rgb_array" else None
+
+    def show_belief(self, belief: BeliefLike | None) -> None:
+        """Let the following frames show what an estimator believes, or nothing."""
+        if self._view is not None:
+            self._view.show_belief(belief)
+
+    def close(self) -> None:
+        """Close the window, if there is one; may be repeated."""
+        if self._view is not None:
+            self._view.close()
+
+    @property
+    def pose(self) -> Array:
+        """True (x, y, θ), shape (3,) [m, m, rad], a fresh array; θ is not wrapped."""
+        return self._body.pose
+
+    @property
+    def landmarks(self) -> Array:
+        """True positions of this episode's landmarks, shape (N, 2) [m], a copy."""
+        if self._landmarks is None:
+            raise ResetNeeded("call reset to place the landmarks")
+        return as_rows(self._landmarks).copy()
+
+    @property
+    def start_estimate(self) -> Array:
+        """Pose from which a filter starts, shape (3,) [m, m, rad], a copy.
+
+        Its standard deviations are ``scenario.start.std``.
+        """
+        if self._landmarks is None:
+            raise ResetNeeded("call reset to draw the start")
+        return self._start_estimate.copy()
+
+    def _draw_start(self, rng: np.random.Generator) -> None:
+        start = self.scenario.start
+        drawn = start.pose + start.std * rng.standard_normal(3)
+        truth, estimate = drawn, np.array(start.pose)
+        if start.drawn == "estimate":
+            truth, estimate = estimate, truth
+        self._body.place(truth.tolist())
+        self._start_estimate = estimate
+
+    def _command(self, action: ArrayLike) -> tuple[float, float]:
+        """Turn an action (v, ω) into the command (d, α) of one step [m, rad]."""
+        if self._landmarks is None:
+            raise ResetNeeded("call reset before step")
+        robot, dt = self.scenario.robot, self.scenario.dt
+        speed, turn_rate = _two_finite_numbers(action)
+        speed = min(max(speed, -robot.max_speed), robot.max_speed)
+        turn_rate = min(max(turn_rate, -robot.max_turn_rate), robot.max_turn_rate)
+        return speed * dt, turn_rate * dt
+
+    def _observe(
+        self, odometry: Array, collision: bool
+    ) -> tuple[Observation, dict[str, Any]]:
+        body = self._body
+        scan = self._sensor.scan(
+            self._landmarks,
+            complex(body.x, body.y),
+            complex(body.cos, body.sin),
+            next(self._sensor_noise),
+        )
+        info = {"pose": body.pose, "collision": collision}
+        if scan.landmark_ids is not None:
+            info["landmark_ids"] = scan.landmark_ids
+        if self._view is not None:
+            visible = scan.measurements[scan.mask]
+            self._view.add(Moment(body.pose, visible, collision))
+        observation = {
+            "landmarks": scan.measurements,
+            "mask": scan.mask,
+            "odometry": odometry,
+        }
+        return observation, info
+
+    def _make_view(self) -> LiveView | None:
+        if self.render_mode is None:
+            return None
+        if self.render_mode not in RENDER_MODES:
+            raise ValueError(
+                f"render_mode must be None or one of {RENDER_MODES}, "
+                f"got {self.render_mode!r}"
+            )
+        fps = self.metadata["render_fps"]
+        return LiveView(self.scenario, self.render_mode, fps)
+
+
+def _two_finite_numbers(action: ArrayLike) -> list[float]:
+    try:
+        array = np.asarray(action)
+    except ValueError:  # ragged
+        array = np.empty(0)
+    if array.shape == (2,) and array.dtype.kind in "fiu":
+        numbers: list[float] = array.tolist()
+        if math.isfinite(numbers[0]) and math.isfinite(numbers[1]):
+            return numbers
+    raise ValueError(
+        f"action must be 2 finite numbers (v [m/s], ω [rad/s]), got {action!r}"
+    )

@@ -1,0 +1,121 @@
+"""Bearing-range measurement model of a point landmark, forward and inverse.
+
+Symbols
+-------
+p = (x, y, θ)  robot pose in the world frame [m, m, rad]
+l = (lx, ly)   landmark position in the world frame [m, m]
+z = (β, r)     bearing from the robot's heading, and range [rad, m]
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .angles import wrap_angle
+
+Array = NDArray[np.float64]
+
+
+class MeasurementPrediction(NamedTuple):
+    """Expected readings of m landmarks and their first derivatives."""
+
+    measurement: Array  # (m, 2), rows (β, r)
+    jacobian_pose: Array  # (m, 2, 3), Hp = ∂h/∂p
+    jacobian_landmark: Array  # (m, 2, 2), Hl = ∂h/∂l
+
+
+class LandmarkLocation(NamedTuple):
+    """World positions of m measured landmarks and their first derivatives."""
+
+    position: Array  # (m, 2), rows (lx, ly)
+    jacobian_pose: Array  # (m, 2, 3), ∂l/∂p
+    jacobian_measurement: Array  # (m, 2, 2), ∂l/∂z
+
+
+def predict_measurement(pose: Array, landmarks: Array) -> MeasurementPrediction:
+    """Bearing and range at which the robot should see each landmark.
+
+    ::
+
+        h(p, l) = (atan2(ly - y, lx - x) - θ,  ‖l - (x, y)‖)
+
+    Parameters
+    ----------
+    pose : ndarray, shape (3,)
+        p = (x, y, θ) [m, m, rad].
+    landmarks : ndarray, shape (m, 2)
+        Landmark positions [m]; none may coincide with the robot.
+
+    Returns
+    -------
+    MeasurementPrediction
+        Readings (m, 2) with the bearing in [-π, π), Hp (m, 2, 3), Hl (m, 2, 2).
+
+    Notes
+    -----
+    CMU 16-833, EKF-SLAM homework, eqs. 1.4 to 1.6 (row order: bearing, range).
+
+    Examples
+    --------
+    >>> predict_measurement(np.zeros(3), np.array([[0.0, 2.0]])).measurement
+    array([[1.57079633, 2.        ]])
+    """
+    dx, dy = (landmarks - pose[:2]).T
+    squared_range = dx**2 + dy**2
+    distance = np.sqrt(squared_range)
+    jacobian_landmark = np.empty((len(landmarks), 2, 2))
+    jacobian_landmark[:, 0] = np.stack([-dy, dx], axis=1) / squared_range[:, None]
+    jacobian_landmark[:, 1] = np.stack([dx, dy], axis=1) / distance[:, None]
+    jacobian_pose = np.zeros((len(landmarks), 2, 3))
+    jacobian_pose[:, :, :2] = -jacobian_landmark
+    jacobian_pose[:, 0, 2] = -1
+    bearing = wrap_angle(np.arctan2(dy, dx) - pose[2])
+    return MeasurementPrediction(
+        measurement=np.stack([bearing, distance], axis=1),
+        jacobian_pose=jacobian_pose,
+        jacobian_landmark=jacobian_landmark,
+    )
+
+
+def locate_landmark(pose: Array, measurement: Array) -> LandmarkLocation:
+    """Where in the world each measured landmark lies: the inverse of h.
+
+    ::
+
+        l = (x + r cos(θ + β),  y + r sin(θ + β))
+
+    Parameters
+    ----------
+    pose : ndarray, shape (3,)
+        p = (x, y, θ) [m, m, rad].
+    measurement : ndarray, shape (m, 2)
+        Rows z = (β, r) [rad, m].
+
+    Returns
+    -------
+    LandmarkLocation
+        Positions (m, 2), ∂l/∂p (m, 2, 3) and ∂l/∂z (m, 2, 2).
+
+    Notes
+    -----
+    CMU 16-833, EKF-SLAM homework, eq. 1.3.
+
+    Examples
+    --------
+    >>> locate_landmark(np.array([1.0, 0.0, 0.0]), np.array([[0.0, 2.0]])).position
+    array([[3., 0.]])
+    """
+    direction = pose[2] + measurement[:, 0]
+    distance = measurement[:, 1]
+    along = np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    across = np.stack([-np.sin(direction), np.cos(direction)], axis=1)
+    turned = distance[:, None] * across
+    jacobian_pose = np.empty((len(measurement), 2, 3))
+    jacobian_pose[:, :, :2] = np.eye(2)
+    jacobian_pose[:, :, 2] = turned
+    return LandmarkLocation(
+        position=pose[:2] + distance[:, None] * along,
+        jacobian_pose=jacobian_pose,
+        jacobian_measurement=np.stack([turned, along], axis=2),
+    )

@@ -1,0 +1,360 @@
+"""EKF-SLAM: the standard filter, on the shared kernels."""
+
+from collections.abc import Mapping, Sequence
+from itertools import compress
+from math import isfinite
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri
+
+from . import validation
+from .interface import Belief, UpdateReport
+from .joint_update import (
+    ADDED,
+    DONE,
+    FATE,
+    GATED,
+    NOT_FINITE,
+    SKIPPED,
+    SLOT,
+    USED,
+    Rules,
+    update_one,
+)
+from .kernels import AT_ESTIMATE, predict
+
+Array = NDArray[np.float64]
+
+
+class EkfSlam:
+    """Extended Kalman filter over the robot pose and a growing landmark map.
+
+    The state is (x, y, θ, l1x, l1y, …), landmarks in the order of first sight; the
+    readings of one scan are linearised together at the predicted state::
+
+        predict   x ← g(x, u),  P ← G P Gᵀ + F R Fᵀ
+        update    S = H P Hᵀ + Q = L Lᵀ,  A = L⁻¹ H P
+                  x ← x + Aᵀ L⁻¹ ν,  P ← P − Aᵀ A
+        new       l = f(x, z),  P_l* = F_p P_p*,  P_ll = F_p P_pp F_pᵀ + F_z Q F_zᵀ
+
+    Parameters
+    ----------
+    motion_std : array_like, shape (3,)
+        (σx, σy, σα) of the motion noise in the robot frame [m, m, rad], per step of
+        dt = 1.
+    measurement_std : array_like, shape (2,)
+        (σβ, σr) of the measurement noise [rad, m].
+    initial_pose : array_like, shape (3,)
+        Mean of the first pose (x, y, θ) [m, m, rad].
+    initial_pose_std : array_like, shape (3,)
+        Its standard deviation; zeros when the first pose defines the map's frame.
+    landmark_init : {"full", "independent"}
+        "full" correlates a new landmark with the pose it was seen from.  "independent"
+        drops that correlation, which makes the filter overconfident: it exists to
+        reproduce results obtained so.
+    range_std_per_metre : float
+        Part of σr that grows with the range: σr(r) = σr + k r.
+    gate_probability : float or None
+        Readings of mapped landmarks outside this chi-square region of their own
+        innovation are rejected; None accepts all.
+    noise_at_rest : bool
+        False: odometry of exactly (0, 0) adds no motion noise.
+    min_range : float
+        Readings closer than this [m] are skipped: they have no usable bearing.
+
+    Raises
+    ------
+    ValueError
+        Where an argument has the wrong shape or is not finite, negative or unknown.
+
+    Notes
+    -----
+    Wherever the heading is uncertain this filter comes to believe that it observes
+    what it cannot, its absolute heading [1]_.
+
+    References
+    ----------
+    .. [1] S. Julier, J. Uhlmann, A counter example to the theory of simultaneous
+       localization and map building, ICRA 2001.
+
+    Examples
+    --------
+    >>> slam = EkfSlam(motion_std=(0.05, 0.02, 0.01), measurement_std=(0.02, 0.1))
+    >>> slam.predict((1.0, 0.0))
+    >>> slam.update([(0.0, 2.0)], landmark_ids=[7]).added_ids
+    (7,)
+    >>> slam.belief().landmarks
+    array([[3., 0.]])
+    """
+
+    _linearisation: ClassVar[int] = AT_ESTIMATE
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        initial_pose: ArrayLike = (0.0, 0.0, 0.0),
+        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        landmark_init: str = "full",
+        range_std_per_metre: float = 0.0,
+        gate_probability: float | None = None,
+        noise_at_rest: bool = True,
+        min_range: float = 1e-3,
+    ) -> None:
+        motion = validation.standard_deviations("motion_std", motion_std, 3)
+        sensor = validation.standard_deviations("measurement_std", measurement_std, 2)
+        self._motion_variance = motion**2
+        self._noise_at_rest = bool(noise_at_rest)
+        self._rules = Rules(
+            linearisation=self._linearisation,
+            correlated=_is_full(landmark_init),
+            bearing_std=float(sensor[0]),
+            range_std=float(sensor[1]),
+            range_std_per_metre=validation.at_least(
+                "range_std_per_metre", range_std_per_metre, 0.0
+            ),
+            min_range=validation.above("min_range", min_range, 0.0),
+            gate=_gate(gate_probability),
+        )
+        self._rule_values = np.array(self._rules)
+        self._ledger = np.zeros((4, 8), dtype=np.int64)
+        self.reset(initial_pose, initial_pose_std)
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run with an empty map.
+
+        Parameters
+        ----------
+        pose : array_like, shape (3,)
+            Mean of the first pose (x, y, θ) [m, m, rad].
+        pose_std : array_like, shape (3,)
+            Its standard deviation.
+        """
+        first = validation.finite_vector("pose", pose, 3)
+        std = validation.standard_deviations("pose_std", pose_std, 3)
+        self._slots: dict[int, int] = {}
+        self._size = 3
+        self._allocate(landmarks=8)
+        self._mean[:3] = self._reference[:3] = first
+        self._covariance[:3, :3] = np.diag(std**2)
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move the pose by one odometry reading.
+
+        Parameters
+        ----------
+        odometry : array_like, shape (2,)
+            u = (d, α): distance driven, then heading turned [m, rad].
+        dt : float
+            Duration that the motion noise counts, in steps: its variance grows with
+            dt, and dt = 0 adds none.
+        """
+        distance, turn = validation.pair("odometry", odometry)
+        if not (isfinite(dt) and dt >= 0):
+            raise ValueError(f"dt must be a finite number >= 0, got {dt!r}")
+        variance = self._motion_variance
+        if dt != 1.0:
+            variance = variance * dt
+        if not self._noise_at_rest and distance == 0 and turn == 0:
+            variance = variance * 0.0
+        predict(
+            self._mean,
+            self._covariance,
+            self._size,
+            distance,
+            turn,
+            variance,
+            self._linearisation,
+            self._reference,
+        )
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
+    ) -> UpdateReport:
+        """Correct the belief with one scan, then map the landmarks seen first.
+
+        Parameters
+        ----------
+        measurements : array_like, shape (m, 2)
+            Rows (β, r) [rad, m], all seen at once: their order does not matter.
+        landmark_ids : sequence of int, length m
+            Identity of the landmark behind each row, without repetition.
+
+        Returns
+        -------
+        UpdateReport
+            Innovations, NIS, and which landmarks were associated, added, rejected.
+
+        Raises
+        ------
+        ValueError
+            Where the arguments are malformed; the belief is then as before.
+        numpy.linalg.LinAlgError
+            Where an innovation covariance is not positive definite, naming the
+            reading; the belief is then as before.
+        """
+        readings = validation.scan(measurements)
+        count = len(readings)
+        ids = self._identities(landmark_ids, count)
+        self._make_room(count)
+        slots = self._slots
+        self._ledger[SLOT, :count] = [slots.get(i, -1) for i in ids]
+        outcome, used, nis, innovation, factor = update_one(
+            self._mean,
+            self._covariance,
+            self._size,
+            readings,
+            self._reference,
+            self._rule_values,
+            self._ledger,
+        )
+        if outcome != DONE:
+            self._refuse(outcome, readings, ids)
+        return self._report(ids, used, nis, innovation, factor)
+
+    def belief(self) -> Belief:
+        """Return the belief as a snapshot that later steps leave alone."""
+        n = self._size
+        return Belief(self._mean[:n], self._covariance[:n, :n], tuple(self._slots))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of mean, covariance, ids and linearisation points."""
+        n = self._size
+        return {
+            "estimator": np.array(type(self).__name__),
+            "mean": self._mean[:n].copy(),
+            "covariance": self._covariance[:n, :n].copy(),
+            "reference": self._reference[:n].copy(),
+            "landmark_ids": np.array(list(self._slots), dtype=np.int64),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state, bit for bit.
+
+        Parameters
+        ----------
+        state : mapping
+            What :meth:`state_dict` returned, also after a trip through ``numpy.savez``.
+
+        Raises
+        ------
+        ValueError
+            Where the state lacks an entry, is of another estimator, or does not fit
+            together; the belief is then as before.
+        """
+        mean, covariance, reference, ids = _checked_state(state, type(self).__name__)
+        self._slots = {i: slot for slot, i in enumerate(ids)}
+        self._size = len(mean)
+        self._allocate(max(8, len(ids)))
+        self._mean[: len(mean)] = mean
+        self._reference[: len(mean)] = reference
+        self._covariance[: len(mean), : len(mean)] = covariance
+
+    def _allocate(self, landmarks: int) -> None:
+        capacity = (3 + 2 * landmarks) // 4 * 4 + 4
+        self._mean = np.zeros(capacity)
+        self._reference = np.zeros(capacity)
+        self._covariance = np.zeros((capacity, capacity))
+
+    def _make_room(self, readings: int) -> None:
+        """Grow the arrays where a scan could overflow them."""
+        n = self._size
+        if n + 2 * readings >= len(self._mean):
+            mean, covariance, reference = self._mean, self._covariance, self._reference
+            self._allocate(2 * len(self._slots) + readings)
+            self._mean[:n], self._reference[:n] = mean[:n], reference[:n]
+            self._covariance[:n, :n] = covariance[:n, :n]
+        if readings > self._ledger.shape[1]:
+            self._ledger = np.zeros((4, 2 * readings), dtype=np.int64)
+
+    def _identities(self, landmark_ids: Sequence[int] | None, count: int) -> list[int]:
+        if landmark_ids is not None:
+            return validation.identities(landmark_ids, count)
+        if count:
+            raise ValueError(
+                f"landmark_ids must be given: {type(self).__name__} does not associate"
+            )
+        return []
+
+    def _refuse(self, outcome: int, readings: Array, ids: list[int]) -> None:
+        if outcome == NOT_FINITE:
+            row = int(np.argmin(np.isfinite(readings).all(axis=1)))
+            raise ValueError(
+                f"measurements must be finite, got {readings[row].tolist()} in row "
+                f"{row} (landmark {ids[row]})"
+            )
+        row = np.flatnonzero(self._ledger[FATE, : len(ids)] == USED)[outcome]
+        raise np.linalg.LinAlgError(
+            "the innovation covariance is not positive definite at the reading of "
+            f"landmark {ids[row]}: the belief or measurement_std is degenerate"
+        )
+
+    def _report(
+        self, ids: list[int], used: int, nis: float, innovation: Array, factor: Array
+    ) -> UpdateReport:
+        _, fates, near, _ = self._ledger[:, : len(ids)].tolist()
+        associated, added, rejected, skipped = tuple(ids), (), (), ()
+        if used < len(ids):
+            associated, added, rejected, skipped = (
+                tuple(i for i, f in zip(ids, fates, strict=True) if f == fate)
+                for fate in (USED, ADDED, GATED, SKIPPED)
+            )
+            for i in added:
+                self._slots[i] = len(self._slots)
+            self._size = 3 + 2 * len(self._slots)
+        return UpdateReport(
+            nis,
+            2 * used,
+            associated,
+            added,
+            rejected,
+            skipped,
+            tuple(compress(ids, near)) if any(near) else (),
+            innovation[:used],
+            factor[: 2 * used, : 2 * used],
+        )
+
+
+def _is_full(landmark_init: str) -> bool:
+    if landmark_init not in ("full", "independent"):
+        raise ValueError(
+            f"landmark_init must be 'full' or 'independent', got {landmark_init!r}"
+        )
+    return landmark_init == "full"
+
+
+def _gate(probability: float | None) -> float:
+    """χ²(2) quantile of the gate."""
+    if probability is None:
+        return np.inf
+    if not 0 < probability < 1:
+        raise ValueError(
+            f"gate_probability must lie between 0 and 1, got {probability!r}"
+        )
+    return float(chdtri(2, 1 - probability))
+
+
+def _checked_state(
+    state: Mapping[str, Any], name: str
+) -> tuple[Array, Array, Array, list[int]]:
+    missing = {"estimator", "mean", "covariance", "reference", "landmark_ids"} - set(
+        state
+    )
+    if missing:
+        raise ValueError(f"state must hold {sorted(missing)[0]!r}, got {sorted(state)}")
+    if str(state["estimator"]) != name:
+        raise ValueError(f"state is of {state['estimator']}, not of {name}")
+    ids: list[int] = np.asarray(state["landmark_ids"]).tolist()
+    size = 3 + 2 * len(ids)
+    mean = validation.finite_vector("state['mean']", state["mean"], size)
+    reference = validation.finite_vector("state['reference']", state["reference"], size)
+    covariance = validation.as_floats("state['covariance']", state["covariance"])
+    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
+        raise ValueError(
+            f"state['covariance'] must be finite with shape ({size}, {size}), "
+            f"got shape {covariance.shape}"
+        )
+    return mean, covariance, reference, ids

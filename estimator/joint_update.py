@@ -1,0 +1,374 @@
+"""One scan's update of one run, compiled: screen, gate, correct, map new landmarks."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .compiled import compiled
+from .kernels import (
+    AT_ESTIMATE,
+    INVARIANT,
+    Array,
+    Int,
+    add_landmark,
+    combine,
+    downdate,
+    linearise,
+    retract,
+    transport,
+    whiten,
+)
+
+# Rows of the ledger of one scan.
+SLOT, FATE, NEAR, COLUMN = 0, 1, 2, 3
+
+# What became of a reading.
+USED, ADDED, GATED, SKIPPED = 0, 1, 2, 3
+
+# What became of the whole call, where it is not the row that failed.
+DONE, NOT_FINITE = -1, -2
+
+
+class Rules(NamedTuple):
+    """What distinguishes one filter's update from another's; plain numbers."""
+
+    linearisation: int = AT_ESTIMATE
+    frame: int = 0
+    iterations: int = 1
+    sequential: bool = False
+    correlated: bool = True
+    bearing_std: float = 0.0  # [rad]
+    range_std: float = 0.0  # [m]
+    range_std_per_metre: float = 0.0
+    min_range: float = 1e-3  # [m]
+    gate: float = np.inf  # largest NIS of one reading
+
+
+class Workspace(NamedTuple):
+    """Room for the intermediate results of one update of up to m readings."""
+
+    readings: Array  # (m, 2) the readings in use
+    variances: Array  # (m, 2)
+    jacobians: Array  # (m, 2, 5)
+    innovations: Array  # (2, m, 2): at the prior, and at a later iterate
+    factors: Array  # (2, 2m, 2m) likewise
+    white: Array  # (2, 2m) likewise
+    gains: Array  # (2m, capacity)
+    vectors: Array  # (4, capacity): δ, way, prior mean, heading column
+
+
+@compiled
+def new_workspace(m: int, capacity: int) -> Workspace:
+    """Allocate for ``m`` readings of a belief with that capacity."""
+    return Workspace(
+        np.empty((m, 2)),
+        np.empty((m, 2)),
+        np.empty((m, 2, 5)),
+        np.empty((2, m, 2)),
+        np.empty((2, 2 * m, 2 * m)),
+        np.empty((2, 2 * m)),
+        np.empty((2 * m, capacity)),
+        np.empty((4, capacity)),
+    )
+
+
+@compiled
+def as_rules(values: Array) -> Rules:
+    """Read rules from the array ``numpy.array(rules)``: one argument, not ten."""
+    return Rules(
+        int(values[0]),
+        int(values[1]),
+        int(values[2]),
+        values[3] > 0,
+        values[4] > 0,
+        values[5],
+        values[6],
+        values[7],
+        values[8],
+        values[9],
+    )
+
+
+@compiled
+def correct(
+    mean: Array,
+    covariance: Array,
+    size: int,
+    reference: Array,
+    rules: Rules,
+    work: Workspace,
+    every_column: Int,
+    first: int,
+    last: int,
+) -> int:
+    """Condition the belief on readings ``first`` to ``last`` at one linearisation.
+
+    With more iterations the readings are linearised again at each iterate, always
+    against the same prior (Bell and Cathey, 1993); NIS, ν and S stay those at the
+    prior.  In the invariant frame the heading column of H is kept at the prior's
+    geometry: the exact Gauss-Newton column would make the filter believe that it sees
+    its heading.
+
+    Returns
+    -------
+    int
+        -1, or the row whose innovation covariance is not positive definite; mean and
+        covariance are then as before.
+    """
+    columns, jacobians = every_column[first:last], work.jacobians[first:last]
+    shift, way = work.vectors[0], work.vectors[1]
+    prior, heading = work.vectors[2], work.vectors[3]
+    prior[:size] = mean[:size]
+    rows = 2 * (last - first)
+    for iteration in range(rules.iterations):
+        stage = min(iteration, 1)
+        innovations = work.innovations[stage, first:last]
+        for k in range(last - first):
+            linearise(
+                mean,
+                reference,
+                columns[k],
+                rules.linearisation,
+                work.readings[first + k],
+                jacobians[k],
+                innovations[k],
+            )
+            if iteration > 0:
+                relate_to_prior(
+                    prior, shift, columns[k], rules.frame, jacobians[k], innovations[k]
+                )
+        factor = work.factors[stage, 2 * first : 2 * last, 2 * first : 2 * last]
+        white = work.white[stage, 2 * first : 2 * last]
+        failed = whiten(
+            covariance,
+            size,
+            columns,
+            jacobians,
+            work.variances[first:last],
+            innovations,
+            work.gains,
+            factor,
+            white,
+        )
+        mean[:size] = prior[:size]
+        if failed >= 0:
+            return first + failed
+        combine(work.gains, white, rows, size, shift)
+        if rules.frame == INVARIANT:
+            way[:size] = shift[:size]
+            retract(mean, way, size)
+        else:
+            mean[:size] += shift[:size]
+    downdate(covariance, size, work.gains, rows)
+    if rules.frame == INVARIANT:
+        transport(covariance, size, way, heading)
+    return -1
+
+
+@compiled
+def relate_to_prior(
+    prior: Array,
+    shift: Array,
+    column: int,
+    frame: int,
+    jacobian: Array,
+    innovation: Array,
+) -> None:
+    """Turn ν at an iterate into z − h + H δ, the innovation seen from the prior."""
+    if frame == INVARIANT:
+        dx, dy = prior[column] - prior[0], prior[column + 1] - prior[1]
+        for i in range(2):
+            jacobian[i, 2] = jacobian[i, 3] * dy - jacobian[i, 4] * dx
+    for i in range(2):
+        innovation[i] += (
+            jacobian[i, 0] * shift[0]
+            + jacobian[i, 1] * shift[1]
+            + jacobian[i, 2] * shift[2]
+            + jacobian[i, 3] * shift[column]
+            + jacobian[i, 4] * shift[column + 1]
+        )
+
+
+@compiled
+def squared_innovation(
+    covariance: Array, column: int, H: Array, variance: Array, innovation: Array
+) -> float:
+    """NIS of one reading by itself, for the gate."""
+    s00 = _spread(covariance, column, H, 0, 0) + variance[0]
+    s10 = _spread(covariance, column, H, 1, 0)
+    s11 = _spread(covariance, column, H, 1, 1) + variance[1]
+    n0, n1 = innovation[0], innovation[1]
+    weighted = n0 * n0 * s11 - 2 * n0 * n1 * s10 + n1 * n1 * s00
+    return weighted / (s00 * s11 - s10 * s10)
+
+
+@compiled
+def _spread(covariance: Array, column: int, H: Array, i: int, j: int) -> float:
+    """One entry of H P Hᵀ."""
+    total = 0.0
+    for a in range(5):
+        at_a = a if a < 3 else column + a - 3
+        for b in range(5):
+            at_b = b if b < 3 else column + b - 3
+            total += H[i, a] * covariance[at_a, at_b] * H[j, b]
+    return total
+
+
+@compiled
+def meets(mean: Array, covariance: Array, column: int) -> bool:
+    """Whether the robot is within 10 σ of a landmark, where linearising fails."""
+    P, c = covariance, column
+    xx = P[c, c] - 2 * P[c, 0] + P[0, 0]
+    yy = P[c + 1, c + 1] - 2 * P[c + 1, 1] + P[1, 1]
+    xy = P[c, c + 1] - P[c, 1] - P[c + 1, 0] + P[0, 1]
+    spread = (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+    return dx * dx + dy * dy < 100 * spread
+
+
+@compiled
+def screen(
+    mean: Array,
+    covariance: Array,
+    readings: Array,
+    reference: Array,
+    rules: Rules,
+    work: Workspace,
+    ledger: Int,
+) -> int:
+    """Decide the fate of every reading and gather those to use; change no belief."""
+    used = 0
+    for k in range(len(readings)):
+        column = 3 + 2 * ledger[SLOT, k]
+        ledger[FATE, k] = ADDED if ledger[SLOT, k] < 0 else USED
+        ledger[NEAR, k] = 0
+        if readings[k, 1] < rules.min_range:
+            ledger[FATE, k] = SKIPPED
+        if ledger[FATE, k] != USED:
+            continue
+        dx, dy = mean[column] - mean[0], mean[column + 1] - mean[1]
+        if dx * dx + dy * dy < rules.min_range * rules.min_range:
+            ledger[FATE, k] = SKIPPED
+            continue
+        ledger[COLUMN, used] = column
+        work.readings[used] = readings[k]
+        set_variance(rules, readings[k, 1], work.variances[used])
+        ledger[NEAR, k] = meets(mean, covariance, column)
+        if rules.gate < np.inf:
+            H, innovation = work.jacobians[used], work.innovations[0, used]
+            linearise(
+                mean,
+                reference,
+                column,
+                rules.linearisation,
+                readings[k],
+                H,
+                innovation,
+            )
+            variance = work.variances[used]
+            nis = squared_innovation(covariance, column, H, variance, innovation)
+            if not nis <= rules.gate:
+                ledger[FATE, k] = GATED
+                continue
+        used += 1
+    return used
+
+
+@compiled
+def set_variance(rules: Rules, distance: float, variance: Array) -> None:
+    """Diagonal of Q for a reading at that range [m]."""
+    variance[0] = rules.bearing_std**2
+    variance[1] = (rules.range_std + rules.range_std_per_metre * distance) ** 2
+
+
+@compiled
+def update_belief(
+    mean: Array,
+    covariance: Array,
+    size: int,
+    readings: Array,
+    reference: Array,
+    rules: Rules,
+    work: Workspace,
+    ledger: Int,
+) -> tuple[int, int, float]:
+    """Update one belief with one scan, in place.
+
+    Parameters
+    ----------
+    mean, covariance, size
+        The belief, with room for the landmarks to add.
+    readings : ndarray, shape (m, 2)
+        Rows (β, r) [rad, m].
+    reference : ndarray, shape (capacity,)
+        Points at which Jacobians are taken, where the rules say so.
+    rules, work
+        What the filter does, and room to do it.
+    ledger : ndarray of int64, shape (4, at least m)
+        Row SLOT: place of each reading's landmark in the map, negative for a new one.
+        On return, row FATE: USED, ADDED, GATED or SKIPPED; row NEAR: whether the
+        landmark was met; row COLUMN: columns of the landmarks in use.
+
+    Returns
+    -------
+    outcome : int
+        DONE, NOT_FINITE, or the row (of those in use) whose innovation covariance is
+        not positive definite.  Unless DONE, nothing has changed.
+    used : int
+        Number of readings of mapped landmarks in use.
+    nis : float
+        νᵀ S⁻¹ ν over them.
+    """
+    m = len(readings)
+    for k in range(m):
+        if not (np.isfinite(readings[k, 0]) and np.isfinite(readings[k, 1])):
+            return NOT_FINITE, 0, 0.0
+    used = screen(mean, covariance, readings, reference, rules, work, ledger)
+    batch = 1 if rules.sequential else max(used, 1)
+    for k in range(0, used, batch):
+        failed = correct(
+            mean, covariance, size, reference, rules, work, ledger[COLUMN], k, k + batch
+        )
+        if failed >= 0:
+            return failed, used, 0.0
+    nis = 0.0
+    for row in range(2 * used):
+        nis += work.white[0, row] * work.white[0, row]
+    for k in range(m):
+        if ledger[FATE, k] == ADDED:
+            variance = work.variances[0]
+            set_variance(rules, readings[k, 1], variance)
+            add_landmark(
+                mean,
+                covariance,
+                size,
+                readings[k],
+                variance,
+                rules.linearisation,
+                reference,
+                rules.correlated,
+            )
+            size += 2
+    return DONE, used, nis
+
+
+@compiled
+def update_one(
+    mean: Array,
+    covariance: Array,
+    size: int,
+    readings: Array,
+    reference: Array,
+    rule_values: Array,
+    ledger: Int,
+) -> tuple[int, int, float, Array, Array]:
+    """Update a single filter: :func:`update_belief` with a workspace of its own.
+
+    Returns outcome, used and nis of :func:`update_belief`, ν (m, 2) and L (2m, 2m), of
+    which the first ``used`` and 2 ``used`` rows hold.
+    """
+    work = new_workspace(len(readings), len(mean))
+    outcome, used, nis = update_belief(
+        mean, covariance, size, readings, reference, as_rules(rule_values), work, ledger
+    )
+    return outcome, used, nis, work.innovations[0], work.factors[0]

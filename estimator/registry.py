@@ -1,0 +1,121 @@
+"""Estimators by name, yours included."""
+
+from collections.abc import Callable
+from difflib import get_close_matches
+from importlib import import_module
+from typing import Any, cast
+
+from numpy.typing import ArrayLike
+
+from .ekf_slam import EkfSlam
+from .interface import SlamEstimator
+
+EstimatorFactory = Callable[..., SlamEstimator]
+
+_factories: dict[str, EstimatorFactory] = {}
+
+
+def register_estimator(name: str, factory: EstimatorFactory) -> None:
+    """Make an estimator available to :func:`make_estimator` and the command line.
+
+    Parameters
+    ----------
+    name : str
+        Name to call it by; an earlier estimator of that name is replaced.
+    factory : callable
+        Called with ``motion_std``, ``measurement_std``, ``initial_pose``,
+        ``initial_pose_std`` and options as keywords; returns the estimator.  Its
+        docstring's first line is shown in lists.
+
+    Examples
+    --------
+    >>> register_estimator("mine", EkfSlam)
+    >>> "mine" in list_estimators()
+    True
+    >>> del _factories["mine"]
+    """
+    if not callable(factory):
+        raise TypeError(f"factory must be callable, got {factory!r}")
+    _factories[name] = factory
+
+
+def list_estimators() -> tuple[str, ...]:
+    """Return the registered names, in the order of registration."""
+    return tuple(_factories)
+
+
+def find_estimator(name: str) -> EstimatorFactory:
+    """Return the factory of a registered name or of an import path "module:Class".
+
+    Raises
+    ------
+    ValueError
+        Where there is none, with the nearest name.
+    """
+    if name in _factories:
+        return _factories[name]
+    if ":" in name:
+        return _imported(name)
+    near = get_close_matches(name, _factories, n=1)
+    hint = f"; did you mean '{near[0]}'?" if near else ""
+    known = ", ".join(_factories)
+    raise ValueError(f"unknown estimator '{name}'{hint} (there are {known})")
+
+
+def make_estimator(
+    name: str,
+    *,
+    motion_std: ArrayLike,
+    measurement_std: ArrayLike,
+    initial_pose: ArrayLike = (0.0, 0.0, 0.0),
+    initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+    **options: Any,
+) -> SlamEstimator:
+    """Make an estimator by its registered name or by its import path.
+
+    Parameters
+    ----------
+    name : str
+        One of :func:`list_estimators`, or "module:Class".
+    motion_std : array_like, shape (3,)
+        (σx, σy, σα) of the motion noise in the robot frame [m, m, rad] per step.
+    measurement_std : array_like, shape (2,)
+        (σβ, σr) of the measurement noise [rad, m].
+    initial_pose, initial_pose_std : array_like, shape (3,)
+        Mean and standard deviation of the first pose (x, y, θ) [m, m, rad].
+    **options
+        What the estimator's own constructor takes beside these.
+
+    Raises
+    ------
+    ValueError
+        Where the name is unknown or an argument is refused.
+    TypeError
+        Where an option is unknown to the estimator.
+
+    Examples
+    --------
+    >>> slam = make_estimator(
+    ...     "ekf", motion_std=(0.1, 0.1, 0.05), measurement_std=(0.02, 0.1)
+    ... )
+    >>> slam.belief().pose
+    array([0., 0., 0.])
+    """
+    return find_estimator(name)(
+        motion_std=motion_std,
+        measurement_std=measurement_std,
+        initial_pose=initial_pose,
+        initial_pose_std=initial_pose_std,
+        **options,
+    )
+
+
+def _imported(path: str) -> EstimatorFactory:
+    module, _, attribute = path.partition(":")
+    try:
+        return cast("EstimatorFactory", getattr(import_module(module), attribute))
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"cannot import estimator '{path}': {error}") from error
+
+
+register_estimator("ekf", EkfSlam)

@@ -1,0 +1,90 @@
+"""Checks at the public door, in words that name the argument."""
+
+from collections.abc import Sequence
+from math import isfinite
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
+    """Return ``value`` as float64 (size,), or refuse it."""
+    vector = as_floats(name, value)
+    if vector.shape != (size,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name} must be {size} finite numbers, got {value!r}")
+    return vector
+
+
+def standard_deviations(name: str, value: ArrayLike, size: int) -> Array:
+    """Return ``value`` as float64 (size,), finite and not negative, or refuse it."""
+    std = as_floats(name, value)
+    if std.shape != (size,) or not (np.isfinite(std) & (std >= 0)).all():
+        raise ValueError(f"{name} must be {size} finite numbers >= 0, got {value!r}")
+    return std
+
+
+def as_floats(name: str, value: ArrayLike) -> Array:
+    """Return ``value`` as a contiguous float64 array, or refuse it."""
+    try:
+        return np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, got {value!r}") from None
+
+
+def scan(measurements: ArrayLike) -> Array:
+    """Return ``measurements`` as float64 (m, 2), or refuse them."""
+    readings = as_floats("measurements", measurements)
+    if readings.ndim == 2 and readings.shape[1] == 2:
+        return readings
+    if readings.size == 0:
+        return readings.reshape(0, 2)
+    raise ValueError(
+        "measurements must have shape (m, 2), rows (bearing, range), "
+        f"got shape {readings.shape}"
+    )
+
+
+def identities(landmark_ids: Sequence[int], count: int) -> list[int]:
+    """Return ids as Python integers: one for each of ``count`` readings, no repeats."""
+    array = np.asarray(landmark_ids)
+    if array.dtype.kind not in "iu" and array.size:
+        raise ValueError(f"landmark_ids must be integers, got {landmark_ids!r}")
+    ids: list[int] = array.tolist()
+    if len(ids) != count:
+        raise ValueError(
+            f"measurements has {count} rows but landmark_ids has {len(ids)} entries"
+        )
+    if len(set(ids)) < count:
+        twice = next(i for i in ids if ids.count(i) > 1)
+        raise ValueError(
+            f"landmark_ids must not repeat within a scan, got {twice} twice"
+        )
+    return ids
+
+
+def pair(name: str, value: ArrayLike) -> tuple[float, float]:
+    """Return ``value`` as two finite floats, or refuse it."""
+    try:
+        first, second = value  # type: ignore[misc, union-attr]
+        a, b = float(first), float(second)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be 2 finite numbers, got {value!r}") from None
+    if not (isfinite(a) and isfinite(b)):
+        raise ValueError(f"{name} must be 2 finite numbers, got {value!r}")
+    return a, b
+
+
+def at_least(name: str, value: float, least: float) -> float:
+    """Return a finite number >= ``least``, or refuse it."""
+    if not (isfinite(value) and value >= least):
+        raise ValueError(f"{name} must be a finite number >= {least:g}, got {value!r}")
+    return float(value)
+
+
+def above(name: str, value: float, least: float) -> float:
+    """Return a finite number > ``least``, or refuse it."""
+    if not (isfinite(value) and value > least):
+        raise ValueError(f"{name} must be a finite number > {least:g}, got {value!r}")
+    return float(value)

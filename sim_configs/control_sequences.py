@@ -1,0 +1,156 @@
+"""What the robot is told to do, open loop: sequences as data, and their commands.
+
+A command is (d, α): drive d straight ahead [m], then turn by α [rad].
+"""
+
+import math
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from .field_types import Command, Count, Part, Positive, broken_rule
+
+_LONGEST_CYCLE = 1_000_000  # steps: refuse a slip of the pen, do not fill the memory
+
+
+class CommandSequence(Part):
+    """Given commands, each repeated a number of times."""
+
+    sequence: Literal["commands"] = "commands"
+    commands: tuple[Command, ...] = Field(
+        min_length=1, description="rows (d [m], α [rad], times), per step"
+    )
+
+
+class SquareSequence(Part):
+    """A square, counter-clockwise: four sides, with a quarter turn after each."""
+
+    sequence: Literal["square"] = "square"
+    side: Positive = Field(description="length of a side [m]")
+    speed: Positive = Field(description="highest speed along a side [m/s]")
+    turn_steps: Count = Field(description="steps of each quarter turn")
+
+
+class CircleSequence(Part):
+    """A circle, counter-clockwise, as the regular polygon inscribed in it."""
+
+    sequence: Literal["circle"] = "circle"
+    radius: Positive = Field(description="radius of the circle [m]")
+    speed: Positive = Field(description="highest speed along the circle [m/s]")
+
+
+class FigureEightSequence(Part):
+    """Two circles that touch at the start: counter-clockwise, then clockwise."""
+
+    sequence: Literal["figure_eight"] = "figure_eight"
+    radius: Positive = Field(description="radius of both circles [m]")
+    speed: Positive = Field(description="highest speed along the circles [m/s]")
+
+
+class SpiralSequence(Part):
+    """A counter-clockwise spiral; its radius grows evenly with the angle turned."""
+
+    sequence: Literal["spiral"] = "spiral"
+    inner_radius: Positive = Field(description="radius of curvature at first [m]")
+    outer_radius: Positive = Field(description="radius of curvature at last [m]")
+    turns: Positive = Field(description="number of full turns")
+    speed: Positive = Field(description="speed along the spiral [m/s]")
+
+    @model_validator(mode="after")
+    def _check_radii(self) -> Self:
+        if self.outer_radius < self.inner_radius:
+            raise broken_rule(
+                f"outer_radius must be >= inner_radius = {self.inner_radius}, "
+                f"got {self.outer_radius}"
+            )
+        return self
+
+
+ControlSequence = Annotated[
+    CommandSequence
+    | SquareSequence
+    | CircleSequence
+    | FigureEightSequence
+    | SpiralSequence,
+    Field(discriminator="sequence"),
+]
+
+
+def command_cycle(controls: ControlSequence, dt: float) -> NDArray[np.float64]:
+    """Compute one cycle of a control sequence.
+
+    Parameters
+    ----------
+    controls : ControlSequence
+        The `controls` of a scenario.
+    dt : float
+        Duration of one step [s].
+
+    Returns
+    -------
+    ndarray of float64, shape (K, 2)
+        Commands (d, α) [m, rad], one row per step.
+
+    Examples
+    --------
+    >>> square = SquareSequence(side=4.0, speed=1.0, turn_steps=1)
+    >>> command_cycle(square, dt=2.0)[:3].round(4).tolist()
+    [[2.0, 0.0], [2.0, 0.0], [0.0, 1.5708]]
+    """
+    match controls:
+        case CommandSequence():
+            return _repeat(controls)
+        case SquareSequence():
+            return _square(controls, dt)
+        case CircleSequence():
+            return _circle(controls.radius, controls.speed * dt)
+        case FigureEightSequence():
+            left = _circle(controls.radius, controls.speed * dt)
+            return np.concatenate([left, left * (1.0, -1.0)])
+        case SpiralSequence():
+            return _spiral(controls, dt)
+
+
+def _repeat(sequence: CommandSequence) -> NDArray[np.float64]:
+    times = [times for _, _, times in sequence.commands]
+    _steps(sum(times), 1.0)  # refuses too many
+    return np.repeat([command[:2] for command in sequence.commands], times, axis=0)
+
+
+def _square(square: SquareSequence, dt: float) -> NDArray[np.float64]:
+    steps = _steps(square.side, square.speed * dt)
+    _steps(square.turn_steps, 1.0)  # refuses too many
+    straight = np.tile([square.side / steps, 0.0], (steps, 1))
+    turn = np.tile([0.0, math.pi / 2 / square.turn_steps], (square.turn_steps, 1))
+    return np.tile(np.concatenate([straight, turn]), (4, 1))
+
+
+def _circle(radius: float, longest_step: float) -> NDArray[np.float64]:
+    """Go round the regular polygon whose corners lie on the circle."""
+    steps = max(3, _steps(2 * math.pi * radius, longest_step))
+    angle = 2 * math.pi / steps
+    return np.tile([2 * radius * math.sin(angle / 2), angle], (steps, 1))
+
+
+def _spiral(spiral: SpiralSequence, dt: float) -> NDArray[np.float64]:
+    """Turn by α = d / r, where the radius r grows with the angle turned so far."""
+    distance, full_angle = spiral.speed * dt, 2 * math.pi * spiral.turns
+    growth = (spiral.outer_radius - spiral.inner_radius) / full_angle
+    _steps(full_angle * spiral.outer_radius, distance)  # refuses too many
+    turned, turns = 0.0, []
+    while turned < full_angle:
+        turns.append(distance / (spiral.inner_radius + growth * turned))
+        turned += turns[-1]
+    return np.column_stack([np.full(len(turns), distance), turns])
+
+
+def _steps(length: float, longest_step: float) -> int:
+    """Count the equal steps, none above the longest, that make up a length."""
+    steps = length / longest_step * (1 - 1e-12)
+    if steps > _LONGEST_CYCLE:
+        raise broken_rule(
+            f"controls must come to at most {_LONGEST_CYCLE} steps, got {steps:.6g}"
+        )
+    return max(1, math.ceil(steps))

@@ -1,0 +1,111 @@
+"""Kinds of scenario fields: strict numbers that say what they expect.
+
+Every type refuses strings and booleans where a number is meant, and NaN everywhere;
+integers may stand for floats.
+"""
+
+from reprlib import repr as short_repr
+from typing import Annotated, Any
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    StrictBool,
+    StrictStr,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from .scenario_errors import closest
+
+
+class Part(BaseModel):
+    """A frozen table of a scenario that refuses unknown keys with a suggestion."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, table: Any) -> Any:
+        if isinstance(table, dict):
+            for key in table:
+                if key not in cls.model_fields:
+                    suggestion = closest(str(key), cls.model_fields)
+                    raise PydanticCustomError(
+                        "unknown_key",
+                        "unknown key '{key}'{suggestion}",
+                        {"key": str(key), "suggestion": suggestion},
+                    )
+        return table
+
+
+def broken_rule(message: str) -> PydanticCustomError:
+    """Make the error of a rule between fields; `message` starts with a field's name."""
+    return PydanticCustomError("rule", "{message}", {"message": message})
+
+
+def expect(expectation: str) -> WrapValidator:
+    """Let whatever is wrong inside a field be told as one expectation."""
+
+    def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return handler(value)
+        except ValidationError:
+            raise PydanticCustomError(
+                "expected",
+                "must be {expected}, got {got}",
+                {"expected": expectation, "got": short_repr(value)},
+            ) from None
+
+    return WrapValidator(validate)
+
+
+_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0)]
+_Integer = Annotated[int, Field(strict=True)]
+
+Text = Annotated[StrictStr, expect("a string")]
+Name = Annotated[StrictStr, Field(min_length=1), expect("a string that is not empty")]
+Flag = Annotated[StrictBool, expect("true or false")]
+
+Positive = Annotated[_Number, Field(gt=0), expect("a finite number > 0")]
+NotNegative = Annotated[_NotNegative, expect("a finite number >= 0")]
+PositiveOrInfinite = Annotated[
+    float, Field(strict=True, allow_inf_nan=True, gt=0), expect("a number > 0, or inf")
+]
+Probability = Annotated[_NotNegative, Field(le=1), expect("a number from 0 to 1")]
+Count = Annotated[_Integer, Field(ge=1), expect("an integer >= 1")]
+CountOrZero = Annotated[_Integer, Field(ge=0), expect("an integer >= 0")]
+
+Point = Annotated[tuple[_Number, _Number], expect("2 finite numbers (x, y) [m]")]
+Pose = Annotated[
+    tuple[_Number, _Number, _Number], expect("3 finite numbers (x, y, θ) [m, m, rad]")
+]
+Bounds = Annotated[
+    tuple[_Number, _Number, _Number, _Number],
+    expect("4 finite numbers (xmin, ymin, xmax, ymax) [m]"),
+]
+Wall = Annotated[
+    tuple[_Number, _Number, _Number, _Number],
+    expect("4 finite numbers (x0, y0, x1, y1) [m]"),
+]
+PoseStd = Annotated[
+    tuple[_NotNegative, _NotNegative, _NotNegative],
+    expect("3 finite numbers >= 0 (σx, σy, σθ) [m, m, rad]"),
+]
+MotionStd = Annotated[
+    tuple[_NotNegative, _NotNegative, _NotNegative],
+    expect("3 finite numbers >= 0 (σx, σy, σα) [m, m, rad]"),
+]
+MeasurementStd = Annotated[
+    tuple[_NotNegative, _NotNegative],
+    expect("2 finite numbers >= 0 (σβ, σr) [rad, m]"),
+]
+Command = Annotated[
+    tuple[_Number, _Number, Annotated[_Integer, Field(ge=1)]],
+    expect("(d [m], α [rad], times): 2 finite numbers and an integer >= 1"),
+]

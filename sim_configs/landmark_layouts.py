@@ -1,0 +1,189 @@
+"""Where the landmarks stand: layouts as data, and the positions they stand for."""
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from .field_types import (
+    Bounds,
+    Count,
+    CountOrZero,
+    NotNegative,
+    Part,
+    Point,
+    Positive,
+    broken_rule,
+)
+from .scenario_errors import ScenarioError
+
+_TRIES_PER_LANDMARK = 2000
+
+
+class PointsLayout(Part):
+    """Landmarks at given positions."""
+
+    layout: Literal["points"] = "points"
+    points: tuple[Point, ...] = Field(
+        min_length=1, description="positions (x, y) in the world frame [m]"
+    )
+
+    @property
+    def count(self) -> int:
+        """Number of landmarks."""
+        return len(self.points)
+
+
+class GridLayout(Part):
+    """Landmarks on a square grid, row by row."""
+
+    layout: Literal["grid"] = "grid"
+    rows: Count = Field(description="number of rows, along y")
+    columns: Count = Field(description="number of columns, along x")
+    spacing: Positive = Field(description="distance of neighbours [m]")
+    origin: Point = Field(
+        default=(0.0, 0.0), description="lower left landmark (x, y) [m]"
+    )
+
+    @property
+    def count(self) -> int:
+        """Number of landmarks."""
+        return self.rows * self.columns
+
+
+class RingLayout(Part):
+    """Landmarks evenly spaced on a circle, counter-clockwise from its +x side."""
+
+    layout: Literal["ring"] = "ring"
+    count: Count = Field(description="number of landmarks")
+    radius: Positive = Field(description="radius of the circle [m]")
+    centre: Point = Field(
+        default=(0.0, 0.0), description="centre of the circle (x, y) [m]"
+    )
+
+
+class CorridorLayout(Part):
+    """Landmarks along both sides of a corridor in +x direction, left and right in turn.
+
+    The first stands on the left (+y) side above the origin, the last at the far end.
+    """
+
+    layout: Literal["corridor"] = "corridor"
+    count: Count = Field(description="number of landmarks")
+    length: Positive = Field(description="length of the corridor [m]")
+    width: Positive = Field(description="distance of the two sides [m]")
+    origin: Point = Field(
+        default=(0.0, 0.0), description="start of the corridor's middle line (x, y) [m]"
+    )
+
+
+class RandomLayout(Part):
+    """Landmarks uniform in a rectangle, with a minimum distance between them."""
+
+    layout: Literal["random"] = "random"
+    count: Count = Field(description="number of landmarks")
+    bounds: Bounds = Field(description="rectangle (xmin, ymin, xmax, ymax) [m]")
+    min_distance: NotNegative = Field(
+        default=0.0, description="least distance of two landmarks [m]"
+    )
+    seed: CountOrZero | None = Field(
+        default=None,
+        description="fixes the layout; without it every episode draws a new one",
+    )
+
+    @model_validator(mode="after")
+    def _check_bounds(self) -> Self:
+        left, bottom, right, top = self.bounds
+        if not (left < right and bottom < top):
+            raise broken_rule(
+                f"bounds must have xmin < xmax and ymin < ymax, got {self.bounds}"
+            )
+        return self
+
+
+LandmarkLayout = Annotated[
+    PointsLayout | GridLayout | RingLayout | CorridorLayout | RandomLayout,
+    Field(discriminator="layout"),
+]
+
+
+def place_landmarks(
+    layout: LandmarkLayout, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Compute the positions of the landmarks of a layout.
+
+    Parameters
+    ----------
+    layout : LandmarkLayout
+        The `landmarks` of a scenario.
+    rng : numpy.random.Generator
+        Drawn from only by a random layout that has no seed of its own.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 2)
+        Positions (x, y) in the world frame [m], N = ``layout.count``.
+
+    Raises
+    ------
+    ScenarioError
+        If a random layout finds no room for its landmarks.
+
+    Examples
+    --------
+    >>> layout = GridLayout(rows=2, columns=2, spacing=3.0)
+    >>> place_landmarks(layout, np.random.default_rng(0)).tolist()
+    [[0.0, 0.0], [3.0, 0.0], [0.0, 3.0], [3.0, 3.0]]
+    """
+    match layout:
+        case PointsLayout():
+            return np.array(layout.points, dtype=np.float64)
+        case GridLayout():
+            return _grid(layout)
+        case RingLayout():
+            return _ring(layout)
+        case CorridorLayout():
+            return _corridor(layout)
+        case RandomLayout():
+            own = layout.seed is not None
+            return _throw_darts(
+                layout, np.random.default_rng(layout.seed) if own else rng
+            )
+
+
+def _grid(layout: GridLayout) -> NDArray[np.float64]:
+    rows, columns = np.divmod(np.arange(layout.count), layout.columns)
+    return layout.origin + layout.spacing * np.column_stack([columns, rows])
+
+
+def _ring(layout: RingLayout) -> NDArray[np.float64]:
+    angles = 2 * np.pi * np.arange(layout.count) / layout.count
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    return layout.centre + layout.radius * directions
+
+
+def _corridor(layout: CorridorLayout) -> NDArray[np.float64]:
+    along = np.linspace(0.0, layout.length, layout.count)
+    across = np.where(np.arange(layout.count) % 2 == 0, 0.5, -0.5) * layout.width
+    return layout.origin + np.column_stack([along, across])
+
+
+def _throw_darts(layout: RandomLayout, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw one landmark after the other, again where it is too near to an earlier."""
+    low, high = layout.bounds[:2], layout.bounds[2:]
+    placed = np.empty((layout.count, 2))
+    for index in range(layout.count):
+        for _ in range(_TRIES_PER_LANDMARK):
+            dart = rng.uniform(low, high)
+            gaps = placed[:index] - dart
+            if (np.hypot(gaps[:, 0], gaps[:, 1]) >= layout.min_distance).all():
+                break
+        else:
+            raise ScenarioError(
+                f"landmarks.min_distance must leave room for {layout.count} landmarks "
+                f"in {layout.bounds}, got {layout.min_distance} "
+                f"({index} placed, then {_TRIES_PER_LANDMARK} tries failed)"
+            )
+        placed[index] = dart
+    return placed

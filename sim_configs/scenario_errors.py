@@ -1,0 +1,93 @@
+"""What a wrong scenario is told: one line per mistake, naming the field."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from typing import Any
+
+from pydantic import ValidationError
+
+_CONTAINERS = {
+    "tuple_type": "a list",
+    "model_type": "a table",
+    "too_short": "a list that is not empty",
+}
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be used; one line of text per mistake."""
+
+
+def closest(word: str, words: Iterable[str]) -> str:
+    """Suggest the nearest of some words, as the end of an error message.
+
+    Examples
+    --------
+    >>> closest("max_rage", ["min_range", "max_range"])
+    "; did you mean 'max_range'?"
+    >>> closest("zzz", ["min_range", "max_range"])
+    ''
+    """
+    nearest = get_close_matches(word, list(words), n=1)
+    return f"; did you mean '{nearest[0]}'?" if nearest else ""
+
+
+def error_lines(error: ValidationError) -> list[str]:
+    """Turn pydantic's report into one line per mistake.
+
+    Parameters
+    ----------
+    error : ValidationError
+        Raised while a `Scenario` was validated.
+
+    Returns
+    -------
+    list of str
+        For example ``"sensor.std must be 2 numbers >= 0, got [-1, 0.1]"``.
+    """
+    mistakes = error.errors(include_url=False)
+    return [_line(dict(details)) for details in mistakes if not _is_echo(dict(details))]
+
+
+def _is_echo(details: dict[str, Any]) -> bool:
+    """Tell a list said to be too short only because its items are wrong."""
+    return details["type"] == "too_short" and len(details["input"]) > 0
+
+
+def _line(details: dict[str, Any]) -> str:
+    kind, path = details["type"], _path(details["loc"])
+    context = details.get("ctx", {})
+    match kind:
+        case "unknown_key":
+            where, suggestion = path or "the scenario", context["suggestion"]
+            return f"unknown key '{context['key']}' in {where}{suggestion}"
+        case "missing":
+            return f"{path} must be given"
+        case "expected":
+            return f"{path} {details['msg']}"
+        case "rule":
+            return f"{path}.{details['msg']}" if path else str(details["msg"])
+        case "union_tag_not_found" | "union_tag_invalid":
+            return _unknown_tag(path, context)
+    expected = _CONTAINERS.get(kind, f"valid ({details['msg']})")
+    return f"{path or 'scenario'} must be {expected}, got {details['input']!r}"
+
+
+def _unknown_tag(path: str, context: dict[str, Any]) -> str:
+    field = f"{path}.{context['discriminator'].strip(chr(39))}"
+    if "tag" not in context:
+        return f"{field} must be given"
+    names = [name.strip().strip("'") for name in context["expected_tags"].split(",")]
+    suggestion = closest(context["tag"], names)
+    return (
+        f"{field} must be one of {', '.join(names)}, got {context['tag']!r}{suggestion}"
+    )
+
+
+def _path(location: tuple[str | int, ...]) -> str:
+    """Write a location as in the file: ``walls[2]``, ``landmarks.radius``."""
+    if len(location) > 1 and location[0] in ("landmarks", "controls"):
+        location = (location[0], *location[2:])  # pydantic adds the layout's own name
+    path = ""
+    for step in location:
+        path += f"[{step}]" if isinstance(step, int) else f".{step}"
+    return path.removeprefix(".")

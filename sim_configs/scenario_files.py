@@ -1,0 +1,130 @@
+"""Scenarios on disk: presets, TOML files and their JSON schema."""
+
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .scenario import Scenario
+from .scenario_errors import ScenarioError, closest
+
+_FOLDER = Path(__file__).parent
+_PRESETS = _FOLDER / "presets"
+SCHEMA_FILE = _FOLDER / "scenario.schema.json"
+
+
+def list_presets() -> tuple[str, ...]:
+    """Name the scenarios that come with the package, in alphabetical order.
+
+    Examples
+    --------
+    >>> "six_landmarks" in list_presets()
+    True
+    """
+    return tuple(sorted(path.stem for path in _PRESETS.glob("*.toml")))
+
+
+def load_scenario(source: Scenario | Mapping[str, object] | str | Path) -> Scenario:
+    """Read a scenario from whatever describes it.
+
+    Parameters
+    ----------
+    source : Scenario, mapping, str or Path
+        The name of a preset, the path of a ``.toml`` file, a mapping of plain values,
+        or a scenario, which is returned as it is.
+
+    Returns
+    -------
+    Scenario
+
+    Raises
+    ------
+    ScenarioError
+        If there is no such preset or file, or if it is not a valid scenario; one line
+        per mistake, with the file's name in front.
+
+    Examples
+    --------
+    >>> load_scenario("six_landmarks").landmarks.count
+    6
+    """
+    if isinstance(source, Scenario):
+        return source
+    if isinstance(source, Mapping):
+        return Scenario.from_table(source)
+    if not isinstance(source, str | Path):
+        raise ScenarioError(
+            "scenario must be a preset's name, the path of a .toml file, a mapping or "
+            f"a Scenario, got {source!r}"
+        )
+    if isinstance(source, Path) or source.endswith(".toml"):
+        return _load_file(Path(source))
+    if source not in list_presets():
+        raise ScenarioError(
+            f"scenario must be a preset ({', '.join(list_presets())}) or a .toml file, "
+            f"got '{source}'{closest(source, list_presets())}"
+        )
+    return _load_file(_PRESETS / f"{source}.toml")
+
+
+def save_scenario(scenario: Scenario, path: str | Path) -> None:
+    """Write a scenario as a TOML file that `load_scenario` reads back equal.
+
+    Every field is written, also those at their defaults.
+    """
+    table = scenario.model_dump(exclude_none=True)
+    parts = {key: value for key, value in table.items() if isinstance(value, dict)}
+    lines = [_assignment(key, table[key]) for key in table if key not in parts]
+    for name, part in parts.items():
+        lines += ["", f"[{name}]", *(_assignment(*item) for item in part.items())]
+    Path(path).write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def scenario_schema() -> str:
+    """Describe scenario files as a JSON schema, for editors that complete and check."""
+    schema = Scenario.model_json_schema()
+    for part in schema["$defs"].values():
+        tags = [key for key in ("layout", "sequence") if key in part["properties"]]
+        part["required"] = tags + part.get("required", [])
+    return json.dumps(schema, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _load_file(path: Path) -> Scenario:
+    try:
+        return Scenario.from_table(tomllib.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        reason = error.strerror or error
+        raise ScenarioError(f"cannot read the scenario '{path}': {reason}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(_syntax_message(path, str(error))) from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path} must be UTF-8 text, got {error.reason}") from None
+    except ScenarioError as error:
+        lines = str(error).splitlines()
+        raise ScenarioError("\n".join(f"{path}: {line}" for line in lines)) from None
+
+
+def _syntax_message(path: Path, message: str) -> str:
+    """Move the line's number, which tomllib appends to its message, to the front."""
+    reason, _, place = message.rpartition(" (at ")
+    line = re.match(r"line \d+", place)
+    where = line[0] if line else place.removesuffix(")")
+    return f"{path}, {where}: {reason}"
+
+
+def _assignment(key: str, value: object) -> str:
+    return f"{key} = {_toml(value)}"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return repr(float(value))  # a NumPy float has another repr
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return repr(value)

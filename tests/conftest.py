@@ -1,0 +1,13 @@
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def public_logs():
+    """Return the folder of public logs, which are not part of the repository."""
+    folder = os.environ.get("SLAMGYM_DATA", "")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("SLAMGYM_DATA names no folder of public logs")
+    return Path(folder)

@@ -1,0 +1,134 @@
+import numpy as np
+import pytest
+
+from slamgym.estimator import (
+    Belief,
+    EkfSlam,
+    EstimatorContractError,
+    SlamEstimator,
+    check_estimator,
+    list_estimators,
+    make_estimator,
+    register_estimator,
+)
+
+NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
+
+
+@pytest.mark.parametrize("name", list_estimators())
+def test_every_registered_estimator_keeps_the_contract(name):
+    check_estimator(lambda **settings: make_estimator(name, **settings))
+    assert isinstance(make_estimator(name, **NOISE), SlamEstimator)
+
+
+class LacksUpdate(EkfSlam):
+    update = None
+
+
+class TurnsBeforeItDrives(EkfSlam):
+    def predict(self, odometry, dt=1.0):
+        d, turn = odometry
+        super().predict((0.0, turn), dt)
+        super().predict((d, 0.0), 0.0)
+
+
+class AnswersWithLiveArrays(EkfSlam):
+    def belief(self):
+        belief = super().belief()
+        if not hasattr(self, "_live"):
+            self._live = belief
+        object.__setattr__(self._live, "mean", belief.mean)
+        object.__setattr__(self._live, "covariance", belief.covariance)
+        object.__setattr__(self._live, "landmark_ids", belief.landmark_ids)
+        return self._live
+
+
+class AcceptsNan(EkfSlam):
+    def predict(self, odometry, dt=1.0):
+        super().predict(np.nan_to_num(odometry), dt)
+
+
+class ForgetsItsMap(EkfSlam):
+    def state_dict(self):
+        fresh = EkfSlam(**NOISE)
+        return fresh.state_dict() | {"estimator": "ForgetsItsMap"}
+
+
+class IgnoresBearings(EkfSlam):
+    def update(self, measurements, landmark_ids=None):
+        turned = np.array(measurements, dtype=float).reshape(-1, 2)
+        turned[:, 0] *= -1
+        return super().update(turned, landmark_ids)
+
+
+class Overconfident(EkfSlam):
+    def belief(self):
+        belief = super().belief()
+        if not belief.landmark_ids:
+            return belief
+        return Belief(belief.mean, belief.covariance / 400, belief.landmark_ids)
+
+
+class AddsNoNoise(EkfSlam):
+    def predict(self, odometry, dt=1.0):
+        super().predict(odometry, 0.0)
+
+
+class KeepsItsMapOnReset(EkfSlam):
+    def reset(self, pose, pose_std):
+        if not hasattr(self, "_slots"):
+            super().reset(pose, pose_std)
+        self._mean[:3] = pose
+
+
+class ReturnsNothing(EkfSlam):
+    def update(self, measurements, landmark_ids=None):
+        super().update(measurements, landmark_ids)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "complaint"),
+    [
+        (LacksUpdate, r"LacksUpdate has no method update\(\)"),
+        (TurnsBeforeItDrives, "drive d along the old heading"),
+        (AnswersWithLiveArrays, "snapshot"),
+        (AcceptsNan, r"predict\(\(nan, 0\)\) must raise a ValueError"),
+        (ForgetsItsMap, "bit for bit"),
+        (IgnoresBearings, "must be mapped where it is"),
+        (Overconfident, "must fit its covariance"),
+        (AddsNoNoise, "noise"),
+        (KeepsItsMapOnReset, "reset"),
+        (ReturnsNothing, "must return an UpdateReport, got NoneType"),
+        (lambda: None, "the factory must accept the keywords"),
+    ],
+)
+def test_a_breach_of_the_contract_is_named(estimator, complaint):
+    with pytest.raises(EstimatorContractError, match=complaint):
+        check_estimator(estimator)
+
+
+def test_unknown_estimator_is_refused_with_a_suggestion():
+    with pytest.raises(ValueError, match="unknown estimator 'efk'; did you mean 'ekf'"):
+        make_estimator("efk", **NOISE)
+
+
+def test_an_estimator_is_found_by_its_import_path():
+    slam = make_estimator("slamgym.estimator:EkfSlam", **NOISE)
+    assert isinstance(slam, EkfSlam)
+    with pytest.raises(ValueError, match=r"cannot import estimator 'no\.such:Filter'"):
+        make_estimator("no.such:Filter", **NOISE)
+
+
+def test_a_registered_estimator_is_made_by_name():
+    class Mine(EkfSlam):
+        pass
+
+    register_estimator("mine_for_this_test", Mine)
+    try:
+        assert isinstance(make_estimator("mine_for_this_test", **NOISE), Mine)
+    finally:
+        from slamgym.estimator import registry
+
+        del registry._factories["mine_for_this_test"]
+    with pytest.raises(TypeError, match="factory must be callable"):
+        register_estimator("nothing", 3)

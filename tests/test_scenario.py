@@ -1,0 +1,388 @@
+import json
+import math
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slamgym.sim_configs import (
+    Scenario,
+    ScenarioError,
+    list_presets,
+    load_scenario,
+    place_landmarks,
+    save_scenario,
+)
+from slamgym.sim_configs import scenario_files as files
+
+CUSTOM_LAYOUTS = [
+    {"layout": "grid", "rows": 2, "columns": 3, "spacing": 1.5},
+    {"layout": "ring", "count": 5, "radius": 2.0, "centre": [1.0, -1.0]},
+    {"layout": "corridor", "count": 6, "length": 10.0, "width": 2.0},
+    {"layout": "random", "count": 4, "bounds": [-1.0, -2.0, 3.0, 4.0]},
+    {"layout": "random", "count": 4, "bounds": [-1.0, -2.0, 3.0, 4.0], "seed": 3},
+]
+
+
+def mistake(table):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(table)
+    return str(caught.value)
+
+
+def mistake_of(**changes):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario("six_landmarks").with_changes(**changes)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sensor": {"max_rage": 3.0}},
+         "unknown key 'max_rage' in sensor; did you mean 'max_range'?"),
+        ({"stesp": 3}, "unknown key 'stesp' in the scenario; did you mean 'steps'?"),
+        ({"landmarks": {"layout": "ring", "raduis": 3.0, "count": 3}},
+         "unknown key 'raduis' in landmarks; did you mean 'radius'?"),
+        ({"zzz": 3}, "unknown key 'zzz' in the scenario"),
+    ],
+)  # fmt: skip
+def test_an_unknown_key_is_refused_with_a_suggestion(changes, message):
+    assert mistake_of(**changes) == message
+
+
+@pytest.mark.parametrize("std", [[-1, 0.1], [0.1], [0.1, 0.1, 0.1], 0.1, ["0.1", 0.1]])
+def test_a_wrong_sensor_std_is_named(std):
+    message = mistake_of(sensor={"std": std})
+    assert message == (
+        f"sensor.std must be 2 finite numbers >= 0 (σβ, σr) [rad, m], got {std!r}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"dt": "3"}, "dt"),
+        ({"dt": True}, "dt"),
+        ({"dt": 0.0}, "dt"),
+        ({"dt": math.inf}, "dt"),
+        ({"steps": 3.0}, "steps"),
+        ({"steps": True}, "steps"),
+        ({"steps": 1}, "steps"),
+        ({"name": ""}, "name"),
+        ({"name": 3}, "name"),
+        ({"description": 3}, "description"),
+        ({"start": {"pose": [0.0, 0.0, math.nan]}}, "start.pose"),
+        ({"start": {"std": [0.1, 0.1, -0.1]}}, "start.std"),
+        ({"start": {"drawn": "both"}}, "start.drawn"),
+        ({"robot": {"radius": 0}}, "robot.radius"),
+        ({"robot": {"max_speed": -1.0}}, "robot.max_speed"),
+        ({"robot": {"max_turn_rate": math.inf}}, "robot.max_turn_rate"),
+        ({"motion": {"std": [0.1, 0.1]}}, "motion.std"),
+        ({"motion": {"noise_in": "wheels"}}, "motion.noise_in"),
+        ({"motion": {"noise_at_rest": 1}}, "motion.noise_at_rest"),
+        ({"sensor": {"identities": "true"}}, "sensor.identities"),
+        ({"sensor": {"occlusion": 0}}, "sensor.occlusion"),
+        ({"sensor": {"max_range": math.nan}}, "sensor.max_range"),
+        ({"sensor": {"max_range": True}}, "sensor.max_range"),
+        ({"sensor": {"min_range": -0.1}}, "sensor.min_range"),
+        ({"sensor": {"range_std_per_metre": -0.1}}, "sensor.range_std_per_metre"),
+        ({"sensor": {"field_of_view": 0.0}}, "sensor.field_of_view"),
+        ({"sensor": {"field_of_view": 6.3}}, "sensor.field_of_view"),
+        ({"sensor": {"dropout": 1.1}}, "sensor.dropout"),
+        ({"sensor": {"dropout": -0.1}}, "sensor.dropout"),
+        ({"sensor": {"clutter": -1.0}}, "sensor.clutter"),
+        ({"sensor": {"max_clutter": 1.5}}, "sensor.max_clutter"),
+        ({"sensor": 3}, "sensor"),
+        ({"walls": 3}, "walls"),
+        ({"walls": [[0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]}, "walls[1]"),
+        ({"walls": [[1.0, 2.0, 1.0, 2.0]]}, "walls[0]"),
+        ({"landmarks": {"points": [[0.0, 0.0], [0.0, "1"]]}}, "landmarks.points[1]"),
+        ({"landmarks": {"points": []}}, "landmarks.points"),
+        ({"landmarks": {"layout": "ring", "count": 0, "radius": 1.0}},
+         "landmarks.count"),
+        ({"landmarks": {"layout": "rnig"}}, "landmarks.layout"),
+        ({"controls": {"commands": [[1.0, 0.0, 0]]}}, "controls.commands[0]"),
+        ({"controls": {"commands": [[1.0, 0.0, 2.0]]}}, "controls.commands[0]"),
+        ({"controls": {"sequence": "cirle"}}, "controls.sequence"),
+    ],
+)  # fmt: skip
+def test_a_bad_value_gets_one_line_that_names_its_field(changes, field):
+    message = mistake_of(**changes)
+    assert message.startswith(f"{field} must ")
+    assert "got" in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("kind", ["landmarks", "controls"])
+def test_an_unknown_kind_is_refused_with_a_suggestion(kind):
+    tag, typo = {"landmarks": ("layout", "rnig"), "controls": ("sequence", "spirral")}[
+        kind
+    ]
+    right = {"rnig": "ring", "spirral": "spiral"}[typo]
+    message = mistake_of(**{kind: {tag: typo}})
+    assert message.endswith(f"got '{typo}'; did you mean '{right}'?")
+
+
+def test_every_missing_field_gets_a_line_of_its_own():
+    lines = mistake({"name": "x", "dt": 1.0}).splitlines()
+    assert lines == [
+        f"{field} must be given"
+        for field in ("steps", "motion", "sensor", "landmarks", "controls")
+    ]
+
+
+def test_a_missing_field_of_a_layout_is_named():
+    ring = {"layout": "ring", "count": 3}
+    assert mistake_of(landmarks=ring) == "landmarks.radius must be given"
+
+
+def test_a_layout_without_its_name_is_refused():
+    table = load_scenario("six_landmarks").model_dump()
+    del table["landmarks"]["layout"]
+    assert mistake(table) == "landmarks.layout must be given"
+
+
+def test_encoders_have_no_sideways_noise():
+    message = mistake_of(motion={"noise_in": "odometry"})
+    assert message.startswith("motion.std must have σy = 0 with noise_in = 'odometry'")
+
+
+def test_min_range_lies_below_max_range():
+    message = mistake_of(sensor={"min_range": 2.0, "max_range": 2.0})
+    assert message == "sensor.min_range must be < max_range = 2.0, got 2.0"
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [
+        {"identities": True, "max_range": 5.0},
+        {"identities": False, "max_range": math.inf},
+    ],
+)
+def test_clutter_needs_hidden_identities_and_a_finite_range(sensor):
+    message = mistake_of(sensor={"clutter": 1.0, "max_clutter": 6, **sensor})
+    assert message.startswith("sensor.clutter must be 0 unless")
+
+
+def test_clutter_needs_rows_to_stand_in():
+    sensor = {"clutter": 2.0, "max_clutter": 1, "identities": False, "max_range": 5.0}
+    message = mistake_of(sensor=sensor)
+    assert message.startswith("sensor.max_clutter must be >= clutter = 2.0")
+
+
+def test_controls_beyond_the_robots_limits_are_refused():
+    assert mistake_of(robot={"max_speed": 0.5}) == (
+        "controls must stay within robot.max_speed = 0.5 m/s, got 1 m/s"
+    )
+    assert mistake_of(robot={"max_turn_rate": 0.1}).startswith(
+        "controls must stay within robot.max_turn_rate = 0.1 rad/s"
+    )
+
+
+def test_integers_stand_for_floats_and_become_floats():
+    scenario = load_scenario("six_landmarks").with_changes(dt=4, sensor={"std": [0, 1]})
+    assert isinstance(scenario.dt, float)
+    assert scenario.sensor.std == (0.0, 1.0)
+
+
+def test_arrays_and_numpy_scalars_are_taken_as_numbers():
+    scenario = load_scenario("six_landmarks").with_changes(
+        dt=np.float64(4.0), steps=np.int64(7), landmarks={"points": np.eye(2)}
+    )
+    assert scenario.landmarks.points == ((1.0, 0.0), (0.0, 1.0))
+    assert scenario.steps == 7
+
+
+def test_a_change_leaves_its_neighbours_and_the_original_alone():
+    before = load_scenario("six_landmarks")
+    after = before.with_changes(sensor={"max_range": 4.0}, steps=10)
+    assert before == load_scenario("six_landmarks")
+    assert (after.sensor.max_range, after.steps) == (4.0, 10)
+    assert after.with_changes(sensor={"max_range": math.inf}, steps=29) == before
+
+
+def test_another_layout_replaces_the_old_one_whole():
+    ring = {"layout": "ring", "count": 3, "radius": 2.0}
+    scenario = load_scenario("six_landmarks").with_changes(landmarks=ring)
+    assert scenario.landmarks.count == 3
+    wider = scenario.with_changes(landmarks={"layout": "ring", "radius": 4.0})
+    assert (wider.landmarks.count, wider.landmarks.radius) == (3, 4.0)
+
+
+def test_a_part_replaces_a_part():
+    sensor = load_scenario("loop").sensor
+    assert load_scenario("six_landmarks").with_changes(sensor=sensor).sensor == sensor
+
+
+def test_scenarios_are_frozen_hashable_values():
+    scenario = load_scenario("six_landmarks")
+    assert hash(scenario) == hash(load_scenario("six_landmarks"))
+    assert pickle.loads(pickle.dumps(scenario)) == scenario
+    with pytest.raises(ValueError, match="frozen"):
+        scenario.steps = 3
+    with pytest.raises(ValueError, match="frozen"):
+        scenario.sensor.max_range = 3.0
+
+
+def test_a_scenario_loads_as_itself():
+    scenario = load_scenario("loop")
+    assert load_scenario(scenario) is scenario
+
+
+def test_a_mapping_of_json_types_loads():
+    scenario = load_scenario("corridor")
+    assert load_scenario(json.loads(json.dumps(scenario.model_dump()))) == scenario
+
+
+@pytest.mark.parametrize("source", [3, [], None])
+def test_anything_else_is_refused(source):
+    assert mistake(source).startswith("scenario must be a preset's name, ")
+
+
+def test_an_unknown_preset_is_refused_with_a_suggestion():
+    message = mistake("six_landmark")
+    assert message.endswith("got 'six_landmark'; did you mean 'six_landmarks'?")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    path = tmp_path / "none.toml"
+    for source in (path, str(path), tmp_path):
+        assert mistake(source).startswith(f"cannot read the scenario '{source}': ")
+
+
+def test_malformed_toml_names_the_file_and_the_line(tmp_path):
+    path = tmp_path / "broken.toml"
+    path.write_text('name = "x"\ndt = = 3\n')
+    assert mistake(path) == f"{path}, line 2: Invalid value"
+
+
+def test_toml_that_ends_too_early_names_the_file_and_the_end(tmp_path):
+    path = tmp_path / "broken.toml"
+    path.write_text('name = "x')
+    message = mistake(path)
+    assert message.startswith(f"{path}, end of document: ")
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"name = '\xff'")
+    assert mistake(path).startswith(f"{path} must be UTF-8 text")
+
+
+def test_a_mistake_in_a_file_names_the_file(tmp_path):
+    path = tmp_path / "typo.toml"
+    text = (Path(files.__file__).parent / "presets/loop.toml").read_text()
+    path.write_text(text.replace("max_range", "max_rage"))
+    assert mistake(path) == (
+        f"{path}: unknown key 'max_rage' in sensor; did you mean 'max_range'?"
+    )
+
+
+@pytest.mark.parametrize("name", list_presets())
+def test_a_saved_preset_loads_back_equal(name, tmp_path):
+    save_scenario(load_scenario(name), tmp_path / "copy.toml")
+    assert load_scenario(tmp_path / "copy.toml") == load_scenario(name)
+
+
+@pytest.mark.parametrize("layout", CUSTOM_LAYOUTS)
+def test_a_saved_layout_loads_back_equal(layout, tmp_path):
+    scenario = load_scenario("six_landmarks").with_changes(landmarks=layout)
+    save_scenario(scenario, tmp_path / "copy.toml")
+    assert load_scenario(tmp_path / "copy.toml") == scenario
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    name=st.text(min_size=1),
+    number=st.floats(min_value=1e-300, max_value=1e300),
+    flag=st.booleans(),
+)
+def test_any_text_and_number_survives_a_file(name, number, flag, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "copy.toml"
+    scenario = load_scenario("six_landmarks").with_changes(
+        name=name,
+        sensor={"std": [number, 0.1], "occlusion": flag},
+        robot={"radius": np.float64(number)},
+    )
+    save_scenario(scenario, path)
+    assert load_scenario(path) == scenario
+
+
+def test_the_schema_file_equals_the_model():
+    assert files.SCHEMA_FILE.read_text(encoding="utf-8") == files.scenario_schema(), (
+        "write scenario_schema() to sim_configs/scenario.schema.json"
+    )
+
+
+def test_the_schema_knows_every_field_with_a_description():
+    schema = json.loads(files.SCHEMA_FILE.read_text(encoding="utf-8"))
+    tables = [schema, *schema["$defs"].values()]
+    fields = [item for table in tables for item in table["properties"].items()]
+    assert len(fields) > 40
+    for name, field in fields:
+        assert "description" in field or name in ("layout", "sequence")
+    assert all(table["additionalProperties"] is False for table in tables)
+
+
+def test_the_schema_asks_for_the_name_of_a_layout():
+    schema = json.loads(files.SCHEMA_FILE.read_text(encoding="utf-8"))
+    assert "layout" in schema["$defs"]["RingLayout"]["required"]
+    assert "sequence" in schema["$defs"]["CircleSequence"]["required"]
+
+
+@pytest.mark.parametrize("name", list_presets())
+class TestPresets:
+    def test_its_name_is_that_of_its_file(self, name):
+        assert load_scenario(name).name == name
+
+    def test_it_points_editors_to_the_schema(self, name):
+        path = Path(files.__file__).parent / "presets" / f"{name}.toml"
+        head = path.read_text(encoding="utf-8").splitlines()[0]
+        link = head.removeprefix("#:schema ")
+        assert (path.parent / link).resolve() == files.SCHEMA_FILE.resolve()
+
+    def test_its_actions_fit_the_unit_box(self, name):
+        robot = load_scenario(name).robot
+        assert max(robot.max_speed, robot.max_turn_rate) <= 1
+
+    def test_its_world_is_the_same_for_every_episode(self, name):
+        layout = load_scenario(name).landmarks
+        first, second = (
+            place_landmarks(layout, np.random.default_rng(seed)) for seed in (1, 2)
+        )
+        assert np.array_equal(first, second)
+
+
+def test_the_presets_are_these():
+    assert list_presets() == (
+        "corridor",
+        "dense",
+        "dropout",
+        "hidden_identities",
+        "loop",
+        "six_landmarks",
+    )
+
+
+def test_the_constructor_takes_typed_parts():
+    loop = load_scenario("loop")
+    fields = {name: getattr(loop, name) for name in Scenario.model_fields}
+    assert Scenario(**fields) == loop
+
+
+def test_importing_scenarios_loads_nothing_heavy():
+    code = (
+        "import sys, slamgym.sim_configs\n"
+        "heavy = {'scipy', 'numba', 'pymunk', 'matplotlib', 'rich', 'typer'}\n"
+        "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
