@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from ..sim_configs import Scenario
 from .line_of_sight import LineOfSight
-from .noise_streams import BoolArray, ComplexArray, SensorNoise
+from .noise_streams import MANY_STD, ComplexArray, SensorNoise
 
 Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _PI = np.array(np.pi)
 
@@ -53,10 +54,10 @@ class BearingRangeSensor:
         self._count = scenario.landmarks.count
         self._hides_identities = not sensor.identities
         self._range_std = sensor.std[1], sensor.range_std_per_metre
-        self._min_range = np.array(sensor.min_range)  # 0-d arrays compare twice as
-        self._max_range = np.array(sensor.max_range)  # fast as Python floats
-        self._half_view = np.array(sensor.field_of_view / 2)
+        self._max_range = np.array(sensor.max_range)  # 0-d arrays compare twice as
+        self._half_view = np.array(sensor.field_of_view / 2)  # fast as Python floats
         self._sees_around = sensor.field_of_view >= 2 * np.pi
+        self._may_wrap = sensor.field_of_view / 2 + MANY_STD * sensor.std[0] >= np.pi
         self._sight = None
         if sensor.occlusion and scenario.walls:
             self._sight = LineOfSight(scenario.walls)
@@ -86,44 +87,35 @@ class BearingRangeSensor:
         Scan
             With M = N, or N + C when identities are hidden.
         """
+        true = np.empty(landmarks.shape, dtype=np.complex128)
         relative = (landmarks - position) * heading.conjugate()
-        ranges = np.abs(relative)
-        bearings = np.arctan2(relative.imag, relative.real)
-        readings = self._read(bearings, ranges, noise)
-        mask = self._see(bearings, ranges, noise)
-        mask &= readings.imag > 0.0
+        bearings = np.arctan2(relative.imag, relative.real, true.real)
+        ranges = np.abs(relative, true.imag)
+        mask = ranges > noise.nearest
+        mask &= ranges <= self._max_range
+        if not self._sees_around:
+            mask &= np.abs(bearings) <= self._half_view
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
-        seen = np.zeros(readings.shape, dtype=np.complex128)
-        np.copyto(seen, readings, where=mask)
+        readings = np.zeros(true.shape, dtype=np.complex128)
+        np.copyto(readings, self._disturb(true, noise), where=mask)
         if self._hides_identities:
-            return hide_identities(seen, mask, noise)
-        return Scan(as_rows(seen), mask, None)
+            return hide_identities(readings, mask, noise)
+        return Scan(as_rows(readings), mask, None)
 
-    def _read(self, bearings: Array, ranges: Array, noise: SensorNoise) -> ComplexArray:
-        """Add the noise to the true readings; returns β + i r, shape (…, N)."""
-        readings = np.empty(ranges.shape, dtype=np.complex128)
-        readings.real = bearings
-        readings.imag = ranges
-        constant, per_metre = self._range_std
-        if per_metre:
-            readings.real += noise.reading.real
-            readings.imag += noise.reading.imag * (constant + per_metre * ranges)
-        else:
-            readings += noise.reading
-        if np.count_nonzero(np.abs(readings.real) >= _PI):
+    def _disturb(self, true: ComplexArray, noise: SensorNoise) -> ComplexArray:
+        """Add noise to true readings β + i r, shape (…, N)."""
+        readings = true + self._scaled(noise.reading, true.imag)
+        if self._may_wrap and np.count_nonzero(np.abs(readings.real) >= _PI):
             readings.real = wrap_bearings(readings.real)
         return readings
 
-    def _see(self, bearings: Array, ranges: Array, noise: SensorNoise) -> BoolArray:
-        """Tell which landmarks are in reach and in view, shape (…, N)."""
-        mask: BoolArray = ranges <= self._max_range
-        mask &= ranges >= self._min_range
-        if not self._sees_around:
-            mask &= np.abs(bearings) <= self._half_view
-        if noise.kept is not None:
-            mask &= noise.kept
-        return mask
+    def _scaled(self, noise: ComplexArray, ranges: Array) -> ComplexArray:
+        """Give noise in units of σr(r) = σr + k r its size; leave other as it is."""
+        constant, per_metre = self._range_std
+        if per_metre == 0.0:
+            return noise
+        return noise.real + 1j * (noise.imag * (constant + per_metre * ranges))
 
 
 def wrap_bearings(bearings: Array) -> Array:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..sim_configs import Scenario, action_sequence
 from ..sim_configs.scenario import Robot
 from ..sim_configs.scenario_errors import closest
+from .planned_path import planned_path
 
 Array = NDArray[np.float64]
 
@@ -149,7 +150,9 @@ class RandomSmooth:
 
         s' = ρ s + √(1 - ρ²) n,    ρ = exp(-dt / correlation_time),  n ~ N(0, 1)
         v = max_speed (1/2 + s_v / 4),      clipped to [0, max_speed]
-        ω = max_turn_rate s_ω / 3,          clipped to ± max_turn_rate
+        ω = max_turn_rate (s_ω / 3 + e),    clipped to ± max_turn_rate
+
+    with e = 0 within reach of home, and the angle from the heading to home beyond it.
 
     Parameters
     ----------
@@ -161,6 +164,10 @@ class RandomSmooth:
         Duration of one step [s].
     correlation_time : float, optional
         Time over which the robot forgets what it did [s].
+    home : (float, float), optional
+        Where the robot turns to when it has gone too far (x, y) [m].
+    reach : float, optional
+        How far from home that is [m]; the default never is.
 
     Examples
     --------
@@ -176,12 +183,16 @@ class RandomSmooth:
         *,
         dt: float,
         correlation_time: float = 5.0,
+        home: tuple[float, float] = (0.0, 0.0),
+        reach: float = math.inf,
     ) -> None:
         self._rng = rng
         self._robot = robot
         self._memory = math.exp(
             -_positive(dt, "dt") / _positive(correlation_time, "correlation_time")
         )
+        self._home = home
+        self._reach = reach
         self._state = np.zeros(2)
 
     def act(self, pose: ArrayLike, step: int) -> Array:
@@ -189,43 +200,20 @@ class RandomSmooth:
         memory = self._memory if step > 0 else 0.0
         noise = math.sqrt(1 - memory**2) * self._rng.standard_normal(2)
         self._state = memory * self._state + noise
-        speed, turn = self._state
+        speed = 0.5 + self._state[0] / 4
+        turn = self._state[1] / 3 + self._way_home(*_pose(pose))
         return np.array(
             [
-                self._robot.max_speed * np.clip(0.5 + speed / 4, 0.0, 1.0),
-                self._robot.max_turn_rate * np.clip(turn / 3, -1.0, 1.0),
+                self._robot.max_speed * np.clip(speed, 0.0, 1.0),
+                self._robot.max_turn_rate * np.clip(turn, -1.0, 1.0),
             ]
         )
 
-
-def planned_path(scenario: Scenario) -> Array:
-    """Compute the poses of the scenario's controls, without noise and walls.
-
-    ::
-
-        x' = x + d cos θ,    y' = y + d sin θ,    θ' = θ + α
-
-    Returns
-    -------
-    ndarray of float64, shape (steps + 1, 3)
-        Poses (x, y, θ) [m, m, rad], the start first, headings not wrapped.
-
-    Examples
-    --------
-    >>> from slamgym.sim_configs import load_scenario
-    >>> planned_path(load_scenario("six_landmarks"))[5].tolist()
-    [15.0, 0.0, 0.0]
-    """
-    distances, turns = (action_sequence(scenario) * scenario.dt).T
-    x, y, heading = scenario.start.pose
-    headings = np.cumsum([heading, *turns])
-    return np.column_stack(
-        [
-            np.cumsum([x, *(distances * np.cos(headings[:-1]))]),
-            np.cumsum([y, *(distances * np.sin(headings[:-1]))]),
-            headings,
-        ]
-    )
+    def _way_home(self, x: float, y: float, heading: float) -> float:
+        ahead, aside = self._home[0] - x, self._home[1] - y
+        if math.hypot(ahead, aside) <= self._reach:
+            return 0.0
+        return _wrap(math.atan2(aside, ahead) - heading)
 
 
 def make_controller(
@@ -237,7 +225,7 @@ def make_controller(
     ----------
     name : {"open_loop", "waypoints", "random"}
         ``"open_loop"`` follows the scenario's controls, ``"waypoints"`` steers along
-        the path they would take without noise, ``"random"`` wanders.
+        the path they would take without noise, ``"random"`` wanders around there.
     scenario : Scenario
         Its controls, step and robot are used.
     rng : numpy.random.Generator
@@ -254,7 +242,7 @@ def make_controller(
         case "waypoints":
             return _follow_plan(scenario)
         case "random":
-            return RandomSmooth(rng, scenario.robot, dt=scenario.dt)
+            return _wander_near_plan(scenario, rng)
     names, hint = ", ".join(CONTROLLERS), closest(name, CONTROLLERS)
     raise ValueError(f"name must be one of {names}, got {name!r}{hint}")
 
@@ -264,10 +252,21 @@ def _follow_plan(scenario: Scenario) -> Waypoints:
     positions = planned_path(scenario)[:, :2]
     legs = np.hypot(*np.diff(positions, axis=0).T)
     return Waypoints(
-        positions[1:][legs > 0] if legs.any() else positions[:1],
+        positions[1:],
         scenario.robot,
         dt=scenario.dt,
         tolerance=legs.max() / 2 if legs.any() else scenario.robot.radius,
+    )
+
+
+def _wander_near_plan(scenario: Scenario, rng: np.random.Generator) -> RandomSmooth:
+    """Wander within the circle around the rectangle that holds the planned path."""
+    positions = planned_path(scenario)[:, :2]
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    x, y = (low + high) / 2
+    reach = max(math.dist(low, high) / 2, scenario.robot.radius)
+    return RandomSmooth(
+        rng, scenario.robot, dt=scenario.dt, home=(float(x), float(y)), reach=reach
     )
 
 

@@ -74,36 +74,6 @@ def covariance_ellipses(covariance: ArrayLike, sigmas: float = 3.0) -> Ellipses:
     )
 
 
-def landmark_covariances(joint_covariance: ArrayLike) -> Array:
-    """Cut the landmarks' own 2 x 2 blocks from the covariance of the whole state.
-
-    Parameters
-    ----------
-    joint_covariance : array_like, shape (3 + 2n, 3 + 2n)
-        Covariance of (x, y, θ, l1x, l1y, …).
-
-    Returns
-    -------
-    ndarray, shape (n, 2, 2)
-        Covariance of each landmark's position [m²].
-
-    Examples
-    --------
-    >>> landmark_covariances(np.diag([0.1, 0.1, 0.01, 4.0, 9.0]))
-    array([[[4., 0.],
-            [0., 9.]]])
-    """
-    joint = np.asarray(joint_covariance, dtype=float)
-    size = len(joint) if joint.ndim else 0
-    if joint.shape != (size, size) or size < 3 or size % 2 == 0:
-        raise ValueError(
-            f"joint_covariance must have shape (3 + 2n, 3 + 2n), got {joint.shape}"
-        )
-    first = np.arange(3, size, 2)
-    rows = np.stack([first, first + 1], axis=1)
-    return joint[rows[:, :, None], rows[:, None, :]]
-
-
 def _check(P: Array, sigmas: float) -> None:
     if P.shape[-2:] != (2, 2):
         raise ValueError(f"covariance must have shape (…, 2, 2), got {P.shape}")

@@ -109,7 +109,9 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
         self.observation_space = observation_space(self.scenario)
         self.render_mode = render_mode
         self._view = self._make_view()
-        self._body = UnicycleBody(self.scenario.robot.radius, self.scenario.walls)
+        robot, self._dt = self.scenario.robot, self.scenario.dt
+        self._limits = robot.max_speed, robot.max_turn_rate
+        self._body = UnicycleBody(robot.radius, self.scenario.walls)
         self._odometer = OdometrySensor(self.scenario)
         self._sensor = BearingRangeSensor(self.scenario)
         self._landmarks: NDArray[np.complex128] | None = None
@@ -161,10 +163,9 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
             If the action is not two finite numbers; the world stays as it is.
         """
         command = self._command(action)
-        noise = self._odometer.place_noise(command, next(self._motion_noise))
-        εx, εy, εα = noise.slip
-        share = self._body.drive(command[0] + εx, εy, command[1] + εα)
-        odometry = self._odometer.read(command, share, noise.error)
+        slip, error = self._odometer.place_noise(command, next(self._motion_noise))
+        share = self._body.drive(command, slip)
+        odometry = self._odometer.read(command, share, error)
         observation, info = self._observe(odometry, collision=share < 1.0)
         self._steps_left -= 1
         return observation, 0.0, False, self._steps_left <= 0, info
@@ -223,11 +224,13 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
         """Turn an action (v, ω) into the command (d, α) of one step [m, rad]."""
         if self._landmarks is None:
             raise ResetNeeded("call reset before step")
-        robot, dt = self.scenario.robot, self.scenario.dt
         speed, turn_rate = _two_finite_numbers(action)
-        speed = min(max(speed, -robot.max_speed), robot.max_speed)
-        turn_rate = min(max(turn_rate, -robot.max_turn_rate), robot.max_turn_rate)
-        return speed * dt, turn_rate * dt
+        fastest, quickest = self._limits
+        if not -fastest <= speed <= fastest:
+            speed = math.copysign(fastest, speed)
+        if not -quickest <= turn_rate <= quickest:
+            turn_rate = math.copysign(quickest, turn_rate)
+        return speed * self._dt, turn_rate * self._dt
 
     def _observe(
         self, odometry: Array, collision: bool

@@ -17,8 +17,9 @@ from ..sim_configs import Scenario
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 Row = TypeVar("Row")
+
+MANY_STD = 10.0  # no normal noise exceeds so many standard deviations: odds 1e-23
 
 _STEPS_PER_BLOCK = 64
 
@@ -54,9 +55,13 @@ class SensorNoise(NamedTuple):
     """
 
     reading: ComplexArray
-    """εβ + i εr, shape (…, N) [rad, m]; εr in units of σr if that grows with range."""
-    kept: BoolArray | None
-    """Which readings do not drop out, shape (…, N); None if none ever does."""
+    """εβ + i εr, shape (…, N) [rad, m]; εr / σr where σr grows with the range."""
+    nearest: Array
+    """True range above which a landmark is read, shape (…, N) [m].
+
+    At least min_range; larger where a negative εr would leave no range above zero;
+    infinite where the reading drops out.
+    """
     clutter: ComplexArray | None
     """False readings β + i r, 0 where there is none, shape (…, C) [rad, m]."""
     order: Array | None
@@ -123,17 +128,27 @@ def draw_sensor_noise(streams: Streams, scenario: Scenario, steps: int) -> Senso
     """
     sensor, count = scenario.sensor, scenario.landmarks.count
     bearing_std, range_std = sensor.std
-    if sensor.range_std_per_metre:
-        range_std = 1.0
+    per_metre = sensor.range_std_per_metre
     unit = streams.measurement.standard_normal((steps, count, 2))
-    scaled = unit * (bearing_std, range_std)
-    kept = clutter = order = None
+    nearest = _nearest_readable(unit[..., 1], range_std, per_metre)
+    np.maximum(nearest, np.nextafter(sensor.min_range, -1.0), out=nearest)
     if sensor.dropout:
-        kept = streams.dropout.random((steps, count)) >= sensor.dropout
+        nearest[streams.dropout.random((steps, count)) < sensor.dropout] = np.inf
+    reading = (unit * (bearing_std, 1.0 if per_metre else range_std)).view(complex)
+    clutter = order = None
     if not sensor.identities:
         clutter = _draw_clutter(streams, scenario, steps)
         order = streams.order.random((steps, count + sensor.max_clutter))
-    return SensorNoise(scaled.view(np.complex128)[..., 0], kept, clutter, order)
+    return SensorNoise(reading[..., 0], nearest, clutter, order)
+
+
+def _nearest_readable(unit: Array, std: float, per_metre: float) -> Array:
+    """Find the true range r above which r + (σ + k r) ε is positive, ε unit noise."""
+    if per_metre == 0.0:
+        return -std * unit
+    slope = 1.0 + per_metre * unit
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(slope > 0.0, -std * unit / slope, np.inf)
 
 
 def _motion_floats(
@@ -148,7 +163,7 @@ def _sensor_noise_by_step(
 ) -> list[SensorNoise]:
     block = draw_sensor_noise(streams, scenario, steps)
     columns = (repeat(None, steps) if part is None else part for part in block)
-    return [SensorNoise(*row) for row in zip(*columns, strict=True)]
+    return list(map(SensorNoise._make, zip(*columns, strict=True)))
 
 
 def _draw_clutter(streams: Streams, scenario: Scenario, steps: int) -> ComplexArray:

@@ -7,7 +7,6 @@ u = (d, α)        command: distance driven, then heading turned [m, rad]
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +14,8 @@ from numpy.typing import NDArray
 from ..sim_configs import Scenario
 
 Command = tuple[float, float]
-
-
-class NoisePlacement(NamedTuple):
-    """Where the motion noise of one step falls; the other place stays exact."""
-
-    slip: Sequence[float]
-    """(εx, εy, εα) added to the true motion [m, m, rad]."""
-    error: Sequence[float]
-    """(εd, εα) added to the odometry [m, rad]."""
+_NO_SLIP = (0.0, 0.0, 0.0)
+_NO_ERROR = (0.0, 0.0)
 
 
 class OdometrySensor:
@@ -43,7 +35,7 @@ class OdometrySensor:
     >>> from slamgym.sim_configs import load_scenario
     >>> sensor = OdometrySensor(load_scenario("six_landmarks"))
     >>> sensor.place_noise((1.0, 0.0), (0.1, 0.2, 0.3))
-    NoisePlacement(slip=(0.1, 0.2, 0.3), error=(0.0, 0.0))
+    ((0.1, 0.2, 0.3), (0.0, 0.0))
     >>> sensor.read((1.0, 0.2), share=0.5, error=(0.0, 0.1))
     array([0.5, 0.3])
     """
@@ -52,13 +44,30 @@ class OdometrySensor:
         self._slips = scenario.motion.noise_in == "motion"
         self._noise_at_rest = scenario.motion.noise_at_rest
 
-    def place_noise(self, command: Command, noise: Sequence[float]) -> NoisePlacement:
-        """Decide what the noise (εx, εy, εα) of one step disturbs."""
+    def place_noise(
+        self, command: Command, noise: Sequence[float]
+    ) -> tuple[Sequence[float], Sequence[float]]:
+        """Decide what the noise of one step disturbs.
+
+        Parameters
+        ----------
+        command : (float, float)
+            u = (d, α) [m, rad].
+        noise : sequence of float, length 3
+            ε [m, m, rad].
+
+        Returns
+        -------
+        slip : sequence of float, length 3
+            Added to the true motion [m, m, rad].
+        error : sequence of float, length 2
+            Added to the odometry [m, rad]. One of the two is zero.
+        """
         if not self._noise_at_rest and command == (0.0, 0.0):
-            return NoisePlacement((0.0, 0.0, 0.0), (0.0, 0.0))
+            return _NO_SLIP, _NO_ERROR
         if self._slips:
-            return NoisePlacement(noise, (0.0, 0.0))
-        return NoisePlacement((0.0, 0.0, 0.0), (noise[0], noise[2]))
+            return noise, _NO_ERROR
+        return _NO_SLIP, (noise[0], noise[2])
 
     def read(
         self, command: Command, share: float, error: Sequence[float]

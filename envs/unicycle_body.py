@@ -11,6 +11,7 @@ Wall = tuple[float, float, float, float]
 
 _SKIN = 1e-6  # distance kept from every wall [m]
 _ANYTHING = pymunk.ShapeFilter()
+_NO_SLIP = (0.0, 0.0, 0.0)
 
 
 class UnicycleBody:
@@ -19,9 +20,9 @@ class UnicycleBody:
     The body is kinematic and has no shape: nothing but its velocity moves it, so one
     `Space.step` of unit time is the turn-last motion model to the last bit::
 
-        x += forward cos θ - sideways sin θ
-        y += forward sin θ + sideways cos θ
-        θ += turn
+        x += (d + εx) cos θ - εy sin θ
+        y += (d + εx) sin θ + εy cos θ
+        θ += α + εα
 
     Walls hold it back through queries, made before each step, for the first contact
     along the displacement. What is queried are walls inflated by the radius of the
@@ -38,7 +39,7 @@ class UnicycleBody:
     Examples
     --------
     >>> body = UnicycleBody(radius=0.5, walls=[(2.0, -1.0, 2.0, 1.0)])
-    >>> body.drive(1.0, 0.0, 0.3)
+    >>> body.drive((1.0, 0.3))
     1.0
     >>> body.pose
     array([1. , 0. , 0.3])
@@ -71,28 +72,30 @@ class UnicycleBody:
         self._body.angle = heading
         self._arrive()
 
-    def drive(self, forward: float, sideways: float, turn: float) -> float:
-        """Move in the frame of the old heading, then turn.
+    def drive(self, command: Sequence[float], slip: Sequence[float] = _NO_SLIP) -> float:
+        """Move along the old heading, then turn.
 
         Parameters
         ----------
-        forward, sideways : float
-            Displacement along the heading and to its left [m].
-        turn : float
-            Change of heading [rad]; no wall prevents it.
+        command : (float, float)
+            (d, α), distance and change of heading [m, rad]; no wall prevents a turn.
+        slip : (float, float, float), default zeros
+            (εx, εy, εα) added to the motion, in the frame of the old heading
+            [m, m, rad].
 
         Returns
         -------
         float
             Share of the displacement, in [0, 1], that no wall held back.
         """
+        forward, sideways = command[0] + slip[0], slip[1]
         dx = forward * self.cos - sideways * self.sin
         dy = forward * self.sin + sideways * self.cos
         share = self._free_share(dx, dy) if self._walls else 1.0
         if share < 1.0:
             dx, dy = share * dx, share * dy
         self._body.velocity = dx, dy
-        self._body.angular_velocity = turn
+        self._body.angular_velocity = command[1] + slip[2]
         self._space.step(1.0)
         self._arrive()
         return share

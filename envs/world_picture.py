@@ -6,7 +6,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ..sim_configs import Scenario
-from .ellipses import landmark_covariances
 from .snapshot import BeliefLike, WorldSnapshot
 from .view_limits import ViewLimits
 from .world_artists import (
@@ -107,7 +106,9 @@ class WorldPicture:
         if belief is None:
             return
         landmarks = np.reshape(belief.landmarks, (-1, 2))
-        spread = landmark_covariances(belief.covariance)
+        n = len(landmarks)
+        blocks = np.reshape(np.asarray(belief.covariance)[3:, 3:], (n, 2, n, 2))
+        spread = np.einsum("iaib->iab", blocks)  # each landmark's own covariance
         moving.map.set_data(*landmarks.T)
         set_ellipses(moving.map_ellipses, landmarks, spread)
         moving.estimate.set_xy(self._arrow_at(belief.pose))

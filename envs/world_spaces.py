@@ -7,8 +7,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..sim_configs import Scenario, place_landmarks
-
-_MANY_STD = 10.0  # no noise of ours ever exceeds so many standard deviations
+from .noise_streams import MANY_STD
 
 
 def action_space(scenario: Scenario) -> spaces.Box:
@@ -49,7 +48,7 @@ def count_rows(scenario: Scenario) -> int:
 
 def _largest_odometry(scenario: Scenario) -> tuple[float, float]:
     robot, motion = scenario.robot, scenario.motion
-    errs = _MANY_STD * (motion.noise_in == "odometry")
+    errs = MANY_STD * (motion.noise_in == "odometry")
     return (
         robot.max_speed * scenario.dt + errs * motion.std[0],
         robot.max_turn_rate * scenario.dt + errs * motion.std[2],
@@ -61,7 +60,7 @@ def _longest_reading(scenario: Scenario) -> float:
     reach = sensor.max_range
     if math.isinf(reach):
         reach = _farthest_landmark(scenario)
-    return reach + _MANY_STD * (sensor.std[1] + sensor.range_std_per_metre * reach)
+    return reach + MANY_STD * (sensor.std[1] + sensor.range_std_per_metre * reach)
 
 
 def _farthest_landmark(scenario: Scenario) -> float:
@@ -70,8 +69,8 @@ def _farthest_landmark(scenario: Scenario) -> float:
     away = _outermost_landmarks(scenario) - start.pose[:2]
     step = scenario.robot.max_speed * scenario.dt
     if motion.noise_in == "motion":
-        step += _MANY_STD * math.hypot(*motion.std[:2])
-    drawn = _MANY_STD * math.hypot(*start.std[:2])
+        step += MANY_STD * math.hypot(*motion.std[:2])
+    drawn = MANY_STD * math.hypot(*start.std[:2])
     return float(np.hypot(*away.T).max()) + drawn + scenario.steps * step
 
 

@@ -17,8 +17,27 @@ def compiled(function: Kernel) -> Kernel:
     or in a thread.  ``NUMBA_DISABLE_JIT=1`` runs the plain Python functions instead,
     for a debugger.
     """
-    options = {"cache": True, "error_model": "numpy", "nogil": True}
-    return cast("Kernel", njit(fastmath={"contract"}, **options)(function))
+    return _compile(function, callable_from_python=True)
+
+
+def part(function: Kernel) -> Kernel:
+    """Compile a function that only kernels call, in about half the time.
+
+    Its ``py_func`` can be called from Python.
+    """
+    return _compile(function, callable_from_python=False)
+
+
+def _compile(function: Kernel, *, callable_from_python: bool) -> Kernel:
+    compiler = njit(
+        cache=True,
+        error_model="numpy",
+        nogil=True,
+        fastmath={"contract"},
+        no_cfunc_wrapper=True,
+        no_cpython_wrapper=not callable_from_python,
+    )
+    return cast("Kernel", compiler(function))
 
 
 def discard_stale_cache(folder: Path) -> None:

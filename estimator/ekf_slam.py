@@ -90,6 +90,7 @@ class EkfSlam:
     """
 
     _linearisation: ClassVar[int] = AT_ESTIMATE
+    _frame: ClassVar[int] = ADDITIVE
 
     def __init__(
         self,
@@ -103,6 +104,8 @@ class EkfSlam:
         gate_probability: float | None = None,
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
+        iterations: int = 1,
+        sequential: bool = False,
     ) -> None:
         motion = validation.standard_deviations("motion_std", motion_std, 3)
         sensor = validation.standard_deviations("measurement_std", measurement_std, 2)

@@ -8,6 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .angles import wrap_angle
+from .error_frames import (
+    ErrorFrame,
+    additive_error,
+    invariant_covariance,
+    invariant_error,
+)
 
 Array = NDArray[np.float64]
 
@@ -56,6 +62,8 @@ class Belief:
     covariance: Array
     """Shape (3 + 2n, 3 + 2n), of the additive error."""
     landmark_ids: tuple[int, ...]
+    frame: ErrorFrame = "additive"
+    """Coordinates in which the filter takes its error to be Gaussian."""
 
     def __post_init__(self) -> None:
         mean = np.array(self.mean, dtype=np.float64)
@@ -93,6 +101,49 @@ class Belief:
         n = len(self.landmark_ids)
         blocks = self.covariance[3:, 3:].reshape(n, 2, n, 2)
         return blocks[np.arange(n), :, np.arange(n), :]
+
+
+    def error(
+        self, true_pose: ArrayLike, true_landmarks: ArrayLike, frame: str | None = None
+    ) -> Array:
+        """Return the error of this belief against the truth.
+
+        Parameters
+        ----------
+        true_pose : array_like, shape (3,)
+            (x, y, θ) [m, m, rad].
+        true_landmarks : array_like, shape (n, 2)
+            In the order of ``landmark_ids`` [m].
+        frame : {"additive", "invariant"}, optional
+            Error coordinates; the filter's own where not given.
+
+        Returns
+        -------
+        ndarray, shape (3 + 2n,)
+            In the order of the state; its covariance is :meth:`error_covariance` of
+            the same frame.
+        """
+        truth = np.concatenate([np.ravel(true_pose), np.ravel(true_landmarks)])
+        if truth.shape != self.mean.shape:
+            raise ValueError(
+                f"the truth must be a pose (3,) and {len(self.landmark_ids)} landmarks "
+                f"(n, 2), got {np.shape(true_pose)} and {np.shape(true_landmarks)}"
+            )
+        if self._chosen(frame) == "invariant":
+            return invariant_error(truth, self.mean)
+        return additive_error(truth, self.mean)
+
+    def error_covariance(self, frame: str | None = None) -> Array:
+        """Return the covariance (3 + 2n, 3 + 2n) that belongs to :meth:`error`."""
+        if self._chosen(frame) == "invariant":
+            return invariant_covariance(self.mean, self.covariance)
+        return self.covariance
+
+    def _chosen(self, frame: str | None) -> str:
+        chosen = frame or self.frame
+        if chosen not in ("additive", "invariant"):
+            raise ValueError(f"frame must be 'additive' or 'invariant', got {frame!r}")
+        return chosen
 
 
 @runtime_checkable

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .compiled import compiled
+from .compiled import compiled, part
 from .kernels import (
     AT_ESTIMATE,
     INVARIANT,
@@ -57,7 +57,7 @@ class Workspace(NamedTuple):
     vectors: Array  # (4, capacity): δ, way, prior mean, heading column
 
 
-@compiled
+@part
 def new_workspace(m: int, capacity: int) -> Workspace:
     """Allocate for ``m`` readings of a belief with that capacity."""
     return Workspace(
@@ -72,7 +72,7 @@ def new_workspace(m: int, capacity: int) -> Workspace:
     )
 
 
-@compiled
+@part
 def as_rules(values: Array) -> Rules:
     """Read rules from the array ``numpy.array(rules)``: one argument, not ten."""
     return Rules(
@@ -89,7 +89,7 @@ def as_rules(values: Array) -> Rules:
     )
 
 
-@compiled
+@part
 def correct(
     mean: Array,
     covariance: Array,
@@ -118,7 +118,8 @@ def correct(
     columns, jacobians = every_column[first:last], work.jacobians[first:last]
     shift, way = work.vectors[0], work.vectors[1]
     prior, heading = work.vectors[2], work.vectors[3]
-    prior[:size] = mean[:size]
+    for j in range(size):
+        prior[j] = mean[j]
     rows = 2 * (last - first)
     for iteration in range(rules.iterations):
         stage = min(iteration, 1)
@@ -150,22 +151,25 @@ def correct(
             factor,
             white,
         )
-        mean[:size] = prior[:size]
+        for j in range(size):
+            mean[j] = prior[j]
         if failed >= 0:
             return first + failed
         combine(work.gains, white, rows, size, shift)
         if rules.frame == INVARIANT:
-            way[:size] = shift[:size]
+            for j in range(size):
+                way[j] = shift[j]
             retract(mean, way, size)
         else:
-            mean[:size] += shift[:size]
+            for j in range(size):
+                mean[j] += shift[j]
     downdate(covariance, size, work.gains, rows)
     if rules.frame == INVARIANT:
         transport(covariance, size, way, heading)
     return -1
 
 
-@compiled
+@part
 def relate_to_prior(
     prior: Array,
     shift: Array,
@@ -189,7 +193,7 @@ def relate_to_prior(
         )
 
 
-@compiled
+@part
 def squared_innovation(
     covariance: Array, column: int, H: Array, variance: Array, innovation: Array
 ) -> float:
@@ -202,7 +206,7 @@ def squared_innovation(
     return weighted / (s00 * s11 - s10 * s10)
 
 
-@compiled
+@part
 def _spread(covariance: Array, column: int, H: Array, i: int, j: int) -> float:
     """One entry of H P Hᵀ."""
     total = 0.0
@@ -214,7 +218,7 @@ def _spread(covariance: Array, column: int, H: Array, i: int, j: int) -> float:
     return total
 
 
-@compiled
+@part
 def meets(mean: Array, covariance: Array, column: int) -> bool:
     """Whether the robot is within 10 σ of a landmark, where linearising fails."""
     P, c = covariance, column
@@ -226,7 +230,7 @@ def meets(mean: Array, covariance: Array, column: int) -> bool:
     return dx * dx + dy * dy < 100 * spread
 
 
-@compiled
+@part
 def screen(
     mean: Array,
     covariance: Array,
@@ -251,7 +255,8 @@ def screen(
             ledger[FATE, k] = SKIPPED
             continue
         ledger[COLUMN, used] = column
-        work.readings[used] = readings[k]
+        work.readings[used, 0] = readings[k, 0]
+        work.readings[used, 1] = readings[k, 1]
         set_variance(rules, readings[k, 1], work.variances[used])
         ledger[NEAR, k] = meets(mean, covariance, column)
         if rules.gate < np.inf:
@@ -274,14 +279,14 @@ def screen(
     return used
 
 
-@compiled
+@part
 def set_variance(rules: Rules, distance: float, variance: Array) -> None:
     """Diagonal of Q for a reading at that range [m]."""
     variance[0] = rules.bearing_std**2
     variance[1] = (rules.range_std + rules.range_std_per_metre * distance) ** 2
 
 
-@compiled
+@part
 def update_belief(
     mean: Array,
     covariance: Array,

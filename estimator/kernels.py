@@ -16,24 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .angles import wrap_angle
-from .compiled import compiled
+from .compiled import compiled, part
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-wrap = compiled(wrap_angle)
+wrap = part(wrap_angle)
 
 # Where the Jacobians are taken.
 AT_ESTIMATE = 0
 AT_REFERENCE = 1  # at fixed points kept beside the estimate
 PROJECTED = 2  # at the estimate, then made blind to a turn of the whole map
+AT_TRUTH = 3  # at the ground truth, for study
 
 # How a correction is composed with the state.
 ADDITIVE = 0
 INVARIANT = 1
 
 
-@compiled
+@part
 def propagate(
     covariance: Array,
     size: int,
@@ -85,11 +86,11 @@ def predict(
     if linearisation != AT_ESTIMATE:
         turned_x = -(mean[1] - reference[1])
         turned_y = mean[0] - reference[0]
-        reference[:3] = mean[:3]
+        reference[0], reference[1], reference[2] = mean[0], mean[1], mean[2]
     propagate(covariance, size, turned_x, turned_y, cos, sin, motion_variance)
 
 
-@compiled
+@part
 def linearise(
     mean: Array,
     reference: Array,
@@ -103,7 +104,7 @@ def linearise(
     dx, dy = mean[column] - mean[0], mean[column + 1] - mean[1]
     innovation[0] = wrap(reading[0] - np.arctan2(dy, dx) + mean[2])
     innovation[1] = reading[1] - np.sqrt(dx * dx + dy * dy)
-    if linearisation == AT_REFERENCE:
+    if linearisation in (AT_REFERENCE, AT_TRUTH):
         dx = reference[column] - reference[0]
         dy = reference[column + 1] - reference[1]
     q = dx * dx + dy * dy
@@ -116,7 +117,7 @@ def linearise(
         _project(reference, column, jacobian)
 
 
-@compiled
+@part
 def _project(reference: Array, column: int, jacobian: Array) -> None:
     """H ← H − (H w) wᵀ / wᵀw: blind to the turn w of robot and landmark together.
 
@@ -139,7 +140,7 @@ def _project(reference: Array, column: int, jacobian: Array) -> None:
         jacobian[i, 4] -= seen * half_x
 
 
-@compiled
+@part
 def whiten(
     covariance: Array,
     size: int,
@@ -191,7 +192,7 @@ def whiten(
     return -1
 
 
-@compiled
+@part
 def _correlate(
     covariance: Array, size: int, column: int, H: Array, gains: Array, row: int
 ) -> None:
@@ -206,7 +207,7 @@ def _correlate(
         gains[row + 1, j] = h10 * p0 + h11 * p1 + h12 * p2 + h13 * p3 + h14 * p4
 
 
-@compiled
+@part
 def _orthogonalise(
     size: int, column: int, H: Array, gains: Array, factor: Array, row: int
 ) -> None:
@@ -225,7 +226,7 @@ def _orthogonalise(
             gains[row + 1, j] = q1 - l11 * a1
 
 
-@compiled
+@part
 def _normalise(
     size: int,
     column: int,
@@ -254,7 +255,7 @@ def _normalise(
     return True
 
 
-@compiled
+@part
 def _times(H: Array, i: int, gains: Array, row: int, column: int) -> float:
     """One row of H times one row of A."""
     return (
@@ -266,7 +267,7 @@ def _times(H: Array, i: int, gains: Array, row: int, column: int) -> float:
     )
 
 
-@compiled
+@part
 def downdate(covariance: Array, size: int, gains: Array, rows: int) -> None:
     """P ← P − Aᵀ A, symmetric by construction; ``rows`` of A, an even number.
 
@@ -300,28 +301,29 @@ def downdate(covariance: Array, size: int, gains: Array, rows: int) -> None:
             covariance[j, i] = covariance[i, j]
 
 
-@compiled
+@part
 def _column(gains: Array, k: int, j: int) -> tuple[float, float, float, float]:
     return gains[k, j], gains[k + 1, j], gains[k + 2, j], gains[k + 3, j]
 
 
-@compiled
+@part
 def _padded(size: int) -> int:
     """Next multiple of 4: whole vector registers, no scalar remainder."""
     return (size + 3) // 4 * 4
 
 
-@compiled
+@part
 def combine(gains: Array, white: Array, rows: int, size: int, shift: Array) -> None:
     """δ = Aᵀ w, the correction of the state."""
-    shift[:size] = 0.0
+    for j in range(size):
+        shift[j] = 0.0
     for k in range(rows):
         weight, gain = white[k], gains[k]
         for j in range(size):
             shift[j] += weight * gain[j]
 
 
-@compiled
+@part
 def retract(mean: Array, shift: Array, size: int) -> None:
     """Compose an invariant correction δ with the state, in place of adding it.
 
@@ -349,14 +351,15 @@ def retract(mean: Array, shift: Array, size: int) -> None:
     shift[2] = 0.0
 
 
-@compiled
+@part
 def transport(covariance: Array, size: int, way: Array, heading: Array) -> None:
     """P ← T P Tᵀ with T = I + v e_θᵀ, v = ``way``: a rank-2 update.
 
     The covariance, constant in invariant coordinates, read at the moved estimate.
     ``heading`` (capacity,) is overwritten with c = P[:, θ].
     """
-    heading[:size] = covariance[2, :size]
+    for j in range(size):
+        heading[j] = covariance[2, j]
     variance = heading[2]
     for i in range(size):
         # P_ij += v_i c_j + v_j (c_i + v_i c_θ), the same for (i, j) and (j, i)
@@ -368,7 +371,7 @@ def transport(covariance: Array, size: int, way: Array, heading: Array) -> None:
             covariance[j, i] = target[j]
 
 
-@compiled
+@part
 def add_landmark(
     mean: Array,
     covariance: Array,
@@ -392,10 +395,11 @@ def add_landmark(
     r, c = reading[1], size
     mean[c], mean[c + 1] = mean[0] + r * cos, mean[1] + r * sin
     turned_x, turned_y = -r * sin, r * cos
-    if linearisation != AT_ESTIMATE:
+    if linearisation in (AT_REFERENCE, PROJECTED):
         reference[c], reference[c + 1] = mean[c], mean[c + 1]
-        turned_x = -(mean[c + 1] - reference[1])
-        turned_y = mean[c] - reference[0]
+    if linearisation != AT_ESTIMATE:
+        turned_x = reference[1] - reference[c + 1]
+        turned_y = reference[c] - reference[0]
     for j in range(size):
         covariance[c, j] = covariance[0, j] + turned_x * covariance[2, j]
         covariance[c + 1, j] = covariance[1, j] + turned_y * covariance[2, j]

@@ -29,6 +29,9 @@ def new_figure(width: float, height: float) -> Figure:
     """Make an empty figure [inches] that lays out itself, unknown to pyplot."""
     figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
+    layout = figure.get_layout_engine()
+    if layout is not None:
+        layout.set(w_pad=0.1, h_pad=0.1, wspace=0.02, hspace=0.02)  # type: ignore[call-arg]
     return figure
 
 
@@ -146,7 +149,7 @@ def set_ellipses(shown: EllipseCollection, means: Array, covariances: Array) -> 
     )
 
 
-def _lying_ellipse(  # noqa: PLR0913 (matplotlib's signature)
+def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)
     legend: object,
     orig_handle: object,
     xdescent: float,

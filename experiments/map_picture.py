@@ -34,12 +34,12 @@ class _Artists(NamedTuple):
     """What differs from step to step, from back to front."""
 
     former: EllipseCollection
-    first: EllipseCollection
-    path: Line2D
-    predicted: EllipseCollection
     later: EllipseCollection
+    first: EllipseCollection
     estimates: Line2D
+    path: Line2D
     updated: EllipseCollection
+    predicted: EllipseCollection
     robot: Polygon
 
 
@@ -60,7 +60,6 @@ class MapPicture:
         self._trace = trace
         self._axes = axes
         self._first_steps = trace.first_steps()
-        self.pose_stride = -(-len(trace.t) // _MOST_POSES)
         self._truth = self._add_truth(scale)
         self._artists = self._add_artists(scale)
 
@@ -72,7 +71,7 @@ class MapPicture:
     def show(self, step: int) -> None:
         """Draw the run up to and including a step."""
         artists, trace = self._artists, self._trace
-        steps = np.append(np.arange(0, step, self.pose_stride), step)
+        steps = np.append(np.arange(0, step, pose_stride(trace)), step)
         artists.path.set_data(*trace.poses[: step + 1, :2].T)
         set_ellipses(
             artists.predicted,
@@ -88,7 +87,7 @@ class MapPicture:
         self._show_landmarks(step)
 
     def legend_keys(self) -> list[Artist]:
-        """What a legend should name; to be drawn with `ELLIPSE_HANDLER`."""
+        """List what a legend should name; to be drawn with `ELLIPSE_HANDLER`."""
         kinds = [PREDICTED, UPDATED, FIRST, LATER]
         keys: list[Artist] = [kind.legend_key() for kind in kinds]
         truth = [] if self._trace.true_landmarks is None else [self._truth]
@@ -113,7 +112,7 @@ class MapPicture:
         )
 
     def _former_steps(self, step: int) -> range:
-        """Steps gone by whose landmarks are shown too: few when the map is large."""
+        """Choose steps gone by whose landmarks are shown too: few in large maps."""
         stride = -(-self._trace.last_step * len(self._first_steps) // _MOST_FORMER)
         return range(0, step, max(1, stride))
 
@@ -144,61 +143,75 @@ class MapPicture:
         axes = self._axes
         artists = _Artists(
             former=_FORMER.add_to(axes, scale),
-            first=FIRST.add_to(axes, scale),
-            path=Line2D([], [], color=GREY, lw=1.1 * scale, label="estimated path"),
-            predicted=PREDICTED.add_to(axes, scale),
             later=LATER.add_to(axes, scale),
-            estimates=Line2D(
-                [], [], ls="", marker=".", ms=3 * scale, color=LATER.colour
-            ),
+            first=FIRST.add_to(axes, scale),
+            estimates=Line2D([], [], ls="", marker=".", ms=3 * scale, c=LATER.colour),
+            path=Line2D([], [], color=GREY, lw=1.1 * scale, label="estimated path"),
             updated=UPDATED.add_to(axes, scale),
+            predicted=PREDICTED.add_to(axes, scale),
             robot=Polygon(
                 np.full((1, 2), np.nan), fc=UPDATED.colour, ec="white", lw=0.6
             ),
         )
-        for artist in (artists.path, artists.estimates, artists.robot):
-            axes.add_artist(artist)
         for depth, artist in enumerate(artists):
             artist.set_zorder(2 + 0.1 * depth)
+            if artist.axes is None:
+                axes.add_artist(artist)
         return artists
 
 
-def map_limits(trace: RunTrace, *, ellipse_share: float = 0.3) -> Array:
-    """Box that holds paths, landmarks and, within reason, their 3σ ellipses.
+def pose_stride(trace: RunTrace) -> int:
+    """Every how many steps the ellipses of the pose are drawn."""
+    return -(-len(trace.t) // _MOST_POSES)
 
-    Parameters
-    ----------
-    trace : RunTrace
-        The run, all of its steps.
-    ellipse_share : float, default 0.3
-        How far ellipses may widen the box of the points, as a share of its span: a
-        single landmark of great uncertainty must not make all others tiny.
+
+def map_limits(trace: RunTrace) -> Array:
+    """Box that holds a run's poses, landmarks and, within reason, their 3σ ellipses.
 
     Returns
     -------
     ndarray, shape (2, 2)
         Lower left and upper right corner [m].
     """
-    truth = (
-        [np.reshape(trace.true_landmarks, (-1, 2))]
-        if trace.true_landmarks is not None
-        else []
+    truth = trace.true_landmarks
+    points = [trace.poses[:, :2], trace.landmarks]
+    return box_around(
+        np.concatenate(points if truth is None else [*points, truth]),
+        np.concatenate(
+            [trace.poses[:, :2], trace.predicted_poses[:, :2], trace.first_landmarks]
+        ),
+        np.concatenate(
+            [
+                trace.pose_covariances[:, :2, :2],
+                trace.predicted_pose_covariances[:, :2, :2],
+                trace.first_landmark_covariances,
+            ]
+        ),
     )
-    points = np.concatenate([trace.poses[:, :2], trace.landmarks, *truth])
+
+
+def box_around(points: Array, means: Array, covariances: Array) -> Array:
+    """Box that holds points and 3σ ellipses, as long as these are not much larger.
+
+    Ellipses widen the box of the points by at most a third of its span: one landmark
+    of great uncertainty must not make all others tiny.
+
+    Parameters
+    ----------
+    points : ndarray, shape (m, 2)
+        Positions [m]; nan rows are left out.
+    means, covariances : ndarray, shapes (k, 2) and (k, 2, 2)
+        Of the ellipses [m, m²].
+
+    Returns
+    -------
+    ndarray, shape (2, 2)
+        Lower left and upper right corner [m].
+    """
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     span = max(float((high - low).max()), 1e-3)
-    means = np.concatenate(
-        [trace.poses[:, :2], trace.predicted_poses[:, :2], trace.first_landmarks]
-    )
-    covariances = np.concatenate(
-        [
-            trace.pose_covariances[:, :2, :2],
-            trace.predicted_pose_covariances[:, :2, :2],
-            trace.first_landmark_covariances,
-        ]
-    )
     reach = 3 * np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
-    room = ellipse_share * span
-    low = np.maximum(np.minimum(low, (means - reach).min(axis=0)), low - room)
-    high = np.minimum(np.maximum(high, (means + reach).max(axis=0)), high + room)
+    lowest, highest = (means - reach).min(axis=0), (means + reach).max(axis=0)
+    low = np.maximum(np.minimum(low, lowest), low - span / 3)
+    high = np.minimum(np.maximum(high, highest), high + span / 3)
     return np.stack([low - 0.03 * span, high + 0.03 * span])

@@ -14,7 +14,7 @@ from PIL import Image
 from ..envs.atomic_file import replace_when_written
 from ..envs.blitting import BlittedFigure
 from .figure_style import ELLIPSE_HANDLER, dress, new_figure, write_title
-from .map_picture import MapPicture, map_limits
+from .map_picture import MapPicture, map_limits, pose_stride
 from .trace import RunTrace
 
 Array = NDArray[np.floating]
@@ -58,9 +58,9 @@ def map_figure(trace: RunTrace, step: int | None = None) -> Figure:
 def map_sequence(
     trace: RunTrace, folder: str | Path, *, dpi: float = 100
 ) -> list[Path]:
-    """Save one map picture after every step: step_000.png, step_001.png, …
+    """Save one map picture after every step.
 
-    Only what differs between the steps is drawn anew.
+    The files are called step_000.png, step_001.png, … Only what differs between the steps is drawn anew.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def map_sequence(
     for step, file in enumerate(files):
         parts.show(step)
         with replace_when_written(file) as partial:
-            Image.fromarray(blitted.frame()).save(partial, format="PNG")
+            Image.fromarray(blitted.frame()).save(partial, "PNG", compress_level=1)
     return files
 
 
@@ -163,8 +163,6 @@ def _map_parts(trace: RunTrace) -> _MapParts:
     _prepare(axes, limits)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     picture = MapPicture(axes, trace)
-    stride = picture.pose_stride
-    extra = f" (every {stride}th pose)" if stride > 1 else ""
     figure.legend(
         handles=picture.legend_keys(),
         handler_map=ELLIPSE_HANDLER,
@@ -172,7 +170,6 @@ def _map_parts(trace: RunTrace) -> _MapParts:
         ncols=3,
         frameon=False,
         fontsize=9,
-        title=extra or None,
     )
     return _MapParts(figure, picture, write_title(axes, *_title(trace, 0)), trace)
 
@@ -180,14 +177,32 @@ def _map_parts(trace: RunTrace) -> _MapParts:
 def _title(trace: RunTrace, step: int) -> tuple[str, str]:
     """Say what the map shows, and how certain it has become."""
     now = trace.map_at(step)
+    stride = pose_stride(trace)
+    thinned = f"  ·  1 pose in {stride} drawn" if stride > 1 else ""
     radius = 3 * np.sqrt(np.linalg.eigvalsh(now.covariances)[:, -1])
     size = f", 3σ within {radius.max():.2g} m" if len(now.ids) else ""
     many = "landmark" if len(now.ids) == 1 else "landmarks"
     return (
         f"Map and poses after step {step} of {trace.last_step}",
         f"{trace.estimator}  ·  t = {trace.t[step]:.4g} s  ·  "
-        f"{len(now.ids)} {many}{size}",
+        f"{len(now.ids)} {many}{size}{thinned}",
     )
+
+
+def _outcome(trace: RunTrace) -> str:
+    """Say how large the final map's ellipses and its errors are."""
+    largest = np.linalg.eigvalsh(trace.landmark_covariances)[:, -1]
+    size = (
+        f"landmarks: 3σ within {3 * np.sqrt(largest.max()):.2g} m"
+        if len(largest)
+        else ""
+    )
+    if trace.true_landmarks is None:
+        return size
+    error = np.linalg.norm(trace.landmarks - trace.true_landmarks, axis=1)
+    if np.isnan(error).all():
+        return size
+    return f"{size}, errors {np.sqrt(np.nanmean(error**2)):.2g} m RMS"
 
 
 def _prepare(axes: Axes, limits: Array, *, size: float = 10.0) -> None:
@@ -199,7 +214,7 @@ def _draw_panel(axes: Axes, panel: NoisePanel, limits: Array) -> MapPicture:
     _prepare(axes, limits, size=9)
     picture = MapPicture(axes, panel.trace, scale=0.75)
     picture.show(panel.trace.last_step)
-    write_title(axes, panel.title, size=10)
+    write_title(axes, panel.title, _outcome(panel.trace), size=10)
     return picture
 
 

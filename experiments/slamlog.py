@@ -277,7 +277,7 @@ def _rendered_scan(scan: Scan) -> Iterator[str]:
 
 
 def _numbers(*values: float) -> str:
-    return ",".join(f"{float(value):.15g}" for value in values)
+    return ",".join(repr(float(value)) for value in values)
 
 
 def _known(value: float) -> str:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..envs.ellipses import landmark_covariances
+from ..estimator.accuracy import landmark_covariances
 
 Array = NDArray[np.floating]
 Integers = NDArray[np.integer]

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slamgym.envs.controllers import planned_path
+from slamgym.envs.planned_path import planned_path
 from slamgym.sim_configs import (
     ScenarioError,
     action_sequence,
@@ -80,8 +80,9 @@ def test_a_square_has_sides_of_its_length_and_goes_left():
 
 
 def test_a_side_of_whole_steps_takes_no_step_more():
-    controls = SquareSequence(side=0.3, speed=0.1, turn_steps=1)
-    assert len(command_cycle(controls, 1.0)) == 4 * (3 + 1)
+    controls = SquareSequence(side=2.1, speed=0.3, turn_steps=1)
+    assert 2.1 / 0.3 > 7
+    assert len(command_cycle(controls, 1.0)) == 4 * (7 + 1)
 
 
 def test_a_circle_keeps_its_radius_to_the_left():

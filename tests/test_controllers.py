@@ -11,8 +11,8 @@ from slamgym.envs.controllers import (
     RandomSmooth,
     Waypoints,
     make_controller,
-    planned_path,
 )
+from slamgym.envs.planned_path import planned_path
 from slamgym.sim_configs import list_presets, load_scenario
 from slamgym.sim_configs.scenario import Robot
 
@@ -198,8 +198,9 @@ def wander(*, steps, dt, correlation_time=5.0, seed=0):
     return np.array([driver.act(ORIGIN, step) for step in range(steps)])
 
 
-def test_wandering_has_the_documented_means_and_spreads():
-    actions = wander(steps=20_000, dt=5.0, correlation_time=1.0)
+@pytest.mark.parametrize("dt", [0.5, 5.0])
+def test_wandering_has_the_documented_means_and_spreads(dt):
+    actions = wander(steps=20_000, dt=dt, correlation_time=1.0)
     assert actions.mean(axis=0) == pytest.approx([0.25, 0.0], abs=0.01)
     spread = np.minimum(np.abs(rng(1).standard_normal(100_000)), 2.0)
     assert actions[:, 0].std() == pytest.approx(
@@ -224,6 +225,31 @@ def test_wandering_starts_anew_at_step_zero():
     driver = RandomSmooth(rng(), ROBOT, dt=0.01, correlation_time=100.0)
     starts = np.array([driver.act(ORIGIN, 0)[1] for _ in range(500)])
     assert abs(np.corrcoef(starts[:-1], starts[1:])[0, 1]) < 0.15
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_beyond_its_reach_a_wanderer_turns_home(side):
+    driver = RandomSmooth(rng(), ROBOT, dt=0.5, home=(5.0, 0.0), reach=2.0)
+    pose = (5.0, 3.0 * side, 0.0)
+    turns = np.array([driver.act(pose, step)[1] for step in range(200)])
+    assert (turns * side < 0).all()
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=10, deadline=None)
+def test_a_wanderer_stays_near_its_home(seed):
+    driver = RandomSmooth(rng(seed), ROBOT, dt=0.5, home=(3.0, 4.0), reach=5.0)
+    path = drive(driver, 1000, dt=0.5)
+    assert np.linalg.norm(path[:, :2] - (3.0, 4.0), axis=1).max() < 5.0 + 3.0
+
+
+def test_within_its_reach_a_wanderer_is_free():
+    free, bound = (
+        RandomSmooth(rng(), ROBOT, dt=0.5, reach=reach) for reach in (math.inf, 9.0)
+    )
+    for step in range(20):
+        pose = (8.0, 0.0, 0.1)
+        assert np.array_equal(free.act(pose, step), bound.act(pose, step))
 
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0), (0.0, 0.0, math.nan), [[0.0] * 3]])
