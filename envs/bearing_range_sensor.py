@@ -54,9 +54,9 @@ class BearingRangeSensor:
         self._count = scenario.landmarks.count
         self._hides_identities = not sensor.identities
         self._range_std = sensor.std[1], sensor.range_std_per_metre
-        self._max_range = np.array(sensor.max_range)  # 0-d arrays compare twice as
-        self._half_view = np.array(sensor.field_of_view / 2)  # fast as Python floats
-        self._sees_around = sensor.field_of_view >= 2 * np.pi
+        self._constant_noise = sensor.range_std_per_metre == 0.0
+        self._max_range = np.array(sensor.max_range) if np.isfinite(sensor.max_range) else None
+        self._half_view = np.array(sensor.field_of_view / 2) if sensor.field_of_view<2*np.pi else None
         self._may_wrap = sensor.field_of_view / 2 + MANY_STD * sensor.std[0] >= np.pi
         self._sight = None
         if sensor.occlusion and scenario.walls:
@@ -88,27 +88,22 @@ class BearingRangeSensor:
             With M = N, or N + C when identities are hidden.
         """
         true = np.empty(landmarks.shape, dtype=np.complex128)
-        relative = (landmarks - position) * heading.conjugate()
+        relative = (landmarks - position) * heading
         bearings = np.arctan2(relative.imag, relative.real, true.real)
         ranges = np.abs(relative, true.imag)
         mask = ranges > noise.nearest
-        mask &= ranges <= self._max_range
-        if not self._sees_around:
+        if self._max_range is not None:
+            mask &= ranges <= self._max_range
+        if self._half_view is not None:
             mask &= np.abs(bearings) <= self._half_view
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
-        readings = np.zeros(true.shape, dtype=np.complex128)
-        np.copyto(readings, self._disturb(true, noise), where=mask)
-        if self._hides_identities:
-            return hide_identities(readings, mask, noise)
-        return Scan(as_rows(readings), mask, None)
-
-    def _disturb(self, true: ComplexArray, noise: SensorNoise) -> ComplexArray:
-        """Add noise to true readings β + i r, shape (…, N)."""
-        readings = true + self._scaled(noise.reading, true.imag)
-        if self._may_wrap and np.count_nonzero(np.abs(readings.real) >= _PI):
-            readings.real = wrap_bearings(readings.real)
-        return readings
+        true += noise.reading if self._constant_noise else self._scaled(noise, ranges)
+        if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
+            true.real = wrap_bearings(bearings)
+        rows = np.zeros((*mask.shape, 2))
+        np.copyto(rows.view(np.complex128)[..., 0], true, where=mask)
+        return rows, mask, None
 
     def _scaled(self, noise: ComplexArray, ranges: Array) -> ComplexArray:
         """Give noise in units of σr(r) = σr + k r its size; leave other as it is."""

@@ -236,24 +236,16 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
         self, odometry: Array, collision: bool
     ) -> tuple[Observation, dict[str, Any]]:
         body = self._body
-        scan = self._sensor.scan(
-            self._landmarks,
-            complex(body.x, body.y),
-            complex(body.cos, body.sin),
-            next(self._sensor_noise),
+        measurements, mask, ids = self._sensor.scan(
+            self._landmarks, body.position, body.inverse, next(self._sensor_noise)
         )
-        info = {"pose": body.pose, "collision": collision}
-        if scan.landmark_ids is not None:
-            info["landmark_ids"] = scan.landmark_ids
+        pose = body.pose
+        info = {"pose": pose, "collision": collision}
+        if ids is not None:
+            info["landmark_ids"] = ids
         if self._view is not None:
-            visible = scan.measurements[scan.mask]
-            self._view.add(Moment(body.pose, visible, collision))
-        observation = {
-            "landmarks": scan.measurements,
-            "mask": scan.mask,
-            "odometry": odometry,
-        }
-        return observation, info
+            self._view.add(Moment(body.pose, measurements[mask], collision))
+        return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
 
     def _make_view(self) -> LiveView | None:
         if self.render_mode is None:

@@ -21,7 +21,7 @@ Row = TypeVar("Row")
 
 MANY_STD = 10.0  # no normal noise exceeds so many standard deviations: odds 1e-23
 
-_STEPS_PER_BLOCK = 64
+_STEPS_PER_BLOCK = 128
 
 
 class Streams(NamedTuple):

@@ -126,7 +126,7 @@ class WorldRenderer:
             figure = window.figure
         else:
             FigureCanvasAgg(figure)
-        figure.set_dpi(self._size_px / _INCHES)
+        figure.set_dpi((self._size_px + 0.01) / _INCHES)  # never a pixel less
         figure.set_size_inches(_INCHES, _INCHES)
         picture = WorldPicture(figure, self._scenario, self._landmarks)
         return _Scene(picture, BlittedFigure(figure, picture.moving), window)

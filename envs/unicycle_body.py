@@ -58,6 +58,7 @@ class UnicycleBody:
                 pymunk.Circle(ground, radius, a),
                 pymunk.Circle(ground, radius, b),
             )
+        self.position = np.empty((), complex); self.inverse = np.empty((), complex)
         self.place((0.0, 0.0, 0.0))
 
     @property
@@ -94,16 +95,20 @@ class UnicycleBody:
         share = self._free_share(dx, dy) if self._walls else 1.0
         if share < 1.0:
             dx, dy = share * dx, share * dy
-        self._body.velocity = dx, dy
-        self._body.angular_velocity = command[1] + slip[2]
+        body = self._body
+        body.velocity = dx, dy
+        body.angular_velocity = command[1] + slip[2]
         self._space.step(1.0)
         self._arrive()
         return share
 
     def _arrive(self) -> None:
-        self.x, self.y = self._body.position
-        self.heading: float = self._body.angle
-        self.cos, self.sin = float(np.cos(self.heading)), float(np.sin(self.heading))
+        body = self._body
+        self.x, self.y = x, y = body.position
+        self.heading = heading = body.angle
+        self.cos, self.sin = cos, sin = float(np.cos(heading)), float(np.sin(heading))
+        self.position[()] = complex(x, y)
+        self.inverse[()] = complex(cos, -sin)
 
     def _free_share(self, dx: float, dy: float) -> float:
         """Find the share of a displacement that ends a skin before first contact.

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sim_configs import Scenario, action_sequence
+from ..sim_configs import Scenario
+from .planned_path import planned_path
 from .snapshot import WorldSnapshot
 
 Array = NDArray[np.floating]
@@ -36,7 +37,7 @@ class ViewLimits:
             [
                 np.reshape(landmarks, (-1, 2)),
                 np.reshape(scenario.walls, (-1, 2)),
-                planned_path(scenario),
+                planned_path(scenario)[:, :2],
             ]
         )
         low, high = points.min(axis=0), points.max(axis=0)
@@ -79,18 +80,3 @@ class ViewLimits:
         width = max(width, height * self._aspect)
         half = np.array([width, width / self._aspect]) / 2
         return np.stack([centre - half, centre + half])
-
-
-def planned_path(scenario: Scenario) -> Array:
-    """Positions at which the scenario's controls would bring a robot without noise.
-
-    Returns
-    -------
-    ndarray, shape (steps + 1, 2)
-        The start first [m].
-    """
-    x, y, heading = scenario.start.pose
-    distance, turn = (action_sequence(scenario) * scenario.dt).T
-    headings = heading + np.concatenate([[0.0], np.cumsum(turn)])[:-1]
-    moves = distance[:, None] * np.stack([np.cos(headings), np.sin(headings)], axis=1)
-    return np.concatenate([[(x, y)], np.array([x, y]) + np.cumsum(moves, axis=0)])

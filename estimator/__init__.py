@@ -6,9 +6,18 @@ A step flows predict → update → belief; the modules are named so.
 from .check_estimator import EstimatorContractError as EstimatorContractError
 from .check_estimator import check_estimator as check_estimator
 from .ekf_slam import EkfSlam as EkfSlam
+from .ideal import IdealEkfSlam as IdealEkfSlam
 from .interface import Belief as Belief
 from .interface import SlamEstimator as SlamEstimator
 from .interface import UpdateReport as UpdateReport
+from .invariant import InvariantEkfSlam as InvariantEkfSlam
+from .iterated import IteratedEkfSlam as IteratedEkfSlam
+from .observability import FirstEstimatesEkfSlam as FirstEstimatesEkfSlam
+from .observability import (
+    ObservabilityConstrainedEkfSlam as ObservabilityConstrainedEkfSlam,
+)
 from .registry import list_estimators as list_estimators
 from .registry import make_estimator as make_estimator
 from .registry import register_estimator as register_estimator
+from .robocentric import RobocentricEkfSlam as RobocentricEkfSlam
+from .unscented import UnscentedSlam as UnscentedSlam

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from . import validation
+from .error_frames import ErrorFrame
 from .interface import Belief, UpdateReport
 from .joint_update import (
     ADDED,
@@ -23,9 +24,11 @@ from .joint_update import (
     Rules,
     update_one,
 )
-from .kernels import AT_ESTIMATE, predict
+from .kernels import ADDITIVE, AT_ESTIMATE, INVARIANT, predict
 
 Array = NDArray[np.float64]
+
+FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 
 
 class EkfSlam:
@@ -104,25 +107,25 @@ class EkfSlam:
         gate_probability: float | None = None,
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
-        iterations: int = 1,
-        sequential: bool = False,
     ) -> None:
         motion = validation.standard_deviations("motion_std", motion_std, 3)
         sensor = validation.standard_deviations("measurement_std", measurement_std, 2)
         self._motion_variance = motion**2
         self._noise_at_rest = bool(noise_at_rest)
-        self._rules = Rules(
-            linearisation=self._linearisation,
-            correlated=_is_full(landmark_init),
-            bearing_std=float(sensor[0]),
-            range_std=float(sensor[1]),
-            range_std_per_metre=validation.at_least(
-                "range_std_per_metre", range_std_per_metre, 0.0
-            ),
-            min_range=validation.above("min_range", min_range, 0.0),
-            gate=_gate(gate_probability),
+        self._adopt(
+            Rules(
+                linearisation=self._linearisation,
+                frame=self._frame,
+                correlated=_is_full(landmark_init),
+                bearing_std=float(sensor[0]),
+                range_std=float(sensor[1]),
+                range_std_per_metre=validation.at_least(
+                    "range_std_per_metre", range_std_per_metre, 0.0
+                ),
+                min_range=validation.above("min_range", min_range, 0.0),
+                gate=_gate(gate_probability),
+            )
         )
-        self._rule_values = np.array(self._rules)
         self._ledger = np.zeros((4, 8), dtype=np.int64)
         self.reset(initial_pose, initial_pose_std)
 
@@ -156,13 +159,7 @@ class EkfSlam:
             dt, and dt = 0 adds none.
         """
         distance, turn = validation.pair("odometry", odometry)
-        if not (isfinite(dt) and dt >= 0):
-            raise ValueError(f"dt must be a finite number >= 0, got {dt!r}")
-        variance = self._motion_variance
-        if dt != 1.0:
-            variance = variance * dt
-        if not self._noise_at_rest and distance == 0 and turn == 0:
-            variance = variance * 0.0
+        variance = self._motion_variance_of(distance, turn, dt)
         predict(
             self._mean,
             self._covariance,
@@ -170,9 +167,16 @@ class EkfSlam:
             distance,
             turn,
             variance,
-            self._linearisation,
+            self._rules.linearisation,
             self._reference,
         )
+
+    def _motion_variance_of(self, distance: float, turn: float, dt: float) -> Array:
+        if not (isfinite(dt) and dt >= 0):
+            raise ValueError(f"dt must be a finite number >= 0, got {dt!r}")
+        if not (self._noise_at_rest or distance or turn):
+            return self._motion_variance * 0.0
+        return self._motion_variance if dt == 1.0 else self._motion_variance * dt
 
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
@@ -221,7 +225,12 @@ class EkfSlam:
     def belief(self) -> Belief:
         """Return the belief as a snapshot that later steps leave alone."""
         n = self._size
-        return Belief(self._mean[:n], self._covariance[:n, :n], tuple(self._slots))
+        return Belief(
+            self._mean[:n],
+            self._covariance[:n, :n],
+            tuple(self._slots),
+            FRAMES[self._frame],
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of mean, covariance, ids and linearisation points."""
@@ -256,6 +265,11 @@ class EkfSlam:
         self._reference[: len(mean)] = reference
         self._covariance[: len(mean), : len(mean)] = covariance
 
+    def _adopt(self, rules: Rules) -> None:
+        """Set what distinguishes this filter's updates."""
+        self._rules = rules
+        self._rule_values = np.array(rules)
+
     def _allocate(self, landmarks: int) -> None:
         capacity = (3 + 2 * landmarks) // 4 * 4 + 4
         self._mean = np.zeros(capacity)
@@ -283,17 +297,24 @@ class EkfSlam:
         return []
 
     def _refuse(self, outcome: int, readings: Array, ids: list[int]) -> None:
+        """Raise the error of an update that did not go through."""
         if outcome == NOT_FINITE:
-            row = int(np.argmin(np.isfinite(readings).all(axis=1)))
-            raise ValueError(
-                f"measurements must be finite, got {readings[row].tolist()} in row "
-                f"{row} (landmark {ids[row]})"
-            )
+            self._check_finite(readings, ids)
         row = np.flatnonzero(self._ledger[FATE, : len(ids)] == USED)[outcome]
         raise np.linalg.LinAlgError(
             "the innovation covariance is not positive definite at the reading of "
             f"landmark {ids[row]}: the belief or measurement_std is degenerate"
         )
+
+    @staticmethod
+    def _check_finite(readings: Array, ids: list[int]) -> None:
+        finite = np.isfinite(readings).all(axis=1)
+        if not finite.all():
+            row = int(np.argmin(finite))
+            raise ValueError(
+                f"measurements must be finite, got {readings[row].tolist()} in row "
+                f"{row} (landmark {ids[row]})"
+            )
 
     def _report(
         self, ids: list[int], used: int, nis: float, innovation: Array, factor: Array

@@ -24,7 +24,7 @@ ErrorFrame = Literal["additive", "invariant"]
 
 
 def additive_error(true_state: Array, mean: Array) -> Array:
-    """e = x − x̂ with the heading wrapped, over any leading axes.
+    """Return e = x − x̂ with the heading wrapped, over any leading axes.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def additive_error(true_state: Array, mean: Array) -> Array:
 
 
 def invariant_error(true_state: Array, mean: Array) -> Array:
-    """ξ = Log(χ χ̂⁻¹), over any leading axes.
+    """Return ξ = Log(χ χ̂⁻¹), over any leading axes.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def invariant_error(true_state: Array, mean: Array) -> Array:
 
 
 def invariant_covariance(mean: Array, covariance: Array) -> Array:
-    """D P Dᵀ, the covariance of ξ for a covariance P of e, over any leading axes.
+    """Return D P Dᵀ, the covariance of ξ for a covariance P of e; any leading axes.
 
     Parameters
     ----------

@@ -102,7 +102,6 @@ class Belief:
         blocks = self.covariance[3:, 3:].reshape(n, 2, n, 2)
         return blocks[np.arange(n), :, np.arange(n), :]
 
-
     def error(
         self, true_pose: ArrayLike, true_landmarks: ArrayLike, frame: str | None = None
     ) -> Array:

@@ -118,28 +118,18 @@ def correct(
     columns, jacobians = every_column[first:last], work.jacobians[first:last]
     shift, way = work.vectors[0], work.vectors[1]
     prior, heading = work.vectors[2], work.vectors[3]
+    rows = 2 * (last - first)
     for j in range(size):
         prior[j] = mean[j]
-    rows = 2 * (last - first)
     for iteration in range(rules.iterations):
         stage = min(iteration, 1)
         innovations = work.innovations[stage, first:last]
-        for k in range(last - first):
-            linearise(
-                mean,
-                reference,
-                columns[k],
-                rules.linearisation,
-                work.readings[first + k],
-                jacobians[k],
-                innovations[k],
-            )
-            if iteration > 0:
-                relate_to_prior(
-                    prior, shift, columns[k], rules.frame, jacobians[k], innovations[k]
-                )
-        factor = work.factors[stage, 2 * first : 2 * last, 2 * first : 2 * last]
         white = work.white[stage, 2 * first : 2 * last]
+        for k in range(last - first):
+            H, nu, z = jacobians[k], innovations[k], work.readings[first + k]
+            linearise(mean, reference, columns[k], rules.linearisation, z, H, nu)
+            if iteration > 0:
+                relate_to_prior(prior, shift, columns[k], rules.frame, H, nu)
         failed = whiten(
             covariance,
             size,
@@ -148,7 +138,7 @@ def correct(
             work.variances[first:last],
             innovations,
             work.gains,
-            factor,
+            work.factors[stage, 2 * first : 2 * last, 2 * first : 2 * last],
             white,
         )
         for j in range(size):
@@ -156,17 +146,23 @@ def correct(
         if failed >= 0:
             return first + failed
         combine(work.gains, white, rows, size, shift)
-        if rules.frame == INVARIANT:
-            for j in range(size):
-                way[j] = shift[j]
-            retract(mean, way, size)
-        else:
-            for j in range(size):
-                mean[j] += shift[j]
+        move(mean, shift, way, size, rules.frame)
     downdate(covariance, size, work.gains, rows)
     if rules.frame == INVARIANT:
         transport(covariance, size, way, heading)
     return -1
+
+
+@part
+def move(mean: Array, shift: Array, way: Array, size: int, frame: int) -> None:
+    """Compose the correction δ with the state, as the error frame has it."""
+    for j in range(size):
+        way[j] = shift[j]
+    if frame == INVARIANT:
+        retract(mean, way, size)
+        return
+    for j in range(size):
+        mean[j] += shift[j]
 
 
 @part

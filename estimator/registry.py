@@ -8,7 +8,13 @@ from typing import Any, cast
 from numpy.typing import ArrayLike
 
 from .ekf_slam import EkfSlam
+from .ideal import IdealEkfSlam
 from .interface import SlamEstimator
+from .invariant import InvariantEkfSlam
+from .iterated import IteratedEkfSlam
+from .observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
+from .robocentric import RobocentricEkfSlam
+from .unscented import UnscentedSlam
 
 EstimatorFactory = Callable[..., SlamEstimator]
 
@@ -118,4 +124,14 @@ def _imported(path: str) -> EstimatorFactory:
         raise ValueError(f"cannot import estimator '{path}': {error}") from error
 
 
-register_estimator("ekf", EkfSlam)
+for _name, _factory in {
+    "ekf": EkfSlam,
+    "invariant": InvariantEkfSlam,
+    "first_estimates": FirstEstimatesEkfSlam,
+    "observability_constrained": ObservabilityConstrainedEkfSlam,
+    "iterated": IteratedEkfSlam,
+    "unscented": UnscentedSlam,
+    "robocentric": RobocentricEkfSlam,
+    "ideal": IdealEkfSlam,
+}.items():
+    register_estimator(_name, _factory)

@@ -88,3 +88,10 @@ def above(name: str, value: float, least: float) -> float:
     if not (isfinite(value) and value > least):
         raise ValueError(f"{name} must be a finite number > {least:g}, got {value!r}")
     return float(value)
+
+
+def whole(name: str, value: int, least: int) -> int:
+    """Return a whole number >= ``least``, or refuse it."""
+    if isinstance(value, bool) or value != int(value) or value < least:
+        raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+    return int(value)

@@ -55,26 +55,25 @@ def truth_figure(trace: RunTrace) -> Figure:
         raise ValueError("trace must have true poses or true landmarks, got neither")
     limits = _limits(trace)
     width, height = limits[1] - limits[0]
-    tall = min(max(6.2 * height / width, 3.6), 8.0) + 1.7
-    figure = new_figure(11.0 if landmarks.any() else 7.2, tall)
-    if landmarks.any():
-        area, metres, deviations = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
-        distances = _landmark_distances(trace, landmarks)
+    distances = _landmark_distances(trace, landmarks) if landmarks.any() else None
+    if distances is None:
+        figure = new_figure(7.2, 6.2 * height / width + 1.5)
+        area = figure.add_subplot()
+    else:  # so low that the map is as high as the bars beside it
+        figure = new_figure(10.8, 5.6 * height / width + 1.5)
+        area, *beside = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
         names = [f"l{i}" for i in trace.landmark_ids[landmarks]]
-        _draw_distances(metres, deviations, distances, names)
-    else:
-        area, distances = figure.subplots(), None
+        _draw_distances(beside[0], beside[1], distances, names)
     dress(area)
     area.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
     area.set(xlabel="x [m]", ylabel="y [m]")
     keys = _draw_comparison(area, trace, poses, landmarks)
     write_title(area, "Estimate and ground truth", _summary(trace, poses, distances))
-    area.legend(
+    figure.legend(
         handles=keys,
         handler_map=ELLIPSE_HANDLER,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.1),
-        ncols=3,
+        loc="outside lower center",
+        ncols=len(keys),
         frameon=False,
         fontsize=9,
     )
@@ -147,28 +146,31 @@ def _landmark_distances(trace: RunTrace, known: Mask) -> LandmarkDistances:
 def _draw_distances(
     metres: Axes, deviations: Axes, distances: LandmarkDistances, names: list[str]
 ) -> None:
-    """Draw one line per landmark, in the order of the state from the top."""
-    rows = np.arange(len(names))
-    for axes, values, name in (
-        (metres, distances.euclidean, "Euclidean [m]"),
-        (deviations, distances.mahalanobis, "Mahalanobis [σ]"),
-    ):
-        dress(axes)
-        axes.grid(visible=False, axis="y")
-        axes.hlines(rows, 0, values, color=ALARM, lw=1.6 if len(rows) <= 40 else 0.8)
-        axes.plot(values, rows, "o", color=ALARM, ms=4.5 if len(rows) <= 40 else 2.5)
-        axes.set(xlabel=name, ylim=(len(rows) - 0.4, -0.6))
-        axes.set_xlim(0, 1.1 * max(float(values.max()), 1e-9))
-        axes.tick_params(axis="y", length=0)
+    """Draw one bar per landmark, in the order of the state from the top."""
+    _draw_bars(metres, distances.euclidean)
+    _draw_bars(deviations, distances.mahalanobis)
     stride = -(-len(names) // _MOST_NAMES)
-    metres.set_yticks(rows[::stride], names[::stride])
+    metres.set_yticks(range(0, len(names), stride), names[::stride])
     deviations.set_yticks([])
-    write_title(metres, "Distance to truth", "of every landmark")
+    metres.set_xlabel("distance [m]")
+    deviations.set_xlabel("distance [σ]")
     bound = float(np.sqrt(chi2.ppf(0.95, 2)))
     deviations.set_xlim(0, max(deviations.get_xlim()[1], 1.15 * bound))
     deviations.axvline(bound, color=GREY, lw=1.2, ls="--")
     inside = np.mean(distances.mahalanobis <= bound)
-    write_title(deviations, "", f"{inside:.0%} within the\n95 % bound (dashed)")
+    write_title(metres, "Euclidean", "from truth, by landmark")
+    write_title(deviations, "Mahalanobis", f"{inside:.0%} in the 95% bound")
+
+
+def _draw_bars(axes: Axes, values: Array) -> None:
+    rows, few = np.arange(len(values)), len(values) <= _MOST_NAMES
+    dress(axes)
+    axes.grid(visible=False, axis="y")
+    axes.hlines(rows, 0, values, color=ALARM, lw=1.6 if few else 0.8)
+    axes.plot(values, rows, "o", color=ALARM, ms=4.5 if few else 2.5)
+    axes.set_xlim(0, 1.1 * max(float(values.max()), 1e-9))
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
 
 
 def _summary(trace: RunTrace, poses: Mask, distances: LandmarkDistances | None) -> str:

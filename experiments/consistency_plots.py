@@ -17,7 +17,7 @@ _LOG_FROM = 8.0  # times the band's upper bound: larger NIS needs a logarithmic 
 
 
 def errors_figure(trace: RunTrace) -> Figure:
-    """Draw pose errors with their ±3σ bands, and the NIS with its 95 % band, over time.
+    """Draw pose errors with their ±3σ bands, and the NIS with its 95% band, over time.
 
     Without true poses only the NIS is drawn, which needs no truth.
 
@@ -122,7 +122,7 @@ def _draw_nis(axes: Axes, trace: RunTrace) -> None:
         color=TEAL,
         alpha=0.18,
         lw=0,
-        label="95 % band",
+        label="95% band",
     )
     inside = used & (trace.nis >= lower) & (trace.nis <= upper)
     size = 4.0 if len(trace.t) <= 300 else 2.0
@@ -139,10 +139,10 @@ def _draw_nis(axes: Axes, trace: RunTrace) -> None:
         write_title(axes, "NIS: no step corrected anything", size=10)
         return
     share = np.mean(inside[used])
-    write_title(axes, f"NIS: {share:.0%} of the steps in the 95 % band", size=10)
+    write_title(axes, f"NIS: {share:.0%} of the steps in the 95% band", size=10)
     if trace.nis[used].max() > _LOG_FROM * np.nanmax(upper):
         axes.set_yscale("log")
-        axes.set_ylim(bottom=max(0.3 * np.nanmin(lower), 1e-3))
+        axes.set_ylim(bottom=max(0.3 * float(np.nanmin(lower)), 1e-3))
     else:
         axes.set_ylim(bottom=0)
     _legend_above(axes, columns=3)

@@ -26,13 +26,11 @@ def covariance_figure(trace: RunTrace) -> Figure:
     trace : RunTrace
         The run.
     """
-    first_ids = next((ids for ids, *_ in trace.landmark_history if len(ids)), ())
-    first_step = next(
-        (k for k, (ids, *_) in enumerate(trace.landmark_history) if len(ids)), 0
-    )
-    figure = new_figure(12.4, 5.9)
+    sizes = [len(ids) for ids, *_ in trace.landmark_history]
+    first_step = next((step for step, size in enumerate(sizes) if size), 0)
+    figure = new_figure(12.4, 5.6)
     before, after = figure.subplots(1, 2)
-    _draw_correlations(before, trace.first_covariance, first_ids)
+    _draw_correlations(before, trace.first_covariance, trace.map_at(first_step).ids)
     image = _draw_correlations(after, trace.final_covariance, trace.landmark_ids)
     write_title(
         before, "Before: the first map", _summary(trace.first_covariance, first_step)
@@ -87,9 +85,10 @@ def _draw_correlations(
     rows, labels = row_labels(ids)
     axes.set_yticks(rows, labels)
     axes.set_xticks(rows, labels, rotation=90)
-    axes.axhline(2.5, color="white", lw=1.5)
-    axes.axvline(2.5, color="white", lw=1.5)
-    if len(covariance) <= _MOST_LABELS:
+    few = len(covariance) <= _MOST_LABELS
+    for line in (axes.axhline, axes.axvline):  # between pose and landmarks
+        line(2.5, color="white", lw=1.5 if few else 0.6)
+    if few:
         _write_deviations(axes, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     return image
 
@@ -109,7 +108,7 @@ def row_labels(ids: NDArray[np.integer]) -> tuple[list[float], list[str]]:
             labels += [f"l{landmark}x", f"l{landmark}y"]
         return rows, labels
     stride = -(-len(ids) // (_MOST_LABELS // 2 - 3))
-    chosen = range(0, len(ids), stride)
+    chosen = range(stride // 2, len(ids), stride)
     return (
         [1.0, *(3.5 + 2 * k for k in chosen)],  # the pose is too thin for three
         ["pose", *(f"l{ids[k]}" for k in chosen)],

@@ -19,7 +19,7 @@ from .trace import RunTrace
 
 Array = NDArray[np.floating]
 
-PREDICTED = EllipseKind("predicted pose, 3σ", "#d216c6", (0, (3, 1.5)), width=1.1)
+PREDICTED = EllipseKind("predicted pose, 3σ", "#d216c6", (0, (4, 3)), width=1.2)
 UPDATED = EllipseKind("updated pose, 3σ", "#1d4ed8", fill=0.12, width=1.3)
 FIRST = EllipseKind("landmark at first, 3σ", "#dc1f26", (0, (5, 1.5, 1, 1.5)))
 LATER = EllipseKind("landmark later, 3σ", "#128a3a", fill=0.16, width=1.5)
@@ -27,6 +27,7 @@ _FORMER = EllipseKind("landmark in between", LATER.colour, width=0.6, alpha=0.35
 
 _MOST_POSES = 60  # ellipses along the path; longer runs show every second, third, …
 _MOST_FORMER = 300  # green ellipses of steps gone by
+_SHORTEST_SIDE = 0.55  # of a map, as a share of its longest
 _ARROW = np.array([[1.0, 0.0], [-0.75, 0.7], [-0.35, 0.0], [-0.75, -0.7]])
 
 
@@ -206,7 +207,7 @@ def box_around(points: Array, means: Array, covariances: Array) -> Array:
     Returns
     -------
     ndarray, shape (2, 2)
-        Lower left and upper right corner [m].
+        Lower left and upper right corner [m]; neither side much shorter than the other.
     """
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     span = max(float((high - low).max()), 1e-3)
@@ -214,4 +215,6 @@ def box_around(points: Array, means: Array, covariances: Array) -> Array:
     lowest, highest = (means - reach).min(axis=0), (means + reach).max(axis=0)
     low = np.maximum(np.minimum(low, lowest), low - span / 3)
     high = np.minimum(np.maximum(high, highest), high + span / 3)
-    return np.stack([low - 0.03 * span, high + 0.03 * span])
+    size = np.maximum(high - low, (high - low).max() * _SHORTEST_SIDE) + 0.06 * span
+    centre = (low + high) / 2
+    return np.stack([centre - size / 2, centre + size / 2])

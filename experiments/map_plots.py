@@ -60,7 +60,8 @@ def map_sequence(
 ) -> list[Path]:
     """Save one map picture after every step.
 
-    The files are called step_000.png, step_001.png, … Only what differs between the steps is drawn anew.
+    The files are called step_000.png, step_001.png, … and only what differs between
+    the steps is drawn anew.
 
     Parameters
     ----------
@@ -116,8 +117,7 @@ def noise_study_figure(panels: Sequence[NoisePanel]) -> Figure:
     limits = _shared_limits([panel.trace for panel in panels])
     rows = 1 + len(panels) // 2
     width, height = limits[1] - limits[0]
-    tall = min(max(3.6 * height / width, 1.8), 5.0) + 0.55
-    figure = new_figure(8.4, tall * rows + 0.4)
+    figure = new_figure(7.6, (3.15 * height / width + 0.55) * rows + 0.4)
     grid = figure.subplots(rows, 2, squeeze=False)
     reference, beside, *others = grid.flat
     picture = _draw_panel(reference, panels[0], limits)
@@ -158,7 +158,7 @@ class _MapParts(NamedTuple):
 def _map_parts(trace: RunTrace) -> _MapParts:
     limits = map_limits(trace)
     width, height = limits[1] - limits[0]
-    figure = new_figure(7.2, min(max(6.4 * height / width, 3.0), 8.5) + 1.7)
+    figure = new_figure(7.2, 6.4 * height / width + 1.5)
     axes = figure.add_subplot()
     _prepare(axes, limits)
     axes.set(xlabel="x [m]", ylabel="y [m]")

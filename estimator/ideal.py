@@ -1,0 +1,92 @@
+"""The ideal EKF-SLAM: Jacobians at the ground truth, for study only."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import validation
+from .ekf_slam import EkfSlam
+from .interface import UpdateReport
+from .kernels import AT_TRUTH
+
+Array = NDArray[np.float64]
+
+
+class IdealEkfSlam(EkfSlam):
+    """The standard filter with its Jacobians taken at the ground truth: no real filter.
+
+    It shows how much of an inconsistency is the fault of the linearisation points [1]_.
+    The truth comes in by a door of its own, :meth:`observe_truth`, before each predict;
+    until it is first opened the filter linearises at its estimate like ``ekf``.  Where
+    the frame itself is uncertain it is no benchmark: Jacobians at the truth and
+    innovations at the estimate then live in different frames, and it diverges.
+
+    Parameters are those of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] G. Huang, A. Mourikis, S. Roumeliotis, Observability-based rules for
+       designing consistent EKF SLAM estimators, IJRR 29(5), 2010.
+    """
+
+    def observe_truth(
+        self, pose: ArrayLike, landmarks: Mapping[int, ArrayLike]
+    ) -> None:
+        """Tell the truth of this moment, before the predict or update that uses it.
+
+        Parameters
+        ----------
+        pose : array_like, shape (3,)
+            True pose (x, y, θ) after the motion [m, m, rad].
+        landmarks : mapping from id to (2,)
+            True positions of all landmarks that may be seen [m].
+        """
+        truth = validation.finite_vector("pose", pose, 3)
+        self._true_landmarks = {
+            i: validation.finite_vector(f"landmarks[{i}]", xy, 2)
+            for i, xy in landmarks.items()
+        }
+        if self._rules.linearisation != AT_TRUTH:
+            self._adopt(self._rules._replace(linearisation=AT_TRUTH))
+            self._reference[:3] = truth
+        for i, slot in self._slots.items():
+            self._reference[3 + 2 * slot : 5 + 2 * slot] = self._true_landmarks[i]
+        self._true_pose = truth
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move by odometry (d, α) [m, rad], the covariance along the true way."""
+        if self._rules.linearisation != AT_TRUTH:
+            super().predict(odometry, dt)
+            return
+        distance, turn = validation.pair("odometry", odometry)
+        variance = self._motion_variance_of(distance, turn, dt)
+        cos, sin = np.cos(self._mean[2]), np.sin(self._mean[2])
+        self._mean[:3] += distance * cos, distance * sin, turn
+        n, heading = self._size, self._reference[2]
+        dx, dy = self._true_pose[:2] - self._reference[:2]
+        G = np.eye(n)
+        G[:2, 2] = -dy, dx
+        F = np.eye(3)
+        F[:2, :2] = [
+            [np.cos(heading), -np.sin(heading)],
+            [np.sin(heading), np.cos(heading)],
+        ]
+        moved = G @ self._covariance[:n, :n] @ G.T
+        moved[:3, :3] += F @ np.diag(variance) @ F.T
+        self._covariance[:n, :n] = (moved + moved.T) / 2
+        self._reference[:3] = self._true_pose
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
+    ) -> UpdateReport:
+        """Correct the belief with one scan, linearised at the truth."""
+        if self._rules.linearisation == AT_TRUTH and landmark_ids is not None:
+            readings = validation.scan(measurements)
+            self._make_room(len(readings))
+            column = self._size
+            for i, distance in zip(landmark_ids, readings[:, 1], strict=False):
+                if i not in self._slots and distance >= self._rules.min_range:
+                    self._reference[column : column + 2] = self._true_landmarks[i]
+                    column += 2
+        return super().update(measurements, landmark_ids)

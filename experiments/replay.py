@@ -1,0 +1,216 @@
+"""Drive an estimator through a log, and keep what it believed on the way."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..estimator.interface import Belief, SlamEstimator, UpdateReport
+from .log_events import Scan
+from .log_steps import Step, predictions, steps_of
+from .map_history import MapHistory
+from .slamlog import SlamLog
+from .trace import RunTrace
+from .true_path import true_landmarks_of, true_poses_of
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], object]
+
+_MOST_MAPS = 500  # kept of a run, unless all are asked for
+
+
+class ReadingCounts(NamedTuple):
+    """What became of the readings of a log."""
+
+    associated: int = 0
+    """Corrected the belief."""
+    added: int = 0
+    """Put a landmark into the map."""
+    rejected: int = 0
+    """Refused by the chi-square gate."""
+    skipped: int = 0
+    """Too close to use."""
+    near: int = 0
+    """Of those associated: within 10 σ of the robot, where linearising is unsafe."""
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """An estimator's run over a log."""
+
+    log: SlamLog
+    """What it was driven through."""
+    trace: RunTrace
+    """What it believed after every step."""
+    belief: Belief
+    """What it believes at the end."""
+    readings: ReadingCounts
+    """What it did with the readings."""
+
+
+def replay(
+    log: SlamLog,
+    estimator: SlamEstimator,
+    *,
+    name: str | None = None,
+    keep_history: bool = False,
+    progress: Progress | None = None,
+) -> Replay:
+    """Feed a log to an estimator: for each step its motion, then its scan.
+
+    Parameters
+    ----------
+    log : SlamLog
+        The log; a scan without landmark ids is left to the estimator to associate.
+    estimator : SlamEstimator
+        At its start, with an empty map; it is at the end of the log afterwards.
+    name : str, optional
+        What to call the estimator; its class by default.
+    keep_history : bool, default False
+        Whether the trace keeps the map after every step, for pictures of each, or
+        only of some hundred steps spread over the run.
+    progress : callable, optional
+        Called with (steps done, steps) after every step.
+
+    Returns
+    -------
+    Replay
+        The trace, the final belief, and what became of the readings.
+
+    Raises
+    ------
+    ValueError
+        If the estimator refuses a reading, naming the time in the log.
+    numpy.linalg.LinAlgError
+        If its covariance degenerates, naming the time too.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import make_estimator
+    >>> from slamgym.experiments.slamlog import OdometryRow, Scan, SlamLog
+    >>> scans = [Scan(t, np.array([[0.0, 5.0 - 2 * t]]), [4]) for t in (0.0, 1.0)]
+    >>> log = SlamLog("drive", events=(scans[0], OdometryRow(1, 2.0, 0.0, 1), scans[1]))
+    >>> slam = make_estimator("ekf", motion_std=(0.1,) * 3, measurement_std=(0.1, 0.1))
+    >>> replay(log, slam).readings
+    ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=0)
+    """
+    steps = list(steps_of(log))
+    recorder = _Recorder(len(steps), MapHistory(None if keep_history else _MOST_MAPS))
+    for number, step in enumerate(steps):
+        try:
+            _take(step, log, estimator, recorder)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise type(error)(f"{log.name}, t = {step.t:g}: {error}") from error
+        if progress is not None:
+            progress(number + 1, len(steps))
+    times = np.array([step.t for step in steps], dtype=np.float64)
+    trace = recorder.trace(name or type(estimator).__name__, times, log)
+    return Replay(log, trace, recorder.belief, recorder.counts())
+
+
+def _take(
+    step: Step, log: SlamLog, estimator: SlamEstimator, recorder: "_Recorder"
+) -> None:
+    for row in step.motions:
+        for odometry, dt in predictions(row, log.motion):
+            estimator.predict(odometry, dt)
+    predicted = estimator.belief()
+    if step.scan is None:
+        recorder.add(predicted, predicted, None)
+        return
+    report = estimator.update(step.scan.measurements, _ids(step.scan))
+    recorder.add(predicted, estimator.belief(), report)
+
+
+def _ids(scan: Scan) -> list[int] | None:
+    return None if scan.landmark_ids is None else scan.landmark_ids.tolist()
+
+
+class _Recorder:
+    """Collect beliefs and reports, step by step, into the arrays of a trace."""
+
+    def __init__(self, steps: int, history: MapHistory) -> None:
+        self._predicted = _PoseTrack(steps)
+        self._updated = _PoseTrack(steps)
+        self._nis = np.zeros(steps)
+        self._dof = np.zeros(steps, dtype=np.int64)
+        self._history = history
+        self._first: dict[int, tuple[Array, Array]] = {}
+        self._first_covariance: Array | None = None
+        self._counts: Counter[str] = Counter()
+        self._ids: tuple[int, ...] = ()
+
+    def add(
+        self, predicted: Belief, updated: Belief, report: UpdateReport | None
+    ) -> None:
+        """Take in one step."""
+        step = len(self._history)
+        self._predicted.put(step, predicted)
+        self._updated.put(step, updated)
+        self._history.append(updated)
+        self.belief = updated
+        if updated.landmark_ids != self._ids:
+            self._meet_new(updated)
+        if report is not None:
+            self._nis[step] = report.nis
+            self._dof[step] = report.degrees_of_freedom
+            for fate in ReadingCounts._fields:
+                self._counts[fate] += len(getattr(report, f"{fate}_ids"))
+
+    def counts(self) -> ReadingCounts:
+        """Count the readings by what became of them."""
+        return ReadingCounts(**self._counts)
+
+    def trace(self, name: str, times: Array, log: SlamLog) -> RunTrace:
+        """Make the trace of a run over a log."""
+        belief = self.belief
+        first = [self._first[i] for i in belief.landmark_ids]
+        first_covariance = self._first_covariance
+        if first_covariance is None:
+            first_covariance = self._updated.covariances[0]
+        return RunTrace(
+            estimator=name,
+            t=times,
+            predicted_poses=self._predicted.poses,
+            predicted_pose_covariances=self._predicted.covariances,
+            poses=self._updated.poses,
+            pose_covariances=self._updated.covariances,
+            true_poses=true_poses_of(log, times),
+            nis=self._nis,
+            nis_dof=self._dof,
+            landmark_ids=np.array(belief.landmark_ids, dtype=np.int64),
+            landmarks=belief.landmarks,
+            first_landmarks=np.array([mean for mean, _ in first]).reshape(-1, 2),
+            first_landmark_covariances=np.array([P for _, P in first]).reshape(
+                -1, 2, 2
+            ),
+            landmark_history=self._history,
+            true_landmarks=true_landmarks_of(log, belief.landmark_ids),
+            first_covariance=first_covariance,
+            final_covariance=belief.covariance,
+        )
+
+    def _meet_new(self, belief: Belief) -> None:
+        """Remember landmarks as they are when they enter the map."""
+        if self._first_covariance is None:
+            self._first_covariance = belief.covariance
+        covariances = belief.landmark_covariances
+        for k, landmark_id in enumerate(belief.landmark_ids):
+            if landmark_id not in self._first:
+                self._first[landmark_id] = (belief.landmarks[k], covariances[k])
+        self._ids = belief.landmark_ids
+
+
+class _PoseTrack:
+    """Poses (steps, 3) and their covariances (steps, 3, 3)."""
+
+    def __init__(self, steps: int) -> None:
+        self.poses = np.empty((steps, 3))
+        self.covariances = np.empty((steps, 3, 3))
+
+    def put(self, step: int, belief: Belief) -> None:
+        self.poses[step] = belief.pose
+        self.covariances[step] = belief.pose_covariance
