@@ -5,8 +5,12 @@ Symbols
 p = (x, y, θ)  true robot pose in the world frame [m, m, rad]
 l = (lx, ly)   landmark [m, m], as the complex number lx + i ly
 z = (β, r)     reading: bearing from the robot's heading, and range [rad, m]
+
+Readings are kept as (all bearings, all ranges) here, so that each is contiguous.
+Every function takes leading axes too, for worlds simulated side by side.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,107 +18,115 @@ from numpy.typing import NDArray
 
 from ..sim_configs import Scenario
 from .line_of_sight import LineOfSight
-from .noise_streams import MANY_STD, ComplexArray, SensorNoise
+from .noise_streams import MANY_STD, SensorNoise
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
-_PI = np.array(np.pi)
+_PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
 
 
-class Scan(NamedTuple):
-    """The readings of one moment; fresh arrays."""
+class AnonymousScan(NamedTuple):
+    """Readings without identities, packed at the front in random order."""
 
-    measurements: Array
-    """Rows (bearing in [-π, π), range), zeros where unseen, shape (…, M, 2)."""
+    readings: Array
+    """(β, r), zeros in empty rows, shape (2, …, M) [rad, m]."""
     mask: BoolArray
     """Which rows hold a reading, shape (…, M)."""
-    landmark_ids: NDArray[np.int64] | None
-    """The landmark of each row, -1 where there is none, shape (…, M).
-
-    None when row i is landmark i.
-    """
+    landmark_ids: NDArray[np.int64]
+    """The true landmark of each row, -1 for clutter and empty rows, shape (…, M)."""
 
 
 class BearingRangeSensor:
-    """Measures N landmarks as a scenario's sensor does, for any leading axes.
+    """Measures N landmarks as a scenario's sensor does.
 
-    A landmark is seen when its true range lies in [min_range, max_range], its true
-    bearing within half the field of view of the heading, no wall hides it, it does
-    not drop out, and its noisy range is above zero.
+    A landmark is read when its true range lies in [min_range, max_range] and its true
+    bearing within half the field of view of the heading, no wall hides it, the reading
+    does not drop out, and its noisy range is above zero.
 
     Parameters
     ----------
     scenario : Scenario
-        Whose sensor, walls and number of landmarks are meant.
+        Whose sensor and walls are meant.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
-        self._count = scenario.landmarks.count
-        self._hides_identities = not sensor.identities
-        self._range_std = sensor.std[1], sensor.range_std_per_metre
-        self._constant_noise = sensor.range_std_per_metre == 0.0
-        self._max_range = np.array(sensor.max_range) if np.isfinite(sensor.max_range) else None
-        self._half_view = np.array(sensor.field_of_view / 2) if sensor.field_of_view<2*np.pi else None
-        self._may_wrap = sensor.field_of_view / 2 + MANY_STD * sensor.std[0] >= np.pi
-        self._sight = None
-        if sensor.occlusion and scenario.walls:
-            self._sight = LineOfSight(scenario.walls)
+        bearing_std, self._range_std = sensor.std
+        self._range_std_per_metre = sensor.range_std_per_metre
+        self._max_range = _limit(sensor.max_range, above=math.inf)
+        self._half_view = _limit(sensor.field_of_view / 2, above=math.pi)
+        self._may_wrap = sensor.field_of_view / 2 + MANY_STD * bearing_std >= math.pi
+        hides = sensor.occlusion and scenario.walls
+        self._sight = LineOfSight(scenario.walls) if hides else None
 
     def scan(
         self,
         landmarks: ComplexArray,
-        position: complex | ComplexArray,
-        heading: complex | ComplexArray,
+        position: ComplexArray,
+        inverse_heading: ComplexArray,
         noise: SensorNoise,
-    ) -> Scan:
+    ) -> tuple[Array, BoolArray]:
         """Measure the landmarks from one pose.
+
+        ::
+
+            δ = (l - p) (cos θ - i sin θ),   z = (arg δ, |δ|) + ε
 
         Parameters
         ----------
         landmarks : complex ndarray, shape (…, N)
             l [m].
-        position : complex, or complex ndarray, shape (…, 1)
+        position : complex ndarray, shape () or (…, 1)
             x + iy [m].
-        heading : complex, or complex ndarray, shape (…, 1)
-            cos θ + i sin θ.
+        inverse_heading : complex ndarray, shape () or (…, 1)
+            cos θ - i sin θ.
         noise : SensorNoise
             Of this step.
 
         Returns
         -------
-        Scan
-            With M = N, or N + C when identities are hidden.
+        readings : ndarray, shape (2, …, N)
+            (β in [-π, π), r), zeros where unseen [rad, m].
+        mask : bool ndarray, shape (…, N)
+            Which landmarks are seen.
         """
-        true = np.empty(landmarks.shape, dtype=np.complex128)
-        relative = (landmarks - position) * heading
-        bearings = np.arctan2(relative.imag, relative.real, true.real)
-        ranges = np.abs(relative, true.imag)
-        mask = ranges > noise.nearest
+        error, nearest, _, _ = noise
+        relative = (landmarks - position) * inverse_heading
+        true = np.empty(error.shape)
+        bearings = np.arctan2(relative.imag, relative.real, true[0])
+        ranges = np.abs(relative, true[1])
+        mask: BoolArray = ranges > nearest
         if self._max_range is not None:
             mask &= ranges <= self._max_range
         if self._half_view is not None:
             mask &= np.abs(bearings) <= self._half_view
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
-        true += noise.reading if self._constant_noise else self._scaled(noise, ranges)
-        if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
-            true.real = wrap_bearings(bearings)
-        rows = np.zeros((*mask.shape, 2))
-        np.copyto(rows.view(np.complex128)[..., 0], true, where=mask)
-        return rows, mask, None
+        readings = np.zeros(error.shape)
+        np.copyto(readings, self._disturb(true, error), where=mask)
+        return readings, mask
 
-    def _scaled(self, noise: ComplexArray, ranges: Array) -> ComplexArray:
-        """Give noise in units of σr(r) = σr + k r its size; leave other as it is."""
-        constant, per_metre = self._range_std
-        if per_metre == 0.0:
-            return noise
-        return noise.real + 1j * (noise.imag * (constant + per_metre * ranges))
+    def _disturb(self, true: Array, error: Array) -> Array:
+        """Add noise to true readings in place, both of shape (2, …, N)."""
+        if self._range_std_per_metre:
+            true[1] += error[1] * (self._range_std + self._range_std_per_metre * true[1])
+            true[0] += error[0]
+        else:
+            true += error
+        if self._may_wrap and np.count_nonzero(np.abs(true[0]) >= _PI):
+            true[0] = wrap_bearings(true[0])
+        return true
+
+
+def _limit(value: float, above: float) -> Array | None:
+    """Keep a limit in the form that compares fastest, or None if it has no effect."""
+    return np.array(value) if value < above else None
 
 
 def wrap_bearings(bearings: Array) -> Array:
-    """Bring angles into [-π, π), without rounding those that lie there already.
+    """Bring angles into [-π, π), to the last bit if they lie there already.
 
     Examples
     --------
@@ -128,14 +140,14 @@ def wrap_bearings(bearings: Array) -> Array:
 
 
 def hide_identities(
-    readings: ComplexArray, mask: BoolArray, noise: SensorNoise
-) -> Scan:
+    readings: Array, mask: BoolArray, noise: SensorNoise
+) -> AnonymousScan:
     """Mix readings with clutter and pack them at the front in random order.
 
     Parameters
     ----------
-    readings : complex ndarray, shape (…, N)
-        β + i r of each landmark, 0 where unseen [rad, m].
+    readings : ndarray, shape (2, …, N)
+        (β, r) of each landmark, zeros where unseen [rad, m].
     mask : bool ndarray, shape (…, N)
         Which landmarks are seen.
     noise : SensorNoise
@@ -143,23 +155,19 @@ def hide_identities(
 
     Returns
     -------
-    Scan
-        With M = N + C rows, and the landmark of each row.
+    AnonymousScan
+        With M = N + C rows.
     """
-    assert noise.clutter is not None
-    assert noise.order is not None
-    rows = np.concatenate([readings, noise.clutter], axis=-1)
-    filled = np.concatenate([mask, noise.clutter.imag > 0.0], axis=-1)
-    ids = np.full(filled.shape, -1, dtype=np.int64)
-    ids[..., : mask.shape[-1]] = np.where(mask, np.arange(mask.shape[-1]), -1)
-    order = np.argsort(np.where(filled, noise.order, 1.0), axis=-1, kind="stable")
-    return Scan(
-        as_rows(np.take_along_axis(rows, order, axis=-1)),
-        np.take_along_axis(filled, order, axis=-1),
-        np.take_along_axis(ids, order, axis=-1),
+    _, _, clutter, order = noise
+    assert clutter is not None
+    assert order is not None
+    count = mask.shape[-1]
+    filled = np.concatenate([mask, clutter[1] > 0.0], axis=-1)
+    ids = np.full((1, *filled.shape), -1.0)
+    np.copyto(ids[0, ..., :count], np.arange(count), where=mask)
+    rows = np.concatenate(
+        [np.concatenate([readings, clutter], axis=-1), ids], axis=0
     )
-
-
-def as_rows(readings: ComplexArray) -> Array:
-    """View β + i r, shape (…, M), as rows (β, r), shape (…, M, 2)."""
-    return readings.view(np.float64).reshape(*readings.shape, 2)
+    places = np.argsort(np.where(filled, order, np.inf), axis=-1)
+    packed = np.take_along_axis(rows, places[None], axis=-1)
+    return AnonymousScan(packed[:2], packed[1] > 0.0, packed[2].astype(np.int64))

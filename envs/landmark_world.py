@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from ..sim_configs import Scenario, load_scenario, place_landmarks
-from .bearing_range_sensor import BearingRangeSensor, as_rows
+from .bearing_range_sensor import BearingRangeSensor, hide_identities
 from .live_view import RENDER_MODES, LiveView, Moment
 from .noise_streams import motion_noise_rows, sensor_noise_rows, spawn_streams
 from .odometry_sensor import OdometrySensor
@@ -114,6 +114,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
         self._body = UnicycleBody(robot.radius, self.scenario.walls)
         self._odometer = OdometrySensor(self.scenario)
         self._sensor = BearingRangeSensor(self.scenario)
+        self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: NDArray[np.complex128] | None = None
 
     def reset(
@@ -199,7 +200,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
         """True positions of this episode's landmarks, shape (N, 2) [m], a copy."""
         if self._landmarks is None:
             raise ResetNeeded("call reset to place the landmarks")
-        return as_rows(self._landmarks).copy()
+        return self._landmarks.copy().view(np.float64).reshape(-1, 2)
 
     @property
     def start_estimate(self) -> Array:
@@ -235,14 +236,16 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
     def _observe(
         self, odometry: Array, collision: bool
     ) -> tuple[Observation, dict[str, Any]]:
-        body = self._body
-        measurements, mask, ids = self._sensor.scan(
-            self._landmarks, body.position, body.inverse, next(self._sensor_noise)
+        body, noise = self._body, next(self._sensor_noise)
+        readings, mask = self._sensor.scan(
+            self._landmarks, body.position, body.inverse_heading, noise
         )
-        pose = body.pose
-        info = {"pose": pose, "collision": collision}
-        if ids is not None:
-            info["landmark_ids"] = ids
+        info = {"pose": body.pose, "collision": collision}
+        if self._hides_identities:
+            readings, mask, info["landmark_ids"] = hide_identities(
+                readings, mask, noise
+            )
+        measurements = readings.T
         if self._view is not None:
             self._view.add(Moment(body.pose, measurements[mask], collision))
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info

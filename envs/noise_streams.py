@@ -5,7 +5,7 @@ source changes the noise of another, and the length of a block changes nothing.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import repeat
 from typing import Generic, NamedTuple, TypeVar
@@ -16,12 +16,29 @@ from numpy.typing import NDArray
 from ..sim_configs import Scenario
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 Row = TypeVar("Row")
 
-MANY_STD = 10.0  # no normal noise exceeds so many standard deviations: odds 1e-23
+MANY_STD = 10.0
+"""No normal noise exceeds so many standard deviations: the odds are 1e-23."""
 
 _STEPS_PER_BLOCK = 128
+
+SensorNoise = tuple[Array, Array, Array | None, Array | None]
+"""What chance does to the sensor in one step: (error, nearest, clutter, order).
+
+A plain tuple, since a named one would cost 1 % of a step. N landmarks, C rows for
+clutter; worlds simulated side by side add axes where the dots are.
+
+error : shape (2, …, N)
+    (εβ, εr) [rad, m]; εr in units of σr(r) where that grows with the range.
+nearest : shape (…, N)
+    A landmark is read above this true range [m]: at least min_range; more where a
+    negative εr would leave no range above zero; inf where the reading drops out.
+clutter : shape (2, …, C), or None with identities
+    False readings (β, r), zeros where there is none [rad, m].
+order : shape (…, N + C), or None with identities
+    Uniform numbers that sort the rows.
+"""
 
 
 class Streams(NamedTuple):
@@ -48,26 +65,6 @@ def spawn_streams(rng: np.random.Generator) -> Streams:
     return Streams(*rng.spawn(len(Streams._fields)))
 
 
-class SensorNoise(NamedTuple):
-    """All that chance does to the sensor in one step, or in many.
-
-    N landmarks, C rows reserved for clutter; the leading axes are steps or worlds.
-    """
-
-    reading: ComplexArray
-    """εβ + i εr, shape (…, N) [rad, m]; εr / σr where σr grows with the range."""
-    nearest: Array
-    """True range above which a landmark is read, shape (…, N) [m].
-
-    At least min_range; larger where a negative εr would leave no range above zero;
-    infinite where the reading drops out.
-    """
-    clutter: ComplexArray | None
-    """False readings β + i r, 0 where there is none, shape (…, C) [rad, m]."""
-    order: Array | None
-    """Uniform numbers that sort the rows, shape (…, N + C); None with identities."""
-
-
 class NoiseRows(Generic[Row]):
     """Endless rows of noise, one per step, drawn in blocks.
 
@@ -83,18 +80,14 @@ class NoiseRows(Generic[Row]):
     True
     """
 
-    def __init__(self, draw: Callable[[int], Sequence[Row]]) -> None:
+    def __init__(self, draw: Callable[[int], Iterable[Row]]) -> None:
         self._draw = draw
-        self._block: Sequence[Row] = ()
-        self._next = 0
+        self._to_come: list[Row] = []  # the next one last
 
     def __next__(self) -> Row:
-        if self._next == len(self._block):
-            self._block = self._draw(_STEPS_PER_BLOCK)
-            self._next = 0
-        row = self._block[self._next]
-        self._next += 1
-        return row
+        if not self._to_come:
+            self._to_come = list(self._draw(_STEPS_PER_BLOCK))[::-1]
+        return self._to_come.pop()
 
 
 def motion_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[list[float]]:
@@ -124,31 +117,21 @@ def draw_sensor_noise(streams: Streams, scenario: Scenario, steps: int) -> Senso
     Returns
     -------
     SensorNoise
-        With one leading axis, the steps.
+        Its four arrays, with the steps as their first axis.
     """
     sensor, count = scenario.sensor, scenario.landmarks.count
     bearing_std, range_std = sensor.std
     per_metre = sensor.range_std_per_metre
-    unit = streams.measurement.standard_normal((steps, count, 2))
-    nearest = _nearest_readable(unit[..., 1], range_std, per_metre)
+    unit = streams.measurement.standard_normal((steps, 2, count))
+    scale = np.array([[bearing_std], [1.0 if per_metre else range_std]])
+    nearest = _nearest_readable(unit[:, 1], range_std, per_metre)
     np.maximum(nearest, np.nextafter(sensor.min_range, -1.0), out=nearest)
     if sensor.dropout:
         nearest[streams.dropout.random((steps, count)) < sensor.dropout] = np.inf
-    reading = (unit * (bearing_std, 1.0 if per_metre else range_std)).view(complex)
-    clutter = order = None
-    if not sensor.identities:
-        clutter = _draw_clutter(streams, scenario, steps)
-        order = streams.order.random((steps, count + sensor.max_clutter))
-    return SensorNoise(reading[..., 0], nearest, clutter, order)
-
-
-def _nearest_readable(unit: Array, std: float, per_metre: float) -> Array:
-    """Find the true range r above which r + (σ + k r) ε is positive, ε unit noise."""
-    if per_metre == 0.0:
-        return -std * unit
-    slope = 1.0 + per_metre * unit
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(slope > 0.0, -std * unit / slope, np.inf)
+    if sensor.identities:
+        return unit * scale, nearest, None, None
+    order = streams.order.random((steps, count + sensor.max_clutter))
+    return unit * scale, nearest, _draw_clutter(streams, scenario, steps), order
 
 
 def _motion_floats(
@@ -160,28 +143,42 @@ def _motion_floats(
 
 def _sensor_noise_by_step(
     streams: Streams, scenario: Scenario, steps: int
-) -> list[SensorNoise]:
-    block = draw_sensor_noise(streams, scenario, steps)
-    columns = (repeat(None, steps) if part is None else part for part in block)
-    return list(map(SensorNoise._make, zip(*columns, strict=True)))
+) -> Iterable[SensorNoise]:
+    error, nearest, clutter, order = draw_sensor_noise(streams, scenario, steps)
+    return zip(
+        error,
+        nearest,
+        repeat(None) if clutter is None else clutter,
+        repeat(None) if order is None else order,
+        strict=False,  # repeat has no end
+    )
 
 
-def _draw_clutter(streams: Streams, scenario: Scenario, steps: int) -> ComplexArray:
+def _nearest_readable(unit: Array, std: float, per_metre: float) -> Array:
+    """Find the range r above which r + (σ + k r) ε is positive, with unit noise ε."""
+    if per_metre == 0.0:
+        return -std * unit
+    slope = 1.0 + per_metre * unit
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(slope > 0.0, -std * unit / slope, np.inf)
+
+
+def _draw_clutter(streams: Streams, scenario: Scenario, steps: int) -> Array:
     """Draw false readings, uniform over the bearings and ranges that the sensor sees.
 
     Per step one number chooses how many, then each reserved row draws (β, r).
+    Returns (β, r), shape (steps, 2, C), zeros where there is none.
     """
-    sensor = scenario.sensor
-    drawn = streams.clutter.random((steps, 1 + 2 * sensor.max_clutter))
+    sensor, rows = scenario.sensor, scenario.sensor.max_clutter
     if sensor.clutter == 0:
-        return np.zeros((steps, sensor.max_clutter), dtype=np.complex128)
+        return np.zeros((steps, 2, rows))
+    drawn = streams.clutter.random((steps, 1 + 2 * rows))
     counts = np.searchsorted(_poisson_cdf(scenario), drawn[:, 0], side="right")
     width = sensor.max_range - sensor.min_range
-    readings = np.empty((steps, sensor.max_clutter), dtype=np.complex128)
-    readings.real = (drawn[:, 1::2] - 0.5) * sensor.field_of_view
-    readings.imag = sensor.max_range - drawn[:, 2::2] * width  # above min_range
-    readings[np.arange(sensor.max_clutter) >= counts[:, None]] = 0.0
-    return readings
+    bearings = (drawn[:, 1::2] - 0.5) * sensor.field_of_view
+    ranges = sensor.max_range - drawn[:, 2::2] * width  # never min_range, maybe 0
+    present = np.arange(rows) < counts[:, None]
+    return np.where(present[:, None], np.stack([bearings, ranges], axis=1), 0.0)
 
 
 def _poisson_cdf(scenario: Scenario) -> Array:

@@ -1,4 +1,11 @@
-"""The robot's body in the physics engine: it drives, turns, and stops at walls."""
+"""The robot's body in the physics engine: it drives, turns, and stops at walls.
+
+Symbols
+-------
+p = (x, y, θ)     true robot pose in the world frame [m, m, rad]
+u = (d, α)        command: distance driven, then heading turned [m, rad]
+ε = (εx, εy, εα)  slip, in the frame of the old heading [m, m, rad]
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -36,6 +43,13 @@ class UnicycleBody:
     walls : sequence of (x0, y0, x1, y1)
         Ends of straight walls [m].
 
+    Attributes
+    ----------
+    position : complex ndarray, shape ()
+        x + iy [m]; every step overwrites it.
+    inverse_heading : complex ndarray, shape ()
+        cos θ - i sin θ; every step overwrites it.
+
     Examples
     --------
     >>> body = UnicycleBody(radius=0.5, walls=[(2.0, -1.0, 2.0, 1.0)])
@@ -51,64 +65,63 @@ class UnicycleBody:
         self._space = pymunk.Space()
         self._body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self._space.add(self._body)
-        for x0, y0, x1, y1 in self._walls:
-            ground, a, b = self._space.static_body, (x0, y0), (x1, y1)
-            self._space.add(
-                pymunk.Segment(ground, a, b, radius),
-                pymunk.Circle(ground, radius, a),
-                pymunk.Circle(ground, radius, b),
-            )
-        self.position = np.empty((), complex); self.inverse = np.empty((), complex)
+        for wall in self._walls:
+            self._space.add(*_inflated(wall, radius, self._space.static_body))
+        self.position = np.zeros((), dtype=np.complex128)
+        self.inverse_heading = np.zeros((), dtype=np.complex128)
         self.place((0.0, 0.0, 0.0))
 
     @property
     def pose(self) -> NDArray[np.float64]:
         """(x, y, θ), shape (3,) [m, m, rad], a fresh array; θ is not wrapped."""
-        return np.array([self.x, self.y, self.heading])
+        return np.array(self._pose)
 
     def place(self, pose: Sequence[float]) -> None:
         """Put the body at (x, y, θ) [m, m, rad]."""
-        x, y, heading = pose
-        self._body.position = x, y
-        self._body.angle = heading
+        self._body.position = pose[0], pose[1]
+        self._body.angle = pose[2]
         self._arrive()
 
-    def drive(self, command: Sequence[float], slip: Sequence[float] = _NO_SLIP) -> float:
+    def drive(
+        self, command: Sequence[float], slip: Sequence[float] = _NO_SLIP
+    ) -> float:
         """Move along the old heading, then turn.
 
         Parameters
         ----------
         command : (float, float)
-            (d, α), distance and change of heading [m, rad]; no wall prevents a turn.
+            u = (d, α) [m, rad].
         slip : (float, float, float), default zeros
-            (εx, εy, εα) added to the motion, in the frame of the old heading
-            [m, m, rad].
+            ε [m, m, rad].
 
         Returns
         -------
         float
-            Share of the displacement, in [0, 1], that no wall held back.
+            Share of the displacement, in [0, 1], that no wall held back. The turn is
+            never held back.
         """
         forward, sideways = command[0] + slip[0], slip[1]
-        dx = forward * self.cos - sideways * self.sin
-        dy = forward * self.sin + sideways * self.cos
+        cos, sin = self._cos, self._sin
+        dx = forward * cos - sideways * sin
+        dy = forward * sin + sideways * cos
         share = self._free_share(dx, dy) if self._walls else 1.0
         if share < 1.0:
             dx, dy = share * dx, share * dy
-        body = self._body
-        body.velocity = dx, dy
-        body.angular_velocity = command[1] + slip[2]
+        self._body.velocity = dx, dy
+        self._body.angular_velocity = command[1] + slip[2]
         self._space.step(1.0)
         self._arrive()
         return share
 
     def _arrive(self) -> None:
-        body = self._body
-        self.x, self.y = x, y = body.position
-        self.heading = heading = body.angle
-        self.cos, self.sin = cos, sin = float(np.cos(heading)), float(np.sin(heading))
+        """Take the pose from the engine."""
+        x, y = self._body.position
+        heading = self._body.angle
+        cos, sin = float(np.cos(heading)), float(np.sin(heading))
+        self._pose = x, y, heading
+        self._cos, self._sin = cos, sin
         self.position[()] = complex(x, y)
-        self.inverse[()] = complex(cos, -sin)
+        self.inverse_heading[()] = complex(cos, -sin)
 
     def _free_share(self, dx: float, dy: float) -> float:
         """Find the share of a displacement that ends a skin before first contact.
@@ -116,21 +129,37 @@ class UnicycleBody:
         A shape that the body moves away from does not hold it back, even if it starts
         inside: so it can always leave a wall.
         """
-        start, end = (self.x, self.y), (self.x + dx, self.y + dy)
+        x, y, _ = self._pose
         share = 1.0
-        for hit in self._space.segment_query(start, end, 0.0, _ANYTHING):
-            inside = hit.alpha == 0.0  # where Chipmunk's normal points the wrong way
-            assert hit.shape is not None
-            nx, ny = hit.shape.point_query(start).gradient if inside else hit.normal
+        for hit in self._space.segment_query((x, y), (x + dx, y + dy), 0.0, _ANYTHING):
+            nx, ny = _outward(hit, (x, y))
             approach = -(dx * nx + dy * ny)
             if approach > 0.0:
                 share = min(share, hit.alpha - _SKIN / approach)
         return max(share, 0.0)
 
     def __getstate__(self) -> dict[str, Any]:
-        pose = (self.x, self.y, self.heading)
-        return {"radius": self._radius, "walls": self._walls, "pose": pose}
+        return {"radius": self._radius, "walls": self._walls, "pose": self._pose}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         UnicycleBody.__init__(self, state["radius"], state["walls"])
         self.place(state["pose"])
+
+
+def _inflated(wall: Wall, radius: float, ground: pymunk.Body) -> list[pymunk.Shape]:
+    """Make the shapes that a point must not enter so that the body avoids a wall."""
+    a, b = wall[:2], wall[2:]
+    return [
+        pymunk.Segment(ground, a, b, radius),
+        pymunk.Circle(ground, radius, a),
+        pymunk.Circle(ground, radius, b),
+    ]
+
+
+def _outward(
+    hit: pymunk.SegmentQueryInfo, start: tuple[float, float]
+) -> tuple[float, float]:
+    """Normal of a contact; where the path starts inside, Chipmunk's points inwards."""
+    if hit.alpha > 0.0 or hit.shape is None:
+        return hit.normal
+    return hit.shape.point_query(start).gradient

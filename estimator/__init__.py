@@ -3,6 +3,10 @@
 A step flows predict → update → belief; the modules are named so.
 """
 
+from .batch import BatchSlam as BatchSlam
+from .batch import BatchTrace as BatchTrace
+from .batch import can_batch as can_batch
+from .batch import make_batch as make_batch
 from .check_estimator import EstimatorContractError as EstimatorContractError
 from .check_estimator import check_estimator as check_estimator
 from .ekf_slam import EkfSlam as EkfSlam

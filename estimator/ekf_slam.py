@@ -265,13 +265,32 @@ class EkfSlam:
         self._reference[: len(mean)] = reference
         self._covariance[: len(mean), : len(mean)] = covariance
 
+    @property
+    def rules(self) -> Rules:
+        """What distinguishes this filter's updates from another's."""
+        return self._rules
+
+    @property
+    def rule_values(self) -> Array:
+        """The rules as the kernels take them."""
+        return self._rule_values
+
+    @property
+    def motion_values(self) -> Array:
+        """(σx², σy², σα²) per step, and 1 where a robot at rest has noise too."""
+        return np.append(self._motion_variance, float(self._noise_at_rest))
+
+    @staticmethod
+    def capacity_for(landmarks: int) -> int:
+        """Length of a mean with room for so many landmarks, as the kernels need it."""
+        return (3 + 2 * landmarks) // 4 * 4 + 4
+
     def _adopt(self, rules: Rules) -> None:
-        """Set what distinguishes this filter's updates."""
         self._rules = rules
         self._rule_values = np.array(rules)
 
     def _allocate(self, landmarks: int) -> None:
-        capacity = (3 + 2 * landmarks) // 4 * 4 + 4
+        capacity = self.capacity_for(landmarks)
         self._mean = np.zeros(capacity)
         self._reference = np.zeros(capacity)
         self._covariance = np.zeros((capacity, capacity))

@@ -17,7 +17,7 @@ class MapHistory(Sequence[MapEstimate]):
     ----------
     most : int, optional
         How many maps to keep, evenly spaced over the run; all of them by default. The
-        first one with a landmark and the latest one are kept in any case.
+        first one with a landmark and the latest one are kept besides.
 
     Examples
     --------
@@ -25,7 +25,7 @@ class MapHistory(Sequence[MapEstimate]):
     >>> for x in range(5):
     ...     history.append(Belief(np.array([0, 0, 0, x, 0.0]), np.eye(5), (7,)))
     >>> [float(landmarks.means[0, 0]) for landmarks in history]
-    [0.0, 0.0, 0.0, 0.0, 4.0]
+    [0.0, 0.0, 2.0, 2.0, 4.0]
     """
 
     def __init__(self, most: int | None = None) -> None:

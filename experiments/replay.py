@@ -95,15 +95,15 @@ def replay(
     >>> log = SlamLog("drive", events=(scans[0], OdometryRow(1, 2.0, 0.0, 1), scans[1]))
     >>> slam = make_estimator("ekf", motion_std=(0.1,) * 3, measurement_std=(0.1, 0.1))
     >>> replay(log, slam).readings
-    ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=0)
+    ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1)
     """
     steps = list(steps_of(log))
     recorder = _Recorder(len(steps), MapHistory(None if keep_history else _MOST_MAPS))
     for number, step in enumerate(steps):
         try:
             _take(step, log, estimator, recorder)
-        except (ValueError, np.linalg.LinAlgError) as error:
-            raise type(error)(f"{log.name}, t = {step.t:g}: {error}") from error
+        except ValueError as error:
+            raise _kind(error)(f"{log.name}, t = {step.t:g}: {error}") from error
         if progress is not None:
             progress(number + 1, len(steps))
     times = np.array([step.t for step in steps], dtype=np.float64)
@@ -123,6 +123,11 @@ def _take(
         return
     report = estimator.update(step.scan.measurements, _ids(step.scan))
     recorder.add(predicted, estimator.belief(), report)
+
+
+def _kind(error: ValueError) -> type[ValueError]:
+    is_numerical = isinstance(error, np.linalg.LinAlgError)
+    return np.linalg.LinAlgError if is_numerical else ValueError
 
 
 def _ids(scan: Scan) -> list[int] | None:

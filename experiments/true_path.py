@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimator.accuracy import PositionAccuracy, position_accuracy, poses_at
+from ..estimator.accuracy import PositionAccuracy, poses_at, position_accuracy
 from .log_lines import LogError
 from .slamlog import SlamLog
 

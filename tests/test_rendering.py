@@ -95,7 +95,8 @@ def test_blitted_frame_is_nearly_that_of_a_full_draw(renderer):
     for artist in picture_of(renderer).moving:
         artist.set_animated(False)
     canvas = picture_of(renderer)._figure.canvas
-    canvas.draw()
+    with canvas.callbacks.blocked(signal="draw_event"):  # draws no moving part twice
+        canvas.draw()
     full = np.asarray(canvas.buffer_rgba())[..., :3]
     assert share_of_different_pixels(blitted, full) < 0.01
 
@@ -207,7 +208,7 @@ def test_texts_stay_inside_the_figure_and_apart(sensor, walls):
     assert legend.y1 < xlabel.y0
     name, alarm, clock = (
         text.get_window_extent()
-        for text in sorted(figure.texts, key=lambda t: t.get_window_extent().x0)
+        for text in sorted(figure.artists, key=lambda t: t.get_window_extent().x0)
     )
     assert name.x1 < alarm.x0 < alarm.x1 < clock.x0 < clock.x1 < figure.bbox.x1
 
@@ -321,10 +322,9 @@ def screen(pyplot, monkeypatch):
 
 def test_human_mode_without_windows_warns_once_and_returns_none(pyplot):
     renderer = WorldRenderer(SIX, LANDMARKS, "human")
-    with pytest.warns(UserWarning, match="'agg' has no windows") as caught:
+    with pytest.warns(UserWarning, match="'agg' has no windows"):
         assert renderer.render(snapshot()) is None
-        assert renderer.render(snapshot()) is None
-    assert len(caught) == 1
+    assert renderer.render(snapshot()) is None  # a warning would be an error
     renderer.close()
     renderer.close()
 

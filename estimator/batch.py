@@ -1,0 +1,276 @@
+"""Many independent runs of one filter at once, on the single filter's own kernels."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import validation
+from .angles import wrap_angle
+from .batch_kernels import NEVER, drive_runs
+from .ekf_slam import FRAMES, EkfSlam
+from .interface import Belief
+from .registry import find_estimator
+
+Array = NDArray[np.float64]
+
+
+class BatchTrace(NamedTuple):
+    """What every run believed after every step; B runs, T steps."""
+
+    poses: Array
+    """(x, y, θ), shape (B, T, 3) [m, m, rad], heading in [-π, π)."""
+    pose_covariances: Array
+    """Shape (B, T, 3, 3)."""
+    nis: Array
+    """νᵀ S⁻¹ ν of each scan, shape (B, T)."""
+    degrees_of_freedom: NDArray[np.int64]
+    """Of the NIS, shape (B, T)."""
+
+
+class BatchSlam:
+    """B runs of one filter, each with its own data, visibility and map.
+
+    Run i gives the same bits as a single filter fed the data of run i; landmark ids
+    are the rows 0 … L−1 of the measurement arrays.  The runs are shared out over
+    threads.  A run whose data is not finite or whose innovation covariance fails stops
+    there, with nan from that step on; the others go on.
+
+    Parameters
+    ----------
+    estimator : EkfSlam
+        Filter to copy rules and noise from; an ``ekf``, ``invariant``, ``iterated``,
+        ``first_estimates`` or ``observability_constrained``.
+    runs, landmarks : int
+        B, and L, the most landmarks a run can meet.
+    initial_poses : array_like, shape (3,) or (B, 3)
+        Means of the first poses [m, m, rad].
+    initial_pose_std : array_like, shape (3,)
+        Their standard deviation.
+    threads : int, optional
+        As many as the machine has cores where not given.
+
+    Raises
+    ------
+    ValueError
+        Where the filter cannot run in batches, or an argument has the wrong shape.
+
+    Examples
+    --------
+    >>> batch = make_batch(
+    ...     "ekf", runs=2, landmarks=1, motion_std=(0, 0, 0), measurement_std=(0.1, 0.1)
+    ... )
+    >>> trace = batch.run(
+    ...     odometry=np.array([[(1.0, 0.0)], [(2.0, 0.0)]]),
+    ...     measurements=np.full((2, 1, 1, 2), 1.0),
+    ...     visible=np.ones((2, 1, 1), dtype=bool),
+    ... )
+    >>> trace.poses[:, -1, 0]
+    array([1., 2.])
+    """
+
+    def __init__(
+        self,
+        estimator: EkfSlam,
+        runs: int,
+        landmarks: int,
+        *,
+        initial_poses: ArrayLike = (0.0, 0.0, 0.0),
+        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        threads: int | None = None,
+    ) -> None:
+        if not can_batch(estimator):
+            raise ValueError(f"{type(estimator).__name__} cannot run in batches")
+        self.runs = validation.whole("runs", runs, 1)
+        self.landmarks = validation.whole("landmarks", landmarks, 0)
+        self._estimator = estimator
+        self._threads = threads or os.cpu_count() or 1
+        std = validation.standard_deviations("initial_pose_std", initial_pose_std, 3)
+        first = validation.as_floats("initial_poses", initial_poses)
+        if first.shape not in ((3,), (self.runs, 3)) or not np.isfinite(first).all():
+            raise ValueError(
+                f"initial_poses must be finite with shape (3,) or ({self.runs}, 3), "
+                f"got shape {first.shape}"
+            )
+        capacity = EkfSlam.capacity_for(self.landmarks)
+        self._means = np.zeros((self.runs, capacity))
+        self._references = np.zeros((self.runs, capacity))
+        self._covariances = np.zeros((self.runs, capacity, capacity))
+        self._means[:, :3] = self._references[:, :3] = first
+        self._covariances[:, range(3), range(3)] = std**2
+        self._slots = np.full((self.runs, self.landmarks), -1, dtype=np.int64)
+        self._mapped = np.zeros(self.runs, dtype=np.int64)
+        self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
+        """Step of the last :meth:`run` at which a run stopped, -1 where it did not."""
+
+    def run(
+        self,
+        odometry: ArrayLike,
+        measurements: ArrayLike,
+        visible: ArrayLike,
+        dt: ArrayLike = 1.0,
+    ) -> BatchTrace:
+        """Take all runs through T steps, each a predict and an update.
+
+        Parameters
+        ----------
+        odometry : array_like, shape (B, T, 2)
+            (d, α) before each scan [m, rad].
+        measurements : array_like, shape (B, T, L, 2)
+            Rows (β, r) of landmarks 0 … L−1 [rad, m]; what is not visible is not read.
+        visible : array_like of bool, shape (B, T, L)
+            Which readings there are.
+        dt : float or array_like, shape (T,)
+            Duration that the motion noise of each step counts.  A first scan before
+            any motion is odometry (0, 0) with dt = 0.
+
+        Returns
+        -------
+        BatchTrace
+        """
+        u = validation.as_floats("odometry", odometry)
+        steps = u.shape[1] if u.ndim == 3 else 0
+        z = validation.as_floats("measurements", measurements)
+        seen = np.ascontiguousarray(visible, dtype=np.bool_)
+        runs, landmarks = self.runs, self.landmarks
+        for name, array, shape in (
+            ("odometry", u, (runs, steps, 2)),
+            ("measurements", z, (runs, steps, landmarks, 2)),
+            ("visible", seen, (runs, steps, landmarks)),
+        ):
+            if array.shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+        durations = np.ascontiguousarray(
+            np.broadcast_to(np.asarray(dt, dtype=np.float64), (steps,))
+        )
+        if not (np.isfinite(durations) & (durations >= 0)).all():
+            raise ValueError(f"dt must be finite numbers >= 0, got {dt!r}")
+        trace = BatchTrace(
+            np.full((runs, steps, 3), np.nan),
+            np.full((runs, steps, 3, 3), np.nan),
+            np.full((runs, steps), np.nan),
+            np.zeros((runs, steps), dtype=np.int64),
+        )
+        self._in_threads(lambda part: self._drive(part, (u, z, seen), durations, trace))
+        trace.poses[..., 2] = wrap_angle(trace.poses[..., 2])
+        return trace
+
+    def belief(self, run: int) -> Belief:
+        """Return the belief of one run as a snapshot."""
+        n = 3 + 2 * int(self._mapped[run])
+        slots = self._slots[run]
+        order = np.argsort(slots[slots >= 0])
+        return Belief(
+            self._means[run, :n],
+            self._covariances[run, :n, :n],
+            tuple(np.flatnonzero(slots >= 0)[order].tolist()),
+            FRAMES[self._estimator.rules.frame],
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the beliefs of all runs take [bytes]."""
+        return sum(
+            array.nbytes
+            for array in (
+                self._means,
+                self._references,
+                self._covariances,
+                self._slots,
+                self._mapped,
+            )
+        )
+
+    def _drive(
+        self,
+        part: slice,
+        data: tuple[Array, Array, NDArray[np.bool_]],
+        dt: Array,
+        trace: BatchTrace,
+    ) -> None:
+        u, z, seen = data
+        drive_runs(
+            self._means[part],
+            self._covariances[part],
+            self._references[part],
+            self._slots[part],
+            self._mapped[part],
+            self._estimator.rule_values,
+            self._estimator.motion_values,
+            u[part],
+            z[part],
+            seen[part],
+            dt,
+            trace.poses[part],
+            trace.pose_covariances[part],
+            trace.nis[part],
+            trace.degrees_of_freedom[part],
+            self.failed_at[part],
+        )
+
+    def _in_threads(self, work: Callable[[slice], None]) -> None:
+        """Do the work on contiguous shares of the runs."""
+        threads = min(self._threads, self.runs)
+        bounds = np.linspace(0, self.runs, threads + 1).astype(int).tolist()
+        shares = [slice(a, b) for a, b in zip(bounds, bounds[1:], strict=False)]
+        if threads == 1:
+            work(shares[0])
+            return
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(work, shares))
+
+
+def can_batch(estimator: object) -> bool:
+    """Whether a filter's predict and update are the shared kernels' and nothing more."""
+    return (
+        isinstance(estimator, EkfSlam)
+        and type(estimator).predict is EkfSlam.predict
+        and type(estimator).update is EkfSlam.update
+        and type(estimator).belief is EkfSlam.belief
+    )
+
+
+def make_batch(
+    name: str,
+    *,
+    runs: int,
+    landmarks: int,
+    motion_std: ArrayLike,
+    measurement_std: ArrayLike,
+    initial_poses: ArrayLike = (0.0, 0.0, 0.0),
+    initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+    threads: int | None = None,
+    **options: Any,
+) -> BatchSlam:
+    """Make a batch of runs of a registered filter.
+
+    Parameters
+    ----------
+    name : str
+        One of :func:`slamgym.estimator.list_estimators`.
+    runs, landmarks, initial_poses, initial_pose_std, threads
+        As in :class:`BatchSlam`.
+    motion_std, measurement_std, **options
+        As in :func:`slamgym.estimator.make_estimator`.
+
+    Raises
+    ------
+    ValueError
+        Where the filter is unknown or cannot run in batches.
+    """
+    estimator = find_estimator(name)(
+        motion_std=motion_std, measurement_std=measurement_std, **options
+    )
+    if not isinstance(estimator, EkfSlam):
+        raise ValueError(f"{name} cannot run in batches")
+    return BatchSlam(
+        estimator,
+        runs,
+        landmarks,
+        initial_poses=initial_poses,
+        initial_pose_std=initial_pose_std,
+        threads=threads,
+    )

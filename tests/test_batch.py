@@ -1,0 +1,152 @@
+"""A batch of runs against single filters fed the same data, bit for bit."""
+
+import numpy as np
+import pytest
+from drives import MEASUREMENT_STD, MOTION_STD, drive
+
+from slamgym.estimator import list_estimators, make_batch, make_estimator
+
+RUNS, STEPS, LANDMARKS = 5, 40, 13
+NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+CASES = {
+    "ekf": ("ekf", {}),
+    "gated": ("ekf", {"gate_probability": 0.9, "range_std_per_metre": 0.02}),
+    "independent": ("ekf", {"landmark_init": "independent", "noise_at_rest": False}),
+    "invariant": ("invariant", {}),
+    "invariant iterated": ("invariant", {"iterations": 3}),
+    "invariant sequential": ("invariant", {"sequential": True}),
+    "iterated": ("iterated", {}),
+    "first_estimates": ("first_estimates", {}),
+    "observability_constrained": ("observability_constrained", {}),
+}
+
+
+@pytest.fixture(scope="module")
+def data():
+    """Odometry, measurements, visibility: each run its own map, noise and gaps."""
+    odometry = np.empty((RUNS, STEPS, 2))
+    measurements = np.full((RUNS, STEPS, LANDMARKS, 2), np.nan)
+    rng = np.random.default_rng(0)
+    visible = rng.random((RUNS, STEPS, LANDMARKS)) < 0.4
+    visible[2, :, 5:] = False  # a run with a small map
+    visible[3, 10:20] = False  # a run that sees nothing for a while
+    for run in range(RUNS):
+        landmarks = rng.uniform(-15, 15, (LANDMARKS, 2))
+        for step, (u, z, _) in enumerate(drive(run, STEPS, landmarks=landmarks)):
+            odometry[run, step] = u
+            measurements[run, step] = z
+    odometry[1, 15:18] = 0.0  # a run that rests
+    measurements[~visible] = np.nan
+    measurements[0, 5, np.argmax(visible[0, 5]), 1] = -0.1  # a reading to skip
+    return odometry, measurements, visible
+
+
+def single(name, options, data, run, dt):
+    slam = make_estimator(
+        name,
+        **NOISE,
+        initial_pose=(run, 0, 0),
+        initial_pose_std=(0.1, 0.1, 0.02),
+        **options,
+    )
+    odometry, measurements, visible = data
+    rows = []
+    for step in range(STEPS):
+        slam.predict(odometry[run, step], dt[step])
+        seen = np.flatnonzero(visible[run, step])
+        report = slam.update(measurements[run, step, seen], seen)
+        belief = slam.belief()
+        rows.append((belief.pose, belief.pose_covariance, report))
+    return slam.belief(), rows
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_run_gives_the_bits_of_a_single_filter(case, data):
+    name, options = CASES[case]
+    dt = np.ones(STEPS)
+    dt[0], dt[7] = 0.0, 2.5
+    batch = make_batch(
+        name,
+        runs=RUNS,
+        landmarks=LANDMARKS,
+        initial_poses=[(run, 0, 0) for run in range(RUNS)],
+        initial_pose_std=(0.1, 0.1, 0.02),
+        threads=2,
+        **NOISE,
+        **options,
+    )
+    trace = batch.run(*data, dt)
+    assert (batch.failed_at == -1).all()
+    for run in range(RUNS):
+        belief, rows = single(name, options, data, run, dt)
+        np.testing.assert_array_equal(batch.belief(run).mean, belief.mean)
+        np.testing.assert_array_equal(batch.belief(run).covariance, belief.covariance)
+        assert batch.belief(run).landmark_ids == belief.landmark_ids
+        assert batch.belief(run).frame == belief.frame
+        for step, (pose, covariance, report) in enumerate(rows):
+            np.testing.assert_array_equal(trace.poses[run, step], pose)
+            np.testing.assert_array_equal(trace.pose_covariances[run, step], covariance)
+            assert trace.nis[run, step] == report.nis
+            assert trace.degrees_of_freedom[run, step] == report.degrees_of_freedom
+
+
+def test_runs_in_pieces_continue_where_they_stopped(data):
+    settings = {"runs": RUNS, "landmarks": LANDMARKS, **NOISE}
+    whole, pieces = make_batch("ekf", **settings), make_batch("ekf", **settings)
+    at_once = whole.run(*data)
+    parts = [
+        pieces.run(*(array[:, a:b] for array in data))
+        for a, b in ((0, 13), (13, STEPS))
+    ]
+    np.testing.assert_array_equal(
+        at_once.poses, np.concatenate([part.poses for part in parts], axis=1)
+    )
+
+
+def test_a_run_with_broken_data_stops_alone_and_says_where(data):
+    odometry, measurements, visible = (array.copy() for array in data)
+    seen = np.argmax(visible[1, 20])
+    measurements[1, 20, seen] = np.inf
+    odometry[4, 6, 0] = np.nan
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    trace = batch.run(odometry, measurements, visible)
+    assert batch.failed_at.tolist() == [-1, 20, -1, -1, 6]
+    assert np.isnan(trace.poses[1, 20:]).all()
+    assert np.isfinite(trace.poses[1, :20]).all()
+    assert np.isfinite(trace.poses[[0, 2, 3]]).all()
+
+
+def test_memory_is_little_more_than_the_covariances():
+    batch = make_batch("ekf", runs=64, landmarks=20, **NOISE)
+    assert batch.nbytes <= 1.2 * 64 * 43 * 43 * 8
+
+
+@pytest.mark.parametrize("name", list_estimators())
+def test_a_filter_either_runs_in_batches_or_says_that_it_cannot(name):
+    settings = {"runs": 2, "landmarks": 3, **NOISE}
+    if name in ("unscented", "robocentric", "ideal"):
+        with pytest.raises(ValueError, match="cannot run in batches"):
+            make_batch(name, **settings)
+    else:
+        assert make_batch(name, **settings).runs == 2
+
+
+@pytest.mark.parametrize(
+    ("index", "message"),
+    [
+        (0, r"odometry must have shape \(5, 0, 2\)"),
+        (1, r"measurements must have shape \(5, 40, 13, 2\), got"),
+        (2, r"visible must have shape \(5, 40, 13\), got"),
+    ],
+)
+def test_arrays_of_a_wrong_shape_are_refused_by_name(data, index, message):
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    arrays = list(data)
+    arrays[index] = arrays[index][0]
+    with pytest.raises(ValueError, match=message):
+        batch.run(*arrays)
+
+
+def test_first_poses_of_a_wrong_shape_are_refused():
+    with pytest.raises(ValueError, match="initial_poses must be finite with shape"):
+        make_batch("ekf", runs=3, landmarks=1, initial_poses=np.zeros((2, 3)), **NOISE)
