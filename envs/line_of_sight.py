@@ -26,50 +26,49 @@ class LineOfSight:
     --------
     >>> sight = LineOfSight([(1.0, -1.0, 1.0, 1.0)])
     >>> landmarks = np.array([2.0 + 0.0j, 0.5 + 0.0j, 2.0 + 5.0j])
-    >>> sight.blocked(landmarks, position=0j)
+    >>> sight.blocked(landmarks, position=np.array(0j))
     array([ True, False, False])
     """
 
     def __init__(self, walls: Sequence[tuple[float, float, float, float]]) -> None:
-        ends = np.array(walls, dtype=np.float64).reshape(-1, 4)
-        self._ends = np.concatenate(
-            [ends[:, 0] + 1j * ends[:, 1], ends[:, 2] + 1j * ends[:, 3]]
-        )
-        lengths = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
-        self._mounted = _MOUNTED * lengths
+        ends = np.array(walls, dtype=np.float64).reshape(-1, 2, 2)
+        a, b = np.moveaxis(ends[..., 0] + 1j * ends[..., 1], 1, 0)
+        self._conjugate_ends = np.conj(np.concatenate([a, b]))
+        self._along = b - a
+        self._origin_side = _cross(a, b)
+        self._mounted = _MOUNTED * np.abs(self._along)
 
-    def blocked(self, landmarks: ComplexArray, position: complex | ComplexArray) -> BoolArray:
+    def blocked(self, landmarks: ComplexArray, position: ComplexArray) -> BoolArray:
         """Tell which lines of sight cross a wall; its end points belong to it.
 
-        The segment p l crosses the wall a b where a and b lie on different sides of
-        the line p l, and p and l on different sides of the line a b::
+        With δ = l - p, and the ends a and b of a wall relative to p, the line from p
+        to l passes between them if δ × a and δ × b differ in sign, and l lies behind
+        the wall if δ × (b - a), which grows with δ, exceeds a × b::
 
-            (δ × a)(δ × b) <= 0   and   (a × b) (a × b + δ × a - δ × b) < 0
-
-        with δ = l - p and a, b relative to p.
+            (δ × a)(δ × b) <= 0   and   δ × (b - a) sign(a × b) > |a × b|
 
         Parameters
         ----------
         landmarks : complex ndarray, shape (…, N)
             l as x + iy [m].
-        position : complex, or complex ndarray, shape (…, 1)
+        position : complex ndarray, shape () or (…, 1)
             p as x + iy [m].
 
         Returns
         -------
         bool ndarray, shape (…, N)
         """
-        count = len(self._mounted)
-        ends, delta = self._ends - position, (landmarks - position)[..., None]
-        sides = _cross(delta, ends[..., None, :])
-        side_a, side_b = sides[..., :count], sides[..., count:]
-        robot_side = _cross(ends[..., :count], ends[..., count:])[..., None, :]
-        landmark_side = robot_side + side_a - side_b
-        behind = landmark_side * np.sign(robot_side) < -self._mounted
-        crossed: BoolArray = (side_a * side_b <= 0) & behind
-        return np.logical_or.reduce(crossed, axis=-1)
+        p = position[..., None]
+        ends = self._conjugate_ends - np.conj(p)
+        sides = ((landmarks - position)[..., None] * ends).imag  # a × δ, then b × δ
+        side_a, side_b = np.split(sides, 2, axis=-1)
+        robot_side = self._origin_side - _cross(p, self._along)
+        nearer = np.abs(robot_side) + self._mounted
+        behind = (side_a - side_b) * np.sign(robot_side) > nearer
+        behind &= side_a * side_b <= 0.0
+        return np.logical_or.reduce(behind, axis=-1)
 
 
 def _cross(u: ComplexArray, v: ComplexArray) -> Array:
-    product: Array = u.real * v.imag - u.imag * v.real
+    product: Array = (np.conj(u) * v).imag
     return product

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -215,7 +216,7 @@ class BatchSlam:
         """Do the work on contiguous shares of the runs."""
         threads = min(self._threads, self.runs)
         bounds = np.linspace(0, self.runs, threads + 1).astype(int).tolist()
-        shares = [slice(a, b) for a, b in zip(bounds, bounds[1:], strict=False)]
+        shares = [slice(a, b) for a, b in pairwise(bounds)]
         if threads == 1:
             work(shares[0])
             return
@@ -224,7 +225,7 @@ class BatchSlam:
 
 
 def can_batch(estimator: object) -> bool:
-    """Whether a filter's predict and update are the shared kernels' and nothing more."""
+    """Whether a filter is the shared kernels and nothing more, so that it can batch."""
     return (
         isinstance(estimator, EkfSlam)
         and type(estimator).predict is EkfSlam.predict

@@ -204,7 +204,8 @@ def _check_empty_scan(factory: Factory) -> None:
     estimator = _make(factory)
     _drive(estimator, steps=2)
     before = estimator.belief()
-    for ids in ([], None):
+    no_ids: tuple[list[int] | None, ...] = ([], None)
+    for ids in no_ids:
         report = estimator.update(np.empty((0, 2)), ids)
         _expect(
             _same(before, estimator.belief()) and report.degrees_of_freedom == 0,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from numba import njit
 
@@ -29,15 +29,15 @@ def part(function: Kernel) -> Kernel:
 
 
 def _compile(function: Kernel, *, callable_from_python: bool) -> Kernel:
-    compiler = njit(
-        cache=True,
-        error_model="numpy",
-        nogil=True,
-        fastmath={"contract"},
-        no_cfunc_wrapper=True,
-        no_cpython_wrapper=not callable_from_python,
-    )
-    return cast("Kernel", compiler(function))
+    options: dict[str, Any] = {
+        "cache": True,
+        "error_model": "numpy",
+        "nogil": True,
+        "fastmath": {"contract"},
+        "no_cfunc_wrapper": True,
+        "no_cpython_wrapper": not callable_from_python,
+    }
+    return cast("Kernel", njit(**options)(function))
 
 
 def discard_stale_cache(folder: Path) -> None:

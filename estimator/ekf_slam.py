@@ -339,22 +339,22 @@ class EkfSlam:
         self, ids: list[int], used: int, nis: float, innovation: Array, factor: Array
     ) -> UpdateReport:
         _, fates, near, _ = self._ledger[:, : len(ids)].tolist()
-        associated, added, rejected, skipped = tuple(ids), (), (), ()
+        by_fate: dict[int, tuple[int, ...]] = {USED: tuple(ids)}
         if used < len(ids):
-            associated, added, rejected, skipped = (
-                tuple(i for i, f in zip(ids, fates, strict=True) if f == fate)
+            by_fate = {
+                fate: tuple(i for i, f in zip(ids, fates, strict=True) if f == fate)
                 for fate in (USED, ADDED, GATED, SKIPPED)
-            )
-            for i in added:
+            }
+            for i in by_fate[ADDED]:
                 self._slots[i] = len(self._slots)
             self._size = 3 + 2 * len(self._slots)
         return UpdateReport(
             nis,
             2 * used,
-            associated,
-            added,
-            rejected,
-            skipped,
+            by_fate[USED],
+            by_fate.get(ADDED, ()),
+            by_fate.get(GATED, ()),
+            by_fate.get(SKIPPED, ()),
             tuple(compress(ids, near)) if any(near) else (),
             innovation[:used],
             factor[: 2 * used, : 2 * used],

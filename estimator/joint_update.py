@@ -199,7 +199,8 @@ def squared_innovation(
     s11 = _spread(covariance, column, H, 1, 1) + variance[1]
     n0, n1 = innovation[0], innovation[1]
     weighted = n0 * n0 * s11 - 2 * n0 * n1 * s10 + n1 * n1 * s00
-    return weighted / (s00 * s11 - s10 * s10)
+    nis: float = weighted / (s00 * s11 - s10 * s10)
+    return nis
 
 
 @part
@@ -223,7 +224,7 @@ def meets(mean: Array, covariance: Array, column: int) -> bool:
     xy = P[c, c + 1] - P[c, 1] - P[c + 1, 0] + P[0, 1]
     spread = (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
-    return dx * dx + dy * dy < 100 * spread
+    return bool(dx * dx + dy * dy < 100 * spread)
 
 
 @part

@@ -258,13 +258,14 @@ def _normalise(
 @part
 def _times(H: Array, i: int, gains: Array, row: int, column: int) -> float:
     """One row of H times one row of A."""
-    return (
+    product: float = (
         H[i, 0] * gains[row, 0]
         + H[i, 1] * gains[row, 1]
         + H[i, 2] * gains[row, 2]
         + H[i, 3] * gains[row, column]
         + H[i, 4] * gains[row, column + 1]
     )
+    return product
 
 
 @part

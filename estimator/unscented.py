@@ -110,7 +110,8 @@ class UnscentedSlam(EkfSlam):
         rules = self._rules
         range_std = rules.range_std + rules.range_std_per_metre * readings[:, 1]
         bearing_std = np.full(len(readings), rules.bearing_std)
-        return np.square(np.stack([bearing_std, range_std], axis=1))
+        std: Array = np.stack([bearing_std, range_std], axis=1)
+        return std**2
 
     def _within_gate(self, innovation: Array, spread: Array, noise: Array) -> Array:
         pairs = spread.reshape(len(innovation), 2, -1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from math import isfinite
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -67,8 +68,8 @@ def identities(landmark_ids: Sequence[int], count: int) -> list[int]:
 def pair(name: str, value: ArrayLike) -> tuple[float, float]:
     """Return ``value`` as two finite floats, or refuse it."""
     try:
-        first, second = value  # type: ignore[misc, union-attr]
-        a, b = float(first), float(second)  # type: ignore[arg-type]
+        first, second = cast("tuple[float, float]", value)
+        a, b = float(first), float(second)
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be 2 finite numbers, got {value!r}") from None
     if not (isfinite(a) and isfinite(b)):

@@ -47,8 +47,10 @@ class Replay:
     """What it believed after every step."""
     belief: Belief
     """What it believes at the end."""
+    scans: int
+    """How many scans the log holds."""
     readings: ReadingCounts
-    """What it did with the readings."""
+    """What it did with their readings."""
 
 
 def replay(
@@ -108,7 +110,8 @@ def replay(
             progress(number + 1, len(steps))
     times = np.array([step.t for step in steps], dtype=np.float64)
     trace = recorder.trace(name or type(estimator).__name__, times, log)
-    return Replay(log, trace, recorder.belief, recorder.counts())
+    scans = sum(step.scan is not None for step in steps)
+    return Replay(log, trace, recorder.belief, scans, recorder.counts())
 
 
 def _take(

@@ -1,29 +1,31 @@
 """The numbers of a run, as one dictionary of plain JSON types."""
 
+import json
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from .. import __version__
 from ..estimator.accuracy import PositionAccuracy, position_accuracy
-from .consistency_plots import nis_band, pose_errors
+from ..estimator.error_frames import additive_error
 from .filter_settings import FilterSettings
 from .replay import Replay
 from .trace import RunTrace
 from .true_path import path_accuracy
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
-_SINGULAR = 1e-10  # smallest eigenvalue of a correlation matrix that counts as one
+_SINGULAR = 1e-10  # eigenvalue of a correlation matrix that counts as zero
+_SHARE = 0.95  # of a consistent filter's NIS within its interval
 
 
 def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[str, Any]:
     """Gather what one wants to know of a run.
 
-    Every number is finite; what is not known, for want of ground truth, is None.
+    Every number is finite; what is unknown, for want of ground truth, is None.
 
     Parameters
     ----------
@@ -35,29 +37,203 @@ def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[st
     Returns
     -------
     dict
-        ``landmarks``: ``{id, x, y, euclidean, mahalanobis}`` of each, in the order of
-        the state, the distances to its true position in metres and in standard
-        deviations; ``pose``, ``pose_covariance``; ``steps``, ``scans``, ``readings`` by
-        what became of them; ``nis`` and ``nees``, see :func:`nis_summary` and
-        :func:`nees_summary`; ``ate``, the root mean square distance of the path from
-        the truth, see :func:`~slamgym.experiments.true_path.path_accuracy`, and
-        ``landmark_rmse`` the same of the map, both ``{raw, aligned}`` [m]; ``log``,
-        ``estimator``, ``settings`` and ``slamgym``, the version.
+        ``landmarks``, see :func:`landmark_table`; ``pose``, ``pose_covariance``;
+        ``steps``, ``scans``, ``readings`` by what became of them; ``nis``, see
+        :func:`nis_summary`; ``nees``, see :func:`nees_summary`; ``ate``, the root mean
+        square distance of the path from the truth at the times of the truth, and
+        ``landmark_rmse``, that of the map, both ``{raw, aligned}`` [m]; ``log``,
+        ``estimator``, ``settings``, and ``slamgym``, the version.
     """
     log, trace = replay.log, replay.trace
     return {
         "slamgym": __version__,
         "log": log.name,
         "estimator": trace.estimator,
-        "settings": None if settings is None else _settings_table(settings),
+        "settings": None if settings is None else settings_table(settings),
         "steps": trace.last_step,
-        "scans": sum(step is not None for step in replay.scanned),
+        "scans": replay.scans,
         "readings": replay.readings._asdict(),
-        "pose": trace.poses[-1].tolist(),
-        "pose_covariance": trace.pose_covariances[-1].tolist(),
+        "pose": _finite_list(trace.poses[-1]),
+        "pose_covariance": [_finite_list(row) for row in trace.pose_covariances[-1]],
         "landmarks": landmark_table(trace),
         "nis": nis_summary(trace),
         "nees": nees_summary(trace),
         "ate": _rmse(path_accuracy(log, trace.t, trace.poses)),
-        "landmark_rmse": _rmse(_map_accuracy(trace)),
+        "landmark_rmse": _rmse(map_accuracy(trace)),
     }
+
+
+def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
+    """List the final landmarks and their distances to the truth.
+
+    ::
+
+        e = l − l_true,    euclidean = ‖e‖,    mahalanobis = sqrt(eᵀ P⁻¹ e)
+
+    Returns
+    -------
+    list of dict
+        ``{id, x, y, euclidean, mahalanobis}`` [m, m, m, -] in the order of the state;
+        the distances are None where the truth is unknown, the last one also where the
+        covariance is singular.
+    """
+    truth = trace.true_landmarks
+    errors = trace.landmarks - (np.nan if truth is None else truth)
+    squared = squared_mahalanobis(errors, trace.landmark_covariances)
+    return [
+        {
+            "id": landmark_id,
+            "x": _finite(x),
+            "y": _finite(y),
+            "euclidean": _finite(math.hypot(*error)),
+            "mahalanobis": _finite(math.sqrt(square)),
+        }
+        for landmark_id, (x, y), error, square in zip(
+            trace.landmark_ids.tolist(), trace.landmarks, errors, squared, strict=True
+        )
+    ]
+
+
+def nis_summary(trace: RunTrace) -> dict[str, Any] | None:
+    """Summarise the normalised innovations squared, ν S⁻¹ ν of whole scans.
+
+    Returns
+    -------
+    dict or None
+        ``mean`` over the ``scans`` that corrected something; ``total`` and its
+        ``degrees_of_freedom``, and their quotient ``per_degree``, near 1 for a
+        consistent filter; ``inside_95``, the share of scans within the two-sided 95 %
+        interval of χ². None where no scan corrected anything.
+    """
+    used = trace.nis_dof > 0
+    if not used.any():
+        return None
+    nis, dof = trace.nis[used], trace.nis_dof[used]
+    tail = (1 - _SHARE) / 2
+    inside = (nis >= chi2.ppf(tail, dof)) & (nis <= chi2.ppf(1 - tail, dof))
+    return {
+        "mean": _finite(nis.mean()),
+        "total": _finite(nis.sum()),
+        "degrees_of_freedom": int(dof.sum()),
+        "per_degree": _finite(nis.sum() / dof.sum()),
+        "inside_95": _finite(inside.mean()),
+        "scans": int(used.sum()),
+    }
+
+
+def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
+    """Summarise the normalised estimation error squared of the pose.
+
+    Returns
+    -------
+    dict or None
+        ``mean`` over the ``steps`` where it is defined, ``final`` at the last step
+        (None where undefined), ``degrees_of_freedom`` 3, and ``per_degree``, the mean
+        by 3, near 1 for a consistent filter. None where it is defined nowhere.
+    """
+    nees = pose_nees(trace)
+    known = np.isfinite(nees)
+    if not known.any():
+        return None
+    return {
+        "mean": _finite(nees[known].mean()),
+        "final": _finite(nees[-1]),
+        "degrees_of_freedom": 3,
+        "per_degree": _finite(nees[known].mean() / 3),
+        "steps": int(known.sum()),
+    }
+
+
+def pose_nees(trace: RunTrace) -> Array:
+    """NEES eᵀ P⁻¹ e of the pose at every step, e additive, its angle wrapped.
+
+    Returns
+    -------
+    ndarray, shape (K + 1,)
+        nan where the true pose is unknown or P is singular, as it is at a start known
+        for certain.
+    """
+    if trace.true_poses is None:
+        return np.full(len(trace.t), np.nan)
+    errors = additive_error(
+        np.asarray(trace.true_poses, dtype=np.float64),
+        np.asarray(trace.poses, dtype=np.float64),
+    )
+    return squared_mahalanobis(errors, trace.pose_covariances)
+
+
+def squared_mahalanobis(errors: Array, covariances: Array) -> Array:
+    """Compute eᵀ P⁻¹ e of many errors.
+
+    Parameters
+    ----------
+    errors : ndarray, shape (k, n)
+        Errors e, nan where unknown.
+    covariances : ndarray, shape (k, n, n)
+        Their covariances P.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        nan where the error is unknown or the covariance singular.
+
+    Examples
+    --------
+    >>> squared_mahalanobis(np.array([[3.0, 4.0]]), np.diag([9.0, 4.0])[None])
+    array([5.])
+    """
+    std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
+    usable = np.isfinite(errors).all(axis=1) & (std > 0).all(axis=1)
+    usable &= np.isfinite(covariances).all(axis=(1, 2))
+    result = np.full(len(errors), np.nan)
+    scaled, std = errors[usable] / std[usable], std[usable]
+    correlation = covariances[usable] / std[:, :, None] / std[:, None, :]
+    regular = np.linalg.eigvalsh(correlation)[:, 0] > _SINGULAR
+    scaled, correlation = scaled[regular], correlation[regular]
+    weighted = np.linalg.solve(correlation, scaled[..., None])[..., 0]
+    result[np.flatnonzero(usable)[regular]] = np.sum(scaled * weighted, axis=1)
+    return result
+
+
+def map_accuracy(trace: RunTrace) -> PositionAccuracy | None:
+    """Compare the final map with the truth; None where no landmark's is known."""
+    if trace.true_landmarks is None:
+        return None
+    known = np.isfinite(trace.true_landmarks).all(axis=1)
+    return position_accuracy(trace.landmarks[known], trace.true_landmarks[known])
+
+
+def settings_table(settings: FilterSettings) -> dict[str, Any]:
+    """Write an estimator's settings as plain JSON types."""
+    return {
+        "motion_std": list(settings.motion_std),
+        "measurement_std": list(settings.measurement_std),
+        "initial_pose_std": list(settings.initial_pose_std),
+        "options": {key: _plain(value) for key, value in settings.options.items()},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Keep what JSON can say; write down the rest as text."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError):
+        return str(value)
+    return value
+
+
+def _rmse(accuracy: PositionAccuracy | None) -> dict[str, float | None] | None:
+    if accuracy is None:
+        return None
+    return {
+        "raw": _finite(accuracy.raw_rmse),
+        "aligned": _finite(accuracy.aligned_rmse),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _finite_list(values: Array) -> list[float | None]:
+    return [_finite(value) for value in values]

@@ -15,7 +15,7 @@ from ..estimator.accuracy import PositionAccuracy, poses_at, position_accuracy
 from .log_lines import LogError
 from .slamlog import SlamLog
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 
 def true_poses_of(log: SlamLog, times: Array) -> Array | None:

@@ -42,13 +42,8 @@ def data():
 
 
 def single(name, options, data, run, dt):
-    slam = make_estimator(
-        name,
-        **NOISE,
-        initial_pose=(run, 0, 0),
-        initial_pose_std=(0.1, 0.1, 0.02),
-        **options,
-    )
+    start = {"initial_pose": (run, 0, 0), "initial_pose_std": (0.1, 0.1, 0.02)}
+    slam = make_estimator(name, **NOISE, **start, **options)
     odometry, measurements, visible = data
     rows = []
     for step in range(STEPS):
@@ -94,12 +89,10 @@ def test_runs_in_pieces_continue_where_they_stopped(data):
     settings = {"runs": RUNS, "landmarks": LANDMARKS, **NOISE}
     whole, pieces = make_batch("ekf", **settings), make_batch("ekf", **settings)
     at_once = whole.run(*data)
-    parts = [
-        pieces.run(*(array[:, a:b] for array in data))
-        for a, b in ((0, 13), (13, STEPS))
-    ]
+    first = pieces.run(*(array[:, :13] for array in data))
+    rest = pieces.run(*(array[:, 13:] for array in data))
     np.testing.assert_array_equal(
-        at_once.poses, np.concatenate([part.poses for part in parts], axis=1)
+        at_once.poses, np.concatenate([first.poses, rest.poses], axis=1)
     )
 
 
