@@ -25,6 +25,7 @@ ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
 _PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
+_LAST = np.array(np.inf)  # sorts behind every other row
 
 
 class AnonymousScan(NamedTuple):
@@ -110,8 +111,11 @@ class BearingRangeSensor:
 
     def _disturb(self, true: Array, error: Array) -> Array:
         """Add noise to true readings in place, both of shape (2, …, N)."""
-        if self._range_std_per_metre:
-            true[1] += error[1] * (self._range_std + self._range_std_per_metre * true[1])
+        per_metre = self._range_std_per_metre
+        if per_metre:
+            true[1] += error[1] * (
+                self._range_std + self._range_std_per_metre * true[1]
+            )
             true[0] += error[0]
         else:
             true += error
@@ -162,12 +166,18 @@ def hide_identities(
     assert clutter is not None
     assert order is not None
     count = mask.shape[-1]
-    filled = np.concatenate([mask, clutter[1] > 0.0], axis=-1)
-    ids = np.full((1, *filled.shape), -1.0)
-    np.copyto(ids[0, ..., :count], np.arange(count), where=mask)
-    rows = np.concatenate(
-        [np.concatenate([readings, clutter], axis=-1), ids], axis=0
-    )
-    places = np.argsort(np.where(filled, order, np.inf), axis=-1)
-    packed = np.take_along_axis(rows, places[None], axis=-1)
+    rows = np.zeros((3, *order.shape))
+    rows[:2, ..., :count] = readings
+    rows[:2, ..., count:] = clutter
+    rows[2] = -1.0
+    np.copyto(rows[2, ..., :count], np.arange(count), where=mask)
+    places = np.argsort(np.where(rows[1] > 0.0, order, _LAST), axis=-1)
+    packed = _take(rows, places)
     return AnonymousScan(packed[:2], packed[1] > 0.0, packed[2].astype(np.int64))
+
+
+def _take(rows: Array, places: NDArray[np.intp]) -> Array:
+    """Sort the last axis of rows, (3, …, M), by places, (…, M)."""
+    if places.ndim == 1:
+        return rows[:, places]  # 20 µs faster
+    return np.take_along_axis(rows, places[None], axis=-1)

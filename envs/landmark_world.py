@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,17 +13,25 @@ from numpy.typing import ArrayLike, NDArray
 from ..sim_configs import Scenario, load_scenario, place_landmarks
 from .bearing_range_sensor import BearingRangeSensor, hide_identities
 from .live_view import RENDER_MODES, LiveView, Moment
-from .noise_streams import motion_noise_rows, sensor_noise_rows, spawn_streams
+from .noise_streams import (
+    NoiseRows,
+    motion_noise_rows,
+    sensor_noise_rows,
+    spawn_streams,
+)
 from .odometry_sensor import OdometrySensor
 from .snapshot import BeliefLike
 from .unicycle_body import UnicycleBody
 from .world_spaces import action_space, observation_space
 
 Array = NDArray[np.float64]
-Observation = dict[str, NDArray[Any]]
+Observation = dict[str, Any]
+
+_FPS = 30
+_REAL_NUMBERS = "efd" + np.typecodes["AllInteger"]
 
 
-class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
+class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
     """A robot drives among point landmarks and measures its motion and the landmarks.
 
     ## Description
@@ -69,7 +77,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
     ## Arguments
     scenario : Scenario, mapping, str or Path, default "six_landmarks"
         A preset's name, a ``.toml`` file, a mapping of plain values, or a scenario.
-        The first three also survive in an ``EnvSpec`` written as JSON.
+        What is plain data also survives in an ``EnvSpec`` written as JSON.
     render_mode : {"human", "rgb_array"}, optional
         Whether every moment is shown in a window, or `render` returns frames.
     **changes
@@ -90,10 +98,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
     array([3., 0.])
     """  # noqa: E501 (tables)
 
-    metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": list(RENDER_MODES),
-        "render_fps": 30,
-    }
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": _FPS}  # noqa: RUF012
 
     def __init__(
         self,
@@ -108,14 +113,17 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
         self.action_space = action_space(self.scenario)
         self.observation_space = observation_space(self.scenario)
         self.render_mode = render_mode
-        self._view = self._make_view()
+        self._view = None
+        if render_mode is not None:
+            self._view = LiveView(self.scenario, render_mode, fps=_FPS)
         robot, self._dt = self.scenario.robot, self.scenario.dt
         self._limits = robot.max_speed, robot.max_turn_rate
         self._body = UnicycleBody(robot.radius, self.scenario.walls)
         self._odometer = OdometrySensor(self.scenario)
         self._sensor = BearingRangeSensor(self.scenario)
         self._hides_identities = not self.scenario.sensor.identities
-        self._landmarks: NDArray[np.complex128] | None = None
+        self._landmarks: NDArray[np.complex128] = np.empty(0, dtype=np.complex128)
+        self._motion_noise = NoiseRows(_refuse_to_step)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -138,14 +146,13 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
             raise ValueError(f"options must be empty, got {options!r}")
         super().reset(seed=seed)
         streams = spawn_streams(self.np_random)
+        self._place_landmarks(streams.map)
+        self._draw_start(streams.start)
         self._motion_noise = motion_noise_rows(streams, self.scenario)
         self._sensor_noise = sensor_noise_rows(streams, self.scenario)
-        landmarks = place_landmarks(self.scenario.landmarks, streams.map)
-        self._landmarks = landmarks.view(np.complex128)[:, 0]
-        self._draw_start(streams.start)
         self._steps_left = self.scenario.steps
         if self._view is not None:
-            self._view.begin(landmarks)
+            self._view.begin(self.landmarks)
         return self._observe(odometry=np.zeros(2), collision=False)
 
     def step(
@@ -171,17 +178,16 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
         self._steps_left -= 1
         return observation, 0.0, False, self._steps_left <= 0, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Return a frame in mode "rgb_array", else None: "human" shows every step."""
-        if self._landmarks is None:
-            raise ResetNeeded("call reset before render")
+        self._refuse_before_reset()
         if self._view is None:
             gymnasium.logger.warn("render shows nothing without a render_mode")
             return None
         return self._view.draw() if self.render_mode == "rgb_array" else None
 
     def show_belief(self, belief: BeliefLike | None) -> None:
-        """Let the following frames show what an estimator believes, or nothing."""
+        """Let the frames show what an estimator believes, from now on; None for not."""
         if self._view is not None:
             self._view.show_belief(belief)
 
@@ -193,13 +199,13 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
     @property
     def pose(self) -> Array:
         """True (x, y, θ), shape (3,) [m, m, rad], a fresh array; θ is not wrapped."""
+        self._refuse_before_reset()
         return self._body.pose
 
     @property
     def landmarks(self) -> Array:
         """True positions of this episode's landmarks, shape (N, 2) [m], a copy."""
-        if self._landmarks is None:
-            raise ResetNeeded("call reset to place the landmarks")
+        self._refuse_before_reset()
         return self._landmarks.copy().view(np.float64).reshape(-1, 2)
 
     @property
@@ -208,23 +214,30 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
 
         Its standard deviations are ``scenario.start.std``.
         """
-        if self._landmarks is None:
-            raise ResetNeeded("call reset to draw the start")
+        self._refuse_before_reset()
         return self._start_estimate.copy()
+
+    def _refuse_before_reset(self) -> None:
+        if len(self._landmarks) == 0:
+            raise ResetNeeded("call reset first: there is no world yet")
+
+    def _place_landmarks(self, rng: np.random.Generator) -> None:
+        layout = self.scenario.landmarks
+        changes = layout.layout == "random" and layout.seed is None
+        if changes or len(self._landmarks) == 0:
+            landmarks = np.ascontiguousarray(place_landmarks(layout, rng))
+            self._landmarks = landmarks.view(np.complex128)[:, 0]
 
     def _draw_start(self, rng: np.random.Generator) -> None:
         start = self.scenario.start
-        drawn = start.pose + start.std * rng.standard_normal(3)
-        truth, estimate = drawn, np.array(start.pose)
-        if start.drawn == "estimate":
-            truth, estimate = estimate, truth
-        self._body.place(truth.tolist())
-        self._start_estimate = estimate
+        centre = np.array(start.pose)
+        drawn = centre + start.std * rng.standard_normal(3)
+        draws_truth = start.drawn == "truth"
+        self._body.place((drawn if draws_truth else centre).tolist())
+        self._start_estimate = centre if draws_truth else drawn
 
     def _command(self, action: ArrayLike) -> tuple[float, float]:
         """Turn an action (v, ω) into the command (d, α) of one step [m, rad]."""
-        if self._landmarks is None:
-            raise ResetNeeded("call reset before step")
         speed, turn_rate = _two_finite_numbers(action)
         fastest, quickest = self._limits
         if not -fastest <= speed <= fastest:
@@ -240,7 +253,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
         readings, mask = self._sensor.scan(
             self._landmarks, body.position, body.inverse_heading, noise
         )
-        info = {"pose": body.pose, "collision": collision}
+        info: dict[str, Any] = {"pose": body.pose, "collision": collision}
         if self._hides_identities:
             readings, mask, info["landmark_ids"] = hide_identities(
                 readings, mask, noise
@@ -250,16 +263,9 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, Array]):
             self._view.add(Moment(body.pose, measurements[mask], collision))
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
 
-    def _make_view(self) -> LiveView | None:
-        if self.render_mode is None:
-            return None
-        if self.render_mode not in RENDER_MODES:
-            raise ValueError(
-                f"render_mode must be None or one of {RENDER_MODES}, "
-                f"got {self.render_mode!r}"
-            )
-        fps = self.metadata["render_fps"]
-        return LiveView(self.scenario, self.render_mode, fps)
+
+def _refuse_to_step(steps: int) -> list[list[float]]:
+    raise ResetNeeded("call reset before step")
 
 
 def _two_finite_numbers(action: ArrayLike) -> list[float]:
@@ -267,7 +273,7 @@ def _two_finite_numbers(action: ArrayLike) -> list[float]:
         array = np.asarray(action)
     except ValueError:  # ragged
         array = np.empty(0)
-    if array.shape == (2,) and array.dtype.kind in "fiu":
+    if array.shape == (2,) and array.dtype.char in _REAL_NUMBERS:
         numbers: list[float] = array.tolist()
         if math.isfinite(numbers[0]) and math.isfinite(numbers[1]):
             return numbers

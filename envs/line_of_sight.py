@@ -34,6 +34,7 @@ class LineOfSight:
         ends = np.array(walls, dtype=np.float64).reshape(-1, 2, 2)
         a, b = np.moveaxis(ends[..., 0] + 1j * ends[..., 1], 1, 0)
         self._conjugate_ends = np.conj(np.concatenate([a, b]))
+        self._count = len(a)
         self._along = b - a
         self._origin_side = _cross(a, b)
         self._mounted = _MOUNTED * np.abs(self._along)
@@ -61,12 +62,13 @@ class LineOfSight:
         p = position[..., None]
         ends = self._conjugate_ends - np.conj(p)
         sides = ((landmarks - position)[..., None] * ends).imag  # a × δ, then b × δ
-        side_a, side_b = np.split(sides, 2, axis=-1)
+        side_a, side_b = sides[..., : self._count], sides[..., self._count :]
         robot_side = self._origin_side - _cross(p, self._along)
         nearer = np.abs(robot_side) + self._mounted
         behind = (side_a - side_b) * np.sign(robot_side) > nearer
         behind &= side_a * side_b <= 0.0
-        return np.logical_or.reduce(behind, axis=-1)
+        blocked: BoolArray = np.logical_or.reduce(behind, axis=-1)
+        return blocked
 
 
 def _cross(u: ComplexArray, v: ComplexArray) -> Array:

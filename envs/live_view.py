@@ -43,12 +43,17 @@ class LiveView:
         At most so many frames per second appear in the window [1/s].
     """
 
-    def __init__(self, scenario: Scenario, mode: RenderMode, fps: float) -> None:
+    def __init__(self, scenario: Scenario, mode: str, fps: float) -> None:
+        if mode not in RENDER_MODES:
+            raise ValueError(
+                f"render_mode must be None or one of {RENDER_MODES}, got {mode!r}"
+            )
         self._scenario = scenario
         self._mode: RenderMode = mode
         self._fps = fps
         self._landmarks: Array = np.empty((0, 2))
-        self._moments: list[Moment] = []
+        self._path: list[list[float]] = []
+        self._moment: Moment | None = None
         self._belief: BeliefLike | None = None
         self._renderer: WorldRenderer | None = None
 
@@ -57,32 +62,39 @@ class LiveView:
         if not np.array_equal(landmarks, self._landmarks):
             self.close()
         self._landmarks = landmarks
-        self._moments = []
+        self._path = []
+        self._moment = None
         self._belief = None
 
     def add(self, moment: Moment) -> None:
         """Add a moment, and show it in the window if there is one."""
-        self._moments.append(moment)
+        self._path.append(moment.pose[:2].tolist())
+        self._moment = moment
         if self._mode == "human":
             self.draw()
 
     def show_belief(self, belief: BeliefLike | None) -> None:
         """Draw a belief from now on, or none."""
         self._belief = belief
-        if self._mode == "human" and self._moments:
+        if self._mode == "human" and self._path:
             self.draw()
 
     def draw(self) -> NDArray[np.uint8] | None:
         """Draw the last moment: a frame, or None in mode "human"."""
         if self._renderer is None:
             self._renderer = self._make_renderer()
-        step = len(self._moments) - 1
-        pose, measurements, collision = self._moments[step]
-        path = np.array([moment.pose[:2] for moment in self._moments])
-        seconds = step * self._scenario.dt
+        assert self._moment is not None
+        pose, measurements, collision = self._moment
+        step = len(self._path) - 1
         return self._renderer.render(
             WorldSnapshot(
-                pose, path, measurements, collision, self._belief, seconds, step
+                pose=pose,
+                path=np.array(self._path),
+                measurements=measurements,
+                collision=collision,
+                belief=self._belief,
+                time=step * self._scenario.dt,
+                step=step,
             )
         )
 
@@ -98,6 +110,4 @@ class LiveView:
     def _make_renderer(self) -> "WorldRenderer":
         from .rendering import WorldRenderer  # noqa: PLC0415 (loads matplotlib)
 
-        return WorldRenderer(
-            self._scenario, self._landmarks, self._mode, fps=self._fps
-        )
+        return WorldRenderer(self._scenario, self._landmarks, self._mode, fps=self._fps)

@@ -159,7 +159,7 @@ def _inflated(wall: Wall, radius: float, ground: pymunk.Body) -> list[pymunk.Sha
 def _outward(
     hit: pymunk.SegmentQueryInfo, start: tuple[float, float]
 ) -> tuple[float, float]:
-    """Normal of a contact; where the path starts inside, Chipmunk's points inwards."""
+    """Correct the normal of a contact: of a path that starts inside, it points in."""
     if hit.alpha > 0.0 or hit.shape is None:
         return hit.normal
     return hit.shape.point_query(start).gradient

@@ -69,10 +69,13 @@ def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:
 
 
 def _write_gif(frames: Iterator[Frame], path: Path, fps: float) -> None:
-    # one palette per frame, without dithering: flat colours stay flat
+    first = next(frames)
+    palette = _palette(first)
+    # without dithering flat colours stay flat, and with one palette for all frames only
+    # what moves is stored
     images = (
-        Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE)
-        for frame in frames
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in chain([first], frames)
     )
     next(images).save(
         path,
@@ -82,6 +85,18 @@ def _write_gif(frames: Iterator[Frame], path: Path, fps: float) -> None:
         duration=1000 / fps,
         loop=0,
     )
+
+
+def _palette(frame: Frame) -> Image.Image:
+    """Choose 128 colours of one frame, and 125 from everywhere for those to come."""
+    own = Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE).getpalette()
+    colours = np.reshape(own or [], (-1, 3))
+    colours[(colours >= 248).all(axis=1)] = 255  # Pillow would take grey for white
+    levels = np.linspace(0, 255, 5).round().astype(int)
+    cube = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(-1, 3)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate([colours[:128], cube]).ravel().tolist())
+    return palette
 
 
 def _write_mp4(

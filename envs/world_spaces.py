@@ -11,7 +11,7 @@ from .noise_streams import MANY_STD
 
 
 def action_space(scenario: Scenario) -> spaces.Box:
-    """(v, ω) within the limits of the robot [m/s, rad/s]."""
+    """Bound (v, ω) by the limits of the robot [m/s, rad/s]."""
     limits = np.array(
         [scenario.robot.max_speed, scenario.robot.max_turn_rate], dtype=np.float32
     )
@@ -19,7 +19,7 @@ def action_space(scenario: Scenario) -> spaces.Box:
 
 
 def observation_space(scenario: Scenario) -> spaces.Dict:
-    """Readings, their mask and the odometry; see `LandmarkWorldEnv`.
+    """Bound readings, mask and odometry; see `LandmarkWorldEnv`.
 
     Examples
     --------
@@ -34,7 +34,7 @@ def observation_space(scenario: Scenario) -> spaces.Dict:
     return spaces.Dict(
         {
             "landmarks": spaces.Box(lowest, highest, dtype=np.float64),
-            "mask": spaces.Box(0, 1, (rows,), dtype=np.bool_),  # type: ignore[arg-type]
+            "mask": spaces.Box(0, 1, (rows,), dtype=np.bool_),
             "odometry": spaces.Box(-odometry, odometry, dtype=np.float64),
         }
     )

@@ -44,7 +44,8 @@ def drive_runs(  # every array of a batch once, with a leading run axis
     """
     rules = as_rules(rule_values)
     landmarks = slots.shape[1]
-    work = new_workspace(landmarks, means.shape[1])
+    capacity = means.shape[1]
+    work = new_workspace(landmarks, 3 + 2 * landmarks, capacity, rules)
     ledger = np.zeros((4, landmarks), np.int64)
     readings = np.empty((landmarks, 2))
     ids = np.empty(landmarks, np.int64)

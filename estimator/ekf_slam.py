@@ -1,6 +1,7 @@
 """EKF-SLAM: the standard filter, on the shared kernels."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import compress
 from math import isfinite
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ from .joint_update import (
     SLOT,
     USED,
     Rules,
+    joint_factor,
     update_one,
 )
 from .kernels import ADDITIVE, AT_ESTIMATE, INVARIANT, predict
@@ -209,7 +211,7 @@ class EkfSlam:
         self._make_room(count)
         slots = self._slots
         self._ledger[SLOT, :count] = [slots.get(i, -1) for i in ids]
-        outcome, used, nis, innovation, factor = update_one(
+        outcome, used, nis, innovation, *parts = update_one(
             self._mean,
             self._covariance,
             self._size,
@@ -220,7 +222,7 @@ class EkfSlam:
         )
         if outcome != DONE:
             self._refuse(outcome, readings, ids)
-        return self._report(ids, used, nis, innovation, factor)
+        return self._report(ids, used, nis, innovation, partial(joint_factor, *parts))
 
     def belief(self) -> Belief:
         """Return the belief as a snapshot that later steps leave alone."""
@@ -336,7 +338,12 @@ class EkfSlam:
             )
 
     def _report(
-        self, ids: list[int], used: int, nis: float, innovation: Array, factor: Array
+        self,
+        ids: list[int],
+        used: int,
+        nis: float,
+        innovation: Array,
+        factor: Callable[[], Array],
     ) -> UpdateReport:
         _, fates, near, _ = self._ledger[:, : len(ids)].tolist()
         by_fate: dict[int, tuple[int, ...]] = {USED: tuple(ids)}
@@ -356,8 +363,8 @@ class EkfSlam:
             by_fate.get(GATED, ()),
             by_fate.get(SKIPPED, ()),
             tuple(compress(ids, near)) if any(near) else (),
-            innovation[:used],
-            factor[: 2 * used, : 2 * used],
+            innovation,
+            factor,
         )
 
 

@@ -1,6 +1,6 @@
 """What every estimator promises, and what it answers with."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -40,14 +40,19 @@ class UpdateReport(NamedTuple):
     """Mapped landmarks within 10 σ of the robot, where linearising is unsafe."""
     innovation: Array = np.empty((0, 2))
     """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
-    innovation_factor: Array = np.empty((0, 0))
-    """L, shape (2m, 2m), lower triangular with L Lᵀ = S."""
+    factor: Array | Callable[[], Array] = np.empty((0, 0))
+    """L, shape (2m, 2m), lower triangular, L Lᵀ = S; or a function that gives it."""
+
+    @property
+    def innovation_factor(self) -> Array:
+        """L, shape (2m, 2m): L⁻¹ ν is white, in the order β1, r1, β2, r2."""
+        return self.factor() if callable(self.factor) else self.factor
 
     @property
     def innovation_covariance(self) -> Array:
         """S, shape (2m, 2m), of the innovations in the order β1, r1, β2, r2."""
-        lower = np.tril(self.innovation_factor)
-        return lower @ lower.T
+        factor = self.innovation_factor
+        return factor @ factor.T
 
 
 @dataclass(frozen=True, eq=False)

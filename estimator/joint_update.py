@@ -10,13 +10,12 @@ from .kernels import (
     INVARIANT,
     Array,
     Int,
+    absorb,
     add_landmark,
-    combine,
-    downdate,
     linearise,
     retract,
+    through,
     transport,
-    whiten,
 )
 
 # Rows of the ledger of one scan.
@@ -27,6 +26,9 @@ USED, ADDED, GATED, SKIPPED = 0, 1, 2, 3
 
 # What became of the whole call, where it is not the row that failed.
 DONE, NOT_FINITE = -1, -2
+
+# Above this size of the state, one pass over P costs more than a triangular solve.
+LARGE = 200
 
 
 class Rules(NamedTuple):
@@ -45,31 +47,53 @@ class Rules(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Room for the intermediate results of one update of up to m readings."""
+    """Room for the intermediate results of one update of up to m readings.
+
+    Where there are two stages, the first holds what was found at the prior, the second
+    what was found at a later iterate.
+    """
 
     readings: Array  # (m, 2) the readings in use
     variances: Array  # (m, 2)
-    jacobians: Array  # (m, 2, 5)
-    innovations: Array  # (2, m, 2): at the prior, and at a later iterate
-    factors: Array  # (2, 2m, 2m) likewise
-    white: Array  # (2, 2m) likewise
-    gains: Array  # (2m, capacity)
+    jacobians: Array  # (stages, m, 2, 5)
+    innovations: Array  # (stages, m, 2)
+    roots: Array  # (stages, m, 3)
+    white: Array  # (stages, 2m)
+    gains: Array  # (stages, 2m, capacity)
     vectors: Array  # (4, capacity): δ, way, prior mean, heading column
+    prior: Array  # (capacity, capacity), or empty where P can be kept without
 
 
 @part
-def new_workspace(m: int, capacity: int) -> Workspace:
-    """Allocate for ``m`` readings of a belief with that capacity."""
+def new_workspace(m: int, size: int, capacity: int, rules: Rules) -> Workspace:
+    """Allocate for ``m`` readings of a belief of that size and capacity."""
+    stages = min(rules.iterations, 2)
+    kept = capacity if rules.iterations > 1 or block_of(size, m) < m else 0
     return Workspace(
         np.empty((m, 2)),
         np.empty((m, 2)),
-        np.empty((m, 2, 5)),
-        np.empty((2, m, 2)),
-        np.empty((2, 2 * m, 2 * m)),
-        np.empty((2, 2 * m)),
-        np.empty((2 * m, capacity)),
+        np.empty((stages, m, 2, 5)),
+        np.empty((stages, m, 2)),
+        np.empty((stages, m, 3)),
+        np.empty((stages, 2 * m)),
+        np.empty((stages, 2 * m, capacity)),
         np.empty((4, capacity)),
+        np.empty((kept, kept)),
     )
+
+
+@part
+def block_of(size: int, readings: int) -> int:
+    """How many readings to absorb at a time: a few while P fits the fast caches."""
+    return 4 if size <= LARGE else max(readings, 1)
+
+
+@part
+def keep(source: Array, target: Array, size: int) -> None:
+    """Copy the lower half of a covariance, and its mirror image."""
+    for i in range(size):
+        for j in range(size):
+            target[i, j] = source[i, j]
 
 
 @part
@@ -115,39 +139,44 @@ def correct(
         -1, or the row whose innovation covariance is not positive definite; mean and
         covariance are then as before.
     """
-    columns, jacobians = every_column[first:last], work.jacobians[first:last]
+    columns, readings = every_column[first:last], work.readings[first:last]
     shift, way = work.vectors[0], work.vectors[1]
     prior, heading = work.vectors[2], work.vectors[3]
-    rows = 2 * (last - first)
     for j in range(size):
         prior[j] = mean[j]
+    if len(work.prior):
+        keep(covariance, work.prior, size)
     for iteration in range(rules.iterations):
         stage = min(iteration, 1)
+        jacobians = work.jacobians[stage, first:last]
         innovations = work.innovations[stage, first:last]
-        white = work.white[stage, 2 * first : 2 * last]
+        if iteration > 0:
+            keep(work.prior, covariance, size)
         for k in range(last - first):
-            H, nu, z = jacobians[k], innovations[k], work.readings[first + k]
-            linearise(mean, reference, columns[k], rules.linearisation, z, H, nu)
+            c, where = columns[k], rules.linearisation
+            linearise(mean, reference, c, where, readings, k, jacobians, innovations)
             if iteration > 0:
-                relate_to_prior(prior, shift, columns[k], rules.frame, H, nu)
-        failed = whiten(
+                relate_to_prior(prior, shift, c, rules.frame, jacobians, innovations, k)
+        for j in range(size):
+            mean[j] = prior[j]
+        failed = absorb(
             covariance,
             size,
             columns,
             jacobians,
             work.variances[first:last],
             innovations,
-            work.gains,
-            work.factors[stage, 2 * first : 2 * last, 2 * first : 2 * last],
-            white,
+            work.gains[stage, 2 * first : 2 * last],
+            work.roots[stage, first:last],
+            work.white[stage, 2 * first : 2 * last],
+            shift,
+            block_of(size, last - first),
         )
-        for j in range(size):
-            mean[j] = prior[j]
         if failed >= 0:
+            if len(work.prior):
+                keep(work.prior, covariance, size)
             return first + failed
-        combine(work.gains, white, rows, size, shift)
         move(mean, shift, way, size, rules.frame)
-    downdate(covariance, size, work.gains, rows)
     if rules.frame == INVARIANT:
         transport(covariance, size, way, heading)
     return -1
@@ -169,24 +198,19 @@ def move(mean: Array, shift: Array, way: Array, size: int, frame: int) -> None:
 def relate_to_prior(
     prior: Array,
     shift: Array,
-    column: int,
+    c: int,
     frame: int,
-    jacobian: Array,
-    innovation: Array,
+    jacobians: Array,
+    innovations: Array,
+    k: int,
 ) -> None:
     """Turn ν at an iterate into z − h + H δ, the innovation seen from the prior."""
     if frame == INVARIANT:
-        dx, dy = prior[column] - prior[0], prior[column + 1] - prior[1]
+        dx, dy = prior[c] - prior[0], prior[c + 1] - prior[1]
         for i in range(2):
-            jacobian[i, 2] = jacobian[i, 3] * dy - jacobian[i, 4] * dx
+            jacobians[k, i, 2] = jacobians[k, i, 3] * dy - jacobians[k, i, 4] * dx
     for i in range(2):
-        innovation[i] += (
-            jacobian[i, 0] * shift[0]
-            + jacobian[i, 1] * shift[1]
-            + jacobian[i, 2] * shift[2]
-            + jacobian[i, 3] * shift[column]
-            + jacobian[i, 4] * shift[column + 1]
-        )
+        innovations[k, i] += through(jacobians, k, i, shift, c)
 
 
 @part
@@ -257,18 +281,10 @@ def screen(
         set_variance(rules, readings[k, 1], work.variances[used])
         ledger[NEAR, k] = meets(mean, covariance, column)
         if rules.gate < np.inf:
-            H, innovation = work.jacobians[used], work.innovations[0, used]
-            linearise(
-                mean,
-                reference,
-                column,
-                rules.linearisation,
-                readings[k],
-                H,
-                innovation,
-            )
+            where, H, nu = rules.linearisation, work.jacobians[0], work.innovations[0]
+            linearise(mean, reference, column, where, work.readings, used, H, nu)
             variance = work.variances[used]
-            nis = squared_innovation(covariance, column, H, variance, innovation)
+            nis = squared_innovation(covariance, column, H[used], variance, nu[used])
             if not nis <= rules.gate:
                 ledger[FATE, k] = GATED
                 continue
@@ -363,14 +379,52 @@ def update_one(
     reference: Array,
     rule_values: Array,
     ledger: Int,
-) -> tuple[int, int, float, Array, Array]:
+) -> tuple[int, int, float, Array, Array, Array, Array]:
     """Update a single filter: :func:`update_belief` with a workspace of its own.
 
-    Returns outcome, used and nis of :func:`update_belief`, ν (m, 2) and L (2m, 2m), of
-    which the first ``used`` and 2 ``used`` rows hold.
+    Returns outcome, used and nis of :func:`update_belief`; of the readings used ν
+    (m, 2), H (m, 2, 5), the diagonal blocks of L (m, 3), and A (2m, 3 + 2m) in the
+    columns of the pose and of their own landmarks: what :func:`joint_factor` needs.
     """
-    work = new_workspace(len(readings), len(mean))
+    rules = as_rules(rule_values)
+    work = new_workspace(len(readings), size, len(mean), rules)
     outcome, used, nis = update_belief(
-        mean, covariance, size, readings, reference, as_rules(rule_values), work, ledger
+        mean, covariance, size, readings, reference, rules, work, ledger
     )
-    return outcome, used, nis, work.innovations[0], work.factors[0]
+    seen = np.empty((2 * used, 3 + 2 * used))
+    for i in range(2 * used if outcome == DONE else 0):
+        for j in range(3):
+            seen[i, j] = work.gains[0, i, j]
+        for k in range(used):
+            c = ledger[COLUMN, k]
+            seen[i, 3 + 2 * k] = work.gains[0, i, c]
+            seen[i, 4 + 2 * k] = work.gains[0, i, c + 1]
+    return (
+        outcome,
+        used,
+        nis,
+        work.innovations[0, :used],
+        work.jacobians[0, :used],
+        work.roots[0, :used],
+        seen,
+    )
+
+
+def joint_factor(jacobians: Array, roots: Array, seen: Array) -> Array:
+    """Put together L of S = L Lᵀ from what :func:`update_one` returned.
+
+    Off its diagonal blocks L = H Aᵀ, since Q is diagonal.
+
+    Returns
+    -------
+    ndarray, shape (2m, 2m), lower triangular
+    """
+    m = len(jacobians)
+    H = np.zeros((m, 2, 3 + 2 * m))
+    H[:, :, :3] = jacobians[:, :, :3]
+    for k in range(m):
+        H[k, :, 3 + 2 * k : 5 + 2 * k] = jacobians[k, :, 3:]
+    factor = np.tril(H.reshape(2 * m, -1) @ seen.T)
+    for k, (l00, l10, l11) in enumerate(roots):
+        factor[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = (l00, 0.0), (l10, l11)
+    return factor

@@ -1,4 +1,4 @@
-"""The filters' arithmetic, compiled: predict, linearise, whiten, downdate, grow.
+"""The filters' arithmetic, compiled: predict, linearise, absorb, retract, grow.
 
 Every function works in place on one run's belief: ``mean`` (capacity,) and
 ``covariance`` (capacity, capacity), of which the first ``size`` = 3 + 2n entries are in
@@ -96,29 +96,30 @@ def linearise(
     reference: Array,
     column: int,
     linearisation: int,
-    reading: Array,
-    jacobian: Array,
-    innovation: Array,
+    readings: Array,
+    k: int,
+    jacobians: Array,
+    innovations: Array,
 ) -> None:
-    """Fill H (2, 5) and ν (2,) of one reading, eqs. 1.4 to 1.6."""
+    """Fill H (2, 5) and ν (2,) of reading k, eqs. 1.4 to 1.6."""
+    H, nu = jacobians, innovations
     dx, dy = mean[column] - mean[0], mean[column + 1] - mean[1]
-    innovation[0] = wrap(reading[0] - np.arctan2(dy, dx) + mean[2])
-    innovation[1] = reading[1] - np.sqrt(dx * dx + dy * dy)
+    nu[k, 0] = wrap(readings[k, 0] - np.arctan2(dy, dx) + mean[2])
+    nu[k, 1] = readings[k, 1] - np.sqrt(dx * dx + dy * dy)
     if linearisation in (AT_REFERENCE, AT_TRUTH):
         dx = reference[column] - reference[0]
         dy = reference[column + 1] - reference[1]
-    q = dx * dx + dy * dy
-    r = np.sqrt(q)
-    jacobian[0, 0], jacobian[0, 1], jacobian[0, 2] = dy / q, -dx / q, -1.0
-    jacobian[0, 3], jacobian[0, 4] = -dy / q, dx / q
-    jacobian[1, 0], jacobian[1, 1], jacobian[1, 2] = -dx / r, -dy / r, 0.0
-    jacobian[1, 3], jacobian[1, 4] = dx / r, dy / r
+    per_range = 1 / np.sqrt(dx * dx + dy * dy)
+    ex, ey = dx * per_range, dy * per_range
+    ax, ay = -ey * per_range, ex * per_range
+    H[k, 0, 0], H[k, 0, 1], H[k, 0, 2], H[k, 0, 3], H[k, 0, 4] = -ax, -ay, -1.0, ax, ay
+    H[k, 1, 0], H[k, 1, 1], H[k, 1, 2], H[k, 1, 3], H[k, 1, 4] = -ex, -ey, 0.0, ex, ey
     if linearisation == PROJECTED:
-        _project(reference, column, jacobian)
+        _project(reference, column, H[k])
 
 
 @part
-def _project(reference: Array, column: int, jacobian: Array) -> None:
+def _project(reference: Array, column: int, H: Array) -> None:
     """H ← H − (H w) wᵀ / wᵀw: blind to the turn w of robot and landmark together.
 
     w is J δ of the reference points, spread about their midpoint: the part of a turn
@@ -128,20 +129,17 @@ def _project(reference: Array, column: int, jacobian: Array) -> None:
     half_y = (reference[column + 1] - reference[1]) / 2
     squared = 1 + 2 * (half_x * half_x + half_y * half_y)
     for i in range(2):
-        seen = (
-            (jacobian[i, 0] - jacobian[i, 3]) * half_y
-            - (jacobian[i, 1] - jacobian[i, 4]) * half_x
-            + jacobian[i, 2]
-        ) / squared
-        jacobian[i, 0] -= seen * half_y
-        jacobian[i, 1] += seen * half_x
-        jacobian[i, 2] -= seen
-        jacobian[i, 3] += seen * half_y
-        jacobian[i, 4] -= seen * half_x
+        along_x, along_y = H[i, 0] - H[i, 3], H[i, 1] - H[i, 4]
+        seen = (along_x * half_y - along_y * half_x + H[i, 2]) / squared
+        H[i, 0] -= seen * half_y
+        H[i, 1] += seen * half_x
+        H[i, 2] -= seen
+        H[i, 3] += seen * half_y
+        H[i, 4] -= seen * half_x
 
 
 @part
-def whiten(
+def absorb(
     covariance: Array,
     size: int,
     columns: Int,
@@ -149,104 +147,125 @@ def whiten(
     variances: Array,
     innovations: Array,
     gains: Array,
-    factor: Array,
+    roots: Array,
     white: Array,
+    shift: Array,
+    block: int,
 ) -> int:
-    """Solve the joint innovation covariance of m simultaneous readings.
+    """Condition P on m simultaneous readings, and find the correction of the state.
 
     ::
 
-        S = H P Hᵀ + Q = L Lᵀ,    A = L⁻¹ H P,    w = L⁻¹ ν
+        S = H P Hᵀ + Q = L Lᵀ,   A = L⁻¹ H P,   w = L⁻¹ ν
+        δ = Aᵀ w,   P ← P − Aᵀ A,   NIS = wᵀ w
 
-    row after row, without touching P.  The result does not depend on the order of the
-    readings, and NIS = wᵀ w.
+    all at one linearisation, so that the order of the readings does not matter.  A few
+    readings at a time, ``block``: P is downdated after each block, which spares a small
+    map most of the triangular solve; with one block P changes at the very end, which
+    spares a large map the many passes over P.
 
     Parameters
     ----------
     covariance, size
-        P; left as it is.
+        P.
     columns : ndarray of int64, shape (m,)
         First column of each reading's landmark.
     jacobians, variances, innovations
         H (m, 2, 5), the diagonal of Q (m, 2), ν (m, 2).
-    gains, factor, white
-        Results A (2m, capacity), L (2m, 2m, lower) and w (2m,).
+    gains, roots, white, shift
+        Results A (2m, capacity), the diagonal blocks of L as (l00, l10, l11), shape
+        (m, 3), w (2m,) and δ (capacity,).
 
     Returns
     -------
     int
-        -1, or the first reading at which S is not positive definite.
+        -1, or the first reading at which S is not positive definite; P is then spoilt
+        if that is not in the first block.
     """
-    for k in range(len(columns)):
-        _correlate(covariance, size, columns[k], jacobians[k], gains, 2 * k)
-        _orthogonalise(size, columns[k], jacobians[k], gains, factor, 2 * k)
-        if not _normalise(
-            size, columns[k], jacobians[k], variances[k], gains, factor, 2 * k
-        ):
-            return k
-        for i in range(2 * k, 2 * k + 2):
-            rest = innovations[k, i - 2 * k]
-            for j in range(i):
-                rest -= factor[i, j] * white[j]
-            white[i] = rest / factor[i, i]
+    m = len(columns)
+    for j in range(size):
+        shift[j] = 0.0
+    for first in range(0, m, block):
+        last = min(first + block, m)
+        if first > 0:
+            for i in range(3):
+                _refresh(covariance, size, i)
+        for k in range(first, last):
+            c = columns[k]
+            if first > 0:
+                _refresh(covariance, size, c)
+                _refresh(covariance, size, c + 1)
+            _correlate(covariance, size, c, jacobians, k, gains)
+            for before in range(2 * first, 2 * k, 2):
+                _orthogonalise(size, c, jacobians, k, gains, before)
+            if not _normalise(size, c, jacobians, k, variances, gains, roots):
+                return k
+            _shift(size, c, jacobians, k, innovations, gains, roots, white, shift)
+        downdate(covariance, size, gains, 2 * first, 2 * last)
+    for i in range(size):
+        _refresh(covariance, size, i)
     return -1
 
 
 @part
+def _refresh(covariance: Array, size: int, row: int) -> None:
+    """Copy a column of the lower half into its row."""
+    for j in range(row + 1, size):
+        covariance[row, j] = covariance[j, row]
+
+
+@part
 def _correlate(
-    covariance: Array, size: int, column: int, H: Array, gains: Array, row: int
+    covariance: Array, size: int, c: int, jacobians: Array, k: int, gains: Array
 ) -> None:
-    """Rows ``row`` and ``row`` + 1 of A: H P of one reading."""
-    c = column
-    h00, h01, h02, h03, h04 = H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4]
-    h10, h11, h12, h13, h14 = H[1, 0], H[1, 1], H[1, 2], H[1, 3], H[1, 4]
+    """Rows 2k and 2k + 1 of A: H P of reading k, its landmark in columns c, c + 1."""
+    H, row = jacobians, 2 * k
+    a0, a1, a2, a3, a4 = H[k, 0, 0], H[k, 0, 1], H[k, 0, 2], H[k, 0, 3], H[k, 0, 4]
+    b0, b1, b2, b3, b4 = H[k, 1, 0], H[k, 1, 1], H[k, 1, 2], H[k, 1, 3], H[k, 1, 4]
     for j in range(_padded(size)):
         p0, p1, p2 = covariance[0, j], covariance[1, j], covariance[2, j]
         p3, p4 = covariance[c, j], covariance[c + 1, j]
-        gains[row, j] = h00 * p0 + h01 * p1 + h02 * p2 + h03 * p3 + h04 * p4
-        gains[row + 1, j] = h10 * p0 + h11 * p1 + h12 * p2 + h13 * p3 + h14 * p4
+        gains[row, j] = a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3 + a4 * p4
+        gains[row + 1, j] = b0 * p0 + b1 * p1 + b2 * p2 + b3 * p3 + b4 * p4
 
 
 @part
 def _orthogonalise(
-    size: int, column: int, H: Array, gains: Array, factor: Array, row: int
+    size: int, c: int, jacobians: Array, k: int, gains: Array, before: int
 ) -> None:
-    """Subtract from two rows of A their part along the rows before; fill L there."""
-    for i in range(0, row, 2):
-        l00, l01 = _times(H, 0, gains, i, column), _times(H, 0, gains, i + 1, column)
-        l10, l11 = _times(H, 1, gains, i, column), _times(H, 1, gains, i + 1, column)
-        factor[row, i], factor[row, i + 1] = l00, l01
-        factor[row + 1, i], factor[row + 1, i + 1] = l10, l11
-        for j in range(_padded(size)):
-            a0, a1 = gains[i, j], gains[i + 1, j]
-            q0, q1 = gains[row, j], gains[row + 1, j]
-            q0 -= l00 * a0
-            q1 -= l10 * a0
-            gains[row, j] = q0 - l01 * a1
-            gains[row + 1, j] = q1 - l11 * a1
+    """Subtract from the rows of reading k their part along two finished rows."""
+    i, row = before, 2 * k
+    l00 = _times(jacobians, k, 0, gains, i, c)
+    l01 = _times(jacobians, k, 0, gains, i + 1, c)
+    l10 = _times(jacobians, k, 1, gains, i, c)
+    l11 = _times(jacobians, k, 1, gains, i + 1, c)
+    for j in range(_padded(size)):
+        a0, a1 = gains[i, j], gains[i + 1, j]
+        gains[row, j] = gains[row, j] - l00 * a0 - l01 * a1
+        gains[row + 1, j] = gains[row + 1, j] - l10 * a0 - l11 * a1
 
 
 @part
 def _normalise(
     size: int,
-    column: int,
-    H: Array,
-    variance: Array,
+    c: int,
+    jacobians: Array,
+    k: int,
+    variances: Array,
     gains: Array,
-    factor: Array,
-    row: int,
+    roots: Array,
 ) -> bool:
-    """Divide two rows of A by the square root of their own 2 × 2 part of S."""
-    s00 = _times(H, 0, gains, row, column) + variance[0]
-    s10 = _times(H, 1, gains, row, column)
-    s11 = _times(H, 1, gains, row + 1, column) + variance[1]
+    """Divide the rows of reading k by the square root of their own 2 × 2 part of S."""
+    row = 2 * k
+    s00 = _times(jacobians, k, 0, gains, row, c) + variances[k, 0]
+    s10 = _times(jacobians, k, 1, gains, row, c)
+    s11 = _times(jacobians, k, 1, gains, row + 1, c) + variances[k, 1]
     if not (s00 > 0 and s11 - s10 * s10 / s00 > 0):
         return False
     l00 = np.sqrt(s00)
     l10 = s10 / l00
     l11 = np.sqrt(s11 - l10 * l10)
-    factor[row, row], factor[row, row + 1] = l00, 0.0
-    factor[row + 1, row], factor[row + 1, row + 1] = l10, l11
+    roots[k, 0], roots[k, 1], roots[k, 2] = l00, l10, l11
     inverse0, inverse1 = 1 / l00, 1 / l11
     for j in range(_padded(size)):
         a0 = gains[row, j] * inverse0
@@ -256,28 +275,56 @@ def _normalise(
 
 
 @part
-def _times(H: Array, i: int, gains: Array, row: int, column: int) -> float:
-    """One row of H times one row of A."""
-    product: float = (
-        H[i, 0] * gains[row, 0]
-        + H[i, 1] * gains[row, 1]
-        + H[i, 2] * gains[row, 2]
-        + H[i, 3] * gains[row, column]
-        + H[i, 4] * gains[row, column + 1]
-    )
+def _shift(
+    size: int,
+    c: int,
+    jacobians: Array,
+    k: int,
+    innovations: Array,
+    gains: Array,
+    roots: Array,
+    white: Array,
+    shift: Array,
+) -> None:
+    """Whiten what the readings before leave of ν, and add its share to δ."""
+    row = 2 * k
+    w0 = (innovations[k, 0] - through(jacobians, k, 0, shift, c)) / roots[k, 0]
+    w1 = innovations[k, 1] - through(jacobians, k, 1, shift, c)
+    w1 = (w1 - roots[k, 1] * w0) / roots[k, 2]
+    white[row], white[row + 1] = w0, w1
+    for j in range(size):
+        shift[j] = shift[j] + w0 * gains[row, j] + w1 * gains[row + 1, j]
+
+
+@part
+def through(jacobians: Array, k: int, i: int, state: Array, c: int) -> float:
+    """One row of H times a vector over the whole state."""
+    H = jacobians
+    pose = H[k, i, 0] * state[0] + H[k, i, 1] * state[1] + H[k, i, 2] * state[2]
+    product: float = pose + H[k, i, 3] * state[c] + H[k, i, 4] * state[c + 1]
     return product
 
 
 @part
-def downdate(covariance: Array, size: int, gains: Array, rows: int) -> None:
-    """P ← P − Aᵀ A, symmetric by construction; ``rows`` of A, an even number.
+def _times(jacobians: Array, k: int, i: int, gains: Array, row: int, c: int) -> float:
+    """One row of H times one row of A."""
+    H, A = jacobians, gains
+    pose = H[k, i, 0] * A[row, 0] + H[k, i, 1] * A[row, 1] + H[k, i, 2] * A[row, 2]
+    product: float = pose + H[k, i, 3] * A[row, c] + H[k, i, 4] * A[row, c + 1]
+    return product
+
+
+@part
+def downdate(covariance: Array, size: int, gains: Array, first: int, last: int) -> None:
+    """P ← P − Aᵀ A with rows ``first`` to ``last`` of A, an even number.
 
     Two rows of P at a time against four of A, and of P the lower half only: what keeps
     the registers of a processor busy.
     """
+    whole = last - (last - first) % 4
     for i in range(0, size, 2):
         width = _padded(i + 2)
-        for k in range(0, rows - 2, 4):
+        for k in range(first, whole, 4):
             b0, b1, b2, b3 = _column(gains, k, i)
             c0, c1, c2, c3 = _column(gains, k, i + 1)
             for j in range(width):
@@ -285,21 +332,13 @@ def downdate(covariance: Array, size: int, gains: Array, rows: int) -> None:
                 p, q = covariance[i, j], covariance[i + 1, j]
                 covariance[i, j] = p - b0 * a0 - b1 * a1 - b2 * a2 - b3 * a3
                 covariance[i + 1, j] = q - c0 * a0 - c1 * a1 - c2 * a2 - c3 * a3
-        if rows % 4:
-            k = rows - 2
-            b0, b1, c0, c1 = (
-                gains[k, i],
-                gains[k + 1, i],
-                gains[k, i + 1],
-                gains[k + 1, i + 1],
-            )
+        if whole < last:
+            b0, c0 = gains[whole, i], gains[whole, i + 1]
+            b1, c1 = gains[whole + 1, i], gains[whole + 1, i + 1]
             for j in range(width):
-                a0, a1 = gains[k, j], gains[k + 1, j]
+                a0, a1 = gains[whole, j], gains[whole + 1, j]
                 covariance[i, j] = covariance[i, j] - b0 * a0 - b1 * a1
                 covariance[i + 1, j] = covariance[i + 1, j] - c0 * a0 - c1 * a1
-    for i in range(size):
-        for j in range(i):
-            covariance[j, i] = covariance[i, j]
 
 
 @part
@@ -311,17 +350,6 @@ def _column(gains: Array, k: int, j: int) -> tuple[float, float, float, float]:
 def _padded(size: int) -> int:
     """Next multiple of 4: whole vector registers, no scalar remainder."""
     return (size + 3) // 4 * 4
-
-
-@part
-def combine(gains: Array, white: Array, rows: int, size: int, shift: Array) -> None:
-    """δ = Aᵀ w, the correction of the state."""
-    for j in range(size):
-        shift[j] = 0.0
-    for k in range(rows):
-        weight, gain = white[k], gains[k]
-        for j in range(size):
-            shift[j] += weight * gain[j]
 
 
 @part

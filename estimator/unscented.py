@@ -102,7 +102,7 @@ class UnscentedSlam(EkfSlam):
             associated_ids=tuple(i for i, k in zip(ids, kept, strict=True) if k),
             rejected_ids=tuple(i for i, k in zip(ids, kept, strict=True) if not k),
             innovation=innovation[kept],
-            innovation_factor=factor,
+            factor=factor,
         )
 
     def _noise_variances(self, readings: Array) -> Array:

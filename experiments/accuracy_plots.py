@@ -7,7 +7,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ..estimator.accuracy import LandmarkDistances, landmark_distances
 from .figure_style import (
@@ -154,7 +154,7 @@ def _draw_distances(
     deviations.set_yticks([])
     metres.set_xlabel("distance [m]")
     deviations.set_xlabel("distance [σ]")
-    bound = float(np.sqrt(chi2.ppf(0.95, 2)))
+    bound = float(np.sqrt(chdtri(2, 0.05)))
     deviations.set_xlim(0, max(deviations.get_xlim()[1], 1.15 * bound))
     deviations.axvline(bound, color=GREY, lw=1.2, ls="--")
     inside = np.mean(distances.mahalanobis <= bound)

@@ -4,10 +4,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ..estimator.angles import wrap_angle
-from .figure_style import ALARM, BLUE, GREY, INK, TEAL, dress, new_figure, write_title
+from .figure_style import (
+    ALARM,
+    BLUE,
+    GREY,
+    INK,
+    TEAL,
+    dress,
+    new_figure,
+    write_title,
+)
 from .trace import RunTrace
 
 Array = NDArray[np.floating]
@@ -43,7 +52,7 @@ def errors_figure(trace: RunTrace) -> Figure:
             write_title(axes[k], title, size=10)
         _legend_above(axes[0], columns=2)
     _draw_nis(axes[-1], trace)
-    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlabel(f"time [{trace.time_unit}]")
     figure.align_ylabels(axes)
     return figure
 
@@ -90,7 +99,7 @@ def nis_band(
     """
     known = np.where(dof > 0, dof, np.nan)
     tail = (1 - probability) / 2
-    return np.asarray(chi2.ppf(tail, known)), np.asarray(chi2.ppf(1 - tail, known))
+    return np.asarray(chdtri(known, 1 - tail)), np.asarray(chdtri(known, tail))
 
 
 def _draw_error(axes: Axes, t: Array, error: Array, std: Array) -> None:

@@ -42,6 +42,7 @@ def covariance_figure(trace: RunTrace) -> Figure:
     bar.set_label("correlation", fontsize=10, color=INK)
     bar.ax.tick_params(labelsize=9, color=GREY)
     bar.outline.set_visible(False)
+    figure.draw_without_rendering()  # its layout comes to rest in the second pass
     return figure
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
@@ -59,9 +60,11 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 200) -> None:
             f"path must end in one of {', '.join(f'.{f}' for f in sorted(formats))}, "
             f"got {str(path)!r}"
         )
+    figure.draw_without_rendering()  # one layout is not enough where axes are equal
     with replace_when_written(target) as partial:
         metadata = _METADATA.get(target.suffix.lower())
-        figure.savefig(partial, dpi=dpi, metadata=metadata)
+        with rc_context({"svg.hashsalt": "slamgym"}):  # else its ids are random
+            figure.savefig(partial, dpi=dpi, metadata=metadata)
 
 
 def dress(axes: Axes, *, size: float = 10.0) -> None:

@@ -212,7 +212,8 @@ def box_around(points: Array, means: Array, covariances: Array) -> Array:
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     span = max(float((high - low).max()), 1e-3)
     reach = 3 * np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
-    lowest, highest = (means - reach).min(axis=0), (means + reach).max(axis=0)
+    lowest = (means - reach).min(axis=0, initial=np.inf)
+    highest = (means + reach).max(axis=0, initial=-np.inf)
     low = np.maximum(np.minimum(low, lowest), low - span / 3)
     high = np.minimum(np.maximum(high, highest), high + span / 3)
     size = np.maximum(high - low, (high - low).max() * _SHORTEST_SIDE) + 0.06 * span

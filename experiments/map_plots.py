@@ -81,6 +81,7 @@ def map_sequence(
     place.mkdir(parents=True, exist_ok=True)
     parts = _map_parts(trace)
     parts.figure.set_dpi(dpi)
+    parts.figure.draw_without_rendering()  # for its layout, see save_figure
     blitted = BlittedFigure(parts.figure, [*parts.picture.moving, *parts.titles])
     digits = max(3, len(str(trace.last_step)))
     files = [
@@ -94,11 +95,11 @@ def map_sequence(
 
 
 def noise_study_figure(panels: Sequence[NoisePanel]) -> Figure:
-    """Compare the maps of one log under other noise settings.
+    """Compare the maps of runs that differ in their noise.
 
-    The reference comes first and largest; below it the others, two to a row, for
-    example each of σx, σy, σα, σβ, σr times 10 (left) and divided by 10 (right). All
-    panels show the same part of the plane: at most twice that of the reference.
+    The reference comes first; below it the others, two to a row, for example each of
+    σx, σy, σα, σβ, σr times 10 (left) and divided by 10 (right). All panels show the
+    same area, at most twice as wide as that of the reference.
 
     Parameters
     ----------
@@ -129,7 +130,7 @@ def noise_study_figure(panels: Sequence[NoisePanel]) -> Figure:
         frameon=False,
         fontsize=10,
         labelspacing=0.9,
-        title="all panels show the same log and the same area",
+        title="All panels show the same area.",
         title_fontsize=10,
         alignment="left",
     )
@@ -184,7 +185,7 @@ def _title(trace: RunTrace, step: int) -> tuple[str, str]:
     many = "landmark" if len(now.ids) == 1 else "landmarks"
     return (
         f"Map and poses after step {step} of {trace.last_step}",
-        f"{trace.estimator}  ·  t = {trace.t[step]:.4g} s  ·  "
+        f"{trace.estimator}  ·  t = {trace.t[step]:.4g} {trace.time_unit}  ·  "
         f"{len(now.ids)} {many}{size}{thinned}",
     )
 

@@ -100,7 +100,7 @@ def _log(
     times = np.arange(len(poses), dtype=np.float64)
     return SlamLog(
         name=scenario.name,
-        header=_header(scenario, seed),
+        header=log_header(scenario, seed),
         start=world.start_estimate,
         landmark_ids=np.arange(len(world.landmarks)),
         landmarks=world.landmarks,
@@ -109,8 +109,14 @@ def _log(
     )
 
 
-def _header(scenario: Scenario, seed: int) -> dict[str, str]:
-    """Write down where the log comes from, and the noise that is in it."""
+def log_header(scenario: Scenario, seed: int) -> dict[str, str]:
+    """Say where a recorded log comes from, and what noise is in it.
+
+    Examples
+    --------
+    >>> log_header(load_scenario("six_landmarks"), seed=0)["motion_std"]
+    '0.25,0.1,0.1'
+    """
     sensor, motion = scenario.sensor, scenario.motion
     header = {
         "source": "slamgym, simulated",

@@ -133,6 +133,10 @@ def _kind(error: ValueError) -> type[ValueError]:
     return np.linalg.LinAlgError if is_numerical else ValueError
 
 
+def _counts_steps(times: Array) -> bool:
+    return bool((times == np.arange(len(times))).all())
+
+
 def _ids(scan: Scan) -> list[int] | None:
     return None if scan.landmark_ids is None else scan.landmark_ids.tolist()
 
@@ -182,6 +186,7 @@ class _Recorder:
         return RunTrace(
             estimator=name,
             t=times,
+            time_unit="steps" if _counts_steps(times) else "s",
             predicted_poses=self._predicted.poses,
             predicted_pose_covariances=self._predicted.covariances,
             poses=self._updated.poses,

@@ -40,7 +40,7 @@ class RunTrace:
     estimator: str
     """Its name, for titles."""
     t: Array
-    """Times, shape (K + 1,) [s]."""
+    """Times, shape (K + 1,) [`time_unit`]."""
     predicted_poses: Array
     """Poses (x, y, θ) before the scans, shape (K + 1, 3) [m, m, rad]."""
     predicted_pose_covariances: Array
@@ -71,6 +71,8 @@ class RunTrace:
     """Of the whole state, right after the first scan that added landmarks."""
     final_covariance: Array
     """Of the whole state at the end, shape (3 + 2n, 3 + 2n)."""
+    time_unit: str = "s"
+    """Of `t`, for labels; simulated logs count "steps"."""
 
     def __post_init__(self) -> None:
         steps, n = len(self.t), len(self.landmark_ids)

@@ -31,6 +31,15 @@ def test_gif_holds_every_frame_at_its_time(tmp_path):
         np.testing.assert_allclose(frame, expected, atol=3)
 
 
+def test_gif_keeps_white_and_shows_colours_that_come_later(tmp_path):
+    frames = [np.full((8, 8, 3), 255, np.uint8) for _ in range(2)]
+    frames[1][2:5, 2:5] = (213, 94, 0)
+    write_video(frames, tmp_path / "run.gif")
+    (_, _), (last, _) = frames_of_gif(tmp_path / "run.gif")
+    np.testing.assert_array_equal(last[0, 0], [255, 255, 255])
+    np.testing.assert_allclose(last[3, 3], [213, 94, 0], atol=32)
+
+
 @pytest.mark.parametrize("size", [(40, 60), (41, 63)])
 def test_mp4_holds_every_frame(tmp_path, size):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")

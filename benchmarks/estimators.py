@@ -1,0 +1,219 @@
+"""How fast is one filter step, and a batch of runs: ratios in one process.
+
+    python benchmarks/estimators.py            # with filterpy and Stone Soup if there
+    pip install "slamgym[benchmark]"           # brings them
+
+Every case takes the same step: predict, then all readings.  "kernels" are the compiled
+functions alone; "public" are ``predict`` and ``update`` with all checks and the report.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from collections.abc import Callable
+from importlib.util import find_spec
+from time import perf_counter, thread_time
+from typing import Any
+
+import numpy as np
+from interleaved import microseconds, ratio, time_interleaved, verdict
+from numpy.typing import NDArray
+from peers import StackedDense, filterpy_step, stonesoup_step
+from rich.console import Console
+from rich.table import Table
+
+from slamgym.estimator import EkfSlam, make_batch, make_estimator
+from slamgym.estimator.joint_update import update_one
+from slamgym.estimator.kernels import predict
+
+MOTION_STD, MEASUREMENT_STD = np.array([0.05, 0.02, 0.02]), np.array([0.02, 0.08])
+NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+ODOMETRY = np.array([0.0, 0.0])  # the robot stands, its noise does not
+CONSOLE = Console(width=100)
+
+
+def scene(landmarks: int) -> NDArray[np.float64]:
+    """Exact readings of landmarks spread around the origin."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-10, 10, (2, landmarks))
+    return np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=1)
+
+
+def prepared(name: str, readings: NDArray[np.float64], **options: Any) -> EkfSlam:
+    """Make a filter that has all landmarks in its map."""
+    slam = make_estimator(name, **NOISE, **options)
+    assert isinstance(slam, EkfSlam)
+    for _ in range(3):
+        slam.predict(ODOMETRY)
+        slam.update(readings, np.arange(len(readings)))  # type: ignore[arg-type]
+    return slam
+
+
+def public_step(slam: EkfSlam, readings: NDArray[np.float64]) -> Callable[[], object]:
+    """One step by the public methods."""
+    ids: Any = np.arange(len(readings))
+
+    def step() -> None:
+        slam.predict(ODOMETRY)
+        slam.update(readings, ids)
+
+    return step
+
+
+def kernel_step(slam: EkfSlam, readings: NDArray[np.float64]) -> Callable[[], object]:
+    """One step by the compiled functions alone."""
+    state = slam.state_dict()
+    size = len(state["mean"])
+    capacity = EkfSlam.capacity_for(len(readings))
+    mean, reference = np.zeros(capacity), np.zeros(capacity)
+    covariance = np.zeros((capacity, capacity))
+    mean[:size], covariance[:size, :size] = state["mean"], state["covariance"]
+    reference[:size] = state["reference"]
+    rules, variance = slam.rule_values, MOTION_STD**2
+    where = slam.rules.linearisation
+    ledger = np.zeros((4, len(readings)), dtype=np.int64)
+    ledger[0] = np.arange(len(readings))
+
+    def step() -> None:
+        predict(mean, covariance, size, 0.0, 0.0, variance, where, reference)
+        update_one(mean, covariance, size, readings, reference, rules, ledger)
+
+    return step
+
+
+def single_cases(landmarks: int) -> dict[str, Callable[[], object]]:
+    """All ways to take one step with this many landmarks, all observed."""
+    readings = scene(landmarks)
+    ekf = prepared("ekf", readings)
+    belief = ekf.belief()
+    noise = (np.diag(MOTION_STD**2), MEASUREMENT_STD**2)
+    slots = np.arange(landmarks)
+    dense = StackedDense(belief.mean, belief.covariance, *noise)
+    data = (ODOMETRY, readings.ravel(), slots)
+    cases: dict[str, Callable[[], object]] = {
+        "stacked dense numpy": lambda: dense.step(*data),
+        "ekf kernels": kernel_step(ekf, readings),
+        "ekf public": public_step(ekf, readings),
+        "invariant kernels": kernel_step(prepared("invariant", readings), readings),
+        "iterated (3) kernels": kernel_step(
+            prepared("iterated", readings, iterations=3), readings
+        ),
+        "invariant (3) kernels": kernel_step(
+            prepared("invariant", readings, iterations=3), readings
+        ),
+    }
+    start = (belief.mean, belief.covariance, noise, data)
+    if find_spec("filterpy"):
+        cases["filterpy"] = filterpy_step(*start)
+    if find_spec("stonesoup"):
+        cases["Stone Soup"] = stonesoup_step(*start)
+    return cases
+
+
+GOALS = {  # (slow, fast): at least, or (slow, fast): at most with a minus sign
+    6: {
+        ("stacked dense numpy", "ekf kernels"): 20,
+        ("stacked dense numpy", "ekf public"): 6,
+        ("filterpy", "ekf public"): 5,
+    },
+    20: {
+        ("stacked dense numpy", "ekf kernels"): 15,
+        ("stacked dense numpy", "ekf public"): 8,
+        ("filterpy", "ekf public"): 5,
+    },
+    50: {("stacked dense numpy", "ekf kernels"): 15},
+}
+COMMON_GOALS = {
+    ("invariant kernels", "ekf kernels"): -1.3,
+    ("iterated (3) kernels", "ekf kernels"): -4,
+    ("invariant (3) kernels", "ekf kernels"): -4,
+}
+
+
+def compare_single(landmarks: int) -> None:
+    """Print times and ratios of one step."""
+    times = time_interleaved(single_cases(landmarks))
+    table = Table(title=f"one step, {landmarks} landmarks, all observed")
+    table.add_column("case")
+    table.add_column("CPU µs per step", justify="right")
+    for name in times:
+        table.add_row(name, f"{microseconds(times, name):.1f}")
+    CONSOLE.print(table)
+    for (slow, fast), goal in (GOALS[landmarks] | COMMON_GOALS).items():
+        if slow in times:
+            found = ratio(times, slow, fast)
+            sign = ">=" if goal > 0 else "<="
+            said = f"{sign} {abs(goal)}: {verdict(found, abs(goal), at_least=goal > 0)}"
+            CONSOLE.print(f"  {slow} / {fast}: {found:.1f} ({said})")
+
+
+def batch_data(
+    runs: int, steps: int, landmarks: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Odometry, noisy readings and visibility (about half) of standing robots."""
+    rng = np.random.default_rng(1)
+    shape = (runs, steps, landmarks)
+    readings = scene(landmarks) + rng.standard_normal((*shape, 2)) * MEASUREMENT_STD
+    return np.zeros((runs, steps, 2)), readings, rng.random(shape) < 0.48
+
+
+def compare_batch(runs: int = 256, steps: int = 100, landmarks: int = 20) -> None:
+    """Print what a batch costs beside a loop over the stacked dense filter."""
+    data = batch_data(runs, steps, landmarks)
+
+    def batch(threads: int) -> tuple[float, float]:
+        slam = make_batch(
+            "ekf", runs=runs, landmarks=landmarks, threads=threads, **NOISE
+        )
+        wall, cpu = perf_counter(), thread_time()
+        slam.run(*data)
+        return perf_counter() - wall, thread_time() - cpu
+
+    def dense(run: int) -> float:
+        ekf = prepared("ekf", scene(landmarks)).belief()
+        peer = StackedDense(
+            ekf.mean, ekf.covariance, np.diag(MOTION_STD**2), MEASUREMENT_STD**2
+        )
+        began = thread_time()
+        for step in range(steps):
+            seen = np.flatnonzero(data[2][run, step])
+            peer.step(ODOMETRY, data[1][run, step, seen].ravel(), seen)
+        return thread_time() - began
+
+    batch(1)
+    per_dense, per_batch, threads_gain = [], [], []
+    for round_ in range(9):
+        per_dense.append(dense(round_) / steps)
+        one_wall, one_cpu = batch(1)
+        two_wall, _ = batch(2)
+        per_batch.append(one_cpu / (runs * steps))
+        threads_gain.append(one_wall / two_wall)
+    gain = float(np.median(np.divide(per_dense, per_batch)))
+    threads = float(np.median(threads_gain))
+    CONSOLE.print(
+        f"\nbatch of {runs} runs, {landmarks} landmarks half visible, one thread: "
+        f"{1e6 * np.median(per_batch):.1f} µs per run-step, "
+        f"stacked dense {1e6 * np.median(per_dense):.0f} µs"
+    )
+    CONSOLE.print(
+        f"  stacked dense / batch: {gain:.1f} "
+        f"(>= 25: {verdict(gain, 25, at_least=True)})"
+    )
+    CONSOLE.print(
+        f"  two threads / one, wall time: {threads:.2f} "
+        f"(>= 1.7: {verdict(threads, 1.7, at_least=True)})"
+    )
+    slam = make_batch("ekf", runs=runs, landmarks=landmarks, **NOISE)
+    size = 3 + 2 * landmarks
+    memory = slam.nbytes / (runs * size * size * 8)
+    CONSOLE.print(
+        f"  memory / covariances: {memory:.2f} "
+        f"(<= 1.2: {verdict(memory, 1.2, at_least=False)})"
+    )
+
+
+if __name__ == "__main__":
+    for count in (6, 20, 50):
+        compare_single(count)
+    compare_batch()

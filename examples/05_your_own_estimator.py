@@ -1,0 +1,160 @@
+"""Write a filter of your own, and hold it against the contract.
+
+Anything with the six methods of `SlamEstimator` can stand wherever slamgym uses a
+filter; there is no base class.  Below is the EKF-SLAM of the textbook with dense
+matrices: the filtering is the twenty lines of ``predict``, ``_correct`` and ``_add``,
+the rest is what lets it be checked, saved and exchanged.
+
+`check_estimator` drives a filter through a small known world, as Gymnasium's
+``check_env`` does with an environment, and names the first promise that it breaks.  The
+second class shows what that looks like: it turns before it drives.
+
+Run it::
+
+    python examples/05_your_own_estimator.py
+
+The command line takes such a class by its import path::
+
+    slamgym run six_landmarks --estimator my_filters:TextbookEkf
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slamgym.estimator import (
+    Belief,
+    EstimatorContractError,
+    UpdateReport,
+    check_estimator,
+    validation,
+)
+from slamgym.estimator.angles import wrap_angle
+from slamgym.estimator.bearing_range_model import locate_landmark, predict_measurement
+from slamgym.estimator.unicycle_motion import predict_pose
+
+Array = NDArray[np.float64]
+
+
+class TextbookEkf:
+    """EKF-SLAM as the textbook writes it; x is the state, P its covariance."""
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        initial_pose: ArrayLike = (0.0, 0.0, 0.0),
+        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:
+        self._R = np.diag(np.square(motion_std))
+        self._Q = np.diag(np.square(measurement_std))
+        self.reset(initial_pose, initial_pose_std)
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start at a pose, the map empty."""
+        self._x = np.array(pose, dtype=np.float64)
+        self._P = np.diag(np.square(pose_std, dtype=np.float64))
+        self._ids: tuple[int, ...] = ()
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move: x ← g(x, u),  P ← G P Gᵀ + F R Fᵀ dt."""
+        u = validation.finite_vector("odometry", odometry, 2)
+        moved = predict_pose(self._x[:3], u)
+        G, F = np.eye(len(self._x)), moved.jacobian_noise
+        G[:3, :3] = moved.jacobian_pose
+        self._x[:3] = moved.pose
+        self._P = G @ self._P @ G.T
+        self._P[:3, :3] += F @ self._R @ F.T * dt
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
+    ) -> UpdateReport:
+        """Correct by the landmarks that are known, then add those that are new."""
+        z = validation.scan(measurements)
+        ids = validation.identities(
+            [] if landmark_ids is None else landmark_ids, len(z)
+        )
+        if not np.isfinite(z).all():
+            raise ValueError(f"measurements must be finite, got {z.tolist()}")
+        known = {i: row for i, row in zip(ids, z, strict=True) if i in self._ids}
+        new = {i: row for i, row in zip(ids, z, strict=True) if i not in self._ids}
+        report = self._correct(known) if known else UpdateReport()
+        for i, row in new.items():
+            self._add(i, row)
+        return report._replace(added_ids=tuple(new))
+
+    def _correct(self, readings: dict[int, Array]) -> UpdateReport:
+        """Correct: x ← x + K ν,  P ← P − K S Kᵀ,  K = P Hᵀ S⁻¹,  S = H P Hᵀ + Q."""
+        slots = [self._ids.index(i) for i in readings]
+        landmarks = self._x[3:].reshape(-1, 2)[slots]
+        expected = predict_measurement(self._x[:3], landmarks)
+        H = np.zeros((2 * len(slots), len(self._x)))
+        for k, slot in enumerate(slots):
+            H[2 * k : 2 * k + 2, :3] = expected.jacobian_pose[k]
+            H[2 * k : 2 * k + 2, 3 + 2 * slot : 5 + 2 * slot] = (
+                expected.jacobian_landmark[k]
+            )
+        innovation = np.stack(list(readings.values())) - expected.measurement
+        innovation[:, 0] = wrap_angle(innovation[:, 0])
+        nu = innovation.ravel()
+        S = H @ self._P @ H.T + np.kron(np.eye(len(slots)), self._Q)
+        K = np.linalg.solve(S, H @ self._P).T
+        self._x += K @ nu
+        self._P -= K @ S @ K.T
+        return UpdateReport(
+            nis=float(nu @ np.linalg.solve(S, nu)),
+            degrees_of_freedom=len(nu),
+            associated_ids=tuple(readings),
+            innovation=innovation,
+            factor=np.linalg.cholesky(S),
+        )
+
+    def _add(self, landmark_id: int, reading: Array) -> None:
+        """Append l = f(x, z), correlated with the pose it was seen from."""
+        seen = locate_landmark(self._x[:3], reading[None])
+        Fp, Fz = seen.jacobian_pose[0], seen.jacobian_measurement[0]
+        across = Fp @ self._P[:3]
+        own = Fp @ self._P[:3, :3] @ Fp.T + Fz @ self._Q @ Fz.T
+        self._x = np.append(self._x, seen.position[0])
+        self._P = np.block([[self._P, across.T], [across, own]])
+        self._ids = (*self._ids, landmark_id)
+
+    def belief(self) -> Belief:
+        """Answer with a snapshot: a Belief copies what it is made of."""
+        return Belief(self._x, self._P, self._ids)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Copy the whole state."""
+        return {"x": self._x.copy(), "P": self._P.copy(), "ids": np.array(self._ids)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a copied state."""
+        self._x, self._P = state["x"].copy(), state["P"].copy()
+        self._ids = tuple(state["ids"].tolist())
+
+
+class TurnsFirst(TextbookEkf):
+    """The same, with the two halves of a motion in the wrong order."""
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Turn by α, then drive d."""
+        distance, turn = validation.finite_vector("odometry", odometry, 2)
+        super().predict((0.0, turn), dt)
+        super().predict((distance, 0.0), 0.0)
+
+
+def main() -> None:
+    for estimator in (TextbookEkf, TurnsFirst):
+        try:
+            check_estimator(estimator)
+        except EstimatorContractError as error:
+            print(f"{estimator.__name__} breaks the contract:\n  {error}")
+        else:
+            print(f"{estimator.__name__} keeps the contract")
+
+
+if __name__ == "__main__":
+    main()

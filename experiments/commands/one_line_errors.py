@@ -1,0 +1,82 @@
+"""Errors of the command line: one line on standard error, and an exit code."""
+
+import os
+import sys
+from typing import Any
+
+import numpy as np
+import typer
+from typer.core import TyperGroup
+
+FAILURE, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+
+class BadInputError(ValueError):
+    """What the user asked for cannot be done; the message says why, in one line."""
+
+
+class OneLineErrors(TyperGroup):
+    """A group of commands that answers an error with one line.
+
+    Bad input ends with exit code 2, a failure with 1, Ctrl-C with 130. The traceback
+    is shown when the environment variable ``SLAMGYM_TRACEBACK`` is set.
+    """
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Run a command, and leave the program when standing alone."""
+        stands_alone = kwargs.pop("standalone_mode", True)
+        kwargs["standalone_mode"] = False
+        if not stands_alone:
+            return super().main(*args, **kwargs)
+        try:
+            result = super().main(*args, **kwargs)
+        except (Exception, KeyboardInterrupt) as error:
+            if "SLAMGYM_TRACEBACK" in os.environ:
+                raise
+            sys.stderr.write(f"slamgym: {message_of(error)}\n")
+            sys.exit(exit_code_of(error))
+        sys.exit(result if isinstance(result, int) else 0)
+
+
+def message_of(error: BaseException) -> str:
+    r"""Say an error in one line.
+
+    Examples
+    --------
+    >>> message_of(ValueError("dt must be > 0, got 0\n steps must be >= 2, got 1"))
+    'dt must be > 0, got 0; steps must be >= 2, got 1'
+    """
+    if _is_interrupt(error):
+        return "interrupted; nothing was written"
+    if hasattr(error, "format_message"):  # of the command line itself
+        return _one_line(error.format_message())
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, ValueError | OSError | ImportError):
+        return _one_line(str(error))
+    what = f"{type(error).__name__}: {_one_line(str(error))}"
+    return f"internal error, {what} (SLAMGYM_TRACEBACK=1 shows where)"
+
+
+def exit_code_of(error: BaseException) -> int:
+    """Tell bad input from failures.
+
+    Examples
+    --------
+    >>> exit_code_of(ValueError("steps must be >= 2, got 1")), exit_code_of(OSError())
+    (2, 1)
+    """
+    if _is_interrupt(error):
+        return INTERRUPTED
+    if isinstance(error, np.linalg.LinAlgError):
+        return FAILURE
+    is_asked_wrongly = hasattr(error, "format_message")
+    return BAD_INPUT if is_asked_wrongly or isinstance(error, ValueError) else FAILURE
+
+
+def _is_interrupt(error: BaseException) -> bool:
+    return isinstance(error, KeyboardInterrupt | typer.Abort)
+
+
+def _one_line(text: str) -> str:
+    return "; ".join(line.strip() for line in text.splitlines() if line.strip())

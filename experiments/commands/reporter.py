@@ -1,0 +1,105 @@
+"""Where a command talks: progress to standard error, results to standard output."""
+
+import contextlib
+import json
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from ..filter_settings import FilterSettings
+
+Tick = Callable[[int, int], None]
+
+_PATIENCE = 1.0  # [s] of silence before the compilation is announced
+
+
+class Reporter:
+    """Talks to people, or to a program: then all it prints is one JSON object.
+
+    Parameters
+    ----------
+    as_json : bool
+        Whether a program listens.
+    """
+
+    def __init__(self, *, as_json: bool) -> None:
+        self._as_json = as_json
+        self._results = Console(highlight=False)
+        self._notes = Console(stderr=True, highlight=False)
+
+    def show(self, *results: RenderableType) -> None:
+        """Print results for people, one below the other."""
+        if not self._as_json:
+            for result in results:
+                self._results.print(result)
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Print the object for programs."""
+        if self._as_json:
+            text = json.dumps(summary, allow_nan=False, ensure_ascii=False)
+            sys.stdout.write(text + "\n")
+
+    @contextlib.contextmanager
+    def progress(self, doing: str) -> Iterator[Tick]:
+        """Show a bar on a terminal, moved by the function lent, until all is done.
+
+        Parameters
+        ----------
+        doing : str
+            What goes on, such as "filtering".
+
+        Yields
+        ------
+        callable
+            To be called with (done, total), as often as one likes.
+        """
+        columns = (
+            TextColumn("{task.description:<10}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+        )
+        with Progress(
+            *columns,
+            console=self._notes,
+            transient=True,
+            disable=not self._notes.is_terminal,
+        ) as bar:
+            task = bar.add_task(doing, total=None)
+
+            def tick(done: int, total: int) -> None:
+                if done == total or done % max(1, total // 200) == 0:
+                    bar.update(task, completed=done, total=total)
+
+            yield tick
+
+    def warm_up(self, settings: FilterSettings) -> None:
+        """Let an estimator take a first step, and say so if it compiles for long.
+
+        Raises
+        ------
+        ValueError
+            If the estimator refuses its settings.
+        """
+        settings.make(initial_pose=(0.0, 0.0, 0.0))
+        spread = replace(settings, motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2)
+        with self._patience("compiling the filter, once after each installation …"):
+            estimator = spread.make(initial_pose=(0.0, 0.0, 0.0))
+            for _ in range(2):
+                estimator.predict((0.1, 0.0))
+                estimator.update([(0.0, 5.0)], [0])
+
+    @contextlib.contextmanager
+    def _patience(self, note: str) -> Iterator[None]:
+        """Print a note if what happens meanwhile takes long."""
+        timer = threading.Timer(_PATIENCE, self._notes.print, [note])
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()

@@ -1,0 +1,133 @@
+"""The numbers of a run as people like to read them."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+_TOO_MUCH, _TOO_LITTLE = 0.5, 2.0  # of NIS or NEES per degree, where 1 is expected
+
+
+def landmark_table(summary: dict[str, Any]) -> Table:
+    """Lay out the landmarks and their distances to the truth."""
+    table = Table(title="Landmarks", title_justify="left", box=None, pad_edge=False)
+    known = any(row["euclidean"] is not None for row in summary["landmarks"])
+    headings = ["id", "x [m]", "y [m]"]
+    headings += ["Euclidean [m]", "Mahalanobis [σ]"] if known else []
+    for heading in headings:
+        table.add_column(Text(heading), justify="right")
+    for row in summary["landmarks"]:
+        cells = [str(row["id"]), _number(row["x"], 4), _number(row["y"], 4)]
+        distances = [_number(row["euclidean"], 7), _number(row["mahalanobis"], 5)]
+        table.add_row(*cells, *(distances if known else []))
+    return table
+
+
+def key_figures(summary: dict[str, Any]) -> Table:
+    """Lay out the few numbers that tell how good a run was."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    for name, text in _figures(summary):
+        table.add_row(name, text)
+    return table
+
+
+def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    readings = summary["readings"]
+    rows = [
+        ("steps", f"{summary['steps']}, with {summary['scans']} scans"),
+        ("readings", _readings(readings)),
+        ("final pose", _pose(summary["pose"], summary["pose_covariance"])),
+    ]
+    for name, key in (("path error", "ate"), ("map error", "landmark_rmse")):
+        if summary[key] is not None:
+            rows.append((name, _rmse(summary[key])))
+    for name, key, hint in (
+        ("pose NEES", "nees", ("too cautious", "too sure of itself")),
+        ("NIS", "nis", ("it assumes too much noise", "it assumes too little noise")),
+    ):
+        if summary[key] is not None:
+            rows.append((name, _ratio(summary[key], hint)))
+    return rows
+
+
+def _readings(counts: dict[str, int]) -> str:
+    text = f"{counts['associated']} of known landmarks, {counts['added']} of new ones"
+    for fate, words in (("rejected", "rejected by the gate"), ("skipped", "too close")):
+        if counts[fate]:
+            text += f", {counts[fate]} {words}"
+    return text
+
+
+def _pose(pose: Sequence[float | None], covariance: Sequence[Sequence[float]]) -> str:
+    parts = []
+    for k, (name, unit) in enumerate((("x", "m"), ("y", "m"), ("θ", "rad"))):
+        variance = covariance[k][k]
+        std = math.sqrt(max(variance, 0.0)) if variance is not None else None
+        parts.append(f"{name} {_number(pose[k], 3)} ± {_number(std, 3)} {unit}")
+    return ", ".join(parts)
+
+
+def _rmse(errors: dict[str, float | None]) -> str:
+    raw, aligned = (_significant(errors[key]) for key in ("raw", "aligned"))
+    return f"{raw} m RMS; {aligned} m once best fitted to the truth"
+
+
+def _ratio(numbers: dict[str, Any], hint: tuple[str, str]) -> str:
+    """Judge a ratio that is 1 for a filter as sure as it may be."""
+    ratio = numbers["per_degree"]
+    text = f"{_significant(ratio)} per degree of freedom; 1 is expected"
+    if ratio is None or ratio > _TOO_LITTLE:
+        return f"{text}: {hint[1]}"
+    return f"{text}: {hint[0]}" if ratio < _TOO_MUCH else text
+
+
+def noise_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Lay out the runs of a noise study."""
+    table = Table(
+        title="Areas of the final 3σ ellipses, RMS errors; NEES and NIS are 1 if honest",
+        title_justify="left",
+        box=None,
+        pad_edge=False,
+    )
+    columns = {
+        "pose_area": "pose\n[m²]",
+        "landmark_area": "landmark\n[m²]",
+        "landmark_rmse": "map\n[m]",
+        "landmark_rmse_aligned": "fitted\n[m]",
+        "ate": "path\n[m]",
+        "nees_per_degree": "NEES\nper dof",
+        "nis_per_degree": "NIS\nper dof",
+    }
+    shown = [key for key in columns if any(row[key] is not None for row in rows)]
+    table.add_column("noise", no_wrap=True)
+    table.add_column("which is", no_wrap=True)
+    for key in shown:
+        table.add_column(Text(columns[key]), justify="right", no_wrap=True)
+    for row in rows:
+        change, _, value = row["title"].partition(" = ")
+        table.add_row(change, value, *(_significant(row[key]) for key in shown))
+    return table
+
+
+def written(folder: str, files: Sequence[str]) -> Text:
+    """Say what was written where; the pictures of single steps in one line."""
+    steps = [file for file in files if file.startswith("map_steps/")]
+    lines = [file for file in files if file not in steps]
+    if steps:
+        lines.append(f"map_steps/ ({len(steps)} pictures)")
+    text = Text("Wrote ", style="bold").append(f"{folder}/", style="not bold")
+    for line in sorted(lines):
+        text.append(f"\n  {line}", style="not bold")
+    return text
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _significant(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"

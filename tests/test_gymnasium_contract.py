@@ -1,0 +1,182 @@
+"""Gymnasium's own checker and the traps that it does not see."""
+
+import json
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv
+
+import slamgym  # noqa: F401 (registers the environments)
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.sim_configs import action_sequence, list_presets, load_scenario
+
+ID = "slamgym/LandmarkWorld-v0"
+HIDDEN = {"scenario": "hidden_identities"}
+
+
+def same(observation, other):
+    assert list(observation) == list(other)
+    for key in observation:
+        np.testing.assert_array_equal(observation[key], other[key])
+
+
+@pytest.mark.parametrize("preset", list_presets())
+def test_gymnasiums_checker_finds_nothing_to_warn_of(preset):
+    env = gym.make(ID, scenario=preset).unwrapped
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="matplotlib's backend")  # no screen
+        check_env(env)
+    env.close()
+
+
+@pytest.mark.parametrize("preset", list_presets())
+def test_every_observation_of_an_episode_lies_in_its_space(preset):
+    env = LandmarkWorldEnv(preset)
+    rng = np.random.default_rng(0)
+    observation, _ = env.reset(seed=0)
+    limits = env.action_space.high
+    for action in action_sequence(env.scenario):
+        assert observation in env.observation_space
+        wild = rng.choice([-limits, limits]) * rng.integers(0, 2, 2)
+        observation, *_ = env.step(wild if rng.random() < 0.3 else action)
+
+
+def test_bounds_are_finite_and_hold_for_the_farthest_landmark():
+    far = {"layout": "points", "points": [[-500.0, 0.0]]}
+    env = LandmarkWorldEnv(landmarks=far, start={"std": [9.0, 0.0, 0.0]})
+    observation, _ = env.reset(seed=0)
+    for _ in range(env.scenario.steps):
+        assert observation in env.observation_space
+        observation, *_ = env.step([1.0, 0.0])
+    assert all(np.isfinite(box.high).all() for box in env.observation_space.values())
+    assert env.observation_space["landmarks"].high[0, 1] < 1000.0
+    assert env.observation_space["landmarks"].low[0].tolist() == [-np.pi, 0.0]
+
+
+def test_keyword_arguments_survive_a_spec_written_as_json():
+    env = gym.make(ID, scenario="loop", sensor={"max_range": 4.0})
+    rebuilt = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert rebuilt.unwrapped.scenario == env.unwrapped.scenario
+    assert rebuilt.unwrapped.scenario.sensor.max_range == 4.0
+    same(env.reset(seed=0)[0], rebuilt.reset(seed=0)[0])
+
+
+@pytest.mark.parametrize("preset", list_presets())
+def test_a_scenario_as_plain_data_survives_a_spec_too(preset):
+    scenario = load_scenario(preset)
+    env = gym.make(ID, scenario=json.loads(json.dumps(scenario.model_dump())))
+    rebuilt = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert rebuilt.unwrapped.scenario == scenario
+
+
+def test_an_id_with_the_package_in_front_makes_the_same_world():
+    env, other = gym.make(ID), gym.make(f"slamgym:{ID}")
+    same(env.reset(seed=0)[0], other.reset(seed=0)[0])
+
+
+def test_gymnasiums_time_limit_comes_on_top_of_the_worlds_own():
+    env = gym.make(ID, max_episode_steps=3)
+    env.reset(seed=0)
+    assert [env.step([0.0, 0.0])[3] for _ in range(3)] == [False, False, True]
+
+
+@pytest.mark.parametrize("changes", [{}, HIDDEN], ids=str)
+def test_a_vector_of_worlds_is_the_worlds_seeded_one_after_the_other(changes):
+    vector = gym.make_vec(ID, 3, vectorization_mode="sync", **changes)
+    singles = [gym.make(ID, **changes) for _ in range(3)]
+    batch, infos = vector.reset(seed=10)
+    for k, env in enumerate(singles):
+        observation, info = env.reset(seed=10 + k)
+        same({key: batch[key][k] for key in batch}, observation)
+        same({key: infos[key][k] for key in info}, info)
+    for action in np.random.default_rng(0).uniform(-1, 1, (20, 3, 2)):
+        batch, _, _, _, infos = vector.step(action)
+        for k, env in enumerate(singles):
+            observation, _, _, _, info = env.step(action[k])
+            same({key: batch[key][k] for key in batch}, observation)
+            same({key: infos[key][k] for key in info}, info)
+    vector.close()
+
+
+def test_worlds_in_other_processes_are_the_same():
+    def factory():
+        return gym.make(f"slamgym:{ID}", **HIDDEN)
+
+    workers = AsyncVectorEnv([factory, factory])
+    single = gym.make(ID, **HIDDEN)
+    batch, _ = workers.reset(seed=4)
+    same({key: batch[key][0] for key in batch}, single.reset(seed=4)[0])
+    batch, *_ = workers.step(np.full((2, 2), 0.3))
+    same({key: batch[key][0] for key in batch}, single.step([0.3, 0.3])[0])
+    workers.close()
+
+
+def test_single_batched_and_flat_observations_have_one_order():
+    env = gym.make(ID, **HIDDEN)
+    vector = gym.make_vec(ID, 2, vectorization_mode="sync", **HIDDEN)
+    order = ["landmarks", "mask", "odometry"]
+    assert list(env.observation_space) == order
+    assert list(env.reset(seed=0)[0]) == order
+    assert list(vector.observation_space) == order
+    observation = env.step([0.5, 0.1])[0]
+    flat = gym.spaces.flatten(env.observation_space, observation)
+    expected = [np.ravel(observation[key]) for key in order]
+    np.testing.assert_array_equal(flat, np.concatenate(expected))
+    vector.close()
+
+
+def test_the_mask_selects_rows():
+    observation, _ = LandmarkWorldEnv("loop").reset(seed=0)
+    selected = observation["landmarks"][observation["mask"]]
+    assert observation["mask"].dtype == np.bool_
+    assert 0 < len(selected) < len(observation["mask"])
+    assert (selected[:, 1] > 0.0).all()
+
+
+@pytest.mark.parametrize("changes", [{}, HIDDEN], ids=str)
+def test_info_has_the_same_keys_shapes_and_types_in_reset_and_step(changes):
+    env = gym.make(ID, **changes).unwrapped
+
+    def form(info):
+        return {k: (type(v), np.shape(v), np.asarray(v).dtype) for k, v in info.items()}
+
+    first = form(env.reset(seed=0)[1])
+    assert first["collision"][0] is bool
+    for _ in range(20):
+        assert form(env.step([1.0, 0.1])[4]) == first
+
+
+@pytest.mark.parametrize("changes", [{}, HIDDEN], ids=str)
+def test_nothing_handed_out_shares_memory_with_anything_else(changes):
+    env = gym.make(ID, **changes).unwrapped
+    moments = [env.reset(seed=0), *(env.step([1.0, 0.1])[::4] for _ in range(3))]
+    moments.append(env.reset())
+    arrays = [
+        value
+        for observation, info in moments
+        for value in (*observation.values(), *info.values())
+        if isinstance(value, np.ndarray)
+    ]
+    arrays += [env.landmarks, env.pose, env.start_estimate]
+    for k, array in enumerate(arrays):
+        assert not any(np.shares_memory(array, other) for other in arrays[:k])
+
+
+def test_seeds_of_64_bits_are_accepted_and_an_absent_seed_does_not_reseed():
+    env = gym.make(ID).unwrapped
+    env.reset(seed=2**64 - 1)
+    assert env.np_random_seed == 2**64 - 1
+    rng = env.np_random
+    env.reset()
+    assert env.np_random is rng
+
+
+def test_rendering_without_a_mode_warns_and_draws_nothing():
+    env = LandmarkWorldEnv()
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None
