@@ -211,7 +211,7 @@ class EkfSlam:
         self._make_room(count)
         slots = self._slots
         self._ledger[SLOT, :count] = [slots.get(i, -1) for i in ids]
-        outcome, used, nis, innovation, *parts = update_one(
+        outcome, used, nis, innovation, record = update_one(
             self._mean,
             self._covariance,
             self._size,
@@ -222,7 +222,7 @@ class EkfSlam:
         )
         if outcome != DONE:
             self._refuse(outcome, readings, ids)
-        return self._report(ids, used, nis, innovation, partial(joint_factor, *parts))
+        return self._report(ids, used, nis, innovation, partial(joint_factor, record))
 
     def belief(self) -> Belief:
         """Return the belief as a snapshot that later steps leave alone."""

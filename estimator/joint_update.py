@@ -379,39 +379,40 @@ def update_one(
     reference: Array,
     rule_values: Array,
     ledger: Int,
-) -> tuple[int, int, float, Array, Array, Array, Array]:
+) -> tuple[int, int, float, Array, Array]:
     """Update a single filter: :func:`update_belief` with a workspace of its own.
 
-    Returns outcome, used and nis of :func:`update_belief`; of the readings used ν
-    (m, 2), H (m, 2, 5), the diagonal blocks of L (m, 3), and A (2m, 3 + 2m) in the
-    columns of the pose and of their own landmarks: what :func:`joint_factor` needs.
+    Returns outcome, used and nis of :func:`update_belief`, and of the readings used ν
+    (m, 2) and what :func:`joint_factor` needs, (2m, 10 + 2m): for each row of the scan
+    its five entries of H, its row of the diagonal block of L, and its row of A in the
+    columns of the pose and of the landmarks.
     """
     rules = as_rules(rule_values)
     work = new_workspace(len(readings), size, len(mean), rules)
     outcome, used, nis = update_belief(
         mean, covariance, size, readings, reference, rules, work, ledger
     )
-    seen = np.empty((2 * used, 3 + 2 * used))
-    for i in range(2 * used if outcome == DONE else 0):
-        for j in range(3):
-            seen[i, j] = work.gains[0, i, j]
-        for k in range(used):
-            c = ledger[COLUMN, k]
-            seen[i, 3 + 2 * k] = work.gains[0, i, c]
-            seen[i, 4 + 2 * k] = work.gains[0, i, c + 1]
-    return (
-        outcome,
-        used,
-        nis,
-        work.innovations[0, :used],
-        work.jacobians[0, :used],
-        work.roots[0, :used],
-        seen,
-    )
+    if outcome != DONE:
+        return outcome, used, nis, work.readings, work.readings
+    record = np.empty((2 * used, 10 + 2 * used))
+    for k in range(used):
+        for i in range(2):
+            row = 2 * k + i
+            for j in range(5):
+                record[row, j] = work.jacobians[0, k, i, j]
+            record[row, 5] = work.roots[0, k, i]
+            record[row, 6] = work.roots[0, k, 2 * i]
+            for j in range(3):
+                record[row, 7 + j] = work.gains[0, row, j]
+            for j in range(used):
+                c = ledger[COLUMN, j]
+                record[row, 10 + 2 * j] = work.gains[0, row, c]
+                record[row, 11 + 2 * j] = work.gains[0, row, c + 1]
+    return outcome, used, nis, work.innovations[0, :used], record
 
 
-def joint_factor(jacobians: Array, roots: Array, seen: Array) -> Array:
-    """Put together L of S = L Lᵀ from what :func:`update_one` returned.
+def joint_factor(record: Array) -> Array:
+    """Put together L of S = L Lᵀ from the record of :func:`update_one`.
 
     Off its diagonal blocks L = H Aᵀ, since Q is diagonal.
 
@@ -419,12 +420,14 @@ def joint_factor(jacobians: Array, roots: Array, seen: Array) -> Array:
     -------
     ndarray, shape (2m, 2m), lower triangular
     """
-    m = len(jacobians)
-    H = np.zeros((m, 2, 3 + 2 * m))
-    H[:, :, :3] = jacobians[:, :, :3]
+    m = len(record) // 2
+    H = np.zeros((2 * m, 3 + 2 * m))
+    H[:, :3] = record[:, :3]
     for k in range(m):
-        H[k, :, 3 + 2 * k : 5 + 2 * k] = jacobians[k, :, 3:]
-    factor = np.tril(H.reshape(2 * m, -1) @ seen.T)
-    for k, (l00, l10, l11) in enumerate(roots):
-        factor[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = (l00, 0.0), (l10, l11)
+        rows = slice(2 * k, 2 * k + 2)
+        H[rows, 3 + 2 * k : 5 + 2 * k] = record[rows, 3:5]
+    factor = np.tril(H @ record[:, 7:].T)
+    for k in range(0, 2 * m, 2):
+        (l00, _), (l10, l11) = record[k : k + 2, 5:7]
+        factor[k : k + 2, k : k + 2] = (l00, 0.0), (l10, l11)
     return factor

@@ -118,11 +118,13 @@ def test_a_landmark_straight_behind_reads_minus_pi():
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_noise_takes_a_bearing_across_the_back_by_wrapping(sign):
-    scenario, landmarks = one_landmark(sign * 3.1, 2.0)
-    noise = (np.array([[sign * 0.1], [0.0]]), np.array([0.05]), None, None)
+@pytest.mark.parametrize("view", [6.0, 2 * np.pi])
+def test_noise_takes_a_bearing_across_the_back_by_wrapping(sign, view):
+    scenario, landmarks = one_landmark(sign * 2.95, 2.0)
+    scenario = scenario.with_changes(sensor={"field_of_view": view, "std": [0.1, 0.1]})
+    noise = (np.array([[sign * 0.3], [0.0]]), np.array([0.05]), None, None)
     readings, _ = scan(scenario, landmarks, (0, 0, 0), noise)
-    assert readings[0, 0] == pytest.approx(sign * (3.2 - 2 * np.pi))
+    assert readings[0, 0] == pytest.approx(sign * (3.25 - 2 * np.pi))
 
 
 def test_wrapped_bearings_lie_in_range_and_those_in_range_keep_every_bit():
@@ -182,6 +184,15 @@ def test_the_true_range_decides_what_is_in_reach_limits_included(distance, seen)
             (error + np.array([[0.0], [noise]]), nearest, *rest),
         )  # fmt: skip
         assert mask.tolist() == [seen]
+
+
+def test_a_landmark_at_the_nearest_range_itself_is_read():
+    scenario, landmarks = one_landmark(0.3, 1.0)
+    scenario = scenario.with_changes(sensor={"min_range": 1.0, "std": [0.1, 0.0]})
+    assert abs(landmarks[0]) == 1.0
+    assert scan(scenario, landmarks, (0, 0, 0), noise_of(scenario))[1].tolist() == [
+        True
+    ]
 
 
 @pytest.mark.parametrize("view", [0.5, np.pi / 2, np.pi, 5.0])

@@ -191,13 +191,12 @@ def test_an_episode_is_truncated_after_its_steps_and_never_terminated():
 # --- actions ---
 
 
-def test_actions_beyond_the_limits_are_clipped():
-    ends = []
-    for action in ([50.0, -1e300], [1.0, -1.0]):
-        env = make()
-        env.reset(seed=0)
-        ends.append(env.step(action)[0]["odometry"].tolist())
-    assert ends[0] == ends[1] == [0.5, -0.5]
+@pytest.mark.parametrize("wild", [[50.0, -1e300], [-1.001, 2.0]])
+def test_actions_beyond_the_limits_are_clipped(wild):
+    env = make()
+    env.reset(seed=0)
+    expected = np.sign(wild) * 0.5
+    np.testing.assert_array_equal(env.step(wild)[0]["odometry"], expected)
 
 
 def test_double_precision_actions_keep_their_precision():
@@ -416,6 +415,8 @@ def test_what_is_handed_out_can_be_changed_without_harm():
         )
         expected = twin.reset(seed=0) if action is None else twin.step(action)[::4]
         assert_same([(observation, info)], [expected])
+        np.testing.assert_array_equal(env.landmarks, twin.landmarks)
+        np.testing.assert_array_equal(env.start_estimate, twin.start_estimate)
         for array in (*observation.values(), info["pose"]):
             array[...] = 1
         for array in (env.pose, env.landmarks, env.start_estimate):
