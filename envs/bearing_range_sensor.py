@@ -54,8 +54,8 @@ class BearingRangeSensor:
 
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
-        bearing_std, self._range_std = sensor.std
-        self._range_std_per_metre = sensor.range_std_per_metre
+        bearing_std, self._std = sensor.std
+        self._growth = sensor.range_std_per_metre  # k in σr(r) = σr + k r
         self._max_range = _limit(sensor.max_range, above=math.inf)
         self._half_view = _limit(sensor.field_of_view / 2, above=math.pi)
         self._may_wrap = sensor.field_of_view / 2 + MANY_STD * bearing_std >= math.pi
@@ -105,23 +105,14 @@ class BearingRangeSensor:
             mask &= np.abs(bearings) <= self._half_view
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
+        if self._growth:
+            error = np.stack([error[0], error[1] * (self._std + self._growth * ranges)])
+        true += error
+        if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
+            wrap_bearings(bearings)
         readings = np.zeros(error.shape)
-        np.copyto(readings, self._disturb(true, error), where=mask)
+        np.copyto(readings, true, where=mask)
         return readings, mask
-
-    def _disturb(self, true: Array, error: Array) -> Array:
-        """Add noise to true readings in place, both of shape (2, …, N)."""
-        per_metre = self._range_std_per_metre
-        if per_metre:
-            true[1] += error[1] * (
-                self._range_std + self._range_std_per_metre * true[1]
-            )
-            true[0] += error[0]
-        else:
-            true += error
-        if self._may_wrap and np.count_nonzero(np.abs(true[0]) >= _PI):
-            true[0] = wrap_bearings(true[0])
-        return true
 
 
 def _limit(value: float, above: float) -> Array | None:
@@ -129,18 +120,20 @@ def _limit(value: float, above: float) -> Array | None:
     return np.array(value) if value < above else None
 
 
-def wrap_bearings(bearings: Array) -> Array:
-    """Bring angles into [-π, π), to the last bit if they lie there already.
+def wrap_bearings(bearings: Array) -> None:
+    """Bring angles into [-π, π) in place; those that lie there keep every bit.
 
     Examples
     --------
-    >>> wrap_bearings(np.array([0.1, np.pi, 1.0 - 2 * np.pi])).round(12)
+    >>> bearings = np.array([0.1, np.pi, 1.0 - 2 * np.pi])
+    >>> wrap_bearings(bearings)
+    >>> bearings.round(12)
     array([ 0.1       , -3.14159265,  1.        ])
     """
-    wrapped = bearings - 2 * np.pi * np.floor((bearings + np.pi) / (2 * np.pi))
-    wrapped = np.where(wrapped >= np.pi, wrapped - 2 * np.pi, wrapped)
-    wrapped = np.where(wrapped < -np.pi, wrapped + 2 * np.pi, wrapped)
-    return np.where(np.abs(bearings) < np.pi, bearings, wrapped)
+    outside = (bearings >= np.pi) | (bearings < -np.pi)
+    wrapped = (bearings[outside] + np.pi) % (2 * np.pi) - np.pi
+    wrapped[wrapped >= np.pi] = -np.pi  # a tiny negative remainder rounds up to 2π
+    bearings[outside] = wrapped
 
 
 def hide_identities(

@@ -1,6 +1,6 @@
 """What an environment shows while it runs: the path so far and the present moment."""
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ class LiveView:
     """Remembers the path of an episode, and draws its last moment.
 
     Matplotlib is loaded by the first frame. The renderer lasts from episode to episode
-    while the map does; it stays behind when the view is pickled or copied.
+    while the map does.
 
     Parameters
     ----------
@@ -103,9 +103,6 @@ class LiveView:
         if self._renderer is not None:
             self._renderer.close()
         self._renderer = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_renderer": None}
 
     def _make_renderer(self) -> "WorldRenderer":
         from .rendering import WorldRenderer  # noqa: PLC0415 (loads matplotlib)

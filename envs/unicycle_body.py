@@ -24,12 +24,14 @@ _NO_SLIP = (0.0, 0.0, 0.0)
 class UnicycleBody:
     """A round body that moves by one displacement and one turn per step.
 
-    The body is kinematic and has no shape: nothing but its velocity moves it, so one
-    `Space.step` of unit time is the turn-last motion model to the last bit::
+    The engine's body is kinematic and has no shape: nothing but its velocity moves it,
+    so one `Space.step` of unit time is the turn-last motion model to the last bit::
 
         x += (d + εx) cos θ - εy sin θ
         y += (d + εx) sin θ + εy cos θ
         θ += α + εα
+
+    A disc meets walls alike at every heading, so θ is kept here and not in the engine.
 
     Walls hold it back through queries, made before each step, for the first contact
     along the displacement. What is queried are walls inflated by the radius of the
@@ -79,8 +81,7 @@ class UnicycleBody:
     def place(self, pose: Sequence[float]) -> None:
         """Put the body at (x, y, θ) [m, m, rad]."""
         self._body.position = pose[0], pose[1]
-        self._body.angle = pose[2]
-        self._arrive()
+        self._arrive(pose[2])
 
     def drive(
         self, command: Sequence[float], slip: Sequence[float] = _NO_SLIP
@@ -108,15 +109,13 @@ class UnicycleBody:
         if share < 1.0:
             dx, dy = share * dx, share * dy
         self._body.velocity = dx, dy
-        self._body.angular_velocity = command[1] + slip[2]
         self._space.step(1.0)
-        self._arrive()
+        self._arrive(self._pose[2] + (command[1] + slip[2]))
         return share
 
-    def _arrive(self) -> None:
-        """Take the pose from the engine."""
+    def _arrive(self, heading: float) -> None:
+        """Take the position from the engine, and face the heading."""
         x, y = self._body.position
-        heading = self._body.angle
         cos, sin = float(np.cos(heading)), float(np.sin(heading))
         self._pose = x, y, heading
         self._cos, self._sin = cos, sin

@@ -60,7 +60,8 @@ class EkfSlam:
         drops that correlation, which makes the filter overconfident: it exists to
         reproduce results obtained so.
     range_std_per_metre : float
-        Part of σr that grows with the range: σr(r) = σr + k r.
+        Part of σr that grows with the range: σr(r) = σr + k r, at the range that the
+        belief expects, or for a new landmark at the range as read.
     gate_probability : float or None
         Readings of mapped landmarks outside this chi-square region of their own
         innovation are rejected; None accepts all.

@@ -272,13 +272,15 @@ def screen(
         if ledger[FATE, k] != USED:
             continue
         dx, dy = mean[column] - mean[0], mean[column + 1] - mean[1]
-        if dx * dx + dy * dy < rules.min_range * rules.min_range:
+        expected = np.sqrt(dx * dx + dy * dy)
+        if expected < rules.min_range:
             ledger[FATE, k] = SKIPPED
             continue
         ledger[COLUMN, used] = column
         work.readings[used, 0] = readings[k, 0]
         work.readings[used, 1] = readings[k, 1]
-        set_variance(rules, readings[k, 1], work.variances[used])
+        # The range as read would make σr small just where its error is negative.
+        set_variance(rules, expected, work.variances[used])
         ledger[NEAR, k] = meets(mean, covariance, column)
         if rules.gate < np.inf:
             where, H, nu = rules.linearisation, work.jacobians[0], work.innovations[0]

@@ -84,7 +84,7 @@ class UnscentedSlam(EkfSlam):
         expected, spread = _through_sensor(self._mean[:n], deviations, columns)
         innovation = readings - expected
         innovation[:, 0] = wrap_angle(innovation[:, 0])
-        noise = self._noise_variances(readings)
+        noise = self._noise_variances(expected[:, 1])
         kept = self._within_gate(innovation, spread, noise)
         rows = np.repeat(kept, 2)
         spread, nu = spread[rows], innovation.ravel()[rows]
@@ -105,11 +105,11 @@ class UnscentedSlam(EkfSlam):
             factor=factor,
         )
 
-    def _noise_variances(self, readings: Array) -> Array:
-        """Diagonal of Q, shape (m, 2)."""
+    def _noise_variances(self, ranges: Array) -> Array:
+        """Diagonal of Q at these ranges [m], shape (m, 2)."""
         rules = self._rules
-        range_std = rules.range_std + rules.range_std_per_metre * readings[:, 1]
-        bearing_std = np.full(len(readings), rules.bearing_std)
+        range_std = rules.range_std + rules.range_std_per_metre * ranges
+        bearing_std = np.full(len(ranges), rules.bearing_std)
         std: Array = np.stack([bearing_std, range_std], axis=1)
         return std**2
 

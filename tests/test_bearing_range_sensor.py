@@ -129,10 +129,13 @@ def test_noise_takes_a_bearing_across_the_back_by_wrapping(sign, view):
 
 def test_wrapped_bearings_lie_in_range_and_those_in_range_keep_every_bit():
     inside = np.random.default_rng(0).uniform(-np.pi, np.pi, 10000)
-    np.testing.assert_array_equal(wrap_bearings(inside), inside)
+    wrapped = inside.copy()
+    wrap_bearings(wrapped)
+    np.testing.assert_array_equal(wrapped, inside)
     steps = [np.nextafter(k * np.pi, s) for k in range(-9, 10) for s in (-99, 99)]
     edges = np.array([*steps, *(k * np.pi for k in range(-9, 10)), 40.0, -40.0])
-    wrapped = wrap_bearings(edges)
+    wrapped = edges.copy()
+    wrap_bearings(wrapped)
     assert (wrapped >= -np.pi).all()
     assert (wrapped < np.pi).all()
     assert angle_gap(wrapped, edges).max() < 1e-14
@@ -187,12 +190,10 @@ def test_the_true_range_decides_what_is_in_reach_limits_included(distance, seen)
 
 
 def test_a_landmark_at_the_nearest_range_itself_is_read():
-    scenario, landmarks = one_landmark(0.3, 1.0)
+    scenario, landmarks = one_landmark(0.0, 1.0)
     scenario = scenario.with_changes(sensor={"min_range": 1.0, "std": [0.1, 0.0]})
-    assert abs(landmarks[0]) == 1.0
-    assert scan(scenario, landmarks, (0, 0, 0), noise_of(scenario))[1].tolist() == [
-        True
-    ]
+    _, mask = scan(scenario, landmarks, (0, 0, 0), noise_of(scenario))
+    assert mask.tolist() == [True]
 
 
 @pytest.mark.parametrize("view", [0.5, np.pi / 2, np.pi, 5.0])

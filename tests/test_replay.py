@@ -161,7 +161,7 @@ def test_readings_are_counted_by_what_became_of_them():
         OdometryRow(1.0, 1.0, 0.0, 1.0),
         scan(1.0, (0.0, 4.0), (1.0, 3.0), ids=[1, 3]),
         OdometryRow(2.0, 1.0, 0.0, 1.0),
-        scan(2.0, (2.0, 9.0), (1.0, 2.5), ids=[1, 3]),
+        scan(2.0, (2.0, 9.0), (1.33, 2.6), ids=[1, 3]),
     )
     estimator = ekf(gate_probability=0.999)
     counts = replay(SlamLog("drive", events=events), estimator).readings

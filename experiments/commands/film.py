@@ -15,6 +15,7 @@ from ...estimator.interface import SlamEstimator
 from ...sim_configs import Scenario
 from ..filter_settings import FilterSettings
 from .reporter import Reporter, Tick
+from .warm_up import warm_up
 from .worlds import driver
 
 _DURATION = 12.0  # [s] of a film whose speed is not asked for
@@ -54,7 +55,7 @@ def film_episode(
     driving = driver(controller, scenario, seed)
     speed = fps or min(max(scenario.steps / _DURATION, _SLOWEST), _FASTEST)
     if settings is not None:
-        reporter.warm_up(settings)
+        warm_up(settings, reporter)
     with reporter.progress("filming") as tick:
         frames = _frames(scenario, settings, driving, seed, tick)
         write_video(frames, out, fps=speed)

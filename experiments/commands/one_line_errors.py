@@ -5,7 +5,6 @@ import sys
 from typing import Any
 
 import numpy as np
-import typer
 from typer.core import TyperGroup
 
 FAILURE, BAD_INPUT, INTERRUPTED = 1, 2, 130
@@ -13,6 +12,10 @@ FAILURE, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 class BadInputError(ValueError):
     """What the user asked for cannot be done; the message says why, in one line."""
+
+
+class InterruptedRunError(Exception):
+    """The user pressed Ctrl-C."""
 
 
 class OneLineErrors(TyperGroup):
@@ -30,15 +33,22 @@ class OneLineErrors(TyperGroup):
             return super().main(*args, **kwargs)
         try:
             result = super().main(*args, **kwargs)
-        except (Exception, KeyboardInterrupt) as error:
+        except Exception as error:
             if "SLAMGYM_TRACEBACK" in os.environ:
                 raise
             sys.stderr.write(f"slamgym: {message_of(error)}\n")
             sys.exit(exit_code_of(error))
         sys.exit(result if isinstance(result, int) else 0)
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that was asked for."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise InterruptedRunError from error
 
-def message_of(error: BaseException) -> str:
+
+def message_of(error: Exception) -> str:
     r"""Say an error in one line.
 
     Examples
@@ -46,7 +56,7 @@ def message_of(error: BaseException) -> str:
     >>> message_of(ValueError("dt must be > 0, got 0\n steps must be >= 2, got 1"))
     'dt must be > 0, got 0; steps must be >= 2, got 1'
     """
-    if _is_interrupt(error):
+    if isinstance(error, InterruptedRunError):
         return "interrupted; nothing was written"
     if hasattr(error, "format_message"):  # of the command line itself
         return _one_line(error.format_message())
@@ -58,7 +68,7 @@ def message_of(error: BaseException) -> str:
     return f"internal error, {what} (SLAMGYM_TRACEBACK=1 shows where)"
 
 
-def exit_code_of(error: BaseException) -> int:
+def exit_code_of(error: Exception) -> int:
     """Tell bad input from failures.
 
     Examples
@@ -66,16 +76,12 @@ def exit_code_of(error: BaseException) -> int:
     >>> exit_code_of(ValueError("steps must be >= 2, got 1")), exit_code_of(OSError())
     (2, 1)
     """
-    if _is_interrupt(error):
+    if isinstance(error, InterruptedRunError):
         return INTERRUPTED
     if isinstance(error, np.linalg.LinAlgError):
         return FAILURE
     is_asked_wrongly = hasattr(error, "format_message")
     return BAD_INPUT if is_asked_wrongly or isinstance(error, ValueError) else FAILURE
-
-
-def _is_interrupt(error: BaseException) -> bool:
-    return isinstance(error, KeyboardInterrupt | typer.Abort)
 
 
 def _one_line(text: str) -> str:

@@ -5,17 +5,14 @@ import json
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from ..filter_settings import FilterSettings
-
 Tick = Callable[[int, int], None]
 
-_PATIENCE = 1.0  # [s] of silence before the compilation is announced
+_PATIENCE = 1.0  # [s] of silence before a note is printed
 
 
 class Reporter:
@@ -77,25 +74,9 @@ class Reporter:
 
             yield tick
 
-    def warm_up(self, settings: FilterSettings) -> None:
-        """Let an estimator take a first step, and say so if it compiles for long.
-
-        Raises
-        ------
-        ValueError
-            If the estimator refuses its settings.
-        """
-        settings.make(initial_pose=(0.0, 0.0, 0.0))
-        spread = replace(settings, motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2)
-        with self._patience("compiling the filter, once after each installation …"):
-            estimator = spread.make(initial_pose=(0.0, 0.0, 0.0))
-            for _ in range(2):
-                estimator.predict((0.1, 0.0))
-                estimator.update([(0.0, 5.0)], [0])
-
     @contextlib.contextmanager
-    def _patience(self, note: str) -> Iterator[None]:
-        """Print a note if what happens meanwhile takes long."""
+    def patience(self, note: str) -> Iterator[None]:
+        """Print a note to standard error if what happens meanwhile takes long."""
         timer = threading.Timer(_PATIENCE, self._notes.print, [note])
         timer.daemon = True
         timer.start()

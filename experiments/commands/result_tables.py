@@ -88,7 +88,7 @@ def _ratio(numbers: dict[str, Any], hint: tuple[str, str]) -> str:
 def noise_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Lay out the runs of a noise study."""
     table = Table(
-        title="Areas of the final 3σ ellipses, RMS errors; NEES and NIS are 1 if honest",
+        title="Final 3σ areas and RMS errors; of an honest filter NEES and NIS are 1",
         title_justify="left",
         box=None,
         pad_edge=False,

@@ -15,6 +15,7 @@ from .output_folder import default_folder, output_folder
 from .reporter import Reporter
 from .result_tables import key_figures, landmark_table, written
 from .run_files import write_figures, write_log, write_summary
+from .warm_up import warm_up
 from .worlds import recorded
 
 _FEW_STEPS = 60  # of a run whose every step is drawn unless told otherwise
@@ -88,7 +89,7 @@ def _filter_and_write(
     output: Output,
     reporter: Reporter,
 ) -> dict[str, Any]:
-    reporter.warm_up(settings)
+    warm_up(settings, reporter)
     every_step = output.draws_steps(log)
     with reporter.progress("filtering") as tick:
         run = replay(

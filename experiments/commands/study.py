@@ -18,6 +18,7 @@ from .output_folder import default_folder, output_folder
 from .reporter import Reporter, Tick
 from .result_tables import noise_table, written
 from .run_files import write_summary
+from .warm_up import warm_up
 from .worlds import driver, recorded
 
 
@@ -97,7 +98,7 @@ def write_study(study: Study, folder: Path | None, *, as_json: bool) -> None:
         "settings": settings_table(study.settings),
     }
     with output_folder(place) as partial:
-        reporter.warm_up(study.settings)
+        warm_up(study.settings, reporter)
         with reporter.progress("filtering") as tick:
             runs = study.run(tick)
         with reporter.progress("drawing"):
