@@ -10,6 +10,7 @@ thread; a ratio is the median over the rounds.
 import math
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 import pymunk
@@ -24,7 +25,7 @@ STEPS = 200  # steps per call, so that the loop around them costs nothing
 BARE = "bare Space.step"
 HALF_VIEW = {"max_range": 8.0, "field_of_view": math.pi}
 WALLS = [[x, -9.0, x + 1.0, -8.0] for x in range(-5, 5)]
-CASES: dict[str, tuple[dict[str, object], float | None]] = {
+CASES: dict[str, tuple[dict[str, Any], float | None]] = {
     # name: (changes to the preset six_landmarks, goal)
     "6 landmarks": ({}, 22.0),
     "6 landmarks, 8 m, 180°": ({"sensor": HALF_VIEW}, 22.0),
@@ -51,7 +52,7 @@ def bare() -> Call:
     return call
 
 
-def world(changes: dict[str, object]) -> Call:
+def world(changes: dict[str, Any]) -> Call:
     landmarks = changes.get("landmarks")
     if landmarks is not None:
         bounds = [-10.0, -10.0, 10.0, 10.0]

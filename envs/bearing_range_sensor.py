@@ -55,7 +55,7 @@ class BearingRangeSensor:
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
         bearing_std, self._std = sensor.std
-        self._growth = sensor.range_std_per_metre  # k in σr(r) = σr + k r
+        self._growth = sensor.range_std_per_metre  # of σr, per metre of range
         self._max_range = _limit(sensor.max_range, above=math.inf)
         self._half_view = _limit(sensor.field_of_view / 2, above=math.pi)
         self._may_wrap = sensor.field_of_view / 2 + MANY_STD * bearing_std >= math.pi
@@ -95,9 +95,9 @@ class BearingRangeSensor:
         """
         error, nearest, _, _ = noise
         relative = (landmarks - position) * inverse_heading
-        true = np.empty(error.shape)
-        bearings = np.arctan2(relative.imag, relative.real, true[0])
-        ranges = np.abs(relative, true[1])
+        readings = np.empty(error.shape)  # true ones first
+        bearings = np.arctan2(relative.imag, relative.real, readings[0])
+        ranges = np.abs(relative, readings[1])
         mask: BoolArray = ranges > nearest
         if self._max_range is not None:
             mask &= ranges <= self._max_range
@@ -107,12 +107,12 @@ class BearingRangeSensor:
             mask &= ~self._sight.blocked(landmarks, position)
         if self._growth:
             error = np.stack([error[0], error[1] * (self._std + self._growth * ranges)])
-        true += error
+        readings += error
         if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
             wrap_bearings(bearings)
-        readings = np.zeros(error.shape)
-        np.copyto(readings, true, where=mask)
-        return readings, mask
+        seen = np.zeros(error.shape)
+        np.copyto(seen, readings, where=mask)
+        return seen, mask
 
 
 def _limit(value: float, above: float) -> Array | None:

@@ -238,12 +238,13 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
 
     def _command(self, action: ArrayLike) -> tuple[float, float]:
         """Turn an action (v, ω) into the command (d, α) of one step [m, rad]."""
-        speed, turn_rate = _two_finite_numbers(action)
+        speed, turn_rate = _two_numbers(action)
         fastest, quickest = self._limits
-        if not -fastest <= speed <= fastest:
-            speed = math.copysign(fastest, speed)
-        if not -quickest <= turn_rate <= quickest:
-            turn_rate = math.copysign(quickest, turn_rate)
+        if not (-fastest <= speed <= fastest and -quickest <= turn_rate <= quickest):
+            if not (math.isfinite(speed) and math.isfinite(turn_rate)):
+                raise _refusal(action)
+            speed = min(max(speed, -fastest), fastest)
+            turn_rate = min(max(turn_rate, -quickest), quickest)
         return speed * self._dt, turn_rate * self._dt
 
     def _observe(
@@ -268,15 +269,18 @@ def _refuse_to_step(steps: int) -> list[list[float]]:
     raise ResetNeeded("call reset before step")
 
 
-def _two_finite_numbers(action: ArrayLike) -> list[float]:
+def _two_numbers(action: ArrayLike) -> list[float]:
     try:
         array = np.asarray(action)
     except ValueError:  # ragged
-        array = np.empty(0)
-    if array.shape == (2,) and array.dtype.char in _REAL_NUMBERS:
-        numbers: list[float] = array.tolist()
-        if math.isfinite(numbers[0]) and math.isfinite(numbers[1]):
-            return numbers
-    raise ValueError(
+        raise _refusal(action) from None
+    if array.shape != (2,) or array.dtype.char not in _REAL_NUMBERS:
+        raise _refusal(action)
+    numbers: list[float] = array.tolist()
+    return numbers
+
+
+def _refusal(action: ArrayLike) -> ValueError:
+    return ValueError(
         f"action must be 2 finite numbers (v [m/s], ω [rad/s]), got {action!r}"
     )

@@ -21,7 +21,8 @@ Row = TypeVar("Row")
 MANY_STD = 10.0
 """No normal noise exceeds so many standard deviations: the odds are 1e-23."""
 
-_STEPS_PER_BLOCK = 128
+_FIRST_BLOCK = 16  # steps; short, so that a reset is quick
+_LONGEST_BLOCK = 128  # steps; later blocks grow to this
 
 SensorNoise = tuple[Array, Array, Array | None, Array | None]
 """What chance does to the sensor in one step: (error, nearest, clutter, order).
@@ -66,7 +67,7 @@ def spawn_streams(rng: np.random.Generator) -> Streams:
 
 
 class NoiseRows(Generic[Row]):
-    """Endless rows of noise, one per step, drawn in blocks.
+    """Endless rows of noise, one per step, drawn in blocks that grow.
 
     Parameters
     ----------
@@ -82,11 +83,13 @@ class NoiseRows(Generic[Row]):
 
     def __init__(self, draw: Callable[[int], Iterable[Row]]) -> None:
         self._draw = draw
+        self._block = _FIRST_BLOCK
         self._to_come: list[Row] = []  # the next one last
 
     def __next__(self) -> Row:
         if not self._to_come:
-            self._to_come = list(self._draw(_STEPS_PER_BLOCK))[::-1]
+            self._to_come = list(self._draw(self._block))[::-1]
+            self._block = min(2 * self._block, _LONGEST_BLOCK)
         return self._to_come.pop()
 
 

@@ -354,10 +354,8 @@ def test_hidden_identities_without_clutter_reserve_no_rows():
 
 
 def test_the_length_of_a_block_changes_nothing(monkeypatch):
-    def rows(steps_per_block):
-        monkeypatch.setattr(
-            "slamgym.envs.noise_streams._STEPS_PER_BLOCK", steps_per_block
-        )
+    def rows(steps):
+        monkeypatch.setattr("slamgym.envs.noise_streams._FIRST_BLOCK", steps)
         scenario = HIDDEN.with_changes(sensor={"dropout": 0.2})
         noise = sensor_noise_rows(spawn_streams(np.random.default_rng(0)), scenario)
         return [next(noise) for _ in range(40)]

@@ -3,6 +3,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from slamgym.experiments.command_line import main
-from slamgym.experiments.commands import run_and_replay
+from slamgym.experiments.commands import reporter, run_and_replay
 from slamgym.sim_configs import list_presets, load_scenario
 
 COMMANDS = ("run", "replay", "noise-study", "render", "scenarios", "estimators")
@@ -400,3 +401,13 @@ def test_the_installed_program_answers_an_error_with_one_line():
     assert result.returncode == 2
     assert result.stdout == ""
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(("patience", "note"), [(0.01, "compiling\n"), (60.0, "")])
+def test_a_long_silence_is_explained_on_standard_error(
+    patience, note, capsys, monkeypatch
+):
+    monkeypatch.setattr(reporter, "_PATIENCE", patience)
+    with reporter.Reporter(as_json=True).patience("compiling"):
+        time.sleep(0.2)
+    assert capsys.readouterr() == ("", note)
