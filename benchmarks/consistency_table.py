@@ -43,7 +43,10 @@ FILTERS: dict[str, tuple[str, dict[str, Any]]] = {
     "invariant, iterated": ("invariant", {"iterations": 3}),
     "invariant, sequential": ("invariant", {"sequential": True}),
 }
-SLOW = {"unscented": ("unscented", {}), "robocentric": ("robocentric", {})}
+SLOW: dict[str, tuple[str, dict[str, Any]]] = {
+    "unscented": ("unscented", {}),
+    "robocentric": ("robocentric", {}),
+}
 
 
 class Row(NamedTuple):

@@ -28,7 +28,7 @@ from slamgym.estimator.joint_update import update_one
 from slamgym.estimator.kernels import predict
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.05, 0.02, 0.02]), np.array([0.02, 0.08])
-NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+NOISE: dict[str, Any] = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 ODOMETRY = np.array([0.0, 0.0])  # the robot stands, its noise does not
 CONSOLE = Console(width=100)
 
@@ -46,7 +46,7 @@ def prepared(name: str, readings: NDArray[np.float64], **options: Any) -> EkfSla
     assert isinstance(slam, EkfSlam)
     for _ in range(3):
         slam.predict(ODOMETRY)
-        slam.update(readings, np.arange(len(readings)))  # type: ignore[arg-type]
+        slam.update(readings, np.arange(len(readings)))
     return slam
 
 

@@ -48,7 +48,7 @@ def normalised_squared_error(errors: Array, covariances: Array) -> Array:
     >>> normalised_squared_error(np.array([[2.0, 0.0]]), np.array([np.eye(2) * 4]))
     array([1.])
     """
-    usable = np.isfinite(covariances).all(axis=(-2, -1))
+    usable = np.asarray(np.isfinite(covariances).all(axis=(-2, -1)))
     safe = np.where(usable[..., None, None], covariances, np.eye(errors.shape[-1]))
     try:
         weighted = np.linalg.solve(safe, errors[..., None])[..., 0]

@@ -1,6 +1,6 @@
 """EKF-SLAM: the standard filter, on the shared kernels."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import compress
 from math import isfinite
@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from . import validation
 from .error_frames import ErrorFrame
-from .interface import Belief, UpdateReport
+from .interface import Belief, LandmarkIds, UpdateReport
 from .joint_update import (
     ADDED,
     DONE,
@@ -182,7 +182,7 @@ class EkfSlam:
         return self._motion_variance if dt == 1.0 else self._motion_variance * dt
 
     def update(
-        self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct the belief with one scan, then map the landmarks seen first.
 
@@ -309,7 +309,7 @@ class EkfSlam:
         if readings > self._ledger.shape[1]:
             self._ledger = np.zeros((4, 2 * readings), dtype=np.int64)
 
-    def _identities(self, landmark_ids: Sequence[int] | None, count: int) -> list[int]:
+    def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
         if landmark_ids is not None:
             return validation.identities(landmark_ids, count)
         if count:

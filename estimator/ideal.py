@@ -1,13 +1,13 @@
 """The ideal EKF-SLAM: Jacobians at the ground truth, for study only."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import validation
 from .ekf_slam import EkfSlam
-from .interface import UpdateReport
+from .interface import LandmarkIds, UpdateReport
 from .kernels import AT_TRUTH
 
 Array = NDArray[np.float64]
@@ -78,7 +78,7 @@ class IdealEkfSlam(EkfSlam):
         self._reference[:3] = self._true_pose
 
     def update(
-        self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct the belief with one scan, linearised at the truth."""
         if self._rules.linearisation == AT_TRUTH and landmark_ids is not None:

@@ -1,6 +1,6 @@
 """What every estimator promises, and what it answers with."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -14,6 +14,7 @@ from .error_frames import (
     invariant_covariance,
     invariant_error,
 )
+from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 
@@ -165,7 +166,7 @@ class SlamEstimator(Protocol):
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
 
     def update(
-        self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Take in one scan, rows (bearing, range) [rad, m], all seen at once."""
         ...

@@ -1,13 +1,11 @@
 """The robocentric EKF-SLAM: the map lives in the robot's own frame."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .compiled import compiled, part
 from .ekf_slam import EkfSlam
-from .interface import Belief, UpdateReport
+from .interface import Belief, LandmarkIds, UpdateReport
 
 Array = NDArray[np.float64]
 
@@ -54,7 +52,7 @@ class RobocentricEkfSlam(EkfSlam):
         )
 
     def update(
-        self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct map and way with one scan, then move the frame to the robot."""
         report = super().update(measurements, landmark_ids)

@@ -1,14 +1,12 @@
 """The unscented EKF-SLAM: cubature points instead of Jacobians."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import validation
 from .angles import wrap_angle
 from .ekf_slam import EkfSlam
-from .interface import UpdateReport
+from .interface import LandmarkIds, UpdateReport
 
 Array = NDArray[np.float64]
 
@@ -57,7 +55,7 @@ class UnscentedSlam(EkfSlam):
         self._covariance[3:n, :3] = self._covariance[:3, 3:n].T
 
     def update(
-        self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct the belief with one scan, then map the landmarks seen first."""
         readings = validation.scan(measurements)

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from math import isfinite
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 
 
 def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
@@ -47,7 +48,7 @@ def scan(measurements: ArrayLike) -> Array:
     )
 
 
-def identities(landmark_ids: Sequence[int], count: int) -> list[int]:
+def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
     """Return ids as Python integers: one for each of ``count`` readings, no repeats."""
     array = np.asarray(landmark_ids)
     if array.dtype.kind not in "iu" and array.size:

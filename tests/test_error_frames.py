@@ -46,7 +46,7 @@ def test_invariant_covariance_is_the_additive_one_to_first_order():
 
 
 def test_invariant_error_of_no_turn_is_the_difference():
-    shifted = MEAN + [1, 2, 0, 1, 2, 1, 2]
+    shifted = MEAN + np.array([1, 2, 0, 1, 2, 1, 2])
     np.testing.assert_allclose(
         invariant_error(shifted, MEAN), [1, 2, 0, 1, 2, 1, 2], atol=1e-15
     )

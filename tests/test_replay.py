@@ -117,6 +117,12 @@ def test_rows_that_end_together_are_one_step_with_the_scan_at_their_end():
     ]
 
 
+def test_step_0_has_no_motion_even_where_the_first_row_takes_no_time():
+    rows = (OdometryRow(0.0, 0.0, 0.0, 0.0), OdometryRow(0.1, 1.0, 0.0, 0.1))
+    steps = list(steps_of(SlamLog("drive", events=rows)))
+    assert [(s.t, len(s.motions)) for s in steps] == [(0.0, 0), (0.0, 1), (0.1, 1)]
+
+
 def test_the_trace_holds_the_beliefs_before_and_after_every_scan():
     trace = replay(short_drive(), ekf(), keep_history=True).trace
     by_hand = ekf()

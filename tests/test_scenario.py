@@ -361,12 +361,18 @@ class TestPresets:
 
 def test_the_presets_are_these():
     assert list_presets() == (
+        "anchored",
+        "coarse_loop",
         "corridor",
         "dense",
         "dropout",
         "hidden_identities",
         "loop",
+        "loop_unknown_heading",
         "six_landmarks",
+        "slippery",
+        "standing",
+        "unknown_heading",
     )
 
 
