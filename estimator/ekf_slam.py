@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from . import validation
 from .error_frames import ErrorFrame
-from .interface import Belief, LandmarkIds, UpdateReport
+from .interface import Belief, UpdateReport
 from .joint_update import (
     ADDED,
     DONE,
@@ -27,6 +27,7 @@ from .joint_update import (
     update_one,
 )
 from .kernels import ADDITIVE, AT_ESTIMATE, INVARIANT, predict
+from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 

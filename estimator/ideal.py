@@ -7,8 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import validation
 from .ekf_slam import EkfSlam
-from .interface import LandmarkIds, UpdateReport
+from .interface import UpdateReport
 from .kernels import AT_TRUTH
+from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,6 @@ from .error_frames import (
     invariant_covariance,
     invariant_error,
 )
-from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 
@@ -166,7 +165,7 @@ class SlamEstimator(Protocol):
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
 
     def update(
-        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
+        self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
     ) -> UpdateReport:
         """Take in one scan, rows (bearing, range) [rad, m], all seen at once."""
         ...

@@ -5,7 +5,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .compiled import compiled, part
 from .ekf_slam import EkfSlam
-from .interface import Belief, LandmarkIds, UpdateReport
+from .interface import Belief, UpdateReport
+from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 

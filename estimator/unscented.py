@@ -6,7 +6,8 @@ from numpy.typing import ArrayLike, NDArray
 from . import validation
 from .angles import wrap_angle
 from .ekf_slam import EkfSlam
-from .interface import LandmarkIds, UpdateReport
+from .interface import UpdateReport
+from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 
