@@ -1,4 +1,5 @@
 import copy
+import os
 import pickle
 import subprocess
 import sys
@@ -345,7 +346,7 @@ def test_episodes_are_the_same_in_every_process():
         subprocess.Popen(
             [sys.executable, "-c", code],
             stdout=subprocess.PIPE,
-            env={"PYTHONHASHSEED": str(k)},
+            env={**os.environ, "PYTHONHASHSEED": str(k)},
         )
         for k in range(2)
     ]
