@@ -9,7 +9,9 @@ from .ekf_slam import EkfSlam
 
 
 class IteratedEkfSlam(EkfSlam):
-    """Iterated EKF: linearise again at each iterate, condition once [1]_.
+    """Iterated EKF: linearise again at each iterate, condition once.
+
+    The Gauss-Newton method on one scan and its prior [1]_.
 
     ::
 

@@ -241,13 +241,20 @@ def _spread(covariance: Array, column: int, H: Array, i: int, j: int) -> float:
 
 @part
 def meets(mean: Array, covariance: Array, column: int) -> bool:
-    """Whether the robot is within 10 σ of a landmark, where linearising fails."""
+    """Whether the robot is within 10 σ of a landmark, where linearising fails.
+
+    σ is the largest deviation of the landmark's place in the robot's frame, whose error
+    is e_l − e_p − J δ e_θ: a doubt about the heading of the whole map is none here.
+    """
     P, c = covariance, column
-    xx = P[c, c] - 2 * P[c, 0] + P[0, 0]
-    yy = P[c + 1, c + 1] - 2 * P[c + 1, 1] + P[1, 1]
-    xy = P[c, c + 1] - P[c, 1] - P[c + 1, 0] + P[0, 1]
-    spread = (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+    x_turn, y_turn = P[c, 2] - P[0, 2], P[c + 1, 2] - P[1, 2]
+    xx = P[c, c] - 2 * P[c, 0] + P[0, 0] + 2 * dy * x_turn + dy * dy * P[2, 2]
+    yy = P[c + 1, c + 1] - 2 * P[c + 1, 1] + P[1, 1]
+    yy += dx * dx * P[2, 2] - 2 * dx * y_turn
+    xy = P[c, c + 1] - P[c, 1] - P[c + 1, 0] + P[0, 1]
+    xy += dy * y_turn - dx * x_turn - dx * dy * P[2, 2]
+    spread = (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     return bool(dx * dx + dy * dy < 100 * spread)
 
 

@@ -18,12 +18,12 @@ RESERVED = (-(2**63), 1 - 2**63)  # ids that hold these two places
 
 
 class RobocentricEkfSlam(EkfSlam):
-    """EKF-SLAM with world origin and landmarks estimated in the robot's frame [1]_.
+    """EKF-SLAM with world origin and landmarks estimated in the robot's frame.
 
-    Between scans only the way w = (x, y, θ) driven since the last one is estimated,
-    starting from zero with no uncertainty; a scan is linearised at w and the map in the
-    frame of the last scan, and then the frame moves along: every point q and the
-    world's heading φ in the robot's frame become::
+    After Castellanos et al. [1]_.  Between scans only the way w = (x, y, θ) driven
+    since the last one is estimated, starting from zero with no uncertainty; a scan is
+    linearised at w and the map in the frame of the last scan, and then the frame moves
+    along: every point q and the world's heading φ in the robot's frame become::
 
         q ← R(−θ_w) (q − (x_w, y_w)),    φ ← φ − θ_w,    w ← 0
 

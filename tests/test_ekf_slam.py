@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from dense_ekf import DenseEkf
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from numeric_jacobian import numeric_jacobian
 from scipy.stats import chi2
 
 from slamgym.estimator import EkfSlam
@@ -191,11 +192,40 @@ def test_reading_below_the_minimum_range_is_skipped_and_reported(distance):
 
 def test_landmark_at_the_robot_is_reported_as_near():
     slam = make()
-    slam.update([(0.0, 0.5)], [0])
+    slam.update([(0.0, 0.9), (1.0, 4.0)], [0, 1])
     slam.predict((0.5, 0.0))
-    report = slam.update([(0.0, 0.02)], [0])
-    assert report.near_ids == (0,) or report.skipped_ids == (0,)
-    assert np.isfinite(slam.belief().covariance).all()
+    report = slam.update([(0.0, 0.4)], [0])
+    assert report.near_ids == (0,)
+    assert report.associated_ids == (0,)
+
+
+def test_a_doubt_about_the_heading_alone_makes_no_landmark_near():
+    slam = EkfSlam((0, 0, 0), (0.001, 0.001), initial_pose_std=(1.0, 1.0, 0.5))
+    slam.update([(0.3, 5.0)], [0])
+    assert slam.update([(0.3, 5.0)], [0]).near_ids == ()
+
+
+def place_in_robot_frame(state):
+    c, s = np.cos(state[2]), np.sin(state[2])
+    return np.array([[c, s], [-s, c]]) @ (state[3:5] - state[:2])
+
+
+def test_near_means_ten_deviations_of_the_place_in_the_robots_frame():
+    rng = np.random.default_rng(0)
+    both = set()
+    for seed in range(40):
+        slam = run(5, seed=seed)
+        state = slam.state_dict()
+        root = rng.standard_normal((15, 15)) * 10 ** rng.uniform(-3, -1)
+        state["covariance"] = root @ root.T
+        slam.load_state_dict(state)
+        H = numeric_jacobian(place_in_robot_frame, state["mean"])
+        sigma = np.sqrt(np.linalg.eigvalsh(H @ state["covariance"] @ H.T)[-1])
+        expected = np.hypot(*place_in_robot_frame(state["mean"])) < 10 * sigma
+        report = slam.update([(0.0, 3.0)], [slam.belief().landmark_ids[0]])
+        assert bool(report.near_ids) == expected
+        both.add(bool(expected))
+    assert both == {True, False}
 
 
 def test_degenerate_innovation_names_the_landmark_and_changes_nothing():
