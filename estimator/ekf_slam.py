@@ -3,12 +3,11 @@
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import compress
-from math import isfinite
+from math import isfinite, log1p
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtri
 
 from . import validation
 from .error_frames import ErrorFrame
@@ -61,8 +60,11 @@ class EkfSlam:
         drops that correlation, which makes the filter overconfident: it exists to
         reproduce results obtained so.
     range_std_per_metre : float
-        Part of σr that grows with the range: σr(r) = σr + k r, at the range that the
-        belief expects, or for a new landmark at the range as read.
+        Part of σr that grows with the range: σr(r) = σr + k r.
+    range_noise_at : {"expected", "reading"}
+        Which range that is: the one that the belief expects, or the one read, which
+        many filters take although it trusts readings more just when they are short.
+        For a new landmark it is always the one read.
     gate_probability : float or None
         Readings of mapped landmarks outside this chi-square region of their own
         innovation are rejected; None accepts all.
@@ -108,6 +110,7 @@ class EkfSlam:
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
         landmark_init: str = "full",
         range_std_per_metre: float = 0.0,
+        range_noise_at: str = "expected",
         gate_probability: float | None = None,
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
@@ -120,7 +123,10 @@ class EkfSlam:
             Rules(
                 linearisation=self._linearisation,
                 frame=self._frame,
-                correlated=_is_full(landmark_init),
+                correlated=validation.one_of(
+                    "landmark_init", landmark_init, ("full", "independent")
+                )
+                == "full",
                 bearing_std=float(sensor[0]),
                 range_std=float(sensor[1]),
                 range_std_per_metre=validation.at_least(
@@ -128,6 +134,10 @@ class EkfSlam:
                 ),
                 min_range=validation.above("min_range", min_range, 0.0),
                 gate=_gate(gate_probability),
+                noise_as_read=validation.one_of(
+                    "range_noise_at", range_noise_at, ("expected", "reading")
+                )
+                == "reading",
             )
         )
         self._ledger = np.zeros((4, 8), dtype=np.int64)
@@ -370,14 +380,6 @@ class EkfSlam:
         )
 
 
-def _is_full(landmark_init: str) -> bool:
-    if landmark_init not in ("full", "independent"):
-        raise ValueError(
-            f"landmark_init must be 'full' or 'independent', got {landmark_init!r}"
-        )
-    return landmark_init == "full"
-
-
 def _gate(probability: float | None) -> float:
     """χ²(2) quantile of the gate."""
     if probability is None:
@@ -386,7 +388,7 @@ def _gate(probability: float | None) -> float:
         raise ValueError(
             f"gate_probability must lie between 0 and 1, got {probability!r}"
         )
-    return float(chdtri(2, 1 - probability))
+    return -2 * log1p(-probability)  # P(χ²₂ > g) = e^{−g/2}
 
 
 def _checked_state(

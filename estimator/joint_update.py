@@ -44,6 +44,7 @@ class Rules(NamedTuple):
     range_std_per_metre: float = 0.0
     min_range: float = 1e-3  # [m]
     gate: float = np.inf  # largest NIS of one reading
+    noise_as_read: bool = False  # take σr at the range as read, not as expected
 
 
 class Workspace(NamedTuple):
@@ -110,6 +111,7 @@ def as_rules(values: Array) -> Rules:
         values[7],
         values[8],
         values[9],
+        values[10] > 0,
     )
 
 
@@ -286,8 +288,9 @@ def screen(
         ledger[COLUMN, used] = column
         work.readings[used, 0] = readings[k, 0]
         work.readings[used, 1] = readings[k, 1]
-        # The range as read would make σr small just where its error is negative.
-        set_variance(rules, expected, work.variances[used])
+        # The range as read makes σr small just where its error is negative.
+        at = readings[k, 1] if rules.noise_as_read else expected
+        set_variance(rules, at, work.variances[used])
         ledger[NEAR, k] = meets(mean, covariance, column)
         if rules.gate < np.inf:
             where, H, nu = rules.linearisation, work.jacobians[0], work.innovations[0]

@@ -83,7 +83,8 @@ class UnscentedSlam(EkfSlam):
         expected, spread = _through_sensor(self._mean[:n], deviations, columns)
         innovation = readings - expected
         innovation[:, 0] = wrap_angle(innovation[:, 0])
-        noise = self._noise_variances(expected[:, 1])
+        at = readings if self._rules.noise_as_read else expected
+        noise = self._noise_variances(at[:, 1])
         kept = self._within_gate(innovation, spread, noise)
         rows = np.repeat(kept, 2)
         spread, nu = spread[rows], innovation.ravel()[rows]

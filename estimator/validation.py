@@ -97,3 +97,11 @@ def whole(name: str, value: int, least: int) -> int:
     if isinstance(value, bool) or value != int(value) or value < least:
         raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
     return int(value)
+
+
+def one_of(name: str, value: str, choices: tuple[str, ...]) -> str:
+    """Return one of a few words, or refuse another."""
+    if value not in choices:
+        wanted = " or ".join(repr(choice) for choice in choices)
+        raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    return value

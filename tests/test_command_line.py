@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments.command_line import main
 from slamgym.experiments.commands import reporter, run_and_replay
 from slamgym.sim_configs import list_presets, load_scenario
@@ -177,6 +178,28 @@ def test_the_pictures_of_single_steps_can_be_left_out(log):
     assert not [name for name in files if name.startswith("map_steps")]
 
 
+@pytest.mark.parametrize("flag", ["--every-step", "--no-every-step"])
+def test_every_map_is_kept_where_every_step_is_drawn(log, flag, monkeypatch):
+    histories = []
+    monkeypatch.setattr(
+        run_and_replay,
+        "write_figures",
+        lambda folder, replay, **_: histories.append(replay.trace.landmark_history),
+    )
+    rows = "".join(f"odometry,{t},0.1,0,1\n" for t in range(2, 602))
+    log.write_text(LOG + rows)
+    answered("replay", log, flag)
+    distinct = {id(landmarks.means) for landmarks in histories[0]}
+    assert len(histories[0]) == 602
+    assert (len(distinct) == 602) == (flag == "--every-step")
+
+
+def test_a_random_controller_wanders_the_same_way_for_the_same_seed(without_pictures):
+    options = ("run", "loop", "--steps", 5, "--controller", "random")
+    assert answered(*options)["pose"] == answered(*options)["pose"]
+    assert answered(*options)["pose"] != answered(*options, "--seed", 1)["pose"]
+
+
 def test_an_older_output_is_replaced_as_a_whole(log, without_pictures):
     first = answered("replay", log, "--out", "out")
     (log.parent / "out" / "map.png").write_text("old")
@@ -184,6 +207,12 @@ def test_an_older_output_is_replaced_as_a_whole(log, without_pictures):
     assert first["pose_covariance"] != second["pose_covariance"]
     assert (log.parent / "out" / "map.png").read_text() == "a picture"
     assert sorted(os.listdir()) == ["little.csv", "out"]
+
+
+def test_a_belief_that_degenerates_is_a_failure_and_no_wrong_input(log):
+    noise = ("--motion-std", "0,0,0", "--measurement-std", "0,0")
+    message = refused("replay", log, *noise, code=1)
+    assert message.startswith("little, t = 1: the innovation covariance is not")
 
 
 def test_a_folder_with_other_things_is_left_alone(log, without_pictures):
@@ -340,6 +369,18 @@ def test_a_film_has_one_frame_per_step_and_one_of_the_start():
     assert summary == {"out": "film.gif", "frames": 4, "fps": 4.0}
     with Image.open("film.gif") as film:
         assert film.n_frames == 4
+
+
+def test_a_film_shows_the_belief_of_a_replay(without_pictures, monkeypatch):
+    shown = []
+    monkeypatch.setattr(
+        LandmarkWorldEnv, "show_belief", lambda self, belief: shown.append(belief)
+    )
+    options = ("six_landmarks", "--steps", 3, "--seed", 5)
+    printed("render", *options, "--out", "film.gif")
+    summary = answered("run", *options)
+    assert len(shown) == 4
+    assert shown[-1].pose.tolist() == summary["pose"]
 
 
 def test_a_world_that_hides_identities_is_filmed_without_a_filter():

@@ -154,6 +154,18 @@ def test_range_noise_grows_with_the_range():
     assert variance == pytest.approx((MEASUREMENT_STD[1] + 1.0) ** 2)
 
 
+def test_range_noise_is_that_of_the_expected_range_or_of_the_one_read():
+    variances = {}
+    for at in ("expected", "reading"):
+        slam = make(range_std_per_metre=0.1, range_noise_at=at)
+        slam.update([(0.0, 10.0)], [0])
+        prior = slam.belief().covariance[3, 3]
+        S = slam.update([(0.0, 5.0)], [0]).innovation_covariance
+        variances[at] = S[1, 1] - prior
+    assert variances["expected"] == pytest.approx((MEASUREMENT_STD[1] + 1.0) ** 2)
+    assert variances["reading"] == pytest.approx((MEASUREMENT_STD[1] + 0.5) ** 2)
+
+
 def test_gate_rejects_an_outlier_and_reports_it():
     plain, gated = run(20), run(20, gate_probability=0.999)
     *_, (odometry, readings, _) = drive(0, 21)
@@ -273,6 +285,7 @@ def test_bad_input_is_refused_by_name_and_changes_nothing(call, message):
         ({"measurement_std": (-1, 0.1)}, "measurement_std must be 2 finite"),
         ({"initial_pose_std": (0, np.nan, 0)}, "pose_std must be 3 finite"),
         ({"landmark_init": "none"}, "landmark_init must be 'full' or 'independent'"),
+        ({"range_noise_at": "true"}, "range_noise_at must be 'expected' or 'reading'"),
         ({"gate_probability": 1.5}, "gate_probability must lie between 0 and 1"),
         ({"min_range": 0.0}, "min_range must be a finite number > 0"),
         ({"range_std_per_metre": -1.0}, "range_std_per_metre must be a finite"),
