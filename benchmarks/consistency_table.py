@@ -11,7 +11,9 @@ freedom; share of runs that diverged beyond all numbers, which the others leave 
 """
 
 import argparse
+import sys
 import time
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +35,8 @@ SCENARIOS = (
     "slippery",
     "standing",
 )
-FILTERS: dict[str, tuple[str, dict[str, Any]]] = {
+Filters = dict[str, tuple[str, dict[str, Any]]]
+FILTERS: Filters = {
     "ekf": ("ekf", {}),
     "ekf, independent": ("ekf", {"landmark_init": "independent"}),
     "iterated": ("iterated", {}),
@@ -43,7 +46,7 @@ FILTERS: dict[str, tuple[str, dict[str, Any]]] = {
     "invariant, iterated": ("invariant", {"iterations": 3}),
     "invariant, sequential": ("invariant", {"sequential": True}),
 }
-SLOW: dict[str, tuple[str, dict[str, Any]]] = {
+SLOW: Filters = {
     "unscented": ("unscented", {}),
     "robocentric": ("robocentric", {}),
 }
@@ -145,19 +148,36 @@ def measure(data: SimulatedRuns, trace: BatchTrace) -> Row:
     )
 
 
-def print_table(name: str, runs: int, seed: int, filters: dict[str, Any]) -> None:
-    """Run all filters on one scenario and print their rows."""
+def rows_of(
+    name: str, runs: int, seed: int, filters: Filters
+) -> Iterator[tuple[str, Row]]:
+    """Run all filters on one scenario."""
     scenario = load_scenario(name)
     data = simulate_runs(scenario, runs, seed)
-    table = Table(title=f"{name}, {runs} runs, seed {seed}")
+    for label, (estimator, options) in filters.items():
+        run = run_singly if label in SLOW else run_batch
+        yield label, measure(data, run(estimator, scenario, data, options))
+
+
+def print_table(title: str, rows: Iterable[tuple[str, Row]]) -> None:
+    """Print one scenario's rows on a terminal."""
+    table = Table(title=title)
     table.add_column("filter")
     for column in Row._fields:
         table.add_column(column.replace("_", " "), justify="right")
-    for label, (estimator, options) in filters.items():
-        run = run_singly if label in SLOW else run_batch
-        row = measure(data, run(estimator, scenario, data, options))
+    for label, row in rows:
         table.add_row(label, *(format_number(value) for value in row))
-    Console(width=120).print(table)
+    Console(width=132).print(table)
+
+
+def print_markdown(title: str, rows: Iterable[tuple[str, Row]]) -> None:
+    """Print one scenario's rows for a document."""
+    names = [name.replace("_", " ") for name in Row._fields]
+    print(f"**{title}**\n\n| filter | {' | '.join(names)} |")
+    print("|---|" + "---:|" * len(names))
+    for label, row in rows:
+        print(f"| {label} | {' | '.join(format_number(value) for value in row)} |")
+    print()
 
 
 def format_number(value: float) -> str:
@@ -172,12 +192,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--scenario", choices=SCENARIOS, action="append")
     parser.add_argument("--slow", action="store_true", help="the slow filters too")
+    parser.add_argument("--markdown", action="store_true", help="for a document")
     arguments = parser.parse_args()
     filters = FILTERS | (SLOW if arguments.slow else {})
     began = time.perf_counter()
+    show = print_markdown if arguments.markdown else print_table
     for name in arguments.scenario or SCENARIOS:
-        print_table(name, arguments.runs, arguments.seed, filters)
-    print(f"{time.perf_counter() - began:.0f} s")
+        title = f"{name}, {arguments.runs} runs, seed {arguments.seed}"
+        show(title, rows_of(name, arguments.runs, arguments.seed, filters))
+    print(f"{time.perf_counter() - began:.0f} s", file=sys.stderr)
 
 
 if __name__ == "__main__":
