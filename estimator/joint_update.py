@@ -28,7 +28,7 @@ USED, ADDED, GATED, SKIPPED = 0, 1, 2, 3
 DONE, NOT_FINITE = -1, -2
 
 # Above this size of the state, one pass over P costs more than a triangular solve.
-LARGE = 200
+LARGE = 250
 
 
 class Rules(NamedTuple):
@@ -86,7 +86,7 @@ def new_workspace(m: int, size: int, capacity: int, rules: Rules) -> Workspace:
 @part
 def block_of(size: int, readings: int) -> int:
     """How many readings to absorb at a time: a few while P fits the fast caches."""
-    return 4 if size <= LARGE else max(readings, 1)
+    return 6 if size <= LARGE else max(readings, 1)
 
 
 @part
