@@ -81,7 +81,6 @@ def map_sequence(
     place.mkdir(parents=True, exist_ok=True)
     parts = _map_parts(trace)
     parts.figure.set_dpi(dpi)
-    parts.figure.draw_without_rendering()  # for its layout, see save_figure
     blitted = BlittedFigure(parts.figure, [*parts.picture.moving, *parts.titles])
     digits = max(3, len(str(trace.last_step)))
     files = [
@@ -172,7 +171,9 @@ def _map_parts(trace: RunTrace) -> _MapParts:
         frameon=False,
         fontsize=9,
     )
-    return _MapParts(figure, picture, write_title(axes, *_title(trace, 0)), trace)
+    titles = write_title(axes, *_title(trace, 0))
+    figure.draw_without_rendering()  # one layout is not enough where axes are equal
+    return _MapParts(figure, picture, titles, trace)
 
 
 def _title(trace: RunTrace, step: int) -> tuple[str, str]:
