@@ -69,6 +69,7 @@ def replay(
         The log; a scan without landmark ids is left to the estimator to associate.
     estimator : SlamEstimator
         At its start, with an empty map; it is at the end of the log afterwards.
+        One with a door for the truth (``ideal``) is told it, where the log has it all.
     name : str, optional
         What to call the estimator; its class by default.
     keep_history : bool, default False
@@ -100,18 +101,35 @@ def replay(
     ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1)
     """
     steps = list(steps_of(log))
+    times = np.array([step.t for step in steps], dtype=np.float64)
+    tell_truth = _truth_teller(estimator, log, times)
     recorder = _Recorder(len(steps), MapHistory(None if keep_history else _MOST_MAPS))
     for number, step in enumerate(steps):
         try:
+            tell_truth(number)
             _take(step, log, estimator, recorder)
         except ValueError as error:
             raise _kind(error)(f"{log.name}, t = {step.t:g}: {error}") from error
         if progress is not None:
             progress(number + 1, len(steps))
-    times = np.array([step.t for step in steps], dtype=np.float64)
     trace = recorder.trace(name or type(estimator).__name__, times, log)
     scans = sum(step.scan is not None for step in steps)
     return Replay(log, trace, recorder.belief, scans, recorder.counts())
+
+
+def _truth_teller(
+    estimator: SlamEstimator, log: SlamLog, times: Array
+) -> Callable[[int], None]:
+    """Make what opens the door for the truth at a step, where an estimator has one."""
+    observe = getattr(estimator, "observe_truth", None)
+    poses = true_poses_of(log, times)
+    seen = {i for e in log.events if isinstance(e, Scan) for i in _ids(e) or ()}
+    landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
+    if observe is None or poses is None or not seen <= set(landmarks):
+        return lambda _: None
+    if not np.isfinite(poses).all():
+        return lambda _: None
+    return lambda step: observe(poses[step], landmarks)
 
 
 def _take(

@@ -454,3 +454,28 @@ def test_on_the_course_log_the_invariant_filter_is_right_in_either_way(public_lo
     assert course_rmse(public_logs, "invariant") <= 0.003
     assert course_rmse(public_logs, "invariant", sequential=True) <= 0.003
     assert course_rmse(public_logs, "ekf") == pytest.approx(0.0086, abs=1e-4)
+
+
+def test_an_estimator_with_a_door_for_the_truth_is_told_it():
+    told = []
+
+    class Student(Listener):
+        def observe_truth(self, pose, landmarks):
+            told.append((pose.tolist(), sorted(landmarks)))
+
+    truth = np.array([[0, 0, 0, 0], [1, 1, 0, 0.2], [3, 2, 0.1, 0.1]], dtype=float)
+    landmarks = {"landmark_ids": np.array([3, 7, 9]), "landmarks": np.zeros((3, 2))}
+    replay(short_drive(ground_truth=truth, **landmarks), Student())
+    assert [pose[0] for pose, _ in told] == [0.0, 1.0, 1.5, 2.0]
+    assert {tuple(ids) for _, ids in told} == {(3, 7, 9)}
+
+
+def test_a_log_without_all_the_truth_tells_none():
+    class Student(Listener):
+        def observe_truth(self, pose, landmarks):
+            raise AssertionError("told")
+
+    replay(short_drive(), Student())
+    truth = np.zeros((2, 4))
+    truth[1, 0] = 3.0
+    replay(short_drive(ground_truth=truth), Student())
