@@ -397,7 +397,7 @@ def update_one(
     Returns outcome, used and nis of :func:`update_belief`, and of the readings used ν
     (m, 2) and what :func:`joint_factor` needs, (2m, 10 + 2m): for each row of the scan
     its five entries of H, its row of the diagonal block of L, and its row of A in the
-    columns of the pose and of the landmarks.
+    columns of the pose and of the landmarks read after its own.
     """
     rules = as_rules(rule_values)
     work = new_workspace(len(readings), size, len(mean), rules)
@@ -406,7 +406,7 @@ def update_one(
     )
     if outcome != DONE:
         return outcome, used, nis, work.readings, work.readings
-    record = np.empty((2 * used, 10 + 2 * used))
+    record = np.zeros((2 * used, 10 + 2 * used))
     for k in range(used):
         for i in range(2):
             row = 2 * k + i
@@ -416,7 +416,7 @@ def update_one(
             record[row, 6] = work.roots[0, k, 2 * i]
             for j in range(3):
                 record[row, 7 + j] = work.gains[0, row, j]
-            for j in range(used):
+            for j in range(k + 1, used):
                 c = ledger[COLUMN, j]
                 record[row, 10 + 2 * j] = work.gains[0, row, c]
                 record[row, 11 + 2 * j] = work.gains[0, row, c + 1]

@@ -322,28 +322,34 @@ def downdate(covariance: Array, size: int, gains: Array, first: int, last: int) 
     the registers of a processor busy.
     """
     whole = last - (last - first) % 4
-    for i in range(0, size, 2):
-        width = _padded(i + 2)
-        for k in range(first, whole, 4):
-            b0, b1, b2, b3 = _column(gains, k, i)
-            c0, c1, c2, c3 = _column(gains, k, i + 1)
+    one, end = np.uint64(1), np.uint64(size)
+    for i in range(np.uint64(0), end, np.uint64(2)):  # unsigned: never from the end
+        below, width = i + one, np.uint64(_padded(int(i) + 2))
+        for k0 in range(np.uint64(first), np.uint64(whole), np.uint64(4)):
+            k1 = k0 + one
+            k2 = k1 + one
+            k3 = k2 + one
+            b0, b1, b2, b3 = gains[k0, i], gains[k1, i], gains[k2, i], gains[k3, i]
+            c0, c1 = gains[k0, below], gains[k1, below]
+            c2, c3 = gains[k2, below], gains[k3, below]
             for j in range(width):
-                a0, a1, a2, a3 = _column(gains, k, j)
-                p, q = covariance[i, j], covariance[i + 1, j]
+                a0, a1, a2, a3 = gains[k0, j], gains[k1, j], gains[k2, j], gains[k3, j]
+                p, q = covariance[i, j], covariance[below, j]
                 covariance[i, j] = p - b0 * a0 - b1 * a1 - b2 * a2 - b3 * a3
-                covariance[i + 1, j] = q - c0 * a0 - c1 * a1 - c2 * a2 - c3 * a3
+                covariance[below, j] = q - c0 * a0 - c1 * a1 - c2 * a2 - c3 * a3
         if whole < last:
-            b0, c0 = gains[whole, i], gains[whole, i + 1]
-            b1, c1 = gains[whole + 1, i], gains[whole + 1, i + 1]
+            r0 = np.uint64(whole)
+            r1 = r0 + one
+            b0, b1, c0, c1 = (
+                gains[r0, i],
+                gains[r1, i],
+                gains[r0, below],
+                gains[r1, below],
+            )
             for j in range(width):
-                a0, a1 = gains[whole, j], gains[whole + 1, j]
+                a0, a1 = gains[r0, j], gains[r1, j]
                 covariance[i, j] = covariance[i, j] - b0 * a0 - b1 * a1
-                covariance[i + 1, j] = covariance[i + 1, j] - c0 * a0 - c1 * a1
-
-
-@part
-def _column(gains: Array, k: int, j: int) -> tuple[float, float, float, float]:
-    return gains[k, j], gains[k + 1, j], gains[k + 2, j], gains[k + 3, j]
+                covariance[below, j] = covariance[below, j] - c0 * a0 - c1 * a1
 
 
 @part
