@@ -188,13 +188,12 @@ def absorb(
     for first in range(0, m, block):
         last = min(first + block, m)
         if first > 0:
-            for i in range(3):
-                _refresh(covariance, size, i)
+            _refresh(covariance, size, 0)
+            _refresh(covariance, size, 2)
         for k in range(first, last):
             c = columns[k]
             if first > 0:
                 _refresh(covariance, size, c)
-                _refresh(covariance, size, c + 1)
             _correlate(covariance, size, c, jacobians, k, gains)
             for before in range(2 * first, 2 * k, 2):
                 _orthogonalise(size, c, jacobians, k, gains, before)
@@ -202,16 +201,18 @@ def absorb(
                 return k
             _shift(size, c, jacobians, k, innovations, gains, roots, white, shift)
         downdate(covariance, size, gains, 2 * first, 2 * last)
-    for i in range(size):
+    for i in range(0, size, 2):
         _refresh(covariance, size, i)
     return -1
 
 
 @part
 def _refresh(covariance: Array, size: int, row: int) -> None:
-    """Copy a column of the lower half into its row."""
-    for j in range(row + 1, size):
+    """Copy two columns of the lower half into their rows."""
+    covariance[row, row + 1] = covariance[row + 1, row]
+    for j in range(row + 2, size):
         covariance[row, j] = covariance[j, row]
+        covariance[row + 1, j] = covariance[j, row + 1]
 
 
 @part
