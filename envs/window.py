@@ -1,7 +1,7 @@
 """Matplotlib's own window, for watching an episode."""
 
+import logging
 import time
-import warnings
 
 from matplotlib import pyplot
 from matplotlib.figure import Figure
@@ -12,8 +12,8 @@ from .blitting import BlittedFigure
 class Window:
     """A figure on the screen that shows a limited number of frames per second.
 
-    Warns when matplotlib has no backend with windows: then nothing can be seen. A
-    window that its user has closed stays closed.
+    Says so in the log when matplotlib has no backend with windows: then nothing can be
+    seen. A window that its user has closed stays closed.
     """
 
     def __init__(self, fps: float) -> None:
@@ -24,10 +24,9 @@ class Window:
         if self._has_screen:
             self.figure.show()
         else:
-            warnings.warn(
-                f"matplotlib's backend {pyplot.get_backend()!r} has no windows: "
-                "mode 'human' shows nothing",
-                stacklevel=4,
+            logging.getLogger(__name__).warning(
+                "matplotlib's backend %r has no windows: mode 'human' shows nothing",
+                pyplot.get_backend(),
             )
 
     def refresh(self, blitted: BlittedFigure) -> None:
