@@ -38,7 +38,7 @@ class BatchSlam:
     Run i gives the same bits as a single filter fed the data of run i; landmark ids
     are the rows 0 … L−1 of the measurement arrays.  The runs are shared out over
     threads.  A run whose data is not finite or whose innovation covariance fails stops
-    there, with nan from that step on; the others go on.
+    there for good, with nan from that step on; the others go on.
 
     Parameters
     ----------
@@ -88,7 +88,8 @@ class BatchSlam:
         self.runs = validation.whole("runs", runs, 1)
         self.landmarks = validation.whole("landmarks", landmarks, 0)
         self._estimator = estimator
-        self._threads = threads or os.cpu_count() or 1
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        self._threads = validation.whole("threads", threads or cores, 1)
         std = validation.standard_deviations("initial_pose_std", initial_pose_std, 3)
         first = validation.as_floats("initial_poses", initial_poses)
         if first.shape not in ((3,), (self.runs, 3)) or not np.isfinite(first).all():
@@ -105,7 +106,10 @@ class BatchSlam:
         self._slots = np.full((self.runs, self.landmarks), -1, dtype=np.int64)
         self._mapped = np.zeros(self.runs, dtype=np.int64)
         self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
-        """Step of the last :meth:`run` at which a run stopped, -1 where it did not."""
+        """Step of the last :meth:`run` at which a run stopped, -1 where it did not.
+
+        A run that has stopped stays so, at step 0 of every later :meth:`run`.
+        """
 
     def run(
         self,
@@ -262,6 +266,10 @@ def make_batch(
     ValueError
         Where the filter is unknown or cannot run in batches.
     """
+    if "initial_pose" in options:
+        raise ValueError(
+            "initial_pose must be given as initial_poses, one for each run"
+        )
     estimator = find_estimator(name)(
         motion_std=motion_std, measurement_std=measurement_std, **options
     )

@@ -51,11 +51,16 @@ def drive_runs(  # every array of a batch once, with a leading run axis
     ids = np.empty(landmarks, np.int64)
     variance = np.empty(3)
     for b in range(len(means)):
-        failed_at[b] = NEVER
+        if failed_at[b] != NEVER:
+            failed_at[b] = 0
+            continue
         mean, covariance = means[b], covariances[b]
         for t in range(len(dt)):
             d, turn = odometry[b, t, 0], odometry[b, t, 1]
-            if not (np.isfinite(d) and np.isfinite(turn)):
+            m = gather(
+                measurements[b, t], visible[b, t], slots[b], readings, ids, ledger
+            )
+            if not (np.isfinite(d) and np.isfinite(turn) and m >= 0):
                 failed_at[b] = t
                 break
             share = dt[t] if motion_values[3] > 0 or d != 0 or turn != 0 else 0.0
@@ -71,9 +76,6 @@ def drive_runs(  # every array of a batch once, with a leading run axis
                 variance,
                 rules.linearisation,
                 references[b],
-            )
-            m = gather(
-                measurements[b, t], visible[b, t], slots[b], readings, ids, ledger
             )
             outcome, used, nis[b, t] = update_belief(
                 mean,
@@ -106,10 +108,17 @@ def gather(
     ids: Int,
     ledger: Int,
 ) -> int:
-    """Collect the readings that there are, and their places in the map."""
+    """Collect the readings that there are, and their places in the map.
+
+    Returns how many, or -1 where one is not finite.
+    """
     m = 0
     for i in range(len(visible)):
         if visible[i]:
+            if not (
+                np.isfinite(measurements[i, 0]) and np.isfinite(measurements[i, 1])
+            ):
+                return -1
             readings[m, 0], readings[m, 1] = measurements[i, 0], measurements[i, 1]
             ids[m] = i
             ledger[SLOT, m] = slots[i]

@@ -1,10 +1,14 @@
 """Compile numerical kernels with numba, and never run a stale one."""
 
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from numba import njit
+
+SOURCES = Path(__file__).parent
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
@@ -37,24 +41,27 @@ def _compile(function: Kernel, *, callable_from_python: bool) -> Kernel:
         "no_cfunc_wrapper": True,
         "no_cpython_wrapper": not callable_from_python,
     }
-    return cast("Kernel", njit(**options)(function))
+    kernel = njit(**options)(function)
+    stats = getattr(kernel, "stats", None)  # None without JIT
+    if stats is not None:
+        discard_stale_cache(SOURCES, Path(stats.cache_path))
+    return cast("Kernel", kernel)
 
 
-def discard_stale_cache(folder: Path) -> None:
-    """Delete cached kernels that are older than any source file of the folder.
+@cache
+def discard_stale_cache(sources: Path, cached: Path) -> None:
+    """Delete cached kernels that are older than any source file; once per folder.
 
     Numba looks at the file of the kernel itself only, not at the files of the kernels
     it calls: after an edit of one of those it would run yesterday's code.
 
     Parameters
     ----------
-    folder : Path
-        Folder of the sources, with numba's cache in its ``__pycache__``.
+    sources, cached : Path
+        Folder of the sources, and the folder in which numba keeps what it compiled.
     """
-    newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
-    for cached in (folder / "__pycache__").glob("*.nb[ic]"):
-        if cached.stat().st_mtime < newest:
-            cached.unlink(missing_ok=True)
-
-
-discard_stale_cache(Path(__file__).parent)
+    newest = max((f.stat().st_mtime for f in sources.glob("*.py")), default=0.0)
+    for file in cached.glob("*.nb[ic]"):
+        with suppress(OSError):  # somebody else's cache
+            if file.stat().st_mtime < newest:
+                file.unlink()

@@ -22,6 +22,15 @@ from .error_frames import (
 
 Array = NDArray[np.float64]
 
+SINGULAR = 1e-10  # eigenvalue of a correlation matrix that counts as zero
+
+
+class LjungBox(NamedTuple):
+    """Test of whiteness."""
+
+    statistic: float
+    p_value: float
+
 
 class Band(NamedTuple):
     """Interval in which an average lies with the stated probability."""
@@ -48,14 +57,18 @@ def normalised_squared_error(errors: Array, covariances: Array) -> Array:
     >>> normalised_squared_error(np.array([[2.0, 0.0]]), np.array([np.eye(2) * 4]))
     array([1.])
     """
-    usable = np.asarray(np.isfinite(covariances).all(axis=(-2, -1)))
-    safe = np.where(usable[..., None, None], covariances, np.eye(errors.shape[-1]))
-    try:
-        weighted = np.linalg.solve(safe, errors[..., None])[..., 0]
-    except np.linalg.LinAlgError:
-        weighted = (np.linalg.pinv(safe) @ errors[..., None])[..., 0]
-        usable = usable & (np.linalg.matrix_rank(safe) == errors.shape[-1])
-    return np.where(usable, (errors * weighted).sum(axis=-1), np.nan)
+    std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
+    usable = np.isfinite(errors).all(axis=-1) & (std > 0).all(axis=-1)
+    usable = np.asarray(usable & np.isfinite(covariances).all(axis=(-2, -1)))
+    result = np.full(usable.shape, np.nan)
+    std, scaled = std[usable], errors[usable] / std[usable]
+    correlation = covariances[usable] / std[:, :, None] / std[:, None, :]
+    regular = np.linalg.eigvalsh(correlation)[:, 0] > SINGULAR
+    scaled, correlation = scaled[regular], correlation[regular]
+    weighted = np.linalg.solve(correlation, scaled[..., None])[..., 0]
+    usable[usable] = regular
+    result[usable] = (scaled * weighted).sum(axis=1)
+    return result
 
 
 def pose_nees(
@@ -76,12 +89,7 @@ def pose_nees(
     -------
     ndarray, shape (...)
     """
-    if frame == "invariant":
-        errors = invariant_error(true_poses, poses)
-        return normalised_squared_error(
-            errors, invariant_covariance(poses, covariances)
-        )
-    return normalised_squared_error(additive_error(true_poses, poses), covariances)
+    return normalised_squared_error(*_in_frame(true_poses, poses, covariances, frame))
 
 
 def heading_nees(true_poses: Array, poses: Array, covariances: Array) -> Array:
@@ -94,6 +102,152 @@ def heading_nees(true_poses: Array, poses: Array, covariances: Array) -> Array:
     """
     errors = additive_error(true_poses, poses)[..., 2]
     return np.asarray(errors**2 / covariances[..., 2, 2])
+
+
+def position_nees(
+    true_poses: Array, poses: Array, covariances: Array, *, frame: ErrorFrame
+) -> Array:
+    """Return the NEES of robot positions, 2 degrees of freedom.
+
+    Parameters
+    ----------
+    true_poses, poses, covariances, frame
+        As in :func:`pose_nees`.
+    """
+    errors, claimed = _in_frame(true_poses, poses, covariances, frame)
+    return normalised_squared_error(errors[..., :2], claimed[..., :2, :2])
+
+
+def state_nees(
+    true_states: Array, means: Array, covariances: Array, *, frame: ErrorFrame
+) -> Array:
+    """Return the NEES of whole states, 3 + 2n degrees of freedom.
+
+    Parameters
+    ----------
+    true_states, means : ndarray, shape (..., 3 + 2n)
+        True and estimated (x, y, θ, l1x, l1y, …) [m, rad].
+    covariances : ndarray, shape (..., 3 + 2n, 3 + 2n)
+        Claimed covariances of the additive error.
+    frame : {"additive", "invariant"}
+        Error coordinates.
+
+    Returns
+    -------
+    ndarray, shape (...)
+    """
+    errors, claimed = _in_frame(true_states, means, covariances, frame)
+    return normalised_squared_error(errors, claimed)
+
+
+def landmark_nees(
+    true_states: Array, means: Array, covariances: Array, *, frame: ErrorFrame
+) -> Array:
+    """Return the NEES of each landmark, 2 degrees of freedom.
+
+    Parameters
+    ----------
+    true_states, means, covariances, frame
+        As in :func:`state_nees`.
+
+    Returns
+    -------
+    ndarray, shape (..., n)
+    """
+    errors, claimed = _in_frame(true_states, means, covariances, frame)
+    rows = np.arange(3, errors.shape[-1]).reshape(-1, 2)
+    blocks = claimed[..., rows[:, :, None], rows[:, None, :]]
+    return normalised_squared_error(errors[..., rows], blocks)
+
+
+def relative_map_nees(true_states: Array, means: Array, covariances: Array) -> Array:
+    """Return the NEES of the map as the robot sees it, 2n degrees of freedom.
+
+    ::
+
+        m = R(θ)ᵀ (l − p),   ∂m/∂θ = −J m,   J = [0 −1; 1 0]
+
+    The frame is the robot's own, which no turn or shift of the whole world changes.
+
+    Parameters
+    ----------
+    true_states, means, covariances
+        As in :func:`state_nees`.
+
+    Returns
+    -------
+    ndarray, shape (...)
+    """
+    seen = _seen_from_robot(means)
+    errors = _seen_from_robot(true_states) - seen
+    n = errors.shape[-1] // 2
+    cos, sin = np.cos(means[..., 2]), np.sin(means[..., 2])
+    turn = np.stack([cos, sin, -sin, cos], axis=-1).reshape(*cos.shape, 2, 2)
+    jacobian = np.zeros((*cos.shape, 2 * n, 3 + 2 * n))
+    for row in range(0, 2 * n, 2):
+        jacobian[..., row : row + 2, :2] = -turn
+        jacobian[..., row : row + 2, 3 + row : 5 + row] = turn
+    jacobian[..., 0::2, 2] = seen[..., 1::2]
+    jacobian[..., 1::2, 2] = -seen[..., 0::2]
+    claimed = jacobian @ covariances @ np.swapaxes(jacobian, -1, -2)
+    return normalised_squared_error(errors, claimed)
+
+
+def autocorrelation(series: Array, *, lags: int) -> tuple[Array, Array]:
+    """Return the autocorrelations of several runs together, and their pairs.
+
+    Parameters
+    ----------
+    series : ndarray, shape (runs, steps)
+        One standardised number per step, nan where there is none.
+    lags : int
+        Largest lag, < steps.
+
+    Returns
+    -------
+    correlations, pairs : ndarray, shape (lags,)
+        At lags 1 … ``lags``, and the number of pairs each is made of.
+    """
+    known = np.isfinite(series)
+    centred = np.where(known, series - np.mean(series[known]), 0.0)
+    power = (centred**2).sum() / known.sum()
+    pairs = np.array(
+        [(known[:, k:] & known[:, :-k]).sum() for k in range(1, lags + 1)], dtype=float
+    )
+    sums = np.array(
+        [(centred[:, k:] * centred[:, :-k]).sum() for k in range(1, lags + 1)]
+    )
+    return sums / np.maximum(pairs, 1) / power, pairs
+
+
+def ljung_box(series: Array, *, lags: int = 10) -> LjungBox:
+    """Test whether several runs of a standardised series are white.
+
+    ::
+
+        Q = Σₖ Nₖ rₖ²,   rₖ the autocorrelation at lag k of Nₖ pairs:  χ²(lags)
+
+    Parameters
+    ----------
+    series : ndarray, shape (runs, steps)
+        One standardised number per step, nan where there is none.
+    lags : int
+        Largest lag, in [1, steps).
+
+    Returns
+    -------
+    LjungBox
+
+    Raises
+    ------
+    ValueError
+        Where there are fewer steps than lags.
+    """
+    if not 1 <= lags < series.shape[-1]:
+        raise ValueError(f"lags must be in [1, {series.shape[-1]}), got {lags}")
+    correlations, pairs = autocorrelation(series, lags=lags)
+    statistic = float((pairs * correlations**2).sum())
+    return LjungBox(statistic, float(chi2.sf(statistic, lags)))
 
 
 def average_band(
@@ -119,3 +273,21 @@ def average_band(
     freedom = runs * degrees_of_freedom
     low, high = chi2.ppf([tail, 1 - tail], freedom) / runs
     return Band(float(low), float(high))
+
+
+def _in_frame(
+    true_states: Array, means: Array, covariances: Array, frame: ErrorFrame
+) -> tuple[Array, Array]:
+    """Errors and their claimed covariances in a named frame."""
+    if frame == "invariant":
+        errors = invariant_error(true_states, means)
+        return errors, invariant_covariance(means, covariances)
+    return additive_error(true_states, means), covariances
+
+
+def _seen_from_robot(states: Array) -> Array:
+    """Landmarks in the robot's frame, shape (..., 2n)."""
+    dx, dy = states[..., 3::2] - states[..., :1], states[..., 4::2] - states[..., 1:2]
+    cos, sin = np.cos(states[..., 2:3]), np.sin(states[..., 2:3])
+    pairs = np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
+    return np.asarray(pairs.reshape(*dx.shape[:-1], -1))

@@ -71,7 +71,8 @@ class EkfSlam:
     noise_at_rest : bool
         False: odometry of exactly (0, 0) adds no motion noise.
     min_range : float
-        Readings closer than this [m] are skipped: they have no usable bearing.
+        Readings closer than this [m], or of landmarks expected closer, are skipped:
+        they have no usable bearing.
 
     Raises
     ------
@@ -118,7 +119,7 @@ class EkfSlam:
         motion = validation.standard_deviations("motion_std", motion_std, 3)
         sensor = validation.standard_deviations("measurement_std", measurement_std, 2)
         self._motion_variance = motion**2
-        self._noise_at_rest = bool(noise_at_rest)
+        self._noise_at_rest = validation.flag("noise_at_rest", noise_at_rest)
         self._adopt(
             Rules(
                 linearisation=self._linearisation,
@@ -258,7 +259,7 @@ class EkfSlam:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, bit for bit.
+        """Continue from a saved state, bit for bit in a filter of the same settings.
 
         Parameters
         ----------
@@ -334,10 +335,7 @@ class EkfSlam:
         if outcome == NOT_FINITE:
             self._check_finite(readings, ids)
         row = np.flatnonzero(self._ledger[FATE, : len(ids)] == USED)[outcome]
-        raise np.linalg.LinAlgError(
-            "the innovation covariance is not positive definite at the reading of "
-            f"landmark {ids[row]}: the belief or measurement_std is degenerate"
-        )
+        raise not_positive_definite(ids[row])
 
     @staticmethod
     def _check_finite(readings: Array, ids: list[int]) -> None:
@@ -380,11 +378,19 @@ class EkfSlam:
         )
 
 
+def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:
+    """Make the error of an innovation covariance that cannot be solved."""
+    return np.linalg.LinAlgError(
+        "the innovation covariance is not positive definite at the reading of "
+        f"landmark {landmark_id}: the belief or measurement_std is degenerate"
+    )
+
+
 def _gate(probability: float | None) -> float:
     """χ²(2) quantile of the gate."""
     if probability is None:
         return np.inf
-    if not 0 < probability < 1:
+    if not (isinstance(probability, float) and 0 < probability < 1):
         raise ValueError(
             f"gate_probability must lie between 0 and 1, got {probability!r}"
         )
@@ -401,7 +407,8 @@ def _checked_state(
         raise ValueError(f"state must hold {sorted(missing)[0]!r}, got {sorted(state)}")
     if str(state["estimator"]) != name:
         raise ValueError(f"state is of {state['estimator']}, not of {name}")
-    ids: list[int] = np.asarray(state["landmark_ids"]).tolist()
+    saved = np.asarray(state["landmark_ids"])
+    ids = validation.identities(saved, saved.size)
     size = 3 + 2 * len(ids)
     mean = validation.finite_vector("state['mean']", state["mean"], size)
     reference = validation.finite_vector("state['reference']", state["reference"], size)
@@ -411,4 +418,6 @@ def _checked_state(
             f"state['covariance'] must be finite with shape ({size}, {size}), "
             f"got shape {covariance.shape}"
         )
+    if not np.array_equal(covariance, covariance.T):
+        raise ValueError("state['covariance'] must be symmetric")
     return mean, covariance, reference, ids

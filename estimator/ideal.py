@@ -1,6 +1,7 @@
 """The ideal EKF-SLAM: Jacobians at the ground truth, for study only."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import validation
 from .ekf_slam import EkfSlam
 from .interface import UpdateReport
-from .kernels import AT_TRUTH
+from .kernels import AT_ESTIMATE, AT_TRUTH
 from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
@@ -31,10 +32,35 @@ class IdealEkfSlam(EkfSlam):
        designing consistent EKF SLAM estimators, IJRR 29(5), 2010.
     """
 
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run, the door for the truth closed."""
+        super().reset(pose, pose_std)
+        self._adopt(self._rules._replace(linearisation=AT_ESTIMATE))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of the state, and whether the truth has been told."""
+        told = self._rules.linearisation == AT_TRUTH
+        return {**super().state_dict(), "at_truth": np.array(told)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state; the truth of each step must be told again."""
+        super().load_state_dict(state)
+        where = AT_TRUTH if state.get("at_truth", False) else AT_ESTIMATE
+        self._adopt(self._rules._replace(linearisation=where))
+
+    @staticmethod
+    def _check_told(ids: Iterable[int], told: Mapping[int, Array]) -> None:
+        untold = [i for i in ids if i not in told]
+        if untold:
+            raise ValueError(
+                f"landmarks must hold the truth of all that are seen, got none of "
+                f"landmark {untold[0]}"
+            )
+
     def observe_truth(
         self, pose: ArrayLike, landmarks: Mapping[int, ArrayLike]
     ) -> None:
-        """Tell the truth of this moment, before the predict or update that uses it.
+        """Tell the truth after a motion, before its predict (at the start: its update).
 
         Parameters
         ----------
@@ -44,10 +70,12 @@ class IdealEkfSlam(EkfSlam):
             True positions of all landmarks that may be seen [m].
         """
         truth = validation.finite_vector("pose", pose, 3)
-        self._true_landmarks = {
+        told = {
             i: validation.finite_vector(f"landmarks[{i}]", xy, 2)
             for i, xy in landmarks.items()
         }
+        self._check_told(self._slots, told)
+        self._true_landmarks = told
         if self._rules.linearisation != AT_TRUTH:
             self._adopt(self._rules._replace(linearisation=AT_TRUTH))
             self._reference[:3] = truth
@@ -85,6 +113,7 @@ class IdealEkfSlam(EkfSlam):
         if self._rules.linearisation == AT_TRUTH and landmark_ids is not None:
             readings = validation.scan(measurements)
             self._make_room(len(readings))
+            self._check_told(landmark_ids, self._true_landmarks)
             column = self._size
             for i, distance in zip(landmark_ids, readings[:, 1], strict=False):
                 if i not in self._slots and distance >= self._rules.min_range:

@@ -68,6 +68,6 @@ class InvariantEkfSlam(EkfSlam):
         super().__init__(motion_std, measurement_std, **settings)
         rules = self._rules._replace(
             iterations=validation.whole("iterations", iterations, 1),
-            sequential=bool(sequential),
+            sequential=validation.flag("sequential", sequential),
         )
         self._adopt(rules)

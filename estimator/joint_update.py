@@ -29,6 +29,7 @@ DONE, NOT_FINITE = -1, -2
 
 # Above this size of the state, one pass over P costs more than a triangular solve.
 LARGE = 250
+BLOCK = 6  # readings absorbed at a time below it
 
 
 class Rules(NamedTuple):
@@ -62,14 +63,18 @@ class Workspace(NamedTuple):
     white: Array  # (stages, 2m)
     gains: Array  # (stages, 2m, capacity)
     vectors: Array  # (4, capacity): δ, way, prior mean, heading column
-    prior: Array  # (capacity, capacity), or empty where P can be kept without
+    prior: Array  # (capacity, capacity) P to iterate from, or empty
+    before: Array  # (capacity, capacity) P to go back to on failure, or empty
+    mean_before: Array  # (capacity,)
 
 
 @part
 def new_workspace(m: int, size: int, capacity: int, rules: Rules) -> Workspace:
     """Allocate for ``m`` readings of a belief of that size and capacity."""
     stages = min(rules.iterations, 2)
-    kept = capacity if rules.iterations > 1 or block_of(size, m) < m else 0
+    iterated = capacity if rules.iterations > 1 else 0
+    spoilable = rules.iterations > 1 or rules.sequential or m > BLOCK
+    kept = capacity if spoilable else 0
     return Workspace(
         np.empty((m, 2)),
         np.empty((m, 2)),
@@ -79,19 +84,21 @@ def new_workspace(m: int, size: int, capacity: int, rules: Rules) -> Workspace:
         np.empty((stages, 2 * m)),
         np.empty((stages, 2 * m, capacity)),
         np.empty((4, capacity)),
+        np.empty((iterated, iterated)),
         np.empty((kept, kept)),
+        np.empty(capacity),
     )
 
 
 @part
 def block_of(size: int, readings: int) -> int:
     """How many readings to absorb at a time: a few while P fits the fast caches."""
-    return 6 if size <= LARGE else max(readings, 1)
+    return BLOCK if size <= LARGE else max(readings, 1)
 
 
 @part
 def keep(source: Array, target: Array, size: int) -> None:
-    """Copy the lower half of a covariance, and its mirror image."""
+    """Copy a covariance."""
     for i in range(size):
         for j in range(size):
             target[i, j] = source[i, j]
@@ -138,15 +145,15 @@ def correct(
     Returns
     -------
     int
-        -1, or the row whose innovation covariance is not positive definite; mean and
-        covariance are then as before.
+        -1, or the row whose innovation covariance is not positive definite; the
+        covariance may then be spoilt.
     """
     columns, readings = every_column[first:last], work.readings[first:last]
     shift, way = work.vectors[0], work.vectors[1]
     prior, heading = work.vectors[2], work.vectors[3]
     for j in range(size):
         prior[j] = mean[j]
-    if len(work.prior):
+    if rules.iterations > 1:
         keep(covariance, work.prior, size)
     for iteration in range(rules.iterations):
         stage = min(iteration, 1)
@@ -175,8 +182,6 @@ def correct(
             block_of(size, last - first),
         )
         if failed >= 0:
-            if len(work.prior):
-                keep(work.prior, covariance, size)
             return first + failed
         move(mean, shift, way, size, rules.frame)
     if rules.frame == INVARIANT:
@@ -355,11 +360,20 @@ def update_belief(
             return NOT_FINITE, 0, 0.0
     used = screen(mean, covariance, readings, reference, rules, work, ledger)
     batch = 1 if rules.sequential else max(used, 1)
+    spoilable = len(work.before) > 0 and used > 0
+    if spoilable:
+        keep(covariance, work.before, size)
+        for j in range(size):
+            work.mean_before[j] = mean[j]
     for k in range(0, used, batch):
         failed = correct(
             mean, covariance, size, reference, rules, work, ledger[COLUMN], k, k + batch
         )
         if failed >= 0:
+            if spoilable:
+                keep(work.before, covariance, size)
+                for j in range(size):
+                    mean[j] = work.mean_before[j]
             return failed, used, 0.0
     nis = 0.0
     for row in range(2 * used):
@@ -414,6 +428,8 @@ def update_one(
                 record[row, j] = work.jacobians[0, k, i, j]
             record[row, 5] = work.roots[0, k, i]
             record[row, 6] = work.roots[0, k, 2 * i]
+            if rules.sequential:  # each reading has a linearisation of its own
+                continue
             for j in range(3):
                 record[row, 7 + j] = work.gains[0, row, j]
             for j in range(k + 1, used):

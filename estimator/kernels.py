@@ -29,6 +29,9 @@ AT_REFERENCE = 1  # at fixed points kept beside the estimate
 PROJECTED = 2  # at the estimate, then made blind to a turn of the whole map
 AT_TRUTH = 3  # at the ground truth, for study
 
+# Share of a variance below which what is left of it counts as rounding.
+SINGULAR = 1e-14
+
 # How a correction is composed with the state.
 ADDITIVE = 0
 INVARIANT = 1
@@ -195,9 +198,14 @@ def absorb(
             if first > 0:
                 _refresh(covariance, size, c)
             _correlate(covariance, size, c, jacobians, k, gains)
+            scale0 = _times(jacobians, k, 0, gains, 2 * k, c) + variances[k, 0]
+            scale1 = _times(jacobians, k, 1, gains, 2 * k + 1, c) + variances[k, 1]
             for before in range(2 * first, 2 * k, 2):
                 _orthogonalise(size, c, jacobians, k, gains, before)
-            if not _normalise(size, c, jacobians, k, variances, gains, roots):
+            least0, least1 = SINGULAR * scale0, SINGULAR * scale1
+            if not _normalise(
+                size, c, jacobians, k, variances, gains, roots, least0, least1
+            ):
                 return k
             _shift(size, c, jacobians, k, innovations, gains, roots, white, shift)
         downdate(covariance, size, gains, 2 * first, 2 * last)
@@ -255,17 +263,25 @@ def _normalise(
     variances: Array,
     gains: Array,
     roots: Array,
+    least0: float,
+    least1: float,
 ) -> bool:
-    """Divide the rows of reading k by the square root of their own 2 × 2 part of S."""
+    """Divide the rows of reading k by the square root of their own 2 × 2 part of S.
+
+    Of what the readings before leave of S; false where nothing but rounding is left.
+    """
     row = 2 * k
     s00 = _times(jacobians, k, 0, gains, row, c) + variances[k, 0]
     s10 = _times(jacobians, k, 1, gains, row, c)
     s11 = _times(jacobians, k, 1, gains, row + 1, c) + variances[k, 1]
-    if not (s00 > 0 and s11 - s10 * s10 / s00 > 0):
+    if not s00 > least0:
         return False
     l00 = np.sqrt(s00)
     l10 = s10 / l00
-    l11 = np.sqrt(s11 - l10 * l10)
+    rest = s11 - l10 * l10
+    if not rest > least1:
+        return False
+    l11 = np.sqrt(rest)
     roots[k, 0], roots[k, 1], roots[k, 2] = l00, l10, l11
     inverse0, inverse1 = 1 / l00, 1 / l11
     for j in range(_padded(size)):

@@ -1,5 +1,8 @@
 """The robocentric EKF-SLAM: the map lives in the robot's own frame."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -60,6 +63,19 @@ class RobocentricEkfSlam(EkfSlam):
         if np.size(measurements):
             move_frame(self._mean, self._covariance, self._size)
         return report
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state, bit for bit in a filter of the same settings."""
+        ids = np.asarray(state.get("landmark_ids", ())).ravel().tolist()
+        if tuple(ids[: len(RESERVED)]) != RESERVED:
+            raise ValueError("state must begin with the world's origin, got landmarks")
+        super().load_state_dict(state)
+
+    def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
+        ids = super()._identities(landmark_ids, count)
+        if not set(RESERVED).isdisjoint(ids):
+            raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
+        return ids
 
     def belief(self) -> Belief:
         """Return the belief in the world's frame."""

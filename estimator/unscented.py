@@ -1,11 +1,13 @@
 """The unscented EKF-SLAM: cubature points instead of Jacobians."""
 
+from itertools import compress
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import validation
 from .angles import wrap_angle
-from .ekf_slam import EkfSlam
+from .ekf_slam import EkfSlam, not_positive_definite
 from .interface import UpdateReport
 from .validation import LandmarkIds
 
@@ -62,21 +64,51 @@ class UnscentedSlam(EkfSlam):
         readings = validation.scan(measurements)
         ids = self._identities(landmark_ids, len(readings))
         self._check_finite(readings, ids)
-        usable = readings[:, 1] >= self._rules.min_range
-        known = np.array([i in self._slots for i in ids], dtype=bool) & usable
+        usable = np.array(
+            [
+                min(reading[1], self._expected_range(i)) >= self._rules.min_range
+                for i, reading in zip(ids, readings, strict=True)
+            ],
+            dtype=bool,
+        )
+        mapped = np.array([i in self._slots for i in ids], dtype=bool)
+        known, skipped = mapped & usable, mapped & ~usable
         corrected = UpdateReport()
         if known.any():
             corrected = self._correct(
                 readings[known], [i for i, k in zip(ids, known, strict=True) if k]
             )
-        others = [i for i, k in zip(ids, known, strict=True) if not k]
-        added = super().update(readings[~known], others)
+        others = list(compress(ids, ~mapped))
+        added = super().update(readings[~mapped], others)
         return corrected._replace(
-            added_ids=added.added_ids, skipped_ids=added.skipped_ids
+            added_ids=added.added_ids,
+            skipped_ids=(*compress(ids, skipped), *added.skipped_ids),
         )
+
+    def _expected_range(self, landmark_id: int) -> float:
+        """Range at which the belief expects a landmark [m]; infinite for a new one."""
+        if landmark_id not in self._slots:
+            return np.inf
+        return float(np.linalg.norm(self._place(landmark_id)[0]))
+
+    def _place(self, landmark_id: int) -> tuple[Array, Array]:
+        """Where a landmark lies from the robot, (2,), and the covariance of that.
+
+        In the robot's frame, but for its heading: e_l − e_p − J δ e_θ.
+        """
+        c = 3 + 2 * self._slots[landmark_id]
+        dx, dy = self._mean[c : c + 2] - self._mean[:2]
+        own = [0, 1, 2, c, c + 1]
+        H = np.array([[-1, 0, dy, 1, 0], [0, -1, -dx, 0, 1]])
+        return np.array([dx, dy]), H @ self._covariance[np.ix_(own, own)] @ H.T
+
+    def _is_near(self, landmark_id: int) -> bool:
+        offset, covariance = self._place(landmark_id)
+        return bool(offset @ offset < 100 * np.linalg.eigvalsh(covariance)[-1])
 
     def _correct(self, readings: Array, ids: list[int]) -> UpdateReport:
         n = self._size
+        near = {i for i in ids if self._is_near(i)}
         columns = 3 + 2 * np.array([self._slots[i] for i in ids])
         root = _square_root(self._covariance[:n, :n])
         deviations = np.sqrt(n) * np.concatenate([root, -root], axis=1)
@@ -88,9 +120,8 @@ class UnscentedSlam(EkfSlam):
         kept = self._within_gate(innovation, spread, noise)
         rows = np.repeat(kept, 2)
         spread, nu = spread[rows], innovation.ravel()[rows]
-        factor = np.linalg.cholesky(
-            spread @ spread.T / spread.shape[1] + np.diag(noise.ravel()[rows])
-        )
+        S = spread @ spread.T / spread.shape[1] + np.diag(noise.ravel()[rows])
+        factor = _factor(S, list(compress(ids, kept)))
         cross = spread @ deviations.T / spread.shape[1]
         gains = np.linalg.solve(factor, cross)
         white = np.linalg.solve(factor, nu)
@@ -101,6 +132,7 @@ class UnscentedSlam(EkfSlam):
             degrees_of_freedom=len(nu),
             associated_ids=tuple(i for i, k in zip(ids, kept, strict=True) if k),
             rejected_ids=tuple(i for i, k in zip(ids, kept, strict=True) if not k),
+            near_ids=tuple(i for i in compress(ids, kept) if i in near),
             innovation=innovation[kept],
             factor=factor,
         )
@@ -113,7 +145,11 @@ class UnscentedSlam(EkfSlam):
         std: Array = np.stack([bearing_std, range_std], axis=1)
         return std**2
 
-    def _within_gate(self, innovation: Array, spread: Array, noise: Array) -> Array:
+    def _within_gate(
+        self, innovation: Array, spread: Array, noise: Array
+    ) -> NDArray[np.bool_]:
+        if not np.isfinite(self._rules.gate):
+            return np.ones(len(innovation), dtype=bool)
         pairs = spread.reshape(len(innovation), 2, -1)
         own = pairs @ pairs.transpose(0, 2, 1) / pairs.shape[2]
         own += noise[:, :, None] * np.eye(2)
@@ -141,6 +177,18 @@ def _through_sensor(
         axis=1,
     )
     return centre.T, spread.reshape(2 * len(columns), -1)
+
+
+def _factor(S: Array, ids: list[int]) -> Array:
+    """Return the Cholesky factor of S, or name the reading at which it fails."""
+    try:
+        return np.asarray(np.linalg.cholesky(S))
+    except np.linalg.LinAlgError:
+        smallest = [
+            np.linalg.eigvalsh(S[: 2 * k, : 2 * k])[0] for k in range(1, len(ids))
+        ]
+        at = next((k for k, value in enumerate(smallest) if value <= 0), len(ids) - 1)
+        raise not_positive_definite(ids[at]) from None
 
 
 def _square_root(covariance: Array) -> Array:

@@ -38,6 +38,8 @@ def as_floats(name: str, value: ArrayLike) -> Array:
 def scan(measurements: ArrayLike) -> Array:
     """Return ``measurements`` as float64 (m, 2), or refuse them."""
     readings = as_floats("measurements", measurements)
+    if not readings.flags.writeable:  # another type to numba: it would compile anew
+        readings = readings.copy()
     if readings.ndim == 2 and readings.shape[1] == 2:
         return readings
     if readings.size == 0:
@@ -51,9 +53,11 @@ def scan(measurements: ArrayLike) -> Array:
 def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
     """Return ids as Python integers: one for each of ``count`` readings, no repeats."""
     array = np.asarray(landmark_ids)
-    if array.dtype.kind not in "iu" and array.size:
+    if array.size and (array.dtype.kind not in "iu" or array.ndim != 1):
         raise ValueError(f"landmark_ids must be integers, got {landmark_ids!r}")
-    ids: list[int] = array.tolist()
+    if array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any():
+        raise ValueError(f"landmark_ids must fit 64 bits, got {landmark_ids!r}")
+    ids: list[int] = array.ravel().tolist()
     if len(ids) != count:
         raise ValueError(
             f"measurements has {count} rows but landmark_ids has {len(ids)} entries"
@@ -71,7 +75,7 @@ def pair(name: str, value: ArrayLike) -> tuple[float, float]:
     try:
         first, second = cast("tuple[float, float]", value)
         a, b = float(first), float(second)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be 2 finite numbers, got {value!r}") from None
     if not (isfinite(a) and isfinite(b)):
         raise ValueError(f"{name} must be 2 finite numbers, got {value!r}")
@@ -80,21 +84,22 @@ def pair(name: str, value: ArrayLike) -> tuple[float, float]:
 
 def at_least(name: str, value: float, least: float) -> float:
     """Return a finite number >= ``least``, or refuse it."""
-    if not (isfinite(value) and value >= least):
+    if not (_is_finite(value) and value >= least):
         raise ValueError(f"{name} must be a finite number >= {least:g}, got {value!r}")
     return float(value)
 
 
 def above(name: str, value: float, least: float) -> float:
     """Return a finite number > ``least``, or refuse it."""
-    if not (isfinite(value) and value > least):
+    if not (_is_finite(value) and value > least):
         raise ValueError(f"{name} must be a finite number > {least:g}, got {value!r}")
     return float(value)
 
 
 def whole(name: str, value: int, least: int) -> int:
     """Return a whole number >= ``least``, or refuse it."""
-    if isinstance(value, bool) or value != int(value) or value < least:
+    is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_whole or value < least:
         raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
     return int(value)
 
@@ -105,3 +110,14 @@ def one_of(name: str, value: str, choices: tuple[str, ...]) -> str:
         wanted = " or ".join(repr(choice) for choice in choices)
         raise ValueError(f"{name} must be {wanted}, got {value!r}")
     return value
+
+
+def flag(name: str, value: bool) -> bool:
+    """Return True or False, or refuse what is neither."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
+def _is_finite(value: float) -> bool:
+    return isinstance(value, int | float | np.number) and isfinite(value)

@@ -205,6 +205,7 @@ class _Recorder:
             estimator=name,
             t=times,
             time_unit="steps" if _counts_steps(times) else "s",
+            frame=belief.frame,
             predicted_poses=self._predicted.poses,
             predicted_pose_covariances=self._predicted.covariances,
             poses=self._updated.poses,

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from .. import __version__
+from ..estimator import consistency
 from ..estimator.accuracy import PositionAccuracy, position_accuracy
-from ..estimator.error_frames import additive_error
 from .filter_settings import FilterSettings
 from .replay import Replay
 from .trace import RunTrace
@@ -18,7 +18,6 @@ from .true_path import path_accuracy
 
 Array = NDArray[np.floating]
 
-_SINGULAR = 1e-10  # eigenvalue of a correlation matrix that counts as zero
 _SHARE = 0.95  # of a consistent filter's NIS within its interval
 
 
@@ -79,7 +78,9 @@ def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
     """
     truth = trace.true_landmarks
     errors = trace.landmarks - (np.nan if truth is None else truth)
-    squared = squared_mahalanobis(errors, trace.landmark_covariances)
+    squared = consistency.normalised_squared_error(
+        np.asarray(errors), np.asarray(trace.landmark_covariances)
+    )
     return [
         {
             "id": landmark_id,
@@ -128,8 +129,9 @@ def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
     -------
     dict or None
         ``mean`` over the ``steps`` where it is defined, ``final`` at the last step
-        (None where undefined), ``degrees_of_freedom`` 3, and ``per_degree``, the mean
-        by 3, near 1 for a consistent filter. None where it is defined nowhere.
+        (None where undefined), ``degrees_of_freedom`` 3, ``per_degree``, the mean by 3,
+        near 1 for a consistent filter, and the ``frame`` of the error, the filter's
+        own. None where it is defined nowhere.
     """
     nees = pose_nees(trace)
     known = np.isfinite(nees)
@@ -141,11 +143,12 @@ def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
         "degrees_of_freedom": 3,
         "per_degree": _finite(nees[known].mean() / 3),
         "steps": int(known.sum()),
+        "frame": trace.frame,
     }
 
 
 def pose_nees(trace: RunTrace) -> Array:
-    """NEES eᵀ P⁻¹ e of the pose at every step, e additive, its angle wrapped.
+    """NEES of the pose at every step, in the error frame of the filter.
 
     Returns
     -------
@@ -155,44 +158,12 @@ def pose_nees(trace: RunTrace) -> Array:
     """
     if trace.true_poses is None:
         return np.full(len(trace.t), np.nan)
-    errors = additive_error(
+    return consistency.pose_nees(
         np.asarray(trace.true_poses, dtype=np.float64),
         np.asarray(trace.poses, dtype=np.float64),
+        np.asarray(trace.pose_covariances, dtype=np.float64),
+        frame=trace.frame,
     )
-    return squared_mahalanobis(errors, trace.pose_covariances)
-
-
-def squared_mahalanobis(errors: Array, covariances: Array) -> Array:
-    """Compute eᵀ P⁻¹ e of many errors.
-
-    Parameters
-    ----------
-    errors : ndarray, shape (k, n)
-        Errors e, nan where unknown.
-    covariances : ndarray, shape (k, n, n)
-        Their covariances P.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        nan where the error is unknown or the covariance singular.
-
-    Examples
-    --------
-    >>> squared_mahalanobis(np.array([[3.0, 4.0]]), np.diag([9.0, 4.0])[None])
-    array([5.])
-    """
-    std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
-    usable = np.isfinite(errors).all(axis=1) & (std > 0).all(axis=1)
-    usable &= np.isfinite(covariances).all(axis=(1, 2))
-    result = np.full(len(errors), np.nan)
-    scaled, std = errors[usable] / std[usable], std[usable]
-    correlation = covariances[usable] / std[:, :, None] / std[:, None, :]
-    regular = np.linalg.eigvalsh(correlation)[:, 0] > _SINGULAR
-    scaled, correlation = scaled[regular], correlation[regular]
-    weighted = np.linalg.solve(correlation, scaled[..., None])[..., 0]
-    result[np.flatnonzero(usable)[regular]] = np.sum(scaled * weighted, axis=1)
-    return result
 
 
 def map_accuracy(trace: RunTrace) -> PositionAccuracy | None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimator.accuracy import landmark_covariances
+from ..estimator.error_frames import ErrorFrame
 
 Array = NDArray[np.floating]
 Integers = NDArray[np.integer]
@@ -73,6 +74,8 @@ class RunTrace:
     """Of the whole state at the end, shape (3 + 2n, 3 + 2n)."""
     time_unit: str = "s"
     """Of `t`, for labels; simulated logs count "steps"."""
+    frame: ErrorFrame = "additive"
+    """Coordinates in which the estimator takes its error to be Gaussian."""
 
     def __post_init__(self) -> None:
         steps, n = len(self.t), len(self.landmark_ids)

@@ -101,5 +101,5 @@ def test_an_edited_kernel_is_compiled_again(tmp_path):
     os.utime(source, (2e9, 2e9))
     (cache / "new.nbi").write_text("")
     os.utime(cache / "new.nbi", (3e9, 3e9))
-    discard_stale_cache(tmp_path)
+    discard_stale_cache(tmp_path, cache)
     assert sorted(f.name for f in cache.iterdir()) == ["module.pyc", "new.nbi"]

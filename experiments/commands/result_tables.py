@@ -45,8 +45,9 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
     for name, key in (("path error", "ate"), ("map error", "landmark_rmse")):
         if summary[key] is not None:
             rows.append((name, _rmse(summary[key])))
+    frame = (summary["nees"] or {}).get("frame", "additive")
     for name, key, hint in (
-        ("pose NEES", "nees", ("too cautious", "too sure of itself")),
+        (f"pose NEES, {frame}", "nees", ("too cautious", "too sure of itself")),
         ("NIS", "nis", ("it assumes too much noise", "it assumes too little noise")),
     ):
         if summary[key] is not None:
