@@ -143,3 +143,65 @@ def test_arrays_of_a_wrong_shape_are_refused_by_name(data, index, message):
 def test_first_poses_of_a_wrong_shape_are_refused():
     with pytest.raises(ValueError, match="initial_poses must be finite with shape"):
         make_batch("ekf", runs=3, landmarks=1, initial_poses=np.zeros((2, 3)), **NOISE)
+
+
+def test_a_run_that_has_stopped_stays_so(data):
+    odometry, measurements, visible = (array.copy() for array in data)
+    odometry[1, 3] = np.nan
+    settings = {"runs": RUNS, "landmarks": LANDMARKS, **NOISE}
+    whole, pieces = make_batch("ekf", **settings), make_batch("ekf", **settings)
+    at_once = whole.run(odometry, measurements, visible)
+    parts = [
+        pieces.run(*(array[:, steps] for array in (odometry, measurements, visible)))
+        for steps in (slice(0, 10), slice(10, STEPS))
+    ]
+    joined = np.concatenate([part.poses for part in parts], axis=1)
+    np.testing.assert_array_equal(at_once.poses, joined)
+    assert pieces.failed_at.tolist() == [-1, 0, -1, -1, -1]
+
+
+@pytest.mark.parametrize("landmarks", [20, 130])
+def test_a_scan_that_fails_leaves_the_belief_of_its_run(landmarks):
+    """Ten readings, the last one impossible: P is NaN only where it reads it."""
+    batch = make_batch("ekf", runs=1, landmarks=landmarks, **NOISE)
+    scan = np.zeros((1, 1, landmarks, 2))
+    scan[..., 0], scan[..., 1] = np.linspace(-3, 3, landmarks), 5.0
+    visible = np.zeros((1, 1, landmarks), dtype=bool)
+    visible[..., :10] = True
+    batch.run(np.zeros((1, 1, 2)), scan, visible)
+    batch._covariances[0, 21:23, 21:23] = -1e3
+    before = batch.belief(0)
+    batch.run(np.zeros((1, 1, 2)), scan, visible, dt=0.0)
+    assert batch.failed_at.tolist() == [0]
+    np.testing.assert_array_equal(batch.belief(0).mean, before.mean)
+    np.testing.assert_array_equal(batch.belief(0).covariance, before.covariance)
+
+
+def test_settings_that_a_batch_would_ignore_are_refused():
+    with pytest.raises(ValueError, match="initial_pose must be given as initial_poses"):
+        make_batch("ekf", runs=1, landmarks=1, initial_pose=(5, 5, 1), **NOISE)
+    with pytest.raises(ValueError, match="threads must be a whole number >= 1"):
+        make_batch("ekf", runs=1, landmarks=1, threads=-1, **NOISE)
+    batch = make_batch("ekf", runs=1, landmarks=1, **NOISE)
+    arrays = (
+        np.zeros((1, 2, 2)),
+        np.zeros((1, 2, 1, 2)),
+        np.zeros((1, 2, 1), dtype=bool),
+    )
+    with pytest.raises(ValueError, match="dt must be finite numbers >= 0"):
+        batch.run(*arrays, dt=-1.0)
+
+
+def test_a_map_beyond_the_blocks_gives_the_bits_of_a_single_filter():
+    rng = np.random.default_rng(0)
+    landmarks = rng.uniform(-30, 30, (140, 2))
+    batch = make_batch("ekf", runs=1, landmarks=140, **NOISE)
+    slam = make_estimator("ekf", **NOISE)
+    steps = list(drive(0, 4, landmarks=landmarks))
+    odometry = np.array([[u for u, _, _ in steps]])
+    measurements = np.array([[z for _, z, _ in steps]])
+    batch.run(odometry, measurements, np.ones((1, 4, 140), dtype=bool))
+    for u, z, _ in steps:
+        slam.predict(u)
+        slam.update(z, range(140))
+    np.testing.assert_array_equal(batch.belief(0).covariance, slam.belief().covariance)

@@ -264,6 +264,10 @@ def test_degenerate_innovation_names_the_landmark_and_changes_nothing():
         (lambda s: s.update([(0, 1)], [0, 1]), "1 rows but landmark_ids has 2"),
         (lambda s: s.update([(0, 1), (1, 1)], [3, 3]), "must not repeat.*got 3 twice"),
         (lambda s: s.update([(0, 1)], [0.5]), "landmark_ids must be integers"),
+        (lambda s: s.update([(0, 1)], [[1]]), "landmark_ids must be integers"),
+        (lambda s: s.update([(0, 1)], np.array(5)), "landmark_ids must be integers"),
+        (lambda s: s.update([(0, 1)], np.array([2**63])), "must fit 64 bits"),
+        (lambda s: s.predict((10**400, 0)), "odometry must be 2 finite numbers"),
         (lambda s: s.update([(0, 1)]), "landmark_ids must be given"),
         (lambda s: s.update("rubbish", [0]), "measurements must be numbers"),
         (lambda s: s.reset((0, 0), (0, 0, 0)), "pose must be 3 finite numbers"),
@@ -287,6 +291,9 @@ def test_bad_input_is_refused_by_name_and_changes_nothing(call, message):
         ({"landmark_init": "none"}, "landmark_init must be 'full' or 'independent'"),
         ({"range_noise_at": "true"}, "range_noise_at must be 'expected' or 'reading'"),
         ({"gate_probability": 1.5}, "gate_probability must lie between 0 and 1"),
+        ({"noise_at_rest": "no"}, "noise_at_rest must be True or False"),
+        ({"gate_probability": "high"}, "gate_probability must lie between 0 and 1"),
+        ({"range_std_per_metre": "x"}, "range_std_per_metre must be a finite number"),
         ({"min_range": 0.0}, "min_range must be a finite number > 0"),
         ({"range_std_per_metre": -1.0}, "range_std_per_metre must be a finite"),
     ],
@@ -318,6 +325,9 @@ def test_saved_state_continues_bit_for_bit(tmp_path):
         ({"covariance": np.full((15, 15), np.nan)}, "covariance'] must be finite"),
         ({"estimator": "OtherFilter"}, "state is of OtherFilter, not of EkfSlam"),
         ({"landmark_ids": None}, "state must hold 'landmark_ids'"),
+        ({"landmark_ids": [3] * 6}, "landmark_ids must not repeat"),
+        ({"landmark_ids": [0.5] * 6}, "landmark_ids must be integers"),
+        ({"covariance": np.triu(np.ones((15, 15)))}, "must be symmetric"),
     ],
 )
 def test_a_broken_state_is_refused_and_changes_nothing(change, message):
@@ -355,3 +365,13 @@ def test_landmark_truth_lies_within_the_ellipses():
     errors = belief.landmarks - SIX
     weighted = np.linalg.solve(belief.landmark_covariances, errors[..., None])[..., 0]
     assert ((errors * weighted).sum(axis=1) < chi2.ppf(0.9999, 2)).all()
+
+
+def test_read_only_readings_are_taken_without_compiling_anew():
+    slam = make()
+    readings = np.array([(0.1, 4.0)])
+    readings.flags.writeable = False
+    slam.update(readings, [0])
+    from slamgym.estimator.joint_update import update_one
+
+    assert len(update_one.signatures) == 1

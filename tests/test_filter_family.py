@@ -101,10 +101,13 @@ def test_equals_its_slow_dense_twin(case):
 def test_the_order_of_readings_does_not_matter(case):
     one, other = make(case), make(case)
     rng = np.random.default_rng(0)
-    for step, (odometry, readings, truth) in enumerate(drive(1, 60)):
-        order = rng.permutation(6) if step else np.arange(6)
-        for each, rows in ((one, np.arange(6)), (other, order)):
-            tell_truth(each, truth)
+    landmarks = rng.uniform(-12, 12, (13, 2))  # several blocks of readings
+    true_map = dict(enumerate(landmarks))
+    drives = drive(1, 60, landmarks=landmarks)
+    for step, (odometry, readings, truth) in enumerate(drives):
+        order = rng.permutation(13) if step else np.arange(13)
+        for each, rows in ((one, np.arange(13)), (other, order)):
+            tell_truth(each, truth, true_map)
             each.predict(odometry)
             each.update(readings[rows], rows)
     one, other = one.belief(), other.belief()
@@ -265,23 +268,132 @@ def test_invariant_filter_on_a_single_iteration_is_the_plain_one():
 def test_saved_state_continues_bit_for_bit(case, tmp_path):
     slam, restored = make(case), make(case)
     tell_truth(slam, np.zeros(3))
-    tell_truth(restored, np.zeros(3))
     for odometry, readings, truth in drive(3, 15):
         tell_truth(slam, truth)
         slam.predict(odometry)
         slam.update(readings, IDS)
     np.savez(tmp_path / "state.npz", **slam.state_dict())
-    tell_truth(restored, truth, TRUE_MAP)
     with np.load(tmp_path / "state.npz") as state:
         restored.load_state_dict(state)
+    drive_both(slam, restored)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_reset_equals_a_new_filter(case):
+    slam, fresh = make(case), make(case)
+    tell_truth(slam, np.ones(3))
+    for odometry, readings, truth in drive(3, 5):
+        tell_truth(slam, truth)
+        slam.predict(odometry)
+        slam.update(readings, IDS)
+    slam.reset((0, 0, 0), (0, 0, 0))
+    drive_both(slam, fresh)
+
+
+def drive_both(slam, other):
+    """Feed two filters the same, and expect the same to the last bit."""
     for odometry, readings, truth in drive(9, 15):
-        for each in (slam, restored):
+        for each in (slam, other):
             tell_truth(each, truth)
             each.predict(odometry)
             each.update(readings, IDS)
-    one, other = slam.belief(), restored.belief()
-    np.testing.assert_array_equal(one.mean, other.mean)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
+    slam, other = slam.belief(), other.belief()
+    np.testing.assert_array_equal(slam.mean, other.mean)
+    np.testing.assert_array_equal(slam.covariance, other.covariance)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_the_report_agrees_with_itself(case):
+    slam = make(case)
+    for odometry, readings, truth in drive(3, 10):
+        tell_truth(slam, truth)
+        slam.predict(odometry)
+        report = slam.update(readings, IDS)
+    white = np.linalg.solve(report.innovation_factor, report.innovation.ravel())
+    assert white @ white == pytest.approx(report.nis, rel=1e-9)
+    np.testing.assert_allclose(
+        report.innovation_covariance,
+        report.innovation_factor @ report.innovation_factor.T,
+    )
+
+
+def solve_or_name(slam, scan):
+    try:
+        return slam.update(scan, range(len(scan)))
+    except np.linalg.LinAlgError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_a_scan_that_cannot_be_solved_is_refused_or_harmless(case):
+    """Without sensor noise rounding decides; nothing absurd may come of either."""
+    refused = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        slam = make(case, motion_std=(0.1, 0.1, 0.1), measurement_std=(0, 0))
+        scan = np.stack([rng.uniform(-3, 3, 9), rng.uniform(2, 9, 9)], axis=1)
+        tell_truth(slam, np.zeros(3), {i: (1.0 + i, 2.0) for i in range(9)})
+        slam.update(scan, range(9))
+        slam.predict((0.3, 0.1))
+        before = slam.belief()
+        outcome = solve_or_name(slam, scan[:8] + 0.01)
+        if isinstance(outcome, str):
+            refused += 1
+            assert "at the reading of landmark" in outcome
+            np.testing.assert_array_equal(slam.belief().mean, before.mean)
+            np.testing.assert_array_equal(slam.belief().covariance, before.covariance)
+        else:
+            assert np.isfinite(slam.belief().covariance).all()
+            assert outcome.nis < 1e9
+    assert refused > 20
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_a_reading_at_an_expected_range_below_the_minimum_is_skipped(case):
+    slam = make(case, min_range=0.5)
+    tell_truth(slam, np.zeros(3), {0: (2.0, 0.0), 1: (0.0, 4.0), 2: (0.4, 0.0)})
+    slam.update([(0.0, 2.0), (np.pi / 2, 4.0)], [0, 1])
+    tell_truth(slam, (1.7, 0.0, 0.0), {0: (2.0, 0.0), 1: (0.0, 4.0), 2: (2.1, 0.0)})
+    slam.predict((1.7, 0.0))
+    report = slam.update([(0.0, 0.6), (2.0, 4.3), (0.0, 0.4)], [0, 1, 2])
+    assert set(report.skipped_ids) == {0, 2}
+    assert report.associated_ids == (1,)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+@pytest.mark.parametrize("at", ["expected", "reading"])
+def test_range_noise_reaches_every_filter(case, at):
+    small = make(case)
+    large = make(case, range_std_per_metre=0.5, range_noise_at=at)
+    for each in (small, large):
+        tell_truth(each, np.zeros(3))
+        each.update(np.array([(0.3, 6.0), (1.0, 9.0)]), [0, 1])
+        each.predict((0.0, 0.0))
+    scan = np.array([(0.3, 3.0), (1.0, 4.5)])
+    plain = small.update(scan, [0, 1]).innovation_covariance
+    noisy = large.update(scan, [0, 1]).innovation_covariance
+    assert noisy[1, 1] > plain[1, 1] + (2.0 if at == "reading" else 4.0)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_a_landmark_at_the_robot_is_reported_as_near(case):
+    slam = make(case)
+    true_map = {0: (0.9, 0.0), 1: (2.0, 3.0)}
+    tell_truth(slam, np.zeros(3), true_map)
+    slam.update([(0.0, 0.9), (np.arctan2(3, 2), 13**0.5)], [0, 1])
+    tell_truth(slam, (0.5, 0.0, 0.0), true_map)
+    slam.predict((0.5, 0.0))
+    assert slam.update([(0.0, 0.4)], [0]).near_ids == (0,)
+
+
+def test_the_ideal_filter_asks_for_the_truth_of_all_it_sees():
+    slam = make("ideal")
+    slam.observe_truth((0, 0, 0), {0: (1.0, 2.0)})
+    with pytest.raises(ValueError, match="got none of landmark 5"):
+        slam.update([(0.3, 2.0)], [5])
+    slam.update([(1.1, 2.2)], [0])
+    with pytest.raises(ValueError, match="got none of landmark 0"):
+        slam.observe_truth((0, 0, 0), {7: (1.0, 2.0)})
 
 
 @pytest.mark.parametrize("case", FAMILY)
