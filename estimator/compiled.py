@@ -17,7 +17,7 @@ def compiled(function: Kernel) -> Kernel:
     """Compile a kernel at its first call and keep it in numba's cache on disk.
 
     Of the liberties of ``fastmath`` it takes only the fused multiply-add: sums keep
-    their order, so that a kernel gives the same bits alone, inlined in another kernel,
+    their order, and one function gives the same bits alone, called by another kernel,
     or in a thread.  ``NUMBA_DISABLE_JIT=1`` runs the plain Python functions instead,
     for a debugger.
     """
@@ -30,6 +30,15 @@ def part(function: Kernel) -> Kernel:
     Its ``py_func`` can be called from Python.
     """
     return _compile(function, callable_from_python=False)
+
+
+def inlined(function: Kernel) -> Kernel:
+    """Make a function part of the kernels that call it, so that it compiles but once.
+
+    For what conducts other kernels: arithmetic in a function of its own gives the same
+    bits wherever it is called from, inlined it may not.
+    """
+    return cast("Kernel", njit(inline="always", error_model="numpy")(function))
 
 
 def _compile(function: Kernel, *, callable_from_python: bool) -> Kernel:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .compiled import compiled, part
+from .compiled import compiled, inlined, part
 from .kernels import (
     AT_ESTIMATE,
     INVARIANT,
@@ -68,7 +68,7 @@ class Workspace(NamedTuple):
     mean_before: Array  # (capacity,)
 
 
-@part
+@inlined
 def new_workspace(m: int, size: int, capacity: int, rules: Rules) -> Workspace:
     """Allocate for ``m`` readings of a belief of that size and capacity."""
     stages = min(rules.iterations, 2)
@@ -104,7 +104,7 @@ def keep(source: Array, target: Array, size: int) -> None:
             target[i, j] = source[i, j]
 
 
-@part
+@inlined
 def as_rules(values: Array) -> Rules:
     """Read rules from the array ``numpy.array(rules)``: one argument, not ten."""
     return Rules(
@@ -122,7 +122,7 @@ def as_rules(values: Array) -> Rules:
     )
 
 
-@part
+@inlined
 def correct(
     mean: Array,
     covariance: Array,
@@ -265,7 +265,7 @@ def meets(mean: Array, covariance: Array, column: int) -> bool:
     return bool(dx * dx + dy * dy < 100 * spread)
 
 
-@part
+@inlined
 def screen(
     mean: Array,
     covariance: Array,
@@ -316,7 +316,7 @@ def set_variance(rules: Rules, distance: float, variance: Array) -> None:
     variance[1] = (rules.range_std + rules.range_std_per_metre * distance) ** 2
 
 
-@part
+@inlined
 def update_belief(
     mean: Array,
     covariance: Array,
