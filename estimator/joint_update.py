@@ -14,7 +14,7 @@ from .kernels import (
     add_landmark,
     linearise,
     retract,
-    through,
+    times,
     transport,
 )
 
@@ -165,7 +165,9 @@ def correct(
             c, where = columns[k], rules.linearisation
             linearise(mean, reference, c, where, readings, k, jacobians, innovations)
             if iteration > 0:
-                relate_to_prior(prior, shift, c, rules.frame, jacobians, innovations, k)
+                relate_to_prior(
+                    prior, work.vectors, c, rules.frame, jacobians, innovations, k
+                )
         for j in range(size):
             mean[j] = prior[j]
         failed = absorb(
@@ -178,7 +180,7 @@ def correct(
             work.gains[stage, 2 * first : 2 * last],
             work.roots[stage, first:last],
             work.white[stage, 2 * first : 2 * last],
-            shift,
+            work.vectors,
             block_of(size, last - first),
         )
         if failed >= 0:
@@ -217,7 +219,7 @@ def relate_to_prior(
         for i in range(2):
             jacobians[k, i, 2] = jacobians[k, i, 3] * dy - jacobians[k, i, 4] * dx
     for i in range(2):
-        innovations[k, i] += through(jacobians, k, i, shift, c)
+        innovations[k, i] += times(jacobians, k, i, shift, 0, c)
 
 
 @part

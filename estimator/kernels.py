@@ -177,7 +177,7 @@ def absorb(
         H (m, 2, 5), the diagonal of Q (m, 2), ν (m, 2).
     gains, roots, white, shift
         Results A (2m, capacity), the diagonal blocks of L as (l00, l10, l11), shape
-        (m, 3), w (2m,) and δ (capacity,).
+        (m, 3), w (2m,) and δ in the first row of an array (…, capacity).
 
     Returns
     -------
@@ -187,7 +187,7 @@ def absorb(
     """
     m = len(columns)
     for j in range(size):
-        shift[j] = 0.0
+        shift[0, j] = 0.0
     for first in range(0, m, block):
         last = min(first + block, m)
         if first > 0:
@@ -198,8 +198,8 @@ def absorb(
             if first > 0:
                 _refresh(covariance, size, c)
             _correlate(covariance, size, c, jacobians, k, gains)
-            scale0 = _times(jacobians, k, 0, gains, 2 * k, c) + variances[k, 0]
-            scale1 = _times(jacobians, k, 1, gains, 2 * k + 1, c) + variances[k, 1]
+            scale0 = times(jacobians, k, 0, gains, 2 * k, c) + variances[k, 0]
+            scale1 = times(jacobians, k, 1, gains, 2 * k + 1, c) + variances[k, 1]
             for before in range(2 * first, 2 * k, 2):
                 _orthogonalise(size, c, jacobians, k, gains, before)
             least0, least1 = SINGULAR * scale0, SINGULAR * scale1
@@ -244,10 +244,10 @@ def _orthogonalise(
 ) -> None:
     """Subtract from the rows of reading k their part along two finished rows."""
     i, row = before, 2 * k
-    l00 = _times(jacobians, k, 0, gains, i, c)
-    l01 = _times(jacobians, k, 0, gains, i + 1, c)
-    l10 = _times(jacobians, k, 1, gains, i, c)
-    l11 = _times(jacobians, k, 1, gains, i + 1, c)
+    l00 = times(jacobians, k, 0, gains, i, c)
+    l01 = times(jacobians, k, 0, gains, i + 1, c)
+    l10 = times(jacobians, k, 1, gains, i, c)
+    l11 = times(jacobians, k, 1, gains, i + 1, c)
     for j in range(_padded(size)):
         a0, a1 = gains[i, j], gains[i + 1, j]
         gains[row, j] = gains[row, j] - l00 * a0 - l01 * a1
@@ -271,9 +271,9 @@ def _normalise(
     Of what the readings before leave of S; false where nothing but rounding is left.
     """
     row = 2 * k
-    s00 = _times(jacobians, k, 0, gains, row, c) + variances[k, 0]
-    s10 = _times(jacobians, k, 1, gains, row, c)
-    s11 = _times(jacobians, k, 1, gains, row + 1, c) + variances[k, 1]
+    s00 = times(jacobians, k, 0, gains, row, c) + variances[k, 0]
+    s10 = times(jacobians, k, 1, gains, row, c)
+    s11 = times(jacobians, k, 1, gains, row + 1, c) + variances[k, 1]
     if not s00 > least0:
         return False
     l00 = np.sqrt(s00)
@@ -305,27 +305,18 @@ def _shift(
 ) -> None:
     """Whiten what the readings before leave of ν, and add its share to δ."""
     row = 2 * k
-    w0 = (innovations[k, 0] - through(jacobians, k, 0, shift, c)) / roots[k, 0]
-    w1 = innovations[k, 1] - through(jacobians, k, 1, shift, c)
+    w0 = (innovations[k, 0] - times(jacobians, k, 0, shift, 0, c)) / roots[k, 0]
+    w1 = innovations[k, 1] - times(jacobians, k, 1, shift, 0, c)
     w1 = (w1 - roots[k, 1] * w0) / roots[k, 2]
     white[row], white[row + 1] = w0, w1
     for j in range(size):
-        shift[j] = shift[j] + w0 * gains[row, j] + w1 * gains[row + 1, j]
+        shift[0, j] = shift[0, j] + w0 * gains[row, j] + w1 * gains[row + 1, j]
 
 
 @part
-def through(jacobians: Array, k: int, i: int, state: Array, c: int) -> float:
-    """One row of H times a vector over the whole state."""
-    H = jacobians
-    pose = H[k, i, 0] * state[0] + H[k, i, 1] * state[1] + H[k, i, 2] * state[2]
-    product: float = pose + H[k, i, 3] * state[c] + H[k, i, 4] * state[c + 1]
-    return product
-
-
-@part
-def _times(jacobians: Array, k: int, i: int, gains: Array, row: int, c: int) -> float:
-    """One row of H times one row of A."""
-    H, A = jacobians, gains
+def times(jacobians: Array, k: int, i: int, rows: Array, row: int, c: int) -> float:
+    """One row of H times one row over the whole state, of A or such."""
+    H, A = jacobians, rows
     pose = H[k, i, 0] * A[row, 0] + H[k, i, 1] * A[row, 1] + H[k, i, 2] * A[row, 2]
     product: float = pose + H[k, i, 3] * A[row, c] + H[k, i, 4] * A[row, c + 1]
     return product
