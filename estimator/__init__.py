@@ -3,6 +3,9 @@
 A step flows predict → update → belief; the modules are named so.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from .batch import BatchSlam as BatchSlam
 from .batch import BatchTrace as BatchTrace
 from .batch import can_batch as can_batch
@@ -25,3 +28,20 @@ from .registry import make_estimator as make_estimator
 from .registry import register_estimator as register_estimator
 from .robocentric import RobocentricEkfSlam as RobocentricEkfSlam
 from .unscented import UnscentedSlam as UnscentedSlam
+
+if TYPE_CHECKING:
+    from .consistency_report import ConsistencyReport as ConsistencyReport
+    from .consistency_report import assert_consistent as assert_consistent
+    from .decisions import runs_to_detect as runs_to_detect
+
+_STATISTICS = {  # loaded when first asked for: scipy.stats takes longer than the rest
+    "ConsistencyReport": "consistency_report",
+    "assert_consistent": "consistency_report",
+    "runs_to_detect": "decisions",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _STATISTICS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_STATISTICS[name]}", __name__), name)
