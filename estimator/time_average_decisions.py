@@ -69,7 +69,8 @@ def bootstrap_decision(
 ) -> Decision:
     """Decide on the per-run time averages by the studentised bootstrap.
 
-    The percentile bootstrap would refuse 9 to 11 % at 20 to 50 runs.
+    The percentile bootstrap would refuse 9 to 11 % of 50 to 20 runs where NEES hardly
+    changes over time.
 
     Parameters
     ----------
