@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.stats import chi2
 
 from .error_frames import (
@@ -22,7 +23,10 @@ from .error_frames import (
 
 Array = NDArray[np.float64]
 
-SINGULAR = 1e-10  # eigenvalue of a correlation matrix that counts as zero
+SINGULAR = 1e-10
+"""A variance, given the entries before it, that counts as zero beside its own."""
+
+_FEW = 4  # so small covariances are factored side by side
 
 
 class LjungBox(NamedTuple):
@@ -58,17 +62,12 @@ def normalised_squared_error(errors: Array, covariances: Array) -> Array:
     array([1.])
     """
     std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
-    usable = np.isfinite(errors).all(axis=-1) & (std > 0).all(axis=-1)
-    usable = np.asarray(usable & np.isfinite(covariances).all(axis=(-2, -1)))
-    result = np.full(usable.shape, np.nan)
-    std, scaled = std[usable], errors[usable] / std[usable]
-    correlation = covariances[usable] / std[:, :, None] / std[:, None, :]
-    regular = np.linalg.eigvalsh(correlation)[:, 0] > SINGULAR
-    scaled, correlation = scaled[regular], correlation[regular]
-    weighted = np.linalg.solve(correlation, scaled[..., None])[..., 0]
-    usable[usable] = regular
-    result[usable] = (scaled * weighted).sum(axis=1)
-    return result
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        scaled = errors / std
+        correlations = covariances / std[..., :, None] / std[..., None, :]
+        whiten = _whiten_few if errors.shape[-1] <= _FEW else _whiten_each
+        white = whiten(scaled, correlations)
+        return np.asarray((white**2).sum(axis=-1))
 
 
 def pose_nees(
@@ -273,6 +272,44 @@ def average_band(
     freedom = runs * degrees_of_freedom
     low, high = chi2.ppf([tail, 1 - tail], freedom) / runs
     return Band(float(low), float(high))
+
+
+def _whiten_few(errors: Array, correlations: Array) -> Array:
+    """Solve L w = e, C = L Lᵀ, entry by entry over all leading axes at once.
+
+    Each entry costs a few operations on whole arrays, which have the same bits whatever
+    stands beside it.
+    """
+    n = errors.shape[-1]
+    white = np.empty(errors.shape)
+    factor = np.empty(correlations.shape)
+    for j in range(n):
+        left = correlations[..., j, j].copy()
+        rest = errors[..., j].copy()
+        for k in range(j):
+            left -= factor[..., j, k] ** 2
+            rest -= factor[..., j, k] * white[..., k]
+        pivot = np.sqrt(np.where(left > SINGULAR, left, np.nan))
+        white[..., j] = rest / pivot
+        for i in range(j + 1, n):
+            entry = correlations[..., i, j].copy()
+            for k in range(j):
+                entry -= factor[..., i, k] * factor[..., j, k]
+            factor[..., i, j] = entry / pivot
+    return white
+
+
+def _whiten_each(errors: Array, correlations: Array) -> Array:
+    """Solve L w = e, C = L Lᵀ, one after the other; nan where C is singular."""
+    n = errors.shape[-1]
+    white = np.full((errors[..., 0].size, n), np.nan)
+    pairs = zip(errors.reshape(-1, n), correlations.reshape(-1, n, n), strict=True)
+    for index, (error, correlation) in enumerate(pairs):
+        if np.isfinite(correlation).all() and np.isfinite(error).all():
+            factor, failed = dpotrf(correlation, lower=1)
+            if not failed and (np.diagonal(factor) ** 2 > SINGULAR).all():
+                white[index] = dtrtrs(factor, error, lower=1)[0]
+    return white.reshape(errors.shape)
 
 
 def _in_frame(

@@ -12,7 +12,7 @@ Where the heading is uncertain, positions are spread over an arc: a banana in ad
 coordinates, an ellipse in these.  States are (x, y, θ, l1x, l1y, …).
 """
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from .angles import wrap_angle
 
 Array = NDArray[np.float64]
 ErrorFrame = Literal["additive", "invariant"]
+ERROR_FRAMES: tuple[ErrorFrame, ...] = get_args(ErrorFrame)
 
 
 def additive_error(true_state: Array, mean: Array) -> Array:

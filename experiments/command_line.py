@@ -4,6 +4,7 @@ What a command does lies in :mod:`slamgym.experiments.commands` and is loaded wh
 runs, so that help answers at once.
 """
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -74,6 +75,8 @@ def _slamgym(
         bool, typer.Option("--version", help="Print the version.")
     ] = False,
 ) -> None:
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)  # for estimators of one's own, "module:Class"
     if version:
         typer.echo(f"slamgym {__version__}")
     elif context.invoked_subcommand is None:
@@ -107,12 +110,13 @@ def run(
 ) -> None:
     """Drive, filter, and write all down."""
     from .commands import run_and_replay, worlds  # noqa: PLC0415 (heavy)
+    from .filter_settings import settings_for_scenario  # noqa: PLC0415 (heavy)
 
     world = worlds.chosen_scenario(scenario, steps=steps, sets=set_ or [])
     chosen = assignments("--option", option or [])
     run_and_replay.run_scenario(
         world,
-        worlds.matched_settings(world, estimator, chosen),
+        settings_for_scenario(world, estimator=estimator, options=chosen),
         controller=controller,
         seed=seed,
         output=run_and_replay.Output(out, every_step, as_json),
@@ -199,14 +203,17 @@ def noise_study(
     """Run the study, and write figure and tables."""
     from .commands import study, worlds  # noqa: PLC0415 (heavy)
     from .commands.run_and_replay import read_any_log  # noqa: PLC0415 (heavy)
-    from .filter_settings import settings_for  # noqa: PLC0415 (heavy)
+    from .filter_settings import (  # noqa: PLC0415 (heavy)
+        settings_for,
+        settings_for_scenario,
+    )
 
     chosen = assignments("--option", option or [])
     stds = _stds(motion_std, measurement_std, initial_pose_std)
     if study.is_scenario(source):
         _refuse(stds, "a log; the filter knows the noise of a scenario")
         world = worlds.chosen_scenario(source, steps=steps, sets=set_ or [])
-        settings = worlds.matched_settings(world, estimator, chosen)
+        settings = settings_for_scenario(world, estimator=estimator, options=chosen)
         planned = study.scenario_study(
             world, settings, controller=controller, seed=seed
         )
@@ -242,13 +249,16 @@ def render(
 ) -> None:
     """Film an episode."""
     from .commands import film, worlds  # noqa: PLC0415 (heavy)
+    from .filter_settings import settings_for_scenario  # noqa: PLC0415 (heavy)
 
     world = worlds.chosen_scenario(scenario, steps=steps, sets=set_ or [])
     shown = estimator or ("ekf" if world.sensor.identities else "none")
     chosen = assignments("--option", option or [])
     film.film_episode(
         world,
-        None if shown == "none" else worlds.matched_settings(world, shown, chosen),
+        None
+        if shown == "none"
+        else settings_for_scenario(world, estimator=shown, options=chosen),
         controller=controller,
         seed=seed,
         fps=fps,

@@ -9,7 +9,9 @@ from numpy.typing import ArrayLike
 
 from ..estimator.interface import SlamEstimator
 from ..estimator.registry import EstimatorFactory, find_estimator, make_estimator
+from ..sim_configs import Scenario
 from .log_lines import LogError
+from .recording import log_header
 from .slamlog import SlamLog
 
 SIGMAS = ("σx", "σy", "σα", "σβ", "σr")
@@ -129,6 +131,29 @@ def settings_for(
         ),
         options={**_told_options(log.name, header, factory), **(options or {})},
     )
+
+
+def settings_for_scenario(
+    scenario: Scenario,
+    *,
+    estimator: str = "ekf",
+    options: Mapping[str, Any] | None = None,
+) -> FilterSettings:
+    """Set up an estimator with the noise of a world.
+
+    Raises
+    ------
+    ValueError
+        If the estimator is unknown.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> settings_for_scenario(load_scenario("six_landmarks")).motion_std
+    (0.25, 0.1, 0.1)
+    """
+    told = SlamLog(scenario.name, log_header(scenario, seed=0))
+    return settings_for(told, estimator=estimator, options=options)
 
 
 def _std(

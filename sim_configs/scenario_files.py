@@ -70,16 +70,26 @@ def load_scenario(source: Scenario | Mapping[str, object] | str | Path) -> Scena
 
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
-    """Write a scenario as a TOML file that `load_scenario` reads back equal.
+    """Write a scenario as a TOML file that `load_scenario` reads back equal."""
+    Path(path).write_text(scenario_text(scenario), encoding="utf-8")
 
-    Every field is written, also those at their defaults.
+
+def scenario_text(scenario: Scenario) -> str:
+    """Write a scenario as TOML, every field, also those at their defaults.
+
+    Examples
+    --------
+    >>> import tomllib
+    >>> scenario = load_scenario("loop")
+    >>> load_scenario(tomllib.loads(scenario_text(scenario))) == scenario
+    True
     """
     table = scenario.model_dump(exclude_none=True)
     parts = {key: value for key, value in table.items() if isinstance(value, dict)}
     lines = [_assignment(key, table[key]) for key in table if key not in parts]
     for name, part in parts.items():
         lines += ["", f"[{name}]", *(_assignment(*item) for item in part.items())]
-    Path(path).write_text("\n".join([*lines, ""]), encoding="utf-8")
+    return "\n".join([*lines, ""])
 
 
 def scenario_schema() -> str:

@@ -1,15 +1,13 @@
 """Scenarios as the command line names and drives them."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
-from typing import Any
 
 import numpy as np
 
 from ...envs.controllers import CONTROLLERS, Controller, make_controller
 from ...sim_configs import Scenario, load_scenario
-from ..filter_settings import FilterSettings, settings_for
-from ..recording import log_header, record_episode
+from ..recording import record_episode
 from ..slamlog import SlamLog
 from .one_line_errors import BadInputError
 from .option_values import changes
@@ -54,17 +52,3 @@ def recorded(
     """Drive one episode with a controller of this name, see `record_episode`."""
     driving = driver(controller, scenario, seed)
     return record_episode(scenario, driving, seed, progress=progress)
-
-
-def matched_settings(
-    scenario: Scenario, estimator: str, options: Mapping[str, Any]
-) -> FilterSettings:
-    """Set up an estimator with the noise of a world.
-
-    Raises
-    ------
-    ValueError
-        If the estimator is unknown.
-    """
-    told = SlamLog(scenario.name, log_header(scenario, seed=0))
-    return settings_for(told, estimator=estimator, options=options)
