@@ -14,16 +14,15 @@ import argparse
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
 from rich.console import Console
 from rich.table import Table
 
-from slamgym.estimator import BatchTrace, make_batch, make_estimator
-from slamgym.estimator.consistency import average_band, heading_nees, pose_nees
-from slamgym.experiments.simulated_runs import SimulatedRuns, simulate_runs
-from slamgym.sim_configs import Scenario, load_scenario
+from slamgym.estimator.consistency import average_band
+from slamgym.experiments.monte_carlo import monte_carlo
 
 SCENARIOS = (
     "loop",
@@ -35,21 +34,17 @@ SCENARIOS = (
     "slippery",
     "standing",
 )
-Filters = dict[str, tuple[str, dict[str, Any]]]
-FILTERS: Filters = {
-    "ekf": ("ekf", {}),
-    "ekf, independent": ("ekf", {"landmark_init": "independent"}),
-    "iterated": ("iterated", {}),
-    "first_estimates": ("first_estimates", {}),
-    "observability_constrained": ("observability_constrained", {}),
-    "invariant": ("invariant", {}),
-    "invariant, iterated": ("invariant", {"iterations": 3}),
-    "invariant, sequential": ("invariant", {"sequential": True}),
-}
-SLOW: Filters = {
-    "unscented": ("unscented", {}),
-    "robocentric": ("robocentric", {}),
-}
+FILTERS = (
+    "ekf",
+    "ekf[landmark_init=independent]",
+    "iterated",
+    "first_estimates",
+    "observability_constrained",
+    "invariant",
+    "invariant[iterations=3]",
+    "invariant[sequential=true]",
+)
+SLOW = ("unscented", "robocentric")
 
 
 class Row(NamedTuple):
@@ -66,97 +61,34 @@ class Row(NamedTuple):
     diverged: float
 
 
-def settings_of(scenario: Scenario) -> dict[str, Any]:
-    """Noise that a filter of this scenario is told: the true one."""
-    return {
-        "motion_std": scenario.motion.std,
-        "measurement_std": scenario.sensor.std,
-        "range_std_per_metre": scenario.sensor.range_std_per_metre,
-        "noise_at_rest": scenario.motion.noise_at_rest,
-        "initial_pose_std": scenario.start.std,
-    }
-
-
-def run_batch(
-    name: str, scenario: Scenario, data: SimulatedRuns, options: dict[str, Any]
-) -> BatchTrace:
-    """All runs through a filter that can batch."""
-    runs, _, landmarks = data.visible.shape
-    batch = make_batch(
-        name,
-        runs=runs,
-        landmarks=landmarks,
-        initial_poses=data.initial_poses,
-        **settings_of(scenario),
-        **options,
-    )
-    return batch.run(data.odometry, data.measurements, data.visible, data.dt)
-
-
-def run_singly(
-    name: str, scenario: Scenario, data: SimulatedRuns, options: dict[str, Any]
-) -> BatchTrace:
-    """All runs through a filter one by one."""
-    runs, steps, _ = data.visible.shape
-    trace = BatchTrace(
-        np.full((runs, steps, 3), np.nan),
-        np.full((runs, steps, 3, 3), np.nan),
-        np.zeros((runs, steps)),
-        np.zeros((runs, steps), dtype=np.int64),
-    )
-    for run in range(runs):
-        slam = make_estimator(
-            name,
-            initial_pose=data.initial_poses[run],
-            **settings_of(scenario),
-            **options,
-        )
-        for step in range(steps):
-            seen = np.flatnonzero(data.visible[run, step])
-            slam.predict(data.odometry[run, step], data.dt[step])
-            report = slam.update(data.measurements[run, step, seen], seen.tolist())
-            belief = slam.belief()
-            trace.poses[run, step] = belief.pose
-            trace.pose_covariances[run, step] = belief.pose_covariance
-            trace.nis[run, step] = report.nis
-            trace.degrees_of_freedom[run, step] = report.degrees_of_freedom
-    return trace
-
-
-def measure(data: SimulatedRuns, trace: BatchTrace) -> Row:
-    """Sum a trace up, leaving out the first scan: before any motion."""
-    steps = np.s_[:, 1:]
-    poses, covariances = trace.poses[steps], trace.pose_covariances[steps]
-    finite = (abs(poses) < 1e6).all(axis=(1, 2)) & np.isfinite(trace.nis).all(axis=1)
-    after = data.true_poses[steps][finite], poses[finite], covariances[finite]
-    invariant = pose_nees(*after, frame="invariant") / 3
-    additive = pose_nees(*after, frame="additive") / 3
+def measure(results: xr.Dataset) -> Row:
+    """Sum the runs of one filter up, leaving out the first scan: before any motion."""
+    later = results.isel(step=slice(1, None))
+    finite = (later.position_error < 1e6).all("step") & ~later.failed
+    sound = later.isel(run=np.flatnonzero(finite))
+    invariant = sound.pose_nees_invariant.values / 3
     low, high = np.array(average_band(len(invariant), 3)) / 3
-    average = invariant.mean(axis=0)
-    per_run = invariant.mean(axis=1)
-    freedom = trace.degrees_of_freedom[finite].sum()
+    average, per_run = invariant.mean(axis=0), invariant.mean(axis=1)
     return Row(
         float(average.mean()),
-        float(additive.mean()),
+        float(sound.pose_nees_additive.mean()) / 3,
         float(((average > low) & (average < high)).mean()),
         float(np.median(per_run)),
         float((per_run > 3).mean()),
-        float(heading_nees(*after).mean()),
-        float(np.rad2deg(np.sqrt(after[2][:, -1, 2, 2]).mean())),
-        float(trace.nis[finite].sum() / max(freedom, 1)),
+        float(sound.heading_nees.mean()),
+        float(np.rad2deg(sound.heading_std.isel(step=-1).mean())),
+        float(sound.nis.sum() / max(int(sound.nis_dof.sum()), 1)),
         float(1 - finite.mean()),
     )
 
 
 def rows_of(
-    name: str, runs: int, seed: int, filters: Filters
+    name: str, runs: int, seed: int, filters: Iterable[str]
 ) -> Iterator[tuple[str, Row]]:
     """Run all filters on one scenario."""
-    scenario = load_scenario(name)
-    data = simulate_runs(scenario, runs, seed)
-    for label, (estimator, options) in filters.items():
-        run = run_singly if label in SLOW else run_batch
-        yield label, measure(data, run(estimator, scenario, data, options))
+    results = monte_carlo(name, filters, runs, seed)
+    for label in results.estimator.values.tolist():
+        yield label, measure(results.sel(estimator=label))
 
 
 def print_table(title: str, rows: Iterable[tuple[str, Row]]) -> None:
@@ -194,7 +126,7 @@ def main() -> None:
     parser.add_argument("--slow", action="store_true", help="the slow filters too")
     parser.add_argument("--markdown", action="store_true", help="for a document")
     arguments = parser.parse_args()
-    filters = FILTERS | (SLOW if arguments.slow else {})
+    filters = FILTERS + (SLOW if arguments.slow else ())
     began = time.perf_counter()
     show = print_markdown if arguments.markdown else print_table
     for name in arguments.scenario or SCENARIOS:

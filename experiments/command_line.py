@@ -14,7 +14,7 @@ import typer
 from .. import __version__
 from .commands import option_types as options
 from .commands.one_line_errors import BadInputError, OneLineErrors
-from .commands.option_values import assignments, standard_deviations
+from .commands.option_values import assignments, changes, standard_deviations
 
 main = typer.Typer(
     name="slamgym",
@@ -173,6 +173,52 @@ def replay(
 
 
 @main.command(
+    name="monte-carlo",
+    short_help="Many runs: do the filters tell the truth?",
+    help=_taught(
+        "Run filters many times over a scenario, all on the same random numbers, and "
+        "decide with known error rates whether their covariances tell the truth about "
+        "their errors. Writes results.nc (estimator x run x step, for xarray), "
+        "summary.json and a report to open in a browser, report.html.",
+        "slamgym monte-carlo loop --estimators ekf,invariant --runs 200 --out loop",
+        "slamgym monte-carlo six_landmarks -e mine:MyFilter --runs 100 --jobs 4",
+        "slamgym monte-carlo loop --assume motion.std=[0.1,0.1,0.1]",
+        "slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://boss:8786",
+    ),
+)
+def monte_carlo(
+    scenario: options.ScenarioName,
+    *,
+    estimators: options.EstimatorNames = "ekf,invariant",
+    runs: options.Runs = 200,
+    seed: options.Seed = 0,
+    steps: options.Steps = None,
+    set_: options.ScenarioChanges = None,
+    assume: options.AssumedChanges = None,
+    jobs: options.Jobs = None,
+    backend: options.Backend = None,
+    scheduler: options.Scheduler = None,
+    block_size: options.RunsPerBlock = 64,
+    out: options.ResumableFolder = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Run many times, measure and decide."""
+    from .commands import monte_carlo_runs, worlds  # noqa: PLC0415 (heavy)
+
+    monte_carlo_runs.run_monte_carlo(
+        worlds.chosen_scenario(scenario, steps=steps, sets=set_ or []),
+        estimators,
+        runs=runs,
+        seed=seed,
+        assumed=changes("--assume", assume or []),
+        workers=monte_carlo_runs.Workers(jobs, backend, scheduler),
+        block_size=block_size,
+        out=out,
+        as_json=as_json,
+    )
+
+
+@main.command(
     name="noise-study",
     short_help="Every noise times 10 and divided by 10.",
     help=_taught(
@@ -183,6 +229,7 @@ def replay(
         "NEES and NIS, which are 1 per degree of freedom for an honest filter.",
         "slamgym noise-study data.txt",
         "slamgym noise-study six_landmarks --seed 3 --out study",
+        "slamgym noise-study six_landmarks --runs 100 -e ekf,invariant",
     ),
 )
 def noise_study(
@@ -197,11 +244,14 @@ def noise_study(
     steps: options.Steps = None,
     controller: options.ControllerName = "open_loop",
     set_: options.ScenarioChanges = None,
+    runs: options.StudyRuns = 1,
+    change: options.Changed = "all",
+    jobs: options.Jobs = None,
     out: options.OutFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Run the study, and write figure and tables."""
-    from .commands import study, worlds  # noqa: PLC0415 (heavy)
+    from .commands import noise_monte_carlo, study, worlds  # noqa: PLC0415 (heavy)
     from .commands.run_and_replay import read_any_log  # noqa: PLC0415 (heavy)
     from .filter_settings import (  # noqa: PLC0415 (heavy)
         settings_for,
@@ -213,6 +263,18 @@ def noise_study(
     if study.is_scenario(source):
         _refuse(stds, "a log; the filter knows the noise of a scenario")
         world = worlds.chosen_scenario(source, steps=steps, sets=set_ or [])
+        if runs != 1:
+            noise_monte_carlo.study_effects(
+                world,
+                estimator,
+                runs=runs,
+                seed=seed,
+                changed=change,
+                jobs=jobs,
+                out=out,
+                as_json=as_json,
+            )
+            return
         settings = settings_for_scenario(world, estimator=estimator, options=chosen)
         planned = study.scenario_study(
             world, settings, controller=controller, seed=seed

@@ -15,7 +15,7 @@ class BadInputError(ValueError):
 
 
 class InterruptedRunError(Exception):
-    """The user pressed Ctrl-C."""
+    """The user pressed Ctrl-C; the message may say what is left of the work."""
 
 
 class OneLineErrors(TyperGroup):
@@ -57,7 +57,7 @@ def message_of(error: Exception) -> str:
     'dt must be > 0, got 0; steps must be >= 2, got 1'
     """
     if isinstance(error, InterruptedRunError):
-        return "interrupted; nothing was written"
+        return str(error) or "interrupted; nothing was written"
     if hasattr(error, "format_message"):  # of the command line itself
         return _one_line(error.format_message())
     if isinstance(error, OSError) and error.filename and error.strerror:

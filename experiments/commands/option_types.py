@@ -170,3 +170,77 @@ FramesPerSecond = Annotated[
         show_default="so that it lasts 12 s",
     ),
 ]
+EstimatorNames = Annotated[
+    str,
+    typer.Option(
+        "--estimators",
+        "-e",
+        metavar="NAMES",
+        help='Filters with commas between, such as "ekf,invariant[iterations=3]" or '
+        '"module:Class" of your own; options stand in brackets.',
+    ),
+]
+Runs = Annotated[
+    int, typer.Option(help="How many; run i is the world of seed SEED + i.")
+]
+AssumedChanges = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--assume",
+        metavar="KEY=VALUE",
+        help="A change of the scenario that only the filters are told of, such as "
+        f"motion.std=[0.1,0.1,0.1]. {_REPEATED}",
+    ),
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        "--jobs",
+        "-j",
+        metavar="N",
+        help="Worker processes, -1 for one on each core.",
+        show_default="this process, its filters on all cores",
+    ),
+]
+Backend = Annotated[
+    str | None,
+    typer.Option(
+        metavar="loky|dask|ray",
+        help="Where the workers are: loky, on this machine; dask or ray, on a cluster.",
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Of the Dask or Ray cluster.",
+        show_default="a cluster of this machine",
+    ),
+]
+RunsPerBlock = Annotated[
+    int, typer.Option(metavar="N", help="Runs done and written at a time.")
+]
+ResumableFolder = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="The folder to write. A job that was stopped there goes on, and more runs "
+        "build on those there are.",
+        show_default="results/monte-carlo-<scenario>",
+    ),
+]
+StudyRuns = Annotated[
+    int,
+    typer.Option(
+        help="Of a scenario: more than one asks for a Monte Carlo of each change."
+    ),
+]
+Changed = Annotated[
+    str,
+    typer.Option(
+        "--change",
+        metavar="both|world|filter|all",
+        help="With --runs: whether noises change in world and filter, in the world "
+        "alone, or in what the filter is told.",
+    ),
+]

@@ -8,7 +8,16 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 Tick = Callable[[int, int], None]
 
@@ -42,13 +51,15 @@ class Reporter:
             sys.stdout.write(text + "\n")
 
     @contextlib.contextmanager
-    def progress(self, doing: str) -> Iterator[Tick]:
+    def progress(self, doing: str, unit: str = "") -> Iterator[Tick]:
         """Show a bar on a terminal, moved by the function lent, until all is done.
 
         Parameters
         ----------
         doing : str
             What goes on, such as "filtering".
+        unit : str, optional
+            What is counted; the bar then tells the rate and the time left too.
 
         Yields
         ------
@@ -59,6 +70,7 @@ class Reporter:
             TextColumn("{task.description:<10}"),
             BarColumn(),
             MofNCompleteColumn(),
+            *((_Rate(unit), TimeRemainingColumn(compact=True)) if unit else ()),
         )
         with Progress(
             *columns,
@@ -84,3 +96,16 @@ class Reporter:
             yield
         finally:
             timer.cancel()
+
+
+class _Rate(ProgressColumn):
+    """How many of something are done in a second."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        """Write the rate, once it is known."""
+        speed = task.speed or task.finished_speed
+        return Text(f"{speed:,.0f} {self._unit}/s" if speed else "")

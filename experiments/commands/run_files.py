@@ -67,6 +67,10 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
         The summary with ``files``.
     """
     complete = {**summary, "files": sorted([*files_in(folder), SUMMARY])}
-    text = json.dumps(complete, indent=2, allow_nan=False, ensure_ascii=False)
-    (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
+    (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
     return complete
+
+
+def as_json_text(summary: dict[str, Any]) -> str:
+    """Write a summary as people and programs can read it."""
+    return json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"

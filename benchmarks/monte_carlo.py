@@ -1,0 +1,147 @@
+"""A whole Monte Carlo against its filter alone, and against the plain loop.
+
+    python benchmarks/monte_carlo.py
+
+One core, one process, interleaved rounds; ratios are medians over the rounds.  The
+world: 20 landmarks around a circle, about half of them in view, 1000 steps.
+"""
+
+import argparse
+import os
+import tempfile
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+
+import gymnasium
+import numpy as np
+from interleaved import verdict
+from peers import StackedDense
+
+import slamgym
+from slamgym.estimator import BatchSlam, EkfSlam
+from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.simulated_runs import simulate_runs
+from slamgym.sim_configs import Scenario, action_sequence, load_scenario
+
+LANDMARKS = 20
+
+
+def world(steps: int) -> Scenario:
+    """Make a robot that circles among landmarks and sees what is before it."""
+    angles = np.arange(LANDMARKS) * 2 * np.pi / LANDMARKS
+    points = 12 * np.column_stack([np.cos(angles), np.sin(angles)]) + [0, 8]
+    return load_scenario("loop").with_changes(
+        name="circle",
+        steps=steps,
+        landmarks={"layout": "points", "points": points.tolist()},
+        sensor={"field_of_view": np.pi, "min_range": 0.05, "max_range": 100.0},
+    )
+
+
+def filter_alone(scenario: Scenario, runs: int) -> Callable[[], object]:
+    """Return what takes the batched kernels through drives that lie ready."""
+    drives = simulate_runs(scenario, runs, 0)
+    print(f"{drives.visible.mean():.0%} of the landmarks in view")
+
+    def kernels() -> object:
+        slam = EkfSlam(scenario.motion.std, scenario.sensor.std)
+        batch = BatchSlam(
+            slam,
+            runs,
+            LANDMARKS,
+            initial_poses=drives.initial_poses,
+            initial_pose_std=scenario.start.std,
+            threads=1,
+        )
+        return batch.run(
+            drives.odometry, drives.measurements, drives.visible, drives.dt
+        )
+
+    return kernels
+
+
+def plain_loop(scenario: Scenario, runs: int) -> Callable[[], object]:
+    """Return what drives single environments and feeds the dense numpy filter.
+
+    It maps all landmarks at its start, from where the truth is, and measures nothing.
+    """
+    env = gymnasium.make("slamgym/LandmarkWorld-v0", scenario=scenario)
+    actions = action_sequence(scenario)
+    variances = np.diag(np.square(scenario.motion.std)), np.square(scenario.sensor.std)
+
+    def loop() -> None:
+        for run in range(runs):
+            observation, info = env.reset(seed=run)
+            landmarks = env.unwrapped.landmarks  # type: ignore[attr-defined]
+            mean = np.concatenate([info["pose"], landmarks.ravel()])
+            slam = StackedDense(mean, 0.01 * np.eye(len(mean)), *variances)
+            for action in actions:
+                observation, *_ = env.step(action)
+                seen = np.flatnonzero(observation["mask"])
+                readings = observation["landmarks"][seen].ravel()
+                slam.step(observation["odometry"], readings, seen)
+
+    return loop
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Time one call."""
+    began = perf_counter()
+    work()
+    return perf_counter() - began
+
+
+def compare(runs: int, steps: int, rounds: int) -> None:
+    """Print times and ratios."""
+    scenario = world(steps)
+    kernels, loop = filter_alone(scenario, runs), plain_loop(scenario, 1)
+    times: dict[str, list[float]] = {"whole": [], "kernels": [], "loop": []}
+    monte_carlo(scenario, "ekf", 1), kernels()  # compile
+    for _ in range(rounds):
+        times["whole"].append(seconds(lambda: monte_carlo(scenario, "ekf", runs)))
+        times["kernels"].append(seconds(kernels))
+        times["loop"].append(runs * seconds(loop))  # of one run, times their number
+    whole, alone = times["whole"], times["kernels"]
+    to_kernels = median(a / b for a, b in zip(whole, alone, strict=True))
+    to_loop = median(a / b for a, b in zip(times["loop"], whole, strict=True))
+    print(f"{runs} runs of {steps} steps, {LANDMARKS} landmarks, ekf, one core:")
+    print(f"  batched kernels alone                 {median(alone):7.2f} s")
+    print(f"  world + filter + measures             {median(whole):7.2f} s")
+    print(f"  plain loop: environment, dense filter {median(times['loop']):7.1f} s")
+    print(f"  whole / kernels  {to_kernels:5.2f}  goal <= 3  ", end="")
+    print(verdict(to_kernels, 3, at_least=False))
+    print(f"  loop / whole     {to_loop:5.1f}  goal >= 15 ", end="")
+    print(verdict(to_loop, 15, at_least=True))
+
+
+def compare_memory(steps: int) -> None:
+    """Print how the peak of numpy's memory grows with runs, written to disk."""
+    scenario, peaks = world(steps), []
+    for runs in (64, 256):
+        with tempfile.TemporaryDirectory() as folder:
+            tracemalloc.start()
+            monte_carlo(scenario, "ekf", runs, out=Path(folder) / "out").close()
+            peaks.append(tracemalloc.get_traced_memory()[1] / 2**20)
+            tracemalloc.stop()
+    print(f"  peak memory for 64 and 256 runs: {peaks[0]:.0f} and {peaks[1]:.0f} MiB")
+
+
+def main() -> None:
+    """Print what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=256)
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--rounds", type=int, default=3)
+    arguments = parser.parse_args()
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    print(f"slamgym {slamgym.__version__}")
+    compare(arguments.runs, arguments.steps, arguments.rounds)
+    compare_memory(arguments.steps)
+
+
+if __name__ == "__main__":
+    main()

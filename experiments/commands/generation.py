@@ -1,0 +1,137 @@
+"""``slamgym generate``: many drives through a scenario, written as a data set."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from ...sim_configs import Scenario
+from ..generate import generate_trajectories
+from ..manifest import Manifest
+from .one_line_errors import InterruptedRunError
+from .output_folder import default_folder
+from .reporter import Reporter
+
+_BETWEEN = 0.1  # [s] between two looks of the bar
+
+
+def write_trajectories(
+    scenario: Scenario,
+    *,
+    episodes: int,
+    controller: str,
+    seed: int,
+    format: str,
+    episodes_per_shard: int | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Generate trajectories, or go on where that was stopped, and tell where they lie.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The world.
+    episodes, controller, seed, format, episodes_per_shard
+        As in `generate_trajectories`.
+    out : Path or None
+        The folder to write; None chooses one below results.
+    as_json : bool
+        Whether to print the summary for programs.
+    """
+    reporter = Reporter(as_json=as_json)
+    place = out or default_folder(scenario.name, controller, format)
+    with _bar() as tick:
+        try:
+            manifest = generate_trajectories(
+                scenario,
+                place,
+                episodes=episodes,
+                controller=controller,
+                seed=seed,
+                format=format,
+                episodes_per_shard=episodes_per_shard,
+                progress=tick,
+            )
+        except KeyboardInterrupt:
+            raise InterruptedRunError(
+                f"interrupted; whole shards stay in {place}, the same command goes on"
+            ) from None
+    size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
+    message = Text(_message(manifest, place, size), no_wrap=True, overflow="ignore")
+    reporter.show(message)
+    reporter.finish(_summary(manifest, place, size))
+
+
+def _message(manifest: Manifest, place: Path, size: int) -> str:
+    job, shards = manifest.job, len(manifest.shards)
+    return (
+        f"{place}: {job.episodes:,} episodes of {job.scenario.steps:,} steps as "
+        f"{job.format}, {size / 1e6:,.1f} MB in {shards} shard{'s' * (shards > 1)}\n"
+        "from slamgym.experiments.trajectory_dataset import load_trajectories\n"
+        f'for trajectory in load_trajectories("{place.as_posix()}"): ...'
+    )
+
+
+def _summary(manifest: Manifest, place: Path, size: int) -> dict[str, object]:
+    job = manifest.job
+    return {
+        "slamgym": manifest.versions["slamgym"],
+        "scenario": job.scenario.name,
+        "controller": job.controller,
+        "seed": job.seed,
+        "episodes": job.episodes,
+        "steps": job.episodes * job.scenario.steps,
+        "format": job.format,
+        "shards": len(manifest.shards),
+        "bytes": size,
+        "out": str(place),
+    }
+
+
+class _Speed(ProgressColumn):
+    """Steps per second, of those made now."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:,.0f} steps/s")
+
+
+@contextlib.contextmanager
+def _bar() -> Iterator[Callable[[int, int], None]]:
+    """Show a bar on a terminal, moved by the function lent."""
+    console = Console(stderr=True, highlight=False)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        _Speed(),
+        TimeRemainingColumn(),
+    )
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task("driving", total=None)
+        next_look = 0.0
+
+        def tick(done: int, total: int) -> None:
+            nonlocal next_look
+            now = time.monotonic()
+            if next_look == 0.0:  # what was there already counts for no speed
+                bar.reset(task, completed=done, total=total)
+            if now >= next_look or done == total:
+                next_look = now + _BETWEEN
+                bar.update(task, completed=done, total=total)
+
+        yield tick

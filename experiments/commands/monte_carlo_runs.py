@@ -1,0 +1,152 @@
+"""``slamgym monte-carlo``: many runs, and whether the filters told the truth."""
+
+import contextlib
+import shlex
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.text import Text
+
+from ...envs.atomic_file import replace_when_written
+from ...sim_configs import Scenario, load_scenario
+from ..estimator_choices import EstimatorChoice, estimator_choices
+from ..html_report import write_html_report
+from ..monte_carlo import BLOCK_SIZE, monte_carlo
+from ..monte_carlo_summary import summarise_monte_carlo
+from ..monte_carlo_table import monte_carlo_table
+from .one_line_errors import BadInputError, InterruptedRunError
+from .output_folder import default_folder
+from .reporter import Reporter
+from .result_tables import written
+from .run_files import as_json_text
+
+REPORT, SUMMARY = "report.html", "summary.json"
+
+_NOTE = "compiling the filters, once after each installation …"
+
+
+class Workers(NamedTuple):
+    """Who does the work."""
+
+    jobs: int | None = None
+    backend: str | None = None
+    scheduler: str | None = None
+    """Address of a Dask cluster, or of a Ray cluster."""
+
+
+def run_monte_carlo(
+    scenario: Scenario,
+    estimators: str,
+    *,
+    runs: int,
+    seed: int,
+    assumed: Mapping[str, Any],
+    workers: Workers,
+    block_size: int = BLOCK_SIZE,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Run, measure, decide, and write results.nc, summary.json and report.html.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The world.
+    estimators : str
+        Which, as in `estimator_choices`.
+    runs, seed, block_size : int
+        As in `monte_carlo`.
+    assumed : mapping
+        Changes of the scenario whose noise the filters are told.
+    workers : Workers
+        Who does the work.
+    out : Path or None
+        The folder to write; None chooses one below results.
+    as_json : bool
+        Whether to print the summary for programs.
+    """
+    reporter = Reporter(as_json=as_json)
+    choices = estimator_choices(estimators)
+    place = out or default_folder("monte-carlo", scenario.name)
+    told = scenario.with_changes(**assumed) if assumed else scenario
+    with reporter.patience(_NOTE):
+        _compile(choices)
+    with (
+        _cluster(workers),
+        reporter.progress("running", unit="runs") as tick,
+        _resumable(place),
+        monte_carlo(
+            scenario,
+            {choice.label: (choice.name, choice.options) for choice in choices},
+            runs,
+            seed,
+            assumed=told,
+            out=place,
+            jobs=workers.jobs,
+            backend=workers.backend,
+            block_size=block_size,
+            command=shlex.join(["slamgym", *sys.argv[1:]]),
+            progress=tick,
+        ) as results,
+    ):
+        summary = summarise_monte_carlo(results)
+        summary["files"] = ["results.nc", SUMMARY, REPORT]
+        write_html_report(results, summary, place / REPORT)
+    with replace_when_written(place / SUMMARY) as partial:
+        partial.write_text(as_json_text(summary), encoding="utf-8")
+    sentences = [entry["sentence"] for entry in summary["estimators"].values()]
+    reporter.show(monte_carlo_table(summary), "")
+    reporter.show(*(Text(sentence) for sentence in sentences), "")
+    reporter.show(written(str(place), summary["files"]))
+    reporter.finish({**summary, "out": str(place)})
+
+
+def _compile(choices: tuple[EstimatorChoice, ...]) -> None:
+    """Run every estimator for two steps, so that its kernels are there."""
+    small = load_scenario("six_landmarks").with_changes(steps=2)
+    for choice in choices:
+        with contextlib.suppress(Exception):  # what fails here fails there, and says so
+            monte_carlo(small, {choice.label: (choice.name, choice.options)}, 1)
+
+
+@contextlib.contextmanager
+def _cluster(workers: Workers) -> Iterator[None]:
+    """Join the cluster that the work is for, or start one on this machine."""
+    if workers.backend == "dask":
+        with _dask_client(workers):
+            yield
+        return
+    if workers.scheduler is not None and workers.backend != "ray":
+        raise BadInputError("--scheduler is for --backend dask or ray")
+    if workers.scheduler is not None:
+        import ray  # noqa: PLC0415 (an extra)
+
+        ray.init(address=workers.scheduler)
+    yield
+
+
+def _dask_client(workers: Workers) -> contextlib.AbstractContextManager[Any]:
+    try:
+        from distributed import Client  # noqa: PLC0415 (an extra)
+    except ImportError:
+        raise BadInputError(
+            "--backend dask needs dask.distributed: pip install 'slamgym[dask]'"
+        ) from None
+    if workers.scheduler is not None:
+        return Client(workers.scheduler)  # type: ignore[no-any-return]
+    return Client(  # type: ignore[no-any-return]
+        n_workers=workers.jobs, threads_per_worker=1, dashboard_address=None
+    )
+
+
+@contextlib.contextmanager
+def _resumable(place: Path) -> Iterator[None]:
+    """Say after Ctrl-C where the runs done so far lie."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise InterruptedRunError(
+            f"interrupted; the runs done lie in {place}, and the same command goes on"
+        ) from None

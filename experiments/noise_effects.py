@@ -1,0 +1,173 @@
+"""What each noise does to filters, over many runs: the noise study with error bars.
+
+Every σ of `SIGMAS` times 10 and divided by 10, one by one: in the world and in what the
+filters are told of it ("both", so that they stay right), in the world alone, or in the
+filters alone, which then trust their odometry or their sensor too much or too little.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import xarray as xr
+
+from ..sim_configs import Scenario, load_scenario
+from ..sim_configs.scenario_errors import closest
+from .filter_settings import SIGMAS
+from .monte_carlo import monte_carlo
+from .noise_study import FACTORS, scaled_scenario
+
+Changed = Literal["both", "world", "filter"]
+CHANGED: tuple[Changed, ...] = get_args(Changed)
+
+_DIVERGED = 1e6  # [m]
+
+
+class NoiseEffect(NamedTuple):
+    """What an estimator made of one change; averages over runs and steps."""
+
+    changed: str
+    """Where: both, world or filter; "nothing" for the reference."""
+    sigma: str
+    """Which noise, one of `SIGMAS`; "none" for the reference."""
+    factor: float
+    """By how much; 1 for the reference."""
+    estimator: str
+    """Its label."""
+    runs: int
+    """That the figures are made of."""
+    failed: int
+    """That failed or diverged, and are left out."""
+    nees_per_degree: float
+    """Of the pose, invariant frame; 1 is right."""
+    nees_per_degree_median: float
+    """Of the runs' own averages, which a few bad runs do not rule."""
+    nis_per_degree: float
+    """1 is expected."""
+    position_rmse: float
+    """Not aligned [m]."""
+    ate_aligned: float
+    """Root mean square error of the path after the best rigid motion [m]."""
+    landmark_rmse_aligned: float
+    """The same of the final map [m]."""
+    pose_area: float
+    """Of the final 3σ ellipse [m²]."""
+    landmark_area: float
+    """Mean of the landmarks' final 3σ ellipses [m²]."""
+
+
+class _Variation(NamedTuple):
+    changed: str
+    sigma: str
+    factor: float
+    world: Scenario
+    told: Scenario
+
+
+def noise_effects(
+    scenario: Scenario | Mapping[str, object] | str | Path,
+    estimators: str | Iterable[str] | Mapping[str, Any],
+    runs: int,
+    seed: int = 0,
+    *,
+    changed: Iterable[Changed] = CHANGED,
+    jobs: int | None = None,
+    backend: str | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> list[NoiseEffect]:
+    """Run a Monte Carlo for each change of each noise, all on the same random numbers.
+
+    Parameters
+    ----------
+    scenario : Scenario, mapping, str or Path
+        The reference.
+    estimators, runs, seed, jobs, backend
+        As in :func:`~slamgym.experiments.monte_carlo.monte_carlo`.
+    changed : iterable of {"both", "world", "filter"}
+        Where a noise changes.
+    progress : callable, optional
+        Called with (runs done, runs).
+
+    Returns
+    -------
+    list of NoiseEffect
+        The reference first, one entry for each estimator; then, for each place of
+        change, two factors of each of `SIGMAS`.
+
+    Raises
+    ------
+    ValueError
+        As `monte_carlo` does, or if ``changed`` names another place.
+
+    Examples
+    --------
+    >>> effects = noise_effects("anchored", "ekf", runs=2, changed=["filter"])
+    >>> len(effects), effects[1].sigma, effects[1].factor
+    (11, 'σx', 10.0)
+    """
+    variations = list(_variations(load_scenario(scenario), list(changed)))
+    effects: list[NoiseEffect] = []
+    for done, variation in enumerate(variations):
+        results = monte_carlo(
+            variation.world,
+            estimators,
+            runs,
+            seed,
+            assumed=variation.told,
+            jobs=jobs,
+            backend=backend,
+        )
+        effects += [
+            _effect(variation, results.sel(estimator=label))
+            for label in results.estimator.values
+        ]
+        if progress is not None:
+            progress((done + 1) * runs, len(variations) * runs)
+    return effects
+
+
+def _variations(world: Scenario, changed: list[Changed]) -> Iterator[_Variation]:
+    for place in changed:
+        if place not in CHANGED:
+            hint = closest(place, CHANGED)
+            raise ValueError(
+                f"changed must be of {', '.join(CHANGED)}, got '{place}'{hint}"
+            )
+    yield _Variation("nothing", "none", 1.0, world, world)
+    for place in changed:
+        for sigma in SIGMAS:
+            for factor in FACTORS:
+                scaled = scaled_scenario(world, sigma, factor)
+                yield _Variation(
+                    place,
+                    sigma,
+                    factor,
+                    world if place == "filter" else scaled,
+                    world if place == "world" else scaled,
+                )
+
+
+def _effect(variation: _Variation, results: xr.Dataset) -> NoiseEffect:
+    later = results.isel(step=slice(1, None))
+    sound = ~results.failed & (later.position_error < _DIVERGED).all("step")
+    kept = later.isel(run=np.flatnonzero(sound))
+    nees = kept.pose_nees_invariant / 3
+    return NoiseEffect(
+        *variation[:3],
+        estimator=str(results.estimator.values),
+        runs=int(sound.sum()),
+        failed=int((~sound).sum()),
+        nees_per_degree=float(nees.mean()),
+        nees_per_degree_median=float(nees.mean("step").median()),
+        nis_per_degree=float(kept.nis.sum() / max(int(kept.nis_dof.sum()), 1)),
+        position_rmse=float(np.sqrt((kept.position_error**2).mean())),
+        ate_aligned=_rms(kept.ate_aligned),
+        landmark_rmse_aligned=_rms(kept.landmark_rmse_aligned),
+        pose_area=float(kept.pose_area.mean()),
+        landmark_area=float(kept.landmark_area.mean()),
+    )
+
+
+def _rms(values: xr.DataArray) -> float:
+    return float(np.sqrt((values**2).mean()))
