@@ -6,9 +6,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from .estimator_lines import log_ticks, look_of, plain
 from .figure_style import GREY, INK, dress, new_figure, write_title
 from .filter_settings import SIGMAS
+from .monte_carlo.estimator_lines import log_ticks, look_of, plain
 from .noise_effects import NoiseEffect
 
 _TITLES = {

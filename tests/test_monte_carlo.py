@@ -15,14 +15,14 @@ import xarray as xr
 from slamgym.envs.controllers import make_controller
 from slamgym.estimator import EkfSlam, make_estimator
 from slamgym.estimator.consistency import pose_nees, state_nees
-from slamgym.experiments.estimator_choices import estimator_choices
 from slamgym.experiments.filter_settings import settings_for
 from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo.estimator_choices import estimator_choices
+from slamgym.experiments.monte_carlo.result_blocks import merge_blocks
+from slamgym.experiments.monte_carlo.results import load_results
+from slamgym.experiments.monte_carlo.run_measures import VARIABLES
 from slamgym.experiments.recording import record_episode
 from slamgym.experiments.replay import replay
-from slamgym.experiments.result_blocks import merge_blocks
-from slamgym.experiments.results import load_results
-from slamgym.experiments.run_measures import VARIABLES
 from slamgym.sim_configs import load_scenario
 
 RUNS = 20

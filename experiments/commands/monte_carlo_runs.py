@@ -11,11 +11,11 @@ from rich.text import Text
 
 from ...envs.atomic_file import replace_when_written
 from ...sim_configs import Scenario, load_scenario
-from ..estimator_choices import EstimatorChoice, estimator_choices
-from ..html_report import write_html_report
-from ..monte_carlo import BLOCK_SIZE, monte_carlo
-from ..monte_carlo_summary import summarise_monte_carlo
-from ..monte_carlo_table import monte_carlo_table
+from ..monte_carlo import monte_carlo
+from ..monte_carlo.estimator_choices import EstimatorChoice, estimator_choices
+from ..monte_carlo.html_report import write_html_report
+from ..monte_carlo.summary import summarise_monte_carlo
+from ..monte_carlo.table import monte_carlo_table
 from .one_line_errors import BadInputError, InterruptedRunError
 from .output_folder import default_folder
 from .reporter import Reporter
@@ -44,7 +44,7 @@ def run_monte_carlo(
     seed: int,
     assumed: Mapping[str, Any],
     workers: Workers,
-    block_size: int = BLOCK_SIZE,
+    block_size: int,
     out: Path | None,
     as_json: bool,
 ) -> None:
@@ -129,16 +129,19 @@ def _cluster(workers: Workers) -> Iterator[None]:
 
 def _dask_client(workers: Workers) -> contextlib.AbstractContextManager[Any]:
     try:
-        from distributed import Client  # noqa: PLC0415 (an extra)
+        import distributed  # noqa: PLC0415 (an extra)
     except ImportError:
         raise BadInputError(
             "--backend dask needs dask.distributed: pip install 'slamgym[dask]'"
         ) from None
+    client: Any = distributed.Client
     if workers.scheduler is not None:
-        return Client(workers.scheduler)  # type: ignore[no-any-return]
-    return Client(  # type: ignore[no-any-return]
+        joined: contextlib.AbstractContextManager[Any] = client(workers.scheduler)
+        return joined
+    started: contextlib.AbstractContextManager[Any] = client(
         n_workers=workers.jobs, threads_per_worker=1, dashboard_address=None
     )
+    return started
 
 
 @contextlib.contextmanager

@@ -5,9 +5,9 @@ import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
-from ..estimator.registry import find_estimator, list_estimators, register_estimator
-from ..sim_configs import Scenario
-from .filter_settings import FilterSettings, settings_for_scenario
+from ...estimator.registry import find_estimator, list_estimators, register_estimator
+from ...sim_configs import Scenario
+from ..filter_settings import FilterSettings, settings_for_scenario
 
 _BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")
 _SPEC = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>[^\]]*)\])?")

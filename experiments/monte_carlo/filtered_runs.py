@@ -6,11 +6,11 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimator.batch import BatchSlam, BatchTrace, can_batch
-from ..estimator.ekf_slam import EkfSlam
-from ..estimator.interface import Belief, SlamEstimator
-from .filter_settings import FilterSettings
-from .simulated_runs import SimulatedRuns
+from ...estimator.batch import BatchSlam, BatchTrace, can_batch
+from ...estimator.ekf_slam import EkfSlam
+from ...estimator.interface import Belief, SlamEstimator
+from ..filter_settings import FilterSettings
+from ..simulated_runs import SimulatedRuns
 
 Array = NDArray[np.float64]
 

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimator import consistency
-from ..estimator.accuracy import position_accuracy
-from ..estimator.angles import wrap_angle
-from ..estimator.error_frames import ERROR_FRAMES
-from ..estimator.interface import Belief
+from ...estimator import consistency
+from ...estimator.accuracy import position_accuracy
+from ...estimator.angles import wrap_angle
+from ...estimator.error_frames import ERROR_FRAMES
+from ...estimator.interface import Belief
+from ..noise_study import ellipse_areas
+from ..simulated_runs import SimulatedRuns
 from .filtered_runs import FilteredRuns
-from .noise_study import ellipse_areas
-from .simulated_runs import SimulatedRuns
 
 Array = NDArray[np.float64]
 Block = dict[str, NDArray[np.generic]]

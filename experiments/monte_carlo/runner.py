@@ -13,21 +13,21 @@ from typing import TYPE_CHECKING, Any
 
 from joblib import Parallel, delayed, effective_n_jobs, parallel_config
 
-from ..estimator.registry import (
+from ...estimator.registry import (
     EstimatorFactory,
     find_estimator,
     list_estimators,
     register_estimator,
 )
-from ..sim_configs import Scenario, load_scenario
-from ..sim_configs.scenario_errors import closest
+from ...sim_configs import Scenario, load_scenario
+from ...sim_configs.scenario_errors import closest
+from ..filter_settings import FilterSettings
+from ..simulated_runs import simulate_runs
 from .estimator_choices import EstimatorChoice, estimator_choices
-from .filter_settings import FilterSettings
 from .filtered_runs import filter_runs
 from .result_blocks import BlockFolder, Job, Span
 from .results import dataset_of, load_results, write_results
 from .run_measures import Block, measure_runs
-from .simulated_runs import simulate_runs
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -110,8 +110,8 @@ def monte_carlo(
     Returns
     -------
     xarray.Dataset
-        The variables of :data:`~slamgym.experiments.run_measures.VARIABLES` over
-        (estimator, run, step); opened from ``out`` where that is given.
+        The variables of ``run_measures.VARIABLES`` over (estimator, run, step); opened
+        from ``out`` where that is given.
 
     Raises
     ------

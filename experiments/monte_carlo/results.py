@@ -11,8 +11,8 @@ import netCDF4
 import numpy as np
 import xarray as xr
 
-from .. import __version__
-from ..envs.atomic_file import replace_when_written
+from ... import __version__
+from ...envs.atomic_file import replace_when_written
 from .result_blocks import Job, Span
 from .run_measures import VARIABLES, Block
 

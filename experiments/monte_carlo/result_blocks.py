@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..envs.atomic_file import replace_when_written
-from ..sim_configs import Scenario
-from ..sim_configs.scenario_files import scenario_text
+from ...envs.atomic_file import replace_when_written
+from ...sim_configs import Scenario
+from ...sim_configs.scenario_files import scenario_text
 from .estimator_choices import EstimatorChoice
 from .run_measures import VARIABLES, Block
 

@@ -1,0 +1,141 @@
+"""The table of a Monte Carlo: a row per measure, a column per estimator."""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rich.table import Table
+from rich.text import Text
+
+from .verdict import CONSISTENT, NOT_CONSISTENT, in_degrees
+
+Entry = dict[str, Any]
+_NOTHING = "–"
+_STYLES = {CONSISTENT: "green", NOT_CONSISTENT: "red"}
+
+
+class Measure(NamedTuple):
+    """A row."""
+
+    name: str
+    right: str
+    """What it is for a consistent filter, or where it cannot be better; else empty."""
+    of: Callable[[Entry], str]
+    """Writes the cell of one estimator of the summary."""
+
+
+def measures(summary: dict[str, Any]) -> list[Measure]:
+    """List the rows that follow the verdict.
+
+    Parameters
+    ----------
+    summary : dict
+        Of ``summarise_monte_carlo``.
+    """
+    frame, runs = summary["frame"], summary["runs"]
+    other = "additive" if frame == "invariant" else "invariant"
+    knowable = summary["knowable_heading_std"]
+    least = f"≥ {in_degrees(knowable)}" if knowable else ""
+
+    def at(
+        *keys: str, write: Callable[[float], str] = number
+    ) -> Callable[[Entry], str]:
+        return lambda entry: _cell(entry, keys, write)
+
+    return [
+        Measure(f"NEES / 3, {frame} frame", "1", at("pose_nees", frame, "mean")),
+        Measure("… at the end", "1", at("pose_nees", frame, "end")),
+        Measure("… of the median run", "≲ 1", at("median_run")),
+        Measure("… runs above 3", "few", at("share_above_3", write=percent)),
+        Measure(
+            "… steps in the 95 % band",
+            "95 %",
+            at("pose_nees", frame, "share_inside_band", write=percent),
+        ),
+        Measure(f"NEES / 3, {other} frame", "", at("pose_nees", other, "mean")),
+        Measure("NEES of the heading", "1", at("heading_nees", "mean")),
+        Measure("NIS / degrees of freedom", "1", at("nis")),
+        Measure(
+            "heading at the end, claimed",
+            least,
+            at("heading_std_end", "claimed", write=in_degrees),
+        ),
+        Measure(
+            "… true error",
+            "= claimed",
+            at("heading_std_end", "true", write=in_degrees),
+        ),
+        Measure("… RMSE over all steps", "", at("rmse", "heading", write=in_degrees)),
+        Measure("path (ATE), raw [m]", "", at("ate", "raw")),
+        Measure("… aligned [m]", "", at("ate", "aligned")),
+        Measure("landmark RMSE, raw [m]", "", at("landmark_rmse", "raw")),
+        Measure("… aligned [m]", "", at("landmark_rmse", "aligned")),
+        Measure(
+            f"failed runs of {runs}", "0", lambda entry: str(len(entry["failed_runs"]))
+        ),
+    ]
+
+
+def monte_carlo_table(summary: dict[str, Any]) -> Table:
+    """Lay a summary out for a terminal of 80 columns or more.
+
+    Parameters
+    ----------
+    summary : dict
+        Of ``summarise_monte_carlo``.
+    """
+    entries = summary["estimators"]
+    table = Table(
+        title=Text(
+            f"{summary['scenario']}: {summary['runs']} runs of {summary['steps']} "
+            f"steps, seed {summary['seed']}"
+        ),
+        caption="Averages over runs and steps; heading and RMSE are root mean squares.",
+        pad_edge=False,
+        box=None,
+    )
+    table.add_column("")
+    table.add_column("should be", justify="right", style="dim", no_wrap=True)
+    for label in entries:
+        table.add_column(Text(label), justify="right", overflow="fold", min_width=7)
+    verdicts = [entry["verdict"] for entry in entries.values()]
+    table.add_row(
+        "verdict", "", *(Text(word, _STYLES.get(word, "yellow")) for word in verdicts)
+    )
+    for measure in measures(summary):
+        cells = [Text(measure.of(entry)) for entry in entries.values()]
+        table.add_row(Text(measure.name), Text(measure.right), *cells)
+    return table
+
+
+def number(value: float) -> str:
+    """Write three digits, and no more noise than that.
+
+    Examples
+    --------
+    >>> number(1.0), number(0.01234), number(12345.6), number(1e9)
+    ('1.00', '0.0123', '12346', '1e+09')
+    """
+    if abs(value) >= 1e6:
+        return f"{value:.0e}"
+    size = math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:.{min(max(2 - size, 0), 6)}f}"
+
+
+def percent(share: float) -> str:
+    """Write a share.
+
+    Examples
+    --------
+    >>> percent(0.0), percent(0.005), percent(0.7303)
+    ('0 %', '0.5 %', '73 %')
+    """
+    shown = 100 * share
+    return f"{shown:.2g} %" if shown < 99.5 else f"{shown:.0f} %"
+
+
+def _cell(entry: Entry, keys: tuple[str, ...], write: Callable[[float], str]) -> str:
+    value: Any = entry
+    for key in keys:
+        value = value[key]
+    return _NOTHING if value is None else write(value)
