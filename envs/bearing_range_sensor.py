@@ -25,6 +25,7 @@ ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
 _PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
+_UNSEEN = np.array(0.0)
 _LAST = np.array(np.inf)  # sorts behind every other row
 
 
@@ -96,7 +97,10 @@ class BearingRangeSensor:
         error, nearest, _, _ = noise
         relative = (landmarks - position) * inverse_heading
         readings = np.empty(error.shape)  # true ones first
-        bearings = np.arctan2(relative.imag, relative.real, readings[0])
+        y, x = relative.imag, relative.real
+        if y.ndim > 1:  # twice as fast, when there are many
+            y, x = y.copy(), x.copy()
+        bearings = np.arctan2(y, x, readings[0])
         ranges = np.abs(relative, readings[1])
         mask: BoolArray = ranges > nearest
         if self._max_range is not None:
@@ -110,7 +114,9 @@ class BearingRangeSensor:
         readings += error
         if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
             wrap_bearings(bearings)
-        seen = np.zeros(error.shape)
+        if mask.ndim > 1:
+            return _only_seen(readings, mask), mask
+        seen = np.zeros(readings.shape)
         np.copyto(seen, readings, where=mask)
         return seen, mask
 
@@ -118,6 +124,13 @@ class BearingRangeSensor:
 def _limit(value: float, above: float) -> Array | None:
     """Keep a limit in the form that compares fastest, or None if it has no effect."""
     return np.array(value) if value < above else None
+
+
+def _only_seen(readings: Array, mask: BoolArray) -> Array:
+    """Put zeros where the mask is False, in the way that is fastest for many."""
+    if np.count_nonzero(mask) == mask.size:
+        return readings
+    return np.where(mask, readings, _UNSEEN)
 
 
 def wrap_bearings(bearings: Array) -> None:

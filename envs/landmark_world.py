@@ -11,6 +11,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from ..sim_configs import Scenario, load_scenario, place_landmarks
+from ..sim_configs.domain_randomisation import refuse_ranges
 from .bearing_range_sensor import BearingRangeSensor, hide_identities
 from .live_view import RENDER_MODES, LiveView, Moment
 from .noise_streams import (
@@ -110,6 +111,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
         self.scenario = load_scenario(scenario)
         if changes:
             self.scenario = self.scenario.with_changes(**changes)
+        refuse_ranges(self.scenario)
         self.action_space = action_space(self.scenario)
         self.observation_space = observation_space(self.scenario)
         self.render_mode = render_mode

@@ -100,7 +100,8 @@ def motion_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[list[fl
 
 def sensor_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[SensorNoise]:
     """Rows of `SensorNoise`; the first belongs to the start, before any step."""
-    return NoiseRows(partial(_sensor_noise_by_step, streams, scenario))
+    law = SensorNoiseLaw(scenario)
+    return NoiseRows(partial(_sensor_noise_by_step, streams, scenario, law))
 
 
 def draw_motion_noise(streams: Streams, scenario: Scenario, steps: int) -> Array:
@@ -114,6 +115,88 @@ def draw_motion_noise(streams: Streams, scenario: Scenario, steps: int) -> Array
     return streams.motion.standard_normal((steps, 3)) * scenario.motion.std
 
 
+class UnitDraws(NamedTuple):
+    """What the generators yield for the sensor, before any setting scales it.
+
+    K steps or K worlds. What a scenario has no use for is None, and is not drawn.
+    """
+
+    measurement: Array
+    """Normal numbers, shape (2, K, N)."""
+    dropout: Array | None
+    """Uniform numbers, shape (K, N)."""
+    clutter: Array | None
+    """Uniform numbers, one for how many, two for each row, shape (K, 1 + 2 C)."""
+    order: Array | None
+    """Uniform numbers, shape (K, N + C)."""
+
+
+def unit_widths(scenario: Scenario) -> tuple[int, int, int, int]:
+    """Count the numbers that each field of `UnitDraws` takes per step, 0 for none.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> unit_widths(load_scenario("dropout"))[:2]
+    (24, 12)
+    """
+    sensor, count = scenario.sensor, scenario.landmarks.count
+    hidden, rows = not sensor.identities, sensor.max_clutter
+    return (
+        2 * count,
+        count if sensor.dropout else 0,
+        1 + 2 * rows if hidden and sensor.clutter else 0,
+        count + rows if hidden else 0,
+    )
+
+
+class SensorNoiseLaw:
+    """Turns unit draws into the noise that a scenario's sensor has.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Whose `sensor` is meant.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._sensor = sensor = scenario.sensor
+        bearing_std, self._std = sensor.std
+        self._growth = sensor.range_std_per_metre
+        range_std = 1.0 if self._growth else self._std
+        self._scale = np.array([[[bearing_std]], [[range_std]]])
+        self._nearest = np.nextafter(sensor.min_range, -1.0)
+        self._counts_below = _poisson_cdf(sensor.clutter, sensor.max_clutter)
+
+    def apply(self, draws: UnitDraws) -> SensorNoise:
+        """Scale the draws of some steps or worlds."""
+        sensor, unit = self._sensor, draws.measurement
+        nearest = _nearest_readable(unit[1], self._std, self._growth)
+        np.maximum(nearest, self._nearest, out=nearest)
+        if draws.dropout is not None:
+            nearest[draws.dropout < sensor.dropout] = np.inf
+        if sensor.identities:
+            return unit * self._scale, nearest, None, None
+        return unit * self._scale, nearest, self._clutter(draws), draws.order
+
+    def _clutter(self, draws: UnitDraws) -> Array:
+        """Place false readings, uniform over the bearings and ranges that are seen.
+
+        Per step one number chooses how many, then each reserved row draws (β, r).
+        Returns (β, r), shape (2, K, C), zeros where there is none.
+        """
+        sensor, rows = self._sensor, self._sensor.max_clutter
+        if draws.clutter is None:
+            return np.zeros((*draws.measurement.shape[:-1], rows))
+        drawn = draws.clutter
+        counts = np.searchsorted(self._counts_below, drawn[..., 0], side="right")
+        width = sensor.max_range - sensor.min_range
+        bearings = (drawn[..., 1::2] - 0.5) * sensor.field_of_view
+        ranges = sensor.max_range - drawn[..., 2::2] * width  # never min_range, maybe 0
+        present = np.arange(rows) < counts[..., None]
+        return np.where(present, np.stack([bearings, ranges]), 0.0)
+
+
 def draw_sensor_noise(streams: Streams, scenario: Scenario, steps: int) -> SensorNoise:
     """Draw the sensor's noise of the steps that come next.
 
@@ -122,19 +205,24 @@ def draw_sensor_noise(streams: Streams, scenario: Scenario, steps: int) -> Senso
     SensorNoise
         Its four arrays, with the steps as their first axis.
     """
-    sensor, count = scenario.sensor, scenario.landmarks.count
-    bearing_std, range_std = sensor.std
-    per_metre = sensor.range_std_per_metre
-    unit = streams.measurement.standard_normal((steps, 2, count))
-    scale = np.array([[bearing_std], [1.0 if per_metre else range_std]])
-    nearest = _nearest_readable(unit[:, 1], range_std, per_metre)
-    np.maximum(nearest, np.nextafter(sensor.min_range, -1.0), out=nearest)
-    if sensor.dropout:
-        nearest[streams.dropout.random((steps, count)) < sensor.dropout] = np.inf
-    if sensor.identities:
-        return unit * scale, nearest, None, None
-    order = streams.order.random((steps, count + sensor.max_clutter))
-    return unit * scale, nearest, _draw_clutter(streams, scenario, steps), order
+    return _draw_and_scale(streams, scenario, SensorNoiseLaw(scenario), steps)
+
+
+def _draw_and_scale(
+    streams: Streams, scenario: Scenario, law: SensorNoiseLaw, steps: int
+) -> SensorNoise:
+    normal, *widths = unit_widths(scenario)
+    sources = streams.dropout, streams.clutter, streams.order
+    unit = streams.measurement.standard_normal((steps, 2, normal // 2))
+    uniform = [
+        source.random((steps, width)) if width else None
+        for source, width in zip(sources, widths, strict=True)
+    ]
+    draws = UnitDraws(unit.transpose(1, 0, 2), *uniform)
+    error, nearest, clutter, order = law.apply(draws)
+    if clutter is not None:
+        clutter = clutter.transpose(1, 0, 2)
+    return error.transpose(1, 0, 2), nearest, clutter, order
 
 
 def _motion_floats(
@@ -145,9 +233,9 @@ def _motion_floats(
 
 
 def _sensor_noise_by_step(
-    streams: Streams, scenario: Scenario, steps: int
+    streams: Streams, scenario: Scenario, law: SensorNoiseLaw, steps: int
 ) -> Iterable[SensorNoise]:
-    error, nearest, clutter, order = draw_sensor_noise(streams, scenario, steps)
+    error, nearest, clutter, order = _draw_and_scale(streams, scenario, law, steps)
     return zip(
         error,
         nearest,
@@ -166,26 +254,9 @@ def _nearest_readable(unit: Array, std: float, per_metre: float) -> Array:
         return np.where(slope > 0.0, -std * unit / slope, np.inf)
 
 
-def _draw_clutter(streams: Streams, scenario: Scenario, steps: int) -> Array:
-    """Draw false readings, uniform over the bearings and ranges that the sensor sees.
-
-    Per step one number chooses how many, then each reserved row draws (β, r).
-    Returns (β, r), shape (steps, 2, C), zeros where there is none.
-    """
-    sensor, rows = scenario.sensor, scenario.sensor.max_clutter
-    if sensor.clutter == 0:
-        return np.zeros((steps, 2, rows))
-    drawn = streams.clutter.random((steps, 1 + 2 * rows))
-    counts = np.searchsorted(_poisson_cdf(scenario), drawn[:, 0], side="right")
-    width = sensor.max_range - sensor.min_range
-    bearings = (drawn[:, 1::2] - 0.5) * sensor.field_of_view
-    ranges = sensor.max_range - drawn[:, 2::2] * width  # never min_range, maybe 0
-    present = np.arange(rows) < counts[:, None]
-    return np.where(present[:, None], np.stack([bearings, ranges], axis=1), 0.0)
-
-
-def _poisson_cdf(scenario: Scenario) -> Array:
-    """P(at most k false readings) for k < max_clutter, where the law is cut off."""
-    mean, largest = scenario.sensor.clutter, scenario.sensor.max_clutter
+def _poisson_cdf(mean: float, largest: int) -> Array:
+    """P(at most k false readings) for k < largest, where the law is cut off."""
+    if mean == 0.0:
+        return np.empty(0)
     logs = [k * math.log(mean) - mean - math.lgamma(k + 1) for k in range(largest)]
     return np.cumsum(np.exp(logs))

@@ -219,6 +219,46 @@ def monte_carlo(
 
 
 @main.command(
+    short_help="Write trajectories by the million.",
+    help=_taught(
+        "Drive many episodes of a scenario and write them as a data set: what was "
+        "commanded, what was read, and the truth. Stopped or killed, the same command "
+        "goes on where it stood, and the same command always gives the same bytes.",
+        "slamgym generate loop --episodes 1000",
+        "slamgym generate corridor --episodes 50 --controller random --format parquet",
+        "slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]",
+    ),
+)
+def generate(
+    scenario: options.ScenarioName,
+    *,
+    episodes: options.Episodes,
+    controller: options.ControllerName = "waypoints",
+    seed: options.Seed = 0,
+    format_: options.TrajectoryFormat = "npz",
+    shard: options.EpisodesPerShard = None,
+    steps: options.Steps = None,
+    set_: options.ScenarioChanges = None,
+    out: options.DatasetFolder = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Generate trajectories."""
+    from .commands import generation, worlds  # noqa: PLC0415 (heavy)
+
+    world = worlds.chosen_scenario(scenario, steps=steps, sets=set_ or [])
+    generation.write_trajectories(
+        world,
+        episodes=episodes,
+        controller=controller,
+        seed=seed,
+        format=format_,
+        episodes_per_shard=shard,
+        out=out,
+        as_json=as_json,
+    )
+
+
+@main.command(
     name="noise-study",
     short_help="Every noise times 10 and divided by 10.",
     help=_taught(

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
-import gymnasium
 import numpy as np
+from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from ..envs.landmark_world import LandmarkWorldEnv
+from ..envs.world_batch import WorldBatch
 from ..sim_configs import Scenario, action_sequence, load_scenario
 
 Array = NDArray[np.float64]
@@ -60,26 +60,30 @@ def simulate_runs(
         raise ValueError(f"runs must be >= 1, got {runs}")
     if not world.sensor.identities:
         raise ValueError(f"scenario '{world.name}' must not hide identities")
-    env = gymnasium.make(
-        "slamgym/LandmarkWorld-v0", scenario=world, disable_env_checker=True
-    ).unwrapped
-    actions = action_sequence(world)
-    each = [
-        _one_run(cast(LandmarkWorldEnv, env), actions, seed + i) for i in range(runs)
-    ]
-    return SimulatedRuns(*(np.array(column) for column in zip(*each, strict=True)))
+    actions, batch = action_sequence(world), WorldBatch(world, runs)
+    batch.reset([seeding.np_random(seed + i)[0] for i in range(runs)])
+    result = _room(batch, len(actions) + 1)
+    _store(result, 0, batch)
+    for step, action in enumerate(actions, start=1):
+        batch.step(np.tile(action, (runs, 1)))
+        _store(result, step, batch)
+    return result
 
 
-def _one_run(env: LandmarkWorldEnv, actions: Array, seed: int) -> tuple[Any, ...]:
-    steps = [env.reset(seed=seed)]
-    for action in actions:
-        observation, _, _, _, info = env.step(action)
-        steps.append((observation, info))
-    return (
-        [observation["odometry"] for observation, _ in steps],
-        [observation["landmarks"] for observation, _ in steps],
-        [observation["mask"] for observation, _ in steps],
-        [info["pose"] for _, info in steps],
-        env.landmarks,
-        env.start_estimate,
+def _room(batch: WorldBatch, scans: int) -> SimulatedRuns:
+    runs, landmarks = batch.mask.shape
+    return SimulatedRuns(
+        odometry=np.empty((runs, scans, 2)),
+        measurements=np.empty((runs, scans, landmarks, 2)),
+        visible=np.empty((runs, scans, landmarks), dtype=np.bool_),
+        true_poses=np.empty((runs, scans, 3)),
+        landmarks=batch.landmarks,
+        initial_poses=batch.start_estimates,
     )
+
+
+def _store(result: SimulatedRuns, scan: int, batch: WorldBatch) -> None:
+    result.odometry[:, scan] = batch.odometry
+    result.measurements[:, scan] = batch.measurements
+    result.visible[:, scan] = batch.mask
+    result.true_poses[:, scan] = batch.poses

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from .control_sequences import ControlSequence, command_cycle
+from .domain_randomisation import Randomise, refuse_impossible_ends
 from .field_types import (
     CountOrZero,
     Flag,
@@ -178,6 +179,9 @@ class Scenario(Part):
     controls: ControlSequence = Field(
         description="what the robot is told, open loop; cycled when short"
     )
+    randomise: Randomise | None = Field(
+        default=None, description="ranges from which every episode draws its own world"
+    )
 
     @model_validator(mode="after")
     def _check_walls(self) -> Self:
@@ -200,6 +204,11 @@ class Scenario(Part):
                     f"controls must stay within robot.{name} = {limit} {unit}, "
                     f"got {asked:.6g} {unit}"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _check_ranges(self) -> Self:
+        refuse_impossible_ends(self)
         return self
 
     def with_changes(self, **changes: object) -> Self:

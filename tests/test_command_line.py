@@ -15,7 +15,16 @@ from slamgym.experiments.command_line import main
 from slamgym.experiments.commands import reporter, run_and_replay
 from slamgym.sim_configs import list_presets, load_scenario
 
-COMMANDS = ("run", "replay", "noise-study", "render", "scenarios", "estimators")
+COMMANDS = (
+    "run",
+    "replay",
+    "generate",
+    "monte-carlo",
+    "noise-study",
+    "render",
+    "scenarios",
+    "estimators",
+)
 LOG = """# format: slamlog 1
 # name: little
 # motion_std: 0.1,0.1,0.05

@@ -50,7 +50,6 @@ def write_trajectories(
     as_json : bool
         Whether to print the summary for programs.
     """
-    reporter = Reporter(as_json=as_json)
     place = out or default_folder(scenario.name, controller, format)
     with _bar() as tick:
         try:
@@ -69,9 +68,10 @@ def write_trajectories(
                 f"interrupted; whole shards stay in {place}, the same command goes on"
             ) from None
     size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
-    message = Text(_message(manifest, place, size), no_wrap=True, overflow="ignore")
-    reporter.show(message)
-    reporter.finish(_summary(manifest, place, size))
+    if not as_json:  # in lines as they are: two of them are meant to be copied
+        message = Text(_message(manifest, place, size))
+        Console(highlight=False).print(message, soft_wrap=True)
+    Reporter(as_json=as_json).finish(_summary(manifest, place, size))
 
 
 def _message(manifest: Manifest, place: Path, size: int) -> str:

@@ -244,3 +244,37 @@ Changed = Annotated[
         "alone, or in what the filter is told.",
     ),
 ]
+Episodes = Annotated[
+    int,
+    typer.Option(
+        min=1, metavar="N", help="How many to drive; episode i has seed SEED + i."
+    ),
+]
+TrajectoryFormat = Annotated[
+    str,
+    typer.Option(
+        "--format",
+        metavar="NAME",
+        help="npz, parquet or minari hold everything; slamlog, g2o and tum what their "
+        "readers know.",
+    ),
+]
+EpisodesPerShard = Annotated[
+    int | None,
+    typer.Option(
+        "--shard",
+        min=1,
+        metavar="N",
+        help="Episodes in each file or folder of the data set.",
+        show_default="100, fewer if they are large",
+    ),
+]
+DatasetFolder = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="The folder to write: new, empty, or begun by the same command, which "
+        "then goes on.",
+        show_default="results/<name>-<controller>-<format>",
+    ),
+]

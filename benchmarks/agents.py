@@ -1,0 +1,151 @@
+"""How fast agents get their steps: many worlds at once, in units of a physics step.
+
+    python benchmarks/agents.py
+
+A bare step is `pymunk.Space.step` with one kinematic body. Times are per world and
+step. The cases run interleaved in one process, in CPU time of this thread; a ratio is
+the median over the rounds. Stable-Baselines3 is timed where it is installed.
+"""
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import pymunk
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.wrappers.vector import FlattenObservation
+from interleaved import microseconds, ratio, time_interleaved, verdict
+from rich.console import Console
+from rich.table import Table
+
+import slamgym  # noqa: F401 (registers the environments)
+from slamgym.envs.stable_baselines import to_stable_baselines
+from slamgym.envs.vector_wrappers import FlattenBatch
+
+Call = Callable[[], object]
+Worlds = VectorEnv[Any, Any, Any]
+ID = "slamgym/LandmarkWorld-v0"
+BARE = "bare Space.step"
+BARE_STEPS = 200  # per call, so that the loop around them costs nothing
+EPISODE = 1000  # steps, as learning has them
+MANY = {"layout": "random", "bounds": [-10, -10, 10, 10], "seed": 0, "count": 100}
+
+
+class Case(NamedTuple):
+    """One alternative, and how it should compare with others."""
+
+    call: Call
+    """Takes `steps` steps of a single world each time."""
+    steps: int
+    at_most: float | None = None
+    """Times the bare step."""
+    faster_than: tuple[str, float] | None = None
+    """Another case, and at least how many times faster than it."""
+
+
+def bare() -> Case:
+    space, body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+    space.add(body)
+    body.velocity, body.angular_velocity = (0.1, 0.2), 0.1
+
+    def call() -> None:
+        for _ in range(BARE_STEPS):
+            space.step(1.0)
+
+    return Case(call, BARE_STEPS)
+
+
+def steps_of(worlds: Any, **goals: Any) -> Case:
+    """Step a vector environment on and on, all its worlds with the same actions."""
+    worlds.reset(seed=0) if isinstance(worlds, VectorEnv) else worlds.reset()
+    count = worlds.num_envs
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (count, 2))
+    actions = actions.astype(np.float32)
+    return Case(lambda: worlds.step(actions), count, **goals)
+
+
+def native(count: int, mode: str = "NextStep", **changes: Any) -> Worlds:
+    options = {"steps": EPISODE, "autoreset_mode": AutoresetMode(mode), **changes}
+    return gymnasium.make_vec(ID, count, **options)
+
+
+def sync(count: int) -> Worlds:
+    return gymnasium.make_vec(ID, count, vectorization_mode="sync", steps=EPISODE)
+
+
+def world_cases() -> dict[str, Case]:
+    than_sync = ("SyncVectorEnv, 64 worlds", 20.0)
+    return {
+        than_sync[0]: steps_of(sync(64)),
+        "vector world, 64": steps_of(native(64), at_most=1.5, faster_than=than_sync),
+        "vector world, 1024": steps_of(native(1024), at_most=0.8),
+        "vector world, 1024, 100 landmarks": steps_of(
+            native(1024, landmarks=MANY), at_most=8.0
+        ),
+    }
+
+
+def flat_cases() -> dict[str, Case]:
+    gymnasiums = "flat by Gymnasium's wrapper, 64"
+    ours = steps_of(FlattenBatch(native(64)), faster_than=(gymnasiums, 1.0))
+    return {
+        gymnasiums: steps_of(FlattenObservation(native(64))),
+        "flat by FlattenBatch, 64": ours,
+    }
+
+
+def stable_baselines_cases() -> dict[str, Case]:
+    if importlib.util.find_spec("stable_baselines3") is None:
+        return {}
+    vec_env = importlib.import_module("stable_baselines3.common.vec_env")
+    dummy = vec_env.DummyVecEnv([lambda: gymnasium.make(ID, steps=EPISODE)] * 64)
+    adapted = to_stable_baselines(native(64, mode="SameStep"))
+    name = "Stable-Baselines3's DummyVecEnv, 64"
+    return {
+        name: steps_of(dummy),
+        "to_stable_baselines, 64": steps_of(adapted, faster_than=(name, 15.0)),
+    }
+
+
+def main() -> int:
+    cases = {BARE: bare()} | world_cases() | flat_cases() | stable_baselines_cases()
+    calls = {name: case.call for name, case in cases.items()}
+    per_call = time_interleaved(calls, rounds=21)
+    times = {
+        name: [seconds / cases[name].steps for seconds in per_call[name]]
+        for name in cases
+    }
+    table = Table(title="one step of one world")
+    for column in ("case", "µs", "× bare", "goal", "", "faster than", "goal", ""):
+        table.add_column(column, justify="left" if column == "case" else "right")
+    missed = 0
+    for name, case in cases.items():
+        row = [name, f"{microseconds(times, name):.2f}"]
+        row += [*_against_bare(times, name, case), *_against_other(times, name, case)]
+        missed += row.count("MISSED")
+        table.add_row(*row)
+    Console(width=120).print(table)
+    return missed
+
+
+def _against_bare(times: dict[str, list[float]], name: str, case: Case) -> list[str]:
+    value = ratio(times, name, BARE)
+    if case.at_most is None:
+        return [f"{value:.2f}", "", ""]
+    word = verdict(value, case.at_most, at_least=False)
+    return [f"{value:.2f}", f"<= {case.at_most}", word]
+
+
+def _against_other(times: dict[str, list[float]], name: str, case: Case) -> list[str]:
+    if case.faster_than is None:
+        return ["", "", ""]
+    other, goal = case.faster_than
+    value = ratio(times, other, name)
+    return [f"{value:.1f}", f">= {goal:g}", verdict(value, goal, at_least=True)]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,120 @@
+"""How fast are trajectories generated, in units of a bare physics step.
+
+    python benchmarks/generation.py             # a million steps to npz
+    python benchmarks/generation.py --quick     # a tenth of it, and the other formats
+
+A bare step is `pymunk.Space.step` with one kinematic body. It is timed before, between
+and after the cases, in CPU time of this process, which generates in one thread.
+"""
+
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from statistics import median
+
+import pymunk
+from rich.console import Console
+from rich.table import Table
+
+from slamgym.experiments.generate import generate_trajectories
+from slamgym.experiments.trajectory_formats import FORMATS, trajectory_format
+from slamgym.sim_configs import Scenario, load_scenario
+
+GOAL = 10.0  # bare steps per step: 150,000 steps/s where a bare step takes 1 / 1.5 M s
+STEPS = 1000
+BARE_STEPS = 300_000
+
+
+def world() -> Scenario:
+    layout = {
+        "layout": "random",
+        "count": 20,
+        "bounds": [-10.0, -10.0, 10.0, 10.0],
+    }
+    return load_scenario("loop").with_changes(steps=STEPS, landmarks=layout)
+
+
+def cpu_seconds(call: Callable[[], object]) -> float:
+    began = time.process_time()
+    call()
+    return time.process_time() - began
+
+
+def bare() -> float:
+    """Measure the seconds of a bare step."""
+    space, body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+    space.add(body)
+    body.velocity, body.angular_velocity = (0.1, 0.2), 0.1
+
+    def call() -> None:
+        for _ in range(BARE_STEPS):
+            space.step(1.0)
+
+    return cpu_seconds(call) / BARE_STEPS
+
+
+def is_installed(name: str) -> bool:
+    try:
+        trajectory_format(name)
+    except ImportError:
+        return False
+    return True
+
+
+def cases(quick: bool) -> list[tuple[str, str, int, Scenario]]:
+    """List (format, controller, episodes, scenario)."""
+    plain, some = world(), 100
+    ranges = {"motion_std": [0.5, 2.0], "start_x": [-1.0, 1.0]}
+    if not quick:
+        return [("npz", "waypoints", 1000, plain)]
+    formats = [name for name in FORMATS if is_installed(name)]
+    return [
+        *[("npz", name, some, plain) for name in ("waypoints", "random", "open_loop")],
+        ("npz", "waypoints", 10, plain.with_changes(randomise=ranges)),
+        *[(name, "waypoints", 10, plain) for name in formats if name != "npz"],
+    ]
+
+
+def main() -> int:
+    table = Table(title="generation of trajectories, 20 landmarks, 1000 steps each")
+    for column in ("case", "steps", "µs", "× bare", "goal", "", "memory"):
+        table.add_column(column, justify="left" if column == "case" else "right")
+    missed = 0
+    bares = [bare()]
+    for name, controller, episodes, scenario in cases("--quick" in sys.argv):
+        with tempfile.TemporaryDirectory() as folder:
+            call = partial(
+                generate_trajectories,
+                scenario,
+                folder,
+                episodes=episodes,
+                controller=controller,
+                format=name,
+            )
+            seconds = cpu_seconds(call)
+        bares.append(bare())
+        per_step = seconds / (episodes * scenario.steps)
+        times_bare = per_step / median(bares[-2:])
+        judged = name == "npz" and scenario.randomise is None
+        word = ("ok" if times_bare <= GOAL else "MISSED") if judged else ""
+        missed += word == "MISSED"
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        ranges = ", ranges" if scenario.randomise else ""
+        table.add_row(
+            f"{name}, {controller}{ranges}",
+            f"{episodes * scenario.steps:,}",
+            f"{1e6 * per_step:.2f}",
+            f"{times_bare:.1f}",
+            f"<= {GOAL:.0f}" if judged else "",
+            word,
+            f"{memory:.0f} MB",
+        )
+    Console(width=100).print(table)
+    return missed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

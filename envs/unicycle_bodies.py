@@ -1,0 +1,120 @@
+"""Many robots' bodies at once, in numpy: the twin of `UnicycleBody` for batches.
+
+Symbols
+-------
+p = (x, y, θ)     true robot pose in the world frame [m, m, rad]
+u = (d, α)        command: distance driven, then heading turned [m, rad]
+ε = (εx, εy, εα)  slip, in the frame of the old heading [m, m, rad]
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .unicycle_body import Wall, WallContacts
+
+Array = NDArray[np.float64]
+Places = NDArray[np.intp]
+
+
+class UnicycleBodies:
+    """B round bodies that move side by side, each in a world of its own.
+
+    Sums and products are those of `UnicycleBody`, number by number, so that their bits
+    agree; walls are asked by the same queries.
+
+    Parameters
+    ----------
+    count : int
+        B.
+    radius : float
+        Of every body [m].
+    walls : sequence of (x0, y0, x1, y1)
+        Ends of straight walls, the same in every world [m].
+
+    Attributes
+    ----------
+    position : complex ndarray, shape (B, 1)
+        x + iy [m]; every step overwrites it.
+    inverse_heading : complex ndarray, shape (B, 1)
+        cos θ - i sin θ; every step overwrites it.
+
+    Examples
+    --------
+    >>> bodies = UnicycleBodies(2, radius=0.5, walls=[(2.0, -1.0, 2.0, 1.0)])
+    >>> bodies.drive(np.array([[1.0, 0.3], [3.0, 0.0]]), np.zeros((2, 3))).round(3)
+    array([1. , 0.5])
+    >>> bodies.poses().round(3)
+    array([[1. , 0. , 0.3],
+           [1.5, 0. , 0. ]])
+    """
+
+    def __init__(self, count: int, radius: float, walls: Sequence[Wall] = ()) -> None:
+        self._contacts = WallContacts(radius, walls) if walls else None
+        self._pose = np.zeros((3, count))  # rows x, y, θ
+        self._ahead = np.zeros((2, count))  # (cos θ, sin θ)
+        self._left = np.zeros((2, count))  # (-sin θ, cos θ)
+        self.position = np.zeros((count, 1), dtype=np.complex128)
+        self.inverse_heading = np.zeros((count, 1), dtype=np.complex128)
+        self._arrive(self._pose)
+
+    def poses(self) -> Array:
+        """(x, y, θ), shape (B, 3) [m, m, rad], a fresh array; θ is not wrapped."""
+        return self._pose.T.copy()
+
+    def place(self, worlds: Places, poses: Array) -> None:
+        """Put some bodies at rows (x, y, θ) [m, m, rad]."""
+        pose = self._pose.copy()
+        pose[:, worlds] = poses.T
+        self._arrive(pose)
+
+    def drive(
+        self, commands: Array, slip: Array, moving: NDArray[np.bool_] | None = None
+    ) -> Array | None:
+        """Move along the old headings, then turn.
+
+        Parameters
+        ----------
+        commands : ndarray, shape (B, 2)
+            u = (d, α) [m, rad].
+        slip : ndarray, shape (B, 3)
+            ε [m, m, rad].
+        moving : bool ndarray, shape (B,), optional
+            Which bodies move (all).
+
+        Returns
+        -------
+        ndarray, shape (B,), or None
+            Shares of the displacements, in [0, 1], that no wall held back; None where
+            there are no walls.
+        """
+        change = np.empty(self._pose.shape)
+        ahead = (commands[:, 0] + slip[:, 0]) * self._ahead
+        displacement = np.add(ahead, slip[:, 1] * self._left, out=change[:2])
+        share = None
+        if self._contacts is not None:
+            share = self._contacts.free_shares(*self._pose[:2], *displacement)
+            displacement *= share
+        np.add(commands[:, 1], slip[:, 2], out=change[2])
+        change += self._pose
+        if moving is not None:
+            change = np.where(moving, change, self._pose)
+        self._arrive(change)
+        return share
+
+    def _arrive(self, pose: Array) -> None:
+        """Take the poses, and face their headings."""
+        self._pose = pose
+        cos, sin = np.cos(pose[2], out=self._ahead[0]), self._ahead[1]
+        np.sin(pose[2], out=sin)
+        np.negative(sin, out=self._left[0])
+        self._left[1] = cos
+        _as_pairs(self.position)[...] = pose[:2].T
+        heading = _as_pairs(self.inverse_heading)
+        heading[:, 0], heading[:, 1] = cos, self._left[0]
+
+
+def _as_pairs(numbers: NDArray[np.complex128]) -> Array:
+    """View complex numbers, (B, 1), as rows (real, imaginary), (B, 2)."""
+    return numbers.view(np.float64)

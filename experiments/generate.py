@@ -1,0 +1,203 @@
+"""Generate trajectories, shard by shard; what was killed goes on where it stood."""
+
+from collections.abc import Callable, Mapping
+from os import PathLike
+from pathlib import Path
+from reprlib import repr as short_repr
+
+from ..envs.controllers import CONTROLLERS
+from ..envs.world_spaces import count_rows
+from ..sim_configs import Scenario, load_scenario
+from ..sim_configs.scenario_errors import closest
+from .driven_episodes import drive_episodes
+from .manifest import (
+    MANIFEST,
+    Job,
+    Manifest,
+    ShardEntry,
+    checksum,
+    read_manifest,
+    versions_now,
+    write_manifest,
+)
+from .shard_folder import claimed, written_whole
+from .trajectory_dataset import is_whole
+from .trajectory_formats import TrajectoryFormat, trajectory_format
+
+Progress = Callable[[int, int], object]
+
+_MOST_EPISODES = 100
+_MOST_MEMORY = 256e6  # [bytes] of a shard
+
+
+def generate_trajectories(
+    scenario: Scenario | Mapping[str, object] | str | Path,
+    out: str | PathLike[str],
+    *,
+    episodes: int,
+    controller: str = "waypoints",
+    seed: int = 0,
+    format: str = "npz",
+    episodes_per_shard: int | None = None,
+    progress: Progress | None = None,
+) -> Manifest:
+    """Drive episodes and write them to a folder, or write those that it still lacks.
+
+    Every shard and the manifest appear complete or not at all. The same call on the
+    same folder goes on after what is whole already, makes damaged shards again, and
+    ends, whatever happened before, with the same bytes.
+
+    Parameters
+    ----------
+    scenario : Scenario, mapping, str or Path
+        The world, as in :func:`slamgym.sim_configs.load_scenario`, perhaps with ranges.
+    out : path
+        The folder: new, empty, or begun by the same job.
+    episodes : int
+        How many, each of ``scenario.steps`` steps.
+    controller : str, optional
+        What drives, see `make_controller`.
+    seed : int, optional
+        Episode i has the world of seed + i, as everywhere.
+    format : str, optional
+        Of the files, see `trajectory_formats`.
+    episodes_per_shard : int, optional
+        The default is 100, fewer where they would take more than 256 MB of memory.
+    progress : callable, optional
+        Called with (steps done, steps of all episodes), also those done earlier,
+        whenever some more are done.
+
+    Returns
+    -------
+    Manifest
+        Of the complete data set.
+
+    Raises
+    ------
+    ValueError
+        If an argument does not fit, or the folder holds another job or something else;
+        nothing is written then.
+    ImportError
+        If the package of the format is not installed.
+    OSError
+        If a file cannot be written.
+    """
+    world = load_scenario(scenario)
+    _check_numbers(episodes=(episodes, 1), seed=(seed, 0))
+    if episodes_per_shard is None:
+        episodes_per_shard = default_episodes_per_shard(world)
+    _check_numbers(episodes_per_shard=(episodes_per_shard, 1))
+    if controller not in CONTROLLERS:
+        names, hint = ", ".join(CONTROLLERS), closest(controller, CONTROLLERS)
+        raise ValueError(f"controller must be one of {names}, got {controller!r}{hint}")
+    layout = trajectory_format(format)
+    layout.check(world)
+    job = Job(world, controller, seed, episodes, episodes_per_shard, format)
+    with claimed(Path(out)):
+        return _continue(job, Path(out), layout, progress)
+
+
+def default_episodes_per_shard(scenario: Scenario) -> int:
+    """Choose how many episodes of a scenario a shard holds.
+
+    Examples
+    --------
+    >>> default_episodes_per_shard(load_scenario("loop"))
+    100
+    """
+    row = 25 * count_rows(scenario) + 57  # bytes of one moment
+    return int(max(1, min(_MOST_EPISODES, _MOST_MEMORY // (row * scenario.steps))))
+
+
+def _check_numbers(**numbers: tuple[int, int]) -> None:
+    for name, (value, least) in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
+
+
+def _continue(
+    job: Job, out: Path, layout: TrajectoryFormat, progress: Progress | None
+) -> Manifest:
+    manifest = _begun(job, out, versions_now(layout.LIBRARIES))
+    bar = _Bar(job, progress)
+    entries = dict(enumerate(manifest.shards))
+    for number in range(job.shards):
+        entry = entries.get(number)
+        if entry is not None and is_whole(out, entry):
+            bar.skip(len(job.episodes_of(number)))
+            continue
+        entries[number] = _make_shard(job, number, out, layout, entry, bar)
+        manifest = manifest.with_shards(entries[k] for k in sorted(entries))
+        write_manifest(manifest, out)
+    return manifest
+
+
+def _begun(job: Job, out: Path, versions: dict[str, str]) -> Manifest:
+    """Read the manifest of a job that was begun, or begin it."""
+    manifest = read_manifest(out) if (out / MANIFEST).exists() else None
+    if manifest is None or not manifest.shards:  # begun, but nothing would be lost
+        manifest = Manifest(job, versions)
+        write_manifest(manifest, out)
+        return manifest
+    _refuse_other(out, "scenario.", vars(manifest.job.scenario), vars(job.scenario))
+    _refuse_other(out, "", vars(manifest.job), vars(job))
+    _refuse_other(out, "the version of ", manifest.versions, versions)
+    return manifest
+
+
+def _refuse_other(
+    out: Path, what: str, there: Mapping[str, object], wanted: Mapping[str, object]
+) -> None:
+    for name in {**there, **wanted}:
+        if there.get(name) != wanted.get(name):
+            raise ValueError(
+                f"{out} holds another job, with {what}{name} = "
+                f"{short_repr(there.get(name))}, not {short_repr(wanted.get(name))}: "
+                "choose another out"
+            )
+
+
+def _make_shard(
+    job: Job,
+    number: int,
+    out: Path,
+    layout: TrajectoryFormat,
+    promised: ShardEntry | None,
+    bar: "_Bar",
+) -> ShardEntry:
+    """Drive the episodes of a shard, and write them."""
+    episodes = job.episodes_of(number)
+    name = f"shard_{number:05d}{layout.ENDING}"
+    seeds = [job.seed + episode for episode in episodes]
+    trajectories = drive_episodes(
+        job.scenario, job.controller, seeds, progress=bar.advance
+    )
+    with written_whole(out / name) as partial:
+        layout.write(trajectories, partial)
+        entry = ShardEntry(name, episodes.start, len(episodes), checksum(partial))
+        if promised is not None and promised != entry:
+            raise OSError(
+                f"{out / name} was damaged, and made again it differs from what "
+                f"{MANIFEST} promises: this machine does not make the same bits"
+            )
+    return entry
+
+
+class _Bar:
+    """Counts the steps that are done."""
+
+    def __init__(self, job: Job, progress: Progress | None) -> None:
+        self._steps = job.scenario.steps
+        self._total = job.episodes * self._steps
+        self._progress = progress
+        self._done = 0
+
+    def advance(self, steps: int) -> None:
+        """Count steps driven."""
+        self._done += steps
+        if self._progress is not None:
+            self._progress(self._done, self._total)
+
+    def skip(self, episodes: int) -> None:
+        """Count episodes that were there already."""
+        self._done += episodes * self._steps

@@ -1,0 +1,206 @@
+"""What a data set of trajectories is made of: enough to check it and to make it again.
+
+A data set is a folder of shards with ``manifest.json`` beside them, which names the job
+(scenario, controller, seed, numbers, format), the versions that fix its bits, and every
+shard with its SHA-256. It holds no date and no path: the same job gives the same bytes.
+"""
+
+import hashlib
+import json
+import platform
+import tomllib
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from .. import __version__
+from ..envs.atomic_file import replace_when_written
+from ..sim_configs import Scenario, load_scenario
+from ..sim_configs.scenario_files import scenario_text
+
+MANIFEST = "manifest.json"
+_KIND = "slamgym trajectories 1"
+_CHUNK = 1 << 20  # [bytes]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be generated.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        With its ranges, if it has any.
+    controller : str
+        Name of a controller, see `make_controller`.
+    seed : int
+        Of episode 0; episode i has seed + i.
+    episodes : int
+        How many.
+    episodes_per_shard : int
+        How many there are in each shard but, perhaps, the last.
+    format : str
+        Name of a format, see `trajectory_format`.
+    """
+
+    scenario: Scenario
+    controller: str
+    seed: int
+    episodes: int
+    episodes_per_shard: int
+    format: str
+
+    @property
+    def shards(self) -> int:
+        """Number of shards."""
+        return -(-self.episodes // self.episodes_per_shard)
+
+    def episodes_of(self, shard: int) -> range:
+        """Return the numbers of the episodes of a shard.
+
+        Examples
+        --------
+        >>> scenario = load_scenario("loop")
+        >>> Job(scenario, "random", 0, 120, 50, "npz").episodes_of(2)
+        range(100, 120)
+        """
+        first = shard * self.episodes_per_shard
+        return range(first, min(first + self.episodes_per_shard, self.episodes))
+
+
+@dataclass(frozen=True)
+class ShardEntry:
+    """A shard that was written.
+
+    Attributes
+    ----------
+    name : str
+        Of its file or folder, beside the manifest.
+    first_episode, episodes : int
+        Which it holds.
+    sha256 : str
+        Its `checksum`.
+    """
+
+    name: str
+    first_episode: int
+    episodes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A job, what it is made with, and the shards there are so far.
+
+    Attributes
+    ----------
+    job : Job
+        What is generated.
+    versions : dict of str to str
+        Of all that can change a bit: packages, Python, and the kind of processor.
+    shards : tuple of ShardEntry
+        In the order of their episodes, without gaps.
+    """
+
+    job: Job
+    versions: dict[str, str]
+    shards: tuple[ShardEntry, ...] = ()
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all shards are there."""
+        return len(self.shards) == self.job.shards
+
+    def with_shards(self, shards: Iterable[ShardEntry]) -> "Manifest":
+        """Return the manifest with other shards."""
+        return replace(self, shards=tuple(shards))
+
+
+def versions_now(libraries: Iterable[str] = ()) -> dict[str, str]:
+    """Name the versions of what makes the bits here.
+
+    Parameters
+    ----------
+    libraries : iterable of str
+        Packages besides numpy.
+    """
+    return {
+        "slamgym": __version__,
+        "python": ".".join(platform.python_version_tuple()[:2]),
+        "machine": platform.machine(),
+        **{name: metadata.version(name) for name in ("numpy", *libraries)},
+    }
+
+
+def write_manifest(manifest: Manifest, folder: Path) -> None:
+    """Write a manifest, which appears complete or not at all."""
+    job = {**vars(manifest.job), "scenario": scenario_text(manifest.job.scenario)}
+    table = {
+        "kind": _KIND,
+        "job": job,
+        "versions": manifest.versions,
+        "shards": [asdict(shard) for shard in manifest.shards],
+    }
+    text = json.dumps(table, indent=1, ensure_ascii=False) + "\n"
+    with replace_when_written(folder / MANIFEST) as partial:
+        partial.write_text(text, encoding="utf-8", newline="\n")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read the manifest of a data set.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or the file is something else.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise ValueError(f"{folder} must be a data set with a {MANIFEST}, it has none")
+    try:
+        return _manifest(json.loads(path.read_text(encoding="utf-8")))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} must be a manifest of '{_KIND}': {type(error).__name__}: {error}"
+        ) from None
+
+
+def _manifest(table: dict[str, Any]) -> Manifest:
+    if table["kind"] != _KIND:
+        raise ValueError(f"kind is {table['kind']!r}")
+    scenario = load_scenario(tomllib.loads(table["job"]["scenario"]))
+    return Manifest(
+        job=Job(**{**table["job"], "scenario": scenario}),
+        versions=table["versions"],
+        shards=tuple(ShardEntry(**shard) for shard in table["shards"]),
+    )
+
+
+def checksum(path: Path) -> str:
+    """Compute the SHA-256 of a shard.
+
+    Of a folder it is the SHA-256 of what ``sha256sum`` prints of its files, named by
+    their paths below it, in alphabetical order.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such shard.
+    """
+    if not path.is_dir():
+        return _file_checksum(path)
+    names = (
+        file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file()
+    )
+    lines = [f"{_file_checksum(path / name)}  {name}\n" for name in sorted(names)]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def _file_checksum(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while chunk := stream.read(_CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()

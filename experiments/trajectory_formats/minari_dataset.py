@@ -1,0 +1,163 @@
+"""Shards as data sets of Minari (in its Arrow format), for offline learning; exact.
+
+Observations, actions and truncations as the environment's; the true pose, the collision
+(one column: Minari itself cannot combine infos without) and the hidden landmark ids are
+infos; the landmarks and the start estimate are in the options of each episode, with
+its scenario as TOML. Actions are float64, wider than the environment's action space, so
+that they keep every bit.
+"""
+
+import json
+import os
+import tomllib
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import minari
+import numpy as np
+import pyarrow as pa  # noqa: F401 (Minari's Arrow format needs it: missed at once)
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from minari.data_collector import EpisodeBuffer
+
+from ...envs.world_spaces import action_space, observation_space
+from ...sim_configs import Scenario, load_scenario
+from ...sim_configs.scenario_files import scenario_text
+from ..trajectories import Trajectory, array_of
+
+ENDING = "-v0"
+LIBRARIES = ("minari", "pyarrow")
+
+_ROOT = "MINARI_DATASETS_PATH"
+
+
+def check(scenario: Scenario) -> None:
+    """Accept every scenario."""
+
+
+def write(trajectories: Sequence[Trajectory], path: Path) -> None:
+    """Write a shard; its folder's name is the id of the data set."""
+    scenario = trajectories[0].scenario
+    with _datasets_in(path.parent), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of fields that a generated set need not have
+        minari.create_dataset_from_buffers(
+            dataset_id=path.name,
+            buffer=[_buffer(each) for each in trajectories],
+            env=_spec(scenario),
+            action_space=_wide(action_space(scenario)),
+            observation_space=_common_space([each.scenario for each in trajectories]),
+            algorithm_name=trajectories[0].controller,
+            author="slamgym",
+            description=f"Drives through the scenario '{scenario.name}'",
+            data_format="arrow",
+        )
+
+
+def read(path: Path) -> Iterator[Trajectory]:
+    """Yield the trajectories of a shard; see `trajectory_formats`."""
+    data = minari.MinariDataset(path / "data")
+    storage = data.storage
+    for episode, about in zip(
+        data.iterate_episodes(),
+        storage.get_episode_metadata(range(len(data))),
+        strict=True,
+    ):
+        yield _trajectory(episode, about)
+
+
+@contextmanager
+def _datasets_in(folder: Path) -> Iterator[None]:
+    """Let Minari keep its data sets in a folder meanwhile."""
+    before = os.environ.get(_ROOT)
+    os.environ[_ROOT] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_ROOT]
+        else:
+            os.environ[_ROOT] = before
+
+
+def _spec(scenario: Scenario) -> EnvSpec:
+    table = json.loads(json.dumps(tomllib.loads(scenario_text(scenario))))
+    return EnvSpec(
+        "slamgym/LandmarkWorld-v0",
+        entry_point="slamgym.envs.landmark_world:LandmarkWorldEnv",
+        kwargs={"scenario": table},
+    )
+
+
+def _common_space(scenarios: Sequence[Scenario]) -> spaces.Dict:
+    """Find bounds that hold in all scenarios."""
+    each = [observation_space(scenario) for scenario in set(scenarios)]
+
+    def box(name: str) -> spaces.Box:
+        boxes = [cast(spaces.Box, space[name]) for space in each]
+        low = np.min([box.low for box in boxes], axis=0)
+        high = np.max([box.high for box in boxes], axis=0)
+        return spaces.Box(low, high, dtype=np.float64)
+
+    return spaces.Dict(
+        {
+            "landmarks": box("landmarks"),
+            "mask": each[0]["mask"],
+            "odometry": box("odometry"),
+        }
+    )
+
+
+def _wide(box: spaces.Box) -> spaces.Box:
+    return spaces.Box(
+        box.low.astype(np.float64), box.high.astype(np.float64), dtype=np.float64
+    )
+
+
+def _buffer(trajectory: Trajectory) -> EpisodeBuffer:
+    steps = trajectory.steps
+    infos: dict[str, Any] = {
+        "pose": trajectory.poses,
+        "collision": np.append(False, array_of(trajectory, "collisions"))[:, None],
+    }
+    if trajectory.landmark_ids is not None:
+        infos["landmark_ids"] = trajectory.landmark_ids
+    return EpisodeBuffer(
+        seed=trajectory.seed,
+        options={
+            "controller": trajectory.controller,
+            "scenario": scenario_text(trajectory.scenario),
+            "start_estimate": trajectory.start_estimate.tolist(),
+            "landmarks": array_of(trajectory, "landmarks").tolist(),
+        },
+        observations={
+            "landmarks": array_of(trajectory, "measurements"),
+            "mask": array_of(trajectory, "mask"),
+            "odometry": np.vstack([np.zeros(2), trajectory.odometry]),
+        },
+        actions=array_of(trajectory, "actions"),
+        rewards=[0.0] * steps,
+        terminations=[False] * steps,
+        truncations=[False] * (steps - 1) + [True],
+        infos=infos,
+    )
+
+
+def _trajectory(episode: Any, about: dict[str, Any]) -> Trajectory:
+    options, seen = about["options"], episode.observations
+    return Trajectory(
+        scenario=load_scenario(tomllib.loads(options["scenario"])),
+        controller=options["controller"],
+        seed=about["seed"],
+        start_estimate=np.array(options["start_estimate"]),
+        odometry=seen["odometry"][1:],
+        poses=episode.infos["pose"],
+        landmarks=np.array(options["landmarks"]),
+        actions=episode.actions,
+        measurements=seen["landmarks"],
+        mask=seen["mask"],
+        collisions=episode.infos["collision"][1:, 0],
+        landmark_ids=episode.infos.get("landmark_ids"),
+    )

@@ -1,0 +1,100 @@
+"""Shards as folders of slamlog CSVs, one per episode: what a filter consumes, exact.
+
+A log holds the start, odometry, measurements, true poses and landmarks, every number
+so that reading gives the same bits. It does not hold the actions, the collisions, and
+the true ids of hidden identities.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ...envs.world_spaces import count_rows
+from ...sim_configs import Scenario
+from ..log_events import OdometryRow, Scan
+from ..recording import log_header
+from ..slamlog import SlamLog, read_slamlog, write_slamlog
+from ..trajectories import Trajectory, array_of
+from .episode_files import EpisodeNotes, read_notes, write_notes
+
+ENDING = ""
+LIBRARIES: tuple[str, ...] = ()
+
+
+def check(scenario: Scenario) -> None:
+    """Accept every scenario."""
+
+
+def write(trajectories: Sequence[Trajectory], path: Path) -> None:
+    """Write a shard; see `trajectory_formats`."""
+    path.mkdir()
+    names = write_notes(trajectories, path)
+    for name, trajectory in zip(names, trajectories, strict=True):
+        write_slamlog(to_slamlog(trajectory), path / f"{name}.csv")
+
+
+def read(path: Path) -> Iterator[Trajectory]:
+    """Yield the trajectories of a shard; see `trajectory_formats`."""
+    for notes in read_notes(path):
+        yield _trajectory(read_slamlog(path / f"{notes.name}.csv"), notes)
+
+
+def to_slamlog(trajectory: Trajectory) -> SlamLog:
+    """Make the log of a trajectory, for filters that replay logs.
+
+    Time counts steps, as in :func:`~slamgym.experiments.recording.record_episode`,
+    whose log of the same seed is equal.
+
+    Raises
+    ------
+    ValueError
+        If the trajectory lacks measurements or landmarks.
+    """
+    landmarks = array_of(trajectory, "landmarks")
+    measurements = array_of(trajectory, "measurements")
+    mask = array_of(trajectory, "mask")
+    known = trajectory.scenario.sensor.identities
+    events: list[OdometryRow | Scan] = []
+    for step, seen in enumerate(mask):
+        if step > 0:
+            distance, turn = trajectory.odometry[step - 1].tolist()
+            events.append(OdometryRow(float(step), distance, turn, dt=1.0))
+        if seen.any():
+            ids = np.flatnonzero(seen) if known else None
+            events.append(Scan(float(step), measurements[step][seen], ids))
+    times = np.arange(len(trajectory.poses), dtype=np.float64)
+    return SlamLog(
+        name=trajectory.scenario.name,
+        header=log_header(trajectory.scenario, trajectory.seed),
+        start=trajectory.start_estimate,
+        landmark_ids=np.arange(len(landmarks)),
+        landmarks=landmarks,
+        events=tuple(events),
+        ground_truth=np.column_stack([times, trajectory.poses]),
+    )
+
+
+def _trajectory(log: SlamLog, notes: EpisodeNotes) -> Trajectory:
+    moves = [event for event in log.events if isinstance(event, OdometryRow)]
+    rows = count_rows(notes.scenario)
+    measurements = np.zeros((len(moves) + 1, rows, 2))
+    mask = np.zeros((len(moves) + 1, rows), dtype=np.bool_)
+    for event in log.events:
+        if isinstance(event, Scan):
+            places = event.landmark_ids
+            if places is None:
+                places = np.arange(len(event.measurements))
+            measurements[int(event.t), places] = event.measurements
+            mask[int(event.t), places] = True
+    return Trajectory(
+        scenario=notes.scenario,
+        controller=notes.controller,
+        seed=notes.seed,
+        start_estimate=log.start,
+        odometry=np.array([(move.d, move.alpha) for move in moves]),
+        poses=log.ground_truth[:, 1:],
+        landmarks=log.landmarks,
+        measurements=measurements,
+        mask=mask,
+    )
