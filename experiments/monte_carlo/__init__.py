@@ -7,5 +7,12 @@ scenario → simulated runs → filtered runs → run measures → result blocks
 from .result_blocks import merge_blocks
 from .results import load_results
 from .runner import monte_carlo
+from .summary import consistency_of, summarise_monte_carlo
 
-__all__ = ["load_results", "merge_blocks", "monte_carlo"]
+__all__ = [
+    "consistency_of",
+    "load_results",
+    "merge_blocks",
+    "monte_carlo",
+    "summarise_monte_carlo",
+]

@@ -192,17 +192,53 @@ def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
     }
 
 
+def consistency_of(
+    results: xr.Dataset, estimator: str, *, frame: ErrorFrame = "invariant"
+) -> ConsistencyReport:
+    """Decide whether an estimator's covariances tell the truth about its errors.
+
+    Parameters
+    ----------
+    results : xarray.Dataset
+        Of ``monte_carlo``.
+    estimator : str
+        Its label.
+    frame : {"invariant", "additive"}
+        Error coordinates of the NEES.
+
+    Raises
+    ------
+    ValueError
+        If there is no such label, or fewer than 2 runs did not fail.
+
+    Examples
+    --------
+    >>> from slamgym.experiments.monte_carlo import monte_carlo
+    >>> results = monte_carlo("six_landmarks", "ekf,invariant", runs=60)
+    >>> [consistency_of(results, label).accepted for label in ("ekf", "invariant")]
+    [False, True]
+    """
+    if estimator not in labels_of(results):
+        known = ", ".join(labels_of(results))
+        raise ValueError(f"estimator must be one of {known}, got '{estimator}'")
+    return _report_of(scores_of(results, estimator, frame), frame)
+
+
 def _decide(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport | None:
     """Decide on the runs that did not fail, where these are enough."""
     freedom = scores.results["nis_dof"].values[:, 1:]
     if scores.good.sum() < 2 or not freedom[scores.good].any():
         return None
+    return _report_of(scores, frame)
+
+
+def _report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
     nees = scores.results[f"pose_nees_{frame}"].values[:, 1:].copy()
     nees[~scores.good] = np.nan
     return consistency_report(
         nees,
         scores.results["nis"].values[:, 1:],
-        freedom,
+        scores.results["nis_dof"].values[:, 1:],
         dof=POSE_FREEDOM,
         frame=frame,
         rng=np.random.default_rng(_BOOTSTRAP_SEED),
