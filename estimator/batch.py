@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -30,6 +31,33 @@ class BatchTrace(NamedTuple):
     """νᵀ S⁻¹ ν of each scan, shape (B, T)."""
     degrees_of_freedom: NDArray[np.int64]
     """Of the NIS, shape (B, T)."""
+
+
+class BatchBeliefs(NamedTuple):
+    """What every run believes now; the state of all is (x, y, θ, l0x, l0y, l1x, …)."""
+
+    means: Array
+    """Shape (B, 3 + 2L), landmarks by id, zeros where not mapped; θ in [-π, π)."""
+    covariances: Array
+    """Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped."""
+    mapped: NDArray[np.bool_]
+    """Which landmarks are in the map, shape (B, L)."""
+
+
+class BatchMarginals(NamedTuple):
+    """What every run believes of its pose and of each landmark, one by one."""
+
+    poses: Array
+    """(x, y, θ), shape (B, 3) [m, m, rad], heading in [-π, π)."""
+    pose_covariances: Array
+    """Shape (B, 3, 3)."""
+    landmarks: Array
+    """Shape (B, L, 2), zeros where not mapped [m]."""
+    spreads: Array
+    """Shape (9, B, L), zeros where not mapped: the covariances xx, xy, yy of a landmark
+    (lx, ly), and of lx and of ly with the pose: lx x, lx y, lx θ, ly x, ly y, ly θ."""
+    mapped: NDArray[np.bool_]
+    """Which landmarks are in the map, shape (B, L)."""
 
 
 class BatchSlam:
@@ -91,12 +119,7 @@ class BatchSlam:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
         self._threads = validation.whole("threads", threads or cores, 1)
         std = validation.standard_deviations("initial_pose_std", initial_pose_std, 3)
-        first = validation.as_floats("initial_poses", initial_poses)
-        if first.shape not in ((3,), (self.runs, 3)) or not np.isfinite(first).all():
-            raise ValueError(
-                f"initial_poses must be finite with shape (3,) or ({self.runs}, 3), "
-                f"got shape {first.shape}"
-            )
+        first = self._first_poses("initial_poses", initial_poses)
         capacity = EkfSlam.capacity_for(self.landmarks)
         self._means = np.zeros((self.runs, capacity))
         self._references = np.zeros((self.runs, capacity))
@@ -117,8 +140,10 @@ class BatchSlam:
         measurements: ArrayLike,
         visible: ArrayLike,
         dt: ArrayLike = 1.0,
+        *,
+        runs: ArrayLike | None = None,
     ) -> BatchTrace:
-        """Take all runs through T steps, each a predict and an update.
+        """Take runs through T steps, each a predict and an update.
 
         Parameters
         ----------
@@ -131,6 +156,9 @@ class BatchSlam:
         dt : float or array_like, shape (T,)
             Duration that the motion noise of each step counts.  A first scan before
             any motion is odometry (0, 0) with dt = 0.
+        runs : array_like of bool, shape (B,), optional
+            The runs that take part, all where not given.  The others stay as they are,
+            and their data is not read; the trace has nan for them.
 
         Returns
         -------
@@ -140,11 +168,11 @@ class BatchSlam:
         steps = u.shape[1] if u.ndim == 3 else 0
         z = validation.as_floats("measurements", measurements)
         seen = np.ascontiguousarray(visible, dtype=np.bool_)
-        runs, landmarks = self.runs, self.landmarks
+        count, landmarks = self.runs, self.landmarks
         for name, array, shape in (
-            ("odometry", u, (runs, steps, 2)),
-            ("measurements", z, (runs, steps, landmarks, 2)),
-            ("visible", seen, (runs, steps, landmarks)),
+            ("odometry", u, (count, steps, 2)),
+            ("measurements", z, (count, steps, landmarks, 2)),
+            ("visible", seen, (count, steps, landmarks)),
         ):
             if array.shape != shape:
                 raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
@@ -154,14 +182,91 @@ class BatchSlam:
         if not (np.isfinite(durations) & (durations >= 0)).all():
             raise ValueError(f"dt must be finite numbers >= 0, got {dt!r}")
         trace = BatchTrace(
-            np.full((runs, steps, 3), np.nan),
-            np.full((runs, steps, 3, 3), np.nan),
-            np.full((runs, steps), np.nan),
-            np.zeros((runs, steps), dtype=np.int64),
+            np.full((count, steps, 3), np.nan),
+            np.full((count, steps, 3, 3), np.nan),
+            np.full((count, steps), np.nan),
+            np.zeros((count, steps), dtype=np.int64),
         )
-        self._in_threads(lambda part: self._drive(part, (u, z, seen), durations, trace))
+        chosen = self._chosen(runs)
+        failed_at = np.where(chosen, self.failed_at, 0)  # the kernel passes these over
+        data = u, z, seen
+        self._in_threads(partial(self._drive, data, durations, trace, failed_at))
+        self.failed_at = np.where(chosen, failed_at, self.failed_at)
         trace.poses[..., 2] = wrap_angle(trace.poses[..., 2])
         return trace
+
+    def reset(
+        self,
+        poses: ArrayLike,
+        pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        runs: ArrayLike | None = None,
+    ) -> None:
+        """Start runs anew, with empty maps; also those that had stopped.
+
+        Parameters
+        ----------
+        poses : array_like, shape (3,) or (B, 3)
+            Means of the first poses [m, m, rad].
+        pose_std : array_like, shape (3,)
+            Their standard deviation.
+        runs : array_like of bool, shape (B,), optional
+            The runs that start anew, all where not given; the others go on.
+        """
+        std = validation.standard_deviations("pose_std", pose_std, 3)
+        first = self._first_poses("poses", poses)
+        chosen = self._chosen(runs)
+        self._means[chosen] = self._references[chosen] = 0.0
+        self._covariances[chosen] = 0.0
+        at = np.flatnonzero(chosen)
+        self._means[at, :3] = self._references[at, :3] = first[at]
+        self._covariances[at[:, None], range(3), range(3)] = std**2
+        self._slots[chosen] = -1
+        self._mapped[chosen] = 0
+        self.failed_at[chosen] = NEVER
+
+    def beliefs(self) -> BatchBeliefs:
+        """Return the beliefs of all runs side by side, as a snapshot.
+
+        A run that has stopped still has the belief it stopped with.
+        """
+        mapped = self._slots >= 0
+        places = 3 + 2 * np.where(mapped, self._slots, 0)
+        pose = np.broadcast_to(np.arange(3), (self.runs, 3))
+        pairs = (places[:, :, None] + np.arange(2)).reshape(self.runs, -1)
+        at = np.concatenate([pose, pairs], axis=1)
+        held = np.ones(at.shape, dtype=np.bool_)
+        held[:, 3:] = np.repeat(mapped, 2, axis=1)
+        row = np.arange(self.runs)[:, None]
+        means = self._means[row, at] * held
+        covariances = self._covariances[row[:, :, None], at[:, :, None], at[:, None]]
+        covariances *= held[:, :, None] & held[:, None]
+        means[:, 2] = wrap_angle(means[:, 2])
+        return BatchBeliefs(means, covariances, mapped)
+
+    def marginals(self) -> BatchMarginals:
+        """Return what :meth:`beliefs` says of pose and landmarks, at less cost."""
+        mapped = self._slots >= 0
+        capacity = self._means.shape[1]
+        run = np.arange(self.runs)[:, None]
+        place = 3 + 2 * np.where(mapped, self._slots, 0)
+        means = self._means.ravel()
+        landmarks = np.stack(
+            [means.take(run * capacity + place + axis) for axis in (0, 1)], axis=-1
+        )
+        row = (run * capacity + place) * capacity
+        below = row + capacity
+        at = [row + place, row + place + 1, below + place + 1]
+        at += [row + axis for axis in range(3)] + [below + axis for axis in range(3)]
+        poses = self._means[:, :3].copy()
+        poses[:, 2] = wrap_angle(poses[:, 2])
+        return BatchMarginals(
+            poses,
+            self._covariances[:, :3, :3].copy(),
+            landmarks * mapped[..., None],
+            self._covariances.ravel().take(np.stack(at)) * mapped,
+            mapped,
+        )
 
     def belief(self, run: int) -> Belief:
         """Return the belief of one run as a snapshot."""
@@ -189,12 +294,33 @@ class BatchSlam:
             )
         )
 
+    def _chosen(self, runs: ArrayLike | None) -> NDArray[np.bool_]:
+        if runs is None:
+            return np.ones(self.runs, dtype=np.bool_)
+        chosen = np.asarray(runs)
+        if chosen.shape != (self.runs,) or chosen.dtype != np.bool_:
+            raise ValueError(
+                f"runs must be {self.runs} booleans, got {chosen.dtype} with shape "
+                f"{chosen.shape}"
+            )
+        return chosen
+
+    def _first_poses(self, name: str, poses: ArrayLike) -> Array:
+        first = validation.as_floats(name, poses)
+        if first.shape not in ((3,), (self.runs, 3)) or not np.isfinite(first).all():
+            raise ValueError(
+                f"{name} must be finite with shape (3,) or ({self.runs}, 3), "
+                f"got shape {first.shape}"
+            )
+        return np.broadcast_to(first, (self.runs, 3))
+
     def _drive(
         self,
-        part: slice,
         data: tuple[Array, Array, NDArray[np.bool_]],
         dt: Array,
         trace: BatchTrace,
+        failed_at: NDArray[np.int64],
+        part: slice,
     ) -> None:
         u, z, seen = data
         drive_runs(
@@ -213,7 +339,7 @@ class BatchSlam:
             trace.pose_covariances[part],
             trace.nis[part],
             trace.degrees_of_freedom[part],
-            self.failed_at[part],
+            failed_at[part],
         )
 
     def _in_threads(self, work: Callable[[slice], None]) -> None:
