@@ -24,8 +24,10 @@ from rich.console import Console
 from rich.table import Table
 
 from slamgym.estimator import EkfSlam, make_batch, make_estimator
-from slamgym.estimator.joint_update import update_one
+from slamgym.estimator.ekf_slam import workspace_for
+from slamgym.estimator.joint_update import update_belief
 from slamgym.estimator.kernels import predict
+from slamgym.estimator.workspace import aligned_zeros
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.05, 0.02, 0.02]), np.array([0.02, 0.08])
 NOISE: dict[str, Any] = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
@@ -67,17 +69,29 @@ def kernel_step(slam: EkfSlam, readings: NDArray[np.float64]) -> Callable[[], ob
     size = len(state["mean"])
     capacity = EkfSlam.capacity_for(len(readings))
     mean, reference = np.zeros(capacity), np.zeros(capacity)
-    covariance = np.zeros((capacity, capacity))
+    covariance = aligned_zeros(capacity, capacity)
     mean[:size], covariance[:size, :size] = state["mean"], state["covariance"]
     reference[:size] = state["reference"]
     rules, variance = slam.rule_values, MOTION_STD**2
     where = slam.rules.linearisation
-    ledger = np.zeros((4, len(readings)), dtype=np.int64)
-    ledger[0] = np.arange(len(readings))
+    count = len(readings)
+    work = workspace_for(slam.rules, count, capacity)
+    ledger = np.zeros((3, count), dtype=np.int64)
+    ledger[0] = np.arange(count)
 
     def step() -> None:
         predict(mean, covariance, size, 0.0, 0.0, variance, where, reference)
-        update_one(mean, covariance, size, readings, reference, rules, ledger)
+        update_belief(
+            mean,
+            covariance,
+            size,
+            readings,
+            count,
+            reference,
+            rules,
+            *work,
+            ledger,
+        )
 
     return step
 

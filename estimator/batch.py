@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from . import validation
 from .angles import wrap_angle
 from .batch_kernels import NEVER, drive_runs
-from .ekf_slam import FRAMES, EkfSlam
+from .ekf_slam import FRAMES, EkfSlam, workspace_for
 from .interface import Belief
 from .registry import find_estimator
+from .workspace import aligned_zeros
 
 Array = NDArray[np.float64]
 
@@ -100,7 +101,7 @@ class BatchSlam:
         capacity = EkfSlam.capacity_for(self.landmarks)
         self._means = np.zeros((self.runs, capacity))
         self._references = np.zeros((self.runs, capacity))
-        self._covariances = np.zeros((self.runs, capacity, capacity))
+        self._covariances = aligned_zeros(self.runs, capacity, capacity)
         self._means[:, :3] = self._references[:, :3] = first
         self._covariances[:, range(3), range(3)] = std**2
         self._slots = np.full((self.runs, self.landmarks), -1, dtype=np.int64)
@@ -214,6 +215,7 @@ class BatchSlam:
             trace.nis[part],
             trace.degrees_of_freedom[part],
             self.failed_at[part],
+            *workspace_for(self._estimator.rules, self.landmarks, self._means.shape[1]),
         )
 
     def _in_threads(self, work: Callable[[slice], None]) -> None:

@@ -4,15 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .compiled import compiled, part
-from .joint_update import (
-    ADDED,
-    DONE,
-    FATE,
-    SLOT,
-    as_rules,
-    new_workspace,
-    update_belief,
-)
+from .joint_update import ADDED, DONE, FATE, SLOT, as_rules, update_belief
 from .kernels import Array, Int, predict
 
 NEVER = -1
@@ -36,17 +28,18 @@ def drive_runs(  # every array of a batch once, with a leading run axis
     nis: Array,
     freedom: Int,
     failed_at: Int,
+    rows: Array,
+    before: Array,
+    prior: Array,
 ) -> None:
     """Take each run through all its steps, in place.
 
     ``motion_values`` holds the variances (σx², σy², σα²) and 1 where a robot at rest
-    has motion noise too.
+    has motion noise too; ``rows``, ``before`` and ``prior`` are a workspace.
     """
     rules = as_rules(rule_values)
     landmarks = slots.shape[1]
-    capacity = means.shape[1]
-    work = new_workspace(landmarks, 3 + 2 * landmarks, capacity, rules)
-    ledger = np.zeros((4, landmarks), np.int64)
+    ledger = np.zeros((3, landmarks), np.int64)
     readings = np.empty((landmarks, 2))
     ids = np.empty(landmarks, np.int64)
     variance = np.empty(3)
@@ -81,10 +74,13 @@ def drive_runs(  # every array of a batch once, with a leading run axis
                 mean,
                 covariance,
                 size,
-                readings[:m],
+                readings,
+                m,
                 references[b],
-                rules,
-                work,
+                rule_values,
+                rows,
+                before,
+                prior,
                 ledger,
             )
             if outcome != DONE:

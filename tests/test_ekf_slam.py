@@ -372,6 +372,6 @@ def test_read_only_readings_are_taken_without_compiling_anew():
     readings = np.array([(0.1, 4.0)])
     readings.flags.writeable = False
     slam.update(readings, [0])
-    from slamgym.estimator.joint_update import update_one
+    from slamgym.estimator.joint_update import update_belief
 
-    assert len(update_one.signatures) == 1
+    assert len(update_belief.signatures) == 1
