@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +17,10 @@ from .registry import find_estimator
 from .workspace import aligned_zeros
 
 Array = NDArray[np.float64]
+
+
+# So many that a thread which gets little of its core holds up the others but little.
+SHARES_PER_THREAD = 8
 
 
 class BatchTrace(NamedTuple):
@@ -219,13 +222,13 @@ class BatchSlam:
         )
 
     def _in_threads(self, work: Callable[[slice], None]) -> None:
-        """Do the work on contiguous shares of the runs."""
+        """Do the work on small shares of the runs, each by whichever thread is free."""
         threads = min(self._threads, self.runs)
-        bounds = np.linspace(0, self.runs, threads + 1).astype(int).tolist()
-        shares = [slice(a, b) for a, b in pairwise(bounds)]
         if threads == 1:
-            work(shares[0])
+            work(slice(0, self.runs))
             return
+        share = -(-self.runs // (SHARES_PER_THREAD * threads))
+        shares = [slice(a, a + share) for a in range(0, self.runs, share)]
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(work, shares))
 
