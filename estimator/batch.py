@@ -41,8 +41,8 @@ class BatchSlam:
 
     Run i gives the same bits as a single filter fed the data of run i; landmark ids
     are the rows 0 … L−1 of the measurement arrays.  The runs are shared out over
-    threads.  A run whose data is not finite or whose innovation covariance fails stops
-    there for good, with nan from that step on; the others go on.
+    threads.  A run whose data is not finite, or beyond 1e12, or whose innovation
+    covariance fails stops there for good, with nan from that step on; the others go on.
 
     Parameters
     ----------
@@ -91,7 +91,9 @@ class BatchSlam:
             raise ValueError(f"{type(estimator).__name__} cannot run in batches")
         self.runs = validation.whole("runs", runs, 1)
         self.landmarks = validation.whole("landmarks", landmarks, 0)
-        self._estimator = estimator
+        self._rules = estimator.rules
+        self._rule_values = estimator.rule_values.copy()
+        self._motion_values = estimator.motion_values
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
         self._threads = validation.whole("threads", threads or cores, 1)
         std = validation.standard_deviations("initial_pose_std", initial_pose_std, 3)
@@ -176,7 +178,7 @@ class BatchSlam:
             self._means[run, :n],
             self._covariances[run, :n, :n],
             tuple(np.flatnonzero(slots >= 0)[order].tolist()),
-            FRAMES[self._estimator.rules.frame],
+            FRAMES[self._rules.frame],
         )
 
     @property
@@ -207,8 +209,8 @@ class BatchSlam:
             self._references[part],
             self._slots[part],
             self._mapped[part],
-            self._estimator.rule_values,
-            self._estimator.motion_values,
+            self._rule_values,
+            self._motion_values,
             u[part],
             z[part],
             seen[part],
@@ -218,7 +220,7 @@ class BatchSlam:
             trace.nis[part],
             trace.degrees_of_freedom[part],
             self.failed_at[part],
-            *workspace_for(self._estimator.rules, self.landmarks, self._means.shape[1]),
+            *workspace_for(self._rules, self.landmarks, self._means.shape[1]),
         )
 
     def _in_threads(self, work: Callable[[slice], None]) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .compiled import compiled, part
-from .joint_update import ADDED, DONE, FATE, SLOT, as_rules, update_belief
+from .joint_update import ADDED, DONE, FATE, SLOT, as_rules, update_belief, usable
 from .kernels import Array, Int, predict
 
 NEVER = -1
@@ -53,7 +53,7 @@ def drive_runs(  # every array of a batch once, with a leading run axis
             m = gather(
                 measurements[b, t], visible[b, t], slots[b], readings, ids, ledger
             )
-            if not (np.isfinite(d) and np.isfinite(turn) and m >= 0):
+            if not (usable(d) and usable(turn) and m >= 0):
                 failed_at[b] = t
                 break
             share = dt[t] if motion_values[3] > 0 or d != 0 or turn != 0 else 0.0
@@ -106,14 +106,12 @@ def gather(
 ) -> int:
     """Collect the readings that there are, and their places in the map.
 
-    Returns how many, or -1 where one is not finite.
+    Returns how many, or -1 where one is not usable.
     """
     m = 0
     for i in range(len(visible)):
         if visible[i]:
-            if not (
-                np.isfinite(measurements[i, 0]) and np.isfinite(measurements[i, 1])
-            ):
+            if not (usable(measurements[i, 0]) and usable(measurements[i, 1])):
                 return -1
             readings[m, 0], readings[m, 1] = measurements[i, 0], measurements[i, 1]
             ids[m] = i

@@ -18,7 +18,7 @@ from .joint_update import (
     DONE,
     FATE,
     GATED,
-    NOT_FINITE,
+    NOT_USABLE,
     SKIPPED,
     SLOT,
     USED,
@@ -342,19 +342,26 @@ class EkfSlam:
 
     def _refuse(self, outcome: int, readings: Array, ids: list[int]) -> None:
         """Raise the error of an update that did not go through."""
-        if outcome == NOT_FINITE:
-            self._check_finite(readings, ids)
+        if outcome == NOT_USABLE:
+            self._check_usable(readings, ids)
         row = np.flatnonzero(self._ledger[FATE, : len(ids)] == USED)[outcome]
         raise not_positive_definite(ids[row])
 
     @staticmethod
-    def _check_finite(readings: Array, ids: list[int]) -> None:
+    def _check_usable(readings: Array, ids: list[int]) -> None:
         finite = np.isfinite(readings).all(axis=1)
         if not finite.all():
             row = int(np.argmin(finite))
             raise ValueError(
                 f"measurements must be finite, got {readings[row].tolist()} in row "
                 f"{row} (landmark {ids[row]})"
+            )
+        usable = (np.abs(readings) <= validation.LARGEST).all(axis=1)
+        if not usable.all():
+            row = int(np.argmin(usable))
+            raise ValueError(
+                f"measurements must not exceed {validation.LARGEST:g}, got "
+                f"{readings[row].tolist()} in row {row} (landmark {ids[row]})"
             )
 
     def _report(self, ids: list[int], used: int, nis: float) -> UpdateReport:

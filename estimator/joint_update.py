@@ -16,6 +16,7 @@ from .kernels import (
     retract,
     transport,
 )
+from .validation import LARGEST
 from .workspace import (
     COLUMN,
     FIRST,
@@ -38,7 +39,7 @@ SLOT, FATE, NEAR = 0, 1, 2
 USED, ADDED, GATED, SKIPPED = 0, 1, 2, 3
 
 # What became of the whole call, where it is not the row that failed.
-DONE, NOT_FINITE = -1, -2
+DONE, NOT_USABLE = -1, -2
 
 
 class Rules(NamedTuple):
@@ -72,6 +73,12 @@ def set_aside(rows: Array, top: int, bottom: int) -> None:
     for row in range(top, bottom):
         for j in range(rows.shape[1]):
             rows[row + down, j] = rows[row, j]
+
+
+@part
+def usable(value: float) -> bool:
+    """Whether a number is finite, and its square with room to spare."""
+    return abs(value) <= LARGEST
 
 
 @part
@@ -300,7 +307,7 @@ def update_belief(
     Returns
     -------
     outcome : int
-        DONE, NOT_FINITE, or which reading, of those in use, has an innovation
+        DONE, NOT_USABLE, or which reading, of those in use, has an innovation
         covariance that is not positive definite.  Unless DONE, nothing has changed.
     used : int
         Number of readings of mapped landmarks in use.
@@ -309,8 +316,8 @@ def update_belief(
     """
     rules = as_rules(rule_values)
     for k in range(count):
-        if not (np.isfinite(readings[k, 0]) and np.isfinite(readings[k, 1])):
-            return NOT_FINITE, 0, 0.0
+        if not (usable(readings[k, 0]) and usable(readings[k, 1])):
+            return NOT_USABLE, 0, 0.0
     used = screen(mean, covariance, readings, count, reference, rules, rows, ledger)
     repeated = rules.sequential or rules.iterations > 1
     spoilable = repeated or used > block_of(size, used)

@@ -7,7 +7,7 @@ from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 from numeric_jacobian import numeric_jacobian
 from scipy.stats import chi2
 
-from slamgym.estimator import EkfSlam
+from slamgym.estimator import EkfSlam, list_estimators, make_estimator
 from slamgym.estimator.angles import wrap_angle
 
 IDS = list(range(6))
@@ -260,6 +260,17 @@ def test_degenerate_innovation_names_the_landmark_and_changes_nothing():
             lambda s: s.update([(0, 1), (np.nan, 2)], [0, 8]),
             r"measurements must be finite, got \[nan, 2.0\] in row 1 \(landmark 8\)",
         ),
+        (
+            lambda s: s.update([(0, 1), (0, 1e200)], [0, 8]),
+            r"measurements must not exceed 1e\+12, got \[0.0, 1e\+200\] in row 1",
+        ),
+        (lambda s: s.predict((-1e200, 0)), r"odometry must not exceed 1e\+12"),
+        (
+            lambda s: s.update(np.ma.masked_array([(0.0, 1.0)], [(False, True)]), [0]),
+            "measurements must be an array without a mask",
+        ),
+        (lambda s: s.update(np.array([(0, 1j)]), [0]), "must be real numbers"),
+        (lambda s: s.predict(np.array([1j, 0])), "odometry must be real numbers"),
         (lambda s: s.update([(0, 1, 2)], [0]), r"shape \(m, 2\).*got shape \(1, 3\)"),
         (lambda s: s.update([(0, 1)], [0, 1]), "1 rows but landmark_ids has 2"),
         (lambda s: s.update([(0, 1), (1, 1)], [3, 3]), "must not repeat.*got 3 twice"),
@@ -375,3 +386,15 @@ def test_read_only_readings_are_taken_without_compiling_anew():
     from slamgym.estimator.joint_update import update_belief
 
     assert len(update_belief.signatures) == 1
+
+
+@pytest.mark.parametrize("name", list_estimators())
+def test_the_largest_readings_leave_the_belief_finite(name):
+    slam = make_estimator(name, motion_std=MOTION_STD, measurement_std=MEASUREMENT_STD)
+    slam.predict((1.0, 0.1))
+    slam.update([(0.3, 1e12), (0.1, 5.0)], [0, 1])
+    slam.predict((1.0, 0.1))
+    assert np.isfinite(slam.belief().mean).all()
+    assert np.isfinite(slam.belief().covariance).all()
+    with pytest.raises(ValueError, match="measurements must not exceed"):
+        slam.update([(0.3, 1e200)], [2])
