@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
 from slamgym.estimator.angles import wrap_angle
+from slamgym.estimator.bearing_range_model import predict_measurement
 
 IDS = list(range(6))
 
@@ -398,3 +399,32 @@ def test_the_largest_readings_leave_the_belief_finite(name):
     assert np.isfinite(slam.belief().covariance).all()
     with pytest.raises(ValueError, match="measurements must not exceed"):
         slam.update([(0.3, 1e200)], [2])
+
+
+@pytest.mark.parametrize("name", ["ekf", "iterated"])
+@pytest.mark.parametrize("seen", [[7, 31, 4], list(range(40))])
+def test_a_report_keeps_the_innovation_covariance_of_its_own_prior(name, seen):
+    """For a few readings in a large map, and for all; also after later updates."""
+    rng = np.random.default_rng(0)
+    landmarks = rng.uniform(-15, 15, (40, 2))
+    slam = make_estimator(name, motion_std=MOTION_STD, measurement_std=MEASUREMENT_STD)
+    steps = list(drive(0, 5, landmarks=landmarks))
+    for odometry, readings, _ in steps[:-1]:
+        slam.predict(odometry)
+        slam.update(readings, range(40))
+    slam.predict(steps[-1][0])
+    prior = slam.belief()
+    model = predict_measurement(prior.pose, prior.landmarks[seen])
+    H = np.zeros((2 * len(seen), len(prior.mean)))
+    for k, landmark in enumerate(seen):
+        H[2 * k : 2 * k + 2, :3] = model.jacobian_pose[k]
+        c = 3 + 2 * landmark
+        H[2 * k : 2 * k + 2, c : c + 2] = model.jacobian_landmark[k]
+    noise = np.tile(np.square(MEASUREMENT_STD), len(seen))
+    S = H @ prior.covariance @ H.T + np.diag(noise)
+    expected = steps[-1][1][seen] - model.measurement
+    expected[:, 0] = wrap_angle(expected[:, 0])
+    report = slam.update(steps[-1][1][seen], seen)
+    slam.update(steps[-1][1], range(40))
+    np.testing.assert_allclose(report.innovation, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(report.innovation_covariance, S, rtol=0, atol=1e-12)
