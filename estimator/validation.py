@@ -32,7 +32,8 @@ def standard_deviations(name: str, value: ArrayLike, size: int) -> Array:
 
 def as_floats(name: str, value: ArrayLike) -> Array:
     """Return ``value`` as a contiguous float64 array, or refuse it."""
-    _refuse_masked_and_complex(name, value)
+    if isinstance(value, np.ndarray):
+        _refuse_masked_and_complex(name, value)
     try:
         return np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -76,9 +77,12 @@ def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
 
 def pair(name: str, value: ArrayLike) -> tuple[float, float]:
     """Return ``value`` as two finite floats of a usable size, or refuse it."""
-    _refuse_masked_and_complex(name, value)
+    given: object = value
+    if isinstance(value, np.ndarray):
+        _refuse_masked_and_complex(name, value)
+        given = value.tolist()  # in half the time that numpy's own numbers take
     try:
-        first, second = cast("tuple[float, float]", value)
+        first, second = cast("tuple[float, float]", given)
         a, b = float(first), float(second)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be 2 finite numbers, got {value!r}") from None
@@ -126,11 +130,11 @@ def flag(name: str, value: bool) -> bool:
     return bool(value)
 
 
-def _refuse_masked_and_complex(name: str, value: object) -> None:
+def _refuse_masked_and_complex(name: str, value: NDArray[Any]) -> None:
     """Numpy would take what lies under a mask, and half of a complex number."""
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(f"{name} must be an array without a mask, got {value!r}")
-    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind == "c":
+    if value.dtype.kind == "c":
         raise ValueError(f"{name} must be real numbers, got {value!r}")
 
 
