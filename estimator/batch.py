@@ -4,7 +4,6 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,11 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 from . import validation
 from .angles import wrap_angle
 from .batch_kernels import NEVER, drive_runs
-from .ekf_slam import FRAMES, EkfSlam
+from .ekf_slam import FRAMES, EkfSlam, workspace_for
 from .interface import Belief
 from .registry import find_estimator
+from .workspace import aligned_zeros
 
 Array = NDArray[np.float64]
+
+
+# So many that a thread which gets little of its core holds up the others but little.
+SHARES_PER_THREAD = 8
 
 
 class BatchTrace(NamedTuple):
@@ -65,8 +69,8 @@ class BatchSlam:
 
     Run i gives the same bits as a single filter fed the data of run i; landmark ids
     are the rows 0 … L−1 of the measurement arrays.  The runs are shared out over
-    threads.  A run whose data is not finite or whose innovation covariance fails stops
-    there for good, with nan from that step on; the others go on.
+    threads.  A run whose data is not finite, or beyond 1e12, or whose innovation
+    covariance fails stops there for good, with nan from that step on; the others go on.
 
     Parameters
     ----------
@@ -115,7 +119,9 @@ class BatchSlam:
             raise ValueError(f"{type(estimator).__name__} cannot run in batches")
         self.runs = validation.whole("runs", runs, 1)
         self.landmarks = validation.whole("landmarks", landmarks, 0)
-        self._estimator = estimator
+        self._rules = estimator.rules
+        self._rule_values = estimator.rule_values.copy()
+        self._motion_values = estimator.motion_values
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
         self._threads = validation.whole("threads", threads or cores, 1)
         std = validation.standard_deviations("initial_pose_std", initial_pose_std, 3)
@@ -123,7 +129,7 @@ class BatchSlam:
         capacity = EkfSlam.capacity_for(self.landmarks)
         self._means = np.zeros((self.runs, capacity))
         self._references = np.zeros((self.runs, capacity))
-        self._covariances = np.zeros((self.runs, capacity, capacity))
+        self._covariances = aligned_zeros(self.runs, capacity, capacity)
         self._means[:, :3] = self._references[:, :3] = first
         self._covariances[:, range(3), range(3)] = std**2
         self._slots = np.full((self.runs, self.landmarks), -1, dtype=np.int64)
@@ -277,7 +283,7 @@ class BatchSlam:
             self._means[run, :n],
             self._covariances[run, :n, :n],
             tuple(np.flatnonzero(slots >= 0)[order].tolist()),
-            FRAMES[self._estimator.rules.frame],
+            FRAMES[self._rules.frame],
         )
 
     @property
@@ -329,8 +335,8 @@ class BatchSlam:
             self._references[part],
             self._slots[part],
             self._mapped[part],
-            self._estimator.rule_values,
-            self._estimator.motion_values,
+            self._rule_values,
+            self._motion_values,
             u[part],
             z[part],
             seen[part],
@@ -340,16 +346,17 @@ class BatchSlam:
             trace.nis[part],
             trace.degrees_of_freedom[part],
             failed_at[part],
+            *workspace_for(self._rules, self.landmarks, self._means.shape[1]),
         )
 
     def _in_threads(self, work: Callable[[slice], None]) -> None:
-        """Do the work on contiguous shares of the runs."""
+        """Do the work on small shares of the runs, each by whichever thread is free."""
         threads = min(self._threads, self.runs)
-        bounds = np.linspace(0, self.runs, threads + 1).astype(int).tolist()
-        shares = [slice(a, b) for a, b in pairwise(bounds)]
         if threads == 1:
-            work(shares[0])
+            work(slice(0, self.runs))
             return
+        share = -(-self.runs // (SHARES_PER_THREAD * threads))
+        shares = [slice(a, a + share) for a in range(0, self.runs, share)]
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(work, shares))
 

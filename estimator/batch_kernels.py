@@ -4,15 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .compiled import compiled, part
-from .joint_update import (
-    ADDED,
-    DONE,
-    FATE,
-    SLOT,
-    as_rules,
-    new_workspace,
-    update_belief,
-)
+from .joint_update import ADDED, DONE, FATE, SLOT, as_rules, update_belief, usable
 from .kernels import Array, Int, predict
 
 NEVER = -1
@@ -36,17 +28,18 @@ def drive_runs(  # every array of a batch once, with a leading run axis
     nis: Array,
     freedom: Int,
     failed_at: Int,
+    rows: Array,
+    before: Array,
+    prior: Array,
 ) -> None:
     """Take each run through all its steps, in place.
 
     ``motion_values`` holds the variances (σx², σy², σα²) and 1 where a robot at rest
-    has motion noise too.
+    has motion noise too; ``rows``, ``before`` and ``prior`` are a workspace.
     """
     rules = as_rules(rule_values)
     landmarks = slots.shape[1]
-    capacity = means.shape[1]
-    work = new_workspace(landmarks, 3 + 2 * landmarks, capacity, rules)
-    ledger = np.zeros((4, landmarks), np.int64)
+    ledger = np.zeros((3, landmarks), np.int64)
     readings = np.empty((landmarks, 2))
     ids = np.empty(landmarks, np.int64)
     variance = np.empty(3)
@@ -60,7 +53,7 @@ def drive_runs(  # every array of a batch once, with a leading run axis
             m = gather(
                 measurements[b, t], visible[b, t], slots[b], readings, ids, ledger
             )
-            if not (np.isfinite(d) and np.isfinite(turn) and m >= 0):
+            if not (usable(d) and usable(turn) and m >= 0):
                 failed_at[b] = t
                 break
             share = dt[t] if motion_values[3] > 0 or d != 0 or turn != 0 else 0.0
@@ -81,10 +74,13 @@ def drive_runs(  # every array of a batch once, with a leading run axis
                 mean,
                 covariance,
                 size,
-                readings[:m],
+                readings,
+                m,
                 references[b],
-                rules,
-                work,
+                rule_values,
+                rows,
+                before,
+                prior,
                 ledger,
             )
             if outcome != DONE:
@@ -110,14 +106,12 @@ def gather(
 ) -> int:
     """Collect the readings that there are, and their places in the map.
 
-    Returns how many, or -1 where one is not finite.
+    Returns how many, or -1 where one is not usable.
     """
     m = 0
     for i in range(len(visible)):
         if visible[i]:
-            if not (
-                np.isfinite(measurements[i, 0]) and np.isfinite(measurements[i, 1])
-            ):
+            if not (usable(measurements[i, 0]) and usable(measurements[i, 1])):
                 return -1
             readings[m, 0], readings[m, 1] = measurements[i, 0], measurements[i, 1]
             ids[m] = i

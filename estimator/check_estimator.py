@@ -1,7 +1,8 @@
 """Hold anybody's estimator against the contract of :class:`SlamEstimator`."""
 
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ def check_estimator(factory: Factory) -> None:
         _check_snapshots,
         _check_refusals,
         _check_save_and_restore,
+        _check_saved_state_is_a_copy,
         _check_reset,
     ):
         check(factory)
@@ -252,22 +254,83 @@ def _check_refusals(factory: Factory) -> None:
                 _same(before, estimator.belief()),
                 f"{name} must leave the belief as it was",
             )
+        except Exception as error:
+            raise EstimatorContractError(
+                f"{name} must raise a ValueError, got {type(error).__name__}: {error}"
+            ) from error
         else:
             raise EstimatorContractError(f"{name} must raise a ValueError")
 
 
 def _check_save_and_restore(factory: Factory) -> None:
+    for way, carried in (("pickle", _pickled), ("numpy.savez", _through_npz)):
+        estimator, other = _make(factory), _make(factory)
+        _drive(estimator, steps=5)
+        try:
+            other.load_state_dict(carried(estimator.state_dict()))
+        except Exception as error:
+            raise EstimatorContractError(
+                f"load_state_dict() must take what state_dict() returned, after {way}, "
+                f"got {type(error).__name__}: {error}"
+            ) from error
+        for each in (estimator, other):
+            _drive(each, steps=3, seed=1)
+        _expect(
+            _same(estimator.belief(), other.belief()),
+            "load_state_dict(state_dict()) must restore the estimator bit for bit: "
+            f"after {way} and three steps the beliefs differ",
+        )
+
+
+def _pickled(state: Mapping[str, Any]) -> Mapping[str, Any]:
+    carried: Mapping[str, Any] = pickle.loads(pickle.dumps(state))
+    return carried
+
+
+def _through_npz(state: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Save as arrays and load them without trusting any pickle."""
+    file = BytesIO()
+    np.savez(file, **state)
+    file.seek(0)
+    with np.load(file) as saved:
+        return dict(saved)
+
+
+def _check_saved_state_is_a_copy(factory: Factory) -> None:
     estimator, other = _make(factory), _make(factory)
-    _drive(estimator, steps=5)
-    state = pickle.loads(pickle.dumps(estimator.state_dict()))
-    other.load_state_dict(state)
     for each in (estimator, other):
-        _drive(each, steps=3, seed=1)
+        _drive(each, steps=5)
+    _overwrite(estimator.state_dict())
     _expect(
-        _same(estimator.belief(), other.belief()),
-        "load_state_dict(state_dict()) must restore the estimator bit for bit: three "
-        "steps later the beliefs differ",
+        _same_later(estimator, other),
+        "state_dict() must return copies: writing into what it returned changed the "
+        "estimator",
     )
+    state = other.state_dict()
+    estimator.load_state_dict(state)
+    _overwrite(state)
+    _expect(
+        _same_later(estimator, other),
+        "load_state_dict() must copy: writing into what it was given changed the "
+        "estimator",
+    )
+
+
+def _overwrite(state: Mapping[str, Any]) -> None:
+    """Spoil every number in the arrays of a saved state."""
+    for value in state.values():
+        numbers = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+        if numbers and value.flags.writeable:
+            value[...] = 77
+
+
+def _same_later(one: SlamEstimator, other: SlamEstimator) -> bool:
+    """Whether two estimators agree now, and after the same three steps."""
+    if not _same(one.belief(), other.belief()):
+        return False
+    for each in (one, other):
+        _drive(each, steps=3, seed=1)
+    return _same(one.belief(), other.belief())
 
 
 def _check_reset(factory: Factory) -> None:

@@ -16,10 +16,10 @@ Kernel = TypeVar("Kernel", bound=Callable[..., object])
 def compiled(function: Kernel) -> Kernel:
     """Compile a kernel at its first call and keep it in numba's cache on disk.
 
-    Of the liberties of ``fastmath`` it takes only the fused multiply-add: sums keep
-    their order, and one function gives the same bits alone, called by another kernel,
-    or in a thread.  ``NUMBA_DISABLE_JIT=1`` runs the plain Python functions instead,
-    for a debugger.
+    It takes none of the liberties of ``fastmath``: one function gives the same bits
+    alone, called by another kernel, in a thread, or loaded from the cache; where
+    multiply-adds are to be fused, :mod:`.fused` says so.  ``NUMBA_DISABLE_JIT=1`` runs
+    the plain Python functions instead, for a debugger.
     """
     return _compile(function, callable_from_python=True)
 
@@ -33,10 +33,9 @@ def part(function: Kernel) -> Kernel:
 
 
 def inlined(function: Kernel) -> Kernel:
-    """Make a function part of the kernels that call it, so that it compiles but once.
+    """Make a function part of the kernel that calls it, so that it compiles but once.
 
-    For what conducts other kernels: arithmetic in a function of its own gives the same
-    bits wherever it is called from, inlined it may not.
+    For what conducts other kernels and is itself called from one place.
     """
     return cast("Kernel", njit(inline="always", error_model="numpy")(function))
 
@@ -46,7 +45,6 @@ def _compile(function: Kernel, *, callable_from_python: bool) -> Kernel:
         "cache": True,
         "error_model": "numpy",
         "nogil": True,
-        "fastmath": {"contract"},
         "no_cfunc_wrapper": True,
         "no_cpython_wrapper": not callable_from_python,
     }

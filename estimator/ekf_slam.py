@@ -1,6 +1,6 @@
 """EKF-SLAM: the standard filter, on the shared kernels."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from itertools import compress
 from math import isfinite, log1p
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import validation
+from .conditioning import BLOCK
 from .error_frames import ErrorFrame
 from .interface import Belief, UpdateReport
 from .joint_update import (
@@ -17,16 +18,18 @@ from .joint_update import (
     DONE,
     FATE,
     GATED,
-    NOT_FINITE,
+    NOT_USABLE,
     SKIPPED,
     SLOT,
     USED,
     Rules,
     joint_factor,
-    update_one,
+    record,
+    update_belief,
 )
 from .kernels import ADDITIVE, AT_ESTIMATE, INVARIANT, predict
 from .validation import LandmarkIds
+from .workspace import INNOVATION, Workspace, aligned_zeros, new_workspace
 
 Array = NDArray[np.float64]
 
@@ -141,7 +144,6 @@ class EkfSlam:
                 == "reading",
             )
         )
-        self._ledger = np.zeros((4, 8), dtype=np.int64)
         self.reset(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
@@ -224,18 +226,20 @@ class EkfSlam:
         self._make_room(count)
         slots = self._slots
         self._ledger[SLOT, :count] = [slots.get(i, -1) for i in ids]
-        outcome, used, nis, innovation, record = update_one(
+        outcome, used, nis = update_belief(
             self._mean,
             self._covariance,
             self._size,
             readings,
+            count,
             self._reference,
             self._rule_values,
+            *self._workspace,
             self._ledger,
         )
         if outcome != DONE:
             self._refuse(outcome, readings, ids)
-        return self._report(ids, used, nis, innovation, partial(joint_factor, record))
+        return self._report(ids, used, nis)
 
     def belief(self) -> Belief:
         """Return the belief as a snapshot that later steps leave alone."""
@@ -303,12 +307,14 @@ class EkfSlam:
     def _adopt(self, rules: Rules) -> None:
         self._rules = rules
         self._rule_values = np.array(rules)
+        self._scan_room = 0  # the rules say what a workspace holds
 
     def _allocate(self, landmarks: int) -> None:
         capacity = self.capacity_for(landmarks)
         self._mean = np.zeros(capacity)
         self._reference = np.zeros(capacity)
-        self._covariance = np.zeros((capacity, capacity))
+        self._covariance = aligned_zeros(capacity, capacity)
+        self._scan_room = 0
 
     def _make_room(self, readings: int) -> None:
         """Grow the arrays where a scan could overflow them."""
@@ -318,8 +324,12 @@ class EkfSlam:
             self._allocate(2 * len(self._slots) + readings)
             self._mean[:n], self._reference[:n] = mean[:n], reference[:n]
             self._covariance[:n, :n] = covariance[:n, :n]
-        if readings > self._ledger.shape[1]:
-            self._ledger = np.zeros((4, 2 * readings), dtype=np.int64)
+        if readings >= self._scan_room:
+            self._scan_room = 8 + 2 * readings
+            self._ledger = np.zeros((3, self._scan_room), dtype=np.int64)
+            self._workspace = workspace_for(
+                self._rules, self._scan_room, len(self._mean)
+            )
 
     def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
         if landmark_ids is not None:
@@ -332,13 +342,13 @@ class EkfSlam:
 
     def _refuse(self, outcome: int, readings: Array, ids: list[int]) -> None:
         """Raise the error of an update that did not go through."""
-        if outcome == NOT_FINITE:
-            self._check_finite(readings, ids)
+        if outcome == NOT_USABLE:
+            self._check_usable(readings, ids)
         row = np.flatnonzero(self._ledger[FATE, : len(ids)] == USED)[outcome]
         raise not_positive_definite(ids[row])
 
     @staticmethod
-    def _check_finite(readings: Array, ids: list[int]) -> None:
+    def _check_usable(readings: Array, ids: list[int]) -> None:
         finite = np.isfinite(readings).all(axis=1)
         if not finite.all():
             row = int(np.argmin(finite))
@@ -346,16 +356,17 @@ class EkfSlam:
                 f"measurements must be finite, got {readings[row].tolist()} in row "
                 f"{row} (landmark {ids[row]})"
             )
+        usable = (np.abs(readings) <= validation.LARGEST).all(axis=1)
+        if not usable.all():
+            row = int(np.argmin(usable))
+            raise ValueError(
+                f"measurements must not exceed {validation.LARGEST:g}, got "
+                f"{readings[row].tolist()} in row {row} (landmark {ids[row]})"
+            )
 
-    def _report(
-        self,
-        ids: list[int],
-        used: int,
-        nis: float,
-        innovation: Array,
-        factor: Callable[[], Array],
-    ) -> UpdateReport:
-        _, fates, near, _ = self._ledger[:, : len(ids)].tolist()
+    def _report(self, ids: list[int], used: int, nis: float) -> UpdateReport:
+        _, fates, near = self._ledger[:, : len(ids)].tolist()
+        found = record(self._workspace.rows, used, self._rules)
         by_fate: dict[int, tuple[int, ...]] = {USED: tuple(ids)}
         if used < len(ids):
             by_fate = {
@@ -373,9 +384,20 @@ class EkfSlam:
             by_fate.get(GATED, ()),
             by_fate.get(SKIPPED, ()),
             tuple(compress(ids, near)) if any(near) else (),
-            innovation,
-            factor,
+            found[:, INNOVATION].reshape(-1, 2),
+            partial(joint_factor, found, self._rules.sequential),
         )
+
+
+def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
+    """Allocate what updates by these rules need, with so many readings at most."""
+    repeated = rules.iterations > 1 or rules.sequential
+    return new_workspace(
+        readings,
+        capacity,
+        iterated=rules.iterations > 1,
+        spoilable=repeated or readings > BLOCK,
+    )
 
 
 def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:

@@ -80,6 +80,7 @@ class Belief:
                 f"and covariance ({size}, {size}), got {mean.shape} and "
                 f"{covariance.shape}"
             )
+        self._chosen(self.frame)
         mean[2] = wrap_angle(float(mean[2]))
         mean.flags.writeable = covariance.flags.writeable = False
         object.__setattr__(self, "mean", mean)
@@ -144,9 +145,9 @@ class Belief:
         return self.covariance
 
     def _chosen(self, frame: str | None) -> str:
-        chosen = frame or self.frame
+        chosen = self.frame if frame is None else frame
         if chosen not in ("additive", "invariant"):
-            raise ValueError(f"frame must be 'additive' or 'invariant', got {frame!r}")
+            raise ValueError(f"frame must be 'additive' or 'invariant', got {chosen!r}")
         return chosen
 
 

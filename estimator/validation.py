@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 
+# Largest reading or odometry [m, rad]; their squares, and products, stay finite.
+LARGEST = 1e12
+
 
 def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
     """Return ``value`` as float64 (size,), or refuse it."""
@@ -29,6 +32,8 @@ def standard_deviations(name: str, value: ArrayLike, size: int) -> Array:
 
 def as_floats(name: str, value: ArrayLike) -> Array:
     """Return ``value`` as a contiguous float64 array, or refuse it."""
+    if isinstance(value, np.ndarray):
+        _refuse_masked_and_complex(name, value)
     try:
         return np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -71,14 +76,20 @@ def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
 
 
 def pair(name: str, value: ArrayLike) -> tuple[float, float]:
-    """Return ``value`` as two finite floats, or refuse it."""
+    """Return ``value`` as two finite floats of a usable size, or refuse it."""
+    given: object = value
+    if isinstance(value, np.ndarray):
+        _refuse_masked_and_complex(name, value)
+        given = value.tolist()  # in half the time that numpy's own numbers take
     try:
-        first, second = cast("tuple[float, float]", value)
+        first, second = cast("tuple[float, float]", given)
         a, b = float(first), float(second)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} must be 2 finite numbers, got {value!r}") from None
     if not (isfinite(a) and isfinite(b)):
         raise ValueError(f"{name} must be 2 finite numbers, got {value!r}")
+    if max(abs(a), abs(b)) > LARGEST:
+        raise ValueError(f"{name} must not exceed {LARGEST:g}, got {value!r}")
     return a, b
 
 
@@ -117,6 +128,14 @@ def flag(name: str, value: bool) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {value!r}")
     return bool(value)
+
+
+def _refuse_masked_and_complex(name: str, value: NDArray[Any]) -> None:
+    """Numpy would take what lies under a mask, and half of a complex number."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError(f"{name} must be an array without a mask, got {value!r}")
+    if value.dtype.kind == "c":
+        raise ValueError(f"{name} must be real numbers, got {value!r}")
 
 
 def _is_finite(value: float) -> bool:

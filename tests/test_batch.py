@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 
-from slamgym.estimator import list_estimators, make_batch, make_estimator
+from slamgym.estimator import (
+    BatchSlam,
+    EkfSlam,
+    list_estimators,
+    make_batch,
+    make_estimator,
+)
 
 RUNS, STEPS, LANDMARKS = 5, 40, 13
 NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
@@ -205,3 +211,22 @@ def test_a_map_beyond_the_blocks_gives_the_bits_of_a_single_filter():
         slam.predict(u)
         slam.update(z, range(140))
     np.testing.assert_array_equal(batch.belief(0).covariance, slam.belief().covariance)
+
+
+def test_a_batch_does_not_follow_later_changes_of_the_filter_it_was_made_from(data):
+    filters = [EkfSlam(MOTION_STD, MEASUREMENT_STD) for _ in range(2)]
+    batches = [BatchSlam(each, RUNS, LANDMARKS) for each in filters]
+    filters[0]._motion_variance *= 4
+    filters[0]._rule_values *= 4
+    filters[0]._adopt(filters[0].rules._replace(range_std=1.0))
+    changed, kept = (batch.run(*data) for batch in batches)
+    np.testing.assert_array_equal(changed.poses, kept.poses)
+
+
+def test_a_run_with_a_reading_too_large_to_square_stops(data):
+    odometry, measurements, visible = (array.copy() for array in data)
+    measurements[1, 20, np.argmax(visible[1, 20])] = 0.1, 1e200
+    odometry[4, 6, 0] = -1e200
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    batch.run(odometry, measurements, visible)
+    assert batch.failed_at.tolist() == [-1, 20, -1, -1, 6]

@@ -86,6 +86,52 @@ class ReturnsNothing(EkfSlam):
         super().update(measurements, landmark_ids)
 
 
+class SavesLiveArrays(EkfSlam):
+    def state_dict(self):
+        n = self._size
+        live = {"mean": self._mean[:n], "covariance": self._covariance[:n, :n]}
+        return super().state_dict() | live
+
+
+class SavesALiveReference(EkfSlam):
+    """What it shares shows only in the next steps."""
+
+    def __init__(self, *arguments, **settings):
+        super().__init__(*arguments, **settings)
+        self.drift = np.zeros(1)
+
+    def predict(self, odometry, dt=1.0):
+        super().predict(np.asarray(odometry) + self.drift, dt)
+
+    def state_dict(self):
+        return super().state_dict() | {"drift": self.drift}
+
+
+class LoadsTheMeanItself(EkfSlam):
+    def load_state_dict(self, state):
+        super().load_state_dict({k: v for k, v in state.items() if k != "own"})
+        self._mean = state["own"]
+
+    def state_dict(self):
+        return super().state_dict() | {"own": self._mean.copy()}
+
+
+class SavesADictionary(EkfSlam):
+    def state_dict(self):
+        return super().state_dict() | {"slots": dict(self._slots)}
+
+    def load_state_dict(self, state):
+        super().load_state_dict(state)
+        self._slots = state["slots"]
+
+
+class RaisesAtNan(EkfSlam):
+    def update(self, measurements, landmark_ids=None):
+        if np.isnan(measurements).any():
+            raise RuntimeError("this cannot be")
+        return super().update(measurements, landmark_ids)
+
+
 @pytest.mark.parametrize(
     ("estimator", "complaint"),
     [
@@ -99,6 +145,11 @@ class ReturnsNothing(EkfSlam):
         (AddsNoNoise, "noise"),
         (KeepsItsMapOnReset, "reset"),
         (ReturnsNothing, "must return an UpdateReport, got NoneType"),
+        (SavesLiveArrays, r"state_dict\(\) must return copies"),
+        (SavesALiveReference, r"state_dict\(\) must return copies"),
+        (LoadsTheMeanItself, r"load_state_dict\(\) must copy"),
+        (SavesADictionary, r"after numpy\.savez, got ValueError: Object arrays"),
+        (RaisesAtNan, r"a NaN must raise a ValueError, got RuntimeError: this cannot"),
         (lambda: None, "the factory must accept the keywords"),
     ],
 )

@@ -7,8 +7,9 @@ from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 from numeric_jacobian import numeric_jacobian
 from scipy.stats import chi2
 
-from slamgym.estimator import EkfSlam
+from slamgym.estimator import EkfSlam, list_estimators, make_estimator
 from slamgym.estimator.angles import wrap_angle
+from slamgym.estimator.bearing_range_model import predict_measurement
 
 IDS = list(range(6))
 
@@ -260,6 +261,17 @@ def test_degenerate_innovation_names_the_landmark_and_changes_nothing():
             lambda s: s.update([(0, 1), (np.nan, 2)], [0, 8]),
             r"measurements must be finite, got \[nan, 2.0\] in row 1 \(landmark 8\)",
         ),
+        (
+            lambda s: s.update([(0, 1), (0, 1e200)], [0, 8]),
+            r"measurements must not exceed 1e\+12, got \[0.0, 1e\+200\] in row 1",
+        ),
+        (lambda s: s.predict((-1e200, 0)), r"odometry must not exceed 1e\+12"),
+        (
+            lambda s: s.update(np.ma.masked_array([(0.0, 1.0)], [(False, True)]), [0]),
+            "measurements must be an array without a mask",
+        ),
+        (lambda s: s.update(np.array([(0, 1j)]), [0]), "must be real numbers"),
+        (lambda s: s.predict(np.array([1j, 0])), "odometry must be real numbers"),
         (lambda s: s.update([(0, 1, 2)], [0]), r"shape \(m, 2\).*got shape \(1, 3\)"),
         (lambda s: s.update([(0, 1)], [0, 1]), "1 rows but landmark_ids has 2"),
         (lambda s: s.update([(0, 1), (1, 1)], [3, 3]), "must not repeat.*got 3 twice"),
@@ -372,6 +384,47 @@ def test_read_only_readings_are_taken_without_compiling_anew():
     readings = np.array([(0.1, 4.0)])
     readings.flags.writeable = False
     slam.update(readings, [0])
-    from slamgym.estimator.joint_update import update_one
+    from slamgym.estimator.joint_update import update_belief
 
-    assert len(update_one.signatures) == 1
+    assert len(update_belief.signatures) == 1
+
+
+@pytest.mark.parametrize("name", list_estimators())
+def test_the_largest_readings_leave_the_belief_finite(name):
+    slam = make_estimator(name, motion_std=MOTION_STD, measurement_std=MEASUREMENT_STD)
+    slam.predict((1.0, 0.1))
+    slam.update([(0.3, 1e12), (0.1, 5.0)], [0, 1])
+    slam.predict((1.0, 0.1))
+    assert np.isfinite(slam.belief().mean).all()
+    assert np.isfinite(slam.belief().covariance).all()
+    with pytest.raises(ValueError, match="measurements must not exceed"):
+        slam.update([(0.3, 1e200)], [2])
+
+
+@pytest.mark.parametrize("name", ["ekf", "iterated"])
+@pytest.mark.parametrize("seen", [[7, 31, 4], list(range(40))])
+def test_a_report_keeps_the_innovation_covariance_of_its_own_prior(name, seen):
+    """For a few readings in a large map, and for all; also after later updates."""
+    rng = np.random.default_rng(0)
+    landmarks = rng.uniform(-15, 15, (40, 2))
+    slam = make_estimator(name, motion_std=MOTION_STD, measurement_std=MEASUREMENT_STD)
+    steps = list(drive(0, 5, landmarks=landmarks))
+    for odometry, readings, _ in steps[:-1]:
+        slam.predict(odometry)
+        slam.update(readings, range(40))
+    slam.predict(steps[-1][0])
+    prior = slam.belief()
+    model = predict_measurement(prior.pose, prior.landmarks[seen])
+    H = np.zeros((2 * len(seen), len(prior.mean)))
+    for k, landmark in enumerate(seen):
+        H[2 * k : 2 * k + 2, :3] = model.jacobian_pose[k]
+        c = 3 + 2 * landmark
+        H[2 * k : 2 * k + 2, c : c + 2] = model.jacobian_landmark[k]
+    noise = np.tile(np.square(MEASUREMENT_STD), len(seen))
+    S = H @ prior.covariance @ H.T + np.diag(noise)
+    expected = steps[-1][1][seen] - model.measurement
+    expected[:, 0] = wrap_angle(expected[:, 0])
+    report = slam.update(steps[-1][1][seen], seen)
+    slam.update(steps[-1][1], range(40))
+    np.testing.assert_allclose(report.innovation, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(report.innovation_covariance, S, rtol=0, atol=1e-12)

@@ -121,3 +121,8 @@ def test_band_holds_the_average_as_often_as_it_says():
     assert ((averages > low) & (averages < high)).mean() == pytest.approx(
         0.95, abs=0.01
     )
+
+
+def test_a_belief_in_an_unknown_frame_is_refused():
+    with pytest.raises(ValueError, match=r"frame must be .*, got 'rubbish'"):
+        Belief(np.zeros(3), np.eye(3), (), frame="rubbish")
