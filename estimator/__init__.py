@@ -12,13 +12,17 @@ from .batch import can_batch as can_batch
 from .batch import make_batch as make_batch
 from .check_estimator import EstimatorContractError as EstimatorContractError
 from .check_estimator import check_estimator as check_estimator
+from .compressed import CompressedEkfSlam as CompressedEkfSlam
 from .ekf_slam import EkfSlam as EkfSlam
+from .field_of_view import FieldOfView as FieldOfView
 from .ideal import IdealEkfSlam as IdealEkfSlam
 from .interface import Belief as Belief
 from .interface import SlamEstimator as SlamEstimator
 from .interface import UpdateReport as UpdateReport
 from .invariant import InvariantEkfSlam as InvariantEkfSlam
 from .iterated import IteratedEkfSlam as IteratedEkfSlam
+from .landmark_management import LandmarkPolicy as LandmarkPolicy
+from .managed import ManagedSlam as ManagedSlam
 from .observability import FirstEstimatesEkfSlam as FirstEstimatesEkfSlam
 from .observability import (
     ObservabilityConstrainedEkfSlam as ObservabilityConstrainedEkfSlam,

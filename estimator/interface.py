@@ -42,6 +42,19 @@ class UpdateReport(NamedTuple):
     """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
     factor: Array | Callable[[], Array] = np.empty((0, 0))
     """L, shape (2m, 2m), lower triangular, L Lᵀ = S; or a function that gives it."""
+    confirmed_ids: tuple[int, ...] = ()
+    """Of those added: tentative before, seen often enough now."""
+    removed_ids: tuple[int, ...] = ()
+    """Landmarks marginalised: missed too often, or beyond the map's capacity."""
+    merged_ids: tuple[tuple[int, int], ...] = ()
+    """Pairs (kept, gone) of landmarks found to be one."""
+    row_ids: tuple[int | None, ...] = ()
+    """For each row of the scan the landmark that it was taken for, if any; empty where
+    nothing was associated."""
+    tentative_rows: tuple[int, ...] = ()
+    """Rows of the scan that speak for a landmark not yet confirmed."""
+    ambiguous_rows: tuple[int, ...] = ()
+    """Rows left out: of more than one landmark perhaps, or too close to tell."""
 
     @property
     def innovation_factor(self) -> Array:

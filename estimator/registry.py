@@ -1,17 +1,21 @@
 """Estimators by name, yours included."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from difflib import get_close_matches
+from functools import partial
 from importlib import import_module
 from typing import Any, cast
 
 from numpy.typing import ArrayLike
 
+from .compressed import CompressedEkfSlam
 from .ekf_slam import EkfSlam
 from .ideal import IdealEkfSlam
 from .interface import SlamEstimator
 from .invariant import InvariantEkfSlam
 from .iterated import IteratedEkfSlam
+from .landmark_management import LandmarkPolicy
+from .managed import ManagedSlam
 from .observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
 from .robocentric import RobocentricEkfSlam
 from .unscented import UnscentedSlam
@@ -75,6 +79,7 @@ def make_estimator(
     measurement_std: ArrayLike,
     initial_pose: ArrayLike = (0.0, 0.0, 0.0),
     initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+    management: LandmarkPolicy | Mapping[str, Any] | bool | None = None,
     **options: Any,
 ) -> SlamEstimator:
     """Make an estimator by its registered name or by its import path.
@@ -89,6 +94,9 @@ def make_estimator(
         (σβ, σr) of the measurement noise [rad, m].
     initial_pose, initial_pose_std : array_like, shape (3,)
         Mean and standard deviation of the first pose (x, y, θ) [m, m, rad].
+    management : LandmarkPolicy, mapping or True, optional
+        How to associate readings without identity, and which landmarks to confirm, to
+        remove, to merge.
     **options
         What the estimator's own constructor takes beside these.
 
@@ -107,7 +115,10 @@ def make_estimator(
     >>> slam.belief().pose
     array([0., 0., 0.])
     """
-    return find_estimator(name)(
+    factory = find_estimator(name)
+    if management is not None and management is not False:
+        factory = partial(ManagedSlam, factory, management=management)
+    return factory(
         motion_std=motion_std,
         measurement_std=measurement_std,
         initial_pose=initial_pose,
@@ -133,5 +144,6 @@ for _name, _factory in {
     "unscented": UnscentedSlam,
     "robocentric": RobocentricEkfSlam,
     "ideal": IdealEkfSlam,
+    "compressed": CompressedEkfSlam,
 }.items():
     register_estimator(_name, _factory)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ..estimator.interface import SlamEstimator
 from ..estimator.registry import EstimatorFactory, find_estimator, make_estimator
 from ..sim_configs import Scenario
+from .log_events import Scan
 from .log_lines import LogError
 from .recording import log_header
 from .slamlog import SlamLog
@@ -129,7 +130,11 @@ def settings_for(
         initial_pose_std=_std(
             log.name, {"start_sigma": "0,0,0"} | header, "start_sigma", initial_pose_std
         ),
-        options={**_told_options(log.name, header, factory), **(options or {})},
+        options={
+            **_told_options(log.name, header, factory),
+            **_needed_options(log, header),
+            **(options or {}),
+        },
     )
 
 
@@ -185,6 +190,15 @@ def _told_options(
         return told
     known = {parameter.name for parameter in parameters}
     return {key: value for key, value in told.items() if key in known}
+
+
+def _needed_options(log: SlamLog, header: Mapping[str, str]) -> dict[str, Any]:
+    """Let readings be associated where the log does not say what they are of."""
+    told = _flag(log.name, "identities", header.get("identities", "true"))
+    scans = (event for event in log.events if isinstance(event, Scan))
+    if told and all(scan.landmark_ids is not None for scan in scans):
+        return {}
+    return {"management": True}
 
 
 def _number(name: str, key: str, text: str) -> float:

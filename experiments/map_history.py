@@ -7,6 +7,7 @@ from typing import overload
 import numpy as np
 
 from ..estimator.interface import Belief
+from ..estimator.map_access import MapView
 from .trace import MapEstimate
 
 
@@ -35,20 +36,31 @@ class MapHistory(Sequence[MapEstimate]):
         self._first_map: int | None = None
         self._length = 0
 
-    def append(self, belief: Belief) -> None:
+    def append(self, belief: Belief | MapView) -> None:
         """Take in the belief after the next step."""
         step = self._length
+        ids = belief.ids if isinstance(belief, MapView) else belief.landmark_ids
         self._latest = MapEstimate(
-            np.array(belief.landmark_ids, dtype=np.int64),
-            belief.landmarks,
+            np.array(ids, dtype=np.int64),
+            belief.landmarks.copy(),
             belief.landmark_covariances,
         )
-        if belief.landmark_ids and self._first_map is None:
+        is_due = self.is_due(step, ids)
+        if ids and self._first_map is None:
             self._first_map = step
-        if self._is_due(step):
+        if is_due:
             self._kept[step] = self._latest
             self._thin()
         self._length += 1
+
+    def leave_out(self) -> None:
+        """Pass over the next step, which is not due, and not the last one either."""
+        self._length += 1
+
+    def is_due(self, step: int, ids: Sequence[int]) -> bool:
+        """Whether the map of a step will be kept; ``ids`` are the landmarks in it."""
+        is_first_map = self._first_map is None and len(ids) > 0
+        return is_first_map or self._is_due(step)
 
     @overload
     def __getitem__(self, index: int) -> MapEstimate: ...

@@ -129,6 +129,8 @@ def log_header(scenario: Scenario, seed: int) -> dict[str, str]:
     }
     if sensor.range_std_per_metre:
         header["range_std_per_metre"] = repr(sensor.range_std_per_metre)
+    if not sensor.identities:
+        header["identities"] = "false"
     header["noise_at_rest"] = str(motion.noise_at_rest).lower()
     return header
 

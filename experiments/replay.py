@@ -2,13 +2,14 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..estimator.interface import Belief, SlamEstimator, UpdateReport
+from ..estimator.map_access import mapped_ids, marginal, view_of
 from .log_events import Scan
 from .log_steps import Step, predictions, steps_of
 from .map_history import MapHistory
@@ -35,6 +36,23 @@ class ReadingCounts(NamedTuple):
     """Too close to use."""
     near: int = 0
     """Of those associated: within 10 σ of the robot, where linearising is unsafe."""
+    tentative: int = 0
+    """Spoke for landmarks not yet confirmed."""
+    ambiguous: int = 0
+    """Could have been of more than one landmark."""
+
+
+class MapChanges(NamedTuple):
+    """What was done to the map of a run besides adding to it."""
+
+    confirmed: int = 0
+    """Landmarks that were tentative before they were added."""
+    removed: int = 0
+    """Landmarks marginalised."""
+    merged: int = 0
+    """Landmarks found to be another one."""
+    most: int = 0
+    """Size of the map when it was largest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +69,8 @@ class Replay:
     """How many scans the log holds."""
     readings: ReadingCounts
     """What it did with their readings."""
+    changes: MapChanges = field(default_factory=MapChanges)
+    """What it did to its map."""
 
 
 def replay(
@@ -98,12 +118,14 @@ def replay(
     >>> log = SlamLog("drive", events=(scans[0], OdometryRow(1, 2.0, 0.0, 1), scans[1]))
     >>> slam = make_estimator("ekf", motion_std=(0.1,) * 3, measurement_std=(0.1, 0.1))
     >>> replay(log, slam).readings
-    ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1)
+    ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1, ...
     """
     steps = list(steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     tell_truth = _truth_teller(estimator, log, times)
-    recorder = _Recorder(len(steps), MapHistory(None if keep_history else _MOST_MAPS))
+    recorder = _Recorder(
+        estimator, len(steps), MapHistory(None if keep_history else _MOST_MAPS)
+    )
     for number, step in enumerate(steps):
         try:
             tell_truth(number)
@@ -112,9 +134,16 @@ def replay(
             raise _kind(error)(f"{log.name}, t = {step.t:g}: {error}") from error
         if progress is not None:
             progress(number + 1, len(steps))
-    trace = recorder.trace(name or type(estimator).__name__, times, log)
+    trace = recorder.trace(name or _name_of(estimator), times, log)
     scans = sum(step.scan is not None for step in steps)
-    return Replay(log, trace, recorder.belief, scans, recorder.counts())
+    return Replay(
+        log, trace, recorder.belief, scans, recorder.counts(), recorder.changes()
+    )
+
+
+def _name_of(estimator: SlamEstimator) -> str:
+    """Name its class, of a managed filter that of the filter."""
+    return type(getattr(estimator, "filter", estimator)).__name__
 
 
 def _truth_teller(
@@ -138,12 +167,11 @@ def _take(
     for row in step.motions:
         for odometry, dt in predictions(row, log.motion):
             estimator.predict(odometry, dt)
-    predicted = estimator.belief()
-    if step.scan is None:
-        recorder.add(predicted, predicted, None)
-        return
-    report = estimator.update(step.scan.measurements, _ids(step.scan))
-    recorder.add(predicted, estimator.belief(), report)
+    predicted = marginal(estimator, ())
+    report = None
+    if step.scan is not None:
+        report = estimator.update(step.scan.measurements, _ids(step.scan))
+    recorder.add(predicted, report)
 
 
 def _kind(error: ValueError) -> type[ValueError]:
@@ -162,7 +190,8 @@ def _ids(scan: Scan) -> list[int] | None:
 class _Recorder:
     """Collect beliefs and reports, step by step, into the arrays of a trace."""
 
-    def __init__(self, steps: int, history: MapHistory) -> None:
+    def __init__(self, slam: SlamEstimator, steps: int, history: MapHistory) -> None:
+        self._slam, self._steps = slam, steps
         self._predicted = _PoseTrack(steps)
         self._updated = _PoseTrack(steps)
         self._nis = np.zeros(steps)
@@ -170,29 +199,43 @@ class _Recorder:
         self._history = history
         self._first: dict[int, tuple[Array, Array]] = {}
         self._first_covariance: Array | None = None
-        self._counts: Counter[str] = Counter()
+        self._readings: Counter[str] = Counter()
+        self._changes: Counter[str] = Counter()
         self._ids: tuple[int, ...] = ()
 
-    def add(
-        self, predicted: Belief, updated: Belief, report: UpdateReport | None
-    ) -> None:
-        """Take in one step."""
+    def add(self, predicted: Belief, report: UpdateReport | None) -> None:
+        """Take in one step, after the scan at its end."""
         step = len(self._history)
         self._predicted.put(step, predicted)
+        updated = predicted if report is None else marginal(self._slam, ())
         self._updated.put(step, updated)
-        self._history.append(updated)
-        self.belief = updated
-        if updated.landmark_ids != self._ids:
-            self._meet_new(updated)
         if report is not None:
             self._nis[step] = report.nis
             self._dof[step] = report.degrees_of_freedom
-            for fate in ReadingCounts._fields:
-                self._counts[fate] += len(getattr(report, f"{fate}_ids"))
+            self._count(report)
+            self._meet_new(mapped_ids(self._slam))
+        if step == self._steps - 1:
+            self.belief = self._slam.belief()
+        if step == self._steps - 1 or self._history.is_due(step, self._ids):
+            self._history.append(view_of(self._slam))
+        else:
+            self._history.leave_out()
 
     def counts(self) -> ReadingCounts:
         """Count the readings by what became of them."""
-        return ReadingCounts(**self._counts)
+        return ReadingCounts(**self._readings)
+
+    def changes(self) -> MapChanges:
+        """Count what was done to the map."""
+        return MapChanges(**self._changes)
+
+    def _count(self, report: UpdateReport) -> None:
+        for fate in ("associated", "added", "rejected", "skipped", "near"):
+            self._readings[fate] += len(getattr(report, f"{fate}_ids"))
+        self._readings["tentative"] += len(report.tentative_rows)
+        self._readings["ambiguous"] += len(report.ambiguous_rows)
+        for change in ("confirmed", "removed", "merged"):
+            self._changes[change] += len(getattr(report, f"{change}_ids"))
 
     def trace(self, name: str, times: Array, log: SlamLog) -> RunTrace:
         """Make the trace of a run over a log."""
@@ -220,20 +263,25 @@ class _Recorder:
                 -1, 2, 2
             ),
             landmark_history=self._history,
-            true_landmarks=true_landmarks_of(log, belief.landmark_ids),
+            true_landmarks=true_landmarks_of(
+                log, belief.landmark_ids, belief.landmarks
+            ),
             first_covariance=first_covariance,
             final_covariance=belief.covariance,
         )
 
-    def _meet_new(self, belief: Belief) -> None:
+    def _meet_new(self, ids: tuple[int, ...]) -> None:
         """Remember landmarks as they are when they enter the map."""
+        if ids == self._ids:
+            return
+        new = [i for i in ids if i not in self._first]
+        belief = marginal(self._slam, new)
         if self._first_covariance is None:
             self._first_covariance = belief.covariance
-        covariances = belief.landmark_covariances
-        for k, landmark_id in enumerate(belief.landmark_ids):
-            if landmark_id not in self._first:
-                self._first[landmark_id] = (belief.landmarks[k], covariances[k])
-        self._ids = belief.landmark_ids
+        pairs = zip(belief.landmarks, belief.landmark_covariances, strict=True)
+        self._first |= dict(zip(new, pairs, strict=True))
+        self._ids = ids
+        self._changes["most"] = max(self._changes["most"], len(ids))
 
 
 class _PoseTrack:

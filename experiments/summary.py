@@ -37,7 +37,8 @@ def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[st
     -------
     dict
         ``landmarks``, see :func:`landmark_table`; ``pose``, ``pose_covariance``;
-        ``steps``, ``scans``, ``readings`` by what became of them; ``nis``, see
+        ``steps``, ``scans``, ``readings`` by what became of them; ``map_changes``, the
+        landmarks confirmed, removed and merged, and the most in the map; ``nis``, see
         :func:`nis_summary`; ``nees``, see :func:`nees_summary`; ``ate``, the root mean
         square distance of the path from the truth at the times of the truth, and
         ``landmark_rmse``, that of the map, both ``{raw, aligned}`` [m]; ``log``,
@@ -52,6 +53,7 @@ def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[st
         "steps": trace.last_step,
         "scans": replay.scans,
         "readings": replay.readings._asdict(),
+        "map_changes": replay.changes._asdict(),
         "pose": _finite_list(trace.poses[-1]),
         "pose_covariance": [_finite_list(row) for row in trace.pose_covariances[-1]],
         "landmarks": landmark_table(trace),

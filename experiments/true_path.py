@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimator.accuracy import PositionAccuracy, poses_at, position_accuracy
+from .log_events import Scan
 from .log_lines import LogError
 from .slamlog import SlamLog
 
@@ -41,18 +42,43 @@ def true_poses_of(log: SlamLog, times: Array) -> Array | None:
     return poses if np.isfinite(poses[:, :2]).any() else None
 
 
-def true_landmarks_of(log: SlamLog, ids: Sequence[int]) -> Array | None:
+def true_landmarks_of(
+    log: SlamLog, ids: Sequence[int], landmarks: Array
+) -> Array | None:
     """Look up the true positions of some landmarks, in their order.
+
+    Where the log does not tell what its readings are of, the ids are the filter's own;
+    a landmark then is the true one that is nearest, if it is the nearest to that, too.
+
+    Parameters
+    ----------
+    log : SlamLog
+        A log, perhaps with true landmarks.
+    ids : sequence of int
+        The landmarks.
+    landmarks : ndarray, shape (n, 2)
+        Where they are estimated to be [m].
 
     Returns
     -------
     ndarray, shape (n, 2), or None
         Positions [m], nan where unknown; None where the log knows none of them.
     """
+    scans = [event for event in log.events if isinstance(event, Scan)]
+    if len(ids) and len(log.landmarks) and any(s.landmark_ids is None for s in scans):
+        return _nearest(log.landmarks, landmarks)
     known = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
     if not any(i in known for i in ids):
         return None
     return np.array([known.get(i, np.full(2, np.nan)) for i in ids])
+
+
+def _nearest(truth: Array, landmarks: Array) -> Array:
+    """Pair each landmark (n, 2) with its true one (n, 2); nan where there is none."""
+    gaps = np.linalg.norm(landmarks[:, None] - truth, axis=2)
+    nearest = gaps.argmin(axis=1)
+    is_mutual = gaps.argmin(axis=0)[nearest] == np.arange(len(landmarks))
+    return np.where(is_mutual[:, None], truth[nearest], np.nan)
 
 
 def path_accuracy(log: SlamLog, times: Array, poses: Array) -> PositionAccuracy | None:

@@ -68,12 +68,28 @@ class SpiralSequence(Part):
         return self
 
 
+class BlocksSequence(Part):
+    """Round every block of a city in turn, row by row, to and fro.
+
+    Eastward rows are driven counter-clockwise, westward rows clockwise: along each
+    block's four sides back to where they began, then on to the next block.
+    """
+
+    sequence: Literal["blocks"] = "blocks"
+    columns: Count = Field(description="number of blocks along x")
+    rows: Count = Field(description="number of blocks along y")
+    side: Positive = Field(description="distance of neighbouring streets [m]")
+    speed: Positive = Field(description="highest speed along a street [m/s]")
+    turn_steps: Count = Field(description="steps of each quarter turn")
+
+
 ControlSequence = Annotated[
     CommandSequence
     | SquareSequence
     | CircleSequence
     | FigureEightSequence
-    | SpiralSequence,
+    | SpiralSequence
+    | BlocksSequence,
     Field(discriminator="sequence"),
 ]
 
@@ -111,6 +127,8 @@ def command_cycle(controls: ControlSequence, dt: float) -> NDArray[np.float64]:
             return np.concatenate([left, left * (1.0, -1.0)])
         case SpiralSequence():
             return _spiral(controls, dt)
+        case BlocksSequence():
+            return _blocks(controls, dt)
 
 
 def _repeat(sequence: CommandSequence) -> NDArray[np.float64]:
@@ -144,6 +162,25 @@ def _spiral(spiral: SpiralSequence, dt: float) -> NDArray[np.float64]:
         turns.append(distance / (spiral.inner_radius + growth * turned))
         turned += turns[-1]
     return np.column_stack([np.full(len(turns), distance), turns])
+
+
+def _blocks(blocks: BlocksSequence, dt: float) -> NDArray[np.float64]:
+    """Drive the sides one by one, each with the quarter turn into it."""
+    steps, turns = _steps(blocks.side, blocks.speed * dt), blocks.turn_steps
+    _steps(blocks.rows * (5.0 * blocks.columns + 1) * (steps + turns), 1.0)
+    east, north, west, south = 0, 1, 2, 3  # quarter turns
+    to = [east, north, west, south, east] * blocks.columns + [north]
+    fro = [west, north, east, south, west] * blocks.columns + [north]
+    way = np.concatenate([fro if row % 2 else to for row in range(blocks.rows)])
+    quarters = (np.diff(way, prepend=east) + 1) % 4 - 1  # -1, 0 or 1: never back
+    straight = np.tile([blocks.side / steps, 0.0], (steps, 1))
+    turn = np.tile([0.0, math.pi / 2 / turns], (turns, 1))
+    parts = [
+        part
+        for quarter in quarters.tolist()
+        for part in ([turn * quarter] if quarter else []) + [straight]
+    ]
+    return np.concatenate(parts)
 
 
 def _steps(length: float, longest_step: float) -> int:

@@ -78,6 +78,38 @@ class CorridorLayout(Part):
     )
 
 
+class StreetsLayout(Part):
+    """Landmarks on the fronts of the blocks of a city with streets like a grid.
+
+    The middles of the streets lie `side` apart; the first two cross in the origin.
+    Blocks in rows along x, and around each counter-clockwise from its lower left.
+    """
+
+    layout: Literal["streets"] = "streets"
+    columns: Count = Field(description="number of blocks along x")
+    rows: Count = Field(description="number of blocks along y")
+    side: Positive = Field(description="distance of neighbouring streets [m]")
+    width: Positive = Field(description="distance of the fronts across a street [m]")
+    per_front: Count = Field(description="landmarks on each of a block's four fronts")
+    origin: Point = Field(
+        default=(0.0, 0.0), description="lower left crossing (x, y) [m]"
+    )
+
+    @property
+    def count(self) -> int:
+        """Number of landmarks."""
+        return 4 * self.per_front * self.columns * self.rows
+
+    @model_validator(mode="after")
+    def _check_width(self) -> Self:
+        if self.width >= self.side:
+            raise broken_rule(
+                f"width must be < side = {self.side}, to leave room for blocks, "
+                f"got {self.width}"
+            )
+        return self
+
+
 class RandomLayout(Part):
     """Landmarks uniform in a rectangle, with a minimum distance between them."""
 
@@ -103,7 +135,12 @@ class RandomLayout(Part):
 
 
 LandmarkLayout = Annotated[
-    PointsLayout | GridLayout | RingLayout | CorridorLayout | RandomLayout,
+    PointsLayout
+    | GridLayout
+    | RingLayout
+    | CorridorLayout
+    | StreetsLayout
+    | RandomLayout,
     Field(discriminator="layout"),
 ]
 
@@ -145,6 +182,8 @@ def place_landmarks(
             return _ring(layout)
         case CorridorLayout():
             return _corridor(layout)
+        case StreetsLayout():
+            return _streets(layout)
         case RandomLayout():
             own = layout.seed is not None
             return _throw_darts(
@@ -167,6 +206,18 @@ def _corridor(layout: CorridorLayout) -> NDArray[np.float64]:
     along = np.linspace(0.0, layout.length, layout.count)
     across = np.where(np.arange(layout.count) % 2 == 0, 0.5, -0.5) * layout.width
     return layout.origin + np.column_stack([along, across])
+
+
+def _streets(layout: StreetsLayout) -> NDArray[np.float64]:
+    """Go along a block's four fronts, and copy them to every block."""
+    front = (np.arange(layout.per_front) + 0.5) / layout.per_front
+    low, high = np.zeros_like(front), np.ones_like(front)
+    x = np.concatenate([front, high, front[::-1], low])
+    y = np.concatenate([low, front, high, front[::-1]])
+    block = layout.width / 2 + (layout.side - layout.width) * np.column_stack([x, y])
+    rows, columns = np.divmod(np.arange(layout.rows * layout.columns), layout.columns)
+    corners = layout.side * np.column_stack([columns, rows])
+    return layout.origin + (corners[:, None] + block).reshape(-1, 2)
 
 
 def _throw_darts(layout: RandomLayout, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -123,7 +123,7 @@ def test_memory_is_little_more_than_the_covariances():
 @pytest.mark.parametrize("name", list_estimators())
 def test_a_filter_either_runs_in_batches_or_says_that_it_cannot(name):
     settings = {"runs": 2, "landmarks": 3, **NOISE}
-    if name in ("unscented", "robocentric", "ideal"):
+    if name in ("unscented", "robocentric", "ideal", "compressed"):
         with pytest.raises(ValueError, match="cannot run in batches"):
             make_batch(name, **settings)
     else:
@@ -230,3 +230,87 @@ def test_a_run_with_a_reading_too_large_to_square_stops(data):
     batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
     batch.run(odometry, measurements, visible)
     assert batch.failed_at.tolist() == [-1, 20, -1, -1, 6]
+
+
+def run_some(batch, data, steps, runs=None):
+    return batch.run(*(array[:, steps] for array in data), runs=runs)
+
+
+def test_runs_begun_anew_are_new_runs_and_the_others_go_on(data):
+    settings = {"runs": RUNS, "landmarks": LANDMARKS, **NOISE}
+    again = np.array([False, True, False, True, True])
+    poses = np.arange(3.0 * RUNS).reshape(RUNS, 3)
+    batch, whole, fresh = (make_batch("invariant", **settings) for _ in range(3))
+    run_some(batch, data, slice(0, 13))
+    run_some(whole, data, slice(0, 13))
+    batch.reset(poses, (0.1, 0.1, 0.02), runs=again)
+    fresh.reset(poses, (0.1, 0.1, 0.02))
+    for each in (batch, whole, fresh):
+        run_some(each, data, slice(13, STEPS))
+    for run in range(RUNS):
+        expected = (fresh if again[run] else whole).belief(run)
+        np.testing.assert_array_equal(batch.belief(run).mean, expected.mean)
+        np.testing.assert_array_equal(batch.belief(run).covariance, expected.covariance)
+        assert batch.belief(run).landmark_ids == expected.landmark_ids
+
+
+def test_a_run_that_has_stopped_can_begin_anew(data):
+    odometry, measurements, visible = (array.copy() for array in data)
+    odometry[1, 3] = np.nan
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    run_some(batch, (odometry, measurements, visible), slice(0, 10))
+    batch.reset(np.zeros(3), runs=np.arange(RUNS) == 1)
+    trace = run_some(batch, data, slice(10, STEPS))
+    assert batch.failed_at.tolist() == [-1] * RUNS
+    assert np.isfinite(trace.poses).all()
+
+
+def test_runs_that_take_no_part_stay_as_they_are(data):
+    settings = {"runs": RUNS, "landmarks": LANDMARKS, **NOISE}
+    batch, other = make_batch("ekf", **settings), make_batch("ekf", **settings)
+    chosen = np.array([True, False, True, False, False])
+    broken = [array.copy() for array in data]
+    broken[0][~chosen] = np.nan  # is not looked at
+    trace = run_some(batch, broken, slice(0, 9), runs=chosen)
+    run_some(batch, data, slice(0, 9), runs=~chosen)
+    run_some(other, data, slice(0, 9))
+    assert np.isnan(trace.poses[~chosen]).all()
+    assert np.isfinite(trace.poses[chosen]).all()
+    assert (batch.failed_at == -1).all()
+    for run in range(RUNS):
+        expected = other.belief(run).covariance
+        np.testing.assert_array_equal(batch.belief(run).covariance, expected)
+
+
+def test_beliefs_side_by_side_are_those_of_each_run(data):
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    run_some(batch, data, slice(0, 4))
+    beliefs, marginals = batch.beliefs(), batch.marginals()
+    assert not beliefs.mapped.all()
+    np.testing.assert_array_equal(marginals.mapped, beliefs.mapped)
+    for run in range(RUNS):
+        belief, ids = batch.belief(run), np.array(batch.belief(run).landmark_ids)
+        at = np.r_[:3, np.ravel(3 + 2 * ids[:, None] + [0, 1])]
+        np.testing.assert_array_equal(beliefs.means[run][at], belief.mean)
+        block = beliefs.covariances[run][np.ix_(at, at)]
+        np.testing.assert_array_equal(block, belief.covariance)
+        assert np.count_nonzero(beliefs.covariances[run]) == np.count_nonzero(block)
+        assert np.flatnonzero(beliefs.mapped[run]).tolist() == sorted(ids)
+        np.testing.assert_array_equal(marginals.poses[run], belief.pose)
+        np.testing.assert_array_equal(
+            marginals.pose_covariances[run], belief.pose_covariance
+        )
+        np.testing.assert_array_equal(marginals.landmarks[run][ids], belief.landmarks)
+        own = belief.landmark_covariances.reshape(-1, 4)[:, [0, 1, 3]]
+        np.testing.assert_array_equal(marginals.spreads[:3, run, ids].T, own)
+        cross = belief.covariance[3:, :3].reshape(-1, 6)
+        np.testing.assert_array_equal(marginals.spreads[3:, run, ids].T, cross)
+
+
+@pytest.mark.parametrize("runs", [[True, False], [0, 1, 0, 1, 1], True])
+def test_a_wrong_choice_of_runs_is_refused(data, runs):
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    with pytest.raises(ValueError, match="runs must be 5 booleans, got"):
+        batch.run(*data, runs=runs)
+    with pytest.raises(ValueError, match="runs must be 5 booleans, got"):
+        batch.reset(np.zeros(3), runs=runs)

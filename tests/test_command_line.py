@@ -334,7 +334,6 @@ def test_a_wrong_option_of_the_filter_is_refused(log, options, message):
         (("loop", "--steps", "1"), "steps must be an integer >= 2, got 1"),
         (("loop", "--controller", "waypoint"), "did you mean 'waypoints'?"),
         (("loop", "--estimator", "EKF"), "unknown estimator 'EKF'"),
-        (("hidden_identities",), "landmark_ids must be given"),
         (("loop", "--seed", "-1"), "Invalid value for '--seed'"),
     ],
 )

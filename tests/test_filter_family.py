@@ -43,6 +43,12 @@ FAMILY = {
     "unscented": ("unscented", {}, DenseUnscented),
     "robocentric": ("robocentric", {}, DenseRobocentric),
     "ideal": ("ideal", {}, DenseIdeal),
+    "compressed": ("compressed", {}, DenseEkf),
+    "compressed invariant": (
+        "compressed",
+        {"base": "invariant"},
+        DenseInvariant,
+    ),
 }
 BLIND_TO_A_TURN = [
     "invariant",
@@ -52,6 +58,7 @@ BLIND_TO_A_TURN = [
     "observability_constrained",
     "robocentric",
     "ideal",
+    "compressed invariant",
 ]
 
 
@@ -420,5 +427,6 @@ def test_beliefs_name_the_frame_of_their_error():
         "invariant",
         "invariant iterated",
         "invariant sequential",
+        "compressed invariant",
     }
     assert isinstance(make("ekf"), EkfSlam)

@@ -12,7 +12,7 @@ from chromium import find_chromium, requests_of, run_chromium, screenshot
 from monte_carlo_dataset import typical, with_failures
 from PIL import Image
 
-from slamgym.experiments import html_report as module
+from slamgym.experiments.monte_carlo import html_report as module
 from slamgym.experiments.monte_carlo.html_report import (
     headline,
     html_report,

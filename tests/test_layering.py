@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-LAYERS = ("estimator", "sim_configs", "envs", "experiments")
+LAYERS = ("estimator", "sim_configs", "envs", "agents", "experiments")
 MAY_IMPORT = {
     "estimator": {"numpy", "scipy", "numba", "estimator"},
     "sim_configs": {"numpy", "pydantic", "pydantic_core", "sim_configs"},
     "envs": {"numpy", "gymnasium", "pymunk", "sim_configs", "envs"},
+    "agents": {"numpy", "gymnasium", "sim_configs", "envs", "estimator", "agents"},
 }
 DRAWING = {  # the only files that may import matplotlib and what it writes with
     "envs": {
@@ -24,6 +25,7 @@ DRAWING = {  # the only files that may import matplotlib and what it writes with
     },
     "estimator": {"plotting"},
     "sim_configs": set(),
+    "agents": set(),
 }
 FILES = [file for layer in MAY_IMPORT for file in sorted((ROOT / layer).rglob("*.py"))]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PARTS = ("envs", "estimator", "experiments", "sim_configs")
+PARTS = ("agents", "envs", "estimator", "experiments", "sim_configs")
 
 
 def call(*command, cwd):

@@ -7,6 +7,12 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+_FATES = (
+    ("rejected", "rejected by the gate"),
+    ("skipped", "too close"),
+    ("tentative", "of unconfirmed ones"),
+    ("ambiguous", "ambiguous"),
+)
 _TOO_MUCH, _TOO_LITTLE = 0.5, 2.0  # of NIS or NEES per degree, where 1 is expected
 
 
@@ -40,6 +46,7 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("steps", f"{summary['steps']}, with {summary['scans']} scans"),
         ("readings", _readings(readings)),
+        ("map", _map(summary["map_changes"], len(summary["landmarks"]))),
         ("final pose", _pose(summary["pose"], summary["pose_covariance"])),
     ]
     for name, key in (("path error", "ate"), ("map error", "landmark_rmse")):
@@ -57,9 +64,17 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _readings(counts: dict[str, int]) -> str:
     text = f"{counts['associated']} of known landmarks, {counts['added']} of new ones"
-    for fate, words in (("rejected", "rejected by the gate"), ("skipped", "too close")):
+    for fate, words in _FATES:
         if counts[fate]:
             text += f", {counts[fate]} {words}"
+    return text
+
+
+def _map(changes: dict[str, int], landmarks: int) -> str:
+    text = f"{landmarks} landmarks"
+    for change in ("confirmed", "removed", "merged"):
+        if changes[change]:
+            text += f", {changes[change]} {change}"
     return text
 
 

@@ -24,3 +24,5 @@ def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
         for _ in range(2):
             estimator.predict((0.1, 0.0))
             estimator.update([(0.0, 5.0)], [0])
+        if settings.options.get("management"):
+            estimator.update([(0.0, 5.0)])

@@ -1,0 +1,122 @@
+"""How well drivers do active SLAM: episodes on maps of given seeds, and their means."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .active_slam import ActiveSlamEnv, Observation
+from .active_slam_baselines import Driver
+
+Array = NDArray[np.float64]
+Policy = Callable[[Observation, ActiveSlamEnv], Array]
+"""Chooses an action from an observation; planners read ``env.situation`` too."""
+
+HELD_OUT = 1_000_000
+"""Maps are judged on seeds from here on; who trains stays below."""
+
+MEASURES = ("total", "success", "known", "steps", "crashed")
+
+
+class Episode(NamedTuple):
+    """What came of one episode."""
+
+    total: float
+    """Sum of the rewards."""
+    success: bool
+    """Whether every landmark became known."""
+    known: float
+    """Share of the landmarks known at the end."""
+    steps: int
+    """Until the episode ended."""
+    crashed: bool
+    """Whether it ended at a wall."""
+    path: Array
+    """True positions, shape (steps + 1, 2) [m]."""
+
+
+class Mean(NamedTuple):
+    """A mean with half the width of its 95 % interval."""
+
+    value: float
+    half_width: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.2f} ± {self.half_width:.2f}"
+
+
+def play(env: ActiveSlamEnv, policy: Policy, seed: int) -> Episode:
+    """Let a policy play the episode of a seed to its end."""
+    observation, info = env.reset(seed=seed)
+    path, total, ended = [info["pose"][:2]], 0.0, False
+    while not ended:
+        action = policy(observation, env)
+        observation, reward, terminated, truncated, info = env.step(action)
+        path.append(info["pose"][:2])
+        total += reward
+        ended = terminated or truncated
+    share = info["known"] / env.scenario.landmarks.count
+    return Episode(
+        total, info["success"], share, len(path) - 1, info["collision"], np.array(path)
+    )
+
+
+def play_all(env: ActiveSlamEnv, policy: Policy, seeds: Iterable[int]) -> list[Episode]:
+    """Let a policy play the episodes of several seeds."""
+    return [play(env, policy, seed) for seed in seeds]
+
+
+def driven_by(driver: Driver) -> Policy:
+    """Make a policy of a driver, which reads the situation alone."""
+    return lambda _, env: driver.act(env.situation)
+
+
+def score_table(played: Mapping[str, Sequence[Episode]]) -> str:
+    """Write a table of means with 95 % intervals, one line per player."""
+    head = ("return", "success", "landmarks known", "steps", "crashed")
+    lines = [f"{'':10}" + "".join(f"{title:>18}" for title in head)]
+    for name, episodes in played.items():
+        cells = [f"{mean_of(episodes, measure)!s:>18}" for measure in MEASURES]
+        lines.append(f"{name:10}" + "".join(cells))
+    return "\n".join(lines)
+
+
+def mean_of(episodes: Sequence[Episode], measure: str) -> Mean:
+    """Average one of `MEASURES` over episodes, with its 95 % interval.
+
+    The interval is the normal one, 1.96 s / √n.
+
+    Examples
+    --------
+    >>> ends = [Episode(x, True, 1.0, 9, False, np.empty((0, 2))) for x in (1.0, 3.0)]
+    >>> print(mean_of(ends, "total"))
+    2.00 ± 1.96
+    """
+    return _mean(_values(episodes, measure))
+
+
+def mean_difference(
+    episodes: Sequence[Episode], others: Sequence[Episode], measure: str
+) -> Mean:
+    """Average how much more `episodes` have than `others` on the same maps, in order.
+
+    Examples
+    --------
+    >>> low, high = (
+    ...     [Episode(x + y, True, 1.0, 9, False, np.empty((0, 2))) for x in (1.0, 7.0)]
+    ...     for y in (0.0, 2.0)
+    ... )
+    >>> print(mean_difference(high, low, "total"))
+    2.00 ± 0.00
+    """
+    return _mean(_values(episodes, measure) - _values(others, measure))
+
+
+def _values(episodes: Sequence[Episode], measure: str) -> Array:
+    return np.array([getattr(each, measure) for each in episodes], dtype=np.float64)
+
+
+def _mean(values: Array) -> Mean:
+    spread = values.std(ddof=1) if len(values) > 1 else np.nan
+    return Mean(float(values.mean()), float(1.96 * spread / np.sqrt(len(values))))

@@ -1,0 +1,149 @@
+"""Beliefs as arrays of one fixed size, so that many stand side by side."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..estimator.batch import BatchMarginals, BatchSlam
+from .estimator_choice import BeliefOfMap
+
+Array = NDArray[np.float64]
+
+
+class BeliefArrays(NamedTuple):
+    """Beliefs of B worlds over a pose and N landmarks, row i of them for landmark i.
+
+    The state is (x, y, θ, l0x, l0y, l1x, …).
+    """
+
+    means: Array
+    """Shape (B, 3 + 2N), zeros where a landmark is not mapped; θ in [-π, π)."""
+    covariances: Array
+    """Of the additive error, shape (B, 3 + 2N, 3 + 2N), zeros where not mapped."""
+    mapped: NDArray[np.bool_]
+    """Which landmarks are in the map, shape (B, N)."""
+
+    @property
+    def poses(self) -> Array:
+        """(x, y, θ), shape (B, 3) [m, m, rad]."""
+        return self.means[:, :3]
+
+    @property
+    def landmarks(self) -> Array:
+        """Positions, shape (B, N, 2) [m], zeros where not mapped."""
+        return self.means[:, 3:].reshape(len(self.means), -1, 2)
+
+    @property
+    def landmark_covariances(self) -> Array:
+        """Marginal covariance of each landmark, shape (B, N, 2, 2) [m²]."""
+        count = self.mapped.shape[1]
+        blocks = self.covariances[:, 3:, 3:].reshape(-1, count, 2, count, 2)
+        each = np.arange(count)
+        return np.moveaxis(blocks[:, each, :, each, :], 0, 1)
+
+
+def marginals_of(beliefs: BeliefArrays) -> BatchMarginals:
+    """Take what is believed of the poses and of each landmark by itself."""
+    x = 3 + 2 * np.arange(beliefs.mapped.shape[1])
+    cov = beliefs.covariances
+    own = [cov[:, x, x], cov[:, x, x + 1], cov[:, x + 1, x + 1]]
+    with_pose = [cov[:, x + axis, of] for axis in (0, 1) for of in range(3)]
+    return BatchMarginals(
+        beliefs.poses,
+        cov[:, :3, :3],
+        beliefs.landmarks,
+        np.stack(own + with_pose),
+        beliefs.mapped,
+    )
+
+
+def beliefs_of_batch(batch: BatchSlam) -> BeliefArrays:
+    """Take the beliefs of a batch of filters."""
+    return BeliefArrays(*batch.beliefs())
+
+
+def belief_in_rows(belief: BeliefOfMap, size: int, *, by_id: bool) -> BeliefArrays:
+    """Give the belief of one world a fixed size; B = 1.
+
+    Parameters
+    ----------
+    belief : Belief
+        Of any estimator.
+    size : int
+        N, the rows for landmarks.
+    by_id : bool
+        Whether row i is for the landmark of identity i. Else the rows are in the
+        order of the map, for estimators that give identities of their own.
+
+    Raises
+    ------
+    ValueError
+        If the map holds more landmarks than there are rows.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import EkfSlam
+    >>> slam = EkfSlam((0.1, 0.1, 0.1), (0.1, 0.1))
+    >>> _ = slam.update([(0.0, 2.0)], landmark_ids=[1])
+    >>> rows = belief_in_rows(slam.belief(), size=3, by_id=True)
+    >>> rows.mapped.tolist(), rows.landmarks[0, 1].tolist()
+    ([[False, True, False]], [2.0, 0.0])
+    """
+    ids = belief.landmark_ids
+    at = list(ids) if by_id else list(range(len(ids)))
+    if at and not (min(at) >= 0 and max(at) < size):
+        what = f"identity {max(at)}" if by_id else f"{len(at)} landmarks"
+        raise ValueError(
+            f"max_landmarks must leave room for the whole map, got {size} rows for a "
+            f"map with {what}"
+        )
+    state = [0, 1, 2, *(3 + 2 * row + axis for row in at for axis in (0, 1))]
+    means = np.zeros((1, 3 + 2 * size))
+    covariances = np.zeros((1, 3 + 2 * size, 3 + 2 * size))
+    mapped = np.zeros((1, size), dtype=np.bool_)
+    means[0, state[:3]] = belief.pose
+    means[0, state[3:]] = np.ravel(belief.landmarks)
+    covariances[0, np.array(state)[:, None], state] = belief.covariance
+    mapped[0, at] = True
+    return BeliefArrays(means, covariances, mapped)
+
+
+def take_scans(
+    filters: BatchSlam,
+    observations: dict[str, NDArray[Any]],
+    worlds: NDArray[np.bool_],
+    *,
+    moved: bool,
+) -> None:
+    """Let the filters of some worlds take in one observation each.
+
+    Parameters
+    ----------
+    filters : BatchSlam
+        One for each of B worlds.
+    observations : dict
+        The batched observation of a landmark world, each key with a leading axis B.
+    worlds : bool ndarray, shape (B,)
+        Whose observations are taken in.
+    moved : bool
+        Whether a step lies behind them. If not, it is the scan from the start.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a filter fails, naming its world.
+    """
+    filters.run(
+        observations["odometry"][:, None],
+        observations["landmarks"][:, None],
+        observations["mask"][:, None],
+        float(moved),
+        runs=worlds,
+    )
+    failed = filters.failed_at >= 0
+    if failed.any():
+        raise np.linalg.LinAlgError(
+            f"the filter of world {int(np.argmax(failed))} has failed: its belief or "
+            "measurement_std is degenerate, or its observation is not finite"
+        )

@@ -1,0 +1,174 @@
+"""Estimators inside the loop of many worlds: beliefs become part of observations."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from .belief_arrays import BeliefArrays, beliefs_of_batch, take_scans
+from .belief_features import belief_features, world_bounds
+from .belief_observation import (
+    count_landmark_rows,
+    joined,
+    scenario_of,
+    with_belief,
+)
+from .estimator_choice import choose_batch
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Observation = dict[str, NDArray[Any]]
+Infos = dict[str, Any]
+
+
+class BeliefObservationVector(
+    VectorWrapper[Observation, NDArray[Any], Observation, NDArray[Any], NDArray[Any]]
+):
+    """Runs a filter per world on what a vector of worlds emits, and shows the beliefs.
+
+    Row i of every array has the bits that `BeliefObservation` gives in world i. It goes
+    with every autoreset mode; ``infos["final_obs"]`` holds the last beliefs too.
+
+    Parameters
+    ----------
+    env : VectorEnv
+        A `LandmarkWorldVectorEnv` with identities, as ``gymnasium.make_vec`` makes it.
+    estimator : str, default "invariant"
+        The registered name of a filter that runs in batches.
+    estimator_options : mapping, optional
+        Further options of the filter.
+    max_landmarks : int, optional
+        N, the rows for landmarks; as many as the world has where not given.
+
+    Raises
+    ------
+    ValueError
+        If the filter cannot run in batches, the worlds hide identities, or have more
+        landmarks than there are rows.
+
+    Examples
+    --------
+    >>> import gymnasium, slamgym
+    >>> worlds = gymnasium.make_vec("slamgym/LandmarkWorld-v0", 3, scenario="loop")
+    >>> worlds = BeliefObservationVector(worlds, estimator="ekf")
+    >>> observations, infos = worlds.reset(seed=0)
+    >>> observations["belief_landmarks"].shape
+    (3, 20, 2)
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Observation, NDArray[Any], NDArray[Any]],
+        estimator: str = "invariant",
+        *,
+        estimator_options: Mapping[str, Any] | None = None,
+        max_landmarks: int | None = None,
+    ) -> None:
+        super().__init__(env)
+        self.scenario = scenario_of(env)
+        if not self.scenario.sensor.identities:
+            raise ValueError(
+                "sensor.identities must be true where worlds run side by side: the "
+                "batched filters do not associate"
+            )
+        if not hasattr(type(env.unwrapped), "start_estimates"):
+            raise ValueError(
+                "env must be a LandmarkWorldVectorEnv, which tells start_estimates, "
+                f"got {type(env.unwrapped).__name__}"
+            )
+        rows = count_landmark_rows(self.scenario, max_landmarks)
+        self._missing_rows = rows - self.scenario.landmarks.count
+        self._bounds = world_bounds(self.scenario)
+        self._filters = choose_batch(
+            estimator, self.scenario, self.num_envs, rows, estimator_options
+        )
+        self._mode = env.metadata["autoreset_mode"]
+        single = with_belief(env.single_observation_space, rows)
+        self.single_observation_space = single
+        self.observation_space = batch_space(single, self.num_envs)
+        self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        self._begun = False
+
+    @property
+    def beliefs(self) -> BeliefArrays:
+        """What the filters believe now."""
+        if not self._begun:
+            raise ResetNeeded("call reset first: there are no beliefs")
+        return beliefs_of_batch(self._filters)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, Infos]:
+        """Begin episodes as the worlds do, with a new map in each filter."""
+        mask = (options or {}).get("reset_mask")
+        worlds = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask.copy()
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._begin(observations, worlds)
+        self._begun = True
+        self._ended = self._ended & ~worlds
+        return self._shown(observations), infos
+
+    def step(
+        self, actions: NDArray[Any]
+    ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], Infos]:
+        """Step the worlds, then let the filters predict and update."""
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        ended = terminated | truncated
+        if self._mode == AutoresetMode.SAME_STEP:
+            self._finish(observations, ended, infos)
+        else:
+            begun = self._ended & (self._mode == AutoresetMode.NEXT_STEP)
+            self._take_in(observations, ~begun, moved=True)
+            if begun.any():
+                self._begin(observations, begun)
+            self._ended = ended
+        return self._shown(observations), rewards, terminated, truncated, infos
+
+    def _finish(
+        self, observations: Observation, ended: BoolArray, infos: Infos
+    ) -> None:
+        """Take in the last moment of episodes that end, then the first of the next."""
+        last = {key: rows.copy() for key, rows in observations.items()}
+        for world in np.flatnonzero(ended).tolist():
+            for key, rows in last.items():
+                rows[world] = infos["final_obs"][world][key]
+        self._take_in(last, np.ones(self.num_envs, dtype=np.bool_), moved=True)
+        if not ended.any():
+            return
+        shown = self._shown(last)
+        for world in np.flatnonzero(ended).tolist():
+            infos["final_obs"][world] = {
+                key: rows[world].copy() for key, rows in shown.items()
+            }
+        self._begin(observations, ended)
+
+    def _begin(self, observations: Observation, worlds: BoolArray) -> None:
+        worlds_of: Any = self.env.unwrapped
+        estimates = worlds_of.start_estimates
+        self._filters.reset(estimates, self.scenario.start.std, runs=worlds)
+        self._take_in(observations, worlds, moved=False)
+
+    def _take_in(
+        self, observations: Observation, worlds: BoolArray, *, moved: bool
+    ) -> None:
+        if self._missing_rows:
+            longer = {
+                key: _lengthened(observations[key], self._missing_rows)
+                for key in ("landmarks", "mask")
+            }
+            observations = {**observations, **longer}
+        take_scans(self._filters, observations, worlds, moved=moved)
+
+    def _shown(self, observations: Observation) -> Observation:
+        marginals = self._filters.marginals()
+        return joined(observations, belief_features(marginals, self._bounds))
+
+
+def _lengthened(rows: NDArray[Any], more: int) -> NDArray[Any]:
+    """Add empty rows to the second axis."""
+    padding = [(0, 0), (0, more), *((0, 0) for _ in rows.shape[2:])]
+    return np.pad(rows, padding)

@@ -1,0 +1,198 @@
+"""Estimators for agents: chosen by name or made by hand, and held to their promises."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..estimator.batch import BatchSlam, make_batch
+from ..estimator.registry import find_estimator
+from ..sim_configs import Scenario
+
+Array = NDArray[np.float64]
+
+
+class BeliefOfMap(Protocol):
+    """What an agent reads of a belief; `slamgym.estimator.Belief` is one."""
+
+    @property
+    def pose(self) -> Array:
+        """Mean of the pose, shape (3,) [m, m, rad]."""
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Covariance of the pose, shape (3, 3)."""
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """Identities of the n mapped landmarks, in the order of the state."""
+
+    @property
+    def landmarks(self) -> Array:
+        """Means of the n mapped landmarks, shape (n, 2) [m]."""
+
+    @property
+    def covariance(self) -> Array:
+        """Of the additive error of the state, shape (3 + 2n, 3 + 2n)."""
+
+
+class FollowingEstimator(Protocol):
+    """What an agent's loop asks of an estimator: four of `SlamEstimator`'s methods."""
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run, the map empty."""
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move by odometry (d, α) [m, rad]."""
+
+    def update(self, measurements: ArrayLike, landmark_ids: Any = None) -> Any:
+        """Take in one scan, rows (bearing, range) [rad, m]."""
+
+    def belief(self) -> Any:
+        """Return the present belief."""
+
+
+EstimatorChoice = str | FollowingEstimator | Callable[..., FollowingEstimator]
+
+_METHODS = ("reset", "predict", "update", "belief")
+_OF_BELIEF = ("pose", "pose_covariance", "landmark_ids", "landmarks", "covariance")
+
+
+def choose_estimator(
+    estimator: EstimatorChoice,
+    scenario: Scenario,
+    options: Mapping[str, Any] | None = None,
+) -> FollowingEstimator:
+    """Make an estimator that knows the noise of a world.
+
+    Parameters
+    ----------
+    estimator : str, callable or object
+        A registered name or "module:Class", a factory with the keywords of
+        `make_estimator`, or an estimator already made, which keeps its settings.
+    scenario : Scenario
+        Its noise is told to the estimator.
+    options : mapping, optional
+        Further options of the estimator's constructor.
+
+    Raises
+    ------
+    ValueError
+        If the name is unknown, or options are given for an estimator already made.
+    TypeError
+        If the estimator lacks a method, which is named.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> type(choose_estimator("ekf", load_scenario("loop"))).__name__
+    'EkfSlam'
+    """
+    if isinstance(estimator, str):
+        estimator = find_estimator(estimator)
+    if isinstance(estimator, type) or not _has_a_method(estimator):
+        estimator = _made_by(estimator, scenario, options or {})
+    elif options:
+        raise ValueError(
+            "estimator_options must be empty with an estimator already made, "
+            f"got {dict(options)!r}"
+        )
+    return checked_estimator(cast("FollowingEstimator", estimator))
+
+
+def choose_batch(
+    estimator: str,
+    scenario: Scenario,
+    runs: int,
+    landmarks: int,
+    options: Mapping[str, Any] | None = None,
+) -> BatchSlam:
+    """Make a batch of a registered estimator that knows the noise of a world.
+
+    One thread: what one step costs is less than handing it to another.
+
+    Raises
+    ------
+    ValueError
+        If the name is unknown, or the estimator cannot run in batches.
+    """
+    if not isinstance(estimator, str):
+        raise ValueError(
+            f"estimator must be a registered name where worlds run side by side, "
+            f"got {estimator!r}"
+        )
+    known = told_options(find_estimator(estimator), scenario)
+    return make_batch(
+        estimator,
+        runs=runs,
+        landmarks=landmarks,
+        motion_std=scenario.motion.std,
+        measurement_std=scenario.sensor.std,
+        threads=1,
+        **{**known, **(options or {})},
+    )
+
+
+def told_options(factory: Callable[..., Any], scenario: Scenario) -> dict[str, Any]:
+    """Collect what a world tells of its noise, as far as the factory takes it."""
+    told = {
+        "range_std_per_metre": scenario.sensor.range_std_per_metre,
+        "noise_at_rest": scenario.motion.noise_at_rest,
+    }
+    parameters = inspect.signature(factory).parameters.values()
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
+        return told
+    names = {parameter.name for parameter in parameters}
+    return {key: value for key, value in told.items() if key in names}
+
+
+def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:
+    """Return the estimator, or name the method of the Protocol that it lacks."""
+    for method in _METHODS:
+        if not callable(getattr(estimator, method, None)):
+            raise TypeError(
+                f"estimator must have the methods {', '.join(_METHODS)}, but "
+                f"{type(estimator).__name__} has no method {method}()"
+            )
+    return estimator
+
+
+def checked_belief(estimator: FollowingEstimator) -> BeliefOfMap:
+    """Ask for the belief, and name what it lacks."""
+    belief = estimator.belief()
+    name = type(estimator).__name__
+    for part in _OF_BELIEF:
+        if not hasattr(belief, part):
+            raise TypeError(
+                f"{name}.belief() must return a belief with {', '.join(_OF_BELIEF)}, "
+                f"got {type(belief).__name__} without {part}"
+            )
+    size = 3 + 2 * len(belief.landmark_ids)
+    if np.shape(belief.covariance) != (size, size):
+        raise TypeError(
+            f"{name}.belief() must have a covariance of shape ({size}, {size}) with "
+            f"{len(belief.landmark_ids)} landmarks, got {np.shape(belief.covariance)}"
+        )
+    if not (np.isfinite(belief.covariance).all() and np.isfinite(belief.pose).all()):
+        raise ValueError(f"{name}.belief() must be finite, got pose {belief.pose}")
+    checked: BeliefOfMap = belief
+    return checked
+
+
+def _has_a_method(estimator: Any) -> bool:
+    return any(hasattr(estimator, method) for method in _METHODS) or not callable(
+        estimator
+    )
+
+
+def _made_by(
+    factory: Any, scenario: Scenario, options: Mapping[str, Any]
+) -> FollowingEstimator:
+    made: FollowingEstimator = factory(
+        motion_std=scenario.motion.std,
+        measurement_std=scenario.sensor.std,
+        **{**told_options(factory, scenario), **options},
+    )
+    return made

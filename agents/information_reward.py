@@ -1,0 +1,259 @@
+"""What knowledge is worth: optimality criteria of a belief, and a reward from them.
+
+How small is a covariance P?  The design of experiments answers by one number:
+
+=====  ==============================  =========================================
+D      ½ log det P [nats]              entropy, but for a constant
+A      trace P [m²]                    mean squared error
+E      largest eigenvalue of P [m²]    error in the worst direction
+=====  ==============================  =========================================
+
+A map grows, so beliefs of different sizes must be compared. Every landmark that is not
+yet mapped counts with a prior, a covariance of ``prior_std``² on its two coordinates,
+uncorrelated with all else: so P has one size from the first step to the last, and the
+decreases of a criterion over an episode add up to its first value minus its last.
+"""
+
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import ArrayLike, NDArray
+
+from ..sim_configs import Scenario
+from .belief_arrays import BeliefArrays
+from .belief_features import world_bounds
+from .belief_observation import BeliefObservation
+
+Array = NDArray[np.float64]
+
+CRITERIA = ("D", "A", "E")
+
+
+def d_optimality(covariance: ArrayLike) -> Array:
+    """Compute ½ log det P of covariances, (…, n, n) to (…) [nats]; -inf if singular.
+
+    Examples
+    --------
+    >>> float(d_optimality(np.diag([np.e**2, np.e**4])))
+    3.0
+    """
+    sign, log_det = np.linalg.slogdet(np.asarray(covariance, dtype=np.float64))
+    return np.asarray(np.where(sign > 0, 0.5 * log_det, -np.inf))
+
+
+def a_optimality(covariance: ArrayLike) -> Array:
+    """Compute trace P of covariances, (…, n, n) to (…).
+
+    Examples
+    --------
+    >>> float(a_optimality(np.diag([1.0, 2.0])))
+    3.0
+    """
+    matrices = np.asarray(covariance, dtype=np.float64)
+    return np.asarray(np.trace(matrices, axis1=-2, axis2=-1))
+
+
+def e_optimality(covariance: ArrayLike) -> Array:
+    """Compute the largest eigenvalue of covariances, (…, n, n) to (…).
+
+    Examples
+    --------
+    >>> float(e_optimality([[2.0, 1.0], [1.0, 2.0]]))
+    3.0
+    """
+    matrices = np.asarray(covariance, dtype=np.float64)
+    return np.asarray(np.linalg.eigvalsh(matrices)[..., -1])
+
+
+_BY_NAME = {"D": d_optimality, "A": a_optimality, "E": e_optimality}
+
+
+def map_covariances(beliefs: BeliefArrays, prior_std: ArrayLike) -> Array:
+    """Take the joint covariance of all landmarks, mapped or not.
+
+    Parameters
+    ----------
+    beliefs : BeliefArrays
+        Of B worlds with N landmarks.
+    prior_std : float or array_like, shape (2,)
+        Of the coordinates of a landmark that is not mapped [m].
+
+    Returns
+    -------
+    ndarray, shape (B, 2N, 2N)
+    """
+    prior = np.broadcast_to(np.asarray(prior_std, dtype=np.float64), (2,)) ** 2
+    joint = beliefs.covariances[:, 3:, 3:].copy()
+    unmapped = np.repeat(~beliefs.mapped, 2, axis=1)
+    diagonal = np.arange(joint.shape[-1])
+    joint[:, diagonal, diagonal] += unmapped * np.tile(prior, beliefs.mapped.shape[1])
+    return joint
+
+
+def uncertainty(beliefs: BeliefArrays, criterion: str, prior_std: ArrayLike) -> Array:
+    """Measure how uncertain maps are.
+
+    Parameters
+    ----------
+    beliefs : BeliefArrays
+        Of B worlds with N landmarks.
+    criterion : {"D", "A", "E"}
+        What is measured. D and A are divided by N, so that they are per landmark.
+    prior_std : float or array_like, shape (2,)
+        Of the coordinates of a landmark that is not mapped [m].
+
+    Returns
+    -------
+    ndarray, shape (B,)
+        The decrease from one belief to the next is the information gained.
+
+    Raises
+    ------
+    ValueError
+        If the criterion is unknown.
+    """
+    if criterion not in CRITERIA:
+        raise ValueError(
+            f"criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}"
+        )
+    measured = _BY_NAME[criterion](map_covariances(beliefs, prior_std))
+    return measured if criterion == "E" else measured / beliefs.mapped.shape[1]
+
+
+def effort(actions: ArrayLike, limits: ArrayLike) -> Array:
+    """Measure what actions cost the robot, (…, 2) to (…): 0 at rest, 1 at both limits.
+
+    ::
+
+        ½ (v / v_max)² + ½ (ω / ω_max)²,    each within its limit
+
+    Examples
+    --------
+    >>> effort([[0.0, 0.0], [1.0, 0.0], [9.0, 9.0]], limits=(1.0, 2.0)).tolist()
+    [0.0, 0.5, 1.0]
+    """
+    bounded = np.minimum(
+        np.abs(np.asarray(actions, dtype=np.float64)) / np.asarray(limits), 1.0
+    )
+    return np.asarray(0.5 * (bounded[..., 0] ** 2 + bounded[..., 1] ** 2))
+
+
+def landmark_prior_std(scenario: Scenario) -> tuple[float, float]:
+    """Give the σ of a landmark that may be anywhere in the world: side / √12 [m].
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> [round(std, 2) for std in landmark_prior_std(load_scenario("corridor"))]
+    [4.16, 4.16]
+    """
+    left, bottom, right, top = world_bounds(scenario)
+    return (right - left) / 12**0.5, (top - bottom) / 12**0.5
+
+
+class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Rewards what the belief gains, and charges for collisions and effort.
+
+    ::
+
+        reward += gain - collision_cost [collision] - effort_cost effort(action)
+
+    where the gain is the decrease of `uncertainty` in this step. The first scan, in
+    `reset`, is not rewarded.
+
+    Parameters
+    ----------
+    env : Env
+        With a `BeliefObservation` among its wrappers.
+    criterion : {"D", "A", "E"}
+        See `uncertainty`.
+    prior_std : float, optional
+        Of the coordinates of a landmark that is not mapped [m]; where not given, of one
+        that may be anywhere in the world.
+    gain : float
+        Factor of the gain.
+    collision_cost, effort_cost : float
+        What a collision, and an `effort` of 1, cost.
+
+    Examples
+    --------
+    >>> import gymnasium, slamgym
+    >>> from slamgym.agents import BeliefObservation
+    >>> env = gymnasium.make("slamgym/LandmarkWorld-v0", sensor={"max_range": 7.0})
+    >>> env = InformationReward(BeliefObservation(env, "ekf"), effort_cost=0.1)
+    >>> _ = env.reset(seed=0)
+    >>> rewards = [env.step([1.0, 0.0])[1] for _ in range(3)]  # more comes into view
+    >>> [reward > 1.0 for reward in rewards]
+    [False, True, True]
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        criterion: str = "D",
+        prior_std: float | None = None,
+        *,
+        gain: float = 1.0,
+        collision_cost: float = 0.0,
+        effort_cost: float = 0.0,
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self,
+            criterion=criterion,
+            prior_std=prior_std,
+            gain=gain,
+            collision_cost=collision_cost,
+            effort_cost=effort_cost,
+        )
+        super().__init__(env)
+        if criterion not in CRITERIA:
+            raise ValueError(
+                f"criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}"
+            )
+        if not _observes_beliefs(env):
+            raise ValueError(
+                "env must have a BeliefObservation among its wrappers, got "
+                f"{type(env).__name__}"
+            )
+        scenario = env.get_wrapper_attr("scenario")
+        self._criterion = criterion
+        self._prior_std: ArrayLike = (
+            landmark_prior_std(scenario) if prior_std is None else prior_std
+        )
+        self._factors = gain, collision_cost, effort_cost
+        self._limits = scenario.robot.max_speed, scenario.robot.max_turn_rate
+        self._uncertainty = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode, and measure the uncertainty of its first belief."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._uncertainty = self._measure()
+        return observation, info
+
+    def step(
+        self, action: Any
+    ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step, and add what the belief has gained to the reward."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        before, self._uncertainty = self._uncertainty, self._measure()
+        gain, collision_cost, effort_cost = self._factors
+        total = float(reward) + gain * (before - self._uncertainty)
+        total -= collision_cost * bool(info["collision"])
+        total -= effort_cost * float(effort(action, self._limits))
+        return observation, total, terminated, truncated, info
+
+    def _measure(self) -> float:
+        beliefs = self.env.get_wrapper_attr("beliefs")
+        return float(uncertainty(beliefs, self._criterion, self._prior_std)[0])
+
+
+def _observes_beliefs(env: gymnasium.Env[Any, Any]) -> bool:
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, BeliefObservation):
+            return True
+        env = env.env
+    return False

@@ -1,0 +1,118 @@
+"""What landmark management remembers of each landmark in the map."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+class LandmarkRecords:
+    """Sightings, misses and information of the landmarks, in the order of the map.
+
+    The information of a landmark is its block of the information matrix: what all
+    its readings said of its place as seen from where the robot was::
+
+        Λ = Σ H_lᵀ Q⁻¹ H_l,   H_l = [a; e],  e towards the landmark, a across by 1/r
+        content = ½ ln det Λ
+
+    It is what goes to waste when the landmark is marginalised and never found again.
+
+    Examples
+    --------
+    >>> records = LandmarkRecords()
+    >>> records.follow([7, 9])
+    >>> ahead, across = np.zeros(2), np.ones(2)
+    >>> records.note_sightings([7, 9], ahead, np.array([4.0, 9.0]), across)
+    >>> records.by_information([9, 7])
+    [7, 9]
+    """
+
+    def __init__(self) -> None:
+        self.ids: tuple[int, ...] = ()
+        self.sightings: Int = np.zeros(0, dtype=np.int64)
+        self.misses: Int = np.zeros(0, dtype=np.int64)
+        self.information: Array = np.zeros((0, 3))
+        self._slots: dict[int, int] = {}
+
+    def follow(self, ids: Sequence[int]) -> None:
+        """Take the map's order: keep who is there still, begin who is new."""
+        if self.ids == tuple(ids):
+            return
+        old = {i: k for k, i in enumerate(self.ids)}
+        rows = np.array([old.get(i, -1) for i in ids], dtype=np.int64)
+        fresh = rows < 0
+        for name in ("sightings", "misses", "information"):
+            before = getattr(self, name)
+            after = np.zeros((len(rows), *before.shape[1:]), dtype=before.dtype)
+            after[~fresh] = before[rows[~fresh]]
+            setattr(self, name, after)
+        self.ids = tuple(ids)
+        self._slots = {i: k for k, i in enumerate(self.ids)}
+
+    def note_sightings(
+        self, ids: Sequence[int], bearings: Array, along: Array, across: Array
+    ) -> None:
+        """Count sightings of some landmarks, all arrays of shape (m,).
+
+        Parameters
+        ----------
+        ids : sequence of int
+            The landmarks, without repetition.
+        bearings : ndarray
+            Directions of the world in which they were seen [rad].
+        along, across : ndarray
+            Information of each reading along the line of sight and across it [1/m²].
+        """
+        slots = self.slots(ids)
+        cos, sin = np.cos(bearings), np.sin(bearings)
+        self.sightings[slots] += 1
+        self.misses[slots] = 0
+        self.information[slots, 0] += along * cos * cos + across * sin * sin
+        self.information[slots, 1] += (along - across) * cos * sin
+        self.information[slots, 2] += along * sin * sin + across * cos * cos
+
+    def slots(self, ids: Iterable[int]) -> Int:
+        """Return the places of landmarks in the order of the map."""
+        return np.array([self._slots[i] for i in ids], dtype=np.int64)
+
+    def note_misses(self, slots: Int) -> None:
+        """Count for some landmarks a scan that should have shown them and did not."""
+        self.misses[slots] += 1
+
+    def overdue(self, misses: int) -> list[int]:
+        """Return the landmarks missed so many times since they were last seen."""
+        return [self.ids[k] for k in np.flatnonzero(self.misses >= misses)]
+
+    def join(self, kept: int, gone: int) -> None:
+        """Count what was known of one landmark for another."""
+        i, j = self._slots[kept], self._slots[gone]
+        self.sightings[i] += self.sightings[j]
+        self.information[i] += self.information[j]
+        self.misses[i] = min(self.misses[i], self.misses[j])
+
+    def by_information(self, ids: Sequence[int]) -> list[int]:
+        """Sort landmarks by information content, the least and latest first."""
+        xx, xy, yy = self.information[self.slots(ids)[::-1]].T
+        order = np.argsort(xx * yy - xy * xy, kind="stable")
+        return [ids[len(ids) - 1 - k] for k in order.tolist()]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of all, as arrays."""
+        return {
+            "ids": np.array(self.ids, dtype=np.int64),
+            "sightings": self.sightings.copy(),
+            "misses": self.misses.copy(),
+            "information": self.information.copy(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take back what :meth:`state_dict` returned."""
+        self.ids = tuple(np.asarray(state["ids"]).tolist())
+        self._slots = {i: k for k, i in enumerate(self.ids)}
+        self.sightings = np.array(state["sightings"], dtype=np.int64)
+        self.misses = np.array(state["misses"], dtype=np.int64)
+        self.information = np.array(state["information"], dtype=np.float64)

@@ -1,0 +1,211 @@
+"""Train an agent to explore: PPO on ``slamgym/ActiveSlam-v0``, beside the baselines.
+
+An agent that sees only what a filter believes learns to find all landmarks, to go back
+to what it knows before it is lost, and not to touch a wall.  64 worlds, each with its
+filter, run side by side in this one process.  Needs Stable-Baselines3::
+
+    pip install torch==2.13.0 stable-baselines3
+
+Run it::
+
+    python examples/09_train_active_slam.py                    # some ten minutes
+    python examples/09_train_active_slam.py --steps 100000 --maps 10    # a taste
+
+It writes into ``results/09_train_active_slam``: ``policy.zip``, which is then read
+back to be judged; ``learning_curve.csv`` and ``.png``; ``scores.txt``, the table of
+policy and baselines over maps that training never saw; and ``trajectories.png``, what
+they all do on one of these maps.
+"""
+
+import argparse
+import csv
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import flatten
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
+from slamgym.agents.active_slam import Observation
+from slamgym.agents.active_slam_baselines import BASELINES, make_baseline
+from slamgym.agents.active_slam_scores import (
+    HELD_OUT,
+    Episode,
+    Policy,
+    driven_by,
+    mean_difference,
+    mean_of,
+    play_all,
+    score_table,
+)
+from slamgym.envs.stable_baselines import to_stable_baselines
+from slamgym.envs.vector_wrappers import FlattenBatch
+
+FOLDER = Path("results/09_train_active_slam")
+INK, PALE, RED = "#222222", "#bbbbbb", "#c0392b"
+
+
+def train(scenario: str, steps: int, worlds: int) -> list[dict[str, float]]:
+    """Train PPO, save the policy, and return the learning curve."""
+    import torch  # noqa: PLC0415 (an extra)
+    from stable_baselines3 import PPO  # noqa: PLC0415
+    from stable_baselines3.common.vec_env import VecMonitor  # noqa: PLC0415
+
+    torch.set_num_threads(1)  # small networks: more threads wait for each other
+    vector = ActiveSlamVectorEnv(worlds, scenario, autoreset_mode="SameStep")
+    adapted = to_stable_baselines(FlattenBatch(vector))
+    model = PPO(
+        "MlpPolicy",
+        VecMonitor(adapted, info_keywords=("success",)),
+        learning_rate=lambda left: 5e-4 * left,
+        n_steps=64,
+        batch_size=1024,
+        n_epochs=5,
+        gamma=0.995,
+        policy_kwargs={"net_arch": [128, 128], "log_std_init": -0.5},
+        device="cpu",
+        seed=0,
+    )
+    curve: list[dict[str, float]] = []
+    began = time.perf_counter()
+
+    def note(*_: Any) -> bool:
+        ended = model.ep_info_buffer
+        if ended and model.num_timesteps >= (len(curve) + 1) * steps / 60:
+            curve.append(
+                {
+                    "steps": model.num_timesteps,
+                    "seconds": round(time.perf_counter() - began, 1),
+                    "return": float(np.mean([each["r"] for each in ended])),
+                    "success": float(np.mean([each["success"] for each in ended])),
+                }
+            )
+            if len(curve) % 6 == 0:
+                print(
+                    "after {steps:8.0f} steps, {seconds:5.0f} s: return {return:6.2f}, "
+                    "success {success:.2f}".format(**curve[-1]),
+                    flush=True,
+                )
+        return True
+
+    model.learn(steps, callback=note)
+    model.save(FOLDER / "policy.zip")
+    return curve
+
+
+def load_policy(path: Path) -> Policy:
+    """Read a saved policy; it acts without chance."""
+    from stable_baselines3 import PPO  # noqa: PLC0415 (an extra)
+
+    model = PPO.load(path, device="cpu")
+
+    def act(observation: Observation, env: ActiveSlamEnv) -> NDArray[np.float64]:
+        flat = flatten(env.observation_space, observation)
+        action, _ = model.predict(np.asarray(flat), deterministic=True)
+        return np.asarray(action, dtype=np.float64)
+
+    return act
+
+
+def play_everyone(
+    env: ActiveSlamEnv, policy: Policy, maps: int
+) -> dict[str, list[Episode]]:
+    """Let policy and baselines play the same maps, none of them trained on."""
+    seeds = range(HELD_OUT, HELD_OUT + maps)
+    players = {"ppo": policy}
+    for name in BASELINES:
+        driver = make_baseline(name, env.scenario, np.random.default_rng(0))
+        players[name] = driven_by(driver)
+    return {name: play_all(env, each, seeds) for name, each in players.items()}
+
+
+def draw_curve(
+    curve: list[dict[str, float]], played: dict[str, list[Episode]]
+) -> Figure:
+    """Draw return against steps, the baselines as lines."""
+    figure = Figure((7, 4), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot([row["steps"] for row in curve], [row["return"] for row in curve], c=INK)
+    for k, name in enumerate(BASELINES):
+        mean = mean_of(played[name], "total").value
+        axes.axhline(mean, color=PALE, linestyle="--", zorder=0)
+        beside = (0.6 + 0.12 * (k % 3)) * curve[-1]["steps"]  # lines can be close
+        axes.annotate(name, (beside, mean), color="#777777", va="bottom", fontsize=9)
+    axes.set(xlabel="steps of training", ylabel="return of an episode")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def draw_trajectories(env: ActiveSlamEnv, played: dict[str, list[Episode]]) -> Figure:
+    """Draw what everyone does on the first map, side by side."""
+    figure = Figure((3 * len(played), 3.4), layout="constrained")
+    env.reset(seed=HELD_OUT)
+    landmarks = env.landmarks
+    for axes, (name, episodes) in zip(
+        np.ravel(figure.subplots(1, len(played))), played.items(), strict=True
+    ):
+        draw_episode(axes, env, landmarks, episodes[0])
+        axes.set_title(f"{name}: {outcome(episodes[0])}", fontsize=10)
+    return figure
+
+
+def draw_episode(
+    axes: Axes, env: ActiveSlamEnv, landmarks: NDArray[np.float64], episode: Episode
+) -> None:
+    """Draw walls, landmarks and one path."""
+    for x0, y0, x1, y1 in env.scenario.walls:
+        axes.plot([x0, x1], [y0, y1], color=INK, linewidth=2)
+    axes.plot(*landmarks.T, "+", color=RED, markersize=8)
+    axes.plot(*episode.path.T, color=INK, linewidth=0.9)
+    axes.plot(*episode.path[0], "o", color=INK, markersize=5)
+    axes.plot(
+        *episode.path[-1], "X" if episode.crashed else "s", color=INK, markersize=6
+    )
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+def outcome(episode: Episode) -> str:
+    """Say in a few words how an episode went."""
+    if episode.success:
+        return f"all known in {episode.steps} steps"
+    how = "crashed" if episode.crashed else "time is up"
+    return f"{how}, {100 * episode.known:.0f} % known"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenario", default="active_medium")
+    parser.add_argument("--steps", type=int, default=2_000_000)
+    parser.add_argument("--worlds", type=int, default=64, help="a multiple of 16")
+    parser.add_argument("--maps", type=int, default=100)
+    given = parser.parse_args()
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    try:
+        curve = train(given.scenario, given.steps, given.worlds)
+    except ImportError as error:
+        sys.exit(f"{error}: pip install torch==2.13.0 stable-baselines3")
+    with (FOLDER / "learning_curve.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["steps", "seconds", "return", "success"])
+        writer.writeheader()
+        writer.writerows(curve)
+    env = ActiveSlamEnv(given.scenario)
+    played = play_everyone(env, load_policy(FOLDER / "policy.zip"), given.maps)
+    table = score_table(played)
+    print(f"{given.scenario}, {given.maps} maps that training never saw:\n{table}")
+    for name in BASELINES:
+        more = mean_difference(played["ppo"], played[name], "total")
+        print(f"on the same map ppo earns {more} more than {name}")
+    (FOLDER / "scores.txt").write_text(table + "\n", encoding="utf-8")
+    draw_curve(curve, played).savefig(FOLDER / "learning_curve.png", dpi=120)
+    draw_trajectories(env, played).savefig(FOLDER / "trajectories.png", dpi=100)
+    print(f"wrote {FOLDER}")
+
+
+if __name__ == "__main__":
+    main()
