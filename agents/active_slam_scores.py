@@ -13,8 +13,12 @@ Array = NDArray[np.float64]
 Policy = Callable[[Observation, ActiveSlamEnv], Array]
 """Chooses an action from an observation; planners read ``env.situation`` too."""
 
-HELD_OUT = 1_000_000
-"""Maps are judged on seeds from here on; who trains stays below."""
+VALIDATION = 1_000_000
+"""Maps to choose by, while observations, rewards and constants are still open: seeds
+from here to `HELD_OUT`.  Who trains stays below."""
+
+HELD_OUT = 2_000_000
+"""Maps to judge by, once: seeds from here on.  No choice may rest on them."""
 
 MEASURES = ("total", "success", "known", "steps", "crashed")
 
@@ -79,6 +83,30 @@ def score_table(played: Mapping[str, Sequence[Episode]]) -> str:
     for name, episodes in played.items():
         cells = [f"{mean_of(episodes, measure)!s:>18}" for measure in MEASURES]
         lines.append(f"{name:10}" + "".join(cells))
+    return "\n".join(lines)
+
+
+def difference_lines(played: Mapping[str, Sequence[Episode]], name: str) -> str:
+    """Write how one player does on the same maps as every other, one line each.
+
+    Examples
+    --------
+    >>> low, high = (
+    ...     [Episode(x + y, True, 1.0, 9, False, np.empty((0, 2))) for x in (1.0, 7.0)]
+    ...     for y in (0.0, 2.0)
+    ... )
+    >>> print(difference_lines({"a": high, "b": low}, "a"))
+    a - b: return 2.00 ± 0.00, success 0.00 ± 0.00, steps 0.00 ± 0.00
+    """
+    measures = {"return": "total", "success": "success", "steps": "steps"}
+    lines = []
+    for other in played:
+        if other != name:
+            parts = (
+                f"{title} {mean_difference(played[name], played[other], measure)}"
+                for title, measure in measures.items()
+            )
+            lines.append(f"{name} - {other}: {', '.join(parts)}")
     return "\n".join(lines)
 
 

@@ -25,9 +25,7 @@ Observation = dict[str, NDArray[Any]]
 Infos = dict[str, Any]
 
 
-class BeliefObservationVector(
-    VectorWrapper[Observation, NDArray[Any], Observation, NDArray[Any], NDArray[Any]]
-):
+class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
     """Runs a filter per world on what a vector of worlds emits, and shows the beliefs.
 
     Row i of every array has the bits that `BeliefObservation` gives in world i. It goes

@@ -4,9 +4,11 @@ Run it::
 
     python benchmarks/active_slam.py --maps 100
 
-Every baseline plays the episodes of the seeds 1,000,000 and up at each difficulty.  A
+Every baseline plays the episodes of the seeds from `HELD_OUT` on at each difficulty,
+maps that nothing was chosen by; who still chooses takes those of ``--validation``.  A
 policy saved by ``examples/09_train_active_slam.py`` plays too where
-``--policy SCENARIO=FILE`` names it.  A mean m of n episodes is given as m ± 1.96 s/√n.
+``--policy SCENARIO=FILE`` names it, and is compared with the others map by map.  A mean
+m of n episodes is given as m ± 1.96 s/√n.
 """
 
 import argparse
@@ -20,8 +22,10 @@ from slamgym.agents import ActiveSlamEnv
 from slamgym.agents.active_slam_baselines import BASELINES, make_baseline
 from slamgym.agents.active_slam_scores import (
     HELD_OUT,
+    VALIDATION,
     Episode,
     Policy,
+    difference_lines,
     driven_by,
     play_all,
     score_table,
@@ -31,7 +35,7 @@ LEVELS = ("active_easy", "active_medium", "active_hard")
 TRAINING = Path(__file__).parents[1] / "examples" / "09_train_active_slam.py"
 
 
-def score(scenario: str, maps: int, policy: str | None) -> dict[str, list[Episode]]:
+def score(scenario: str, seeds: range, policy: str | None) -> dict[str, list[Episode]]:
     """Let everybody play the maps of one difficulty."""
     env = ActiveSlamEnv(scenario)
     players: dict[str, Policy] = {}
@@ -41,7 +45,6 @@ def score(scenario: str, maps: int, policy: str | None) -> dict[str, list[Episod
     if policy is not None:
         load_policy = runpy.run_path(str(TRAINING))["load_policy"]
         players["ppo"] = load_policy(Path(policy))
-    seeds = range(HELD_OUT, HELD_OUT + maps)
     return {name: play_all(env, player, seeds) for name, player in players.items()}
 
 
@@ -52,13 +55,19 @@ def main() -> None:
     parser.add_argument(
         "--policy", metavar="SCENARIO=FILE", action="append", default=[]
     )
+    parser.add_argument(
+        "--validation", action="store_true", help="maps to choose by, not to judge by"
+    )
     given = parser.parse_args()
+    first = VALIDATION if given.validation else HELD_OUT
+    seeds = range(first, first + given.maps)
     policies = dict(each.split("=", 1) for each in given.policy)
     for scenario in given.level or LEVELS:
         began = time.perf_counter()
-        played = score(scenario, given.maps, policies.get(scenario))
+        played = score(scenario, seeds, policies.get(scenario))
         took = time.perf_counter() - began
-        print(f"{scenario}, {given.maps} maps ({took:.0f} s)\n{score_table(played)}\n")
+        print(f"{scenario}, {given.maps} maps ({took:.0f} s)\n{score_table(played)}")
+        print(f"{difference_lines(played, 'ppo')}\n" if "ppo" in played else "")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,10 @@
 
 A bare step is `pymunk.Space.step` with one kinematic body. Times are per world and
 step. The cases run interleaved in one process, in CPU time of this thread; a ratio is
-the median over the rounds. Stable-Baselines3 is timed where it is installed.
+the median over the rounds. Stable-Baselines3 and, as peers of a single world, ir-sim
+and the Robotics Toolbox are timed where they are installed.
+
+A second table tells what observing beliefs costs, see `agents_beliefs`.
 """
 
 import importlib.util
@@ -15,13 +18,15 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import pymunk
+from agents_beliefs import belief_table
+from agents_peers import peer_calls
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import FlattenObservation
 from interleaved import microseconds, ratio, time_interleaved, verdict
 from rich.console import Console
 from rich.table import Table
 
-import slamgym  # noqa: F401 (registers the environments)
+from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.stable_baselines import to_stable_baselines
 from slamgym.envs.vector_wrappers import FlattenBatch
 
@@ -29,7 +34,9 @@ Call = Callable[[], object]
 Worlds = VectorEnv[Any, Any, Any]
 ID = "slamgym/LandmarkWorld-v0"
 BARE = "bare Space.step"
+SINGLE = "single world"
 BARE_STEPS = 200  # per call, so that the loop around them costs nothing
+PEERS_SLOWER = 8.0
 EPISODE = 1000  # steps, as learning has them
 MANY = {"layout": "random", "bounds": [-10, -10, 10, 10], "seed": 0, "count": 100}
 
@@ -44,6 +51,8 @@ class Case(NamedTuple):
     """Times the bare step."""
     faster_than: tuple[str, float] | None = None
     """Another case, and at least how many times faster than it."""
+    slower_than: tuple[str, float] | None = None
+    """Another case, and at least how many times slower than it."""
 
 
 def bare() -> Case:
@@ -110,8 +119,29 @@ def stable_baselines_cases() -> dict[str, Case]:
     }
 
 
+def single_case() -> Case:
+    """Step one world, unwrapped, as the peers are."""
+    env = LandmarkWorldEnv("six_landmarks", steps=EPISODE)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(BARE_STEPS)]
+
+    def call() -> None:
+        for action in actions:
+            env.step(action)
+
+    return Case(call, BARE_STEPS)
+
+
 def main() -> int:
-    cases = {BARE: bare()} | world_cases() | flat_cases() | stable_baselines_cases()
+    peers = peer_calls()
+    cases = {BARE: bare(), SINGLE: single_case()}
+    cases |= {
+        name: Case(call, 1, slower_than=(SINGLE, PEERS_SLOWER))
+        for name, call in peers.items()
+        if call is not None
+    }
+    cases |= world_cases() | flat_cases() | stable_baselines_cases()
     calls = {name: case.call for name, case in cases.items()}
     per_call = time_interleaved(calls, rounds=21)
     times = {
@@ -119,7 +149,7 @@ def main() -> int:
         for name in cases
     }
     table = Table(title="one step of one world")
-    for column in ("case", "µs", "× bare", "goal", "", "faster than", "goal", ""):
+    for column in ("case", "µs", "× bare", "goal", "", "than other", "goal", ""):
         table.add_column(column, justify="left" if column == "case" else "right")
     missed = 0
     for name, case in cases.items():
@@ -127,8 +157,13 @@ def main() -> int:
         row += [*_against_bare(times, name, case), *_against_other(times, name, case)]
         missed += row.count("MISSED")
         table.add_row(*row)
-    Console(width=120).print(table)
-    return missed
+    for name in (name for name, call in peers.items() if call is None):
+        table.add_row(name, "not installed")
+    beliefs, of_beliefs = belief_table()
+    console = Console(width=120)
+    console.print(table)
+    console.print(beliefs)
+    return missed + of_beliefs
 
 
 def _against_bare(times: dict[str, list[float]], name: str, case: Case) -> list[str]:
@@ -140,11 +175,16 @@ def _against_bare(times: dict[str, list[float]], name: str, case: Case) -> list[
 
 
 def _against_other(times: dict[str, list[float]], name: str, case: Case) -> list[str]:
-    if case.faster_than is None:
+    if case.faster_than is not None:
+        other, goal = case.faster_than
+        value, word = ratio(times, other, name), "faster"
+    elif case.slower_than is not None:
+        other, goal = case.slower_than
+        value, word = ratio(times, name, other), "slower"
+    else:
         return ["", "", ""]
-    other, goal = case.faster_than
-    value = ratio(times, other, name)
-    return [f"{value:.1f}", f">= {goal:g}", verdict(value, goal, at_least=True)]
+    verdict_on = verdict(value, goal, at_least=True)
+    return [f"{value:.1f} × {word}", f">= {goal:g}", verdict_on]
 
 
 if __name__ == "__main__":

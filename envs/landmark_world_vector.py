@@ -61,6 +61,8 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
     ((3, 28, 2), (3, 3))
     """
 
+    _views: WorldViews | None = None  # here, as close comes even after a refusal
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -87,7 +89,6 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.render_mode = render_mode
-        self._views = None
         if render_mode is not None:
             fps = float(self.metadata["render_fps"])
             self._views = WorldViews(self.scenario, render_mode, fps, num_envs)

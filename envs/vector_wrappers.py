@@ -13,9 +13,7 @@ Array = NDArray[np.float64]
 Infos = dict[str, Any]
 
 
-class FlattenBatch(
-    VectorWrapper[Array, NDArray[Any], dict[str, Any], NDArray[Any], NDArray[Any]]
-):
+class FlattenBatch(VectorWrapper):  # with type parameters since Gymnasium 1.4 only
     """Lays the arrays of every world's observation side by side: (B, D) numbers.
 
     World by world it gives what `gymnasium.wrappers.FlattenObservation` does, keys in

@@ -6,6 +6,7 @@ stated.  Here only independent numbers are added: one per run, or innovations.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -32,10 +33,13 @@ from .time_average_decisions import (
 )
 
 FEW_RUNS = 20
+FEW_AVERAGES = 10
+"""Runs below which the t-test refuses too often to share the 5 %, and has no say."""
 FACTORS = (1.1, 1.2, 1.5)
 _GRID = 10
 _LAGS = 10
 _ERROR_RATE = 0.05
+_MOST_NAMES = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,25 +79,39 @@ class ConsistencyReport:
     def accepted(self) -> bool:
         """Whether no run failed and no NEES decision refuses, wrongly 5 % at most.
 
-        Final step, time averages and grid share the 5 %, after Bonferroni.  NIS is left
-        out: pooled over 10⁵ scans it refuses departures of a few thousandths, which say
+        Final step, time averages and grid share the 5 %, after Bonferroni; below 10
+        runs, the time averages, whose test is not exact, have no say.  NIS is left out:
+        pooled over 10⁵ scans it refuses departures of a few thousandths, which say
         nothing about the errors; so is the bootstrap, which repeats the t-test.
         """
-        p = (self.final_step.p_value, self.time_average.p_value, self.family.p_value)
+        p = (self.final_step.p_value, self.average_p_value, self.family.p_value)
         return not self.failed_runs and min(p) * len(p) >= _ERROR_RATE
+
+    @property
+    def used_runs(self) -> int:
+        """Runs that did not fail."""
+        return self.runs - len(self.failed_runs)
+
+    @property
+    def average_p_value(self) -> float:
+        """The time averages' p as `accepted` counts it: 1 below 10 runs."""
+        return 1.0 if self.used_runs < FEW_AVERAGES else self.time_average.p_value
 
     def warnings(self) -> tuple[str, ...]:
         """Say what weakens the report: failed runs, few runs."""
         found = []
         if self.failed_runs:
-            names = ", ".join(map(str, self.failed_runs))
             count = len(self.failed_runs)
+            names = ", ".join(map(str, self.failed_runs[:_MOST_NAMES]))
+            if count > _MOST_NAMES:
+                names += f" and {count - _MOST_NAMES} more"
             found.append(
                 f"{count} of {self.runs} runs failed and are left out: {names}."
             )
-        used = self.runs - len(self.failed_runs)
-        if used < FEW_RUNS:
-            found.append(f"Only {used} runs: below {FEW_RUNS} little can be shown.")
+        if self.used_runs < FEW_RUNS:
+            found.append(
+                f"Only {self.used_runs} runs: below {FEW_RUNS} little can be shown."
+            )
         return tuple(found)
 
     def sentences(self) -> tuple[str, ...]:
@@ -182,7 +200,7 @@ def consistency_report(
         mean_ratio=float(averages.mean() / dof),
         median_ratio=float(np.median(averages) / dof),
         share_above_3=float(np.mean(averages > 3 * dof)),
-        runs_needed=tuple((factor, runs_to_detect(factor, dof)) for factor in FACTORS),
+        runs_needed=_runs_needed(dof),
     )
 
 
@@ -194,6 +212,11 @@ def assert_consistent(report: ConsistencyReport) -> None:
     """
     if not report.accepted:
         raise AssertionError("not consistent\n" + "\n".join(report.sentences()))
+
+
+@cache
+def _runs_needed(dof: int) -> tuple[tuple[float, int], ...]:
+    return tuple((factor, runs_to_detect(factor, dof)) for factor in FACTORS)
 
 
 class _Scores(NamedTuple):
@@ -233,6 +256,11 @@ def _gaps(
 
 def _sentence(title: str, name: str, decision: Decision) -> str:
     low, high = decision.interval
+    if np.isnan(decision.p_value):
+        return (
+            f"{title}: {name} {decision.statistic:.3f}, nothing decided: too few runs, "
+            "or all equal."
+        )
     return (
         f"{title}: {name} {decision.statistic:.3f}, accepted within "
         f"[{low:.3f}, {high:.3f}], p = {decision.p_value:.2g}: "

@@ -8,7 +8,7 @@ NEES ratios are NEES divided by its degrees of freedom: 1 where the claim is tru
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
 from . import validation
@@ -151,8 +151,8 @@ def whiteness_decision(
 ) -> Decision:
     """Decide whether the NIS is white, by Ljung-Box over all runs.
 
-    Each NIS is made about normal by Wilson and Hilferty's cube root first.  NIS is
-    quadratic: innovations correlated by ρ show as ρ² here, so this finds gross errors;
+    Each NIS is made about normal first, see :func:`normal_scores`.  NIS is quadratic:
+    innovations correlated by ρ show as ρ² here, so this finds gross errors;
     :func:`.consistency.ljung_box` takes normalised innovations where these are at hand.
 
     Parameters
@@ -164,16 +164,44 @@ def whiteness_decision(
     error_rate : float
         Probability of refusing white ones.
     """
-    freedom = np.asarray(degrees_of_freedom, dtype=np.float64)
-    spread = 2 / (9 * np.maximum(freedom, 1))
-    root = np.cbrt(np.asarray(nis) / np.maximum(freedom, 1))
-    scores = np.where(freedom > 0, (root - (1 - spread)) / np.sqrt(spread), np.nan)
-    test = ljung_box(scores, lags=lags)
+    test = ljung_box(normal_scores(nis, degrees_of_freedom), lags=lags)
     limit = float(chi2.ppf(1 - error_rate, lags))
     accepted = test.p_value >= error_rate
     return Decision(
         test.statistic, Band(0.0, limit), test.p_value, accepted, error_rate
     )
+
+
+def normal_scores(
+    chi_squares: ArrayLike, degrees_of_freedom: ArrayLike
+) -> NDArray[np.float64]:
+    """Make chi-square numbers about standard normal by a cube root [1]_.
+
+    Parameters
+    ----------
+    chi_squares : array_like
+        Each >= 0, as NIS or NEES.
+    degrees_of_freedom : array_like, of the same shape
+        n of each.
+
+    Returns
+    -------
+    ndarray, of the same shape
+        nan where there are 0 degrees of freedom.
+
+    References
+    ----------
+    .. [1] E. B. Wilson, M. M. Hilferty, The distribution of chi-square, PNAS 17, 1931.
+
+    Examples
+    --------
+    >>> normal_scores([7.815, 5.991], [3, 2])  # the 95 % points
+    array([1.653..., 1.657...])
+    """
+    freedom = np.asarray(degrees_of_freedom, dtype=np.float64)
+    spread = 2 / (9 * np.maximum(freedom, 1))
+    root = np.cbrt(np.asarray(chi_squares) / np.maximum(freedom, 1))
+    return np.where(freedom > 0, (root - (1 - spread)) / np.sqrt(spread), np.nan)
 
 
 def runs_to_detect(

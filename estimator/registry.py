@@ -18,6 +18,7 @@ from .landmark_management import LandmarkPolicy
 from .managed import ManagedSlam
 from .observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
 from .robocentric import RobocentricEkfSlam
+from .sparse_information import SparseInformationSlam
 from .unscented import UnscentedSlam
 
 EstimatorFactory = Callable[..., SlamEstimator]
@@ -145,5 +146,6 @@ for _name, _factory in {
     "robocentric": RobocentricEkfSlam,
     "ideal": IdealEkfSlam,
     "compressed": CompressedEkfSlam,
+    "sparse_information": SparseInformationSlam,
 }.items():
     register_estimator(_name, _factory)

@@ -17,6 +17,8 @@ from .consistency import Array, Band
 from .decisions import Decision, one_per_run, to_band
 
 EQUIVALENCE_MARGIN = Band(0.8, 1.25)
+FEWEST_RESAMPLED = 5
+"""Runs below which there are too few different resamples for a bootstrap."""
 
 
 class Equivalence(NamedTuple):
@@ -70,7 +72,9 @@ def bootstrap_decision(
     """Decide on the per-run time averages by the studentised bootstrap.
 
     The percentile bootstrap would refuse 9 to 11 % of 50 to 20 runs where NEES hardly
-    changes over time.
+    changes over time.  Resamples of one run only, which have no spread to divide by,
+    are left out.  Below 5 runs, or where all averages are equal, nothing is decided:
+    the p-value is nan, and any mean is accepted.
 
     Parameters
     ----------
@@ -83,14 +87,16 @@ def bootstrap_decision(
     """
     ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
     mean, error = _mean_and_error(ratios)
+    if len(ratios) < FEWEST_RESAMPLED or np.ptp(ratios) == 0:
+        return Decision(mean, Band(-np.inf, np.inf), np.nan, True, error_rate)
     drawn = ratios[rng.integers(0, len(ratios), (resamples, len(ratios)))]
+    drawn = drawn[np.ptp(drawn, axis=1) > 0]
     errors = drawn.std(axis=1, ddof=1) / np.sqrt(len(ratios))
-    offsets = drawn.mean(axis=1) - mean
-    scores = np.sort(offsets / np.maximum(errors, np.finfo(float).tiny))
-    score = (mean - 1) / error if error else np.inf
+    scores = np.sort((drawn.mean(axis=1) - mean) / errors)
+    score = (mean - 1) / error
     below = np.searchsorted(scores, score, "right")
-    above = resamples - np.searchsorted(scores, score, "left")
-    p_value = min(1.0, 2 * (1 + min(below, above)) / (resamples + 1))
+    above = len(scores) - np.searchsorted(scores, score, "left")
+    p_value = min(1.0, 2 * (1 + min(below, above)) / (len(scores) + 1))
     ends = 1 + error * np.quantile(scores, [error_rate / 2, 1 - error_rate / 2])
     return Decision(mean, to_band(ends), p_value, p_value >= error_rate, error_rate)
 

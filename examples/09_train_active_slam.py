@@ -8,13 +8,17 @@ filter, run side by side in this one process.  Needs Stable-Baselines3::
 
 Run it::
 
-    python examples/09_train_active_slam.py                    # some ten minutes
+    python examples/09_train_active_slam.py      # some eight minutes of a core's time
     python examples/09_train_active_slam.py --steps 100000 --maps 10    # a taste
 
 It writes into ``results/09_train_active_slam``: ``policy.zip``, which is then read
 back to be judged; ``learning_curve.csv`` and ``.png``; ``scores.txt``, the table of
-policy and baselines over maps that training never saw; and ``trajectories.png``, what
+policy and baselines over maps that neither training nor any choice saw, and by how much
+the policy differs from each baseline on the same maps; and ``trajectories.png``, what
 they all do on one of these maps.
+
+On 100 maps of ``active_medium`` a policy of two million steps earns 15.1 ± 0.6,
+coverage 13.5 ± 0.7, greedy 11.2 ± 1.1 and chance -1.6 ± 0.5: see docs/active_slam.md.
 """
 
 import argparse
@@ -37,8 +41,8 @@ from slamgym.agents.active_slam_scores import (
     HELD_OUT,
     Episode,
     Policy,
+    difference_lines,
     driven_by,
-    mean_difference,
     mean_of,
     play_all,
     score_table,
@@ -115,7 +119,7 @@ def load_policy(path: Path) -> Policy:
 def play_everyone(
     env: ActiveSlamEnv, policy: Policy, maps: int
 ) -> dict[str, list[Episode]]:
-    """Let policy and baselines play the same maps, none of them trained on."""
+    """Let policy and baselines play the same maps, none of them trained or tuned on."""
     seeds = range(HELD_OUT, HELD_OUT + maps)
     players = {"ppo": policy}
     for name in BASELINES:
@@ -196,12 +200,9 @@ def main() -> None:
         writer.writerows(curve)
     env = ActiveSlamEnv(given.scenario)
     played = play_everyone(env, load_policy(FOLDER / "policy.zip"), given.maps)
-    table = score_table(played)
-    print(f"{given.scenario}, {given.maps} maps that training never saw:\n{table}")
-    for name in BASELINES:
-        more = mean_difference(played["ppo"], played[name], "total")
-        print(f"on the same map ppo earns {more} more than {name}")
-    (FOLDER / "scores.txt").write_text(table + "\n", encoding="utf-8")
+    scores = f"{score_table(played)}\n{difference_lines(played, 'ppo')}"
+    print(f"{given.scenario}, {given.maps} maps that training never saw:\n{scores}")
+    (FOLDER / "scores.txt").write_text(scores + "\n", encoding="utf-8")
     draw_curve(curve, played).savefig(FOLDER / "learning_curve.png", dpi=120)
     draw_trajectories(env, played).savefig(FOLDER / "trajectories.png", dpi=100)
     print(f"wrote {FOLDER}")

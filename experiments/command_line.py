@@ -199,20 +199,23 @@ def monte_carlo(
     backend: options.Backend = None,
     scheduler: options.Scheduler = None,
     block_size: options.RunsPerBlock = 64,
+    first_run: options.FirstRun = 0,
+    merge: options.MergedFolders = None,
+    fresh: options.Fresh = False,
     out: options.ResumableFolder = None,
     as_json: options.AsJson = False,
-) -> None:
+) -> int:
     """Run many times, measure and decide."""
     from .commands import monte_carlo_runs, worlds  # noqa: PLC0415 (heavy)
 
-    monte_carlo_runs.run_monte_carlo(
+    return monte_carlo_runs.run_monte_carlo(
         worlds.chosen_scenario(scenario, steps=steps, sets=set_ or []),
         estimators,
         runs=runs,
         seed=seed,
         assumed=changes("--assume", assume or []),
         workers=monte_carlo_runs.Workers(jobs, backend, scheduler),
-        block_size=block_size,
+        blocks=monte_carlo_runs.Blocks(block_size, first_run, merge or [], fresh),
         out=out,
         as_json=as_json,
     )

@@ -10,22 +10,24 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-import xarray as xr
 
 from ..sim_configs import Scenario, load_scenario
 from ..sim_configs.scenario_errors import closest
 from .filter_settings import SIGMAS
 from .monte_carlo import monte_carlo
+from .monte_carlo.known_values import mean, quotient, root_mean_square, standard_error
+from .monte_carlo.scores import EstimatorScores, labels_of, scores_of
 from .noise_study import FACTORS, scaled_scenario
 
 Changed = Literal["both", "world", "filter"]
 CHANGED: tuple[Changed, ...] = get_args(Changed)
 
-_DIVERGED = 1e6  # [m]
-
 
 class NoiseEffect(NamedTuple):
-    """What an estimator made of one change; averages over runs and steps."""
+    """What an estimator made of one change; averages over runs and steps.
+
+    nan where too few runs did not fail.
+    """
 
     changed: str
     """Where: both, world or filter; "nothing" for the reference."""
@@ -38,9 +40,12 @@ class NoiseEffect(NamedTuple):
     runs: int
     """That the figures are made of."""
     failed: int
-    """That failed or diverged, and are left out."""
+    """That failed, or whose NEES or NIS is not finite or above 1e100: left out."""
     nees_per_degree: float
     """Of the pose, invariant frame; 1 is right."""
+    nees_per_degree_error: float
+    """Its standard error: of the mean of the runs' own averages, which alone are
+    independent."""
     nees_per_degree_median: float
     """Of the runs' own averages, which a few bad runs do not rule."""
     nis_per_degree: float
@@ -119,8 +124,8 @@ def noise_effects(
             backend=backend,
         )
         effects += [
-            _effect(variation, results.sel(estimator=label))
-            for label in results.estimator.values
+            _effect(variation, scores_of(results, label, "invariant"))
+            for label in labels_of(results)
         ]
         if progress is not None:
             progress((done + 1) * runs, len(variations) * runs)
@@ -148,26 +153,28 @@ def _variations(world: Scenario, changed: list[Changed]) -> Iterator[_Variation]
                 )
 
 
-def _effect(variation: _Variation, results: xr.Dataset) -> NoiseEffect:
-    later = results.isel(step=slice(1, None))
-    sound = ~results.failed & (later.position_error < _DIVERGED).all("step")
-    kept = later.isel(run=np.flatnonzero(sound))
-    nees = kept.pose_nees_invariant / 3
+def _effect(variation: _Variation, scores: EstimatorScores) -> NoiseEffect:
+    per_run = scores.ratios("invariant").mean(axis=1)
+    freedom = scores.over_time("nis_dof")
+    nis = np.where(freedom > 0, scores.over_time("nis"), 0.0)
     return NoiseEffect(
         *variation[:3],
-        estimator=str(results.estimator.values),
-        runs=int(sound.sum()),
-        failed=int((~sound).sum()),
-        nees_per_degree=float(nees.mean()),
-        nees_per_degree_median=float(nees.mean("step").median()),
-        nis_per_degree=float(kept.nis.sum() / max(int(kept.nis_dof.sum()), 1)),
-        position_rmse=float(np.sqrt((kept.position_error**2).mean())),
-        ate_aligned=_rms(kept.ate_aligned),
-        landmark_rmse_aligned=_rms(kept.landmark_rmse_aligned),
-        pose_area=float(kept.pose_area.mean()),
-        landmark_area=float(kept.landmark_area.mean()),
+        estimator=scores.label,
+        runs=len(per_run),
+        failed=len(scores.failures),
+        nees_per_degree=_known(mean(per_run)),
+        nees_per_degree_error=_known(standard_error(per_run)),
+        nees_per_degree_median=float(np.median(per_run)) if len(per_run) else np.nan,
+        nis_per_degree=_known(quotient(nis, freedom)),
+        position_rmse=_known(root_mean_square(scores.over_time("position_error"))),
+        ate_aligned=_known(root_mean_square(scores.per_run("ate_aligned"))),
+        landmark_rmse_aligned=_known(
+            root_mean_square(scores.per_run("landmark_rmse_aligned"))
+        ),
+        pose_area=_known(mean(scores.per_run("pose_area"))),
+        landmark_area=_known(mean(scores.per_run("landmark_area"))),
     )
 
 
-def _rms(values: xr.DataArray) -> float:
-    return float(np.sqrt((values**2).mean()))
+def _known(value: float | None) -> float:
+    return np.nan if value is None else value

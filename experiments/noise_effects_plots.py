@@ -1,7 +1,9 @@
 """The picture of a noise study over many runs."""
 
+import math
 from collections.abc import Sequence
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -22,6 +24,8 @@ _SHIFT = 0.28  # of the rows, between × 10 and ÷ 10
 def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
     """Draw the NEES per degree of freedom after every change, a panel for each place.
 
+    Bars are one standard error long to either side.
+
     Parameters
     ----------
     effects : sequence of NoiseEffect
@@ -38,7 +42,10 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
     rows = ("none", *SIGMAS)
     all_axes[0, 0].set_yticks(range(len(rows)), ("unchanged", *SIGMAS))
     all_axes[0, 0].set_ylim(len(rows) - 0.5, -0.5)
-    figure.supxlabel("pose NEES / 3, mean over runs and steps; 1 is right", fontsize=10)
+    figure.supxlabel(
+        "mean pose NEES / 3 ± standard error; 1 is right",
+        fontsize=10,
+    )
     figure.legend(
         handles=[*_keys(labels)],
         loc="outside upper left",
@@ -56,9 +63,13 @@ def _draw(axes: Axes, effects: Sequence[NoiseEffect], labels: list[str]) -> None
     for effect in effects:
         look = look_of(labels.index(effect.estimator))
         shift = 0.0 if effect.factor == 1 else -_SHIFT if effect.factor > 1 else _SHIFT
+        row, error = rows[effect.sigma] + shift, effect.nees_per_degree_error
+        if math.isfinite(error):
+            ends = effect.nees_per_degree + error * np.array([-1.0, 1.0])
+            axes.plot(ends, [row, row], color=look.colour, lw=1.6, zorder=1.9)
         axes.plot(
             effect.nees_per_degree,
-            rows[effect.sigma] + shift,
+            row,
             look.marker,
             color=look.colour,
             ms=6.5,

@@ -15,7 +15,7 @@ import slamgym  # noqa: F401 (registers the environments)
 from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
 from slamgym.agents.active_slam_baselines import BASELINES, lanes_of, make_baseline
 from slamgym.agents.active_slam_scores import (
-    HELD_OUT,
+    VALIDATION,
     Episode,
     driven_by,
     mean_of,
@@ -425,7 +425,9 @@ def scores():
     played = {}
     for name in BASELINES:
         driver = make_baseline(name, env.scenario, np.random.default_rng(0))
-        played[name] = play_all(env, driven_by(driver), range(HELD_OUT, HELD_OUT + 8))
+        played[name] = play_all(
+            env, driven_by(driver), range(VALIDATION, VALIDATION + 8)
+        )
     return played
 
 
@@ -446,7 +448,7 @@ def test_those_who_plan_do_not_touch_a_wall(scores):
 def test_a_baseline_does_the_same_again(name, scores):
     env = ActiveSlamEnv("active_easy")
     driver = make_baseline(name, env.scenario, np.random.default_rng(0))
-    again = play(env, driven_by(driver), HELD_OUT)
+    again = play(env, driven_by(driver), VALIDATION)
     np.testing.assert_array_equal(again.path, scores[name][0].path)
 
 
@@ -562,7 +564,10 @@ def test_the_example_trains_saves_reads_back_and_draws(tmp_path, monkeypatch, ca
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", [str(example), *few, "--scenario", "active_easy"])
     runpy.run_path(str(example), run_name="__main__")
-    assert "ppo" in capsys.readouterr().out
+    scores = tmp_path / "results" / "09_train_active_slam" / "scores.txt"
+    table = scores.read_text(encoding="utf-8")
+    assert table in capsys.readouterr().out
+    assert all(f"\nppo - {name}: return " in table for name in BASELINES)
     written = {path.name for path in (tmp_path / "results").rglob("*.*")}
     assert written >= {
         "policy.zip",

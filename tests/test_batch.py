@@ -123,7 +123,13 @@ def test_memory_is_little_more_than_the_covariances():
 @pytest.mark.parametrize("name", list_estimators())
 def test_a_filter_either_runs_in_batches_or_says_that_it_cannot(name):
     settings = {"runs": 2, "landmarks": 3, **NOISE}
-    if name in ("unscented", "robocentric", "ideal", "compressed"):
+    if name in (
+        "unscented",
+        "robocentric",
+        "ideal",
+        "compressed",
+        "sparse_information",
+    ):
         with pytest.raises(ValueError, match="cannot run in batches"):
             make_batch(name, **settings)
     else:

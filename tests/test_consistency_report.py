@@ -75,6 +75,32 @@ def test_few_runs_are_warned_of(scores, runs, warned):
     assert any("Only 19 runs" in line for line in found.warnings()) == warned
 
 
+def test_below_10_runs_the_time_averages_have_no_say():
+    nees = np.full((9, 5), 3.8) + 0.02 * np.arange(9)[:, None]  # far too much alike
+    nis, freedom = np.random.default_rng(3).chisquare(2, (9, 5)), np.full((9, 5), 2)
+    few = report(nees, nis, freedom)
+    assert few.time_average.p_value < 0.001
+    assert few.final_step.p_value > 0.02
+    assert few.accepted
+    many = report(*(np.concatenate([a, a[:1]]) for a in (nees, nis, freedom)))
+    assert not many.accepted
+
+
+def test_a_bootstrap_of_too_few_runs_says_so(scores):
+    lines = report(*(array[:3] for array in scores)).sentences()
+    (line,) = (line for line in lines if "bootstrap" in line)
+    assert line.endswith("nothing decided: too few runs, or all equal.")
+
+
+def test_many_failed_runs_are_not_all_named(scores):
+    nees, nis, freedom = scores
+    nees[:60, 5] = np.nan
+    assert report(nees, nis, freedom).warnings()[0] == (
+        "60 of 100 runs failed and are left out: 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 50 "
+        "more."
+    )
+
+
 def test_every_nees_sentence_names_the_frame(scores):
     lines = report(*scores, frame="additive").sentences()
     assert sum("additive frame" in line for line in lines) == 6

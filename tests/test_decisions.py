@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from linear_filter import kalman_scores
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from slamgym.estimator.consistency import average_band, ljung_box
 from slamgym.estimator.decisions import (
@@ -11,6 +11,7 @@ from slamgym.estimator.decisions import (
     family_decision,
     final_step_decision,
     nis_decision,
+    normal_scores,
     runs_to_detect,
     whiteness_decision,
 )
@@ -143,6 +144,34 @@ def test_the_family_band_is_wider_for_more_times():
 )
 def test_runs_to_detect_a_factor(factor, runs):
     assert runs_to_detect(factor, DOF) == runs
+
+
+@pytest.mark.parametrize("runs", range(2, 8))
+def test_the_bootstrap_of_few_runs_is_finite_or_decides_nothing(runs):
+    rng = np.random.default_rng(9)
+    for averages in rng.chisquare(DOF, (30, runs)):
+        decision = bootstrap_decision(averages, DOF, rng=rng)
+        assert decision.statistic == pytest.approx(averages.mean() / DOF)
+        if runs < 5:
+            assert np.isnan(decision.p_value)
+            assert decision.accepted
+        else:
+            assert 0 < decision.p_value <= 1
+            assert np.abs(decision.interval).max() < 1e6
+
+
+def test_the_bootstrap_of_runs_that_are_all_equal_decides_nothing():
+    averages = np.full(7, 0.1)  # whose mean is not 0.1 to the last bit
+    decision = bootstrap_decision(averages, DOF, rng=np.random.default_rng(9))
+    assert np.isnan(decision.p_value)
+
+
+def test_normal_scores_have_the_quantiles_of_a_normal():
+    for dof in (10, 30, 100):
+        x = chi2.ppf([0.025, 0.5, 0.975], dof)
+        expected = norm.ppf([0.025, 0.5, 0.975])
+        np.testing.assert_allclose(normal_scores(x, [dof] * 3), expected, atol=0.03)
+    assert np.isnan(normal_scores([1.0], [0]))
 
 
 def test_equivalence_has_three_verdicts():

@@ -1,5 +1,6 @@
 """The report as a web page: whole, safe, alone, and seen in a real browser."""
 
+import ast
 import html
 import json
 import re
@@ -8,17 +9,21 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+import xarray as xr
 from chromium import find_chromium, requests_of, run_chromium, screenshot
 from monte_carlo_dataset import typical, with_failures
 from PIL import Image
 
 from slamgym.experiments.monte_carlo import html_report as module
+from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.html_report import (
     headline,
     html_report,
     write_html_report,
 )
 from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
+from slamgym.experiments.noise_study import scaled_scenario
+from slamgym.sim_configs import load_scenario
 
 needs_chromium = pytest.mark.skipif(
     find_chromium() is None, reason="no chromium here (SLAMGYM_CHROMIUM may name one)"
@@ -174,11 +179,47 @@ def test_runs_that_all_failed_leave_a_page_without_figures():
     assert page.count("boom") == 80
 
 
-def test_without_a_command_the_call_is_told():
-    dataset = typical().copy()
-    dataset.attrs["command"] = ""
-    call = "monte_carlo('six_landmarks', ['ekf', 'invariant'], runs=40, seed=0)"
-    assert call in html.unescape(page_of(dataset))
+def call_on(page, folder):
+    """Follow the page: save the scenarios that it shows, and run its call there."""
+    (code,) = re.findall(r'<pre class="command"[^>]*><code>(.*?)</code>', page, re.S)
+    code = html.unescape(code)
+    titled = r"<summary>[^<]*, (\w+\.toml)</summary>\n<pre[^>]*><code>(.*?)</code>"
+    for name, text in re.findall(titled, page, re.S):
+        if repr(name) in code:
+            assert f"save {name!r}" in code or f"and {name!r}" in code
+            (folder / name).write_text(html.unescape(text), encoding="utf-8")
+    last = ast.parse(code).body.pop()
+    names = {}
+    exec(code.removesuffix(ast.get_source_segment(code, last)), names)
+    return eval(ast.get_source_segment(code, last), names), code
+
+
+@pytest.mark.parametrize("changes", [{}, {"steps": 5}, {"name": "my_own"}])
+@pytest.mark.parametrize("assumed", [False, True])
+@pytest.mark.parametrize(
+    "estimators",
+    [
+        "ekf,invariant",
+        "invariant[iterations=3]",
+        {"mine": ("ekf", {"gate_probability": 0.99})},
+    ],
+)
+def test_the_call_on_the_page_makes_the_same_results(
+    changes, assumed, estimators, tmp_path, monkeypatch
+):
+    world = load_scenario("six_landmarks").with_changes(**changes)
+    told = scaled_scenario(world, "σr", 10) if assumed else None
+    done = monte_carlo(world, estimators, 3, 4, assumed=told, block_size=2)
+    monkeypatch.chdir(tmp_path)
+    again, code = call_on(page_of(done), tmp_path)
+    xr.testing.assert_identical(again, done)
+    assert ("toml" in code) == (bool(changes) or assumed)
+
+
+def test_the_call_of_a_later_part_of_the_runs_makes_that_part(tmp_path):
+    done = monte_carlo("six_landmarks", "ekf", 5, 4, block_size=2, first_run=2)
+    again, _ = call_on(page_of(done), tmp_path)
+    xr.testing.assert_identical(again, done)
 
 
 def test_many_estimators_are_counted_in_the_headline():
@@ -271,6 +312,42 @@ def test_the_page_does_not_scroll_sideways(report, tmp_path, width):
     assert all(wide >= min(0.9 * (width - 32), 400) for _, _, wide, _ in boxes)
 
 
+@needs_chromium
+def test_two_estimators_fit_a_telephone_and_more_of_them_show_that_they_scroll(
+    report, tmp_path
+):
+    wide, room = number_table(framed(report, tmp_path, 390))
+    assert wide <= room
+    four = typical().isel(estimator=[0, 1, 0, 1]).assign_coords(estimator=list("abcd"))
+    four.attrs["estimators"] = "{}"
+    path = tmp_path / "four.html"
+    path.write_text(page_of(four), encoding="utf-8")
+    wide, room = number_table(framed(path, tmp_path, 390))
+    assert wide > room
+    assert shade_beside_the_table(path, tmp_path) > 60
+    assert shade_beside_the_table(report, tmp_path) < 20
+
+
+def number_table(page):
+    """Width of the main table, and the room that it has [px]."""
+    dom, _ = run_chromium(page, "--dump-dom")
+    table = json.loads(re.search(r"<pre>(.*?)</pre>", dom)[1])["table"]
+    return table["scroll"], table["client"]
+
+
+def shade_beside_the_table(report, folder):
+    """How much darker than the paper the table's right end is, where it is empty."""
+    page = framed(report, folder, 390)
+    dom, _ = run_chromium(page, "--dump-dom")
+    table = json.loads(re.search(r"<pre>(.*?)</pre>", dom)[1])["table"]
+    screenshot(page, folder / "table.png", size=(500, 3000))
+    with Image.open(folder / "table.png") as picture:
+        pixels = np.asarray(picture.convert("L")).astype(float)
+    top, right = int(table["top"]), int(table["left"] + table["client"])
+    column = pixels[top + 50 : top + 400, right - 3]
+    return pixels[2, 2] - np.median(column)
+
+
 def figure_boxes(report, folder, width):
     """Place of every figure on a page so wide: (left, top, width, height) [px]."""
     dom, _ = run_chromium(framed(report, folder, width), "--dump-dom")
@@ -293,7 +370,16 @@ frame.onload = () => {{
     return [box.left, box.top, box.width, box.height];
   }});
   const scroll = inner.documentElement.scrollWidth;
-  document.querySelector("pre").textContent = JSON.stringify({{ boxes, scroll }});
+  const wide = inner.querySelector(".wide"), place = wide.getBoundingClientRect();
+  const outer = frame.getBoundingClientRect();
+  const table = {{
+    client: wide.clientWidth,
+    scroll: wide.scrollWidth,
+    left: place.left + outer.left,
+    top: place.top + outer.top,
+  }};
+  document.querySelector("pre").textContent =
+    JSON.stringify({{ boxes, scroll, table }});
 }};
 </script>""",
         encoding="utf-8",

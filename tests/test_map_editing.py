@@ -161,8 +161,9 @@ def test_a_removed_landmark_is_not_missed_by_the_rest(name):
             slam.update(readings[others], others)
     one, other = removed.belief(), marginal(kept, others)
     assert one.landmark_ids == other.landmark_ids
-    np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-12)
+    rounding = 1e-11 if name == "sparse_information" else 1e-12  # Λ is ill-conditioned
+    np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=rounding)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=rounding)
 
 
 def volume(belief):

@@ -1,19 +1,23 @@
 """The Monte Carlo runner: same bits however it is run, and what it says of rubbish."""
 
+import errno
 import os
 import resource
 import signal
 import subprocess
 import sys
 import textwrap
+import time
 import tracemalloc
+import zipfile
 
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
 
 from slamgym.envs.controllers import make_controller
-from slamgym.estimator import EkfSlam, make_estimator
+from slamgym.estimator import Belief, EkfSlam, make_estimator
 from slamgym.estimator.consistency import pose_nees, state_nees
 from slamgym.experiments.filter_settings import settings_for
 from slamgym.experiments.monte_carlo import monte_carlo
@@ -183,32 +187,138 @@ def test_more_runs_build_on_those_there_are(whole, tmp_path):
         xr.testing.assert_equal(fewer.load(), whole.isel(run=slice(0, 18)))
 
 
-def test_blocks_of_two_machines_are_one_job(whole, tmp_path):
+def test_parts_of_two_machines_are_one_job(whole, tmp_path):
     job = {"estimators": "ekf,invariant", "block_size": 8}
-    for name, runs in (("a", 8), ("b", RUNS)):
-        monte_carlo("six_landmarks", runs=runs, out=tmp_path / name, **job).close()
-    (tmp_path / "b" / "blocks" / "runs-0000000-0000008.npz").unlink()
-    merge_blocks([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
+    one, two, both = (tmp_path / name for name in ("one", "two", "both"))
+    monte_carlo("six_landmarks", runs=12, out=one, **job).close()
+    with monte_carlo("six_landmarks", runs=RUNS, first_run=8, out=two, **job) as part:
+        xr.testing.assert_equal(part.load(), whole.isel(run=slice(8, None)))
+    merge_blocks([str(one), two], str(both))
     done = []
     with monte_carlo(
         "six_landmarks",
         runs=RUNS,
-        out=tmp_path / "both",
+        out=both,
         progress=lambda runs, of: done.append(runs),
         **job,
-    ) as both:
-        xr.testing.assert_equal(both.load(), whole)
+    ) as merged:
+        xr.testing.assert_equal(merged.load(), whole)
     assert done == [RUNS]  # there was nothing left to do
-    monte_carlo("loop", "ekf", 1, out=tmp_path / "c").close()
-    with pytest.raises(ValueError, match="c holds results of scenario"):
-        merge_blocks([tmp_path / "a", tmp_path / "c"], tmp_path / "d")
+
+
+def test_only_parts_of_one_job_are_merged(tmp_path):
+    monte_carlo("six_landmarks", "ekf", 1, out=tmp_path / "a").close()
+    monte_carlo("loop", "ekf", 1, out=tmp_path / "b").close()
+    with pytest.raises(ValueError, match="b holds results of scenario"):
+        merge_blocks([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+    with pytest.raises(ValueError, match="at least one folder"):
+        merge_blocks([], tmp_path / "c")
+    (block,) = (tmp_path / "a" / "blocks").iterdir()
+    block.write_bytes(block.read_bytes()[:-9])
+    with pytest.raises(ValueError, match="truncated"):
+        merge_blocks([tmp_path / "a"], tmp_path / "c")
+    with pytest.raises(ValueError, match="first_run must be a multiple"):
+        monte_carlo("six_landmarks", "ekf", 20, first_run=5)
+
+
+def test_a_filter_that_has_changed_is_not_mixed_with_what_it_was(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    source = tmp_path / "changing_filter.py"
+    text = "from slamgym.estimator import EkfSlam\nclass Mine(EkfSlam):\n    pass\n"
+    source.write_text(text)
+    asked = ("six_landmarks", "changing_filter:Mine", 2)
+    monte_carlo(*asked, out=tmp_path / "out").close()
+    monte_carlo(*asked, out=tmp_path / "out").close()
+    source.write_text(text + "# repaired\n")
+    with pytest.raises(ValueError, match=r"holds results of code .*ask for fresh"):
+        monte_carlo(*asked, out=tmp_path / "out")
+    done = []
+    monte_carlo(
+        *asked,
+        out=tmp_path / "out",
+        fresh=True,
+        progress=lambda runs, of: done.append(runs),
+    ).close()
+    assert done == [0, 2]
+
+
+class ForeignIds(OneByOne):
+    """Names a landmark that there is not, in some of the runs."""
+
+    def belief(self):
+        belief = super().belief()
+        ids = belief.landmark_ids
+        if belief.mean[0] < 7:
+            ids = (106, *ids[1:])
+        return Belief(belief.mean, belief.covariance, ids)
+
+
+class LeavesTheProgram(OneByOne):
+    def update(self, measurements, landmark_ids=None):
+        raise SystemExit(3)
+
+
+class UnknownMap(OneByOne):
+    """Its map's covariance is not a number."""
+
+    def belief(self):
+        belief = super().belief()
+        covariance = belief.covariance.copy()
+        covariance[3:, 3:] = np.nan
+        return Belief(belief.mean, covariance, belief.landmark_ids)
+
+
+def test_a_belief_that_is_no_map_of_the_world_ends_its_own_run_only(whole):
+    filters = {
+        "foreign": ForeignIds,
+        "gone": LeavesTheProgram,
+        "blind": UnknownMap,
+        "ekf": "ekf",
+    }
+    results = monte_carlo("six_landmarks", filters, RUNS)
+    failed = results.failed.sum("run")
+    assert 0 < failed.sel(estimator="foreign") < RUNS
+    assert failed.sel(estimator="gone") == RUNS
+    assert failed.sel(estimator="blind") == RUNS
+    said = [set(results.message.sel(estimator=name).values) for name in filters]
+    assert any("landmark_ids must be different ones of 0 … 5" in m for m in said[0])
+    assert said[1] == {"SystemExit: 3"}
+    assert said[2] == {"the belief about the map is not finite"}
+    xr.testing.assert_equal(
+        results.sel(estimator=["ekf"]), whole.sel(estimator=["ekf"])
+    )
+
+
+def test_a_block_that_cannot_be_read_for_now_is_not_touched(tmp_path, monkeypatch):
+    job = {"estimators": "ekf", "runs": 2, "out": tmp_path}
+    monte_carlo("six_landmarks", **job).close()
+    (block,) = (tmp_path / "blocks").iterdir()
+    before = block.read_bytes()
+
+    def busy(*_):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(zipfile.ZipFile, "testzip", busy)
+        with pytest.raises(OSError, match="Too many open files"):
+            monte_carlo("six_landmarks", **job)
+    assert block.read_bytes() == before
+
+
+def test_a_disk_that_fills_under_the_results_says_so(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise RuntimeError("NetCDF: HDF error")
+
+    monkeypatch.setattr(netCDF4, "Dataset", full)
+    with pytest.raises(OSError, match=r"results\.nc cannot be written: .*blocks stay"):
+        monte_carlo("six_landmarks", "ekf", 2, out=tmp_path)
+    assert list((tmp_path / "blocks").glob("runs-*.npz"))
 
 
 KILLED = textwrap.dedent(
     """
     import sys
     from slamgym.experiments.monte_carlo import monte_carlo
-    print("ready", flush=True)
     monte_carlo("six_landmarks", "ekf,invariant", 20, block_size=1, out=sys.argv[1])
     """
 )
@@ -216,20 +326,18 @@ KILLED = textwrap.dedent(
 
 def test_a_job_killed_ten_times_ends_with_the_same_bits(whole, tmp_path):
     rng = np.random.default_rng(0)
-    kills = 0
-    while kills < 10:
-        child = subprocess.Popen(
-            [sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE
-        )
-        with child:
-            child.stdout.readline()
-            try:
-                child.wait(timeout=float(rng.uniform(0, 0.15)))
-            except subprocess.TimeoutExpired:
-                child.send_signal(signal.SIGKILL)
-        kills += 1
-        if child.returncode == 0:
-            (tmp_path / "blocks" / f"runs-{kills:07d}-{kills + 1:07d}.npz").unlink()
+    blocks = tmp_path / "blocks"
+    stood = []
+    for _ in range(10):
+        before = len(list(blocks.glob("runs-*.npz")))
+        with subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path)]) as child:
+            while child.poll() is None:
+                if len(list(blocks.glob("runs-*.npz"))) > before:
+                    time.sleep(float(rng.uniform(0, 0.004)))  # some time in the next
+                    child.send_signal(signal.SIGKILL)
+                    break
+        stood.append(len(list(blocks.glob("runs-*.npz"))))
+    assert len({count for count in stood if 0 < count < RUNS}) >= 5  # in the middle
     with monte_carlo(
         "six_landmarks", "ekf,invariant", RUNS, block_size=1, out=tmp_path
     ) as resumed:
@@ -243,7 +351,7 @@ def test_a_broken_block_is_named_and_done_again(whole, tmp_path):
     block.write_bytes(block.read_bytes()[:-100])
     done = []
     with (
-        pytest.warns(UserWarning, match="runs-0000008-0000016.npz is truncated"),
+        pytest.warns(UserWarning, match=r"runs-0000008-0000016\.npz is truncated"),
         monte_carlo(
             "six_landmarks",
             runs=RUNS,
@@ -307,7 +415,10 @@ def test_memory_grows_with_the_block_and_not_with_the_runs(tmp_path):
         ({"estimators": ""}, "must name at least one"),
         ({"estimators": "ekf[iterations"}, "must be like ekf or invariant"),
         ({"estimators": "ekf[speed=3]"}, "refuses its options"),
-        ({"jobs": 0}, "jobs must be >= 1"),
+        ({"jobs": 0}, "jobs must be an integer >= 1"),
+        ({"jobs": 2.5}, "jobs must be an integer >= 1"),
+        ({"seed": 2**63}, "seed must be"),
+        ({"estimators": None}, "estimators must be names"),
         ({"backend": "lokey"}, "did you mean 'loky'"),
         ({"block_size": 0}, "block_size must be"),
         ({"scenario": "hidden_identities"}, "must not hide identities"),

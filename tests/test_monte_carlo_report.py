@@ -1,24 +1,30 @@
 """The numbers, the words, the table and the figures of a Monte Carlo."""
 
+import html
 import io
 import itertools
 import json
+import re
 
 import numpy as np
 import pytest
-from monte_carlo_dataset import typical, with_failures
+from monte_carlo_dataset import FILTERS, typical, with_failures
 from rich.console import Console
 from scipy.stats import chi2
 
 from slamgym.estimator.consistency_report import consistency_report
+from slamgym.estimator.decisions import family_band
+from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.estimator_lines import look_of, thinned
+from slamgym.experiments.monte_carlo.html_report import html_report
 from slamgym.experiments.monte_carlo.nis_plots import nis_autocorrelation, pooled_nis
 from slamgym.experiments.monte_carlo.plots import report_figures
 from slamgym.experiments.monte_carlo.run_measures import VARIABLES
 from slamgym.experiments.monte_carlo.scores import scores_of
 from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
-from slamgym.experiments.monte_carlo.table import monte_carlo_table
-from slamgym.experiments.monte_carlo.verdict import judge
+from slamgym.experiments.monte_carlo.table import measures, monte_carlo_table
+from slamgym.experiments.monte_carlo.verdict import KINDS, judge
+from slamgym.sim_configs import load_scenario
 
 FAILURES = (
     ("invariant", 3, 12, "LinAlgError: not positive definite"),
@@ -161,6 +167,48 @@ def test_verdicts_on_white_nees(factor, runs, word, said):
     assert said in verdict.reason
 
 
+@pytest.mark.parametrize("runs", [2, 3, 5, 10, 20])
+def test_few_runs_of_a_consistent_filter_are_called_wrong_in_5_percent(runs):
+    """NEES that never changes over time is the hardest case: as skewed as can be."""
+    repetitions = 1000
+    rng = np.random.default_rng(13)
+    dof = np.full((runs, 4), 2)
+    wrong = 0
+    for _ in range(repetitions):
+        nees = np.repeat(rng.chisquare(3, (runs, 1)), 4, axis=1)
+        nis = rng.chisquare(2, (runs, 4))
+        report = consistency_report(nees, nis, dof, frame="invariant", rng=rng)
+        found = judge(report, 0, runs).word == "not consistent"
+        assert not (found and report.accepted)
+        wrong += found
+    assert wrong <= 0.05 * repetitions
+
+
+@pytest.mark.parametrize("runs", [3, 5, 9])
+def test_few_runs_of_a_filter_that_is_far_off_are_found(runs):
+    assert judge(white_report(8.0, runs), 0, runs).word == "not consistent"
+
+
+@pytest.mark.parametrize("runs", range(2, 7))
+def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs):
+    world = load_scenario("six_landmarks").with_changes(steps=12)
+    for seed in (0, 5, 9):
+        dataset = monte_carlo(world, "ekf", runs, seed)
+        summary = summarise_monte_carlo(dataset)
+        json.dumps(summary, allow_nan=False)
+        bootstrap = summary["estimators"]["ekf"]["decisions"]["bootstrap"]
+        assert (bootstrap["p_value"] is None) == (runs < 5)
+        page = html_report(dataset, summary)
+        (row,) = re.findall(r"Time averages, bootstrap</th>(.*?)</tr>", page)
+        if runs < 5:
+            assert row.count("<td>–</td>") == 3
+        assert not re.findall(
+            r"\d{9}", html.unescape(re.sub(r"<svg.*?</svg>", "", row))
+        )
+        assert "nan" not in row
+        assert "None" not in row
+
+
 def test_a_few_bad_runs_that_make_the_average_are_pointed_out():
     verdict = judge(white_report(1.0, 200, outliers=4), 0, 200)
     assert verdict.word == "not consistent"
@@ -183,6 +231,36 @@ def test_failed_runs_are_told_and_counted_nowhere_else():
     ]
     assert entry["verdict"] == "not shown"
     assert entry["reason"].startswith("2 of 40 runs failed; of the others, ")
+
+
+def test_notes_group_failures_and_warn_of_few_runs():
+    boom, odd = "ZeroDivisionError: boom", "ValueError: [red]odd[/red]\nsecond line"
+    failures = [("ekf", run, 3, boom) for run in range(30)]
+    failures += [("ekf", 31, -1, odd), ("ekf", 33, 5, "c"), ("ekf", 34, 5, "d")]
+    summary = summarise_monte_carlo(with_failures(typical(), failures))
+    groups = summary["estimators"]["ekf"]["failure_groups"]
+    assert groups[0] == {"count": 30, "message": boom, "run": 0, "step": 3}
+    assert [group["count"] for group in groups] == [30, 1, 1, 1]
+    assert summary["notes"] == [
+        "ekf: 33 of 40 runs failed: 30 × ZeroDivisionError: boom (first: run 0, "
+        "step 3); 1 × ValueError: [red]odd[/red] second line (first: run 31); "
+        "1 × c (first: run 33, step 5); 1 × other messages.",
+        "ekf: only 7 runs did not fail: below 20 little can be shown.",
+    ]
+    assert summarise_monte_carlo(typical())["notes"] == []
+
+
+def test_notes_tell_why_all_runs_failed():
+    failures = [(label, run, 3, "boom") for label in FILTERS for run in range(40)]
+    summary = summarise_monte_carlo(with_failures(typical(), failures))
+    for label in FILTERS:
+        said = f"{label}: 40 of 40 runs failed: 40 × boom (first: run 0, step 3)."
+        assert said in summary["notes"]
+
+
+def test_few_runs_are_noted_once_for_all_estimators():
+    summary = summarise_monte_carlo(typical().isel(run=slice(8)))
+    assert summary["notes"] == ["Only 8 runs: below 20 little can be shown."]
 
 
 def test_a_flagged_run_counts_as_failed_even_if_its_numbers_are_finite():
@@ -279,6 +357,31 @@ def test_the_table_fits_80_columns_and_keeps_brackets():
         assert words in text
 
 
+def test_the_share_inside_the_band_is_not_expected_to_be_95_percent():
+    summary = summarise_monte_carlo(typical())
+    (row,) = (row for row in measures(summary) if "95 % band" in row.name)
+    assert row.right == "varies"
+
+
+@pytest.mark.parametrize(("std", "bound"), [(0.1, "≥ 5.7°"), (1e-4, "")])
+def test_a_bound_of_the_heading_too_small_to_matter_is_left_out(std, bound):
+    summary = summarise_monte_carlo(typical()) | {"knowable_heading_std": std}
+    (row,) = (row for row in measures(summary) if "claimed" in row.name)
+    assert row.right == bound
+
+
+def test_a_word_has_one_colour_on_terminal_and_page():
+    summary = summarise_monte_carlo(typical())
+    styles = {"good": "green", "bad": "red", "open": "yellow"}
+    for word, kind in KINDS.items():
+        summary["estimators"]["ekf"]["verdict"] = word
+        cell = monte_carlo_table(summary).columns[2]._cells[0]
+        assert (str(cell), cell.style) == (word, styles[kind])
+        page = html_report(typical(), summary)
+        assert f'<li class="{kind}"><h3><span>ekf</span>' in page
+    assert KINDS["nearly consistent"] == "good"
+
+
 def test_labels_with_markup_reach_the_table_as_they_are():
     dataset = typical().assign_coords(estimator=["[red]x", "y[iterations=3]"])
     text = table_text(summarise_monte_carlo(dataset), 100)
@@ -295,6 +398,20 @@ def test_curves_are_averages_over_runs():
     errors = typical()["position_error"].sel(estimator="ekf").values[:, 1:]
     line = line_of(figure_of(typical(), "rmse").axes[0], "ekf")
     np.testing.assert_allclose(line.get_ydata(), np.sqrt((errors**2).mean(axis=0)))
+
+
+def test_the_legend_counts_the_steps_that_are_tested():
+    dataset = typical(steps=4)
+    (part,) = (
+        part
+        for part in report_figures(dataset, summarise_monte_carlo(dataset))
+        if part.name == "nees"
+    )
+    axes = part.figure.axes[0]
+    lines = [line_of(axes, "95 % band, 4 steps")]
+    assert lines[0].get_ydata()[0] == pytest.approx(family_band(40, 3, 4).low / 3)
+    assert "all 4 marked steps" in part.sentence
+    line_of(figure_of(typical(), "nees").axes[0], "95 % band, 10 steps")
 
 
 def test_the_heading_panels_show_claim_truth_and_what_is_knowable():

@@ -1,10 +1,16 @@
 """The noise study over many runs."""
 
+import csv
+import json
+
 import numpy as np
 import pytest
 
+from slamgym.experiments import noise_effects as noise_effects_module
+from slamgym.experiments.commands.noise_monte_carlo import study_effects
 from slamgym.experiments.filter_settings import SIGMAS
 from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo.scores import scores_of
 from slamgym.experiments.noise_effects import noise_effects
 from slamgym.experiments.noise_effects_plots import noise_effects_figure
 from slamgym.experiments.noise_study import scaled_scenario
@@ -48,6 +54,8 @@ def test_figures_are_those_of_a_monte_carlo_told_the_same(effects):
     nees = results.pose_nees_invariant.values / 3
     assert found.nees_per_degree == pytest.approx(nees.mean())
     assert found.nees_per_degree_median == pytest.approx(np.median(nees.mean(axis=1)))
+    error = nees.mean(axis=1).std(ddof=1) / np.sqrt(RUNS)
+    assert found.nees_per_degree_error == pytest.approx(error)
     assert found.pose_area == pytest.approx(float(results.pose_area.mean()))
     assert (found.runs, found.failed) == (RUNS, 0)
 
@@ -79,6 +87,54 @@ def test_the_figure_shows_a_panel_for_each_place(effects):
         assert len(marks) == 22  # (1 + 2 × 5) of two estimators
     names = [tick.get_text() for tick in figure.axes[0].get_yticklabels()]
     assert names == ["unchanged", *SIGMAS]
+
+
+def test_bars_of_the_figure_are_a_standard_error_to_either_side(effects):
+    figure = noise_effects_figure([e for e in effects if e.estimator == "ekf"])
+    lines = figure.axes[0].lines
+    bars = [line.get_xdata() for line in lines if line.get_marker() == "None"]
+    shown = [e for e in effects if e.changed in ("nothing", "both")]
+    for effect in (e for e in shown if e.estimator == "ekf"):
+        mean, error = effect.nees_per_degree, effect.nees_per_degree_error
+        assert any(np.allclose(bar, [mean - error, mean + error]) for bar in bars)
+    assert "standard error" in figure.get_supxlabel()
+
+
+def test_runs_have_failed_where_the_report_says_so(monkeypatch):
+    results = monte_carlo("six_landmarks", "ekf", 4).load()
+    results["nis"].loc[{"run": 1, "step": 7}] = np.nan
+    results["pose_nees_invariant"].loc[{"run": 2, "step": 9}] = 1e200
+    results["position_error"].loc[{"run": 3, "step": 9}] = 1e7  # far off, yet a number
+    monkeypatch.setattr(noise_effects_module, "monte_carlo", lambda *_, **__: results)
+    reference = noise_effects("six_landmarks", "ekf", 4)[0]
+    scores = scores_of(results, "ekf", "invariant")
+    assert reference.failed == len(scores.failures) == 2
+    assert reference.runs == 2
+    nees = results.pose_nees_invariant.values[0, [0, 3], 1:] / 3
+    assert reference.nees_per_degree == pytest.approx(nees.mean())
+
+
+@pytest.mark.parametrize("runs", [1, 2])
+def test_table_csv_and_summary_show_the_error_where_there_is_one(
+    runs, tmp_path, capsys
+):
+    study_effects(
+        load_scenario("six_landmarks"),
+        "ekf",
+        runs=runs,
+        seed=0,
+        changed="filter",
+        jobs=None,
+        out=tmp_path / "study",
+        as_json=True,
+    )
+    with (tmp_path / "study" / "noise_study.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    told = json.loads((tmp_path / "study" / "summary.json").read_text("utf-8"))["rows"]
+    for row, entry in zip(rows, told, strict=True):
+        error = float(row["nees_per_degree_error"])
+        assert np.isnan(error) == (entry["nees_per_degree_error"] is None)
+        assert np.isnan(error) == (runs == 1)
 
 
 def test_another_place_is_refused():

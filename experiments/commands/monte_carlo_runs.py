@@ -3,7 +3,7 @@
 import contextlib
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,12 +11,12 @@ from rich.text import Text
 
 from ...envs.atomic_file import replace_when_written
 from ...sim_configs import Scenario, load_scenario
-from ..monte_carlo import monte_carlo
+from ..monte_carlo import merge_blocks, monte_carlo
 from ..monte_carlo.estimator_choices import EstimatorChoice, estimator_choices
 from ..monte_carlo.html_report import write_html_report
 from ..monte_carlo.summary import summarise_monte_carlo
 from ..monte_carlo.table import monte_carlo_table
-from .one_line_errors import BadInputError, InterruptedRunError
+from .one_line_errors import FAILURE, BadInputError, InterruptedRunError
 from .output_folder import default_folder
 from .reporter import Reporter
 from .result_tables import written
@@ -24,7 +24,7 @@ from .run_files import as_json_text
 
 REPORT, SUMMARY = "report.html", "summary.json"
 
-_NOTE = "compiling the filters, once after each installation …"
+_NOTE = "getting the filters ready …"
 
 
 class Workers(NamedTuple):
@@ -36,6 +36,19 @@ class Workers(NamedTuple):
     """Address of a Dask cluster, or of a Ray cluster."""
 
 
+class Blocks(NamedTuple):
+    """Which part of the work, and what becomes of earlier results."""
+
+    size: int
+    """Runs in a block."""
+    first_run: int = 0
+    """Those below are another machine's."""
+    merged: Sequence[Path] = ()
+    """Folders of other machines, to take over."""
+    fresh: bool = False
+    """Whether to remove earlier results."""
+
+
 def run_monte_carlo(
     scenario: Scenario,
     estimators: str,
@@ -44,10 +57,10 @@ def run_monte_carlo(
     seed: int,
     assumed: Mapping[str, Any],
     workers: Workers,
-    block_size: int,
+    blocks: Blocks,
     out: Path | None,
     as_json: bool,
-) -> None:
+) -> int:
     """Run, measure, decide, and write results.nc, summary.json and report.html.
 
     Parameters
@@ -56,16 +69,23 @@ def run_monte_carlo(
         The world.
     estimators : str
         Which, as in `estimator_choices`.
-    runs, seed, block_size : int
+    runs, seed : int
         As in `monte_carlo`.
     assumed : mapping
         Changes of the scenario whose noise the filters are told.
     workers : Workers
         Who does the work.
+    blocks : Blocks
+        Which part of it.
     out : Path or None
         The folder to write; None chooses one below results.
     as_json : bool
         Whether to print the summary for programs.
+
+    Returns
+    -------
+    int
+        Exit code: 1 if no run of any estimator went well.
     """
     reporter = Reporter(as_json=as_json)
     choices = estimator_choices(estimators)
@@ -73,8 +93,11 @@ def run_monte_carlo(
     told = scenario.with_changes(**assumed) if assumed else scenario
     with reporter.patience(_NOTE):
         _compile(choices)
+    if blocks.merged:
+        merge_blocks(blocks.merged, place)
     with (
         _cluster(workers),
+        reporter.warnings(),
         reporter.progress("running", unit="runs") as tick,
         _resumable(place),
         monte_carlo(
@@ -86,7 +109,9 @@ def run_monte_carlo(
             out=place,
             jobs=workers.jobs,
             backend=workers.backend,
-            block_size=block_size,
+            block_size=blocks.size,
+            first_run=blocks.first_run,
+            fresh=blocks.fresh,
             command=shlex.join(["slamgym", *sys.argv[1:]]),
             progress=tick,
         ) as results,
@@ -99,8 +124,12 @@ def run_monte_carlo(
     sentences = [entry["sentence"] for entry in summary["estimators"].values()]
     reporter.show(monte_carlo_table(summary), "")
     reporter.show(*(Text(sentence) for sentence in sentences), "")
+    if summary["notes"]:
+        reporter.show(*(Text(note) for note in summary["notes"]), "")
     reporter.show(written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
+    went_well = any(entry["good_runs"] for entry in summary["estimators"].values())
+    return 0 if went_well else FAILURE
 
 
 def _compile(choices: tuple[EstimatorChoice, ...]) -> None:
@@ -121,8 +150,10 @@ def _cluster(workers: Workers) -> Iterator[None]:
     if workers.scheduler is not None and workers.backend != "ray":
         raise BadInputError("--scheduler is for --backend dask or ray")
     if workers.scheduler is not None:
-        import ray  # noqa: PLC0415 (an extra)
-
+        try:
+            import ray  # noqa: PLC0415 (an extra)
+        except ImportError:
+            raise BadInputError("--backend ray needs ray: pip install ray") from None
         ray.init(address=workers.scheduler)
     yield
 

@@ -83,7 +83,7 @@ def _table(scenario: Scenario, runs: int, effects: Sequence[NoiseEffect]) -> Tab
     labels = list(dict.fromkeys(effect.estimator for effect in effects))
     table = Table(
         title=f"{scenario.name}, {runs} runs each: NEES / 3 of the pose; 1 is right",
-        caption="What is more lies in noise_study.csv.",
+        caption="± is the standard error. What is more lies in noise_study.csv.",
         title_justify="left",
         box=None,
         pad_edge=False,
@@ -96,11 +96,20 @@ def _table(scenario: Scenario, runs: int, effects: Sequence[NoiseEffect]) -> Tab
     for effect in effects:
         cells = rows.setdefault((effect.changed, effect.sigma, effect.factor), [])
         failed = f" ({effect.failed} failed)" if effect.failed else ""
-        cells.append(f"{effect.nees_per_degree:.3g}{failed}")
+        cells.append(f"{_with_error(effect)}{failed}")
     for (changed, sigma, factor), cells in rows.items():
         change = f"{sigma} {'× 10' if factor > 1 else '÷ 10'}"
         table.add_row(changed, "" if changed == "nothing" else change, *cells)
     return table
+
+
+def _with_error(effect: NoiseEffect) -> str:
+    """Write the NEES, and how far it is off where that is known."""
+    if math.isnan(effect.nees_per_degree):
+        return "–"
+    error = effect.nees_per_degree_error
+    known = "" if math.isnan(error) else f" ± {error:.3g}"
+    return f"{effect.nees_per_degree:.3g}{known}"
 
 
 def _write_table(path: Path, effects: Sequence[NoiseEffect]) -> None:

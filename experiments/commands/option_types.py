@@ -181,7 +181,11 @@ EstimatorNames = Annotated[
     ),
 ]
 Runs = Annotated[
-    int, typer.Option(help="How many; run i is the world of seed SEED + i.")
+    int,
+    typer.Option(
+        help="How many; run i is the world of seed SEED + i, so that seeds closer "
+        "than this share worlds."
+    ),
 ]
 AssumedChanges = Annotated[
     list[str] | None,
@@ -219,6 +223,24 @@ Scheduler = Annotated[
 ]
 RunsPerBlock = Annotated[
     int, typer.Option(metavar="N", help="Runs done and written at a time.")
+]
+FirstRun = Annotated[
+    int,
+    typer.Option(
+        metavar="N",
+        help="Leave the runs below N, a multiple of the block size, to others.",
+    ),
+]
+MergedFolders = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--merge",
+        metavar="DIR",
+        help=f"Take over what another machine has done of this job. {_REPEATED}",
+    ),
+]
+Fresh = Annotated[
+    bool, typer.Option("--fresh", help="Remove earlier results in the folder first.")
 ]
 ResumableFolder = Annotated[
     Path | None,

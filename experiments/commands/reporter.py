@@ -4,6 +4,7 @@ import contextlib
 import json
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -85,6 +86,18 @@ class Reporter:
                     bar.update(task, completed=done, total=total)
 
             yield tick
+
+    @contextlib.contextmanager
+    def warnings(self) -> Iterator[None]:
+        """Print warnings that come meanwhile as plain lines on standard error."""
+
+        def show(message: Warning | str, *_: object, **__: object) -> None:
+            self._notes.print(f"note: {message}", markup=False)
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = show
+            yield
 
     @contextlib.contextmanager
     def patience(self, note: str) -> Iterator[None]:

@@ -1,14 +1,19 @@
 """Which estimators a Monte Carlo compares, as code or the command line names them."""
 
+import hashlib
+import inspect
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from ...estimator import registry
 from ...estimator.registry import find_estimator, list_estimators, register_estimator
 from ...sim_configs import Scenario
 from ..filter_settings import FilterSettings, settings_for_scenario
 
+_PACKAGE = Path(registry.__file__).resolve().parents[1]
 _BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")
 _SPEC = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>[^\]]*)\])?")
 
@@ -21,6 +26,16 @@ class EstimatorChoice(NamedTuple):
     """Registered name or "module:Class"."""
     options: Mapping[str, Any] = {}
     """What its constructor takes besides the noise of the world."""
+
+    def code(self) -> str:
+        """Identify the source of an estimator of one's own; nothing of slamgym's."""
+        try:
+            source = inspect.getsourcefile(find_estimator(self.name))
+        except TypeError:
+            return ""
+        if source is None or Path(source).resolve().is_relative_to(_PACKAGE):
+            return ""
+        return hashlib.sha256(Path(source).read_bytes()).hexdigest()[:12]
 
     def settings(self, scenario: Scenario) -> FilterSettings:
         """Set it up with the noise of a world."""
@@ -53,6 +68,8 @@ def estimator_choices(
     EstimatorChoice(label='invariant[iterations=3]', name='invariant', \
 options={'iterations': 3})
     """
+    if not isinstance(estimators, Iterable):
+        raise ValueError(f"estimators must be names or labels, got {estimators!r}")
     if isinstance(estimators, Mapping):
         choices = [_labelled(label, what) for label, what in estimators.items()]
     else:

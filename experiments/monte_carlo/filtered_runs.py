@@ -14,7 +14,8 @@ from ..simulated_runs import SimulatedRuns
 
 Array = NDArray[np.float64]
 
-_NOT_FINITE = "the belief is not finite"
+_NOT_FINITE = "the pose, its covariance or the NIS is not finite"
+_MAP_NOT_FINITE = "the belief about the map is not finite"
 
 
 class Failure(NamedTuple):
@@ -88,12 +89,12 @@ def _in_a_batch(
     finite = np.isfinite(trace.poses).all(axis=2)
     finite &= np.isfinite(trace.pose_covariances).all(axis=(2, 3))
     finite &= np.isfinite(trace.nis)
+    beliefs: list[Belief | None] = [batch.belief(run) for run in range(count)]
+    finite[:, -1] &= [belief is None or _is_finite_map(belief) for belief in beliefs]
     failures = {}
     for run in np.flatnonzero(~finite.all(axis=1)).tolist():
         failures[run] = _why(settings, runs, run, int(finite[run].argmin()))
         _erase(trace, run, failures[run].step)
-    beliefs: list[Belief | None] = [batch.belief(run) for run in range(count)]
-    for run in failures:
         beliefs[run] = None
     return FilteredRuns(trace, beliefs, failures)
 
@@ -120,10 +121,12 @@ def _one_by_one(
         for step in range(runs.visible.shape[1]):
             _tell_truth(slam, runs.true_poses[run, step], landmarks)
             belief = _step(slam, runs, run, step, trace)
-            if not _is_finite(belief, trace.nis[run, step]):
+            if not _is_finite(trace, run, step):
                 return Failure(step, _NOT_FINITE)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         return Failure(step, f"{type(error).__name__}: {error}")
+    if not _is_finite_map(belief):
+        return Failure(step, _MAP_NOT_FINITE)
     beliefs.append(belief)
     return None
 
@@ -152,12 +155,16 @@ def _tell_truth(
         observe(pose, landmarks)
 
 
-def _is_finite(belief: Belief, nis: float) -> bool:
+def _is_finite(trace: BatchTrace, run: int, step: int) -> bool:
     return bool(
-        np.isfinite(nis)
-        and np.isfinite(belief.mean).all()
-        and np.isfinite(belief.pose_covariance).all()
+        np.isfinite(trace.nis[run, step])
+        and np.isfinite(trace.poses[run, step]).all()
+        and np.isfinite(trace.pose_covariances[run, step]).all()
     )
+
+
+def _is_finite_map(belief: Belief) -> bool:
+    return bool(np.isfinite(belief.mean).all() and np.isfinite(belief.covariance).all())
 
 
 def _empty_trace(runs: int, steps: int) -> BatchTrace:

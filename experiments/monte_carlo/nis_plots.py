@@ -7,6 +7,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy.stats import chi2
 
 from ...estimator.consistency import autocorrelation
+from ...estimator.decisions import normal_scores
 from ..figure_style import GREY, dress, new_figure
 from .estimator_lines import EstimatorLook, legend_above, plain
 from .scores import Array, EstimatorScores
@@ -67,18 +68,14 @@ def pooled_nis(scores: EstimatorScores) -> tuple[Array, Array, Array]:
 def nis_autocorrelation(scores: EstimatorScores) -> tuple[Array, Array]:
     """Correlate the NIS with itself some scans later.
 
-    Each NIS is made about normal by Wilson and Hilferty's cube root first, as the
-    decision on whiteness does.
+    Each NIS is made about normal first, as the decision on whiteness does.
 
     Returns
     -------
     correlations, pairs : ndarray, shape (lags,)
         At lags 1 to 10, and of how many pairs.
     """
-    freedom = scores.over_time("nis_dof").astype(np.float64)
-    spread = 2 / (9 * np.maximum(freedom, 1))
-    root = np.cbrt(scores.over_time("nis") / np.maximum(freedom, 1))
-    normal = np.where(freedom > 0, (root - (1 - spread)) / np.sqrt(spread), np.nan)
+    normal = normal_scores(scores.over_time("nis"), scores.over_time("nis_dof"))
     return autocorrelation(normal, lags=min(_LAGS, normal.shape[1] - 1))
 
 

@@ -31,7 +31,6 @@ from .scores import (
 Shown = list[tuple[EstimatorScores, EstimatorLook]]
 
 _WIDTH = 4.8
-_GRID_STEPS = 10
 _LOG_FROM = 4.0
 _BINS = 70
 _MOST_DOTS, _FEW_DOTS = 300, 100
@@ -67,6 +66,7 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> list[ReportF
     if not shown:
         return []
     runs = max(int(scores.good.sum()) for scores, _ in shown)
+    times = grid_steps(summary)
     knowable = summary["knowable_heading_std"]
     return [
         ReportFigure(
@@ -74,8 +74,7 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> list[ReportF
             "Do the covariances tell the truth?",
             f"NEES of the pose / 3, {frame} frame, averaged over {runs} runs: a "
             "consistent filter stays near 1, in the grey band at most steps (95 % on "
-            "average) and between the thin lines at all ten marked steps (filled: "
-            "refused).",
+            f"average){_between(times)}.",
             nees_figure(shown, frame, summary),
         ),
         ReportFigure(
@@ -113,15 +112,16 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> list[ReportF
 
 
 def nees_figure(shown: Shown, frame: ErrorFrame, summary: dict[str, Any]) -> Figure:
-    """Draw ANEES / 3 over time, with the 95 % bands of one step and of ten."""
+    """Draw ANEES / 3 over time, with the 95 % bands of one step and of the grid."""
     figure = new_figure(_WIDTH, 2.9)
     axes = figure.subplots()
     runs = max(int(scores.good.sum()) for scores, _ in shown)
     band = np.array(average_band(runs, POSE_FREEDOM)) / POSE_FREEDOM
-    wide = np.array(family_band(runs, POSE_FREEDOM, _GRID_STEPS)) / POSE_FREEDOM
     axes.axhspan(*band, color=GREY, alpha=0.25, lw=0, label="95 % band")
-    for end, label in zip(wide, ("95 % band, ten steps", None), strict=True):
-        axes.axhline(end, color=GREY, lw=0.8, label=label)
+    if times := grid_steps(summary):
+        wide = np.array(family_band(runs, POSE_FREEDOM, times)) / POSE_FREEDOM
+        for end, label in zip(wide, (f"95 % band, {_steps(times)}", None), strict=True):
+            axes.axhline(end, color=GREY, lw=0.8, label=label)
     extremes = [band]
     for scores, look in shown:
         average = scores.ratios(frame).mean(axis=0)
@@ -214,6 +214,23 @@ def rmse_figure(shown: Shown) -> Figure:
     axes.set(xlabel="step", ylabel="RMS error, raw [m]")
     legend_above(figure, axes)
     return figure
+
+
+def grid_steps(summary: dict[str, Any]) -> int:
+    """Return how many steps are tested together, 0 where nothing was decided."""
+    decisions = [entry["decisions"] for entry in summary["estimators"].values()]
+    return max((len(found["grid"]["steps"]) for found in decisions if found), default=0)
+
+
+def _between(times: int) -> str:
+    if not times:
+        return ""
+    marked = "the marked step" if times == 1 else f"all {times} marked steps"
+    return f" and between the thin lines at {marked} (filled: refused)"
+
+
+def _steps(times: int) -> str:
+    return "1 step" if times == 1 else f"{times} steps"
 
 
 def _mark_grid(

@@ -22,7 +22,7 @@ _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
 _FROM_TRUTH = "of a consistent filter NEES and NIS are χ² with the degrees told"
 
 
-def dataset_of(job: Job, blocks: Blocks, runs: int, command: str = "") -> xr.Dataset:
+def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Dataset:
     """Put the blocks of a job together in memory.
 
     Parameters
@@ -31,8 +31,8 @@ def dataset_of(job: Job, blocks: Blocks, runs: int, command: str = "") -> xr.Dat
         The job.
     blocks : iterator
         All of its blocks, in order.
-    runs : int
-        How many runs they hold.
+    runs : Span
+        The runs that they hold.
     command : str
         How to do it again.
     """
@@ -44,19 +44,19 @@ def dataset_of(job: Job, blocks: Blocks, runs: int, command: str = "") -> xr.Dat
         )
         for name, variable in VARIABLES.items()
     }
-    _fill(arrays, blocks)
+    _fill(arrays, blocks, runs)
     return xr.Dataset(
         {
             name: (_dims(name), arrays[name], {"long_name": variable.meaning})
             for name, variable in VARIABLES.items()
         },
-        {dim: (dim, values) for dim, values in _coordinates(job, sizes).items()},
+        {dim: (dim, values) for dim, values in _coordinates(job, runs).items()},
         attributes(job, runs, command),
     )
 
 
 def write_results(
-    path: Path, job: Job, blocks: Blocks, runs: int, command: str = ""
+    path: Path, job: Job, blocks: Blocks, runs: Span, command: str = ""
 ) -> None:
     """Write the blocks of a job as one netCDF file, with one block in memory at a time.
 
@@ -67,19 +67,13 @@ def write_results(
     job, blocks, runs, command
         As in :func:`dataset_of`.
     """
-    sizes = _sizes(job, runs)
-    with replace_when_written(path) as partial, netCDF4.Dataset(partial, "w") as file:
-        for dim, size in sizes.items():
-            file.createDimension(dim, size)
-        for dim, values in _coordinates(job, sizes).items():
-            file.createVariable(dim, _stored(values.dtype.kind), (dim,))[:] = values
-        for name, variable in VARIABLES.items():
-            made = file.createVariable(name, _stored(variable.kind), _dims(name))
-            made.long_name = variable.meaning
-            if variable.kind == "?":
-                made.setncattr("dtype", "bool")  # xarray gives it back as such
-        _fill(file.variables, blocks)
-        file.setncatts(attributes(job, runs, command))
+    try:
+        with replace_when_written(path) as partial:
+            _write(partial, job, blocks, runs, command)
+    except (OSError, RuntimeError) as error:  # netCDF raises the second on a full disk
+        raise OSError(
+            f"{path} cannot be written: {error}; its blocks stay, to go on from"
+        ) from error
 
 
 def load_results(path: str | Path) -> xr.Dataset:
@@ -113,17 +107,32 @@ def load_results(path: str | Path) -> xr.Dataset:
     return results
 
 
-def attributes(job: Job, runs: int, command: str) -> dict[str, Any]:
+def _write(path: Path, job: Job, blocks: Blocks, runs: Span, command: str) -> None:
+    with netCDF4.Dataset(path, "w") as file:
+        for dim, size in _sizes(job, runs).items():
+            file.createDimension(dim, size)
+        for dim, values in _coordinates(job, runs).items():
+            file.createVariable(dim, _stored(values.dtype.kind), (dim,))[:] = values
+        for name, variable in VARIABLES.items():
+            made = file.createVariable(name, _stored(variable.kind), _dims(name))
+            made.long_name = variable.meaning
+            if variable.kind == "?":
+                made.setncattr("dtype", "bool")  # xarray gives it back as such
+        _fill(file.variables, blocks, runs)
+        file.setncatts(attributes(job, runs, command))
+
+
+def attributes(job: Job, runs: Span, command: str) -> dict[str, Any]:
     """Say where results come from: all that is needed to do it again."""
     identity = job.identity()
     return {
-        "title": f"Monte Carlo of {job.scenario.name}, {runs} runs",
+        "title": f"Monte Carlo of {job.scenario.name}, {runs.size} runs",
         "scenario_name": job.scenario.name,
         "scenario": identity["scenario"],
         "assumed": identity["assumed"],
         "estimators": json.dumps(identity["estimators"]),
         "seed": job.seed,
-        "runs": runs,
+        "runs": runs.size,
         "block_size": job.block_size,
         "versions": json.dumps(_versions()),
         "command": command,
@@ -136,13 +145,16 @@ def _versions() -> dict[str, str]:
     return own | {package: version(package) for package in _PACKAGES}
 
 
-def _fill(arrays: MutableMapping[str, Any] | Mapping[str, Any], blocks: Blocks) -> None:
+def _fill(
+    arrays: MutableMapping[str, Any] | Mapping[str, Any], blocks: Blocks, runs: Span
+) -> None:
     for span, parts in blocks:
+        rows = slice(span.first - runs.first, span.stop - runs.first)
         for number, block in enumerate(parts):
             for name, values in block.items():
                 text = VARIABLES[name].kind == "U"
                 part = values.astype(object) if text else values
-                arrays[name][number, span.first : span.stop] = part
+                arrays[name][number, rows] = part
 
 
 def _stored(kind: str) -> Any:
@@ -154,16 +166,20 @@ def _dims(name: str) -> tuple[str, ...]:
     return ("estimator", *VARIABLES[name].dims)
 
 
-def _sizes(job: Job, runs: int) -> dict[str, int]:
+def _sizes(job: Job, runs: Span) -> dict[str, int]:
     return {
         "estimator": len(job.estimators),
-        "run": runs,
+        "run": runs.size,
         "step": job.scenario.steps + 1,
         "landmark": job.scenario.landmarks.count,
     }
 
 
-def _coordinates(job: Job, sizes: dict[str, int]) -> dict[str, np.ndarray[Any, Any]]:
-    labels = np.array([choice.label for choice in job.estimators])
-    numbered = {dim: np.arange(n) for dim, n in sizes.items() if dim != "estimator"}
-    return {"estimator": labels, **numbered}
+def _coordinates(job: Job, runs: Span) -> dict[str, np.ndarray[Any, Any]]:
+    sizes = _sizes(job, runs)
+    return {
+        "estimator": np.array([choice.label for choice in job.estimators]),
+        "run": np.arange(runs.first, runs.stop),
+        "step": np.arange(sizes["step"]),
+        "landmark": np.arange(sizes["landmark"]),
+    }

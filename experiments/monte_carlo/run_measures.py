@@ -15,7 +15,7 @@ from ...estimator.error_frames import ERROR_FRAMES
 from ...estimator.interface import Belief
 from ..noise_study import ellipse_areas
 from ..simulated_runs import SimulatedRuns
-from .filtered_runs import FilteredRuns
+from .filtered_runs import Failure, FilteredRuns
 
 Array = NDArray[np.float64]
 Block = dict[str, NDArray[np.generic]]
@@ -86,19 +86,26 @@ def measure_runs(runs: SimulatedRuns, filtered: FilteredRuns) -> Block:
     count, steps, landmarks = runs.visible.shape
     sizes = {"run": count, "step": steps, "landmark": landmarks}
     block = {name: _empty(variable, sizes) for name, variable in VARIABLES.items()}
+    failures = dict(filtered.failures)
     for run, belief in enumerate(filtered.beliefs):
         truth = runs.true_poses[run]
         with np.errstate(all="ignore"):  # a diverged run may leave all numbers
             measured = _measure_path(truth, filtered, run)
-            if belief is not None:
-                measured |= _measure_map(truth[-1], runs.landmarks[run], belief)
+            try:
+                if belief is not None:
+                    measured |= _measure_map(truth[-1], runs.landmarks[run], belief)
+            except Exception as error:  # of somebody's estimator, only at the end
+                said = f"the final belief is no map of this world: {error}"
+                failures[run] = Failure(steps - 1, said)
         for name, value in measured.items():
             block[name][run] = value
-    for run, failure in filtered.failures.items():
+    for run, failure in failures.items():
         block["failed"][run] = True
         block["failed_at"][run] = failure.step
-    said = {run: failure.message for run, failure in filtered.failures.items()}
-    block["message"] = np.array([said.get(run, "") for run in range(count)])
+    messages = [
+        failures[run].message if run in failures else "" for run in range(count)
+    ]
+    block["message"] = np.array(messages)
     return block
 
 
@@ -143,6 +150,11 @@ def _measure_map(
     true_pose: Array, true_landmarks: Array, belief: Belief
 ) -> dict[str, Value]:
     ids = list(belief.landmark_ids)
+    if len(set(ids)) < len(ids) or not set(ids) <= set(range(len(true_landmarks))):
+        raise ValueError(
+            f"landmark_ids must be different ones of 0 … {len(true_landmarks) - 1}, "
+            f"got {tuple(ids)}"
+        )
     states = (
         np.concatenate([true_pose, true_landmarks[ids].ravel()]),
         belief.mean,

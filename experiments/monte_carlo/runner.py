@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from joblib import Parallel, delayed, effective_n_jobs, parallel_config
 
 from ...estimator.registry import (
@@ -33,9 +34,12 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Progress = Callable[[int, int], object]
+Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed
+Workers = Callable[[Iterable[Call]], Iterable[Any]]
 
 BACKENDS = ("loky", "threading", "dask", "ray")
 BLOCK_SIZE = 64
+_LARGEST = 2**63  # what a file of results can hold
 RESULTS = "results.nc"
 
 
@@ -72,6 +76,8 @@ def monte_carlo(
     jobs: int | None = None,
     backend: str | None = None,
     block_size: int = BLOCK_SIZE,
+    first_run: int = 0,
+    fresh: bool = False,
     command: str = "",
     progress: Progress | None = None,
 ) -> "xr.Dataset":
@@ -88,7 +94,8 @@ def monte_carlo(
     runs : int
         How many; at least 1, and better more than 20.
     seed : int
-        Of the first run; run i is seeded ``seed + i``.
+        Of run 0; run i is seeded ``seed + i``, so seeds closer than ``runs`` share
+        worlds.
     assumed : Scenario, mapping, str or Path, optional
         The scenario whose noise the estimators are told; that of the world where not
         given.
@@ -102,6 +109,11 @@ def monte_carlo(
         from outside.
     block_size : int
         Runs in a block.
+    first_run : int
+        Runs below it are another machine's part; a multiple of ``block_size``.  See
+        :func:`~slamgym.experiments.monte_carlo.merge_blocks`.
+    fresh : bool
+        Whether to remove what an earlier job left in ``out``.
     command : str, optional
         What to note as the way to do it again.
     progress : callable, optional
@@ -127,35 +139,35 @@ def monte_carlo(
     """
     world, choices = _with_identities(scenario), estimator_choices(estimators)
     told = world if assumed is None else load_scenario(assumed)
-    count = _whole("runs", runs, 1)
     size = _whole("block_size", block_size, 1)
+    asked = _span(_whole("first_run", first_run, 0), _whole("runs", runs, 1), size)
     job = Job(world, told, choices, _whole("seed", seed, 0), size)
     workers = _workers(jobs, backend)
     work = _Work(
         world,
         tuple(_checked(choice, told) for choice in choices),
         {choice.name: find_estimator(choice.name) for choice in choices},
-        seed,
+        job.seed,
         threads=None if workers is None else 1,
     )
-    folder = BlockFolder(job, None if out is None else Path(out))
-    missing = folder.missing(count)
-    done = count - sum(span.size for span in missing)
+    folder = BlockFolder(job, None if out is None else Path(out), fresh=fresh)
+    missing = folder.missing(asked)
+    done = asked.size - sum(span.size for span in missing)
     report = progress or (lambda done, runs: None)
-    report(done, count)
+    report(done, asked.size)
     for span, blocks in _computed(work, missing, workers):
         folder.add(span, blocks)
         done += span.size
-        report(done, count)
+        report(done, asked.size)
     if out is None:
-        return dataset_of(job, folder.blocks(count), count, command)
+        return dataset_of(job, folder.blocks(asked), asked, command)
     target = Path(out) / RESULTS
-    write_results(target, job, folder.blocks(count), count, command)
+    write_results(target, job, folder.blocks(asked), asked, command)
     return load_results(target)
 
 
 def _computed(
-    work: _Work, spans: list[Span], workers: Parallel | None
+    work: _Work, spans: list[Span], workers: Workers | None
 ) -> Iterator[tuple[Span, list[Block]]]:
     """Yield the blocks as they come, in any order."""
     if workers is None:
@@ -168,32 +180,50 @@ def _do(work: _Work, span: Span) -> tuple[Span, list[Block]]:
     return span, work.do(span)
 
 
-def _workers(jobs: int | None, backend: str | None) -> Parallel | None:
+def _workers(jobs: int | None, backend: str | None) -> Workers | None:
     """Engage workers, or None where this process does it alone."""
     if backend is not None and backend not in BACKENDS:
         hint = closest(backend, BACKENDS)
         raise ValueError(
             f"backend must be one of {', '.join(BACKENDS)}, got '{backend}'{hint}"
         )
-    if jobs is not None and (jobs < -1 or jobs == 0):
-        raise ValueError(f"jobs must be >= 1, or -1 for all cores, got {jobs}")
+    if jobs is not None and jobs != -1:
+        _whole("jobs", jobs, 1)
+    if backend == "ray":
+        return _ray_workers(None if jobs == -1 else jobs)
     if backend is None and effective_n_jobs(jobs) == 1:
         return None
-    if backend == "ray":
-        _register_ray()
     chosen: dict[str, Any] = {} if backend is None else {"backend": backend}
     if jobs is not None or backend is not None:
         chosen["n_jobs"] = jobs or -1
     with parallel_config(**chosen):
-        return Parallel(return_as="generator_unordered", pre_dispatch="2*n_jobs")
+        workers: Workers = Parallel(
+            return_as="generator_unordered", pre_dispatch="2*n_jobs"
+        )
+        return workers
 
 
-def _register_ray() -> None:
+def _ray_workers(jobs: int | None) -> Workers:
+    """Engage a cluster's workers by Ray's own pool.
+
+    Ray's backend for joblib hands results out only when the last one is there, so that
+    nothing could be written before.
+    """
     try:
-        from ray.util.joblib import register_ray  # noqa: PLC0415 (an extra)
+        from ray.util.multiprocessing import Pool  # noqa: PLC0415 (an extra)
     except ImportError:
         raise ValueError("backend 'ray' needs ray: pip install ray") from None
-    register_ray()
+
+    def work_off(calls: Iterable[Call]) -> Iterator[Any]:
+        with Pool(jobs) as pool:
+            yield from pool.imap_unordered(_call, calls)
+
+    return work_off
+
+
+def _call(call: Call) -> Any:
+    function, arguments, options = call
+    return function(*arguments, **options)
 
 
 def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:
@@ -211,6 +241,16 @@ def _with_identities(source: Scenario | Mapping[str, object] | str | Path) -> Sc
 
 
 def _whole(name: str, value: int, least: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not (whole and least <= value < _LARGEST):
         raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
-    return value
+    return int(value)
+
+
+def _span(first_run: int, runs: int, block_size: int) -> Span:
+    if first_run % block_size or first_run >= runs:
+        raise ValueError(
+            f"first_run must be a multiple of block_size = {block_size} below runs = "
+            f"{runs}, got {first_run}"
+        )
+    return Span(first_run, runs)

@@ -1,7 +1,6 @@
 """The numbers of a Monte Carlo, as one dictionary of plain JSON types."""
 
 import json
-import math
 from typing import Any
 
 import numpy as np
@@ -9,13 +8,13 @@ import xarray as xr
 
 from ...estimator.consistency import average_band
 from ...estimator.consistency_report import ConsistencyReport, consistency_report
-from ...estimator.decisions import Decision
 from ...estimator.error_frames import ErrorFrame
-from ...estimator.time_average_decisions import EQUIVALENCE_MARGIN
+from .decision_entries import decisions_table
+from .known_values import finite, mean, quotient, root_mean_square
+from .notes import failure_groups, notes_of
 from .scores import (
     POINT_FREEDOM,
     POSE_FREEDOM,
-    Array,
     EstimatorScores,
     estimators_of,
     labels_of,
@@ -47,31 +46,38 @@ def summarise_monte_carlo(
     -------
     dict
         ``scenario`` (its name), ``scenario_toml``, ``assumed_toml`` (whose noise the
-        estimators were told, None where the same), ``seed``, ``runs``, ``steps``,
+        estimators were told, None where the same), ``seed``, ``runs``, ``first_run``
+        (number of the first of them), ``steps``, ``block_size`` (None where unknown),
         ``versions``, ``command``; ``frame``; ``knowable_heading_std`` [rad], the
-        deviation of the heading at the start, below which it cannot fall; and
-        ``estimators`` by label, see :func:`summarise_estimator`.
+        deviation of the heading at the start, below which it cannot fall;
+        ``estimators`` by label, see :func:`summarise_estimator`; and ``notes``,
+        sentences that nobody should miss, see :func:`.notes.notes_of`.
     """
     attrs = dataset.attrs
     assumed = attrs.get("assumed", attrs["scenario"])
     known = estimators_of(dataset)
     knowable = start_heading_std(dataset)
+    entries = {
+        label: known.get(label, {})
+        | summarise_estimator(scores_of(dataset, label, frame), frame, knowable)
+        for label in labels_of(dataset)
+    }
+    block_size = attrs.get("block_size")
     return {
         "scenario": str(attrs["scenario_name"]),
         "scenario_toml": str(attrs["scenario"]),
         "assumed_toml": None if assumed == attrs["scenario"] else str(assumed),
         "seed": int(attrs["seed"]),
         "runs": dataset.sizes["run"],
+        "first_run": int(dataset["run"].values[0]),
         "steps": dataset.sizes["step"] - 1,
+        "block_size": None if block_size is None else int(block_size),
         "versions": json.loads(attrs.get("versions", "{}")),
         "command": str(attrs.get("command", "")),
         "frame": frame,
         "knowable_heading_std": knowable,
-        "estimators": {
-            label: known.get(label, {})
-            | summarise_estimator(scores_of(dataset, label, frame), frame, knowable)
-            for label in labels_of(dataset)
-        },
+        "estimators": entries,
+        "notes": notes_of(entries, dataset.sizes["run"]),
     }
 
 
@@ -98,7 +104,8 @@ def summarise_estimator(
     dict
         ``verdict`` with ``reason``, ``sentence`` and ``heading_sentence``; ``accepted``
         and ``decisions`` (None where fewer than 2 runs did not fail), ``sentences``,
-        ``warnings``; ``good_runs``, ``failed_runs``; by frame ``pose_nees`` and its
+        ``warnings``; ``good_runs``, ``failed_runs``, ``failure_groups`` (see
+        :func:`.notes.failure_groups`); by frame ``pose_nees`` and its
         share of steps inside the 95 % band, and ``position_nees``;
         ``heading_nees``; ``median_run`` and ``share_above_3`` of the runs' averages;
         NEES at the end of ``state``, ``landmarks`` and ``relative_map``; ``nis``;
@@ -123,72 +130,35 @@ def summarise_estimator(
         "warnings": [] if report is None else list(report.warnings()),
         "good_runs": int(scores.good.sum()),
         "failed_runs": [failure._asdict() for failure in scores.failures],
+        "failure_groups": failure_groups(scores.failures),
         "pose_nees": {name: _nees(scores, name) for name in ("invariant", "additive")},
         "position_nees": {
-            name: _mean(scores.over_time(f"position_nees_{name}") / POINT_FREEDOM)
+            name: mean(scores.over_time(f"position_nees_{name}") / POINT_FREEDOM)
             for name in ("invariant", "additive")
         },
-        "median_run": _finite(np.median(per_run) if len(per_run) else np.nan),
-        "share_above_3": _mean(per_run > POSE_FREEDOM),
+        "median_run": finite(np.median(per_run) if len(per_run) else np.nan),
+        "share_above_3": mean(per_run > POSE_FREEDOM),
         "heading_nees": {
-            "mean": _mean(scores.over_time("heading_nees")),
-            "end": _mean(scores.over_time("heading_nees")[:, -1]),
+            "mean": mean(scores.over_time("heading_nees")),
+            "end": mean(scores.over_time("heading_nees")[:, -1]),
         },
         "nees_end": _nees_at_the_end(scores, frame),
         "nis": _nis(scores),
         "heading_std_end": heading,
         "rmse": {
-            "position": _rms(scores.over_time("position_error")),
-            "position_end": _rms(scores.over_time("position_error")[:, -1]),
-            "heading": _rms(scores.over_time("heading_error")),
+            "position": root_mean_square(scores.over_time("position_error")),
+            "position_end": root_mean_square(scores.over_time("position_error")[:, -1]),
+            "heading": root_mean_square(scores.over_time("heading_error")),
         },
         "ate": _raw_and_aligned(scores, "ate"),
         "landmark_rmse": _raw_and_aligned(scores, "landmark_rmse"),
-        "landmark_mahalanobis": _rms(scores.per_run("landmark_mahalanobis")),
+        "landmark_mahalanobis": root_mean_square(
+            scores.per_run("landmark_mahalanobis")
+        ),
         "area": {
-            "pose": _mean(scores.per_run("pose_area")),
-            "landmark": _mean(scores.per_run("landmark_area")),
+            "pose": mean(scores.per_run("pose_area")),
+            "landmark": mean(scores.per_run("landmark_area")),
         },
-    }
-
-
-def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
-    """Write a report's decisions as plain JSON types.
-
-    Returns
-    -------
-    dict
-        ``final_step``, ``time_average``, ``bootstrap``, ``nis``, ``whiteness``, each
-        ``{statistic, interval, p_value, accepted, error_rate}`` with the interval that
-        is accepted; ``grid``, with ``steps``, ``rejected`` and one ``statistic`` per
-        step; ``equivalence``, whose 90 % ``interval`` must lie inside ``margin``;
-        ``runs_needed`` to find covariances too small by a factor in 90 % of cases.
-    """
-    grid, equivalence = report.family, report.equivalence
-    return {
-        "final_step": _decision(report.final_step),
-        "time_average": _decision(report.time_average),
-        "bootstrap": _decision(report.bootstrap),
-        "grid": {
-            "steps": (report.family_steps + 1).tolist(),  # it has not seen step 0
-            "statistic": [_finite(value) for value in grid.statistic],
-            "interval": list(grid.interval),
-            "p_value": grid.p_value,
-            "rejected": grid.rejected.tolist(),
-            "accepted": bool(grid.accepted),
-            "error_rate": grid.error_rate,
-        },
-        "nis": _decision(report.nis),
-        "whiteness": _decision(report.whiteness),
-        "equivalence": {
-            "statistic": _finite(equivalence.statistic),
-            "interval": [_finite(end) for end in equivalence.interval],
-            "margin": list(EQUIVALENCE_MARGIN),
-            "verdict": equivalence.verdict,
-            "accepted": equivalence.accepted,
-            "error_rate": equivalence.error_rate,
-        },
-        "runs_needed": {f"{factor:g}": runs for factor, runs in report.runs_needed},
     }
 
 
@@ -245,16 +215,6 @@ def _report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
     )
 
 
-def _decision(decision: Decision) -> dict[str, Any]:
-    return {
-        "statistic": _finite(decision.statistic),
-        "interval": [_finite(end) for end in decision.interval],
-        "p_value": _finite(decision.p_value),
-        "accepted": bool(decision.accepted),
-        "error_rate": decision.error_rate,
-    }
-
-
 def _nees(scores: EstimatorScores, frame: ErrorFrame) -> dict[str, float | None]:
     ratios = scores.ratios(frame)
     if not len(ratios):
@@ -262,9 +222,9 @@ def _nees(scores: EstimatorScores, frame: ErrorFrame) -> dict[str, float | None]
     average = ratios.mean(axis=0)
     low, high = np.array(average_band(len(ratios), POSE_FREEDOM)) / POSE_FREEDOM
     return {
-        "mean": _mean(average),
-        "end": _finite(average[-1]),
-        "share_inside_band": _mean((average > low) & (average < high)),
+        "mean": mean(average),
+        "end": finite(average[-1]),
+        "share_inside_band": mean((average > low) & (average < high)),
     }
 
 
@@ -276,49 +236,26 @@ def _nees_at_the_end(
     relative = scores.per_run("relative_map_nees")
     each = scores.per_run(f"landmark_nees_{frame}")
     return {
-        "state": _quotient(state, scores.per_run("state_dof")),
-        "landmarks": _quotient(each, np.full(each.shape, POINT_FREEDOM)),
-        "relative_map": _quotient(relative, scores.per_run("relative_map_dof")),
+        "state": quotient(state, scores.per_run("state_dof")),
+        "landmarks": quotient(each, np.full(each.shape, POINT_FREEDOM)),
+        "relative_map": quotient(relative, scores.per_run("relative_map_dof")),
     }
 
 
 def _nis(scores: EstimatorScores) -> float | None:
     freedom = scores.over_time("nis_dof")
-    return _quotient(np.where(freedom > 0, scores.over_time("nis"), 0.0), freedom)
+    return quotient(np.where(freedom > 0, scores.over_time("nis"), 0.0), freedom)
 
 
 def _heading_std_end(scores: EstimatorScores) -> dict[str, float | None]:
     return {
-        "claimed": _rms(scores.over_time("heading_std")[:, -1]),
-        "true": _rms(scores.over_time("heading_error")[:, -1]),
+        "claimed": root_mean_square(scores.over_time("heading_std")[:, -1]),
+        "true": root_mean_square(scores.over_time("heading_error")[:, -1]),
     }
 
 
 def _raw_and_aligned(scores: EstimatorScores, name: str) -> dict[str, float | None]:
     return {
-        "raw": _rms(scores.per_run(name)),
-        "aligned": _rms(scores.per_run(f"{name}_aligned")),
+        "raw": root_mean_square(scores.per_run(name)),
+        "aligned": root_mean_square(scores.per_run(f"{name}_aligned")),
     }
-
-
-def _quotient(values: Array, freedom: Array) -> float | None:
-    """Divide sums, over entries that are known."""
-    known = np.isfinite(values)
-    total = freedom[known].sum()
-    return _finite(values[known].sum() / total) if total else None
-
-
-def _mean(values: Array) -> float | None:
-    """Average over entries that are known."""
-    known = np.asarray(values)[np.isfinite(values)]
-    return _finite(known.mean()) if len(known) else None
-
-
-def _rms(values: Array) -> float | None:
-    with np.errstate(over="ignore"):
-        square = _mean(np.asarray(values) ** 2)
-    return None if square is None else math.sqrt(square)
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 from rich.table import Table
 from rich.text import Text
 
-from .verdict import CONSISTENT, NOT_CONSISTENT, in_degrees
+from .verdict import KINDS, in_degrees
 
 Entry = dict[str, Any]
 _NOTHING = "–"
-_STYLES = {CONSISTENT: "green", NOT_CONSISTENT: "red"}
+_STYLES = {"good": "green", "bad": "red", "open": "yellow"}
+_LEAST_BOUND = math.radians(0.1)  # on a heading, worth a word
 
 
 class Measure(NamedTuple):
@@ -35,7 +36,7 @@ def measures(summary: dict[str, Any]) -> list[Measure]:
     frame, runs = summary["frame"], summary["runs"]
     other = "additive" if frame == "invariant" else "invariant"
     knowable = summary["knowable_heading_std"]
-    least = f"≥ {in_degrees(knowable)}" if knowable else ""
+    least = f"≥ {in_degrees(knowable)}" if knowable >= _LEAST_BOUND else ""
 
     def at(
         *keys: str, write: Callable[[float], str] = number
@@ -49,7 +50,7 @@ def measures(summary: dict[str, Any]) -> list[Measure]:
         Measure("… runs above 3", "few", at("share_above_3", write=percent)),
         Measure(
             "… steps in the 95 % band",
-            "95 %",
+            "varies",
             at("pose_nees", frame, "share_inside_band", write=percent),
         ),
         Measure(f"NEES / 3, {other} frame", "", at("pose_nees", other, "mean")),
@@ -100,7 +101,7 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
         table.add_column(Text(label), justify="right", overflow="fold", min_width=7)
     verdicts = [entry["verdict"] for entry in entries.values()]
     table.add_row(
-        "verdict", "", *(Text(word, _STYLES.get(word, "yellow")) for word in verdicts)
+        "verdict", "", *(Text(word, _STYLES[KINDS[word]]) for word in verdicts)
     )
     for measure in measures(summary):
         cells = [Text(measure.of(entry)) for entry in entries.values()]

@@ -12,6 +12,8 @@ CONSISTENT = "consistent"
 NEARLY = "nearly consistent"
 NOT_CONSISTENT = "not consistent"
 NOT_SHOWN = "not shown"
+KINDS = {CONSISTENT: "good", NEARLY: "good", NOT_CONSISTENT: "bad", NOT_SHOWN: "open"}
+"""What each word means for the filter; colours follow it."""
 
 _ERROR_RATE = 0.05
 _DECIDING = 3  # final step, time averages and grid share the error rate
@@ -26,8 +28,9 @@ class Verdict(NamedTuple):
 
     word: str
     """"consistent": no decision refuses, and the ratio is shown to be near 1;
-    "nearly consistent": refused, but shown to be near 1; "not consistent": refused;
-    "not shown": neither, or some runs failed."""
+    "nearly consistent": refused, but shown to be near 1; "not consistent": refused,
+    which befalls a consistent filter in 5 % of cases at most; "not shown": neither, or
+    some runs failed."""
     reason: str
     """Goes on after the word; without a full stop."""
 
@@ -131,21 +134,20 @@ def _judge_good_runs(report: ConsistencyReport) -> Verdict:
         )
     if refusal:
         return Verdict(NOT_CONSISTENT, refusal + _outliers(report))
-    if verdict.verdict == NOT_CONSISTENT:
-        return Verdict(NOT_CONSISTENT, f"{interval}, lies outside {_MARGIN}")
     if verdict.accepted:
         return Verdict(CONSISTENT, f"{_NOT_REFUSED}, and {interval}, {_inside()}")
+    outside = verdict.verdict == NOT_CONSISTENT  # refuses in up to 10 %: not enough
+    lies = "lies outside" if outside else "is not inside"
     return Verdict(
         NOT_SHOWN,
-        f"{_NOT_REFUSED}, but {interval}, is not inside {_MARGIN}: "
-        "more runs are needed",
+        f"{_NOT_REFUSED}, but {interval}, {lies} {_MARGIN}: more runs are needed",
     )
 
 
 def _refusal(report: ConsistencyReport) -> str:
     """Say by how much the filter is wrong, if final step, averages or grid refuse."""
     final, average, grid = report.final_step, report.time_average, report.family
-    p_value = min(final.p_value, average.p_value)
+    p_value = min(final.p_value, report.average_p_value)
     ratios = [final.statistic, average.statistic]
     claims = "what its covariances claim"
     amounts = "{} times {} at the end, {} times over all steps"
@@ -184,7 +186,7 @@ def _number(ratio: float) -> str:
 
 
 def _interval(band: tuple[float, float]) -> str:
-    return f"[{band[0]:.3f}, {band[1]:.3f}]"
+    return f"[{max(band[0], 0.0):.3f}, {band[1]:.3f}]"  # no ratio is below 0
 
 
 def _inside() -> str:

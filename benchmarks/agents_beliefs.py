@@ -1,0 +1,111 @@
+"""What the belief wrapper of many worlds costs beside the kernels that do the updates.
+
+For B worlds, in the same round and on the same scans::
+
+    added / kernels = (wrapped step - plain step - kernels) / kernels
+
+wrapped step    `BeliefObservationVector.step` with ``ekf``, beliefs and all
+plain step      `step` of the same worlds without the wrapper, seeds and actions alike
+kernels         what `drive_runs` takes, by a stopwatch within the wrapped steps: one
+                predict and one update with six readings in each world
+
+So everything is "added" that is Python and numpy between the scans and the features
+that the agent observes, and the kernels' time is that of the very updates wrapped.
+"""
+
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import Any, NamedTuple
+from unittest import mock
+
+import gymnasium
+import numpy as np
+from interleaved import verdict
+from rich.table import Table
+
+from slamgym.agents import BeliefObservationVector
+from slamgym.estimator import batch
+from slamgym.estimator.batch_kernels import drive_runs
+
+ID = "slamgym/LandmarkWorld-v0"
+GOAL = 3.0
+ROUNDS = 21
+STEPS = {20: 30, 64: 30, 1024: 4}  # worlds: steps of each in a round
+EPISODE = 10_000  # steps: none ends meanwhile
+
+
+class Round(NamedTuple):
+    """CPU seconds of one step of all worlds."""
+
+    plain: float
+    wrapped: float
+    kernels: float
+
+    @property
+    def added(self) -> float:
+        """What is neither the worlds nor the kernels."""
+        return self.wrapped - self.plain - self.kernels
+
+
+class Stopwatch:
+    """Calls a function, and adds up the CPU time that it takes."""
+
+    def __init__(self, function: Callable[..., object]) -> None:
+        self._function = function
+        self.seconds = 0.0
+
+    def __call__(self, *arguments: object) -> None:
+        """Call, with the watch running."""
+        began = time.thread_time()
+        self._function(*arguments)
+        self.seconds += time.thread_time() - began
+
+
+def belief_rounds(count: int, steps: int, rounds: int = ROUNDS) -> list[Round]:
+    """Step worlds with beliefs and without, in turns."""
+    plain, bare = (gymnasium.make_vec(ID, count, steps=EPISODE) for _ in range(2))
+    wrapped = BeliefObservationVector(bare, estimator="ekf")
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (count, 2))
+    watch = Stopwatch(drive_runs)
+    with mock.patch.object(batch, "drive_runs", watch):
+        for worlds in (plain, wrapped):
+            worlds.reset(seed=0)
+            _time(worlds, actions, steps)  # warm, and every landmark mapped
+        return [_round(plain, wrapped, watch, actions, steps) for _ in range(rounds)]
+
+
+def belief_table() -> tuple[Table, int]:
+    """Measure every number of worlds; return the table and how many goals it missed."""
+    table = Table(title="one step of all worlds with an ekf each, 6 landmarks [µs]")
+    columns = ("worlds", "plain step", "kernels", "added by the wrapper")
+    for column in (*columns, "added / kernels", "goal", ""):
+        table.add_column(column, justify="right")
+    missed = 0
+    for count, steps in STEPS.items():
+        rounds = belief_rounds(count, steps)
+        value = median(each.added / each.kernels for each in rounds)
+        word = verdict(value, GOAL, at_least=False)
+        missed += word == "MISSED"
+        times = [
+            f"{1e6 * median(getattr(each, name) for each in rounds):.0f}"
+            for name in ("plain", "kernels", "added")
+        ]
+        table.add_row(str(count), *times, f"{value:.2f}", f"<= {GOAL:g}", word)
+    return table, missed
+
+
+def _round(
+    plain: Any, wrapped: Any, watch: Stopwatch, actions: Any, steps: int
+) -> Round:
+    alone = _time(plain, actions, steps)
+    watch.seconds = 0.0
+    together = _time(wrapped, actions, steps)
+    return Round(alone, together, watch.seconds / steps)
+
+
+def _time(worlds: Any, actions: Any, steps: int) -> float:
+    began = time.thread_time()
+    for _ in range(steps):
+        worlds.step(actions)
+    return (time.thread_time() - began) / steps

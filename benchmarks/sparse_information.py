@@ -1,0 +1,263 @@
+"""Sparse information filter: time and memory against map size, NEES against pruning.
+
+    python benchmarks/sparse_information.py                # maps of 1000 and 10,000
+    python benchmarks/sparse_information.py --sizes 100000
+    python benchmarks/sparse_information.py --nees
+
+Ten nearest landmarks are seen per step.  The large map is made, not driven: a scan
+from beside each landmark, a place of which nothing is known, adds what it says about
+the ten landmarks around, and the landmarks near the start fix the frame.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from argparse import ArgumentParser
+from collections.abc import Iterator
+from resource import RUSAGE_SELF, getrusage
+from time import perf_counter, thread_time
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from slamgym.estimator.bearing_range_model import predict_measurement
+from slamgym.estimator.consistency import pose_nees
+from slamgym.estimator.registry import make_estimator
+from slamgym.estimator.sparse_information import SparseInformationSlam
+from slamgym.estimator.unicycle_motion import predict_pose
+from slamgym.experiments.simulated_runs import simulate_runs
+from slamgym.sim_configs import load_scenario
+
+Array = NDArray[np.float64]
+
+SEEN = 10
+MOTION_STD, MEASUREMENT_STD = np.array([0.02, 0.01, 0.01]), np.array([0.01, 0.05])
+CHUNK = 5000
+CONSOLE = Console(width=110)
+
+
+class Step(NamedTuple):
+    """What a filter is given."""
+
+    odometry: Array
+    readings: Array
+    ids: NDArray[np.int64]
+
+
+def town(count: int) -> Array:
+    """Landmarks, one to 25 m²: (count, 2) [m]."""
+    half = np.sqrt(25.0 * count) / 2
+    return np.random.default_rng(0).uniform(-half, half, (count, 2))
+
+
+def known_map(landmarks: Array) -> SparseInformationSlam:
+    """Make a filter that has mapped all landmarks and stands at the origin."""
+    tree, count = cKDTree(landmarks), len(landmarks)
+    places = landmarks + np.random.default_rng(1).normal(0.0, 2.0, landmarks.shape)
+    total = csr_array((2 * count, 2 * count))
+    for first in range(0, count, CHUNK):
+        chunk = places[first : first + CHUNK]
+        total = total + _information_of(chunk, landmarks, tree)
+    anchored = np.repeat(tree.query(np.zeros(2), SEEN)[1] * 2, 2)
+    anchored[1::2] += 1
+    fixed = np.full(len(anchored), 1e4)
+    total = total + csr_array((fixed, (anchored, anchored)), shape=total.shape)
+    total = total.tobsr(blocksize=(2, 2))
+    slam = SparseInformationSlam(
+        MOTION_STD, MEASUREMENT_STD, initial_pose_std=(0.1, 0.1, 0.1)
+    )
+    slam.load_state_dict(
+        slam.state_dict()
+        | {
+            "landmark_ids": np.arange(count),
+            "slots": np.arange(count),
+            "points": landmarks.ravel(),
+            "residual": np.zeros(2 * count),
+            "matrix_counts": np.diff(total.indptr),
+            "matrix_links": total.indices,
+            "matrix_blocks": total.data,
+        }
+    )
+    return slam
+
+
+def _information_of(places: Array, landmarks: Array, tree: cKDTree) -> csr_array:
+    """Sum over scans of H_lᵀ (1 − H_p (H_pᵀ H_p)⁻¹ H_pᵀ) H_l, all whitened."""
+    m, size = len(places), 2 * len(landmarks)
+    seen = tree.query(places, SEEN)[1]
+    H_p, H_l = np.empty((m, 2 * SEEN, 3)), np.zeros((m, 2 * SEEN, 2 * SEEN))
+    for k in range(m):
+        pose = np.append(places[k], 0.0)
+        expected = predict_measurement(pose, landmarks[seen[k]])
+        H_p[k] = (expected.jacobian_pose / MEASUREMENT_STD[:, None]).reshape(-1, 3)
+        blocks = expected.jacobian_landmark / MEASUREMENT_STD[:, None]
+        for j in range(SEEN):
+            H_l[k, 2 * j : 2 * j + 2, 2 * j : 2 * j + 2] = blocks[j]
+    cross = H_p.transpose(0, 2, 1) @ H_l
+    info = H_l.transpose(0, 2, 1) @ H_l - cross.transpose(0, 2, 1) @ np.linalg.solve(
+        H_p.transpose(0, 2, 1) @ H_p, cross
+    )
+    columns = np.stack([2 * seen, 2 * seen + 1], axis=2).reshape(m, -1)
+    rows = np.repeat(columns, 2 * SEEN, axis=1).ravel()
+    both = (rows, np.tile(columns, (1, 2 * SEEN)).ravel())
+    return csr_array((info.ravel(), both), shape=(size, size))
+
+
+def drive(landmarks: Array, steps: int, seed: int = 0) -> Iterator[Step]:
+    """From place to place, half a metre per step."""
+    rng, tree = np.random.default_rng(seed), cKDTree(landmarks)
+    pose, goal = np.zeros(3), np.zeros(2)
+    half = np.abs(landmarks).max()
+    for step in range(steps):
+        if step % 100 == 0:
+            goal = np.clip(pose[:2] + rng.uniform(-60, 60, 2), -half, half)
+        way = goal - pose[:2]
+        ahead = np.arctan2(way[1], way[0]) - pose[2]
+        turn = np.clip((ahead + np.pi) % (2 * np.pi) - np.pi, -0.3, 0.3)
+        motion = predict_pose(pose, np.array([0.5, turn]))
+        pose = motion.pose + motion.jacobian_noise @ (
+            MOTION_STD * rng.standard_normal(3)
+        )
+        ids = tree.query(pose[:2], SEEN)[1]
+        readings = predict_measurement(pose, landmarks[ids]).measurement
+        noise = MEASUREMENT_STD * rng.standard_normal(readings.shape)
+        yield Step(np.array([0.5, turn]), readings + noise, ids)
+
+
+class Cost(NamedTuple):
+    """What a map of one size costs."""
+
+    landmarks: int
+    links: float
+    """Blocks of Λ per landmark."""
+    mean: float
+    median: float
+    worst: float
+    """Of a step [ms]."""
+    megabytes: float
+    """Of map and local map."""
+    peak: float
+    """Largest memory of the process so far, all its libraries included [GB]."""
+    pose_belief: float
+    """First ``belief([])`` among new landmarks [s]; nan where not asked for."""
+
+
+def cost(count: int, steps: int = 300, *, largest_belief: int = 10_000) -> Cost:
+    """Drive through a known map and measure, in CPU time of this thread."""
+    landmarks = town(count)
+    slam, times = known_map(landmarks), []
+    for odometry, readings, ids in drive(landmarks, steps):
+        start = thread_time()
+        slam.predict(odometry)
+        slam.update(readings, ids)
+        times.append(1e3 * (thread_time() - start))
+    start, asked = thread_time(), count <= largest_belief
+    if asked:
+        slam.belief([])
+    return Cost(
+        count,
+        slam.link_count / count,
+        float(np.mean(times[1:])),
+        float(np.median(times[1:])),
+        float(np.max(times[1:])),
+        slam.nbytes / 1e6,
+        getrusage(RUSAGE_SELF).ru_maxrss / 1e6,
+        thread_time() - start if asked else np.nan,
+    )
+
+
+def nees(scenario: str, runs: int, bound: int) -> dict[str, Array]:
+    """NEES / 3 of the pose per run, in the additive frame, every tenth step."""
+    world, data = load_scenario(scenario), simulate_runs(scenario, runs, 0)
+    noise: dict[str, Any] = {
+        "motion_std": world.motion.std,
+        "measurement_std": world.sensor.std,
+        "range_std_per_metre": world.sensor.range_std_per_metre,
+        "initial_pose_std": world.start.std,
+    }
+
+    def follow(run: int, kind: str) -> float:
+        first = data.initial_poses[run]
+        slam: Any = (
+            make_estimator("ekf", initial_pose=first, **noise)
+            if kind == "ekf"
+            else SparseInformationSlam(
+                initial_pose=first, active_bound=bound, sparsify=kind, **noise
+            )
+        )
+        poses, covariances, times = [], [], range(9, data.odometry.shape[1], 10)
+        for step, odometry in enumerate(data.odometry[run]):
+            slam.predict(odometry, data.dt[step])
+            ids = np.flatnonzero(data.visible[run, step])
+            slam.update(data.measurements[run, step, ids], ids)
+            if step in times:
+                belief = slam.belief() if kind == "ekf" else slam.belief([])
+                poses.append(belief.pose)
+                covariances.append(belief.pose_covariance)
+        truth = data.true_poses[run, times]
+        scores = pose_nees(
+            truth[None],
+            np.array(poses)[None],
+            np.array(covariances)[None],
+            frame="additive",
+        )
+        return float(scores.mean()) / 3
+
+    return {
+        kind: np.array([follow(run, kind) for run in range(runs)])
+        for kind in ("ekf", "relocate", "prune")
+    }
+
+
+def print_costs(sizes: list[int]) -> None:
+    table = Table(title=f"{SEEN} nearest seen per step, CPU time")
+    for name in (
+        "landmarks",
+        "links each",
+        "mean ms",
+        "median ms",
+        "worst ms",
+        "MB",
+        "GB",
+    ):
+        table.add_column(name, justify="right")
+    table.add_column("belief([]) s", justify="right")
+    for size in sizes:
+        row = cost(size)
+        table.add_row(str(size), *(f"{value:.3g}" for value in row[1:]))
+    CONSOLE.print(table)
+
+
+def print_nees(runs: int) -> None:
+    table = Table(title=f"NEES of the pose per dimension, {runs} runs: mean (median)")
+    for name in ("scenario", "Γ", "ekf", "relocate", "prune"):
+        table.add_column(name, justify="right")
+    for scenario, bound in (("anchored", 4), ("dense", 12), ("loop", 4), ("loop", 8)):
+        scores = nees(scenario, runs, bound).values()
+        cells = (f"{np.mean(s):.3g} ({np.median(s):.3g})" for s in scores)
+        table.add_row(scenario, str(bound), *cells)
+    CONSOLE.print(table)
+
+
+def main() -> None:
+    parser = ArgumentParser(description=__doc__)
+    parser.add_argument("--sizes", type=int, nargs="*", default=[1000, 10_000])
+    parser.add_argument("--nees", action="store_true")
+    parser.add_argument("--runs", type=int, default=20)
+    arguments = parser.parse_args()
+    start = perf_counter()
+    if arguments.nees:
+        print_nees(arguments.runs)
+    else:
+        print_costs(arguments.sizes)
+    CONSOLE.print(f"{perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,203 @@
+"""The landmarks around the robot, with all that the rest of the map means for them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, lapack
+
+from .angles import wrap_angle
+from .bearing_range_model import predict_measurement
+from .information_matrix import InformationMatrix, Surroundings, surround
+from .pose_given_map import LinearScan, MapReading, PoseGivenMap
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+class Map:
+    """Means and information of all landmarks, in the order of their slots.
+
+    The exact mean is m + Λ⁻¹ b: ``residual`` b is what a correction left to do.
+    """
+
+    def __init__(self) -> None:
+        self.information = InformationMatrix()
+        self.points = np.zeros(0)
+        self.residual = np.zeros(0)
+
+    def grow(self, count: int) -> None:
+        """Make room for so many landmarks."""
+        self.information.grow(count)
+        if 2 * count > len(self.points):
+            more = np.zeros(4 * count - len(self.points))
+            self.points = np.append(self.points, more)
+            self.residual = np.append(self.residual, more)
+
+
+@dataclass(frozen=True)
+class Outer:
+    """The landmarks beyond the surroundings, held where they are."""
+
+    slots: Int
+    response: Array
+    """W = Λ_OH T, shape (2o, c): their residual is b + W δ_B."""
+    residual: Array
+    """b when the local map was chosen, shape (2o,)."""
+    scale: Array
+    """Inverse Cholesky factors of their own blocks, shape (o, 2, 2)."""
+
+    def residual_after(self, shift: Array) -> Array:
+        """Residual after the border moved by δ_B, shape (2o,)."""
+        return self.residual + self.response @ shift
+
+    def unrest(self, shift: Array) -> float:
+        """Largest residual, as a shift in its own conditional standard deviations."""
+        left = self.residual_after(shift).reshape(-1, 2)
+        white = np.einsum("oij,oj->oi", self.scale, left)
+        return float(np.sqrt((white**2).sum(axis=1).max(initial=0.0)))
+
+
+@dataclass(frozen=True)
+class LocalInformation:
+    """Mean and information of the landmarks L near the robot; a value.
+
+    While only they are seen, Λ changes nowhere else, so that C (the complement of the
+    :class:`Surroundings`) holds, and all that a full solution would say about L follows
+    from the small dense Λ_LL − C.
+    """
+
+    slots: Int
+    points: Array
+    """Means, shape (2k,) [m]."""
+    information: Array
+    """Λ_LL, shape (2k, 2k)."""
+    start: Array
+    """Means of the border when L was chosen, shape (c,)."""
+    surroundings: Surroundings
+    outer: Outer
+
+    @property
+    def shift(self) -> Array:
+        """How far the border has moved, δ_B, shape (c,)."""
+        return self.points[self.surroundings.border] - self.start
+
+    def solver(self) -> tuple[Array, bool]:
+        """Cholesky factor of Λ_LL − C, for :func:`scipy.linalg.cho_solve`."""
+        border = self.surroundings.border
+        marginal = self.information.copy()
+        marginal[np.ix_(border, border)] -= self.surroundings.complement
+        factor, failed = lapack.dpotrf(marginal, lower=1, clean=1)
+        if failed:
+            raise np.linalg.LinAlgError(
+                "the information of the map is not positive definite at landmark "
+                f"{(failed - 1) // 2} of the local map"
+            )
+        return factor, True
+
+    def without_factor(self) -> "LocalInformation":
+        """Let go of the factor around it, which may be large."""
+        return replace(self, surroundings=self.surroundings._replace(solve=np.copy))
+
+    def absorb(
+        self, pose: PoseGivenMap, reading: MapReading
+    ) -> tuple["LocalInformation", PoseGivenMap]:
+        """Add information, Λ ← Λ + Yᵀ Y, and move map and pose to the new mean."""
+        added = replace(
+            self, information=self.information + reading.rows.T @ reading.rows
+        )
+        return added.settle(pose, reading.rows.T @ reading.innovation)
+
+    def settle(
+        self, pose: PoseGivenMap, residual: Array
+    ) -> tuple["LocalInformation", PoseGivenMap]:
+        """Move the map by δ = (Λ_LL − C)⁻¹ b, and the pose by K δ."""
+        if not residual.any():
+            return self, pose
+        delta = cho_solve(self.solver(), residual, check_finite=False)
+        moved = pose._replace(mean=pose.mean + pose.gain @ delta)
+        return replace(self, points=self.points + delta), moved
+
+    def extended(self, slots: Int, points: Array) -> "LocalInformation":
+        """Append landmarks of which nothing is known yet, at these points."""
+        return replace(
+            self,
+            slots=np.concatenate([self.slots, slots]),
+            points=np.concatenate([self.points, points]),
+            information=np.pad(self.information, (0, 2 * len(slots))),
+        )
+
+
+def begin(
+    world: Map, pose: PoseGivenMap, slots: Int, reach: float
+) -> tuple[LocalInformation, PoseGivenMap]:
+    """Take landmarks in hand, the ``reach`` nearest by links eliminated around them.
+
+    ``pose.gain`` must be that of these landmarks.
+    """
+    matrix = world.information
+    around = surround(matrix, slots, matrix.around(slots, reach))
+    columns = pairs(around.slots)
+    outer = np.setdiff1d(matrix.neighbours(around.slots), slots)
+    waiting = around.solve(world.residual[columns])
+    world.points[columns] += waiting
+    world.residual[columns] = 0.0
+    rest = matrix.part(outer, around.slots)
+    outside, inside = pairs(outer), pairs(slots)
+    world.residual[outside] -= rest @ waiting
+    residual = world.residual[inside].copy()
+    residual -= matrix.part(slots, around.slots) @ waiting
+    world.residual[inside] = 0.0
+    local = LocalInformation(
+        slots,
+        world.points[inside],
+        matrix.dense(slots),
+        world.points[inside][around.border],
+        around,
+        Outer(
+            outer,
+            np.ascontiguousarray(rest @ around.response),
+            world.residual[outside],
+            np.linalg.inv(np.linalg.cholesky(matrix.diagonal(outer))),
+        ),
+    )
+    return local.settle(pose, residual)
+
+
+def finish(world: Map, local: LocalInformation) -> None:
+    """Hand everything back to the map."""
+    world.points[pairs(local.slots)] = local.points
+    around, shift = local.surroundings, local.shift
+    world.points[pairs(around.slots)] -= around.response @ shift
+    world.residual[pairs(local.outer.slots)] = local.outer.residual_after(shift)
+    world.information.put(local.slots, local.information)
+
+
+def link_count(world: Map, local: LocalInformation) -> int:
+    """Count the blocks of Λ that are not zero, those of the local map as they are."""
+    matrix, slots = world.information, local.slots
+    k = len(slots)
+    blocks = local.information.reshape(k, 2, k, 2)
+    now = int(blocks.any(axis=(1, 3)).sum())
+    return matrix.block_count - len(matrix.part(slots, slots).indices) + now
+
+
+def linear_scan(
+    pose: Array, points: Array, places: Int, readings: Array, variance: Array
+) -> LinearScan:
+    """Linearise readings of local landmarks at a pose and a map."""
+    expected = predict_measurement(pose, points.reshape(-1, 2)[places])
+    innovation = readings - expected.measurement
+    innovation[:, 0] = wrap_angle(innovation[:, 0])
+    return LinearScan(
+        innovation,
+        expected.jacobian_pose,
+        expected.jacobian_landmark,
+        variance,
+        places,
+    )
+
+
+def pairs(places: Int) -> Int:
+    """Return the two columns of each landmark, in turn."""
+    return (2 * places[:, None] + (0, 1)).ravel()

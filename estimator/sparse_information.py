@@ -1,0 +1,429 @@
+"""The exactly sparse extended information filter: a large map with few links."""
+
+from collections.abc import Mapping, Sequence
+from math import inf
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import validation
+from .angles import wrap_angle
+from .information_matrix import Surroundings, surround
+from .interface import Belief, UpdateReport
+from .local_choice import (
+    AROUND,
+    choose_local,
+    first_reach,
+    local_size,
+    union,
+    wider,
+)
+from .local_information import Map, begin, finish, link_count, pairs
+from .pose_given_map import PoseGivenMap, move
+from .sparse_information_state import SavedState, as_arrays, checked_state
+from .sparse_marginals import marginal, means
+from .sparse_scan import ScanRules
+from .sparse_update import Sparsity, consider
+from .sparsification import State, active, identify, integrate_out
+from .validation import LandmarkIds
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+class SparseInformationSlam:
+    """Exactly sparse extended information filter: few links, and none of them made up.
+
+    The map is kept as an information matrix Λ, whose zeros say that two landmarks are
+    independent given all others [1]_.  A motion links all landmarks to which the pose
+    is linked, the *active* ones.  When a scan would make them more than
+    ``active_bound``, every other of its readings of mapped landmarks corrects the
+    belief as usual; then the pose is integrated out, which links the landmarks active
+    so far and no others, and taken anew from the remaining readings alone, as if the
+    robot had been kidnapped.  So Λ stays exactly sparse, no reading counts twice, and
+    what is lost is odometry: the belief is less certain than that of the EKF, never
+    more.
+
+    Means and covariances near the robot come from a small dense matrix, in which the
+    landmarks around it are eliminated by a Cholesky factor; while the robot stays among
+    the same landmarks this factor holds.
+
+    Parameters
+    ----------
+    motion_std, measurement_std, initial_pose, initial_pose_std, range_std_per_metre, \
+range_noise_at, gate_probability, noise_at_rest, min_range
+        As in :class:`EkfSlam`; ``measurement_std`` above 0.
+    active_bound : int or None
+        Γ, the largest number of landmarks linked with the pose; at least 2.  A scan
+        that holds more itself, or fewer than two readings of mapped landmarks that
+        determine the pose, exceeds it for a while.  None: no bound, the EKF in other
+        clothes, with a matrix that fills.
+    sparsify : {"relocate", "prune"}
+        "prune" cuts the weakest links between pose and landmarks instead, as the SEIF
+        does [2]_, which makes the filter overconfident: it exists for comparison.
+    tolerance : float
+        Corrections wait where they would move a landmark far from the robot by less
+        than this share of its standard deviation given its neighbours.  What waits is
+        kept and not lost.  0: none waits, every mean is exact, at the cost of
+        eliminating the whole map whenever the robot leaves its local map.
+    belief_limit : int
+        Largest number of landmarks of which ``belief`` makes a dense covariance.
+
+    Raises
+    ------
+    ValueError
+        Where an argument is refused.
+
+    References
+    ----------
+    .. [1] M. Walter, R. Eustice, J. Leonard, Exactly sparse extended information
+       filters for feature-based SLAM, IJRR 26(4), 2007.
+    .. [2] S. Thrun, Y. Liu, D. Koller, A. Ng, Z. Ghahramani, H. Durrant-Whyte,
+       Simultaneous localization and mapping with sparse extended information filters,
+       IJRR 23(7-8), 2004.
+
+    Examples
+    --------
+    >>> slam = SparseInformationSlam((0.05, 0.02, 0.01), (0.02, 0.1), active_bound=10)
+    >>> slam.update([(0.0, 2.0), (1.5, 3.0)], landmark_ids=[7, 9]).added_ids
+    (7, 9)
+    >>> slam.belief([7]).landmarks  # of the whole map: belief()
+    array([[2., 0.]])
+    """
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        initial_pose: ArrayLike = (0.0, 0.0, 0.0),
+        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        active_bound: int | None = 20,
+        sparsify: str = "relocate",
+        tolerance: float = 1e-3,
+        belief_limit: int = 5000,
+        **settings: Any,
+    ) -> None:
+        self._scan_rules = ScanRules(motion_std, measurement_std, **settings)
+        self._sparsity = Sparsity(
+            inf
+            if active_bound is None
+            else validation.whole("active_bound", active_bound, 2),
+            validation.one_of("sparsify", sparsify, ("relocate", "prune")) == "prune",
+        )
+        self._tolerance = validation.at_least("tolerance", tolerance, 0.0)
+        self._belief_limit = validation.whole("belief_limit", belief_limit, 1)
+        self.reset(initial_pose, initial_pose_std)
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run with an empty map, as :meth:`EkfSlam.reset`."""
+        first = validation.finite_vector("pose", pose, 3)
+        std = validation.standard_deviations("pose_std", pose_std, 3)
+        self._slots: dict[int, int] = {}  # place of each landmark in the map
+        self._free: list[int] = []
+        self._world = Map()
+        self._pose = PoseGivenMap(first.copy(), np.zeros((3, 0)), np.diag(std**2))
+        self._local, self._pose = begin(
+            self._world, self._pose, np.empty(0, dtype=np.int64), AROUND
+        )
+        self._reach: float = AROUND
+        self._widened = False  # whether the first reach did not do
+        self._origin = first[:2].copy()  # where the local map was chosen
+        self._others: Surroundings | None = None
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
+        distance, turn = validation.pair("odometry", odometry)
+        variance = self._scan_rules.motion_variance(distance, turn, dt)
+        self._pose = move(self._pose, np.array([distance, turn]), variance)
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
+    ) -> UpdateReport:
+        """Correct the belief with one scan, then map the landmarks seen first.
+
+        Parameters and report as in :meth:`EkfSlam.update`; innovation, its covariance
+        and the NIS are those of all readings in use at the prior, whether they then
+        correct the pose or replace it.
+
+        Raises
+        ------
+        ValueError
+            Where the arguments are malformed; the belief is then as before.
+        numpy.linalg.LinAlgError
+            Where a covariance is not positive definite; the belief is then as before,
+            up to rounding.
+        """
+        readings = validation.scan(measurements)
+        ids = self._identities(landmark_ids, readings)
+        if not ids:
+            return UpdateReport()
+        self._look_after(ids)
+        while True:
+            outcome = consider(
+                (self._local, self._pose),
+                self._scan_rules,
+                self._sparsity,
+                (readings, ids),
+                self._slots,
+                self._vacant(len(ids)),
+            )
+            local = outcome.local
+            if local.outer.unrest(local.shift) <= self._tolerance:
+                break
+            self._take(self._local.slots, wider(self._reach, len(self._slots)))
+            self._widened = True
+        for i, slot in zip(outcome.report.added_ids, outcome.added_slots, strict=True):
+            self._slots[i] = slot
+        self._free = [slot for slot in self._free if slot not in outcome.added_slots]
+        self._world.grow(len(self._slots) + len(self._free))
+        self._pose, self._local = outcome.pose, local
+        return outcome.report
+
+    def remove(self, landmark_ids: LandmarkIds) -> None:
+        """Forget landmarks; the belief about all else stays exactly as it was.
+
+        Landmarks that were linked with the same removed one are linked afterwards.
+
+        Parameters
+        ----------
+        landmark_ids : sequence of int
+            Mapped landmarks, without repetition.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map; nothing is then removed.
+        """
+        ids = self._mapped(landmark_ids)
+        if ids:
+            gone = self._take_with_links(ids)
+            self._drop(ids, gone, integrate_out(self._local, self._pose, gone))
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Condition on two landmarks being one, and forget the second.
+
+        Parameters
+        ----------
+        kept, gone : int
+            Two mapped landmarks.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map, or they are the same; nothing is then merged.
+        """
+        one, _ = self._mapped([kept, gone])
+        dropped = self._take_with_links([gone, kept])
+        place = int(np.flatnonzero(self._local.slots == self._slots[one])[0])
+        dropped[place] = False
+        merged = identify(self._local, self._pose, place, dropped)
+        self._drop([gone], dropped, merged)
+
+    def _take_with_links(self, ids: Sequence[int]) -> Flags:
+        """Take landmarks in hand and all that are linked with them; return which."""
+        slots = np.array([self._slots[i] for i in ids])
+        linked = np.append(slots, self._world.information.neighbours(slots))
+        self._take(union(self._local.slots, linked), self._first_reach())
+        return np.isin(self._local.slots, slots)
+
+    def _drop(self, ids: Sequence[int], gone: Flags, rest: State) -> None:
+        """Go on with what remains of the belief, and free the places of the others."""
+        stays = np.repeat(~gone, 2)
+        information = np.where(stays & stays[:, None], self._local.information, 0.0)
+        self._world.information.put(self._local.slots, information)
+        self._local, self._pose = rest
+        self._others = None
+        for i in ids:
+            self._free.append(self._slots.pop(i))
+
+    def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
+        """Return the belief as a snapshot, of the whole map or of a part of it.
+
+        Parameters
+        ----------
+        landmark_ids : sequence of int, optional
+            Of these landmarks and the pose only, in this order: their marginal.
+            ``belief([])`` is that of the pose.  The first call since the local map was
+            chosen factorises all the rest of the map; further ones, as long as they
+            ask for landmarks near the robot, cost little.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map, or they are more than ``belief_limit``.
+        """
+        ids = list(self._slots) if landmark_ids is None else self._mapped(landmark_ids)
+        if len(ids) > self._belief_limit:
+            gigabytes = 8e-9 * (3 + 2 * len(ids)) ** 2
+            raise ValueError(
+                f"belief() of {len(ids)} landmarks has a dense covariance of "
+                f"{gigabytes:.1f} GB, and belief_limit is {self._belief_limit}: give "
+                "landmark_ids, or raise belief_limit"
+            )
+        slots = np.array([self._slots[i] for i in ids], dtype=np.int64)
+        answer = marginal(
+            self._world, self._local, self._everything(), self._pose, slots
+        )
+        return Belief(answer.mean, answer.covariance, tuple(ids), "additive")
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return tuple(self._slots)
+
+    @property
+    def local_ids(self) -> tuple[int, ...]:
+        """The landmarks of the local map."""
+        local = set(self._local.slots.tolist())
+        return tuple(i for i, slot in self._slots.items() if slot in local)
+
+    @property
+    def active_ids(self) -> tuple[int, ...]:
+        """The landmarks linked with the pose."""
+        linked = set(self._local.slots[active(self._pose)].tolist())
+        return tuple(i for i, slot in self._slots.items() if slot in linked)
+
+    @property
+    def landmarks(self) -> Array:
+        """Positions of all landmarks, shape (n, 2) [m]; no covariance is computed."""
+        points = means(self._world, self._local).reshape(-1, 2)
+        return points[list(self._slots.values())]
+
+    @property
+    def pose(self) -> Array:
+        """(x, y, θ), shape (3,) [m, m, rad]; no covariance is computed."""
+        x, y, heading = self._pose.mean
+        return np.array([x, y, wrap_angle(heading)])
+
+    @property
+    def link_count(self) -> int:
+        """Number of 2 × 2 blocks of Λ that are not zero, the diagonal counted."""
+        return link_count(self._world, self._local)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the belief takes [bytes]."""
+        local, world = self._local, self._world
+        arrays = (world.points, world.residual, local.information)
+        around = (local.surroundings.response, local.outer.response)
+        return world.information.nbytes + sum(a.nbytes for a in arrays + around)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of everything, as arrays."""
+        return as_arrays(
+            SavedState(
+                self._slots,
+                self._free,
+                self._world,
+                self._local,
+                self._pose,
+                self._origin,
+                self._reach,
+                self._widened,
+            ),
+            type(self).__name__,
+        )
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state, bit for bit in a filter of the same settings.
+
+        Parameters
+        ----------
+        state : mapping
+            What :meth:`state_dict` returned, also after a trip through ``numpy.savez``.
+
+        Raises
+        ------
+        ValueError
+            Where the state lacks an entry, is of another estimator, or does not fit
+            together; the belief is then as before.
+        """
+        saved = checked_state(state, type(self).__name__)
+        self._slots, self._free, self._world = saved.slots, saved.free, saved.world
+        self._local, self._pose = saved.local, saved.pose
+        self._origin, self._reach = saved.origin, saved.reach
+        self._widened = saved.widened
+        self._others = None
+
+    def _identities(
+        self, landmark_ids: LandmarkIds | None, readings: Array
+    ) -> list[int]:
+        if landmark_ids is None and len(readings):
+            raise ValueError(
+                f"landmark_ids must be given: {type(self).__name__} does not associate"
+            )
+        ids = validation.identities(
+            [] if landmark_ids is None else landmark_ids, len(readings)
+        )
+        for usable, rule in (
+            (np.isfinite(readings), "must be finite"),
+            (
+                np.abs(readings) <= validation.LARGEST,
+                f"must not exceed {validation.LARGEST:g}",
+            ),
+        ):
+            if not usable.all():
+                row = int(np.argmin(usable.all(axis=1)))
+                raise ValueError(
+                    f"measurements {rule}, got {readings[row].tolist()} in row {row} "
+                    f"(landmark {ids[row]})"
+                )
+        return ids
+
+    def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
+        ids = validation.identities(landmark_ids, np.size(landmark_ids))
+        for i in ids:
+            if i not in self._slots:
+                raise ValueError(f"landmark_ids must be of mapped landmarks, got {i}")
+        return ids
+
+    def _look_after(self, ids: Sequence[int]) -> None:
+        """Choose a new local map where this scan, or what was found, asks for one."""
+        seen = np.array([self._slots[i] for i in ids if i in self._slots], dtype=int)
+        local = self._local.slots
+        wanted = union(seen, local[active(self._pose)])
+        size = local_size(len(self._slots), len(ids), len(wanted))
+        if np.isin(seen, local).all() and 2 * len(local) <= 3 * size:
+            return
+        here = self._pose.mean[:2]
+        ahead = here + (here - self._origin) / 2  # where it may be going
+        mapped = np.array(list(self._slots.values()))
+        points = self._world.points.reshape(-1, 2)
+        self._take(
+            choose_local(mapped, points, ahead, wanted, size), self._first_reach()
+        )
+        self._origin, self._widened = here.copy(), False
+
+    def _first_reach(self) -> float:
+        if not self._tolerance:
+            return inf
+        return first_reach(self._reach, self._widened, len(self._slots))
+
+    def _take(self, slots: Int, reach: float) -> None:
+        """Hand the local map back, and take these landmarks in hand."""
+        old, pose = self._local.slots, self._pose
+        finish(self._world, self._local)
+        self._others, self._local = None, self._local.without_factor()
+        gain = np.zeros((3, 2 * len(slots)))
+        _, before, now = np.intersect1d(old, slots, return_indices=True)
+        gain[:, pairs(now)] = pose.gain[:, pairs(before)]
+        pose = pose._replace(gain=gain)
+        self._local, self._pose = begin(self._world, pose, slots, reach)
+        self._reach = reach
+        self._others = None if np.isfinite(reach) else self._local.surroundings
+
+    def _everything(self) -> Surroundings:
+        """All landmarks but the local ones, eliminated."""
+        if self._others is None:
+            matrix, slots = self._world.information, self._local.slots
+            self._others = surround(matrix, slots, matrix.around(slots, inf))
+        return self._others
+
+    def _vacant(self, count: int) -> Int:
+        """Places for so many new landmarks."""
+        fresh = len(self._slots) + len(self._free)
+        places = self._free[::-1] + list(range(fresh, fresh + count))
+        return np.array(places[:count], dtype=np.int64)

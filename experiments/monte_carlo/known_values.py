@@ -1,0 +1,56 @@
+"""Averages over what is known, as plain numbers; None where nothing is."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def finite(value: float) -> float | None:
+    """Return a number, or None for nan and infinity, which JSON does not know."""
+    return float(value) if math.isfinite(value) else None
+
+
+def mean(values: NDArray[Any]) -> float | None:
+    """Average over the entries that are finite.
+
+    Examples
+    --------
+    >>> mean(np.array([1.0, np.nan, 2.0])), mean(np.array([np.nan]))
+    (1.5, None)
+    """
+    known = np.asarray(values)[np.isfinite(values)]
+    return finite(known.mean()) if len(known) else None
+
+
+def root_mean_square(values: NDArray[Any]) -> float | None:
+    """Take the root of the mean square of the entries that are finite."""
+    with np.errstate(over="ignore"):
+        square = mean(np.asarray(values) ** 2)
+    return None if square is None else math.sqrt(square)
+
+
+def quotient(values: NDArray[Any], freedom: NDArray[Any]) -> float | None:
+    """Divide sums, over the entries whose value is finite.
+
+    Parameters
+    ----------
+    values, freedom : ndarray, of the same shape
+        Chi-square numbers and their degrees of freedom.
+    """
+    known = np.isfinite(values)
+    total = freedom[known].sum()
+    return finite(values[known].sum() / total) if total else None
+
+
+def standard_error(values: NDArray[Any]) -> float | None:
+    """Say how far the mean of independent numbers is off, s / √M; None below two.
+
+    Examples
+    --------
+    >>> standard_error(np.array([1.0, 3.0])), standard_error(np.array([1.0]))
+    (1.0, None)
+    """
+    count = len(values)
+    return finite(values.std(ddof=1) / math.sqrt(count)) if count > 1 else None

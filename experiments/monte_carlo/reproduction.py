@@ -1,0 +1,63 @@
+"""The call of Python that makes the same results again."""
+
+import tomllib
+from typing import Any
+
+from ...sim_configs import load_scenario
+
+ASSUMED_FILE = "assumed.toml"
+
+
+def python_call(summary: dict[str, Any]) -> str:
+    """Write the call of ``monte_carlo`` that a summary comes from.
+
+    A scenario that is no preset, or a changed one, is called by a file, which a comment
+    tells to save first; so is the scenario whose noise was assumed.
+
+    Parameters
+    ----------
+    summary : dict
+        Of ``summarise_monte_carlo``.
+    """
+    preset = _is_preset(summary)
+    name = summary["scenario"]
+    world = name if preset else f"{name}.toml"
+    files = [] if preset else [world]
+    arguments = [repr(world), _estimators(summary["estimators"])]
+    first = summary["first_run"]
+    arguments += [f"runs={first + summary['runs']}", f"seed={summary['seed']}"]
+    if summary["assumed_toml"]:
+        files.append(ASSUMED_FILE)
+        arguments.append(f"assumed={ASSUMED_FILE!r}")
+    if summary["block_size"] is not None:
+        arguments.append(f"block_size={summary['block_size']}")
+    if first:
+        arguments.append(f"first_run={first}")
+    note = (
+        f"# first save {' and '.join(map(repr, files))}, see below\n" if files else ""
+    )
+    listed = "".join(f"    {argument},\n" for argument in arguments)
+    return (
+        "from slamgym.experiments.monte_carlo import monte_carlo\n\n"
+        f"{note}monte_carlo(\n{listed})"
+    )
+
+
+def _is_preset(summary: dict[str, Any]) -> bool:
+    """Whether the preset of that name is the scenario itself, and not a namesake."""
+    try:
+        world = load_scenario(tomllib.loads(summary["scenario_toml"]))
+        return bool(world == load_scenario(summary["scenario"]))
+    except ValueError:
+        return False
+
+
+def _estimators(entries: dict[str, Any]) -> str:
+    """Write names alone where they say all, else labels with (name, options)."""
+    named = {
+        label: (entry.get("name", label), entry.get("options") or {})
+        for label, entry in entries.items()
+    }
+    if all(label == name and not options for label, (name, options) in named.items()):
+        return repr(list(named))
+    return repr(named)
