@@ -32,6 +32,7 @@ from .registry import make_estimator as make_estimator
 from .registry import register_estimator as register_estimator
 from .robocentric import RobocentricEkfSlam as RobocentricEkfSlam
 from .sparse_information import SparseInformationSlam as SparseInformationSlam
+from .submaps import SubmapSlam as SubmapSlam
 from .unscented import UnscentedSlam as UnscentedSlam
 
 if TYPE_CHECKING:

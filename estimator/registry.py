@@ -19,6 +19,7 @@ from .managed import ManagedSlam
 from .observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
 from .robocentric import RobocentricEkfSlam
 from .sparse_information import SparseInformationSlam
+from .submaps import SubmapSlam
 from .unscented import UnscentedSlam
 
 EstimatorFactory = Callable[..., SlamEstimator]
@@ -147,5 +148,6 @@ for _name, _factory in {
     "ideal": IdealEkfSlam,
     "compressed": CompressedEkfSlam,
     "sparse_information": SparseInformationSlam,
+    "submaps": SubmapSlam,
 }.items():
     register_estimator(_name, _factory)

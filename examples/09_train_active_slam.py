@@ -8,7 +8,7 @@ filter, run side by side in this one process.  Needs Stable-Baselines3::
 
 Run it::
 
-    python examples/09_train_active_slam.py      # some eight minutes of a core's time
+    python examples/09_train_active_slam.py      # some seven minutes of a core's time
     python examples/09_train_active_slam.py --steps 100000 --maps 10    # a taste
 
 It writes into ``results/09_train_active_slam``: ``policy.zip``, which is then read

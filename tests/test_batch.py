@@ -129,6 +129,7 @@ def test_a_filter_either_runs_in_batches_or_says_that_it_cannot(name):
         "ideal",
         "compressed",
         "sparse_information",
+        "submaps",
     ):
         with pytest.raises(ValueError, match="cannot run in batches"):
             make_batch(name, **settings)

@@ -49,6 +49,7 @@ FAMILY = {
         {"base": "invariant"},
         DenseInvariant,
     ),
+    "submaps": ("submaps", {}, DenseInvariant),
     "sparse_information": ("sparse_information", {"active_bound": None}, DenseEkf),
 }
 BLIND_TO_A_TURN = [
@@ -60,6 +61,7 @@ BLIND_TO_A_TURN = [
     "robocentric",
     "ideal",
     "compressed invariant",
+    "submaps",
 ]
 
 
@@ -432,5 +434,6 @@ def test_beliefs_name_the_frame_of_their_error():
         "invariant iterated",
         "invariant sequential",
         "compressed invariant",
+        "submaps",
     }
     assert isinstance(make("ekf"), EkfSlam)
