@@ -35,7 +35,7 @@ from scipy.linalg.blas import dsyrk
 
 from slamgym.estimator import EkfSlam
 from slamgym.estimator.bearing_range_model import predict_measurement
-from slamgym.estimator.compressed import CompressedEkfSlam
+from slamgym.estimator.growing_maps.compressed import CompressedEkfSlam
 from slamgym.estimator.unicycle_motion import predict_pose
 
 Array = NDArray[np.float64]

@@ -28,8 +28,8 @@ from scipy.spatial import cKDTree
 
 from slamgym.estimator.bearing_range_model import predict_measurement
 from slamgym.estimator.consistency import pose_nees
+from slamgym.estimator.growing_maps.sparse_information import SparseInformationSlam
 from slamgym.estimator.registry import make_estimator
-from slamgym.estimator.sparse_information import SparseInformationSlam
 from slamgym.estimator.unicycle_motion import predict_pose
 from slamgym.experiments.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario

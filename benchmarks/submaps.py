@@ -33,7 +33,7 @@ from rich.table import Table
 from scipy.spatial import KDTree
 
 from slamgym.estimator.bearing_range_model import predict_measurement
-from slamgym.estimator.submaps import SubmapSlam
+from slamgym.estimator.growing_maps.submaps import SubmapSlam
 from slamgym.estimator.unicycle_motion import predict_pose
 from slamgym.experiments.monte_carlo import monte_carlo
 

@@ -12,17 +12,21 @@ from .batch import can_batch as can_batch
 from .batch import make_batch as make_batch
 from .check_estimator import EstimatorContractError as EstimatorContractError
 from .check_estimator import check_estimator as check_estimator
-from .compressed import CompressedEkfSlam as CompressedEkfSlam
 from .ekf_slam import EkfSlam as EkfSlam
-from .field_of_view import FieldOfView as FieldOfView
+from .growing_maps.compressed import CompressedEkfSlam as CompressedEkfSlam
+from .growing_maps.sparse_information import (
+    SparseInformationSlam as SparseInformationSlam,
+)
+from .growing_maps.submaps import SubmapSlam as SubmapSlam
 from .ideal import IdealEkfSlam as IdealEkfSlam
 from .interface import Belief as Belief
 from .interface import SlamEstimator as SlamEstimator
 from .interface import UpdateReport as UpdateReport
 from .invariant import InvariantEkfSlam as InvariantEkfSlam
 from .iterated import IteratedEkfSlam as IteratedEkfSlam
-from .landmark_management import LandmarkPolicy as LandmarkPolicy
-from .managed import ManagedSlam as ManagedSlam
+from .landmark_management.field_of_view import FieldOfView as FieldOfView
+from .landmark_management.landmark_policy import LandmarkPolicy as LandmarkPolicy
+from .landmark_management.managed import ManagedSlam as ManagedSlam
 from .observability import FirstEstimatesEkfSlam as FirstEstimatesEkfSlam
 from .observability import (
     ObservabilityConstrainedEkfSlam as ObservabilityConstrainedEkfSlam,
@@ -31,8 +35,6 @@ from .registry import list_estimators as list_estimators
 from .registry import make_estimator as make_estimator
 from .registry import register_estimator as register_estimator
 from .robocentric import RobocentricEkfSlam as RobocentricEkfSlam
-from .sparse_information import SparseInformationSlam as SparseInformationSlam
-from .submaps import SubmapSlam as SubmapSlam
 from .unscented import UnscentedSlam as UnscentedSlam
 
 if TYPE_CHECKING:

@@ -67,7 +67,7 @@ def discard_stale_cache(sources: Path, cached: Path) -> None:
     sources, cached : Path
         Folder of the sources, and the folder in which numba keeps what it compiled.
     """
-    newest = max((f.stat().st_mtime for f in sources.glob("*.py")), default=0.0)
+    newest = max((f.stat().st_mtime for f in sources.rglob("*.py")), default=0.0)
     for file in cached.glob("*.nb[ic]"):
         with suppress(OSError):  # somebody else's cache
             if file.stat().st_mtime < newest:

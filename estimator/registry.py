@@ -8,18 +8,18 @@ from typing import Any, cast
 
 from numpy.typing import ArrayLike
 
-from .compressed import CompressedEkfSlam
 from .ekf_slam import EkfSlam
+from .growing_maps.compressed import CompressedEkfSlam
+from .growing_maps.sparse_information import SparseInformationSlam
+from .growing_maps.submaps import SubmapSlam
 from .ideal import IdealEkfSlam
 from .interface import SlamEstimator
 from .invariant import InvariantEkfSlam
 from .iterated import IteratedEkfSlam
-from .landmark_management import LandmarkPolicy
-from .managed import ManagedSlam
+from .landmark_management.landmark_policy import LandmarkPolicy
+from .landmark_management.managed import ManagedSlam
 from .observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
 from .robocentric import RobocentricEkfSlam
-from .sparse_information import SparseInformationSlam
-from .submaps import SubmapSlam
 from .unscented import UnscentedSlam
 
 EstimatorFactory = Callable[..., SlamEstimator]

@@ -7,7 +7,7 @@ from typing import overload
 import numpy as np
 
 from ..estimator.interface import Belief
-from ..estimator.map_access import MapView
+from ..estimator.landmark_management.map_access import MapView
 from .trace import MapEstimate
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimator.interface import Belief, SlamEstimator, UpdateReport
-from ..estimator.map_access import mapped_ids, marginal, view_of
+from ..estimator.landmark_management.map_access import mapped_ids, marginal, view_of
 from .log_events import Scan
 from .log_steps import Step, predictions, steps_of
 from .map_history import MapHistory

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
 from slamgym.estimator.bearing_range_model import predict_measurement
-from slamgym.estimator.compressed import BASES, CompressedEkfSlam
+from slamgym.estimator.growing_maps.compressed import BASES, CompressedEkfSlam
+from slamgym.estimator.growing_maps.local_map_storage import BLOCK, DeferredCovariance
 from slamgym.estimator.interface import Belief
-from slamgym.estimator.local_map_storage import BLOCK, DeferredCovariance
-from slamgym.estimator.map_access import access_to
+from slamgym.estimator.landmark_management.map_access import access_to
 from slamgym.estimator.unicycle_motion import predict_pose
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))

@@ -8,14 +8,14 @@ from slamgym.envs.landmark_world import LandmarkWorldEnv
 from slamgym.estimator import make_estimator
 from slamgym.estimator.angles import wrap_angle
 from slamgym.estimator.bearing_range_model import predict_measurement
-from slamgym.estimator.data_association import (
+from slamgym.estimator.landmark_management.data_association import (
     AMBIGUOUS,
     NEW,
     Distances,
     innovation_distances,
     nearest_neighbours,
 )
-from slamgym.estimator.tentative_landmarks import TentativeLandmarks
+from slamgym.estimator.landmark_management.tentative_landmarks import TentativeLandmarks
 from slamgym.estimator.unicycle_motion import predict_pose
 from slamgym.sim_configs import action_sequence, load_scenario
 

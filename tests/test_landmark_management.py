@@ -13,9 +13,12 @@ from scipy.stats import chi2
 
 from slamgym.estimator import check_estimator, list_estimators, make_estimator
 from slamgym.estimator.consistency import normalised_squared_error
-from slamgym.estimator.field_of_view import FieldOfView
-from slamgym.estimator.landmark_management import LandmarkPolicy, as_policy
-from slamgym.estimator.map_editing import separation
+from slamgym.estimator.landmark_management.field_of_view import FieldOfView
+from slamgym.estimator.landmark_management.landmark_policy import (
+    LandmarkPolicy,
+    as_policy,
+)
+from slamgym.estimator.landmark_management.map_editing import separation
 from slamgym.experiments.filter_settings import settings_for
 from slamgym.experiments.replay import replay
 from slamgym.experiments.slamlog import OdometryRow, Scan, SlamLog

@@ -7,8 +7,12 @@ from scipy.linalg import expm
 
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
 from slamgym.estimator.error_frames import invariant_covariance, invariant_error
-from slamgym.estimator.map_access import access_to, marginal
-from slamgym.estimator.map_editing import coincide, separation, without_landmarks
+from slamgym.estimator.landmark_management.map_access import access_to, marginal
+from slamgym.estimator.landmark_management.map_editing import (
+    coincide,
+    separation,
+    without_landmarks,
+)
 
 # Closed submaps stay as they are, so that nothing can be taken out of their map.
 MANAGEABLE = [name for name in list_estimators() if name != "submaps"]

@@ -13,15 +13,15 @@ from town_drives import map_all, wander
 
 from slamgym.estimator import EkfSlam, check_estimator
 from slamgym.estimator.bearing_range_model import predict_measurement
-from slamgym.estimator.information_matrix import InformationMatrix, solver
-from slamgym.estimator.local_information import Map, begin, finish
-from slamgym.estimator.pose_given_map import (
+from slamgym.estimator.growing_maps.information_matrix import InformationMatrix, solver
+from slamgym.estimator.growing_maps.local_information import Map, begin, finish
+from slamgym.estimator.growing_maps.pose_given_map import (
     LinearScan,
     PoseGivenMap,
     cut_links,
     relocate,
 )
-from slamgym.estimator.sparse_information import SparseInformationSlam
+from slamgym.estimator.growing_maps.sparse_information import SparseInformationSlam
 from slamgym.estimator.unicycle_motion import predict_pose
 from slamgym.experiments.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario

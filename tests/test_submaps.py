@@ -14,12 +14,16 @@ from scipy.optimize import least_squares
 from slamgym.estimator import check_estimator
 from slamgym.estimator.angles import wrap_angle
 from slamgym.estimator.bearing_range_model import predict_measurement
-from slamgym.estimator.submap_elimination import Elimination, dissect
-from slamgym.estimator.submap_fusion import fuse
-from slamgym.estimator.submap_joining import Gaussian
-from slamgym.estimator.submap_relation import inverse_spread, relation, retract
-from slamgym.estimator.submap_store import AT_HAND, MARK
-from slamgym.estimator.submaps import BASES, SubmapSlam
+from slamgym.estimator.growing_maps.submap_elimination import Elimination, dissect
+from slamgym.estimator.growing_maps.submap_fusion import fuse
+from slamgym.estimator.growing_maps.submap_joining import Gaussian
+from slamgym.estimator.growing_maps.submap_relation import (
+    inverse_spread,
+    relation,
+    retract,
+)
+from slamgym.estimator.growing_maps.submap_store import AT_HAND, MARK
+from slamgym.estimator.growing_maps.submaps import BASES, SubmapSlam
 from slamgym.estimator.unicycle_motion import predict_pose
 from slamgym.experiments.monte_carlo import monte_carlo
 
@@ -611,7 +615,7 @@ def test_a_belief_beyond_the_limit_names_the_memory_it_would_take():
 
 
 def test_submaps_that_cannot_be_joined_are_told(driven, monkeypatch):
-    monkeypatch.setattr("slamgym.estimator.submap_joining.ITERATIONS", 1)
+    monkeypatch.setattr("slamgym.estimator.growing_maps.submap_joining.ITERATIONS", 1)
     other = made()
     other.load_state_dict(driven.state_dict())
     with pytest.raises(np.linalg.LinAlgError, match="did not converge in 1 iterations"):

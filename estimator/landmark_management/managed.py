@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import validation
-from .interface import Belief, SlamEstimator, UpdateReport
-from .landmark_management import LandmarkPolicy, as_policy
+from .. import validation
+from ..interface import Belief, SlamEstimator, UpdateReport
+from ..validation import LandmarkIds
+from .landmark_policy import LandmarkPolicy, as_policy
 from .map_access import (
     MapView,
     RememberedAccess,
@@ -20,7 +21,6 @@ from .map_access import (
 )
 from .map_upkeep import MapUpkeep
 from .scan_plan import Newcomers, ScanPlan
-from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import validation
-from .angles import wrap_angle
-from .ekf_slam import FRAMES, EkfSlam
-from .interface import Belief, UpdateReport
-from .invariant import InvariantEkfSlam
+from .. import validation
+from ..angles import wrap_angle
+from ..ekf_slam import FRAMES, EkfSlam
+from ..interface import Belief, UpdateReport
+from ..invariant import InvariantEkfSlam
+from ..validation import LandmarkIds
 from .submap_chain import Chain
 from .submap_fusion import fuse
 from .submap_joining import Gaussian, JoinedMap, with_uncertain_start
@@ -19,7 +20,6 @@ from .submap_placing import Outline, Placing
 from .submap_relation import compose, pairs
 from .submap_state import as_arrays, checked_state, outline_of
 from .submap_store import FolderStore, MemoryStore, Submap, SubmapStore
-from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from math import sqrt
 from typing import Any, TypeVar
 
-from . import validation
+from .. import validation
 from .field_of_view import FieldOfView
 
 MOST_SCANS = 63  # that fit one mask of a tentative landmark

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple, Protocol, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from .ekf_slam import FRAMES, EkfSlam
-from .interface import Belief, SlamEstimator
-from .kernels import AT_ESTIMATE
+from ..ekf_slam import FRAMES, EkfSlam
+from ..interface import Belief, SlamEstimator
+from ..kernels import AT_ESTIMATE
 from .map_editing import coincide, without_landmarks
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .error_frames import ErrorFrame
+from ..error_frames import ErrorFrame
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import validation
+from .. import validation
 from .submap_chain import Chain
 from .submap_placing import Outline
 from .submap_store import FolderStore, MemoryStore, Submap, SubmapStore

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lapack, solve_triangular
 
-from .ekf_slam import EkfSlam, not_positive_definite
+from ..ekf_slam import EkfSlam, not_positive_definite
 from .local_information import LocalInformation, linear_scan
 from .pose_given_map import LinearScan, PoseGivenMap, seen_from
 

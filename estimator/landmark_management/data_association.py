@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .angles import wrap_angle
-from .compiled import compiled, part
+from ..angles import wrap_angle
+from ..compiled import compiled, part
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .angles import wrap_angle
+from ..angles import wrap_angle
 from .data_association import Distances, Noise, innovation_distances
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from .data_association import (
     innovation_distances,
     nearest_neighbours,
 )
-from .landmark_management import LandmarkPolicy
+from .landmark_policy import LandmarkPolicy
 from .map_access import MapView
 from .tentative_landmarks import TentativeLandmarks
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .interface import UpdateReport
+from ..interface import UpdateReport
 from .local_information import LocalInformation
 from .pose_given_map import PoseGivenMap
 from .sparse_scan import ScanRules, Screened

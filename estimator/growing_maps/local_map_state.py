@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import validation
+from .. import validation
 from .local_map_extension import virtual_landmarks
 from .local_map_storage import DeferredCovariance
 

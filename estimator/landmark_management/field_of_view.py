@@ -7,8 +7,8 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from . import validation
-from .angles import wrap_angle
+from .. import validation
+from ..angles import wrap_angle
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .bearing_range_model import locate_landmark
+from ..bearing_range_model import locate_landmark
 from .local_information import LocalInformation, linear_scan
 from .pose_given_map import (
     LinearScan,

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import validation
+from .. import validation
 from .information_matrix import InformationMatrix, Solver, Surroundings, solver
 from .local_information import LocalInformation, Map, Outer
 from .pose_given_map import PoseGivenMap

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from .angles import wrap_angle
-from .error_frames import ErrorFrame
+from ..angles import wrap_angle
+from ..error_frames import ErrorFrame
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

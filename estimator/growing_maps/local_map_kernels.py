@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import compiled
+from ..compiled import compiled
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import validation
-from .angles import wrap_angle
+from .. import validation
+from ..angles import wrap_angle
+from ..interface import Belief, UpdateReport
+from ..validation import LandmarkIds
 from .information_matrix import Surroundings, surround
-from .interface import Belief, UpdateReport
 from .local_choice import (
     AROUND,
     choose_local,
@@ -26,7 +27,6 @@ from .sparse_marginals import marginal, means
 from .sparse_scan import ScanRules
 from .sparse_update import Sparsity, consider
 from .sparsification import State, active, identify, integrate_out
-from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]

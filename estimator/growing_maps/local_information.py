@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, lapack
 
-from .angles import wrap_angle
-from .bearing_range_model import predict_measurement
+from ..angles import wrap_angle
+from ..bearing_range_model import predict_measurement
 from .information_matrix import InformationMatrix, Surroundings, surround
 from .pose_given_map import LinearScan, MapReading, PoseGivenMap
 

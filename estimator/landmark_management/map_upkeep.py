@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .data_association import Noise
-from .landmark_management import LandmarkPolicy
+from .landmark_policy import LandmarkPolicy
 from .landmark_records import LandmarkRecords
 from .map_access import MapAccess, MapView
 from .map_editing import separation

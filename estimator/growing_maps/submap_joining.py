@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
-from .error_frames import ErrorFrame
+from ..error_frames import ErrorFrame
 from .submap_elimination import Elimination, Quadratic, dissect
 from .submap_placing import Outline, points_seen
 from .submap_relation import (

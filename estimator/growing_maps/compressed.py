@@ -6,11 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import validation
-from .ekf_slam import FRAMES, EkfSlam
-from .interface import Belief, UpdateReport
-from .invariant import InvariantEkfSlam
-from .iterated import IteratedEkfSlam
+from .. import validation
+from ..ekf_slam import FRAMES, EkfSlam
+from ..interface import Belief, UpdateReport
+from ..invariant import InvariantEkfSlam
+from ..iterated import IteratedEkfSlam
+from ..landmark_management.map_access import access_to
+from ..observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
+from ..validation import LandmarkIds
 from .local_map_extension import (
     Phase,
     combine,
@@ -21,9 +24,6 @@ from .local_map_extension import (
 )
 from .local_map_state import checked_state
 from .local_map_storage import DeferredCovariance, subtract, symmetric
-from .map_access import access_to
-from .observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
-from .validation import LandmarkIds
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]

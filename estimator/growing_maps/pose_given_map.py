@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from .unicycle_motion import predict_pose
+from ..unicycle_motion import predict_pose
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
 
-from .error_frames import ErrorFrame, invariant_covariance
+from ..error_frames import ErrorFrame, invariant_covariance
 from .submap_joining import Gaussian, times
 from .submap_relation import compose, pairs, points_of, retract, state_of
 
