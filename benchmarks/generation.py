@@ -19,8 +19,8 @@ import pymunk
 from rich.console import Console
 from rich.table import Table
 
-from slamgym.experiments.generate import generate_trajectories
-from slamgym.experiments.trajectory_formats import FORMATS, trajectory_format
+from slamgym.experiments.trajectories.formats import FORMATS, trajectory_format
+from slamgym.experiments.trajectories.generate import generate_trajectories
 from slamgym.sim_configs import Scenario, load_scenario
 
 GOAL = 10.0  # bare steps per step: 150,000 steps/s where a bare step takes 1 / 1.5 M s

@@ -16,23 +16,23 @@ import numpy as np
 import pytest
 
 from slamgym.envs.controllers import CONTROLLERS
-from slamgym.experiments import generate, shard_folder
 from slamgym.experiments.commands import generation
 from slamgym.experiments.commands.one_line_errors import InterruptedRunError
 from slamgym.experiments.commands.worlds import recorded
-from slamgym.experiments.driven_episodes import drive_episodes
-from slamgym.experiments.generate import (
-    default_episodes_per_shard,
-    generate_trajectories,
-)
-from slamgym.experiments.manifest import checksum, read_manifest
 from slamgym.experiments.slamlog import write_slamlog
-from slamgym.experiments.trajectory_dataset import (
+from slamgym.experiments.trajectories import generate, shard_folder
+from slamgym.experiments.trajectories.dataset import (
     DamagedShardError,
     load_trajectories,
 )
-from slamgym.experiments.trajectory_formats import FORMATS, npz, trajectory_format
-from slamgym.experiments.trajectory_formats.slamlog_files import to_slamlog
+from slamgym.experiments.trajectories.driven_episodes import drive_episodes
+from slamgym.experiments.trajectories.formats import FORMATS, npz, trajectory_format
+from slamgym.experiments.trajectories.formats.slamlog_files import to_slamlog
+from slamgym.experiments.trajectories.generate import (
+    default_episodes_per_shard,
+    generate_trajectories,
+)
+from slamgym.experiments.trajectories.manifest import checksum, read_manifest
 from slamgym.sim_configs import list_presets, load_scenario
 
 LOOP = load_scenario("loop").with_changes(steps=30)
@@ -176,7 +176,7 @@ def test_the_same_job_gives_the_same_bytes(name, tmp_path):
 
 JOB = """
 import sys
-from slamgym.experiments.generate import generate_trajectories
+from slamgym.experiments.trajectories.generate import generate_trajectories
 from slamgym.sim_configs import load_scenario
 scenario = load_scenario("loop").with_changes(steps=200)
 generate_trajectories(

@@ -11,12 +11,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from slamgym.experiments.driven_episodes import drive_episodes
 from slamgym.experiments.log_events import OdometryRow
 from slamgym.experiments.log_importers import read_log
-from slamgym.experiments.trajectories import ARRAYS
-from slamgym.experiments.trajectory_formats import FORMATS, trajectory_format
-from slamgym.experiments.trajectory_formats.slamlog_files import to_slamlog
+from slamgym.experiments.trajectories.driven_episodes import drive_episodes
+from slamgym.experiments.trajectories.formats import FORMATS, trajectory_format
+from slamgym.experiments.trajectories.formats.slamlog_files import to_slamlog
+from slamgym.experiments.trajectories.trajectory import ARRAYS
 from slamgym.sim_configs import load_scenario
 
 LIBRARIES = {"parquet": ["pyarrow"], "minari": ["minari", "pyarrow"]}
@@ -416,7 +416,7 @@ def test_an_unknown_format_is_answered_with_a_suggestion():
 
 
 def test_a_missing_package_is_named(monkeypatch):
-    module = "slamgym.experiments.trajectory_formats.parquet"
+    module = "slamgym.experiments.trajectories.formats.parquet"
     monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(ImportError, match="'parquet' needs the package pyarrow: pip"):

@@ -17,8 +17,8 @@ from rich.progress import (
 from rich.text import Text
 
 from ...sim_configs import Scenario
-from ..generate import generate_trajectories
-from ..manifest import Manifest
+from ..trajectories.generate import generate_trajectories
+from ..trajectories.manifest import Manifest
 from .one_line_errors import InterruptedRunError
 from .output_folder import default_folder
 from .reporter import Reporter
@@ -79,7 +79,7 @@ def _message(manifest: Manifest, place: Path, size: int) -> str:
     return (
         f"{place}: {job.episodes:,} episodes of {job.scenario.steps:,} steps as "
         f"{job.format}, {size / 1e6:,.1f} MB in {shards} shard{'s' * (shards > 1)}\n"
-        "from slamgym.experiments.trajectory_dataset import load_trajectories\n"
+        "from slamgym.experiments.trajectories import load_trajectories\n"
         f'for trajectory in load_trajectories("{place.as_posix()}"): ...'
     )
 

@@ -6,10 +6,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal
 
-from ..sim_configs.scenario_errors import closest
+from ...sim_configs.scenario_errors import closest
+from .formats import trajectory_format
 from .manifest import Manifest, ShardEntry, checksum, read_manifest
-from .trajectories import Trajectory
-from .trajectory_formats import trajectory_format
+from .trajectory import Trajectory
 
 _DAMAGED = ("raise", "skip")
 

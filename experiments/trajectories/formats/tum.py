@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...estimator.angles import wrap_angle
-from ...sim_configs import Scenario
-from ..trajectories import Array, Trajectory
+from ....estimator.angles import wrap_angle
+from ....sim_configs import Scenario
+from ..trajectory import Array, Trajectory
 from .dead_reckoning import dead_reckoning
 from .episode_files import numbers, read_notes, write_lines, write_notes
 

@@ -23,10 +23,10 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 
-from ...envs.world_spaces import action_space, observation_space
-from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.scenario_files import scenario_text
-from ..trajectories import Trajectory, array_of
+from ....envs.world_spaces import action_space, observation_space
+from ....sim_configs import Scenario, load_scenario
+from ....sim_configs.scenario_files import scenario_text
+from ..trajectory import Trajectory, array_of
 
 ENDING = "-v0"
 LIBRARIES = ("minari", "pyarrow")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sim_configs import Scenario
+from ...sim_configs import Scenario
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.scenario_files import scenario_text
-from ..trajectories import ARRAYS, Trajectory, array_of, arrays_to_write
+from ....sim_configs import Scenario, load_scenario
+from ....sim_configs.scenario_files import scenario_text
+from ..trajectory import ARRAYS, Trajectory, array_of, arrays_to_write
 
 ENDING = ".npz"
 LIBRARIES: tuple[str, ...] = ()

@@ -16,9 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.scenario_files import scenario_text
-from ..trajectories import Array, Trajectory, array_of
+from ....sim_configs import Scenario, load_scenario
+from ....sim_configs.scenario_files import scenario_text
+from ..trajectory import Array, Trajectory, array_of
 
 ENDING = ""
 LIBRARIES = ("pyarrow",)

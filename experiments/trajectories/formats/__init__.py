@@ -19,9 +19,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol, cast
 
-from ...sim_configs import Scenario
-from ...sim_configs.scenario_errors import closest
-from ..trajectories import Trajectory
+from ....sim_configs import Scenario
+from ....sim_configs.scenario_errors import closest
+from ..trajectory import Trajectory
 
 FORMATS = {
     "slamlog": "slamlog_files",

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...envs.world_spaces import count_rows
-from ...sim_configs import Scenario
-from ..log_events import OdometryRow, Scan
-from ..recording import log_header
-from ..slamlog import SlamLog, read_slamlog, write_slamlog
-from ..trajectories import Trajectory, array_of
+from ....envs.world_spaces import count_rows
+from ....sim_configs import Scenario
+from ...log_events import OdometryRow, Scan
+from ...recording import log_header
+from ...slamlog import SlamLog, read_slamlog, write_slamlog
+from ..trajectory import Trajectory, array_of
 from .episode_files import EpisodeNotes, read_notes, write_notes
 
 ENDING = ""

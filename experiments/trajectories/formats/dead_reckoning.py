@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..trajectories import Array
+from ..trajectory import Array
 
 
 def dead_reckoning(start: Array, odometry: Array) -> Array:

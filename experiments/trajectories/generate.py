@@ -5,11 +5,13 @@ from os import PathLike
 from pathlib import Path
 from reprlib import repr as short_repr
 
-from ..envs.controllers import CONTROLLERS
-from ..envs.world_spaces import count_rows
-from ..sim_configs import Scenario, load_scenario
-from ..sim_configs.scenario_errors import closest
+from ...envs.controllers import CONTROLLERS
+from ...envs.world_spaces import count_rows
+from ...sim_configs import Scenario, load_scenario
+from ...sim_configs.scenario_errors import closest
+from .dataset import is_whole
 from .driven_episodes import drive_episodes
+from .formats import TrajectoryFormat, trajectory_format
 from .manifest import (
     MANIFEST,
     Job,
@@ -21,8 +23,6 @@ from .manifest import (
     write_manifest,
 )
 from .shard_folder import claimed, written_whole
-from .trajectory_dataset import is_whole
-from .trajectory_formats import TrajectoryFormat, trajectory_format
 
 Progress = Callable[[int, int], object]
 

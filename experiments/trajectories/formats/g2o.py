@@ -22,8 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...sim_configs import Scenario
-from ..trajectories import Array, Trajectory, array_of
+from ....sim_configs import Scenario
+from ..trajectory import Array, Trajectory, array_of
 from .dead_reckoning import dead_reckoning
 from .episode_files import EpisodeNotes, numbers, read_notes, write_lines, write_notes
 

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.scenario_files import scenario_text
-from ..trajectories import Trajectory
+from ....sim_configs import Scenario, load_scenario
+from ....sim_configs.scenario_files import scenario_text
+from ..trajectory import Trajectory
 
 NOTES = "episodes.jsonl"
 
