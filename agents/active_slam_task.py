@@ -8,7 +8,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..sim_configs import Scenario
-from .belief_arrays import BeliefArrays, marginals_of
+from .belief_arrays import BeliefArrays, stored
 from .belief_features import (
     belief_features,
     belief_space,
@@ -162,7 +162,7 @@ class ActiveSlamTask:
         =============== =========== ===============================================
         """
         beliefs, plan = progress.beliefs, self.plan
-        belief = belief_features(marginals_of(beliefs), plan.bounds)
+        belief = belief_features(stored(beliefs), plan.bounds)
         return {
             **{key: rows.reshape(len(rows), -1) for key, rows in belief.items()},
             "goals": self._goals(progress),
@@ -175,7 +175,10 @@ class ActiveSlamTask:
     def _progress(
         self, beliefs: BeliefArrays, explored: BoolArray, steps: NDArray[np.int64]
     ) -> Progress:
-        variance = largest_variances(*marginals_of(beliefs).spreads[:3])
+        spread = beliefs.landmark_covariances
+        variance = largest_variances(
+            spread[..., 0, 0], spread[..., 0, 1], spread[..., 1, 1]
+        )
         known = beliefs.mapped & (variance <= self.stakes.accuracy**2)
         measure = uncertainty(beliefs, self.stakes.criterion, self.prior_std)
         return Progress(beliefs, explored, steps, measure, variance, known)

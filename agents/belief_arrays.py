@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimator.batch import BatchMarginals, BatchSlam
+from ..estimator.batch import BatchSlam, BatchStorage
 from .estimator_choice import BeliefOfMap
 
 Array = NDArray[np.float64]
@@ -43,18 +43,13 @@ class BeliefArrays(NamedTuple):
         return np.moveaxis(blocks[:, each, :, each, :], 0, 1)
 
 
-def marginals_of(beliefs: BeliefArrays) -> BatchMarginals:
-    """Take what is believed of the poses and of each landmark by itself."""
-    x = 3 + 2 * np.arange(beliefs.mapped.shape[1])
-    cov = beliefs.covariances
-    own = [cov[:, x, x], cov[:, x, x + 1], cov[:, x + 1, x + 1]]
-    with_pose = [cov[:, x + axis, of] for axis in (0, 1) for of in range(3)]
-    return BatchMarginals(
-        beliefs.poses,
-        cov[:, :3, :3],
-        beliefs.landmarks,
-        np.stack(own + with_pose),
-        beliefs.mapped,
+def stored(beliefs: BeliefArrays) -> BatchStorage:
+    """Lay beliefs out as a batch of filters keeps its own."""
+    rows = np.arange(beliefs.mapped.shape[1])
+    return BatchStorage.of(
+        np.ascontiguousarray(beliefs.means),
+        np.ascontiguousarray(beliefs.covariances),
+        np.where(beliefs.mapped, rows, -1),
     )
 
 

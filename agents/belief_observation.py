@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..envs import LandmarkWorldEnv
 from ..sim_configs import Scenario
-from .belief_arrays import BeliefArrays, belief_in_rows, marginals_of
+from .belief_arrays import BeliefArrays, belief_in_rows, stored
 from .belief_features import belief_features, belief_space, world_bounds
 from .estimator_choice import (
     BeliefOfMap,
@@ -129,7 +129,7 @@ class BeliefObservation(
         self._beliefs = belief_in_rows(belief, self._rows, by_id=self._by_id)
         if self.env.render_mode is not None:
             self.env.get_wrapper_attr("show_belief")(belief)
-        features = belief_features(marginals_of(self._beliefs), self._bounds)
+        features = belief_features(stored(self._beliefs), self._bounds)
         return joined(observation, {key: row[0] for key, row in features.items()})
 
 

@@ -162,8 +162,8 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         take_scans(self._filters, observations, worlds, moved=moved)
 
     def _shown(self, observations: Observation) -> Observation:
-        marginals = self._filters.marginals()
-        return joined(observations, belief_features(marginals, self._bounds))
+        features = belief_features(self._filters.storage(), self._bounds)
+        return joined(observations, features)
 
 
 def _lengthened(rows: NDArray[Any], more: int) -> NDArray[Any]:

@@ -15,7 +15,7 @@ from .batch_kernels import NEVER, drive_runs
 from .ekf_slam import FRAMES, EkfSlam, workspace_for
 from .interface import Belief
 from .registry import find_estimator
-from .workspace import aligned_zeros
+from .workspace import Workspace, aligned_zeros
 
 Array = NDArray[np.float64]
 
@@ -62,6 +62,30 @@ class BatchMarginals(NamedTuple):
     (lx, ly), and of lx and of ly with the pose: lx x, lx y, lx θ, ly x, ly y, ly θ."""
     mapped: NDArray[np.bool_]
     """Which landmarks are in the map, shape (B, L)."""
+
+
+class BatchStorage(NamedTuple):
+    """Where the beliefs of all runs stand: live, but not to be written to.
+
+    What lies beyond the mapped landmarks means nothing.
+    """
+
+    means: Array
+    """Shape (B, capacity): (x, y, θ), then the landmarks by slot; θ as it comes."""
+    covariances: Array
+    """Of the additive error, shape (B, capacity, capacity)."""
+    slots: NDArray[np.int64]
+    """Shape (B, L): landmark i stands at 3 + 2 slots[i]; -1 where not mapped."""
+
+    @classmethod
+    def of(
+        cls, means: Array, covariances: Array, slots: NDArray[np.int64]
+    ) -> "BatchStorage":
+        """Take views that cannot be written to."""
+        views = means.view(), covariances.view(), slots.view()
+        for view in views:
+            view.flags.writeable = False
+        return cls(*views)
 
 
 class BatchSlam:
@@ -134,6 +158,7 @@ class BatchSlam:
         self._covariances[:, range(3), range(3)] = std**2
         self._slots = np.full((self.runs, self.landmarks), -1, dtype=np.int64)
         self._mapped = np.zeros(self.runs, dtype=np.int64)
+        self._kept_room: Workspace | None = None
         self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
         """Step of the last :meth:`run` at which a run stopped, -1 where it did not.
 
@@ -274,6 +299,13 @@ class BatchSlam:
             mapped,
         )
 
+    def storage(self) -> BatchStorage:
+        """Return the arrays that the runs work on, without a copy.
+
+        They change with the next :meth:`run` or :meth:`reset`.
+        """
+        return BatchStorage.of(self._means, self._covariances, self._slots)
+
     def belief(self, run: int) -> Belief:
         """Return the belief of one run as a snapshot."""
         n = 3 + 2 * int(self._mapped[run])
@@ -346,8 +378,19 @@ class BatchSlam:
             trace.nis[part],
             trace.degrees_of_freedom[part],
             failed_at[part],
-            *workspace_for(self._rules, self.landmarks, self._means.shape[1]),
+            *self._room(),
         )
+
+    def _room(self) -> Workspace:
+        """Give each share a workspace of its own; kept where there is one thread."""
+        if self._threads > 1:
+            return self._new_room()
+        if self._kept_room is None:
+            self._kept_room = self._new_room()
+        return self._kept_room
+
+    def _new_room(self) -> Workspace:
+        return workspace_for(self._rules, self.landmarks, self._means.shape[1])
 
     def _in_threads(self, work: Callable[[slice], None]) -> None:
         """Do the work on small shares of the runs, each by whichever thread is free."""

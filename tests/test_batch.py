@@ -321,3 +321,36 @@ def test_a_wrong_choice_of_runs_is_refused(data, runs):
         batch.run(*data, runs=runs)
     with pytest.raises(ValueError, match="runs must be 5 booleans, got"):
         batch.reset(np.zeros(3), runs=runs)
+
+
+def test_the_storage_of_a_batch_is_live_and_cannot_be_written_to(data):
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    storage = batch.storage()
+    assert (storage.slots == -1).all()
+    run_some(batch, data, slice(0, 4))
+    for run in range(RUNS):
+        belief = batch.belief(run)
+        slots = storage.slots[run][list(belief.landmark_ids)]
+        at = np.r_[:3, np.ravel(3 + 2 * slots[:, None] + [0, 1])]
+        np.testing.assert_array_equal(storage.means[run][at][3:], belief.mean[3:])
+        block = storage.covariances[run][np.ix_(at, at)]
+        np.testing.assert_array_equal(block, belief.covariance)
+    for array in storage:
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = 0
+
+
+@pytest.mark.parametrize("name", ["ekf", "iterated"])
+def test_runs_that_are_taken_up_again_do_not_notice_the_room_of_earlier_ones(
+    name, data
+):
+    """One thread keeps its workspace between runs; more threads have new ones."""
+    one, two = (
+        make_batch(name, runs=RUNS, landmarks=LANDMARKS, threads=threads, **NOISE)
+        for threads in (1, 2)
+    )
+    for step in range(8):
+        for batch in (one, two):
+            run_some(batch, data, slice(step, step + 1))
+    for ours, theirs in zip(one.beliefs(), two.beliefs(), strict=True):
+        np.testing.assert_array_equal(ours, theirs)

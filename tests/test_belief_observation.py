@@ -5,20 +5,24 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import numpy_belief_features as twin
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
-
-import slamgym  # noqa: F401 (registers the environments)
-from slamgym.agents import BeliefObservation, BeliefObservationVector
-from slamgym.agents.belief_arrays import belief_in_rows, marginals_of
-from slamgym.agents.belief_features import (
+from numpy_belief_features import (
+    marginals_of,
     on_log_scale,
     relative_landmarks,
     relative_spreads,
-    world_bounds,
 )
-from slamgym.estimator import EkfSlam, InvariantEkfSlam
+
+import slamgym  # noqa: F401 (registers the environments)
+from slamgym.agents import BeliefObservation, BeliefObservationVector
+from slamgym.agents.belief_arrays import belief_in_rows, stored
+from slamgym.agents.belief_features import belief_features, world_bounds
+from slamgym.agents.belief_kernels import on_log_scale as log_scale_of_one
+from slamgym.agents.belief_kernels import show_beliefs
+from slamgym.estimator import EkfSlam, InvariantEkfSlam, make_batch
 from slamgym.sim_configs import load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
@@ -76,6 +80,79 @@ def test_their_covariance_is_that_of_numeric_derivatives(belief):
             [[aa[row], ab[row]], [ab[row], bb[row]]], spread, rtol=1e-6, atol=1e-12
         )
     assert not aa[~belief.mapped[0][None][0]].any()
+
+
+NOISE = {"motion_std": (0.3, 0.1, 0.2), "measurement_std": (0.1, 0.2)}
+FLOOR = (-12.0, -7.0, 9.0, 8.0)
+RUNS, LANDMARKS, STEPS = 7, 9, 12
+
+
+@pytest.fixture(scope="module", params=["ekf", "invariant"])
+def batch(request):
+    """Filters that met their landmarks in any order; one met none, one has turned."""
+    rng = np.random.default_rng(4)
+    batch = make_batch(request.param, runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    batch.reset(rng.uniform(-6, 6, (RUNS, 3)), (0.2, 0.1, 0.3))
+    visible = rng.random((RUNS, STEPS, LANDMARKS)) < 0.12
+    visible[0] = False
+    readings = np.stack(
+        [rng.uniform(-3, 3, visible.shape), rng.uniform(1, 9, visible.shape)], axis=-1
+    )
+    odometry = rng.uniform((0.0, -0.5), (1.0, 0.5), (RUNS, STEPS, 2))
+    odometry[1, :, 1] = 1.0
+    batch.run(odometry, readings, visible)
+    slots = batch.storage().slots
+    assert not (slots[0] >= 0).any()
+    assert any((np.diff(row[row >= 0]) < 0).any() for row in slots)
+    assert np.abs(batch.storage().means[1, 2]) > 2 * np.pi
+    return batch
+
+
+def agree(features, expected):
+    assert list(features) == list(expected)
+    for key, rows in features.items():
+        assert rows.dtype == expected[key].dtype
+        np.testing.assert_allclose(rows, expected[key], rtol=0, atol=1e-12)
+
+
+def test_the_compiled_pass_agrees_with_its_slow_twin(batch):
+    expected = twin.belief_features(batch.marginals(), FLOOR)
+    assert (expected["belief_mask"].sum(axis=1) > 1).any()
+    agree(belief_features(batch.storage(), FLOOR), expected)
+
+
+def test_the_compiled_pass_agrees_with_its_slow_twin_at_the_bounds(batch):
+    tiny = (-0.1, -0.2, 0.1, 0.3)  # all is outside
+    expected = twin.belief_features(batch.marginals(), tiny)
+    assert np.abs(expected["belief_landmarks"]).max() == 1.0
+    agree(belief_features(batch.storage(), tiny), expected)
+    certain = make_batch("ekf", runs=2, landmarks=0, **NOISE)  # all variances are 0
+    expected = twin.belief_features(certain.marginals(), FLOOR)
+    assert not expected["belief_pose_std"].any()
+    agree(belief_features(certain.storage(), FLOOR), expected)
+
+
+def test_every_number_is_written_where_nothing_is_mapped(batch):
+    rows = belief_features(batch.storage(), FLOOR)
+    shown = [
+        np.full(row.shape, True if row.dtype == bool else np.nan)
+        for row in rows.values()
+    ]
+    show_beliefs(*batch.storage(), FLOOR, *shown)
+    for key, written in zip(rows, shown, strict=True):
+        np.testing.assert_array_equal(written, rows[key])
+        if "landmark" in key:
+            assert not written[~rows["belief_mask"]].any()
+
+
+def test_features_do_not_depend_on_how_a_belief_is_stored(batch):
+    """A batch, and each of its beliefs by itself with its landmarks in rows."""
+    many = belief_features(batch.storage(), FLOOR)
+    for run in range(RUNS):
+        rows = belief_in_rows(batch.belief(run), LANDMARKS, by_id=True)
+        alone = belief_features(stored(rows), FLOOR)
+        for key, values in many.items():
+            np.testing.assert_array_equal(values[run], alone[key][0])
 
 
 def test_the_pose_is_spread_in_the_frame_of_the_robot():
@@ -398,7 +475,9 @@ def test_rows_of_a_vector_can_be_more_than_its_landmarks():
 
 def test_a_log_scale_spans_a_millimetre_to_ten_metres():
     std = np.array([0.0, 1e-3, 1e-2, 10.0, 1e9])
-    np.testing.assert_allclose(on_log_scale(std), [0, 0, 0.25, 1, 1], atol=1e-12)
+    values = [log_scale_of_one(each) for each in std.tolist()]
+    np.testing.assert_allclose(values, [0, 0, 0.25, 1, 1], atol=1e-12)
+    np.testing.assert_allclose(on_log_scale(std), values, atol=1e-12)
 
 
 def test_a_world_without_walls_is_bounded_by_its_landmarks_and_its_path():

@@ -1,0 +1,163 @@
+"""The arithmetic of the features of a belief, compiled: one pass over all worlds.
+
+Symbols are those of `belief_features`.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..estimator.angles import wrap_angle
+from ..estimator.compiled import compiled, part
+
+Array = NDArray[np.float64]
+Rectangle = tuple[float, float, float, float]
+
+SMALLEST_STD, LARGEST_STD = 1e-3, 10.0
+"""Standard deviations [m, rad] that `on_log_scale` maps to 0 and to 1."""
+
+_DECADES = math.log10(LARGEST_STD / SMALLEST_STD)
+
+
+def clip(value: float, low: float, high: float) -> float:
+    """Bring a number into an interval."""
+    return min(max(value, low), high)
+
+
+def root(variance: float) -> float:
+    """Compute a standard deviation; 0 where rounding has made a variance negative."""
+    return math.sqrt(max(variance, 0.0))
+
+
+def on_log_scale(std: float) -> float:
+    """Map a standard deviation to [0, 1], four decades evenly.
+
+    ::
+
+        0 at 1 mm (or mrad) and below, 1 at 10 m and above
+
+    Examples
+    --------
+    >>> [round(on_log_scale(std), 12) for std in (0.0, 0.01, 0.1, 50.0)]
+    [0.0, 0.25, 0.5, 1.0]
+    """
+    bounded = min(max(std, SMALLEST_STD), LARGEST_STD)
+    # the ends by hand: a rounded logarithm could leave the interval
+    return min(max(math.log10(bounded / SMALLEST_STD) / _DECADES, 0.0), 1.0)
+
+
+def correlation(covariance: float, product: float) -> float:
+    """Divide by a product of standard deviations; 0 where there is nothing to."""
+    return min(max(covariance / product, -1.0), 1.0) if product > 0.0 else 0.0
+
+
+def turned(
+    xx: float, xy: float, yy: float, cos: float, sin: float
+) -> tuple[float, float, float]:
+    """Compute Rᵀ [xx xy; xy yy] R: variance ahead, covariance, variance aside.
+
+    Examples
+    --------
+    >>> turned(1.0, 0.5, 4.0, cos=0.0, sin=1.0)
+    (4.0, -0.5, 1.0)
+    """
+    across = 2 * cos * sin * xy
+    return (
+        cos * cos * xx + across + sin * sin * yy,
+        cos * sin * (yy - xx) + (cos * cos - sin * sin) * xy,
+        sin * sin * xx - across + cos * cos * yy,
+    )
+
+
+_clip, _root, _on_log_scale = part(clip), part(root), part(on_log_scale)
+_correlation, _turned, _wrap = part(correlation), part(turned), part(wrap_angle)
+
+
+@part
+def show_pose(
+    mean: Array,
+    covariance: Array,
+    bounds: Rectangle,
+    pose: Array,
+    correlations: Array,
+    std: Array,
+) -> None:
+    """Write the features of one pose."""
+    left, bottom, right, top = bounds
+    heading = _wrap(mean[2])
+    cos, sin = math.cos(heading), math.sin(heading)
+    pose[0] = _clip((2 * mean[0] - left - right) / (right - left), -1.0, 1.0)
+    pose[1] = _clip((2 * mean[1] - bottom - top) / (top - bottom), -1.0, 1.0)
+    pose[2], pose[3] = cos, sin
+    aa, ab, bb = _turned(covariance[0, 0], covariance[0, 1], covariance[1, 1], cos, sin)
+    x_h, y_h = covariance[0, 2], covariance[1, 2]
+    ahead, aside, turn = _root(aa), _root(bb), _root(covariance[2, 2])
+    std[0], std[1] = _on_log_scale(ahead), _on_log_scale(aside)
+    std[2] = _on_log_scale(turn)
+    correlations[0] = _correlation(ab, ahead * aside)
+    correlations[1] = _correlation(cos * x_h + sin * y_h, ahead * turn)
+    correlations[2] = _correlation(cos * y_h - sin * x_h, aside * turn)
+
+
+@part
+def relative_spread(
+    covariance: Array, x: int, dx: float, dy: float
+) -> tuple[float, float, float]:
+    """Compute the covariance of e_l - e_p - e_θ J (l - p): its xx, xy and yy."""
+    y = x + 1
+    to_x = covariance[x, 2] - covariance[0, 2]  # of e_l - e_p with e_θ
+    to_y = covariance[y, 2] - covariance[1, 2]
+    turn = covariance[2, 2]
+    xx = covariance[x, x] + covariance[0, 0] - 2 * covariance[x, 0]
+    xy = covariance[x, y] + covariance[0, 1] - covariance[x, 1] - covariance[y, 0]
+    yy = covariance[y, y] + covariance[1, 1] - 2 * covariance[y, 1]
+    return (
+        xx + 2 * to_x * dy + turn * dy * dy,
+        xy - to_x * dx + to_y * dy - turn * dx * dy,
+        yy - 2 * to_y * dx + turn * dx * dx,
+    )
+
+
+@compiled
+def show_beliefs(  # noqa: PLR0917 (the outputs one by one, in order of their keys)
+    means: Array,
+    covariances: Array,
+    slots: NDArray[np.int64],
+    bounds: Rectangle,
+    landmark_correlation: Array,
+    landmark_map_std: Array,
+    landmark_std: Array,
+    landmarks: Array,
+    mask: NDArray[np.bool_],
+    pose: Array,
+    pose_correlation: Array,
+    pose_std: Array,
+) -> None:
+    """Write the features of all beliefs; see `belief_features` for what they are."""
+    left, bottom, right, top = bounds
+    diagonal = math.hypot(right - left, top - bottom)
+    for b in range(len(means)):
+        mean, covariance = means[b], covariances[b]
+        show_pose(mean, covariance, bounds, pose[b], pose_correlation[b], pose_std[b])
+        cos, sin = pose[b, 2], pose[b, 3]
+        for i in range(slots.shape[1]):
+            mask[b, i] = slots[b, i] >= 0
+            if not mask[b, i]:
+                landmark_correlation[b, i] = landmark_map_std[b, i] = 0.0
+                landmark_std[b, i] = 0.0
+                landmarks[b, i] = 0.0
+                continue
+            x = 3 + 2 * slots[b, i]
+            dx, dy = mean[x] - mean[0], mean[x + 1] - mean[1]
+            landmarks[b, i, 0] = _clip((cos * dx + sin * dy) / diagonal, -1.0, 1.0)
+            landmarks[b, i, 1] = _clip((cos * dy - sin * dx) / diagonal, -1.0, 1.0)
+            xx, xy, yy = relative_spread(covariance, x, dx, dy)
+            aa, ab, bb = _turned(xx, xy, yy, cos, sin)
+            ahead, aside = _root(aa), _root(bb)
+            landmark_std[b, i, 0] = _on_log_scale(ahead)
+            landmark_std[b, i, 1] = _on_log_scale(aside)
+            landmark_correlation[b, i] = _correlation(ab, ahead * aside)
+            xx, yy = covariance[x, x], covariance[x + 1, x + 1]
+            across = math.hypot(0.5 * (xx - yy), covariance[x, x + 1])
+            landmark_map_std[b, i] = _on_log_scale(_root(0.5 * (xx + yy) + across))
