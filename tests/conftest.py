@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-# Before numpy is loaded: BLAS threads that wait for a core which somebody else uses make
-# small products fifty times slower.  Subprocesses inherit it.
+# Before numpy is loaded: BLAS threads that wait for a core which others use make small
+# products fifty times slower.  Subprocesses inherit it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
