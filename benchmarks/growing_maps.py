@@ -5,6 +5,8 @@
     python benchmarks/growing_maps.py --largest 10000 \
         --figure docs/images/growing_maps.png           # the curves; takes 8 GB
     pip install "slamgym[benchmark]"                    # brings GTSAM
+    python benchmarks/growing_maps.py --overview        # full, compressed, submaps,
+                                                        # sparse; about 7 minutes
 
 The robot drives 0.5 m per step in a square with one landmark on 25 m², all of which are
 in the map; the ten nearest are seen in every step.  CPU time of one thread, stretches
@@ -16,16 +18,17 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
-import time
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import mean, median
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from growing_maps_overview import SIZES, SMALLEST, show_overview
 from growing_maps_peers import FullWithDsyrk, Isam2
+from growing_maps_timing import STRETCH, Costs, Reading, Step, measure, step_of
 from interleaved import verdict
 from matplotlib import pyplot as plt
 from numpy.typing import NDArray
@@ -44,23 +47,7 @@ MOTION_STD, MEASUREMENT_STD = np.array([0.02, 0.01, 0.01]), np.array([0.01, 0.05
 NOISE = (MOTION_STD, MEASUREMENT_STD)
 SEEN = 10
 FASTEST = "ekf, half storage and dsyrk"
-STRETCH = 20  # steps of one filter before the next one's turn
 CONSOLE = Console(width=110)
-
-
-class Reading(NamedTuple):
-    """What one step brings."""
-
-    odometry: tuple[float, float]
-    readings: Array
-    ids: list[int]
-
-
-class Costs(NamedTuple):
-    """Seconds of every step of a filter, and the memory of its belief."""
-
-    steps: list[float]
-    nbytes: int = 0
 
 
 def landmarks_of(count: int) -> tuple[Array, float]:
@@ -102,19 +89,6 @@ def first_look(count: int) -> Iterator[tuple[Array, list[int]]]:
         yield readings[first:last], list(range(first, last))
 
 
-Step = Callable[[Reading], object]
-
-
-def step_of(slam: Any) -> Step:
-    """One step of anything with predict and update."""
-
-    def step(now: Reading) -> None:
-        slam.predict(now.odometry)
-        slam.update(now.readings, now.ids)
-
-    return step
-
-
 def mapped(slam: Any, count: int) -> Any:
     """Let a filter see the whole map."""
     for readings, ids in first_look(count):
@@ -128,22 +102,6 @@ def dsyrk_floor(count: int) -> Step:
     covariance = np.asfortranarray(np.eye(size))
     rows = np.random.default_rng(0).standard_normal((2 * SEEN, size)) * 1e-6
     return lambda _: dsyrk(-1.0, rows, 1.0, covariance, trans=1, lower=1, overwrite_c=1)
-
-
-def measure(
-    cases: dict[str, tuple[Step, int]], data: list[Reading]
-) -> dict[str, Costs]:
-    """Time stretches of steps of all cases in turn, each up to its number of steps."""
-    costs: dict[str, list[float]] = {name: [] for name in cases}
-    for first in range(0, len(data), STRETCH):
-        for name, (step, most) in cases.items():
-            for now in data[first : first + STRETCH]:
-                if len(costs[name]) < most:
-                    began = time.thread_time()
-                    step(now)
-                    costs[name].append(time.thread_time() - began)
-    # the first stretch warms up caches and compiles
-    return {name: Costs(steps[STRETCH:]) for name, steps in costs.items()}
 
 
 def compare(count: int, steps: int, *, jumping: bool = False) -> dict[str, Costs]:
@@ -259,7 +217,18 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=420)
     parser.add_argument("--markdown", action="store_true")
     parser.add_argument("--figure", type=Path, help="where to draw the curves")
+    parser.add_argument(
+        "--overview", action="store_true", help="the filters for large maps, compared"
+    )
+    parser.add_argument(
+        "--sizes", type=int, nargs="+", default=SIZES, help="of the overview"
+    )
     chosen = parser.parse_args()
+    if chosen.overview:
+        if min(chosen.sizes) < SMALLEST:
+            parser.error(f"--sizes must be >= {SMALLEST}, got {min(chosen.sizes)}")
+        show_overview(chosen.sizes, markdown=chosen.markdown, figure=chosen.figure)
+        return
     sizes = [n for n in (100, 200, 500, 1000, 2000, 4000) if n < chosen.largest]
     near: dict[int, dict[str, Costs]] = {}
     for count in [*sizes, chosen.largest]:

@@ -84,9 +84,11 @@ def goals(half: float) -> Iterator[Array]:
         sign = -sign
 
 
-def drive(landmarks: Array, half: float, start: Array) -> Iterator[Reading]:
+def drive(
+    landmarks: Array, half: float, start: Array, *, seed: int = 1
+) -> Iterator[Reading]:
     """Drive row by row; see the nearest landmarks."""
-    rng, tree = np.random.default_rng(1), KDTree(landmarks)
+    rng, tree = np.random.default_rng(seed), KDTree(landmarks)
     pose = start.copy()
     for goal in goals(half):
         while np.hypot(*(goal - pose[:2])) > STEP:
