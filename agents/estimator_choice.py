@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..estimator.batch import BatchSlam, make_batch
-from ..estimator.registry import find_estimator
+from ..estimator.registry import find_estimator, make_estimator
 from ..sim_configs import Scenario
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def choose_estimator(
     'EkfSlam'
     """
     if isinstance(estimator, str):
-        estimator = find_estimator(estimator)
+        return checked_estimator(_named(estimator, scenario, options or {}))
     if isinstance(estimator, type) or not _has_a_method(estimator):
         estimator = _made_by(estimator, scenario, options or {})
     elif options:
@@ -185,6 +185,22 @@ def _has_a_method(estimator: Any) -> bool:
     return any(hasattr(estimator, method) for method in _METHODS) or not callable(
         estimator
     )
+
+
+def _named(
+    name: str, scenario: Scenario, options: Mapping[str, Any]
+) -> FollowingEstimator:
+    """Make a registered estimator; it associates where the world hides identities."""
+    known: dict[str, Any] = told_options(find_estimator(name), scenario)
+    if not scenario.sensor.identities:
+        known["management"] = True
+    made: Any = make_estimator(
+        name,
+        motion_std=scenario.motion.std,
+        measurement_std=scenario.sensor.std,
+        **{**known, **options},
+    )
+    return cast("FollowingEstimator", made)
 
 
 def _made_by(

@@ -14,6 +14,7 @@ uncorrelated with all else: so P has one size from the first step to the last, a
 decreases of a criterion over an episode add up to its first value minus its last.
 """
 
+import math
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -217,6 +218,15 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
                 "env must have a BeliefObservation among its wrappers, got "
                 f"{type(env).__name__}"
             )
+        for name, value in (
+            ("gain", gain),
+            ("collision_cost", collision_cost),
+            ("effort_cost", effort_cost),
+        ):
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be finite and >= 0, got {value!r}")
+        if prior_std is not None and not 0 < prior_std < math.inf:
+            raise ValueError(f"prior_std must be finite and > 0, got {prior_std!r}")
         scenario = env.get_wrapper_attr("scenario")
         self._criterion = criterion
         self._prior_std: ArrayLike = (

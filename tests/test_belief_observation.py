@@ -508,3 +508,12 @@ def test_the_example_shows_that_going_home_keeps_the_map_better(
     on, home, *_ = capsys.readouterr().out.splitlines()
     assert float(on.split()[-2]) > float(home.split()[-2])
     assert (tmp_path / "results" / "08_belief_in_the_loop.png").exists()
+
+
+def test_where_identities_are_hidden_a_named_estimator_associates():
+    world = gym.make("slamgym/LandmarkWorld-v0", scenario="hidden_identities")
+    env = BeliefObservation(world, "invariant", max_landmarks=60)
+    env.reset(seed=0)
+    for _ in range(30):
+        observation, *_ = env.step(np.array([0.5, 0.1]))
+    assert 0 < observation["belief_mask"].sum() < 60

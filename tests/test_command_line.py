@@ -460,3 +460,12 @@ def test_a_long_silence_is_explained_on_standard_error(
     with reporter.Reporter(as_json=True).patience("compiling"):
         time.sleep(0.2)
     assert capsys.readouterr() == ("", note)
+
+
+def test_submaps_may_lie_in_a_folder(here, without_pictures):
+    summary = answered(
+        *("run", "six_landmarks", "--steps", 4, "--estimator", "submaps"),
+        *("--option", "folder=maps", "--out", "out"),
+    )
+    assert len(summary["landmarks"]) == 6
+    assert (here / "maps" / "submaps.txt").exists()

@@ -187,3 +187,19 @@ def test_the_wrapper_survives_a_spec_written_as_json():
     env.reset(seed=0)
     rebuilt.reset(seed=0)
     assert env.step([0.25, 0.0])[1] == rebuilt.step([0.25, 0.0])[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("prior_std", 0),
+        ("prior_std", np.nan),
+        ("collision_cost", -1),
+        ("effort_cost", np.nan),
+        ("gain", np.inf),
+    ],
+)
+def test_nonsense_is_refused(name, value):
+    env = BeliefObservation(gym.make("slamgym/LandmarkWorld-v0"), "ekf")
+    with pytest.raises(ValueError, match=f"{name} must be finite"):
+        InformationReward(env, **{name: value})

@@ -13,6 +13,7 @@ import pytest
 
 from slamgym.experiments.log_events import OdometryRow
 from slamgym.experiments.log_importers import read_log
+from slamgym.experiments.trajectories import generate_trajectories, load_trajectories
 from slamgym.experiments.trajectories.driven_episodes import drive_episodes
 from slamgym.experiments.trajectories.formats import FORMATS, trajectory_format
 from slamgym.experiments.trajectories.formats.slamlog_files import to_slamlog
@@ -443,3 +444,10 @@ def test_the_environment_of_a_drawn_trajectory_gives_its_readings():
             assert drive.poses[step].tolist() == info["pose"].tolist()
             observation, *_, info = env.step(action)
             assert drive.odometry[step].tolist() == observation["odometry"].tolist()
+
+
+def test_minari_data_may_lie_in_a_relative_folder(tmp_path, monkeypatch):
+    pytest.importorskip("minari", reason="needs minari")
+    monkeypatch.chdir(tmp_path)
+    generate_trajectories("six_landmarks", "here", episodes=2, format="minari")
+    assert len(list(load_trajectories("here"))) == 2

@@ -18,7 +18,12 @@ def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
     """
     origin = (0.0, 0.0, 0.0)
     settings.make(origin)
-    usual = replace(settings, motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2)
+    usual = replace(
+        settings,
+        motion_std=(0.1,) * 3,
+        measurement_std=(0.1,) * 2,
+        options={k: v for k, v in settings.options.items() if k != "folder"},
+    )  # a folder is for the run that comes
     with reporter.patience(_NOTE):
         estimator = usual.make(origin)
         for _ in range(2):

@@ -72,7 +72,7 @@ def read(path: Path) -> Iterator[Trajectory]:
 def _datasets_in(folder: Path) -> Iterator[None]:
     """Let Minari keep its data sets in a folder meanwhile."""
     before = os.environ.get(_ROOT)
-    os.environ[_ROOT] = str(folder)
+    os.environ[_ROOT] = str(folder.resolve())  # it is joined to itself else
     try:
         yield
     finally:
