@@ -332,37 +332,14 @@ class EkfSlam:
             )
 
     def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
-        if landmark_ids is not None:
-            return validation.identities(landmark_ids, count)
-        if count:
-            raise ValueError(
-                f"landmark_ids must be given: {type(self).__name__} does not associate"
-            )
-        return []
+        return validation.given_identities(landmark_ids, count, self)
 
     def _refuse(self, outcome: int, readings: Array, ids: list[int]) -> None:
         """Raise the error of an update that did not go through."""
         if outcome == NOT_USABLE:
-            self._check_usable(readings, ids)
+            validation.refuse_unusable(readings, ids)
         row = np.flatnonzero(self._ledger[FATE, : len(ids)] == USED)[outcome]
         raise not_positive_definite(ids[row])
-
-    @staticmethod
-    def _check_usable(readings: Array, ids: list[int]) -> None:
-        finite = np.isfinite(readings).all(axis=1)
-        if not finite.all():
-            row = int(np.argmin(finite))
-            raise ValueError(
-                f"measurements must be finite, got {readings[row].tolist()} in row "
-                f"{row} (landmark {ids[row]})"
-            )
-        usable = (np.abs(readings) <= validation.LARGEST).all(axis=1)
-        if not usable.all():
-            row = int(np.argmin(usable))
-            raise ValueError(
-                f"measurements must not exceed {validation.LARGEST:g}, got "
-                f"{readings[row].tolist()} in row {row} (landmark {ids[row]})"
-            )
 
     def _report(self, ids: list[int], used: int, nis: float) -> UpdateReport:
         _, fates, near = self._ledger[:, : len(ids)].tolist()
@@ -422,13 +399,8 @@ def _gate(probability: float | None) -> float:
 def _checked_state(
     state: Mapping[str, Any], name: str
 ) -> tuple[Array, Array, Array, list[int]]:
-    missing = {"estimator", "mean", "covariance", "reference", "landmark_ids"} - set(
-        state
-    )
-    if missing:
-        raise ValueError(f"state must hold {sorted(missing)[0]!r}, got {sorted(state)}")
-    if str(state["estimator"]) != name:
-        raise ValueError(f"state is of {state['estimator']}, not of {name}")
+    entries = ("covariance", "landmark_ids", "mean", "reference")
+    validation.refuse_other_state(state, entries, estimator=name)
     saved = np.asarray(state["landmark_ids"])
     ids = validation.identities(saved, saved.size)
     size = 3 + 2 * len(ids)

@@ -63,7 +63,7 @@ class UnscentedSlam(EkfSlam):
         """Correct the belief with one scan, then map the landmarks seen first."""
         readings = validation.scan(measurements)
         ids = self._identities(landmark_ids, len(readings))
-        self._check_usable(readings, ids)
+        validation.refuse_unusable(readings, ids)
         usable = np.array(
             [
                 min(reading[1], self._expected_range(i)) >= self._rules.min_range

@@ -1,6 +1,6 @@
 """Checks at the public door, in words that name the argument."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from math import isfinite
 from typing import Any, cast
 
@@ -73,6 +73,65 @@ def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
             f"landmark_ids must not repeat within a scan, got {twice} twice"
         )
     return ids
+
+
+def given_identities(
+    landmark_ids: LandmarkIds | None, count: int, estimator: object
+) -> list[int]:
+    """Return the ids of ``count`` readings for an estimator that needs them."""
+    if landmark_ids is not None:
+        return identities(landmark_ids, count)
+    if count:
+        raise ValueError(
+            f"landmark_ids must be given: {type(estimator).__name__} does not associate"
+        )
+    return []
+
+
+def mapped_identities(landmark_ids: LandmarkIds, mapped: Container[int]) -> list[int]:
+    """Return ids of mapped landmarks, without repetition, or refuse another."""
+    ids = identities(landmark_ids, np.size(landmark_ids))
+    for i in ids:
+        if i not in mapped:
+            raise ValueError(f"landmark_ids must be of mapped landmarks, got {i}")
+    return ids
+
+
+def refuse_unusable(readings: Array, ids: Sequence[int]) -> None:
+    """Refuse readings that are not finite or too large, naming the first."""
+    for usable, rule in (
+        (np.isfinite(readings), "must be finite"),
+        (np.abs(readings) <= LARGEST, f"must not exceed {LARGEST:g}"),
+    ):
+        if not usable.all():
+            row = int(np.argmin(usable.all(axis=1)))
+            raise ValueError(
+                f"measurements {rule}, got {readings[row].tolist()} in row {row} "
+                f"(landmark {ids[row]})"
+            )
+
+
+def refuse_other_state(
+    state: Mapping[str, Any], entries: Iterable[str], **classes: str
+) -> None:
+    """Refuse a saved state that lacks an entry, or is of other classes than these."""
+    for key in (*classes, *entries):
+        if key not in state:
+            raise ValueError(f"state must hold {key!r}, got {sorted(state)}")
+    for key, name in classes.items():
+        if str(state[key]) != name:
+            raise ValueError(f"state is of {state[key]}, not of {name}")
+
+
+def refuse_large_belief(landmarks: int, limit: int, instead: str) -> None:
+    """Refuse a dense covariance of more landmarks than the limit, with its size."""
+    if landmarks > limit:
+        gigabytes = 8e-9 * (3 + 2 * landmarks) ** 2
+        raise ValueError(
+            f"belief() of {landmarks} landmarks has a dense covariance of "
+            f"{gigabytes:.1f} GB, and belief_limit is {limit}: {instead}, or raise "
+            "belief_limit"
+        )
 
 
 def pair(name: str, value: ArrayLike) -> tuple[float, float]:

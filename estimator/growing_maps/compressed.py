@@ -14,6 +14,7 @@ from ..iterated import IteratedEkfSlam
 from ..landmark_management.map_access import access_to
 from ..observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
 from ..validation import LandmarkIds
+from .coordinates import pairs
 from .local_map_extension import (
     Phase,
     combine,
@@ -168,24 +169,8 @@ class CompressedEkfSlam:
         ValueError
             Where one is not in the map; nothing is then removed.
         """
-        ids = self._mapped(landmark_ids)
-        near = list(self._near)
-        gone = [near.index(i) for i in ids if i in self._near]
-        if gone:
-            state = self._local.state_dict()
-            places = 3 + 2 * (self._virtual + np.array(gone))
-            keep = np.ones(len(state["mean"]), dtype=bool)
-            keep[places] = keep[places + 1] = False
-            ids_kept = np.delete(state["landmark_ids"], self._virtual + np.array(gone))
-            self._local.load_state_dict(
-                state
-                | {
-                    "mean": state["mean"][keep],
-                    "reference": state["reference"][keep],
-                    "covariance": state["covariance"][np.ix_(keep, keep)],
-                    "landmark_ids": ids_kept,
-                }
-            )
+        ids = validation.mapped_identities(landmark_ids, self._slots)
+        access_to(self._local).remove([i for i in ids if i in self._near])
         for i in ids:
             self._near.pop(i, None)
             self._free.append(self._slots.pop(i))
@@ -203,7 +188,7 @@ class CompressedEkfSlam:
         ValueError
             Where one is not in the map; nothing is then merged.
         """
-        ids = self._mapped([kept, gone])
+        ids = validation.mapped_identities([kept, gone], self._slots)
         if not all(i in self._near for i in ids):
             self._regroup(ids, max(self._local_size or 0, len(self._near), 2))
         access_to(self._local).merge(kept, gone)
@@ -224,20 +209,24 @@ class CompressedEkfSlam:
         ValueError
             Where one is not in the map.
         """
-        ids = list(self._slots) if landmark_ids is None else self._mapped(landmark_ids)
+        ids = (
+            list(self._slots)
+            if landmark_ids is None
+            else validation.mapped_identities(landmark_ids, self._slots)
+        )
         now = self._phase()
         near = {i: place for place, i in enumerate(self._near)}
         mean = np.zeros(3 + 2 * len(ids))
         covariance = np.zeros((len(mean), len(mean)))
         is_near = np.array([i in near for i in ids], dtype=bool)
-        places = _columns([near[i] for i in ids if i in near])
-        inside = np.r_[0:3, 3 + _columns(np.flatnonzero(is_near))]
+        places = pairs([near[i] for i in ids if i in near])
+        inside = np.r_[0:3, 3 + pairs(np.flatnonzero(is_near))]
         local = np.r_[0:3, 3 + places]
         mean[inside] = now.mean[local]
         covariance[np.ix_(inside, inside)] = now.covariance[np.ix_(local, local)]
         if not is_near.all():
-            outside = 3 + _columns(np.flatnonzero(~is_near))
-            far = _columns([self._slots[i] for i in ids if i not in near])
+            outside = 3 + pairs(np.flatnonzero(~is_near))
+            far = pairs([self._slots[i] for i in ids if i not in near])
             strip = np.ascontiguousarray(self._strip[:, far])
             mean[outside] = self._points[far] + self._combine(now.shift, strip)[0]
             cross = self._combine(now.gain[local], strip)
@@ -287,19 +276,7 @@ class CompressedEkfSlam:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, bit for bit in a filter of the same settings.
-
-        Parameters
-        ----------
-        state : mapping
-            What :meth:`state_dict` returned, also after a trip through ``numpy.savez``.
-
-        Raises
-        ------
-        ValueError
-            Where the state lacks an entry, is of another estimator, or does not fit
-            together; the belief is then as before.
-        """
+        """Continue from a saved state, as :meth:`EkfSlam.load_state_dict`."""
         name, base = type(self).__name__, type(self._local).__name__
         saved = checked_state(state, name, base, self._invariant)
         self._local.load_state_dict(saved.local)
@@ -309,22 +286,11 @@ class CompressedEkfSlam:
         self._rest = bool(rest)
 
     def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
-        if landmark_ids is None and count:
-            raise ValueError(
-                f"landmark_ids must be given: {type(self).__name__} does not associate"
-            )
-        ids = validation.identities([] if landmark_ids is None else landmark_ids, count)
+        ids = validation.given_identities(landmark_ids, count, self)
         if min(ids, default=0) < _LOWEST + _RESERVED:
             raise ValueError(
                 f"landmark_ids must be >= {_LOWEST + _RESERVED}, got {min(ids)}"
             )
-        return ids
-
-    def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
-        ids = validation.identities(landmark_ids, np.size(landmark_ids))
-        for i in ids:
-            if i not in self._slots:
-                raise ValueError(f"landmark_ids must be of mapped landmarks, got {i}")
         return ids
 
     def _look_after(self, ids: Sequence[int]) -> None:
@@ -359,11 +325,11 @@ class CompressedEkfSlam:
         places = {slot(i): k for k, i in enumerate(near) if i not in chosen}
         leaving = sorted(places)
         entering = sorted((i for i in chosen if i not in self._near), key=slot)
-        departing = rows[3 + _columns([places[s] for s in leaving])]
-        self._far.put(_columns(leaving), departing)
+        departing = rows[3 + pairs([places[s] for s in leaving])]
+        self._far.put(pairs(leaving), departing)
         columns = self._places(entering)
         fresh = self._far.rows(columns)
-        kept = rows[np.r_[0:3, 3 + _columns(staying)]]
+        kept = rows[np.r_[0:3, 3 + pairs(staying)]]
         self._near = dict.fromkeys([near[k] for k in staying] + entering)
         fresh[:, self._places([near[k] for k in staying])] = kept[3:, columns].T
         self._strip = np.concatenate([kept, fresh])
@@ -450,10 +416,4 @@ class CompressedEkfSlam:
 
     def _places(self, ids: Sequence[int]) -> Int:
         """Columns of landmarks in the map's arrays."""
-        return _columns([self._slots[i] for i in ids])
-
-
-def _columns(places: Sequence[int] | Int) -> Int:
-    """Return the two columns of each landmark, in turn."""
-    first = 2 * np.asarray(places, dtype=np.int64)
-    return np.stack([first, first + 1], axis=1).ravel()
+        return pairs([self._slots[i] for i in ids])

@@ -8,6 +8,7 @@ from scipy.linalg import cho_solve, lapack
 
 from ..angles import wrap_angle
 from ..bearing_range_model import predict_measurement
+from .coordinates import pairs
 from .information_matrix import InformationMatrix, Surroundings, surround
 from .pose_given_map import LinearScan, MapReading, PoseGivenMap
 
@@ -196,8 +197,3 @@ def linear_scan(
         variance,
         places,
     )
-
-
-def pairs(places: Int) -> Int:
-    """Return the two columns of each landmark, in turn."""
-    return (2 * places[:, None] + (0, 1)).ravel()

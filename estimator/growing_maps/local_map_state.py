@@ -32,13 +32,9 @@ def checked_state(
 ) -> SavedState:
     """Read what ``CompressedEkfSlam.state_dict`` returned, or refuse it."""
     far = DeferredCovariance()
-    entries = ["estimator", "base", *_OWN, *(f"local_{k}" for k in _LOCAL)]
-    for key in entries + [f"far_{k}" for k in far.state_dict()]:
-        if key not in state:
-            raise ValueError(f"state must hold {key!r}, got {sorted(state)}")
-    for key, own in (("estimator", name), ("base", base)):
-        if str(state[key]) != own:
-            raise ValueError(f"state is of {state[key]}, not of {own}")
+    entries = [*_OWN, *(f"local_{k}" for k in _LOCAL)]
+    entries += [f"far_{k}" for k in far.state_dict()]
+    validation.refuse_other_state(state, entries, estimator=name, base=base)
     far.load_state_dict({k: state[f"far_{k}"] for k in far.state_dict()})
     ids, slots, numbers, local_ids = (
         np.asarray(state[k]).ravel().tolist()

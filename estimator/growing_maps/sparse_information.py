@@ -11,6 +11,7 @@ from .. import validation
 from ..angles import wrap_angle
 from ..interface import Belief, UpdateReport
 from ..validation import LandmarkIds
+from .coordinates import pairs
 from .information_matrix import Surroundings, surround
 from .local_choice import (
     AROUND,
@@ -20,7 +21,7 @@ from .local_choice import (
     union,
     wider,
 )
-from .local_information import Map, begin, finish, link_count, pairs
+from .local_information import Map, begin, finish, link_count
 from .pose_given_map import PoseGivenMap, move
 from .sparse_information_state import SavedState, as_arrays, checked_state
 from .sparse_marginals import marginal, means
@@ -157,7 +158,8 @@ range_noise_at, gate_probability, noise_at_rest, min_range
             up to rounding.
         """
         readings = validation.scan(measurements)
-        ids = self._identities(landmark_ids, readings)
+        ids = validation.given_identities(landmark_ids, len(readings), self)
+        validation.refuse_unusable(readings, ids)
         if not ids:
             return UpdateReport()
         self._look_after(ids)
@@ -197,7 +199,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             Where one is not in the map; nothing is then removed.
         """
-        ids = self._mapped(landmark_ids)
+        ids = validation.mapped_identities(landmark_ids, self._slots)
         if ids:
             gone = self._take_with_links(ids)
             self._drop(ids, gone, integrate_out(self._local, self._pose, gone))
@@ -215,7 +217,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             Where one is not in the map, or they are the same; nothing is then merged.
         """
-        one, _ = self._mapped([kept, gone])
+        one, _ = validation.mapped_identities([kept, gone], self._slots)
         dropped = self._take_with_links([gone, kept])
         place = int(np.flatnonzero(self._local.slots == self._slots[one])[0])
         dropped[place] = False
@@ -255,14 +257,14 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             Where one is not in the map, or they are more than ``belief_limit``.
         """
-        ids = list(self._slots) if landmark_ids is None else self._mapped(landmark_ids)
-        if len(ids) > self._belief_limit:
-            gigabytes = 8e-9 * (3 + 2 * len(ids)) ** 2
-            raise ValueError(
-                f"belief() of {len(ids)} landmarks has a dense covariance of "
-                f"{gigabytes:.1f} GB, and belief_limit is {self._belief_limit}: give "
-                "landmark_ids, or raise belief_limit"
-            )
+        ids = (
+            list(self._slots)
+            if landmark_ids is None
+            else validation.mapped_identities(landmark_ids, self._slots)
+        )
+        validation.refuse_large_belief(
+            len(ids), self._belief_limit, "give landmark_ids"
+        )
         slots = np.array([self._slots[i] for i in ids], dtype=np.int64)
         answer = marginal(
             self._world, self._local, self._everything(), self._pose, slots
@@ -328,57 +330,13 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         )
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, bit for bit in a filter of the same settings.
-
-        Parameters
-        ----------
-        state : mapping
-            What :meth:`state_dict` returned, also after a trip through ``numpy.savez``.
-
-        Raises
-        ------
-        ValueError
-            Where the state lacks an entry, is of another estimator, or does not fit
-            together; the belief is then as before.
-        """
+        """Continue from a saved state, as :meth:`EkfSlam.load_state_dict`."""
         saved = checked_state(state, type(self).__name__)
         self._slots, self._free, self._world = saved.slots, saved.free, saved.world
         self._local, self._pose = saved.local, saved.pose
         self._origin, self._reach = saved.origin, saved.reach
         self._widened = saved.widened
         self._others = None
-
-    def _identities(
-        self, landmark_ids: LandmarkIds | None, readings: Array
-    ) -> list[int]:
-        if landmark_ids is None and len(readings):
-            raise ValueError(
-                f"landmark_ids must be given: {type(self).__name__} does not associate"
-            )
-        ids = validation.identities(
-            [] if landmark_ids is None else landmark_ids, len(readings)
-        )
-        for usable, rule in (
-            (np.isfinite(readings), "must be finite"),
-            (
-                np.abs(readings) <= validation.LARGEST,
-                f"must not exceed {validation.LARGEST:g}",
-            ),
-        ):
-            if not usable.all():
-                row = int(np.argmin(usable.all(axis=1)))
-                raise ValueError(
-                    f"measurements {rule}, got {readings[row].tolist()} in row {row} "
-                    f"(landmark {ids[row]})"
-                )
-        return ids
-
-    def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
-        ids = validation.identities(landmark_ids, np.size(landmark_ids))
-        for i in ids:
-            if i not in self._slots:
-                raise ValueError(f"landmark_ids must be of mapped landmarks, got {i}")
-        return ids
 
     def _look_after(self, ids: Sequence[int]) -> None:
         """Choose a new local map where this scan, or what was found, asks for one."""

@@ -109,7 +109,7 @@ def _later(matrix: InformationMatrix, slots: Int) -> Solver:
 
 
 def _check_entries(state: Mapping[str, Any], name: str) -> None:
-    entries = ["estimator", "landmark_ids", "slots", "free", "points", "residual"]
+    entries = ["landmark_ids", "slots", "free", "points", "residual"]
     for prefix, keys in (
         ("matrix", _MATRIX),
         ("local", _LOCAL),
@@ -118,11 +118,8 @@ def _check_entries(state: Mapping[str, Any], name: str) -> None:
         ("pose", _POSE),
     ):
         entries += [f"{prefix}_{key}" for key in keys]
-    for key in [*entries, "origin", "reach", "widened"]:
-        if key not in state:
-            raise ValueError(f"state must hold {key!r}, got {sorted(state)}")
-    if str(state["estimator"]) != name:
-        raise ValueError(f"state is of {state['estimator']}, not of {name}")
+    entries += ["origin", "reach", "widened"]
+    validation.refuse_other_state(state, entries, estimator=name)
 
 
 def _part(

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from .coordinates import pairs
 from .information_matrix import Surroundings
-from .local_information import LocalInformation, Map, pairs
+from .local_information import LocalInformation, Map
 from .pose_given_map import PoseGivenMap
 
 Array = NDArray[np.float64]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
 
 from ..error_frames import ErrorFrame, invariant_covariance
+from .coordinates import pairs
 from .submap_joining import Gaussian, times
-from .submap_relation import compose, pairs, points_of, retract, state_of
+from .submap_relation import compose, points_of, retract, state_of
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
 from ..error_frames import ErrorFrame
+from .coordinates import pairs
 from .submap_elimination import Elimination, Quadratic, dissect
 from .submap_placing import Outline, points_seen
 from .submap_relation import (
     floor,
     inverse_spread,
-    pairs,
     points_of,
     relation,
     whitened,

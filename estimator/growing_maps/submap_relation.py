@@ -153,8 +153,3 @@ def state_of(points: Complex, heading: float) -> Array:
     """Return (x, y, θ, l1x, l1y, …), shape (3 + 2n,)."""
     flat = np.ascontiguousarray(points).view(np.float64)
     return np.concatenate([flat[:2], [heading], flat[2:]])
-
-
-def pairs(places: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the two coordinates of each of some places: 2 p, 2 p + 1."""
-    return (2 * np.asarray(places)[:, None] + np.arange(2)).ravel()

@@ -78,13 +78,9 @@ def checked_state(
     ValueError
         Where something is missing or does not fit together.
     """
-    wanted = {"estimator", "base", "landmark_ids", "submap_count", "run"}
-    wanted |= {f"chain_{key}" for key in SHAPES} | {"local_estimator"}
-    if missing := sorted(wanted - set(state)):
-        raise ValueError(f"state must hold {missing[0]!r}, got {sorted(state)}")
-    for key, expected in (("estimator", name), ("base", base)):
-        if str(state[key]) != expected:
-            raise ValueError(f"state is of {state[key]}, not of {expected}")
+    entries = ["landmark_ids", "submap_count", "run", "local_estimator"]
+    entries += [f"chain_{key}" for key in SHAPES]
+    validation.refuse_other_state(state, entries, estimator=name, base=base)
     saved = np.asarray(state["landmark_ids"])
     ids = validation.identities(saved, saved.size)
     count = int(state["submap_count"])

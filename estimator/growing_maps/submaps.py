@@ -13,11 +13,12 @@ from ..ekf_slam import FRAMES, EkfSlam
 from ..interface import Belief, UpdateReport
 from ..invariant import InvariantEkfSlam
 from ..validation import LandmarkIds
+from .coordinates import pairs
 from .submap_chain import Chain
 from .submap_fusion import fuse
 from .submap_joining import Gaussian, JoinedMap, with_uncertain_start
 from .submap_placing import Outline, Placing
-from .submap_relation import compose, pairs
+from .submap_relation import compose
 from .submap_state import as_arrays, checked_state, outline_of
 from .submap_store import FolderStore, MemoryStore, Submap, SubmapStore
 
@@ -206,14 +207,13 @@ class SubmapSlam:
             Where the submaps contradict each other so that they cannot be joined, or
             where their covariances are degenerate.
         """
-        ids = list(self._slots) if landmark_ids is None else self._mapped(landmark_ids)
-        if len(ids) > self._belief_limit:
-            gigabytes = 8e-9 * (3 + 2 * len(ids)) ** 2
-            raise ValueError(
-                f"belief() of {len(ids)} landmarks has a dense covariance of "
-                f"{gigabytes:.1f} GB, and belief_limit is {self._belief_limit}: give "
-                "landmark_ids, call local_belief(), or raise belief_limit"
-            )
+        ids = (
+            list(self._slots)
+            if landmark_ids is None
+            else validation.mapped_identities(landmark_ids, self._slots)
+        )
+        instead = "give landmark_ids, call local_belief()"
+        validation.refuse_large_belief(len(ids), self._belief_limit, instead)
         local, local_slots = self._present()
         wanted = np.array([self._slots[i] for i in ids], dtype=np.int64)
         if landmark_ids is None:
@@ -285,19 +285,13 @@ class SubmapSlam:
         )
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, bit for bit in a filter of the same settings.
-
-        Parameters
-        ----------
-        state : mapping
-            What :meth:`state_dict` returned, also after a trip through ``numpy.savez``.
+        """Continue from a saved state, as :meth:`EkfSlam.load_state_dict`.
 
         Raises
         ------
         ValueError
-            Where the state lacks an entry, is of another estimator, or does not fit
-            together, or where it was saved with a folder and this filter's is of
-            another run, lacks a submap or holds another; the belief is then as before.
+            Also where it was saved with a folder, and this filter's is of another run,
+            lacks a submap or holds another; the belief is then as before.
         """
         base = type(self._local).__name__
         saved = checked_state(state, type(self).__name__, base, self._folder)
@@ -385,13 +379,6 @@ class SubmapSlam:
             slots = np.array(sorted(self._closed_slots), dtype=np.int64)
             self._whole = slots, self._closed(slots)
         return self._whole
-
-    def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
-        ids = validation.identities(landmark_ids, np.size(landmark_ids))
-        for i in ids:
-            if i not in self._slots:
-                raise ValueError(f"landmark_ids must be of mapped landmarks, got {i}")
-        return ids
 
 
 def _limit(name: str, value: float | None) -> float:

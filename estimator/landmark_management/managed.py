@@ -215,13 +215,8 @@ class ManagedSlam:
             Where the state lacks an entry, or is of another estimator; all is then as
             before.
         """
-        missing = [key for key in self.state_dict() if key not in state]
-        if missing:
-            raise ValueError(f"state must hold {missing[0]!r}, got {sorted(state)}")
-        if str(state["estimator"]) != type(self).__name__:
-            raise ValueError(
-                f"state is of {state['estimator']}, not of {type(self).__name__}"
-            )
+        name = type(self).__name__
+        validation.refuse_other_state(state, self.state_dict(), estimator=name)
         inner, landmarks, tentative = (_part_of(state, name) for name in _PARTS)
         newcomers, before = (
             Newcomers.from_state_dict(tentative),
