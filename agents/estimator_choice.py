@@ -1,14 +1,14 @@
 """Estimators for agents: chosen by name or made by hand, and held to their promises."""
 
-import inspect
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..estimator.batch import BatchSlam, make_batch
-from ..estimator.registry import find_estimator, make_estimator
+from ..estimator.registry import accepted_options, find_estimator, make_estimator
 from ..sim_configs import Scenario
 
 Array = NDArray[np.float64]
@@ -93,7 +93,9 @@ def choose_estimator(
     if isinstance(estimator, str):
         return checked_estimator(_named(estimator, scenario, options or {}))
     if isinstance(estimator, type) or not _has_a_method(estimator):
-        estimator = _made_by(estimator, scenario, options or {})
+        factory = cast("Callable[..., FollowingEstimator]", estimator)
+        told = told_options(factory, scenario)
+        estimator = _made_by(factory, scenario, {**told, **(options or {})})
     elif options:
         raise ValueError(
             "estimator_options must be empty with an estimator already made, "
@@ -141,11 +143,7 @@ def told_options(factory: Callable[..., Any], scenario: Scenario) -> dict[str, A
         "range_std_per_metre": scenario.sensor.range_std_per_metre,
         "noise_at_rest": scenario.motion.noise_at_rest,
     }
-    parameters = inspect.signature(factory).parameters.values()
-    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-        return told
-    names = {parameter.name for parameter in parameters}
-    return {key: value for key, value in told.items() if key in names}
+    return accepted_options(factory, told)
 
 
 def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:
@@ -194,21 +192,13 @@ def _named(
     known: dict[str, Any] = told_options(find_estimator(name), scenario)
     if not scenario.sensor.identities:
         known["management"] = True
-    made: Any = make_estimator(
-        name,
-        motion_std=scenario.motion.std,
-        measurement_std=scenario.sensor.std,
-        **{**known, **options},
-    )
-    return cast("FollowingEstimator", made)
+    return _made_by(partial(make_estimator, name), scenario, {**known, **options})
 
 
 def _made_by(
     factory: Any, scenario: Scenario, options: Mapping[str, Any]
 ) -> FollowingEstimator:
     made: FollowingEstimator = factory(
-        motion_std=scenario.motion.std,
-        measurement_std=scenario.sensor.std,
-        **{**told_options(factory, scenario), **options},
+        motion_std=scenario.motion.std, measurement_std=scenario.sensor.std, **options
     )
     return made

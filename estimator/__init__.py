@@ -13,20 +13,12 @@ from .batch import make_batch as make_batch
 from .check_estimator import EstimatorContractError as EstimatorContractError
 from .check_estimator import check_estimator as check_estimator
 from .ekf_slam import EkfSlam as EkfSlam
-from .growing_maps.compressed import CompressedEkfSlam as CompressedEkfSlam
-from .growing_maps.sparse_information import (
-    SparseInformationSlam as SparseInformationSlam,
-)
-from .growing_maps.submaps import SubmapSlam as SubmapSlam
 from .ideal import IdealEkfSlam as IdealEkfSlam
 from .interface import Belief as Belief
 from .interface import SlamEstimator as SlamEstimator
 from .interface import UpdateReport as UpdateReport
 from .invariant import InvariantEkfSlam as InvariantEkfSlam
 from .iterated import IteratedEkfSlam as IteratedEkfSlam
-from .landmark_management.field_of_view import FieldOfView as FieldOfView
-from .landmark_management.landmark_policy import LandmarkPolicy as LandmarkPolicy
-from .landmark_management.managed import ManagedSlam as ManagedSlam
 from .observability import FirstEstimatesEkfSlam as FirstEstimatesEkfSlam
 from .observability import (
     ObservabilityConstrainedEkfSlam as ObservabilityConstrainedEkfSlam,
@@ -41,15 +33,29 @@ if TYPE_CHECKING:
     from .consistency_report import ConsistencyReport as ConsistencyReport
     from .consistency_report import assert_consistent as assert_consistent
     from .decisions import runs_to_detect as runs_to_detect
+    from .growing_maps.compressed import CompressedEkfSlam as CompressedEkfSlam
+    from .growing_maps.sparse_information import (
+        SparseInformationSlam as SparseInformationSlam,
+    )
+    from .growing_maps.submaps import SubmapSlam as SubmapSlam
+    from .landmark_management.field_of_view import FieldOfView as FieldOfView
+    from .landmark_management.landmark_policy import LandmarkPolicy as LandmarkPolicy
+    from .landmark_management.managed import ManagedSlam as ManagedSlam
 
-_STATISTICS = {  # loaded when first asked for: scipy.stats takes longer than the rest
+_LATER = {  # loaded when first asked for: scipy's parts take longer than the rest
+    "CompressedEkfSlam": "growing_maps.compressed",
     "ConsistencyReport": "consistency_report",
+    "FieldOfView": "landmark_management.field_of_view",
+    "LandmarkPolicy": "landmark_management.landmark_policy",
+    "ManagedSlam": "landmark_management.managed",
+    "SparseInformationSlam": "growing_maps.sparse_information",
+    "SubmapSlam": "growing_maps.submaps",
     "assert_consistent": "consistency_report",
     "runs_to_detect": "decisions",
 }
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _STATISTICS:
+    if name not in _LATER:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{_STATISTICS[name]}", __name__), name)
+    return getattr(import_module(f".{_LATER[name]}", __name__), name)

@@ -1,30 +1,29 @@
 """Estimators by name, yours included."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import ArrayLike
 
 from .ekf_slam import EkfSlam
-from .growing_maps.compressed import CompressedEkfSlam
-from .growing_maps.sparse_information import SparseInformationSlam
-from .growing_maps.submaps import SubmapSlam
 from .ideal import IdealEkfSlam
 from .interface import SlamEstimator
 from .invariant import InvariantEkfSlam
 from .iterated import IteratedEkfSlam
-from .landmark_management.landmark_policy import LandmarkPolicy
-from .landmark_management.managed import ManagedSlam
 from .observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
 from .robocentric import RobocentricEkfSlam
 from .unscented import UnscentedSlam
 
+if TYPE_CHECKING:
+    from .landmark_management.landmark_policy import LandmarkPolicy
+
 EstimatorFactory = Callable[..., SlamEstimator]
 
-_factories: dict[str, EstimatorFactory] = {}
+_factories: dict[str, EstimatorFactory | str] = {}  # or where to import it from
 
 
 def register_estimator(name: str, factory: EstimatorFactory) -> None:
@@ -64,10 +63,11 @@ def find_estimator(name: str) -> EstimatorFactory:
     ValueError
         Where there is none, with the nearest name.
     """
-    if name in _factories:
-        return _factories[name]
-    if ":" in name:
-        return _imported(name)
+    factory = _factories.get(name, name)
+    if not isinstance(factory, str):
+        return factory
+    if ":" in factory:
+        return _imported(factory)
     near = get_close_matches(name, _factories, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else ""
     known = ", ".join(_factories)
@@ -81,7 +81,7 @@ def make_estimator(
     measurement_std: ArrayLike,
     initial_pose: ArrayLike = (0.0, 0.0, 0.0),
     initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
-    management: LandmarkPolicy | Mapping[str, Any] | bool | None = None,
+    management: "LandmarkPolicy | Mapping[str, Any] | bool | None" = None,
     **options: Any,
 ) -> SlamEstimator:
     """Make an estimator by its registered name or by its import path.
@@ -119,6 +119,8 @@ def make_estimator(
     """
     factory = find_estimator(name)
     if management is not None and management is not False:
+        from .landmark_management.managed import ManagedSlam  # noqa: PLC0415 (heavy)
+
         factory = partial(ManagedSlam, factory, management=management)
     return factory(
         motion_std=motion_std,
@@ -137,7 +139,26 @@ def _imported(path: str) -> EstimatorFactory:
         raise ValueError(f"cannot import estimator '{path}': {error}") from error
 
 
-for _name, _factory in {
+def accepted_options(
+    factory: EstimatorFactory, options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return those options that a factory takes, as its signature tells.
+
+    Examples
+    --------
+    >>> accepted_options(EkfSlam, {"min_range": 0.1, "colour": "red"})
+    {'min_range': 0.1}
+    """
+    parameters = inspect.signature(factory).parameters.values()
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
+        return dict(options)
+    known = {parameter.name for parameter in parameters}
+    return {key: value for key, value in options.items() if key in known}
+
+
+_GROWING = f"{__package__}.growing_maps"
+
+_factories |= {
     "ekf": EkfSlam,
     "invariant": InvariantEkfSlam,
     "first_estimates": FirstEstimatesEkfSlam,
@@ -146,8 +167,7 @@ for _name, _factory in {
     "unscented": UnscentedSlam,
     "robocentric": RobocentricEkfSlam,
     "ideal": IdealEkfSlam,
-    "compressed": CompressedEkfSlam,
-    "sparse_information": SparseInformationSlam,
-    "submaps": SubmapSlam,
-}.items():
-    register_estimator(_name, _factory)
+    "compressed": f"{_GROWING}.compressed:CompressedEkfSlam",
+    "sparse_information": f"{_GROWING}.sparse_information:SparseInformationSlam",
+    "submaps": f"{_GROWING}.submaps:SubmapSlam",
+}

@@ -1,6 +1,6 @@
 """Checks at the public door, in words that name the argument."""
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite
 from typing import Any, cast
 
@@ -88,8 +88,12 @@ def given_identities(
     return []
 
 
-def mapped_identities(landmark_ids: LandmarkIds, mapped: Container[int]) -> list[int]:
-    """Return ids of mapped landmarks, without repetition, or refuse another."""
+def mapped_identities(
+    landmark_ids: LandmarkIds | None, mapped: Mapping[int, int]
+) -> list[int]:
+    """Return ids of mapped landmarks without repetition, all of them for None."""
+    if landmark_ids is None:
+        return list(mapped)
     ids = identities(landmark_ids, np.size(landmark_ids))
     for i in ids:
         if i not in mapped:

@@ -1,6 +1,5 @@
 """How an estimator is set up for a log: what the log tells, and what the user says."""
 
-import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -8,7 +7,12 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from ..estimator.interface import SlamEstimator
-from ..estimator.registry import EstimatorFactory, find_estimator, make_estimator
+from ..estimator.registry import (
+    EstimatorFactory,
+    accepted_options,
+    find_estimator,
+    make_estimator,
+)
 from ..sim_configs import Scenario
 from .log_events import Scan
 from .log_lines import LogError
@@ -185,11 +189,7 @@ def _told_options(
     if "range_std_per_metre" in header:
         key = "range_std_per_metre"
         told[key] = _number(name, key, header[key])
-    parameters = inspect.signature(factory).parameters.values()
-    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-        return told
-    known = {parameter.name for parameter in parameters}
-    return {key: value for key, value in told.items() if key in known}
+    return accepted_options(factory, told)
 
 
 def _needed_options(log: SlamLog, header: Mapping[str, str]) -> dict[str, Any]:

@@ -209,11 +209,7 @@ class CompressedEkfSlam:
         ValueError
             Where one is not in the map.
         """
-        ids = (
-            list(self._slots)
-            if landmark_ids is None
-            else validation.mapped_identities(landmark_ids, self._slots)
-        )
+        ids = validation.mapped_identities(landmark_ids, self._slots)
         now = self._phase()
         near = {i: place for place, i in enumerate(self._near)}
         mean = np.zeros(3 + 2 * len(ids))

@@ -257,11 +257,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             Where one is not in the map, or they are more than ``belief_limit``.
         """
-        ids = (
-            list(self._slots)
-            if landmark_ids is None
-            else validation.mapped_identities(landmark_ids, self._slots)
-        )
+        ids = validation.mapped_identities(landmark_ids, self._slots)
         validation.refuse_large_belief(
             len(ids), self._belief_limit, "give landmark_ids"
         )

@@ -207,11 +207,7 @@ class SubmapSlam:
             Where the submaps contradict each other so that they cannot be joined, or
             where their covariances are degenerate.
         """
-        ids = (
-            list(self._slots)
-            if landmark_ids is None
-            else validation.mapped_identities(landmark_ids, self._slots)
-        )
+        ids = validation.mapped_identities(landmark_ids, self._slots)
         instead = "give landmark_ids, call local_belief()"
         validation.refuse_large_belief(len(ids), self._belief_limit, instead)
         local, local_slots = self._present()
