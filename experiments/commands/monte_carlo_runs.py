@@ -12,7 +12,7 @@ from rich.text import Text
 from ...envs.atomic_file import replace_when_written
 from ...sim_configs import Scenario, load_scenario
 from ..monte_carlo import merge_blocks, monte_carlo
-from ..monte_carlo.estimator_choices import EstimatorChoice, estimator_choices
+from ..monte_carlo.estimator_choices import estimator_choices
 from ..monte_carlo.html_report import write_html_report
 from ..monte_carlo.summary import summarise_monte_carlo
 from ..monte_carlo.table import monte_carlo_table
@@ -88,11 +88,11 @@ def run_monte_carlo(
         Exit code: 1 if no run of any estimator went well.
     """
     reporter = Reporter(as_json=as_json)
-    choices = estimator_choices(estimators)
+    estimator_choices(estimators)  # a wrong name is told before any work
     place = out or default_folder("monte-carlo", scenario.name)
     told = scenario.with_changes(**assumed) if assumed else scenario
     with reporter.patience(_NOTE):
-        _compile(choices)
+        _compile(estimators)
     if blocks.merged:
         merge_blocks(blocks.merged, place)
     with (
@@ -102,7 +102,7 @@ def run_monte_carlo(
         _resumable(place),
         monte_carlo(
             scenario,
-            {choice.label: (choice.name, choice.options) for choice in choices},
+            estimators,
             runs,
             seed,
             assumed=told,
@@ -132,12 +132,11 @@ def run_monte_carlo(
     return 0 if went_well else FAILURE
 
 
-def _compile(choices: tuple[EstimatorChoice, ...]) -> None:
-    """Run every estimator for two steps, so that its kernels are there."""
+def _compile(estimators: str) -> None:
+    """Run all estimators for two steps, so that their kernels are there."""
     small = load_scenario("six_landmarks").with_changes(steps=2)
-    for choice in choices:
-        with contextlib.suppress(Exception):  # what fails here fails there, and says so
-            monte_carlo(small, {choice.label: (choice.name, choice.options)}, 1)
+    with contextlib.suppress(Exception):  # what fails here fails there, and says so
+        monte_carlo(small, estimators, 1)
 
 
 @contextlib.contextmanager

@@ -18,16 +18,14 @@ def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
     """
     origin = (0.0, 0.0, 0.0)
     settings.make(origin)
-    usual = replace(
-        settings,
-        motion_std=(0.1,) * 3,
-        measurement_std=(0.1,) * 2,
-        options={k: v for k, v in settings.options.items() if k != "folder"},
-    )  # a folder is for the run that comes
+    usual = replace(settings, motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2)
     with reporter.patience(_NOTE):
         estimator = usual.make(origin)
-        for _ in range(2):
-            estimator.predict((0.1, 0.0))
-            estimator.update([(0.0, 5.0)], [0])
-        if settings.options.get("management"):
-            estimator.update([(0.0, 5.0)])
+        try:
+            for _ in range(2):
+                estimator.predict((0.1, 0.0))
+                estimator.update([(0.0, 5.0)], [0])
+            if settings.options.get("management"):
+                estimator.update([(0.0, 5.0)])
+        finally:
+            estimator.reset(origin, (0.0, 0.0, 0.0))  # deletes what it wrote

@@ -5,8 +5,7 @@ whole or not at all, so that a job may be killed at any time and goes on after i
 whole block.  Blocks of one job made on several machines may be put into one folder.
 """
 
-import hashlib
-import json
+import contextlib
 import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -20,10 +19,16 @@ from ...envs.atomic_file import replace_when_written
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import scenario_text
 from .estimator_choices import EstimatorChoice
+from .job_folder import (
+    BLOCKS,
+    FORMAT,
+    blocks_in,
+    claimed,
+    digest_of,
+    identity_in,
+    refuse_other,
+)
 from .run_measures import VARIABLES, Block
-
-FORMAT = "slamgym monte carlo 1"
-JOB = "job.json"
 
 
 class Span(NamedTuple):
@@ -68,10 +73,6 @@ class Job(NamedTuple):
             "block_size": self.block_size,
         }
 
-    def digest(self) -> str:
-        """Identify the job in its blocks."""
-        return _digest(self.identity())
-
     def spans(self, runs: Span) -> list[Span]:
         """Divide runs into blocks, the last one perhaps shorter."""
         size = self.block_size
@@ -80,7 +81,7 @@ class Job(NamedTuple):
 
 
 class BlockFolder:
-    """The blocks of one job.
+    """The blocks of one job; within ``with``, no other process writes to its folder.
 
     Parameters
     ----------
@@ -94,17 +95,33 @@ class BlockFolder:
     Raises
     ------
     ValueError
-        If the folder holds another job, or what slamgym did not write.
+        If the folder is a file.  On entry: if it holds another job, or what slamgym did
+        not write, or another process writes to it.
     OSError
-        If it cannot be written.
+        On entry, if it cannot be written.
     """
 
     def __init__(self, job: Job, path: Path | None, *, fresh: bool = False) -> None:
+        if path is not None and path.exists() and not path.is_dir():
+            raise ValueError(f"out must be a folder, got the file {path}")
         self._job = job
         self._path = path
+        self._fresh = fresh
+        self._identity = job.identity()  # as the sources of its estimators are now
+        self._digest = digest_of(self._identity)
         self._kept: dict[int, list[Block]] = {}
-        if path is not None:
-            _claim(path, job, fresh)
+        self._claim = contextlib.ExitStack()
+
+    def __enter__(self) -> "BlockFolder":
+        """Claim the folder."""
+        if self._path is not None:
+            claim = claimed(self._path, self._identity, fresh=self._fresh)
+            self._claim.enter_context(claim)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let other writers in."""
+        self._claim.close()
 
     def missing(self, runs: Span) -> list[Span]:
         """List the blocks that are still to be computed; warn of a broken one."""
@@ -123,7 +140,7 @@ class BlockFolder:
         file = self._file(span)
         try:
             with replace_when_written(file) as partial:
-                np.savez(partial, allow_pickle=False, job=self._job.digest(), **arrays)
+                np.savez(partial, allow_pickle=False, job=self._digest, **arrays)
         except OSError as error:
             whole = len(list(file.parent.glob("runs-*.npz")))
             raise OSError(
@@ -146,7 +163,7 @@ class BlockFolder:
         if self._path is None:
             return False
         for file in self._files_from(span.first):
-            problem = _problem(file, self._job.digest())
+            problem = _problem(file, self._digest)
             if problem:
                 aside = file.replace(file.with_suffix(".broken"))
                 warnings.warn(
@@ -168,11 +185,11 @@ class BlockFolder:
 
     def _file(self, span: Span) -> Path:
         assert self._path is not None
-        return self._path / "blocks" / f"runs-{span.first:07d}-{span.stop:07d}.npz"
+        return self._path / BLOCKS / f"runs-{span.first:07d}-{span.stop:07d}.npz"
 
     def _files_from(self, first: int) -> list[Path]:
         assert self._path is not None
-        return sorted((self._path / "blocks").glob(f"runs-{first:07d}-*.npz"))
+        return sorted((self._path / BLOCKS).glob(f"runs-{first:07d}-*.npz"))
 
 
 def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
@@ -190,94 +207,25 @@ def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
     Raises
     ------
     ValueError
-        If a folder holds another job than the first, or a damaged block.
+        If a folder holds another job than the first, or a damaged block, or another
+        process writes to the target.
     """
     folders = [Path(source) for source in sources]
     if not folders:
         raise ValueError("sources must be at least one folder, got none")
-    place, identity = Path(target), _identity_in(folders[0])
+    place, identity = Path(target), identity_in(folders[0])
     for source in folders:
-        _refuse_other(source, _identity_in(source), identity)
-    if place.exists() and any(place.iterdir()):
-        _refuse_other(place, _identity_in(place), identity)
-    _make_ours(place, identity)
-    for file in (f for source in folders for f in _blocks_in(source)):
-        problem = _problem(file, _digest(identity))
-        if problem:
-            raise ValueError(f"{file} {problem}")
-        copy = place / "blocks" / file.name
-        if not copy.exists():
-            with replace_when_written(copy) as partial:
-                partial.write_bytes(file.read_bytes())
-
-
-def _digest(identity: dict[str, Any]) -> str:
-    text = json.dumps(identity, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _blocks_in(path: Path) -> list[Path]:
-    return sorted((path / "blocks").glob("runs-*.npz"))
-
-
-def _claim(path: Path, job: Job, fresh: bool) -> None:
-    """Make a folder the job's own, or see that it is."""
-    if path.exists() and not path.is_dir():
-        raise ValueError(f"out must be a folder, got the file {path}")
-    if path.exists() and any(path.iterdir()):
-        found = _identity_in(path)
-        if fresh:
-            for block in _blocks_in(path):
-                block.unlink()
-        else:
-            _refuse_other(path, found, job.identity())
-    _make_ours(path, job.identity())
-
-
-def _make_ours(path: Path, identity: dict[str, Any]) -> None:
-    text = json.dumps(identity, indent=2, ensure_ascii=False)
-    try:
-        (path / "blocks").mkdir(parents=True, exist_ok=True)
-        with replace_when_written(path / JOB) as partial:
-            partial.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        reason = error.strerror or error
-        raise OSError(f"the folder {path} cannot be written: {reason}") from error
-
-
-def _identity_in(path: Path) -> dict[str, Any]:
-    file = path / JOB
-    if not file.exists():
-        raise ValueError(f"{path} holds no Monte Carlo of slamgym: there is no {JOB}")
-    try:
-        identity = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError:
-        identity = None
-    if not isinstance(identity, dict) or identity.get("format") != FORMAT:
-        raise ValueError(f"{file} is damaged, or not of a Monte Carlo of slamgym")
-    return identity
-
-
-def _refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> None:
-    for key, value in asked.items():
-        if found.get(key) != value:
-            raise ValueError(
-                f"{path} holds results of {_said(key, found.get(key))}, not of "
-                f"{_said(key, value)}: choose another folder, or ask for fresh results"
-            )
-
-
-def _said(key: str, value: Any) -> str:
-    """Name a part of a job in a few words."""
-    if key in ("scenario", "assumed"):
-        lines = str(value).splitlines()
-        digest = hashlib.sha256(str(value).encode()).hexdigest()[:8]
-        return f"{key} {lines[0].removeprefix('name = ') if lines else ''} ({digest})"
-    if key == "estimators" and isinstance(value, dict):
-        return f"estimators {', '.join(value)}"
-    if key == "code" and isinstance(value, dict):
-        return f"code {', '.join(f'{k} {v}' for k, v in value.items())}"
-    return f"{key} {value}"
+        refuse_other(source, identity_in(source), identity)
+    with claimed(place, identity):
+        digest = digest_of(identity)
+        for file in (f for source in folders for f in blocks_in(source)):
+            problem = _problem(file, digest)
+            if problem:
+                raise ValueError(f"{file} {problem}")
+            copy = place / BLOCKS / file.name
+            if not copy.exists():
+                with replace_when_written(copy) as partial:
+                    partial.write_bytes(file.read_bytes())
 
 
 def _problem(file: Path, digest: str) -> str:

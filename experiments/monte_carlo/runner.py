@@ -129,7 +129,7 @@ def monte_carlo(
     ------
     ValueError
         If a count is too small, the scenario or an estimator is unknown, or ``out``
-        holds another job.
+        holds another job, or another process writes to it.
 
     Examples
     --------
@@ -150,20 +150,20 @@ def monte_carlo(
         job.seed,
         threads=None if workers is None else 1,
     )
-    folder = BlockFolder(job, None if out is None else Path(out), fresh=fresh)
-    missing = folder.missing(asked)
-    done = asked.size - sum(span.size for span in missing)
-    report = progress or (lambda done, runs: None)
-    report(done, asked.size)
-    for span, blocks in _computed(work, missing, workers):
-        folder.add(span, blocks)
-        done += span.size
+    with BlockFolder(job, None if out is None else Path(out), fresh=fresh) as folder:
+        missing = folder.missing(asked)
+        done = asked.size - sum(span.size for span in missing)
+        report = progress or (lambda done, runs: None)
         report(done, asked.size)
-    if out is None:
-        return dataset_of(job, folder.blocks(asked), asked, command)
-    target = Path(out) / RESULTS
-    write_results(target, job, folder.blocks(asked), asked, command)
-    return load_results(target)
+        for span, blocks in _computed(work, missing, workers):
+            folder.add(span, blocks)
+            done += span.size
+            report(done, asked.size)
+        if out is None:
+            return dataset_of(job, folder.blocks(asked), asked, command)
+        target = Path(out) / RESULTS
+        write_results(target, job, folder.blocks(asked), asked, command)
+        return load_results(target)
 
 
 def _computed(

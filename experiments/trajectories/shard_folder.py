@@ -1,13 +1,13 @@
 """The folder of a data set while it is written: one writer, whole shards, no rests."""
 
 import contextlib
-import os
 import re
 import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from ..sole_writer import sole_writer
 from .manifest import MANIFEST
 
 _WRITING = ".writing-"
@@ -29,7 +29,7 @@ def claimed(folder: Path) -> Iterator[None]:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"out must be a folder, got the file {folder}")
     folder.mkdir(parents=True, exist_ok=True)
-    with _locked(folder):
+    with sole_writer(folder):
         foreign = sorted(
             entry.name for entry in folder.iterdir() if not _RESTS.fullmatch(entry.name)
         )
@@ -71,23 +71,3 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold a lock on a folder, which ends with the process at the latest."""
-    try:
-        import fcntl  # noqa: PLC0415 (not on Windows)
-    except ImportError:
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise ValueError(f"another process is writing to {folder}") from None
-    try:
-        yield
-    finally:
-        os.close(handle)
