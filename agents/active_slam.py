@@ -65,14 +65,16 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
     ## Observation Space
     ``Dict`` of float64 arrays within [-1, 1] and a bool mask; see
     `ActiveSlamTask.observe` and `belief_features`. All of it comes from the belief and
-    the plan. N is the number of landmarks, row i is landmark i.
+    the plan. N is the number of landmarks, row i is landmark i. Where landmarks are
+    believed is told in the robot's frame, ahead along the heading and aside to the
+    left, in diagonals of the floor; zeros where they are not mapped.
 
     | key | shape | content |
     |---|---|---|
     | ``belief_pose`` | (4,) | x, y on the floor's scale; cos θ, sin θ |
     | ``belief_pose_std`` | (3,) | σ ahead, aside, of the heading; log scale |
     | ``belief_pose_correlation`` | (3,) | of the three |
-    | ``belief_landmarks`` | (2N,) | in the robot's frame, in diagonals of the floor |
+    | ``belief_landmarks`` | (2N,) | landmark 0 ahead, aside; 1 ahead, aside; … |
     | ``belief_landmark_std`` | (2N,) | σ of the same, log scale |
     | ``belief_landmark_correlation`` | (N,) | of the two |
     | ``belief_landmark_map_std`` | (N,) | worst σ in the map's frame, log scale |
@@ -171,7 +173,7 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
         self._world.np_random = self.np_random
         observation, info = self._world.reset(options=options)
         self._estimator.reset(self._world.start_estimate, self.scenario.start.std)
-        self._progress = self.task.begin(self._take_in(observation))
+        self._progress = self.task.begin(self._take_in(observation, step=0))
         return self._answer(info, success=False)
 
     def step(
@@ -187,7 +189,8 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
         before = self._reached()
         observation, _, _, _, info = self._world.step(action)
         self._estimator.predict(observation["odometry"])
-        after = self.task.proceed(before, self._take_in(observation))
+        step = int(before.steps[0]) + 1
+        after = self.task.proceed(before, self._take_in(observation, step=step))
         self._progress = after
         collision = np.array([info["collision"]])
         actions = np.asarray(action, dtype=np.float64)[None]
@@ -230,11 +233,11 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
             raise ResetNeeded("call reset first: there is no episode yet")
         return self._progress
 
-    def _take_in(self, observation: Observation) -> Any:
+    def _take_in(self, observation: Observation, *, step: int) -> Any:
         """Let the estimator see one scan; return its belief in rows."""
         seen = np.flatnonzero(observation["mask"])
         self._estimator.update(observation["landmarks"][seen], seen.tolist())
-        self._belief = checked_belief(self._estimator)
+        self._belief = checked_belief(self._estimator, step)
         if self.render_mode is not None:
             self._world.show_belief(self._belief)
         return belief_in_rows(self._belief, self.scenario.landmarks.count, by_id=True)

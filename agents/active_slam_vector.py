@@ -19,6 +19,7 @@ from ..envs.vector_episodes import (
 )
 from ..envs.world_batch import WorldBatch
 from ..envs.world_spaces import action_space
+from ..estimator import validation
 from ..sim_configs import Scenario, load_scenario
 from .active_slam import split_settings
 from .active_slam_task import ActiveSlamTask, Progress
@@ -75,6 +76,7 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             raise ValueError(
                 f"render_mode must be None for worlds side by side, got {render_mode!r}"
             )
+        num_envs = validation.whole("num_envs", num_envs, 1)
         stakes, changes = split_settings(settings)
         self.scenario = load_scenario(scenario)
         if changes:
@@ -88,7 +90,7 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self.single_observation_space = self.task.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._most_steps = max_episode_steps or self.scenario.steps
+        self._most_steps = _episode_steps(self.scenario, max_episode_steps)
         self._worlds = WorldBatch(self.scenario, num_envs)
         self._filters = choose_batch(
             estimator,
@@ -232,3 +234,9 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             "success": success.copy(),
         }
         return self.task.observe(progress), infos
+
+
+def _episode_steps(scenario: Scenario, most: int | None) -> int:
+    if most is None or most == -1:  # Gymnasium's word for no limit
+        return scenario.steps
+    return min(validation.whole("max_episode_steps", most, 1), scenario.steps)

@@ -10,6 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from ..envs import LandmarkWorldEnv
+from ..estimator import validation
 from ..sim_configs import Scenario
 from .belief_arrays import BeliefArrays, belief_in_rows, stored
 from .belief_features import belief_features, belief_space, world_bounds
@@ -51,7 +52,8 @@ class BeliefObservation(
     TypeError
         If the estimator lacks a method, or its belief a part, which is named.
     ValueError
-        If the world has, or the map comes to hold, more landmarks than there are rows.
+        If the world has, or the map comes to hold, more landmarks than there are rows,
+        or a belief is not finite or has a negative variance; then the step is named.
 
     Examples
     --------
@@ -88,6 +90,7 @@ class BeliefObservation(
         self.observation_space = with_belief(env.observation_space, self._rows)
         self._belief: BeliefOfMap | None = None
         self._beliefs: BeliefArrays | None = None
+        self._steps = 0
 
     @property
     def belief(self) -> BeliefOfMap:
@@ -110,6 +113,7 @@ class BeliefObservation(
         observation, info = self.env.reset(seed=seed, options=options)
         world = self.env.get_wrapper_attr("start_estimate")
         self._estimator.reset(world, self.scenario.start.std)
+        self._steps = 0
         return self._take_in(observation), info
 
     def step(
@@ -118,13 +122,14 @@ class BeliefObservation(
         """Step the world, then let the estimator predict and update."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._estimator.predict(observation["odometry"])
+        self._steps += 1
         return self._take_in(observation), reward, terminated, truncated, info
 
     def _take_in(self, observation: Observation) -> Observation:
         seen = np.flatnonzero(observation["mask"])
         ids = seen.tolist() if self._by_id else None
         self._estimator.update(observation["landmarks"][seen], ids)
-        belief = checked_belief(self._estimator)
+        belief = checked_belief(self._estimator, self._steps)
         self._belief = belief
         self._beliefs = belief_in_rows(belief, self._rows, by_id=self._by_id)
         if self.env.render_mode is not None:
@@ -149,12 +154,12 @@ def count_landmark_rows(scenario: Scenario, max_landmarks: int | None) -> int:
     count = scenario.landmarks.count
     if max_landmarks is None:
         return count
-    if max_landmarks < (count if scenario.sensor.identities else 1):
+    rows = validation.whole("max_landmarks", max_landmarks, 1)
+    if scenario.sensor.identities and rows < count:
         raise ValueError(
-            f"max_landmarks must be >= the {count} landmarks of the world, "
-            f"got {max_landmarks}"
+            f"max_landmarks must be >= the {count} landmarks of the world, got {rows}"
         )
-    return int(max_landmarks)
+    return rows
 
 
 def with_belief(space: spaces.Space[Any], rows: int) -> spaces.Dict:

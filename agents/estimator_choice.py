@@ -1,5 +1,6 @@
 """Estimators for agents: chosen by name or made by hand, and held to their promises."""
 
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Protocol, cast
@@ -58,6 +59,8 @@ EstimatorChoice = str | FollowingEstimator | Callable[..., FollowingEstimator]
 
 _METHODS = ("reset", "predict", "update", "belief")
 _OF_BELIEF = ("pose", "pose_covariance", "landmark_ids", "landmarks", "covariance")
+_ARRAYS = ("pose", "pose_covariance", "landmarks", "covariance")
+_ROUNDING = 1e-9  # that a variance may be below 0, as in `check_estimator`
 
 
 def choose_estimator(
@@ -157,26 +160,72 @@ def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:
     return estimator
 
 
-def checked_belief(estimator: FollowingEstimator) -> BeliefOfMap:
-    """Ask for the belief, and name what it lacks."""
+def checked_belief(estimator: FollowingEstimator, step: int) -> BeliefOfMap:
+    """Ask for the belief, and name what is wrong with it.
+
+    Shapes, finite numbers and variances are looked at in every step. Whether the whole
+    covariance is positive semidefinite costs more; `check_estimator` tells that.
+
+    Parameters
+    ----------
+    estimator : FollowingEstimator
+        Whose belief is asked for.
+    step : int
+        For the message; 0 is the first scan, before any motion.
+
+    Raises
+    ------
+    TypeError
+        If a part is missing or has another shape.
+    ValueError
+        If a number is not finite or a variance is negative.
+    """
     belief = estimator.belief()
     name = type(estimator).__name__
-    for part in _OF_BELIEF:
-        if not hasattr(belief, part):
+    parts = {part: getattr(belief, part, None) for part in _OF_BELIEF}
+    for part, value in parts.items():
+        if value is None:
             raise TypeError(
                 f"{name}.belief() must return a belief with {', '.join(_OF_BELIEF)}, "
                 f"got {type(belief).__name__} without {part}"
             )
-    size = 3 + 2 * len(belief.landmark_ids)
-    if np.shape(belief.covariance) != (size, size):
-        raise TypeError(
-            f"{name}.belief() must have a covariance of shape ({size}, {size}) with "
-            f"{len(belief.landmark_ids)} landmarks, got {np.shape(belief.covariance)}"
-        )
-    if not (np.isfinite(belief.covariance).all() and np.isfinite(belief.pose).all()):
-        raise ValueError(f"{name}.belief() must be finite, got pose {belief.pose}")
+    count = len(belief.landmark_ids)
+    arrays = {part: np.asarray(parts[part]) for part in _ARRAYS}
+    for (part, array), shape in zip(arrays.items(), _shapes(count), strict=True):
+        if array.shape != shape and not 0 == array.size == math.prod(shape):
+            what = part if part == "landmarks" else f"a {part}"
+            raise TypeError(
+                f"{name}.belief() must have {what} of shape {shape} with {count} "
+                f"landmarks, got {array.shape} at step {step}"
+            )
+    for part, array in arrays.items():
+        problem = _wrong_number(part, array)
+        if problem:
+            raise ValueError(f"{name}.belief() must {problem} at step {step}")
     checked: BeliefOfMap = belief
     return checked
+
+
+def _shapes(landmarks: int) -> tuple[tuple[int, ...], ...]:
+    size = 3 + 2 * landmarks
+    return (3,), (3, 3), (landmarks, 2), (size, size)
+
+
+def _wrong_number(part: str, values: NDArray[Any]) -> str | None:
+    """Tell which rule a part of a belief breaks, and by which number."""
+    finite = np.isfinite(values)
+    if not finite.all():
+        return f"be finite, got {_first(part, values, ~finite)}"
+    if part.endswith("covariance") and values.diagonal().min() < -_ROUNDING:
+        wrong = np.diag(values.diagonal() < -_ROUNDING)
+        return f"have variances >= 0, got {_first(part, values, wrong)}"
+    return None
+
+
+def _first(part: str, values: NDArray[Any], wrong: NDArray[np.bool_]) -> str:
+    """Write the first wrong entry, as in "covariance[1, 1] = -0.5"."""
+    place = np.argwhere(wrong)[0].tolist()
+    return f"{part}{place} = {values[tuple(place)]}"
 
 
 def _has_a_method(estimator: Any) -> bool:

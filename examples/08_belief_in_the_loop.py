@@ -15,6 +15,7 @@ It prints what each of the two earns and how well it knows the map, and writes
 Then 64 worlds run side by side, each with its filter.
 """
 
+import argparse
 from pathlib import Path
 from typing import NamedTuple
 
@@ -96,6 +97,7 @@ def draw(drives: dict[str, Drive]) -> Figure:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     drives = {
         "drives on": drive(goes_home=False),
         "goes home when unsure": drive(goes_home=True),

@@ -135,10 +135,11 @@ def draw_curve(
     figure = Figure((7, 4), layout="constrained")
     axes = figure.add_subplot()
     axes.plot([row["steps"] for row in curve], [row["return"] for row in curve], c=INK)
+    end = curve[-1]["steps"] if curve else 1  # no episode may have ended yet
     for k, name in enumerate(BASELINES):
         mean = mean_of(played[name], "total").value
         axes.axhline(mean, color=PALE, linestyle="--", zorder=0)
-        beside = (0.6 + 0.12 * (k % 3)) * curve[-1]["steps"]  # lines can be close
+        beside = (0.6 + 0.12 * (k % 3)) * end  # lines can be close
         axes.annotate(name, (beside, mean), color="#777777", va="bottom", fontsize=9)
     axes.set(xlabel="steps of training", ylabel="return of an episode")
     axes.spines[["top", "right"]].set_visible(False)
@@ -182,13 +183,34 @@ def outcome(episode: Episode) -> str:
     return f"{how}, {100 * episode.known:.0f} % known"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenario", default="active_medium")
-    parser.add_argument("--steps", type=int, default=2_000_000)
-    parser.add_argument("--worlds", type=int, default=64, help="a multiple of 16")
-    parser.add_argument("--maps", type=int, default=100)
+def arguments() -> argparse.Namespace:
+    """Read the command line; what cannot be is refused before the training."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--scenario", default="active_medium", help="a preset or .toml file with walls")
+    add("--steps", type=int, default=2_000_000, help="of training, in all worlds")
+    add("--worlds", type=int, default=64, help="side by side, a multiple of 16")
+    add("--maps", type=int, default=100, help="that everyone is judged on")
     given = parser.parse_args()
+    for name, least in (("steps", 1), ("worlds", 16), ("maps", 1)):
+        if (value := getattr(given, name)) < least:
+            parser.error(f"argument --{name}: must be >= {least}, got {value}")
+    if given.worlds % 16:
+        parser.error(f"argument --worlds: must be a multiple of 16, got {given.worlds}")
+    try:
+        env = ActiveSlamEnv(given.scenario)
+        for name in BASELINES:  # they need a floor without inner walls
+            make_baseline(name, env.scenario, np.random.default_rng(0))
+    except (OSError, ValueError) as error:
+        parser.error(f"argument --scenario: {error}")
+    return given
+
+
+def main() -> None:
+    given = arguments()
     FOLDER.mkdir(parents=True, exist_ok=True)
     try:
         curve = train(given.scenario, given.steps, given.worlds)

@@ -1,6 +1,7 @@
 """The benchmark task: its rules, its twin of many worlds, its baselines."""
 
 import math
+import re
 import runpy
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +13,12 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import slamgym  # noqa: F401 (registers the environments)
-from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
+from slamgym.agents import (
+    ActiveSlamEnv,
+    ActiveSlamVectorEnv,
+    BeliefObservation,
+    BeliefObservationVector,
+)
 from slamgym.agents.active_slam_baselines import BASELINES, lanes_of, make_baseline
 from slamgym.agents.active_slam_scores import (
     VALIDATION,
@@ -26,8 +32,9 @@ from slamgym.agents.active_slam_scores import (
 from slamgym.agents.floor_plan import SECTORS, FloorPlan
 from slamgym.agents.information_reward import effort, map_covariances
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.estimator import EkfSlam
+from slamgym.estimator import EkfSlam, list_estimators
 from slamgym.sim_configs import load_scenario
+from slamgym.sim_configs.domain_randomisation import drawn_scenario
 
 ID = "slamgym/ActiveSlam-v0"
 LEVELS = ["active_easy", "active_medium", "active_hard"]
@@ -244,7 +251,186 @@ def test_frames_show_world_and_belief():
     env.close()
 
 
+# what an estimator may say
+
+
+class Slip(EkfSlam):
+    """Tells the truth for two steps, then writes one number into its belief."""
+
+    part, place, number = "covariance", (0, 0), 0.0
+
+    def reset(self, pose, pose_std):
+        super().reset(pose, pose_std)
+        self.told = 0
+
+    def belief(self):
+        honest = super().belief()
+        parts = {
+            name: np.array(getattr(honest, name))
+            for name in ("pose", "pose_covariance", "landmarks", "covariance")
+        }
+        if self.told == 2:
+            parts[self.part][self.place] = self.number
+        self.told += 1
+        return type("Said", (), {"landmark_ids": honest.landmark_ids, **parts})()
+
+
+def observed(estimator):
+    return BeliefObservation(
+        gym.make("slamgym/LandmarkWorld-v0", scenario="active_easy"), estimator
+    )
+
+
+def slips(make, part, place, number):
+    """Drive on the belief of an estimator that slips at step 2."""
+    written = {"part": part, "place": place, "number": number}
+    env = make(type("Careless", (Slip,), written))
+    env.reset(seed=0)
+    env.step([0.2, 0.1])
+    env.reset()  # steps are counted anew
+    for _ in range(3):
+        env.step([0.2, 0.1])
+
+
+@pytest.mark.parametrize(
+    "make", [observed, lambda e: ActiveSlamEnv("active_easy", estimator=e)]
+)
+@pytest.mark.parametrize(
+    ("part", "place", "number", "said"),
+    [
+        ("pose_covariance", (2, 2), -0.5, "have variances >= 0"),
+        ("covariance", (1, 1), -2e-9, "have variances >= 0"),
+        ("covariance", (4, 4), -1.0, "have variances >= 0"),
+        ("pose_covariance", (0, 1), np.nan, "be finite"),
+        ("covariance", (3, 0), np.inf, "be finite"),
+        ("pose", (2,), np.nan, "be finite"),
+        ("landmarks", (0, 1), -np.inf, "be finite"),
+    ],
+)
+def test_a_belief_that_cannot_be_is_refused_with_its_number_and_the_step(
+    make, part, place, number, said
+):
+    where = f"{part}{list(place)} = {number}"
+    message = f"Careless.belief() must {said}, got {where} at step 2"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        slips(make, part, place, number)
+
+
+def test_a_variance_may_be_negative_by_rounding():
+    slips(observed, "covariance", (4, 4), -1e-12)
+
+
+@pytest.mark.parametrize(
+    ("part", "shape"),
+    [("pose", (2,)), ("pose_covariance", (2, 2)), ("landmarks", (1, 2))],
+)
+def test_a_part_of_a_belief_of_another_shape_is_named(part, shape):
+    class Short(EkfSlam):
+        def belief(self):
+            said = super().belief()
+            parts = {
+                name: getattr(said, name)
+                for name in ("pose", "pose_covariance", "landmarks", "covariance")
+            }
+            parts[part] = np.zeros(shape)
+            return type("Said", (), {"landmark_ids": said.landmark_ids, **parts})()
+
+    message = rf"Short\.belief\(\) must have .*{part} of shape .*got .* at step 0"
+    with pytest.raises(TypeError, match=message):
+        observed(Short).reset(seed=0)
+
+
+@pytest.mark.parametrize("rows", ["20", 0, -3, 2.5, 25.0, True, [1], np.nan])
+@pytest.mark.parametrize("scenario", ["loop", "hidden_identities"])
+def test_odd_numbers_of_rows_are_refused_by_name(scenario, rows):
+    world = gym.make("slamgym/LandmarkWorld-v0", scenario=scenario)
+    message = rf"max_landmarks must be a whole number >= 1, got {re.escape(repr(rows))}"
+    with pytest.raises(ValueError, match=message):
+        BeliefObservation(world, "ekf", max_landmarks=rows)
+    if scenario == "loop":
+        worlds = gym.make_vec("slamgym/LandmarkWorld-v0", 2, scenario=scenario)
+        with pytest.raises(ValueError, match=message):
+            BeliefObservationVector(worlds, "ekf", max_landmarks=rows)
+
+
+@pytest.mark.parametrize("rows", [25, np.int64(25)])
+def test_rows_may_be_any_integer(rows):
+    env = BeliefObservation(
+        gym.make("slamgym/LandmarkWorld-v0", scenario="loop"), "ekf", max_landmarks=rows
+    )
+    assert env.observation_space["belief_mask"].shape == (25,)
+
+
+def test_landmarks_are_told_ahead_and_aside_one_after_the_other_in_diagonals():
+    env = ActiveSlamEnv("active_medium")
+    for observation, *_ in wander(env, 40, seed=3):
+        belief, told = env.situation.belief, observation["belief_landmarks"]
+        count = env.scenario.landmarks.count
+        assert told.shape == (2 * count,)
+        x, y, heading = belief.pose
+        for k in range(count):
+            ahead, aside = told[2 * k : 2 * k + 2] * 16 * 2**0.5
+            if k not in belief.landmark_ids:
+                assert (ahead, aside) == (0, 0)
+                continue
+            lx, ly = belief.landmarks[belief.landmark_ids.index(k)]
+            turned = np.exp(-1j * heading) * complex(lx - x, ly - y)  # left is +i
+            assert complex(ahead, aside) == pytest.approx(turned, abs=1e-9)
+    assert len(belief.landmark_ids) > 3
+
+
 # many worlds
+
+
+@pytest.mark.parametrize("count", [0, -1, True, 2.0, "2", None])
+@pytest.mark.parametrize("name", [ID, "slamgym/LandmarkWorld-v0"])
+def test_odd_numbers_of_worlds_are_refused_by_name(name, count):
+    message = rf"num_envs must be an? \w+ ?\w* >= 1, got {count!r}"
+    with pytest.raises(ValueError, match=message):
+        gym.make_vec(name, count)
+
+
+@pytest.mark.parametrize("most", [0, -3, 2.5, True, "x"])
+def test_odd_time_limits_are_refused_by_name(most):
+    with pytest.raises(ValueError, match="max_episode_steps must be a whole number"):
+        ActiveSlamVectorEnv(2, "active_easy", max_episode_steps=most)
+
+
+@pytest.mark.parametrize("most", [None, -1, 9])
+def test_without_a_lower_time_limit_that_of_the_scenario_holds(most):
+    vector = ActiveSlamVectorEnv(2, "active_easy", steps=3, max_episode_steps=most)
+    vector.reset(seed=0)
+    cut = [vector.step(np.zeros((2, 2)))[3].any() for _ in range(3)]
+    assert cut == [False, False, True]
+
+
+def test_the_estimators_that_run_side_by_side_are_those_of_the_documents():
+    page = (Path(__file__).parents[1] / "docs" / "active_slam.md").read_text()
+    sentence = page.split("chosen by name:")[1].split("run side by side")[0]
+    able = set(re.findall(r"`(\w+)`", sentence))
+    assert able
+    for name in able:
+        ActiveSlamVectorEnv(2, "active_easy", estimator=name)
+    for name in set(list_estimators()) - able:
+        with pytest.raises(ValueError, match="cannot run in batches"):
+            ActiveSlamVectorEnv(2, "active_easy", estimator=name)
+
+
+def test_worlds_drawn_from_ranges_observe_in_one_space():
+    ranges = {
+        "motion_std": [0.5, 2.0],
+        "max_range": [3.0, 4.5],
+        "start_x": [-2.0, 2.0],
+        "map_scale": [0.8, 1.1],
+    }
+    family = load_scenario("active_easy").with_changes(randomise=ranges)
+    with pytest.raises(ValueError, match="has ranges"):
+        ActiveSlamVectorEnv(2, family)
+    rng = np.random.default_rng(0)
+    draws = [drawn_scenario(family, rng) for _ in range(3)]
+    spaces = [ActiveSlamEnv(drawn).observation_space for drawn in draws]
+    assert spaces[0] == spaces[1] == spaces[2]
+    assert len({drawn.motion.std for drawn in draws}) == 3
 
 
 def compare(batch, infos, world, observation, info):

@@ -136,3 +136,47 @@ def test_07_draws_the_picture_of_the_readme(run):
     shown = EXAMPLES.parent / "docs" / "images" / "honest_ellipses.png"
     with Image.open("results/07_honest_ellipses.png") as new, Image.open(shown) as old:
         assert new.size == old.size
+
+
+@pytest.mark.parametrize("arguments", [["--bogus"], ["more"]])
+@pytest.mark.parametrize("name", ["08_belief_in_the_loop", "09_train_active_slam"])
+def test_08_and_09_refuse_what_they_do_not_know(name, arguments, run, capsys):
+    with pytest.raises(SystemExit) as end:
+        run(name, *arguments)
+    assert end.value.code == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said == f"{name}.py: error: unrecognized arguments: {arguments[0]}"
+
+
+@pytest.mark.parametrize("name", ["08_belief_in_the_loop", "09_train_active_slam"])
+def test_08_and_09_explain_themselves(name, run, capsys):
+    with pytest.raises(SystemExit) as end:
+        run(name, "--help")
+    assert end.value.code == 0
+    assert f"usage: {name}.py" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--steps", "0", "must be >= 1, got 0"),
+        ("--steps", "many", "invalid int value: 'many'"),
+        ("--worlds", "-16", "must be >= 16, got -16"),
+        ("--worlds", "24", "must be a multiple of 16, got 24"),
+        ("--maps", "0", "must be >= 1, got 0"),
+        ("--scenario", "nope", "scenario must be a preset (active_easy, "),
+        ("--scenario", "nope.toml", "cannot read the scenario 'nope.toml'"),
+        ("--scenario", "loop", "scenario must have walls around its floor, got none"),
+        ("--scenario", "corridor", "the floor must be a rectangle without inner walls"),
+    ],
+)
+def test_09_refuses_what_cannot_be_before_it_trains(
+    option, value, message, run, capsys
+):
+    with pytest.raises(SystemExit) as end:
+        run("09_train_active_slam", option, value)
+    assert end.value.code == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    start = f"09_train_active_slam.py: error: argument {option}: "
+    assert said.startswith(start + message)
+    assert not Path("results").exists()

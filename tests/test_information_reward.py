@@ -9,7 +9,11 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 import slamgym  # noqa: F401 (registers the environments)
-from slamgym.agents import BeliefObservation, InformationReward
+from slamgym.agents import (
+    BeliefObservation,
+    BeliefObservationVector,
+    InformationReward,
+)
 from slamgym.agents.belief_arrays import belief_in_rows
 from slamgym.agents.information_reward import (
     CRITERIA,
@@ -169,6 +173,23 @@ def test_a_new_episode_begins_with_a_new_uncertainty():
         env.reset(seed=4)
         rewards.append([env.step([0.25, 0.1])[1] for _ in range(20)])
     assert rewards[0] == rewards[1]
+
+
+def test_what_the_uncertainty_of_many_worlds_falls_by_is_the_reward_of_each():
+    worlds = BeliefObservationVector(gym.make_vec(ID, 3, scenario="loop"), "ekf")
+    envs = [wrapped() for _ in range(3)]
+    prior = landmark_prior_std(worlds.scenario)
+    worlds.reset(seed=7)
+    for k, env in enumerate(envs):
+        env.reset(seed=7 + k)
+    before = uncertainty(worlds.beliefs, "D", prior)
+    for actions in np.random.default_rng(0).uniform(-0.25, 0.25, (20, 3, 2)):
+        worlds.step(actions)
+        after = uncertainty(worlds.beliefs, "D", prior)
+        rewards = [env.step(a)[1] for env, a in zip(envs, actions, strict=True)]
+        np.testing.assert_allclose(before - after, rewards, atol=1e-9)
+        before = after
+    assert max(rewards) > 0
 
 
 def test_an_unknown_criterion_is_refused():

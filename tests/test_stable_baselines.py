@@ -1,7 +1,9 @@
 """The adapter to Stable-Baselines3, held against its own DummyVecEnv."""
 
 import importlib
+import re
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -147,3 +149,75 @@ def test_ppo_learns_on_it(flat):
         model, monitored, n_eval_episodes=4, return_episode_rewards=True
     )[1]
     assert lengths == [16] * 4
+
+
+DOCUMENT = Path(__file__).parents[1] / "docs" / "active_slam.md"
+
+
+def blocks(heading):
+    """Return (language, code) of the blocks below a heading of the document."""
+    section = DOCUMENT.read_text().split(f"# {heading}\n")[1].split("\n#")[0]
+    return re.findall(r"^```(\w+)\n(.*?)^```$", section, re.M | re.S)
+
+
+def test_the_document_leads_from_make_vec_to_a_policy():
+    """The block that needs Stable-Baselines3 is run here, in the place of readers."""
+    scope = {"__name__": "reader"}
+    languages = []
+    for language, code in blocks("From `make_vec` to an RL library"):
+        languages.append(language)
+        if language != "text":
+            exec(compile(code, "document", "exec"), scope)
+    assert languages == ["python", "text", "py"]
+    assert scope["model"].num_timesteps == 8192
+
+
+def randomised():
+    """Return the two blocks on randomisation: draws per round, draws per episode."""
+    found = blocks("Domain randomisation")
+    return [code for language, code in found if language == "python"]
+
+
+def test_a_policy_goes_on_in_worlds_drawn_anew_per_round():
+    """The document's lines, also those that stand in comments there."""
+    code = randomised()[0].replace("# model.", "model.").replace("64 * 512", "1024")
+    easy = gym.make_vec(
+        "slamgym/ActiveSlam-v0", 64, scenario="active_easy", autoreset_mode="SameStep"
+    )
+    worlds = to_stable_baselines(FlattenBatch(easy))
+    model = sb3.PPO("MlpPolicy", worlds, n_steps=16, batch_size=256, n_epochs=1)
+    known = {"to_stable_baselines": to_stable_baselines, "FlattenBatch": FlattenBatch}
+    scope = {"__name__": "reader", "model": model, **known}
+    exec(compile(code, "document", "exec"), scope)
+    assert model.num_timesteps == 3 * 1024
+    assert model.get_env().worlds.env is scope["worlds"]
+
+
+def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed():
+    scope = {"__name__": "reader"}
+    exec(compile(randomised()[1], "document", "exec"), scope)
+    drives, noises = [], set()
+    for seed in (3, 3):
+        worlds = scope["worlds"]
+        vector = to_stable_baselines(FlattenBatch(worlds))
+        vector.seed(seed)
+        seen, ends = [vector.reset()], 0
+        for _ in range(40):
+            ahead = np.tile(np.float32([1, 0]), (4, 1))  # into the wall, soon
+            observations, _, dones, _ = vector.step(ahead)
+            seen.append(observations)
+            ends += dones.sum()
+            noises |= {env.unwrapped.scenario.motion.std for env in worlds.envs}
+        drives.append(seen)
+    assert ends > 4
+    assert len(noises) == ends + 4
+    np.testing.assert_array_equal(*drives)
+
+
+def test_ppo_takes_worlds_that_are_drawn_anew_per_episode():
+    scope = {"__name__": "reader"}
+    exec(compile(randomised()[1], "document", "exec"), scope)
+    worlds = to_stable_baselines(FlattenBatch(scope["worlds"]))
+    model = sb3.PPO("MlpPolicy", worlds, n_steps=16, batch_size=32, n_epochs=1, seed=0)
+    model.learn(128)
+    assert model.num_timesteps == 128

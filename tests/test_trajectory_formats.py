@@ -13,7 +13,11 @@ import pytest
 
 from slamgym.experiments.log_events import OdometryRow
 from slamgym.experiments.log_importers import read_log
-from slamgym.experiments.trajectories import generate_trajectories, load_trajectories
+from slamgym.experiments.trajectories import (
+    generate,
+    generate_trajectories,
+    load_trajectories,
+)
 from slamgym.experiments.trajectories.driven_episodes import drive_episodes
 from slamgym.experiments.trajectories.formats import FORMATS, trajectory_format
 from slamgym.experiments.trajectories.formats.slamlog_files import to_slamlog
@@ -451,3 +455,40 @@ def test_minari_data_may_lie_in_a_relative_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     generate_trajectories("six_landmarks", "here", episodes=2, format="minari")
     assert len(list(load_trajectories("here"))) == 2
+
+
+def interrupted(folder, whole):
+    """Begin a set of 7 drives in 3 shards, and stop after some."""
+    job = {"episodes": 7, "episodes_per_shard": 3, "controller": "random", "seed": 4}
+    shards = []
+
+    def drive(*arguments, **options):
+        if len(shards) == whole:
+            raise KeyboardInterrupt
+        shards.append(arguments)
+        return drive_episodes(*arguments, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generate, "drive_episodes", drive)
+        with pytest.raises(KeyboardInterrupt):
+            generate_trajectories("six_landmarks", folder, **job)
+
+
+@pytest.mark.parametrize(("whole", "there"), [(0, 0), (1, 3), (2, 6)])
+def test_an_unfinished_set_warns_how_much_is_there_and_what_goes_on(
+    whole, there, tmp_path
+):
+    interrupted(tmp_path, whole)
+    with pytest.warns(UserWarning, match=f"is not finished: {there} of 7 ep") as caught:
+        drives = load_trajectories(tmp_path)
+    assert caught[0].filename == __file__
+    assert [drive.seed for drive in drives] == list(range(4, 4 + there))
+    told = str(caught[0].message).split("scenario ")[1]
+    job = eval(f"dict(scenario={told})")  # as a reader types it over
+    assert generate_trajectories(job.pop("scenario"), tmp_path, **job).is_complete
+    assert [drive.seed for drive in load_trajectories(tmp_path)] == list(range(4, 11))
+
+
+def test_drives_of_no_seeds_are_refused():
+    with pytest.raises(ValueError, match=r"seeds must be one or more .* got \[\]"):
+        drive_episodes(load_scenario("loop"), "waypoints", [])

@@ -98,7 +98,7 @@ def load_trajectories(
     Parameters
     ----------
     path : path
-        The folder; one that is not complete yet gives what it has.
+        The folder; one that is not finished gives what it has, and warns.
     damaged : {"raise", "skip"}, optional
         What happens at a shard that does not match its checksum: iterating raises a
         `DamagedShardError`, or warns and goes on with the next.
@@ -115,11 +115,31 @@ def load_trajectories(
         If the folder holds no manifest, or `damaged` is neither.
     ImportError
         If the package of its format is not installed.
+
+    Warns
+    -----
+    UserWarning
+        If episodes are still to come: how many there are, and what goes on with them.
     """
     if damaged not in _DAMAGED:
         hint = closest(str(damaged), _DAMAGED)
         raise ValueError(f"damaged must be 'raise' or 'skip', got {damaged!r}{hint}")
-    return TrajectoryDataset(Path(path), damaged)
+    dataset = TrajectoryDataset(Path(path), damaged)
+    if not dataset.manifest.is_complete:
+        warnings.warn(_unfinished(dataset), stacklevel=2)
+    return dataset
+
+
+def _unfinished(dataset: TrajectoryDataset) -> str:
+    """Tell how much is there, and the job that makes the rest."""
+    job = dataset.manifest.job
+    return (
+        f"{dataset.folder} is not finished: {len(dataset)} of {job.episodes} episodes "
+        "are there. Where no process writes them now, the same slamgym generate or "
+        f"generate_trajectories makes the others: scenario '{job.scenario.name}', "
+        f"episodes={job.episodes}, controller={job.controller!r}, seed={job.seed}, "
+        f"format={job.format!r}, episodes_per_shard={job.episodes_per_shard}"
+    )
 
 
 def is_whole(folder: Path, shard: ShardEntry) -> bool:

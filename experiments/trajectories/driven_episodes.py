@@ -35,7 +35,7 @@ def drive_episodes(
     controller : str
         See `make_controller`.
     seeds : sequence of int
-        One per episode.
+        One per episode, at least one.
     progress : callable, optional
         Called with the number of steps just done, in all episodes together.
 
@@ -44,6 +44,11 @@ def drive_episodes(
     list of Trajectory
         One per seed.
 
+    Raises
+    ------
+    ValueError
+        If there are no seeds.
+
     Examples
     --------
     >>> from slamgym.sim_configs import load_scenario
@@ -51,6 +56,8 @@ def drive_episodes(
     >>> drives[1].measurements.shape
     (30, 6, 2)
     """
+    if not len(seeds):
+        raise ValueError(f"seeds must be one or more integers >= 0, got {seeds!r}")
     scenarios = [
         drawn_scenario(scenario, np.random.default_rng([seed, _SCENARIO_STREAM]))
         for seed in seeds
