@@ -17,12 +17,17 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import pymunk
 from agents_beliefs import belief_table
 from agents_peers import peer_calls
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import FlattenObservation
-from interleaved import microseconds, ratio, time_interleaved, verdict
+from interleaved import (
+    bare_steps,
+    microseconds,
+    ratio,
+    time_interleaved,
+    verdict,
+)
 from rich.console import Console
 from rich.table import Table
 
@@ -53,18 +58,6 @@ class Case(NamedTuple):
     """Another case, and at least how many times faster than it."""
     slower_than: tuple[str, float] | None = None
     """Another case, and at least how many times slower than it."""
-
-
-def bare() -> Case:
-    space, body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-    space.add(body)
-    body.velocity, body.angular_velocity = (0.1, 0.2), 0.1
-
-    def call() -> None:
-        for _ in range(BARE_STEPS):
-            space.step(1.0)
-
-    return Case(call, BARE_STEPS)
 
 
 def steps_of(worlds: Any, **goals: Any) -> Case:
@@ -135,7 +128,8 @@ def single_case() -> Case:
 
 def main() -> int:
     peers = peer_calls()
-    cases = {BARE: bare(), SINGLE: single_case()}
+    bare = Case(bare_steps(BARE_STEPS), BARE_STEPS)
+    cases = {BARE: bare, SINGLE: single_case()}
     cases |= {
         name: Case(call, 1, slower_than=(SINGLE, PEERS_SLOWER))
         for name, call in peers.items()

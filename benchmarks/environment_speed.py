@@ -13,8 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
-import pymunk
-from interleaved import microseconds, ratio, time_interleaved, verdict
+from interleaved import bare_steps, microseconds, ratio, time_interleaved, verdict
 from rich.console import Console
 from rich.table import Table
 
@@ -38,18 +37,6 @@ CASES: dict[str, tuple[dict[str, Any], float | None]] = {
         None,
     ),
 }
-
-
-def bare() -> Call:
-    space, body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-    space.add(body)
-    body.velocity, body.angular_velocity = (0.1, 0.2), 0.1
-
-    def call() -> None:
-        for _ in range(STEPS):
-            space.step(1.0)
-
-    return call
 
 
 def world(changes: dict[str, Any]) -> Call:
@@ -84,7 +71,7 @@ def cartpole() -> Call:
 
 
 def main() -> int:
-    cases = {BARE: bare(), "CartPole-v1": cartpole()}
+    cases = {BARE: bare_steps(STEPS), "CartPole-v1": cartpole()}
     cases |= {name: world(changes) for name, (changes, _) in CASES.items()}
     times = time_interleaved(cases, rounds=41)
     table = Table(title="one step of slamgym/LandmarkWorld-v0, unwrapped")

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from functools import partial
 from statistics import median
 
-import pymunk
+from interleaved import bare_steps
 from rich.console import Console
 from rich.table import Table
 
@@ -45,15 +45,7 @@ def cpu_seconds(call: Callable[[], object]) -> float:
 
 def bare() -> float:
     """Measure the seconds of a bare step."""
-    space, body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-    space.add(body)
-    body.velocity, body.angular_velocity = (0.1, 0.2), 0.1
-
-    def call() -> None:
-        for _ in range(BARE_STEPS):
-            space.step(1.0)
-
-    return cpu_seconds(call) / BARE_STEPS
+    return cpu_seconds(bare_steps(BARE_STEPS)) / BARE_STEPS
 
 
 def is_installed(name: str) -> bool:

@@ -4,6 +4,24 @@ import time
 from collections.abc import Callable, Mapping
 from statistics import median
 
+import pymunk
+
+
+def bare_steps(count: int) -> Callable[[], None]:
+    """Return a call that takes ``count`` steps of a bare physics world.
+
+    A bare step is `pymunk.Space.step` with one kinematic body.
+    """
+    space, body = pymunk.Space(), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+    space.add(body)
+    body.velocity, body.angular_velocity = (0.1, 0.2), 0.1
+
+    def call() -> None:
+        for _ in range(count):
+            space.step(1.0)
+
+    return call
+
 
 def time_interleaved(
     cases: Mapping[str, Callable[[], object]],

@@ -48,22 +48,6 @@ class BatchBeliefs(NamedTuple):
     """Which landmarks are in the map, shape (B, L)."""
 
 
-class BatchMarginals(NamedTuple):
-    """What every run believes of its pose and of each landmark, one by one."""
-
-    poses: Array
-    """(x, y, θ), shape (B, 3) [m, m, rad], heading in [-π, π)."""
-    pose_covariances: Array
-    """Shape (B, 3, 3)."""
-    landmarks: Array
-    """Shape (B, L, 2), zeros where not mapped [m]."""
-    spreads: Array
-    """Shape (9, B, L), zeros where not mapped: the covariances xx, xy, yy of a landmark
-    (lx, ly), and of lx and of ly with the pose: lx x, lx y, lx θ, ly x, ly y, ly θ."""
-    mapped: NDArray[np.bool_]
-    """Which landmarks are in the map, shape (B, L)."""
-
-
 class BatchStorage(NamedTuple):
     """Where the beliefs of all runs stand: live, but not to be written to.
 
@@ -274,30 +258,6 @@ class BatchSlam:
         covariances *= held[:, :, None] & held[:, None]
         means[:, 2] = wrap_angle(means[:, 2])
         return BatchBeliefs(means, covariances, mapped)
-
-    def marginals(self) -> BatchMarginals:
-        """Return what :meth:`beliefs` says of pose and landmarks, at less cost."""
-        mapped = self._slots >= 0
-        capacity = self._means.shape[1]
-        run = np.arange(self.runs)[:, None]
-        place = 3 + 2 * np.where(mapped, self._slots, 0)
-        means = self._means.ravel()
-        landmarks = np.stack(
-            [means.take(run * capacity + place + axis) for axis in (0, 1)], axis=-1
-        )
-        row = (run * capacity + place) * capacity
-        below = row + capacity
-        at = [row + place, row + place + 1, below + place + 1]
-        at += [row + axis for axis in range(3)] + [below + axis for axis in range(3)]
-        poses = self._means[:, :3].copy()
-        poses[:, 2] = wrap_angle(poses[:, 2])
-        return BatchMarginals(
-            poses,
-            self._covariances[:, :3, :3].copy(),
-            landmarks * mapped[..., None],
-            self._covariances.ravel().take(np.stack(at)) * mapped,
-            mapped,
-        )
 
     def storage(self) -> BatchStorage:
         """Return the arrays that the runs work on, without a copy.

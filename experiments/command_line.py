@@ -294,7 +294,7 @@ def noise_study(
     as_json: options.AsJson = False,
 ) -> None:
     """Run the study, and write figure and tables."""
-    from .commands import noise_monte_carlo, study, worlds  # noqa: PLC0415 (heavy)
+    from .commands import study, worlds  # noqa: PLC0415 (heavy)
     from .commands.run_and_replay import read_any_log  # noqa: PLC0415 (heavy)
     from .filter_settings import (  # noqa: PLC0415 (heavy)
         settings_for,
@@ -307,6 +307,8 @@ def noise_study(
         _refuse(stds, "a log; the filter knows the noise of a scenario")
         world = worlds.chosen_scenario(source, steps=steps, sets=set_ or [])
         if runs != 1:
+            from .commands import noise_monte_carlo  # noqa: PLC0415 (heavy)
+
             noise_monte_carlo.study_effects(
                 world,
                 estimator,

@@ -15,7 +15,7 @@ from ..sim_configs import Scenario, load_scenario
 from ..sim_configs.scenario_errors import closest
 from .filter_settings import SIGMAS
 from .monte_carlo import monte_carlo
-from .monte_carlo.known_values import mean, quotient, root_mean_square, standard_error
+from .monte_carlo.known_values import mean, root_mean_square, standard_error
 from .monte_carlo.scores import EstimatorScores, labels_of, scores_of
 from .noise_study import FACTORS, scaled_scenario
 
@@ -155,8 +155,6 @@ def _variations(world: Scenario, changed: list[Changed]) -> Iterator[_Variation]
 
 def _effect(variation: _Variation, scores: EstimatorScores) -> NoiseEffect:
     per_run = scores.ratios("invariant").mean(axis=1)
-    freedom = scores.over_time("nis_dof")
-    nis = np.where(freedom > 0, scores.over_time("nis"), 0.0)
     return NoiseEffect(
         *variation[:3],
         estimator=scores.label,
@@ -165,7 +163,7 @@ def _effect(variation: _Variation, scores: EstimatorScores) -> NoiseEffect:
         nees_per_degree=_known(mean(per_run)),
         nees_per_degree_error=_known(standard_error(per_run)),
         nees_per_degree_median=float(np.median(per_run)) if len(per_run) else np.nan,
-        nis_per_degree=_known(quotient(nis, freedom)),
+        nis_per_degree=_known(scores.nis_per_degree),
         position_rmse=_known(root_mean_square(scores.over_time("position_error"))),
         ate_aligned=_known(root_mean_square(scores.per_run("ate_aligned"))),
         landmark_rmse_aligned=_known(

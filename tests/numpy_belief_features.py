@@ -1,24 +1,42 @@
 """The features of beliefs once more, in numpy: the slow twin of the compiled pass."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from slamgym.estimator.batch import BatchMarginals
+
+class BeliefMarginals(NamedTuple):
+    """What B beliefs say of the pose and of each of L landmarks, one by one."""
+
+    poses: np.ndarray
+    """Shape (B, 3)."""
+    pose_covariances: np.ndarray
+    """Shape (B, 3, 3)."""
+    landmarks: np.ndarray
+    """Shape (B, L, 2), zeros where not mapped."""
+    spreads: np.ndarray
+    """Shape (9, B, L), zeros where not mapped: the covariances xx, xy, yy of a landmark
+    (lx, ly), and of lx and of ly with the pose: lx x, lx y, lx θ, ly x, ly y, ly θ."""
+    mapped: np.ndarray
+    """Which landmarks are in the map, shape (B, L)."""
 
 
 def marginals_of(beliefs):
-    """Take what is believed of the poses and of each landmark by itself."""
-    x = 3 + 2 * np.arange(beliefs.mapped.shape[1])
-    cov = beliefs.covariances
+    """Take what is believed of the poses and of each landmark by itself.
+
+    The beliefs are those of a batch, `BatchSlam.beliefs()`, or of an agent's worlds.
+    """
+    mapped, means, cov = beliefs.mapped, beliefs.means, beliefs.covariances
+    x = 3 + 2 * np.arange(mapped.shape[1])
     own = [cov[:, x, x], cov[:, x, x + 1], cov[:, x + 1, x + 1]]
     with_pose = [cov[:, x + axis, of] for axis in (0, 1) for of in range(3)]
-    return BatchMarginals(
-        beliefs.poses,
+    return BeliefMarginals(
+        means[:, :3],
         cov[:, :3, :3],
-        beliefs.landmarks,
+        means[:, 3:].reshape(*mapped.shape, 2),
         np.stack(own + with_pose),
-        beliefs.mapped,
+        mapped,
     )
 
 

@@ -116,18 +116,18 @@ def agree(features, expected):
 
 
 def test_the_compiled_pass_agrees_with_its_slow_twin(batch):
-    expected = twin.belief_features(batch.marginals(), FLOOR)
+    expected = twin.belief_features(marginals_of(batch.beliefs()), FLOOR)
     assert (expected["belief_mask"].sum(axis=1) > 1).any()
     agree(belief_features(batch.storage(), FLOOR), expected)
 
 
 def test_the_compiled_pass_agrees_with_its_slow_twin_at_the_bounds(batch):
     tiny = (-0.1, -0.2, 0.1, 0.3)  # all is outside
-    expected = twin.belief_features(batch.marginals(), tiny)
+    expected = twin.belief_features(marginals_of(batch.beliefs()), tiny)
     assert np.abs(expected["belief_landmarks"]).max() == 1.0
     agree(belief_features(batch.storage(), tiny), expected)
     certain = make_batch("ekf", runs=2, landmarks=0, **NOISE)  # all variances are 0
-    expected = twin.belief_features(certain.marginals(), FLOOR)
+    expected = twin.belief_features(marginals_of(certain.beliefs()), FLOOR)
     assert not expected["belief_pose_std"].any()
     agree(belief_features(certain.storage(), FLOOR), expected)
 
@@ -504,6 +504,7 @@ def test_the_example_shows_that_going_home_keeps_the_map_better(
 ):
     example = next(Path(__file__).parents[1].glob("examples/*belief_in_the_loop.py"))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", [str(example)])
     runpy.run_path(str(example), run_name="__main__")
     on, home, *_ = capsys.readouterr().out.splitlines()
     assert float(on.split()[-2]) > float(home.split()[-2])

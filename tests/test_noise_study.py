@@ -1,4 +1,6 @@
 import math
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -142,3 +144,16 @@ def test_without_truth_the_errors_are_unknown(log):
     row = study_log(blind, settings_for(blind))[0].row
     assert (row.landmark_rmse, row.ate, row.nees_per_degree) == (None, None, None)
     assert row.landmark_area > 0
+
+
+def test_a_study_of_one_run_loads_nothing_of_the_monte_carlo():
+    program = (
+        "import sys\n"
+        "from slamgym.experiments.command_line import main\n"
+        "from slamgym.experiments.commands import study\n"
+        "study.write_study = lambda *_, **__: None\n"
+        "main(['noise-study', 'six_landmarks'], standalone_mode=False)\n"
+        "heavy = {'xarray', 'netCDF4', 'joblib'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)

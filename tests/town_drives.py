@@ -15,8 +15,11 @@ def town(count, seed=0):
     return np.random.default_rng(seed).uniform(-half, half, (count, 2)), half
 
 
-def wander(count, steps, *, seed=0, seen=10):
-    """Yield (odometry, readings of the nearest landmarks, ids)."""
+def wander(count, steps, *, seed=0, seen=10, jumping=False):
+    """Yield (odometry, readings, ids) of a drive from place to place.
+
+    The nearest landmarks are seen, or, ``jumping``, any.
+    """
     rng = np.random.default_rng(seed + 1)
     landmarks, half = town(count, seed)
     pose = np.zeros(3)
@@ -29,7 +32,10 @@ def wander(count, steps, *, seed=0, seen=10):
         slip = TOWN_MOTION_STD * rng.standard_normal(3)
         pose = motion.pose + motion.jacobian_noise @ slip
         distances = ((landmarks - pose[:2]) ** 2).sum(axis=1)
+        distances[distances < 1] = np.inf  # too close to have a bearing
         ids = np.argpartition(distances, seen)[:seen]
+        if jumping:
+            ids = rng.choice(count, seen, replace=False)
         readings = predict_measurement(pose, landmarks[ids]).measurement
         noise = MEASUREMENT_STD * rng.standard_normal(readings.shape)
         yield (0.5, float(turn)), readings + noise, ids

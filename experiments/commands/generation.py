@@ -1,19 +1,8 @@
 """``slamgym generate``: many drives through a scenario, written as a data set."""
 
-import contextlib
-import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.text import Text
 
 from ...sim_configs import Scenario
@@ -22,8 +11,6 @@ from ..trajectories.manifest import Manifest
 from .one_line_errors import InterruptedRunError
 from .output_folder import default_folder
 from .reporter import Reporter
-
-_BETWEEN = 0.1  # [s] between two looks of the bar
 
 
 def write_trajectories(
@@ -51,7 +38,8 @@ def write_trajectories(
         Whether to print the summary for programs.
     """
     place = out or default_folder(scenario.name, controller, format)
-    with _bar() as tick:
+    reporter = Reporter(as_json=as_json)
+    with reporter.progress("driving", unit="steps") as tick:
         try:
             manifest = generate_trajectories(
                 scenario,
@@ -71,7 +59,7 @@ def write_trajectories(
     if not as_json:  # in lines as they are: two of them are meant to be copied
         message = Text(_message(manifest, place, size))
         Console(highlight=False).print(message, soft_wrap=True)
-    Reporter(as_json=as_json).finish(_summary(manifest, place, size))
+    reporter.finish(_summary(manifest, place, size))
 
 
 def _message(manifest: Manifest, place: Path, size: int) -> str:
@@ -98,40 +86,3 @@ def _summary(manifest: Manifest, place: Path, size: int) -> dict[str, object]:
         "bytes": size,
         "out": str(place),
     }
-
-
-class _Speed(ProgressColumn):
-    """Steps per second, of those made now."""
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:,.0f} steps/s")
-
-
-@contextlib.contextmanager
-def _bar() -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on a terminal, moved by the function lent."""
-    console = Console(stderr=True, highlight=False)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        _Speed(),
-        TimeRemainingColumn(),
-    )
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task("driving", total=None)
-        next_look = 0.0
-
-        def tick(done: int, total: int) -> None:
-            nonlocal next_look
-            now = time.monotonic()
-            if next_look == 0.0:  # what was there already counts for no speed
-                bar.reset(task, completed=done, total=total)
-            if now >= next_look or done == total:
-                next_look = now + _BETWEEN
-                bar.update(task, completed=done, total=total)
-
-        yield tick

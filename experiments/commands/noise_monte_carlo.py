@@ -1,6 +1,5 @@
 """``slamgym noise-study SCENARIO --runs N``: every noise changed, over many runs."""
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from .one_line_errors import BadInputError
 from .output_folder import default_folder, output_folder
 from .reporter import Reporter
 from .result_tables import written
-from .run_files import write_summary
+from .run_files import write_summary, write_table
 
 
 def study_effects(
@@ -70,7 +69,7 @@ def study_effects(
                 progress=tick,
             )
         save_figure(noise_effects_figure(effects), partial / "noise_study.png", dpi=150)
-        _write_table(partial / "noise_study.csv", effects)
+        write_table(partial / "noise_study.csv", NoiseEffect._fields, effects)
         about = {"slamgym": __version__, "name": scenario.name, "runs": runs}
         rows = [_plain(effect) for effect in effects]
         summary = write_summary(partial, {**about, "seed": seed, "rows": rows})
@@ -110,13 +109,6 @@ def _with_error(effect: NoiseEffect) -> str:
     error = effect.nees_per_degree_error
     known = "" if math.isnan(error) else f" ± {error:.3g}"
     return f"{effect.nees_per_degree:.3g}{known}"
-
-
-def _write_table(path: Path, effects: Sequence[NoiseEffect]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(NoiseEffect._fields)
-        writer.writerows(effects)
 
 
 def _plain(effect: NoiseEffect) -> dict[str, Any]:

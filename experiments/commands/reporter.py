@@ -4,6 +4,7 @@ import contextlib
 import json
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -23,6 +24,7 @@ from rich.text import Text
 Tick = Callable[[int, int], None]
 
 _PATIENCE = 1.0  # [s] of silence before a note is printed
+_BETWEEN = 0.1  # [s] between two moves of a bar
 
 
 class Reporter:
@@ -65,7 +67,8 @@ class Reporter:
         Yields
         ------
         callable
-            To be called with (done, total), as often as one likes.
+            To be called with (done, total), as often as one likes. What is done at the
+            first call, as when a stopped job goes on, counts for no rate.
         """
         columns = (
             TextColumn("{task.description:<10}"),
@@ -80,10 +83,17 @@ class Reporter:
             disable=not self._notes.is_terminal,
         ) as bar:
             task = bar.add_task(doing, total=None)
+            next_look: float | None = None
 
             def tick(done: int, total: int) -> None:
-                if done == total or done % max(1, total // 200) == 0:
-                    bar.update(task, completed=done, total=total)
+                nonlocal next_look
+                now = time.monotonic()
+                if next_look is None:
+                    bar.reset(task, completed=done, total=total)
+                elif now < next_look and done != total:
+                    return
+                next_look = now + _BETWEEN
+                bar.update(task, completed=done, total=total)
 
             yield tick
 

@@ -1,7 +1,8 @@
 """The files of a run: figures, the log, the numbers."""
 
+import csv
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,16 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     complete = {**summary, "files": sorted([*files_in(folder), SUMMARY])}
     (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
     return complete
+
+
+def write_table(
+    path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
+    """Write rows as CSV below the names of their columns, empty where None."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
 def as_json_text(summary: dict[str, Any]) -> str:

@@ -1,7 +1,6 @@
 """``slamgym noise-study``: every noise times 10 and divided by 10."""
 
-import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ from .one_line_errors import BadInputError
 from .output_folder import default_folder, output_folder
 from .reporter import Reporter, Tick
 from .result_tables import noise_table, written
-from .run_files import write_summary
+from .run_files import write_summary, write_table
 from .warm_up import warm_up
 from .worlds import driver, recorded
 
@@ -105,18 +104,11 @@ def write_study(study: Study, folder: Path | None, *, as_json: bool) -> None:
             panels = [NoisePanel(run.title, run.trace) for run in runs]
             figure = noise_study_figure(panels)
             save_figure(figure, partial / "noise_study.png", dpi=130)
-        _write_table(partial / "noise_study.csv", [run.row for run in runs])
+        table = partial / "noise_study.csv"
+        write_table(table, NoiseRow._fields, [run.row for run in runs])
         rows = [{"title": run.title, **run.row._asdict()} for run in runs]
         summary = write_summary(partial, {**about, "rows": rows})
     title = f"[bold]{study.name}[/], noise study of [bold]{estimator}[/]\n"
     files = written(str(place), summary["files"])
     reporter.show(title, noise_table(rows), "", files)
     reporter.finish({**summary, "out": str(place)})
-
-
-def _write_table(path: Path, rows: Sequence[NoiseRow]) -> None:
-    """Write rows as CSV, empty where a value is unknown."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(NoiseRow._fields)
-        writer.writerows(rows)

@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ...estimator.error_frames import ErrorFrame
+from .known_values import quotient
 
 Array = NDArray[np.float64]
 
@@ -60,6 +61,12 @@ class EstimatorScores(NamedTuple):
         """Return NEES of the pose divided by 3, shape (M, K + 1 − first)."""
         nees = self.over_time(f"pose_nees_{frame}")[:, self.first - _FIRST :]
         return np.asarray(nees / POSE_FREEDOM)
+
+    @property
+    def nis_per_degree(self) -> float | None:
+        """All NIS by all their degrees of freedom; None where nothing was read."""
+        freedom = self.over_time("nis_dof")
+        return quotient(np.where(freedom > 0, self.over_time("nis"), 0.0), freedom)
 
 
 def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorScores:

@@ -143,7 +143,7 @@ def summarise_estimator(
             "end": mean(scores.over_time("heading_nees")[:, -1]),
         },
         "nees_end": _nees_at_the_end(scores, frame),
-        "nis": _nis(scores),
+        "nis": scores.nis_per_degree,
         "heading_std_end": heading,
         "rmse": {
             "position": root_mean_square(scores.over_time("position_error")),
@@ -240,11 +240,6 @@ def _nees_at_the_end(
         "landmarks": quotient(each, np.full(each.shape, POINT_FREEDOM)),
         "relative_map": quotient(relative, scores.per_run("relative_map_dof")),
     }
-
-
-def _nis(scores: EstimatorScores) -> float | None:
-    freedom = scores.over_time("nis_dof")
-    return quotient(np.where(freedom > 0, scores.over_time("nis"), 0.0), freedom)
 
 
 def _heading_std_end(scores: EstimatorScores) -> dict[str, float | None]:
