@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimator.interface import Belief, SlamEstimator, UpdateReport
-from ..estimator.landmark_management.map_access import mapped_ids, marginal, view_of
+from ..estimator.landmark_management.map_access import (
+    at_once,
+    looks_around,
+    mapped_ids,
+    view_of,
+)
 from .log_events import Scan
 from .log_steps import Step, predictions, steps_of
 from .map_history import MapHistory
@@ -20,7 +25,8 @@ from .true_path import true_landmarks_of, true_poses_of
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], object]
 
-_MOST_MAPS = 500  # kept of a run, unless all are asked for
+# Maps kept of a run, unless all are asked for; and where each must be joined for that.
+_MOST_MAPS, _MOST_JOINED = 500, 50
 
 
 class ReadingCounts(NamedTuple):
@@ -83,6 +89,10 @@ def replay(
 ) -> Replay:
     """Feed a log to an estimator: for each step its motion, then its scan.
 
+    Of a filter that joins its map when it is asked (``submaps``), the trace holds what
+    it could say at once, from the surroundings of the robot as of the last submap that
+    it closed; its map is joined for the pictures, and at the end.
+
     Parameters
     ----------
     log : SlamLog
@@ -123,9 +133,9 @@ def replay(
     steps = list(steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     tell_truth = _truth_teller(estimator, log, times)
-    recorder = _Recorder(
-        estimator, len(steps), MapHistory(None if keep_history else _MOST_MAPS)
-    )
+    most = _MOST_JOINED if looks_around(estimator) else _MOST_MAPS
+    history = MapHistory(None if keep_history else most)
+    recorder = _Recorder(estimator, len(steps), history)
     for number, step in enumerate(steps):
         try:
             tell_truth(number)
@@ -167,7 +177,7 @@ def _take(
     for row in step.motions:
         for odometry, dt in predictions(row, log.motion):
             estimator.predict(odometry, dt)
-    predicted = marginal(estimator, ())
+    predicted = at_once(estimator, ())
     report = None
     if step.scan is not None:
         report = estimator.update(step.scan.measurements, _ids(step.scan))
@@ -207,7 +217,7 @@ class _Recorder:
         """Take in one step, after the scan at its end."""
         step = len(self._history)
         self._predicted.put(step, predicted)
-        updated = predicted if report is None else marginal(self._slam, ())
+        updated = predicted if report is None else at_once(self._slam, ())
         self._updated.put(step, updated)
         if report is not None:
             self._nis[step] = report.nis
@@ -216,6 +226,8 @@ class _Recorder:
             self._meet_new(mapped_ids(self._slam))
         if step == self._steps - 1:
             self.belief = self._slam.belief()
+            if looks_around(self._slam):  # the last word is that of the joined map
+                self._updated.put(step, self.belief)
         if step == self._steps - 1 or self._history.is_due(step, self._ids):
             self._history.append(view_of(self._slam))
         else:
@@ -275,7 +287,7 @@ class _Recorder:
         if ids == self._ids:
             return
         new = [i for i in ids if i not in self._first]
-        belief = marginal(self._slam, new)
+        belief = at_once(self._slam, new)
         if self._first_covariance is None:
             self._first_covariance = belief.covariance
         pairs = zip(belief.landmarks, belief.landmark_covariances, strict=True)

@@ -25,8 +25,7 @@ from slamgym.experiments.slamlog import OdometryRow, Scan, SlamLog
 from slamgym.experiments.summary import summarise
 from slamgym.experiments.true_path import true_landmarks_of
 
-# Closed submaps stay as they are, so that nothing can be taken out of their map.
-MANAGEABLE = [name for name in list_estimators() if name != "submaps"]
+MANAGEABLE = list_estimators()
 
 IDS = list(range(6))
 AROUND = FieldOfView(30.0)
@@ -608,11 +607,122 @@ def test_the_replay_sees_the_same_with_and_without_a_door_to_parts():
             np.testing.assert_array_equal(a, b)
 
 
-def test_submaps_say_that_they_cannot_be_managed():
-    with pytest.raises(TypeError, match="SubmapSlam cannot be managed so"):
-        make_estimator(
-            "submaps",
-            motion_std=(0.1, 0.1, 0.1),
-            measurement_std=(0.1, 0.1),
-            management=True,
+# --- a filter that joins its map only when it is asked ---
+
+
+SMALL = {"submap_size": 9, "extent_limit": 2.0}  # many submaps in a short drive
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_managed_submaps_keep_the_contract_also_when_they_are_closed(base):
+    options = {"base": base, "management": TIDY, **SMALL}
+    check_estimator(partial(make_estimator, "submaps", **options))
+
+
+def test_with_identities_the_default_policy_changes_nothing_in_closed_submaps():
+    managed, bare = (make("submaps", m, **SMALL) for m in (True, None))
+    for odometry, readings, _ in drive(0, 40):
+        for slam in (managed, bare):
+            slam.predict(odometry)
+        assert managed.update(readings, IDS).nis == bare.update(readings, IDS).nis
+    assert bare.closed_count > 5
+    assert same(managed.belief(), bare.belief())
+
+
+def test_submaps_associate_as_a_full_filter_does():
+    """Readings without identity, with clutter; landmarks vanish and come back."""
+    full, joined = make("invariant", TIDY), make("submaps", TIDY, **SMALL)
+    fates = "row_ids", "tentative_rows", "ambiguous_rows", "confirmed_ids"
+    for (one, _), (other, _) in zip(
+        busy_run(full, 60), busy_run(joined, 60), strict=True
+    ):
+        for name in (*fates, "removed_ids", "added_ids"):
+            assert getattr(one, name) == getattr(other, name)
+    assert joined.filter.closed_count > 10
+    one, other = full.belief(), joined.belief()
+    assert one.landmark_ids == other.landmark_ids
+    std = np.sqrt(np.diag(one.covariance))
+    np.testing.assert_allclose((one.mean - other.mean) / std, 0, atol=0.3)
+
+
+def test_landmarks_begun_in_a_new_submap_count_as_seen():
+    slam = make("submaps", {"view": AROUND, "remove_after": 3}, **SMALL)
+    others = IDS[:-1]
+    for step, (odometry, readings, _) in enumerate(drive(0, 20)):
+        slam.predict(odometry)
+        ids = IDS if step % 3 == 0 else others
+        assert slam.update(readings[ids], ids).removed_ids == ()
+    sightings = slam.state_dict()["landmarks.sightings"]
+    assert slam.filter.closed_count > 3
+    assert sightings.tolist() == [20] * 5 + [7]
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_a_saved_run_in_submaps_goes_on_bit_for_bit(tmp_path, folder):
+    options = {**SMALL, **({"folder": tmp_path / "run"} if folder else {})}
+    whole, first = make("submaps", TIDY, **SMALL), make("submaps", TIDY, **options)
+    expected = busy_run(whole, 60)
+    busy_run(first, 27)
+    np.savez(tmp_path / "state.npz", **first.state_dict())
+    second = make("submaps", TIDY, **options)
+    with np.load(tmp_path / "state.npz") as state:
+        second.load_state_dict(state)
+    for (report, belief), (other, again) in zip(
+        expected[27:], busy_run(second, 33, start=27), strict=True
+    ):
+        assert same(belief, again)
+        assert report.row_ids == other.row_ids
+        assert report.removed_ids == other.removed_ids
+    assert any(report.removed_ids for report, _ in expected)
+    if not folder:
+        final = second.state_dict()
+        assert all(np.array_equal(v, final[k]) for k, v in whole.state_dict().items())
+
+
+def test_merging_true_duplicates_keeps_submaps_consistent():
+    """Landmark 0 gets another name halfway, after submaps were closed."""
+    errors, merges, runs, steps = [], 0, 30, 40
+    for seed in range(runs):
+        slam = make("submaps", LandmarkPolicy(merge_within=2.0), **SMALL)
+        steps_of_run = list(drive(seed, steps))
+        for step, (odometry, readings, _) in enumerate(steps_of_run):
+            slam.predict(odometry)
+            first = 0 if step < steps // 2 else 6
+            report = slam.update(readings, [first, *IDS[1:]])
+            merges += len(report.merged_ids)
+        errors.append(state_nees(slam.belief(), steps_of_run[-1][2], SIX))
+    assert slam.filter.closed_count > 7
+    assert merges / runs > 0.95
+    assert in_band(np.array(errors), 15)
+
+
+def test_the_capacity_of_submaps_counts_the_landmarks_far_away_too():
+    landmarks = np.column_stack([np.arange(0, 42, 3.0), np.tile([3.0, -3.0], 7)])
+    slam, gone = make("submaps", {"capacity": 8}, **SMALL), []
+    for odometry, readings, _ in drive(1, 50, landmarks=landmarks, odometry=(0.75, 0)):
+        slam.predict(odometry)
+        ids = np.flatnonzero(readings[:, 1] < 5.0)
+        gone += slam.update(readings[ids], ids).removed_ids
+        assert len(slam.landmark_ids) <= 8
+    assert set(gone) | set(slam.landmark_ids) == set(range(14))
+    assert slam.belief().landmark_ids == slam.landmark_ids
+
+
+def test_a_replay_of_submaps_tells_what_they_could_say_at_once():
+    log = hidden_log(58)
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    runs = [
+        replay(
+            log,
+            settings_for(log, estimator=name, **noise, options=options).make((0, 0, 0)),
         )
+        for name, options in (("invariant", {}), ("submaps", SMALL))
+    ]
+    full, joined = (run.trace for run in runs)
+    std = np.sqrt(np.diagonal(full.pose_covariances, axis1=1, axis2=2))[1:]
+    shift = joined.poses[1:] - full.poses[1:]
+    np.testing.assert_allclose(shift / std, 0, atol=0.3)
+    change = joined.pose_covariances[1:] - full.pose_covariances[1:]
+    np.testing.assert_allclose(change / (std[:, :, None] * std[:, None]), 0, atol=0.1)
+    np.testing.assert_array_equal(joined.poses[-1], runs[1].belief.pose)
+    assert runs[0].changes == runs[1].changes

@@ -14,8 +14,7 @@ from slamgym.estimator.landmark_management.map_editing import (
     without_landmarks,
 )
 
-# Closed submaps stay as they are, so that nothing can be taken out of their map.
-MANAGEABLE = [name for name in list_estimators() if name != "submaps"]
+MANAGEABLE = list_estimators()
 
 START_STD = (0.05, 0.05, 0.1)
 IDS = list(range(6))

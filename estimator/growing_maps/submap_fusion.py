@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
 
 from ..error_frames import ErrorFrame, invariant_covariance
+from ..interface import Belief
 from .coordinates import pairs
 from .submap_joining import Gaussian, times
 from .submap_relation import compose, points_of, retract, state_of
@@ -120,3 +121,24 @@ def _composed(
         T[:, cut + 2] += T[:, cut:] @ state_of(1j * points_of(own), 0.0)
     moved = T @ covariance @ T.T
     return Gaussian(state_of(points, float(pose[2])), (moved + moved.T) / 2)
+
+
+def part_of(map_: Gaussian, order: Int, wanted: Int, ids: tuple[int, ...]) -> Belief:
+    """Return the marginal of the pose and some landmarks.
+
+    Parameters
+    ----------
+    map_ : Gaussian
+        Of landmarks in n slots.
+    order : ndarray, shape (n,)
+        These slots.
+    wanted : ndarray, shape (v,)
+        Those of the landmarks wanted.
+    ids : tuple of int
+        Of the same.
+    """
+    sorter = np.argsort(order)
+    places = sorter[np.searchsorted(order, wanted, sorter=sorter)]
+    rows = np.concatenate([np.arange(3), 3 + pairs(places)])
+    covariance = map_.covariance[rows[:, None], rows]
+    return Belief(map_.mean[rows], covariance, ids, "invariant")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .submap_relation import compose, floor
+from .submap_store import Submap
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -38,6 +39,11 @@ class Outline(NamedTuple):
     def nbytes(self) -> int:
         """Memory that it takes [bytes]."""
         return sum(part.nbytes for part in self)
+
+
+def outline_of(submap: Submap) -> Outline:
+    """Return what is kept at hand of a submap."""
+    return Outline(submap.slots, submap.mean, submap.covariance[:3, :3].copy())
 
 
 class Placing:

@@ -1,14 +1,19 @@
 """A run in submaps as arrays, to save and to continue from."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import validation
+from .closed_submaps import ClosedSubmaps
+from .present_submap import PresentSubmap
 from .submap_chain import Chain
-from .submap_placing import Outline
+from .submap_merging import merged
+from .submap_placing import outline_of
+from .submap_run import SubmapRun
+from .submap_slots import Slots, slot_of_link
 from .submap_store import FolderStore, MemoryStore, Submap, SubmapStore
 
 Array = NDArray[np.float64]
@@ -25,31 +30,31 @@ class SavedRun(NamedTuple):
     """What a saved state holds."""
 
     local: dict[str, Any]
-    near: tuple[int, ...]
-    """Landmarks of the present submap."""
-    slots: dict[int, int]
-    outlines: list[Outline]
+    vicinity: dict[str, Any]
+    """Empty where nobody has looked around."""
+    slots: Slots
     chain: Chain
-    store: SubmapStore
+    closed: ClosedSubmaps
 
 
-def as_arrays(
-    name: str,
-    local: Mapping[str, Any],
-    landmark_ids: Sequence[int],
-    chain: Chain,
-    store: SubmapStore,
-) -> dict[str, Any]:
+def as_arrays(name: str, run: SubmapRun, vicinity: Mapping[str, Any]) -> dict[str, Any]:
     """Return copies of everything; submaps in a folder by their checksums."""
+    slots, closed, store = run.slots, run.closed, run.closed.store
+    local = run.present.filter.state_dict()
+    renamed = np.array(list(closed.renamed.items()), dtype=np.int64)
     state: dict[str, Any] = {
         "estimator": np.array(name),
         "base": np.array(str(local["estimator"])),
-        "landmark_ids": np.array(landmark_ids, dtype=np.int64),
+        "landmark_ids": np.array(list(slots), dtype=np.int64),
+        "slots": np.array(list(slots.values()), dtype=np.int64),
+        "slot_count": np.array(slots.count),
+        "renamed": renamed.reshape(-1, 2),
         "submap_count": np.array(len(store)),
         "run": np.array(""),
     }
     state |= {f"local_{key}": value for key, value in local.items()}
-    state |= {f"chain_{key}": value for key, value in chain.state_dict().items()}
+    state |= {f"vicinity_{key}": value for key, value in vicinity.items()}
+    state |= {f"chain_{key}": value for key, value in run.chain.state_dict().items()}
     if isinstance(store, FolderStore):
         digests = np.array(store.digests, dtype=np.int64)
         return state | {"run": np.array(store.run), "digests": digests}
@@ -60,7 +65,10 @@ def as_arrays(
 
 
 def checked_state(
-    state: Mapping[str, Any], name: str, base: str, folder: FolderStore | None
+    state: Mapping[str, Any],
+    name: str,
+    present: PresentSubmap,
+    folder: FolderStore | None,
 ) -> SavedRun:
     """Return what the state holds, or refuse it.
 
@@ -68,46 +76,72 @@ def checked_state(
     ----------
     state : mapping
         From :func:`as_arrays`.
-    name, base : str
-        Classes of the estimator that is to continue, and of the filter of its submaps.
+    name : str
+        Class of the estimator that is to continue.
+    present : PresentSubmap
+        Of that estimator, which is left as it is.
     folder : FolderStore or None
-        The folder of that estimator, which is left as it is.
+        Likewise its folder.
 
     Raises
     ------
     ValueError
         Where something is missing or does not fit together.
     """
-    entries = ["landmark_ids", "submap_count", "run", "local_estimator"]
-    entries += [f"chain_{key}" for key in SHAPES]
+    entries = ["landmark_ids", "slots", "slot_count", "renamed", "submap_count", "run"]
+    entries += ["local_estimator", *(f"chain_{key}" for key in SHAPES)]
+    base = type(present.filter).__name__
     validation.refuse_other_state(state, entries, estimator=name, base=base)
-    saved = np.asarray(state["landmark_ids"])
-    ids = validation.identities(saved, saved.size)
+    slots = _slots(state)
     count = int(state["submap_count"])
     chain = _chain(state, count)
     store = _store(state, count, folder)
+    pairs = _numbers(state, "renamed", slots.count).reshape(-1, 2)
+    renamed = dict(zip(*pairs.T.tolist(), strict=True))
     outlines = []
     for k in range(count):
         submap = store.load(k)
-        _check(submap, k, len(ids))
-        outlines.append(outline_of(submap))
-    local = {
-        key.removeprefix("local_"): value
-        for key, value in state.items()
-        if key.startswith("local_")
-    }
-    slots = {i: slot for slot, i in enumerate(ids)}
-    near = tuple(np.asarray(local.get("landmark_ids", ())).ravel().tolist())
-    if unknown := set(near) - set(slots):
+        _check(submap, k, slots.count)
+        outlines.append(outline_of(merged(submap, renamed, present.frame)))
+    closed = ClosedSubmaps(store, present.frame, renamed, outlines)
+    local = _part(state, "local_")
+    _check_names(local, slots, closed)
+    return SavedRun(local, _part(state, "vicinity_"), slots, chain, closed)
+
+
+def _part(state: Mapping[str, Any], start: str) -> dict[str, Any]:
+    return {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}
+
+
+def _numbers(state: Mapping[str, Any], key: str, limit: int) -> Int:
+    numbers = np.asarray(state[key])
+    if numbers.dtype.kind != "i" or not ((numbers >= 0) & (numbers < limit)).all():
+        raise ValueError(f"state[{key!r}] must be whole numbers from 0 to {limit - 1}")
+    return numbers
+
+
+def _slots(state: Mapping[str, Any]) -> Slots:
+    """Return who stands where in the map, in its order."""
+    saved = np.asarray(state["landmark_ids"])
+    ids = validation.identities(saved, saved.size)
+    count = int(state["slot_count"])
+    slots = _numbers(state, "slots", count).ravel()
+    if len(slots) != len(ids) or (np.diff(slots) <= 0).any():
+        raise ValueError(
+            f"state['slots'] must be {len(ids)} ascending numbers, one for each of "
+            f"landmark_ids, got {slots.tolist()}"
+        )
+    return Slots(dict(zip(ids, slots.tolist(), strict=True)), count)
+
+
+def _check_names(local: Mapping[str, Any], slots: Slots, closed: ClosedSubmaps) -> None:
+    """Refuse a present submap of landmarks that are not in the map."""
+    names = np.asarray(local.get("landmark_ids", ())).ravel().tolist()
+    links = slots.links(names)
+    if unknown := {i for i in links if slot_of_link(i) not in closed.slots}:
         raise ValueError(
             f"state['local_landmark_ids'] must be in the map, got {min(unknown)}"
         )
-    return SavedRun(local, near, slots, outlines, chain, store)
-
-
-def outline_of(submap: Submap) -> Outline:
-    """Return what is kept at hand of a submap."""
-    return Outline(submap.slots, submap.mean, submap.covariance[:3, :3].copy())
 
 
 def _chain(state: Mapping[str, Any], count: int) -> Chain:

@@ -2,6 +2,8 @@
 
 import os
 from collections.abc import Mapping
+from functools import partial
+from math import hypot
 from typing import Any
 
 import numpy as np
@@ -9,26 +11,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from .. import validation
 from ..angles import wrap_angle
-from ..ekf_slam import FRAMES, EkfSlam
+from ..ekf_slam import EkfSlam
 from ..interface import Belief, UpdateReport
 from ..invariant import InvariantEkfSlam
+from ..landmark_management.map_access import MapView
 from ..validation import LandmarkIds
-from .coordinates import pairs
+from .closed_submaps import ClosedSubmaps
+from .present_submap import ORIGIN, PresentSubmap
 from .submap_chain import Chain
-from .submap_fusion import fuse
-from .submap_joining import Gaussian, JoinedMap, with_uncertain_start
-from .submap_placing import Outline, Placing
 from .submap_relation import compose
-from .submap_state import as_arrays, checked_state, outline_of
-from .submap_store import FolderStore, MemoryStore, Submap, SubmapStore
+from .submap_run import SubmapRun
+from .submap_slots import Slots
+from .submap_state import as_arrays, checked_state
+from .submap_store import FolderStore, MemoryStore
+from .submap_vicinity import Extent, Vicinity
 
 Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 BASES: dict[str, type[EkfSlam]] = {"ekf": EkfSlam, "invariant": InvariantEkfSlam}
-
-ORIGIN = (0.0, 0.0, 0.0)
-ROUGHLY = 0.1
 
 
 class SubmapSlam:
@@ -110,8 +110,11 @@ class SubmapSlam:
         **settings: Any,
     ) -> None:
         make = BASES[validation.one_of("base", base, tuple(BASES))]
-        self._local = make(motion_std, measurement_std, **settings)
-        self._frame = FRAMES[self._local.rules.frame]
+        self._present = PresentSubmap(make(motion_std, measurement_std, **settings))
+        noise = np.array(motion_std), np.array(measurement_std)
+        ungated = settings | {"gate_probability": None}
+        near = partial(InvariantEkfSlam, *noise, **ungated)
+        self._vicinity = Vicinity(near, self._survey)
         self._submap_size = validation.whole("submap_size", submap_size, 1)
         self._heading_limit = _limit("heading_limit", heading_limit)
         self._extent_limit = _limit("extent_limit", extent_limit)
@@ -126,19 +129,18 @@ class SubmapSlam:
         if self._folder is not None:
             self._folder.clear()
         folder = self._folder  # an empty one is false
-        self._store: SubmapStore = MemoryStore() if folder is None else folder
-        self._slots: dict[int, int] = {}  # place of each landmark in the whole map
-        self._outlines: list[Outline] = []  # of the closed submaps
-        self._closed_slots: set[int] = set()
-        self._near: tuple[int, ...] = ()  # landmarks of the present one, in their order
-        self._chain = Chain(first, np.diag(std**2))
-        self._placing = Placing()
-        self._begin()
+        store = MemoryStore() if folder is None else folder
+        closed = ClosedSubmaps(store, self._present.frame)
+        chain = Chain(first, np.diag(std**2))
+        self._present.begin()
+        self._run = SubmapRun(Slots(), chain, closed, self._present)
+        self._vicinity.forget()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
         self._claim_folder()
-        self._local.predict(odometry, dt)
+        self._present.filter.predict(odometry, dt)
+        self._vicinity.predict(odometry, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -163,15 +165,62 @@ class SubmapSlam:
                 f"submap_size must be >= {len(validation.scan(measurements))}, the "
                 f"landmarks of one scan, got {self._submap_size}"
             )
+        self._present.refuse_links(landmark_ids)
         self._claim_folder()
-        report = self._local.update(measurements, landmark_ids)
-        new = [i for i in report.added_ids if i not in self._slots]
-        for i in new:
-            self._slots[i] = len(self._slots)
-        self._near += report.added_ids
+        report = self._present.filter.update(measurements, landmark_ids)
+        slots = self._run.slots
+        new = tuple(i for i in report.added_ids if i not in slots)
+        slots.add(new)
+        report = report._replace(added_ids=new)
+        self._vicinity.update(measurements, landmark_ids, report)
         if np.size(measurements) and self._is_full():
-            self._close()
-        return report._replace(added_ids=tuple(new))
+            self._run.close()
+            self._vicinity.renew()
+        return report
+
+    def remove(self, landmark_ids: LandmarkIds) -> None:
+        """Forget landmarks; the belief about all else stays as it was.
+
+        One that several submaps hold goes on to tie them together, but nothing tells of
+        it any more: seen again, it is a new landmark.
+
+        Parameters
+        ----------
+        landmark_ids : sequence of int
+            Mapped landmarks, without repetition.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map; nothing is then removed.
+        """
+        ids = validation.mapped_identities(landmark_ids, self._run.slots)
+        self._claim_folder()
+        self._run.remove(ids)
+        self._vicinity.remove(ids)
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Condition on two landmarks being one, and forget the second.
+
+        Submaps that hold either are tied together by it, as by any common landmark;
+        those that hold both are conditioned each (:mod:`.submap_merging`).
+
+        Parameters
+        ----------
+        kept, gone : int
+            Two mapped landmarks.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map; nothing is then merged.
+        numpy.linalg.LinAlgError
+            Where nothing can be said of their distance; nothing is then merged.
+        """
+        validation.mapped_identities([kept, gone], self._run.slots)
+        self._claim_folder()
+        self._run.merge(kept, gone)
+        self._vicinity.merge(kept, gone)
 
     def join(self) -> None:
         """Join the closed submaps, and go on from there.
@@ -180,14 +229,8 @@ class SubmapSlam:
         and ``local_belief()`` know of the loops closed so far, and later joins begin
         at this one.
         """
-        if not self._outlines:
-            return
-        joined = self._join()
-        last = joined.marginal(np.empty(0, dtype=np.int64))
-        where = with_uncertain_start(last, *self._chain.start)
-        self._chain.rebase(joined.frames, *where)
-        self._placing = Placing()
-        self._forget_joined()
+        if self.closed_count:
+            self._run.join()
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Join the submaps, and return the belief as a snapshot.
@@ -207,22 +250,10 @@ class SubmapSlam:
             Where the submaps contradict each other so that they cannot be joined, or
             where their covariances are degenerate.
         """
-        ids = validation.mapped_identities(landmark_ids, self._slots)
+        ids = validation.mapped_identities(landmark_ids, self._run.slots)
         instead = "give landmark_ids, call local_belief()"
         validation.refuse_large_belief(len(ids), self._belief_limit, instead)
-        local, local_slots = self._present()
-        wanted = np.array([self._slots[i] for i in ids], dtype=np.int64)
-        if landmark_ids is None:
-            closed, world = self._everything()
-        else:
-            needed = np.union1d(wanted, local_slots)
-            closed = needed[[slot in self._closed_slots for slot in needed.tolist()]]
-            world = self._closed(closed)
-        _, in_world, in_local = np.intersect1d(closed, local_slots, return_indices=True)
-        fused = fuse(world, local, self._frame, (in_world, in_local))
-        fused = with_uncertain_start(fused, *self._chain.start)
-        order = np.concatenate([closed, np.delete(local_slots, in_local)])
-        return _chosen(fused, order, wanted, tuple(ids))
+        return self._run.belief(tuple(ids), remember=landmark_ids is None)
 
     def local_belief(self) -> Belief:
         """Return pose and landmarks of the present submap, in the world, at once.
@@ -231,40 +262,57 @@ class SubmapSlam:
         the last :meth:`join` puts it; nothing is joined, and the cost does not grow
         with the map.
         """
-        local, slots = self._present()
-        world = Gaussian(self._chain.pose, self._chain.covariance)
-        none = np.empty(0, dtype=np.int64)
-        fused = fuse(world, local, self._frame, (none, none))
-        return _chosen(fused, slots, slots, self.local_ids)
+        return self._run.local_belief()
+
+    def view_around(self, within: float = 0.0) -> MapView:
+        """Look at pose and near landmarks as the joined map has them, in every step.
+
+        From the first call on, the filter follows the robot in a part of the joined
+        map, which it takes anew whenever a submap is closed or the robot has left it.
+        That changes nothing in the submaps, nor in what :meth:`belief` answers.
+
+        Parameters
+        ----------
+        within : float
+            How far from the robot to look at least [m].
+
+        Returns
+        -------
+        MapView
+            To look at, not to keep; it may hold landmarks farther away.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            As :meth:`belief`; all is then as before.
+        """
+        return self._vicinity.view(within)._replace(whole=self.landmark_ids)
 
     @property
     def pose(self) -> Array:
         """(x, y, θ), shape (3,) [m, m, rad], as :meth:`local_belief` has it."""
-        x, y, heading = compose(self._chain.pose, self._local_pose)[0]
+        x, y, heading = compose(self._run.chain.pose, self._present.pose)[0]
         return np.array([x, y, wrap_angle(float(heading))])
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The mapped landmarks, in the order of the belief."""
-        return tuple(self._slots)
+        return tuple(self._run.slots)
 
     @property
     def local_ids(self) -> tuple[int, ...]:
         """The landmarks of the present submap."""
-        return self._near
+        return tuple(i for i in self._present.names if i in self._run.slots)
 
     @property
     def closed_count(self) -> int:
         """Number of closed submaps."""
-        return len(self._outlines)
+        return len(self._run.closed)
 
     @property
     def nbytes(self) -> int:
         """Memory that submaps and what joins them take [bytes]."""
-        outlines = sum(outline.nbytes for outline in self._outlines)
-        joined = 0 if self._joined is None else self._joined.nbytes
-        whole = 0 if self._whole is None else self._whole[1].covariance.nbytes
-        return self._store.nbytes + outlines + joined + whole
+        return self._run.closed.nbytes + self._vicinity.nbytes
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of everything, as arrays; with a folder, its submaps not.
@@ -272,13 +320,7 @@ class SubmapSlam:
         The folder must then stay as it is: a filter that continues from this state
         reads the submaps from there.
         """
-        return as_arrays(
-            type(self).__name__,
-            self._local.state_dict(),
-            list(self._slots),
-            self._chain,
-            self._store,
-        )
+        return as_arrays(type(self).__name__, self._run, self._vicinity.state_dict())
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, as :meth:`EkfSlam.load_state_dict`.
@@ -289,102 +331,30 @@ class SubmapSlam:
             Also where it was saved with a folder, and this filter's is of another run,
             lacks a submap or holds another; the belief is then as before.
         """
-        base = type(self._local).__name__
-        saved = checked_state(state, type(self).__name__, base, self._folder)
-        self._local.load_state_dict(saved.local)
-        self._near = saved.near
-        self._slots, self._chain = saved.slots, saved.chain
-        self._store, self._outlines = saved.store, saved.outlines
-        self._closed_slots = set().union(*(o.slots.tolist() for o in saved.outlines))
-        self._placing = Placing()
-        if isinstance(saved.store, FolderStore):
-            self._folder = saved.store
-        self._forget_joined()
+        saved = checked_state(state, type(self).__name__, self._present, self._folder)
+        vicinity = self._vicinity.restored(saved.vicinity)
+        self._present.filter.load_state_dict(saved.local)
+        self._present.adopt(saved.slots)
+        self._run = SubmapRun(saved.slots, saved.chain, saved.closed, self._present)
+        self._vicinity = vicinity
+        if isinstance(saved.closed.store, FolderStore):
+            self._folder = saved.closed.store
 
     def _claim_folder(self) -> None:
         if self._folder is not None:
             self._folder.claim()
 
-    def _begin(self) -> None:
-        """Begin a submap: the robot at the origin of its frame, which is certain."""
-        self._local.reset(ORIGIN, ORIGIN)
-        self._near = ()
-        self._forget_joined()
-
-    def _forget_joined(self) -> None:
-        self._joined: JoinedMap | None = None
-        self._whole: tuple[Int, Gaussian] | None = None
-
-    @property
-    def _local_pose(self) -> Array:
-        return self._local._mean[:3]  # no public way to it costs as little
-
-    def _present(self) -> tuple[Gaussian, Int]:
-        """Return the present submap, in its filter's error coordinates; its slots."""
-        mean: Array = self._local.state_dict()["mean"]  # its heading is not wrapped
-        covariance = self._local.belief().error_covariance()
-        slots = np.array([self._slots[i] for i in self._near], dtype=np.int64)
-        return Gaussian(mean, covariance), slots
-
     def _is_full(self) -> bool:
+        x, y, _ = self._present.pose.tolist()
         return (
-            len(self._near) >= self._submap_size
-            or self._local._covariance[2, 2] > self._heading_limit**2
-            or float(np.hypot(*self._local_pose[:2])) > self._extent_limit
+            len(self._present) >= self._submap_size
+            or self._present.heading_variance > self._heading_limit**2
+            or hypot(x, y) > self._extent_limit
         )
 
-    def _close(self) -> None:
-        """Close the present submap; the next begins at the robot."""
-        local, slots = self._present()
-        submap = Submap(slots, local.mean, local.covariance)
-        self._store.append(submap)
-        self._outlines.append(outline_of(submap))
-        self._closed_slots.update(slots.tolist())
-        self._chain.extend(local.mean[:3], self._local.belief().pose_covariance)
-        self._begin()
-
-    def _join(self) -> JoinedMap:
-        if self._joined is None:
-            self._joined = JoinedMap(
-                self._store.load,
-                self._outlines,
-                self._frame,
-                self._placing.frames(self._outlines, self._chain.joined, self._settle),
-            )
-        return self._joined
-
-    def _settle(self, first: int, last: int, frames: Array) -> Array:
-        """Join some submaps by themselves, roughly; return their frames."""
-        return JoinedMap(
-            lambda index: self._store.load(first + index),
-            self._outlines[first:last],
-            self._frame,
-            frames,
-            ROUGHLY,
-        ).frames
-
-    def _closed(self, slots: Int) -> Gaussian:
-        """Return the last frame and closed landmarks, given where the run began."""
-        if not self._outlines:
-            return Gaussian(self._chain.start[0], np.zeros((3, 3)))
-        return self._join().marginal(slots)
-
-    def _everything(self) -> tuple[Int, Gaussian]:
-        """All landmarks of closed submaps, kept until the next one is closed."""
-        if self._whole is None:
-            slots = np.array(sorted(self._closed_slots), dtype=np.int64)
-            self._whole = slots, self._closed(slots)
-        return self._whole
+    def _survey(self, reach: float) -> tuple[Belief, Extent]:
+        return self._run.survey(reach)
 
 
 def _limit(name: str, value: float | None) -> float:
     return np.inf if value is None else validation.above(name, value, 0.0)
-
-
-def _chosen(map_: Gaussian, order: Int, wanted: Int, ids: tuple[int, ...]) -> Belief:
-    """Marginal of the wanted landmarks, by their places in the order of the map."""
-    sorter = np.argsort(order)
-    places = sorter[np.searchsorted(order, wanted, sorter=sorter)]
-    rows = np.concatenate([np.arange(3), 3 + pairs(places)])
-    covariance = map_.covariance[rows[:, None], rows]
-    return Belief(map_.mean[rows], covariance, ids, "invariant")

@@ -99,6 +99,8 @@ class ManagedSlam:
         self._newcomers = Newcomers()
         if hasattr(self._filter, "observe_truth"):
             self.observe_truth = self._filter.observe_truth
+        if hasattr(self._filter, "view_around"):
+            self.view_around = self._filter.view_around
 
     @property
     def policy(self) -> LandmarkPolicy:
@@ -113,9 +115,11 @@ class ManagedSlam:
     @property
     def tentative_landmarks(self) -> Array:
         """Where landmarks not yet confirmed seem to be, shape (t, 2) [m]."""
+        places = self._newcomers.tentative.places
+        if not len(places):
+            return places.copy()
         x, y, heading = self._door.map_view().mean[:3]
         cos, sin = np.cos(heading), np.sin(heading)
-        places = self._newcomers.tentative.places
         return np.asarray(places @ np.array([[cos, sin], [-sin, cos]]) + (x, y))
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
@@ -233,14 +237,22 @@ class ManagedSlam:
 
     def _planned(self, readings: Array, landmark_ids: LandmarkIds | None) -> ScanPlan:
         plan = ScanPlan(self._policy, self._newcomers, len(readings))
-        view = self._door.map_view()
+        view = self._door.map_view(self._reach(readings))
         if landmark_ids is None:
             _check_finite(readings)
             plan.associate(readings, view, self._noise, self._min_range)
         else:
             given = validation.identities(landmark_ids, len(readings))
-            plan.translate(given, view.ids, self._upkeep.aliases)
+            plan.translate(given, view.mapped, self._upkeep.aliases)
         return plan
+
+    def _reach(self, readings: Array) -> float:
+        """Return from how far away a landmark may matter for a scan [m]."""
+        policy, ranges = self._policy, readings[np.isfinite(readings[:, 1]), 1]
+        reach = float(ranges.max(initial=0.0))
+        if policy.remove_after is not None and policy.view is not None:
+            reach = max(reach, policy.view.max_range)
+        return reach + (policy.merge_within or 0.0)
 
     def _tidied(
         self,
@@ -250,7 +262,8 @@ class ManagedSlam:
         report: UpdateReport,
     ) -> UpdateReport:
         """Remove and merge what the policy says, after a scan."""
-        seen = {*report.associated_ids, *report.added_ids}
+        refused = {*report.rejected_ids, *report.skipped_ids}
+        seen = set(self._door.map_view().ids).intersection(plan.row_ids) - refused
         rows = [row for row, i in enumerate(plan.row_ids) if i in seen]
         ids = [i for i in plan.row_ids if i is not None and i in seen]
         self._upkeep.note_sightings(readings[rows], ids)

@@ -6,7 +6,9 @@ copy of the whole covariance.  Others may have doors of their own, each by itsel
 * ``belief(landmark_ids)`` answers with the marginal of the pose and these landmarks;
 * ``landmark_ids`` are the mapped landmarks in the order of the belief;
 * ``remove(landmark_ids)`` marginalises landmarks, all else keeps its last bit;
-* ``merge(kept, gone)`` conditions on two landmarks being one, and drops the second.
+* ``merge(kept, gone)`` conditions on two landmarks being one, and drops the second;
+* ``view_around(within)`` looks at the pose and at least those landmarks that are within
+  so many metres of it, where to look at all of them takes long.
 
 What is lacking goes through ``belief()``, ``state_dict()`` and ``load_state_dict()``.
 """
@@ -35,6 +37,13 @@ class MapView(NamedTuple):
     """Of the additive error; there may be room behind it."""
     ids: Sequence[int]
     """Landmarks in the order of the state."""
+    whole: Sequence[int] | None = None
+    """All landmarks in the map, where the view holds but those around the robot."""
+
+    @property
+    def mapped(self) -> Sequence[int]:
+        """All landmarks in the map, in its order."""
+        return self.ids if self.whole is None else self.whole
 
     @property
     def landmarks(self) -> Array:
@@ -51,8 +60,11 @@ class MapView(NamedTuple):
 class MapAccess(Protocol):
     """What landmark management does with a filter's map."""
 
-    def map_view(self) -> MapView:
-        """Look at pose and map; the view ends with the filter's next step."""
+    def map_view(self, within: float = 0.0) -> MapView:
+        """Look at pose and map; the view ends with the filter's next step.
+
+        Landmarks farther away than ``within`` [m] may be left out.
+        """
         ...
 
     def remove(self, ids: Sequence[int]) -> None:
@@ -101,6 +113,29 @@ def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     whole = slam.belief()
     order = {i: slot for slot, i in enumerate(whole.landmark_ids)}
     return _part(whole.mean, whole.covariance, order, ids, whole.frame)
+
+
+def at_once(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
+    """Return the same as the filter has it without joining anything, if it can tell.
+
+    Of a filter that looks around (``view_around``) it is what that view tells, so far
+    as it holds these landmarks; its error is then to be judged in the invariant frame.
+    """
+    view = _around(slam, 0.0) if looks_around(slam) else None
+    if view is None or not set(ids) <= set(view.ids):
+        return marginal(slam, ids)
+    order = {i: slot for slot, i in enumerate(view.ids)}
+    return _part(view.mean, view.covariance, order, ids, "invariant")
+
+
+def looks_around(slam: SlamEstimator) -> bool:
+    """Whether a filter can show the surroundings of the robot by themselves."""
+    return callable(getattr(slam, "view_around", None))
+
+
+def _around(slam: Any, within: float) -> MapView:
+    view: MapView = slam.view_around(within)
+    return view
 
 
 def _part(
@@ -155,16 +190,17 @@ class RememberedAccess:
     def __init__(self, door: MapAccess) -> None:
         self._door = door
         self._view: MapView | None = None
+        self._within = 0.0
 
-    def map_view(self) -> MapView:
+    def map_view(self, within: float = 0.0) -> MapView:
         """Look at pose and map, or remember."""
-        if self._view is None:
-            self._view = self._door.map_view()
+        if self._view is None or within > self._within:
+            self._view, self._within = self._door.map_view(within), within
         return self._view
 
     def expire(self) -> None:
         """Forget the view: the filter has taken a step."""
-        self._view = None
+        self._view, self._within = None, 0.0
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks."""
@@ -183,7 +219,7 @@ class _ArrayAccess:
     def __init__(self, slam: EkfSlam) -> None:
         self._slam = slam
 
-    def map_view(self) -> MapView:
+    def map_view(self, within: float = 0.0) -> MapView:
         return view_of(self._slam)
 
     def remove(self, ids: Sequence[int]) -> None:
@@ -216,7 +252,9 @@ class _OwnAccess:
     def __init__(self, slam: Any) -> None:
         self._slam = slam
 
-    def map_view(self) -> MapView:
+    def map_view(self, within: float = 0.0) -> MapView:
+        if looks_around(self._slam):
+            return _around(self._slam, within)
         return view_of(self._slam)
 
     def remove(self, ids: Sequence[int]) -> None:
@@ -232,7 +270,7 @@ class _StateAccess:
     def __init__(self, slam: SlamEstimator) -> None:
         self._slam = slam
 
-    def map_view(self) -> MapView:
+    def map_view(self, within: float = 0.0) -> MapView:
         return view_of(self._slam)
 
     def remove(self, ids: Sequence[int]) -> None:

@@ -43,7 +43,7 @@ class MapUpkeep:
     def note_sightings(self, readings: Array, ids: Sequence[int]) -> None:
         """Remember which landmarks the scan (m, 2) has shown, and who side by side."""
         view = self._door.map_view()
-        self._records.follow(view.ids)
+        self._records.follow(view.mapped)
         if not ids:
             return
         bearing, distance = readings.T
@@ -53,7 +53,7 @@ class MapUpkeep:
         directions = bearing + view.mean[2]
         self._records.note_sightings(ids, directions, along, across)
         if self._policy.merge_within is not None:
-            places = view.landmarks[self._records.slots(ids)]
+            places = view.landmarks[self._places(view, ids)]
             close = _gaps(places, places) < 2 * self._policy.merge_within
             for i, j in np.argwhere(np.triu(close, 1)).tolist():
                 self._apart.add(_ordered(ids[i], ids[j]))
@@ -83,7 +83,7 @@ class MapUpkeep:
             kept, gone = pair
             self._door.merge(kept, gone)
             self._records.join(kept, gone)
-            self._records.follow(self._door.map_view().ids)
+            self._records.follow(self._door.map_view().mapped)
             earlier = {i: kept for i, j in self.aliases.items() if j == gone}
             self.aliases |= {gone: kept, **earlier}
             self._apart = {_renamed(pair, gone, kept) for pair in self._apart}
@@ -93,7 +93,7 @@ class MapUpkeep:
 
     def keep_capacity(self, seen: set[int]) -> list[int]:
         """Give up the landmarks of least information, of those not seen if possible."""
-        capacity, ids = self._policy.capacity, list(self._door.map_view().ids)
+        capacity, ids = self._policy.capacity, list(self._door.map_view().mapped)
         if capacity is None or len(ids) <= capacity:
             return []
         ranked = self._records.by_information(ids)
@@ -117,7 +117,7 @@ class MapUpkeep:
     def _remove(self, ids: list[int]) -> list[int]:
         if ids:
             self._door.remove(ids)
-            self._records.follow(self._door.map_view().ids)
+            self._records.follow(self._door.map_view().mapped)
             gone = set(ids)
             self._apart = {both for both in self._apart if gone.isdisjoint(both)}
         return ids
@@ -127,13 +127,20 @@ class MapUpkeep:
         view, within = self._door.map_view(), self._policy.merge_within
         if within is None:
             return None
-        slots = self._records.slots(i for i in view.ids if i in seen)
+        slots = self._places(view, [i for i in view.ids if i in seen])
         places = view.landmarks
         for row, other in np.argwhere(_gaps(places[slots], places) < within).tolist():
             kept, gone = sorted((int(slots[row]), other))
             if kept != gone and self._is_one(view, kept, gone):
                 return view.ids[kept], view.ids[gone]
         return None
+
+    def _places(self, view: MapView, ids: Sequence[int]) -> Int:
+        """Return where landmarks stand in the order of a view."""
+        if view.whole is None:
+            return self._records.slots(ids)
+        places = {i: place for place, i in enumerate(view.ids)}
+        return np.array([places[i] for i in ids], dtype=np.int64)
 
     def _is_one(self, view: MapView, kept: int, gone: int) -> bool:
         if _ordered(view.ids[kept], view.ids[gone]) in self._apart:
