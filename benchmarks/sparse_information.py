@@ -2,7 +2,8 @@
 
     python benchmarks/sparse_information.py                # maps of 1000 and 10,000
     python benchmarks/sparse_information.py --sizes 100000
-    python benchmarks/sparse_information.py --nees
+    python benchmarks/sparse_information.py --nees         # minutes
+    python benchmarks/sparse_information.py --error --sizes 300 1000
 
 Ten nearest landmarks are seen per step.  The large map is made, not driven: a scan
 from beside each landmark, a place of which nothing is known, adds what it says about
@@ -14,12 +15,14 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from argparse import ArgumentParser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from resource import RUSAGE_SELF, getrusage
 from time import perf_counter, thread_time
 from typing import Any, NamedTuple
 
 import numpy as np
+import submaps
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -28,17 +31,18 @@ from scipy.spatial import cKDTree
 
 from slamgym.estimator.bearing_range_model import predict_measurement
 from slamgym.estimator.consistency import pose_nees
+from slamgym.estimator.growing_maps.compressed import CompressedEkfSlam
 from slamgym.estimator.growing_maps.sparse_information import SparseInformationSlam
-from slamgym.estimator.registry import make_estimator
 from slamgym.estimator.unicycle_motion import predict_pose
-from slamgym.experiments.simulated_runs import simulate_runs
-from slamgym.sim_configs import load_scenario
+from slamgym.experiments.simulated_runs import SimulatedRuns, simulate_runs
+from slamgym.sim_configs import Scenario, load_scenario
 
 Array = NDArray[np.float64]
 
 SEEN = 10
 MOTION_STD, MEASUREMENT_STD = np.array([0.02, 0.01, 0.01]), np.array([0.01, 0.05])
 CHUNK = 5000
+DRIVES = {300: 20, 1000: 10, 3000: 3}  # up to so many landmarks; over larger maps one
 CONSOLE = Console(width=110)
 
 
@@ -78,7 +82,9 @@ def known_map(landmarks: Array) -> SparseInformationSlam:
             "landmark_ids": np.arange(count),
             "slots": np.arange(count),
             "points": landmarks.ravel(),
+            "first": landmarks.ravel(),
             "residual": np.zeros(2 * count),
+            "nodes": np.zeros(count, dtype=np.int64),
             "matrix_counts": np.diff(total.indptr),
             "matrix_links": total.indices,
             "matrix_blocks": total.data,
@@ -172,46 +178,146 @@ def cost(count: int, steps: int = 300, *, largest_belief: int = 10_000) -> Cost:
     )
 
 
-def nees(scenario: str, runs: int, bound: int) -> dict[str, Array]:
+class Case(NamedTuple):
+    """A scenario for the honesty table, and how many landmarks may be active."""
+
+    scenario: str
+    bound: int
+    blocks: int | None = None
+    """Blocks along either side of a smaller city, driven round once."""
+
+    @property
+    def name(self) -> str:
+        """Of its row."""
+        size = f", {self.blocks} × {self.blocks} blocks"
+        return self.scenario + (size if self.blocks else "")
+
+    def world(self) -> Scenario:
+        """Load it, and make it smaller where that is asked for."""
+        world = load_scenario(self.scenario)
+        if not self.blocks:
+            return world
+        size = {"columns": self.blocks, "rows": self.blocks}
+        steps = 58 * self.blocks**2
+        return world.with_changes(steps=steps, landmarks=size, controls=size)
+
+
+CASES = (
+    Case("anchored", 4),
+    Case("dense", 12),
+    Case("loop", 4),
+    Case("loop", 8),
+    Case("city", 12, blocks=3),
+    Case("city", 20, blocks=3),
+)
+HONEST = "observability_constrained"
+KINDS: dict[str, dict[str, Any]] = {
+    "ekf": {},
+    "relocate": {},
+    "relocate, constrained": {"base": HONEST},
+    "prune": {"sparsify": "prune"},
+}
+
+
+def nees(case: Case, runs: int) -> dict[str, Array]:
     """NEES / 3 of the pose per run, in the additive frame, every tenth step."""
-    world, data = load_scenario(scenario), simulate_runs(scenario, runs, 0)
+    scores: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    for run in range(runs):
+        world = case.world()
+        data = simulate_runs(world, 1, run)
+        for kind in KINDS:
+            scores[kind].append(_follow(world, data, kind, case.bound))
+    return {kind: np.array(values) for kind, values in scores.items()}
+
+
+def _follow(world: Scenario, data: SimulatedRuns, kind: str, bound: int) -> float:
+    """Follow a run; the EKF as :class:`CompressedEkfSlam`, which is the same."""
     noise: dict[str, Any] = {
         "motion_std": world.motion.std,
         "measurement_std": world.sensor.std,
         "range_std_per_metre": world.sensor.range_std_per_metre,
         "initial_pose_std": world.start.std,
+        "initial_pose": data.initial_poses[0],
     }
-
-    def follow(run: int, kind: str) -> float:
-        first = data.initial_poses[run]
-        slam: Any = (
-            make_estimator("ekf", initial_pose=first, **noise)
-            if kind == "ekf"
-            else SparseInformationSlam(
-                initial_pose=first, active_bound=bound, sparsify=kind, **noise
+    slam: Any = (
+        CompressedEkfSlam(**noise)
+        if kind == "ekf"
+        else SparseInformationSlam(active_bound=bound, **KINDS[kind], **noise)
+    )
+    scores = []
+    for step, odometry in enumerate(data.odometry[0]):
+        slam.predict(odometry, data.dt[step])
+        ids = np.flatnonzero(data.visible[0, step])
+        slam.update(data.measurements[0, step, ids], ids)
+        if step % 10 == 9:
+            belief, truth = slam.belief([]), data.true_poses[0, step]
+            scores.append(
+                pose_nees(truth, belief.pose, belief.pose_covariance, frame="additive")
             )
-        )
-        poses, covariances, times = [], [], range(9, data.odometry.shape[1], 10)
-        for step, odometry in enumerate(data.odometry[run]):
-            slam.predict(odometry, data.dt[step])
-            ids = np.flatnonzero(data.visible[run, step])
-            slam.update(data.measurements[run, step, ids], ids)
-            if step in times:
-                belief = slam.belief() if kind == "ekf" else slam.belief([])
-                poses.append(belief.pose)
-                covariances.append(belief.pose_covariance)
-        truth = data.true_poses[run, times]
-        scores = pose_nees(
-            truth[None],
-            np.array(poses)[None],
-            np.array(covariances)[None],
-            frame="additive",
-        )
-        return float(scores.mean()) / 3
+    return float(np.mean(scores)) / 3
+
+
+class Error(NamedTuple):
+    """A filter at the end of the drives of the overview (submaps.py)."""
+
+    error: float
+    """Of the position, root mean square [m]."""
+    std: float
+    """That it says, mean [m]."""
+    nees: float
+    """Of the pose, per dimension, in the frame of the filter, mean."""
+    apart: float
+    """Distance to the "ekf" on the same drive, root mean square [m]."""
+    aligned: float
+    """Distance to the invariant filter on the same drive, root mean square [m]."""
+
+
+OF_ERROR: dict[str, Callable[..., Any]] = {
+    "ekf": CompressedEkfSlam,
+    "invariant": partial(CompressedEkfSlam, base="invariant"),
+    "relocate": SparseInformationSlam,
+    "… tolerance=0": partial(SparseInformationSlam, tolerance=0.0),
+    "… active_bound=10": partial(SparseInformationSlam, active_bound=10),
+    "… active_bound=40": partial(SparseInformationSlam, active_bound=40),
+    "… first_estimates": partial(SparseInformationSlam, base="first_estimates"),
+    "… constrained": partial(SparseInformationSlam, base=HONEST),
+}
+
+
+def errors(count: int, drives: int) -> dict[str, Error]:
+    """Give the same readings to all filters, row by row over an unknown map."""
+    ends: dict[str, list[Array]] = {name: [] for name in OF_ERROR}
+    for seed in range(drives):
+        half = np.sqrt(25.0 * count) / 2
+        landmarks = np.random.default_rng(seed).uniform(-half, half, (count, 2))
+        start = np.array([-half, -half, 0.0])
+        steps = list(submaps.drive(landmarks, half, start, seed=seed + 1))
+        for name, make in OF_ERROR.items():
+            noise = (submaps.MOTION_STD, submaps.MEASUREMENT_STD)
+            slam = make(*noise, initial_pose=start)
+            for step in steps:
+                slam.predict(step.odometry)
+                slam.update(step.readings, step.ids)
+            belief, truth = slam.belief([]), steps[-1].pose
+            P = belief.pose_covariance
+            score = pose_nees(truth, belief.pose, P, frame=belief.frame) / 3
+            std = np.sqrt(P[0, 0] + P[1, 1])
+            off = belief.pose[:2] - truth[:2]
+            ends[name].append(np.array([*off, std, score]))
+    table = {name: np.array(rows) for name, rows in ends.items()}
+
+    def distance(one: Array, other: Array | float = 0.0) -> float:
+        return float(np.sqrt(((one - other)[:, :2] ** 2).sum(axis=1).mean()))
 
     return {
-        kind: np.array([follow(run, kind) for run in range(runs)])
-        for kind in ("ekf", "relocate", "prune")
+        name: Error(
+            distance(rows),
+            float(rows[:, 2].mean()),
+            float(rows[:, 3].mean()),
+            distance(rows, table["ekf"]),
+            distance(rows, table["invariant"]),
+        )
+        for name, rows in table.items()
     }
 
 
@@ -235,25 +341,39 @@ def print_costs(sizes: list[int]) -> None:
 
 
 def print_nees(runs: int) -> None:
-    table = Table(title=f"NEES of the pose per dimension, {runs} runs: mean (median)")
-    for name in ("scenario", "Γ", "ekf", "relocate", "prune"):
-        table.add_column(name, justify="right")
-    for scenario, bound in (("anchored", 4), ("dense", 12), ("loop", 4), ("loop", 8)):
-        scores = nees(scenario, runs, bound).values()
+    """Print a line per case as soon as it is known."""
+    print(f"NEES of the pose per dimension, {runs} runs: mean (median)")
+    print("| scenario | Γ |", " | ".join(KINDS), "|")
+    print("|---|---:|" + "---:|" * len(KINDS))
+    for case in CASES:
+        scores = nees(case, runs).values()
         cells = (f"{np.mean(s):.3g} ({np.median(s):.3g})" for s in scores)
-        table.add_row(scenario, str(bound), *cells)
-    CONSOLE.print(table)
+        print(f"| {case.name} | {case.bound} |", " | ".join(cells), "|", flush=True)
+
+
+def print_errors(sizes: list[int]) -> None:
+    """Print what the filters are off by, over as many drives as the overview has."""
+    print("| landmarks | filter | error, m | std, m | NEES / 3 | from ekf, m", end="")
+    print(" | from invariant, m | drives |\n| ---: | --- |" + " ---: |" * 6)
+    for count in sizes:
+        drives = next((n for most, n in DRIVES.items() if count <= most), 1)
+        for name, row in errors(count, drives).items():
+            cells = (f"{value:.2f}" for value in row)
+            print(f"| {count} | {name} |", " | ".join(cells), f"| {drives} |")
 
 
 def main() -> None:
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("--sizes", type=int, nargs="*", default=[1000, 10_000])
     parser.add_argument("--nees", action="store_true")
+    parser.add_argument("--error", action="store_true")
     parser.add_argument("--runs", type=int, default=20)
     arguments = parser.parse_args()
     start = perf_counter()
     if arguments.nees:
         print_nees(arguments.runs)
+    elif arguments.error:
+        print_errors(arguments.sizes)
     else:
         print_costs(arguments.sizes)
     CONSOLE.print(f"{perf_counter() - start:.0f} s")

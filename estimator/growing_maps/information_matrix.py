@@ -117,6 +117,18 @@ class InformationMatrix:
         place[slots] = place[result] = -1
         return result
 
+    def links(self, slot: int) -> Int:
+        """Return what a landmark is linked with, itself among it."""
+        return self._links[slot]
+
+    def filled(self, slots: Int) -> NDArray[np.bool_]:
+        """Whether anything is known about each of some landmarks."""
+        return np.array([len(self._links[i]) > 0 for i in slots.tolist()], dtype=bool)
+
+    def rows(self, slots: Int) -> tuple[Int, Int, Array]:
+        """Return the rows of some landmarks: lengths, links and blocks, in sequence."""
+        return self._gather(slots)
+
     def neighbours(self, slots: Int) -> Int:
         """Return all landmarks linked with these and not among them."""
         if not len(slots):
@@ -185,11 +197,13 @@ class Surroundings(NamedTuple):
     border: Int
     """Columns of B in L, shape (c,)."""
     response: Array
-    """T, shape (2h, c)."""
+    """T, shape (2h, c); not made, (0, c), where H is all of the map."""
     complement: Array
     """C, shape (c, c), symmetric."""
     solve: Solver
     """b ↦ Λ_HH⁻¹ b."""
+    respond: Solver
+    """δ_B ↦ T δ_B."""
 
 
 def surround(matrix: InformationMatrix, local: Int, around: Int) -> Surroundings:
@@ -208,7 +222,12 @@ def surround(matrix: InformationMatrix, local: Int, around: Int) -> Surroundings
     response = np.ascontiguousarray(solve(right) if len(border) else right)
     complement = right.T @ response
     return Surroundings(
-        around, border, response, (complement + complement.T) / 2, solve
+        around,
+        border,
+        response,
+        (complement + complement.T) / 2,
+        solve,
+        response.__matmul__,
     )
 
 

@@ -11,7 +11,7 @@ Int = NDArray[np.int64]
 # Landmarks that a local map holds at least when it is chosen, and those eliminated
 # around it at first, where the tolerance allows to leave others.
 LOCAL, AROUND = 50, 100
-# By how many times more of those are taken, should they not do.
+# By how many times more of those are taken, should they not do; all, should these not.
 WIDER = 16
 # In a large map the local one is larger: all around it may have to be eliminated, at a
 # cost that grows with the map, while a step costs the third power of the local size.
@@ -34,18 +34,17 @@ def choose_local(
     return union(wanted, np.sort(nearest))[: max(size, len(wanted))]
 
 
-def first_reach(last: float, widened: bool, mapped: int) -> float:
+def first_reach(last: float, *, widened: bool) -> float:
     """Return how many landmarks to eliminate around a new local map: what was needed.
 
     Where the last reach did at once, less may do.
     """
-    last = min(last, mapped)
-    return max(AROUND, last if widened else last / WIDER)
+    return last if widened else max(AROUND, min(last, WIDER**2 * AROUND) / WIDER)
 
 
-def wider(reach: float, mapped: int) -> float:
-    """Return how many to eliminate where ``reach`` did not do; all rather than most."""
-    return WIDER * reach if 3 * WIDER * reach < mapped else inf
+def wider(reach: float) -> float:
+    """Return how many to eliminate where ``reach`` did not do: in the end, all."""
+    return WIDER * reach if reach < WIDER * AROUND else inf
 
 
 def union(first: Int, second: Int) -> Int:

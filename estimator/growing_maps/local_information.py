@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, lapack
 
-from ..angles import wrap_angle
-from ..bearing_range_model import predict_measurement
 from .coordinates import pairs
 from .information_matrix import InformationMatrix, Surroundings, surround
-from .pose_given_map import LinearScan, MapReading, PoseGivenMap
+from .pose_given_map import MapReading, PoseGivenMap
+from .sparse_elimination import Elimination, surround_all
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -24,7 +23,9 @@ class Map:
 
     def __init__(self) -> None:
         self.information = InformationMatrix()
+        self.elimination = Elimination()
         self.points = np.zeros(0)
+        self.first = np.zeros(0)  # where each was found
         self.residual = np.zeros(0)
 
     def grow(self, count: int) -> None:
@@ -33,6 +34,7 @@ class Map:
         if 2 * count > len(self.points):
             more = np.zeros(4 * count - len(self.points))
             self.points = np.append(self.points, more)
+            self.first = np.append(self.first, more)
             self.residual = np.append(self.residual, more)
 
 
@@ -71,6 +73,8 @@ class LocalInformation:
     slots: Int
     points: Array
     """Means, shape (2k,) [m]."""
+    first: Array
+    """Their first estimates, shape (2k,) [m]."""
     information: Array
     """Λ_LL, shape (2k, 2k)."""
     start: Array
@@ -98,7 +102,10 @@ class LocalInformation:
 
     def without_factor(self) -> "LocalInformation":
         """Let go of the factor around it, which may be large."""
-        return replace(self, surroundings=self.surroundings._replace(solve=np.copy))
+        return replace(
+            self,
+            surroundings=self.surroundings._replace(solve=np.copy, respond=np.copy),
+        )
 
     def absorb(
         self, pose: PoseGivenMap, reading: MapReading
@@ -125,6 +132,7 @@ class LocalInformation:
             self,
             slots=np.concatenate([self.slots, slots]),
             points=np.concatenate([self.points, points]),
+            first=np.concatenate([self.first, points]),
             information=np.pad(self.information, (0, 2 * len(slots))),
         )
 
@@ -137,13 +145,18 @@ def begin(
     ``pose.gain`` must be that of these landmarks.
     """
     matrix = world.information
-    around = surround(matrix, slots, matrix.around(slots, reach))
+    around = _eliminated(world, slots, reach)
     columns = pairs(around.slots)
     outer = np.setdiff1d(matrix.neighbours(around.slots), slots)
-    waiting = around.solve(world.residual[columns])
+    waiting = world.residual[columns]
+    if waiting.any():
+        waiting = around.solve(waiting)
     world.points[columns] += waiting
     world.residual[columns] = 0.0
     rest = matrix.part(outer, around.slots)
+    response = np.zeros((0, len(around.border)))
+    if len(outer):
+        response = np.ascontiguousarray(rest @ around.response)
     outside, inside = pairs(outer), pairs(slots)
     world.residual[outside] -= rest @ waiting
     residual = world.residual[inside].copy()
@@ -152,12 +165,13 @@ def begin(
     local = LocalInformation(
         slots,
         world.points[inside],
+        world.first[inside],
         matrix.dense(slots),
         world.points[inside][around.border],
         around,
         Outer(
             outer,
-            np.ascontiguousarray(rest @ around.response),
+            response,
             world.residual[outside],
             np.linalg.inv(np.linalg.cholesky(matrix.diagonal(outer))),
         ),
@@ -165,13 +179,24 @@ def begin(
     return local.settle(pose, residual)
 
 
+def _eliminated(world: Map, slots: Int, reach: float) -> Surroundings:
+    """Eliminate the nearest by links, or all where these are as many as there are."""
+    matrix = world.information
+    if reach >= len(matrix) - len(slots):
+        return surround_all(world.elimination, matrix, slots)
+    return surround(matrix, slots, matrix.around(slots, reach))
+
+
 def finish(world: Map, local: LocalInformation) -> None:
     """Hand everything back to the map."""
     world.points[pairs(local.slots)] = local.points
+    world.first[pairs(local.slots)] = local.first
     around, shift = local.surroundings, local.shift
-    world.points[pairs(around.slots)] -= around.response @ shift
+    if shift.any():
+        world.points[pairs(around.slots)] -= around.respond(shift)
     world.residual[pairs(local.outer.slots)] = local.outer.residual_after(shift)
     world.information.put(local.slots, local.information)
+    world.elimination.revise(world.information, world.first, local.slots)
 
 
 def link_count(world: Map, local: LocalInformation) -> int:
@@ -181,19 +206,3 @@ def link_count(world: Map, local: LocalInformation) -> int:
     blocks = local.information.reshape(k, 2, k, 2)
     now = int(blocks.any(axis=(1, 3)).sum())
     return matrix.block_count - len(matrix.part(slots, slots).indices) + now
-
-
-def linear_scan(
-    pose: Array, points: Array, places: Int, readings: Array, variance: Array
-) -> LinearScan:
-    """Linearise readings of local landmarks at a pose and a map."""
-    expected = predict_measurement(pose, points.reshape(-1, 2)[places])
-    innovation = readings - expected.measurement
-    innovation[:, 0] = wrap_angle(innovation[:, 0])
-    return LinearScan(
-        innovation,
-        expected.jacobian_pose,
-        expected.jacobian_landmark,
-        variance,
-        places,
-    )

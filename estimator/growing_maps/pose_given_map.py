@@ -34,6 +34,8 @@ class PoseGivenMap(NamedTuple):
     """K, shape (3, 2k)."""
     covariance: Array
     """Ω, shape (3, 3)."""
+    reference: Array
+    """x̄, where it is linearised but for "ekf", shape (2,) [m]."""
 
 
 class LinearScan(NamedTuple):
@@ -79,12 +81,23 @@ class MapReading(NamedTuple):
     """w = W ν."""
 
 
-def move(pose: PoseGivenMap, odometry: Array, variance: Array) -> PoseGivenMap:
-    """Drive: K ← G K, Ω ← G Ω Gᵀ + F R Fᵀ; the map's own information stays."""
+def move(
+    pose: PoseGivenMap, odometry: Array, variance: Array, *, from_mean: bool = True
+) -> PoseGivenMap:
+    """Drive: K ← G K, Ω ← G Ω Gᵀ + F R Fᵀ; the map's own information stays.
+
+    G is taken over the way from the mean; or from x̄, which the predicted position
+    replaces: G = I + (J (x̂⁻ − x̄), 0) e_θᵀ.
+    """
     motion = predict_pose(pose.mean, odometry)
     G, F = motion.jacobian_pose, motion.jacobian_noise
+    if not from_mean:
+        way = motion.pose[:2] - pose.reference
+        G = G.copy()
+        G[:2, 2] = -way[1], way[0]
     covariance = G @ pose.covariance @ G.T + (F * variance) @ F.T
-    return PoseGivenMap(motion.pose, G @ pose.gain, (covariance + covariance.T) / 2)
+    covariance = (covariance + covariance.T) / 2
+    return PoseGivenMap(motion.pose, G @ pose.gain, covariance, motion.pose[:2].copy())
 
 
 def seen_from(pose: PoseGivenMap, scan: LinearScan) -> tuple[Array, Array]:
@@ -111,7 +124,10 @@ def correct(pose: PoseGivenMap, scan: LinearScan) -> tuple[PoseGivenMap, MapRead
     white = solve_triangular(L, right, lower=True, check_finite=False)
     Y, w, V = white[:, :-4], white[:, -4], white[:, -3:]
     corrected = PoseGivenMap(
-        pose.mean + V.T @ w, pose.gain - V.T @ Y, pose.covariance - V.T @ V
+        pose.mean + V.T @ w,
+        pose.gain - V.T @ Y,
+        pose.covariance - V.T @ V,
+        pose.reference,
     )
     return corrected, MapReading(Y, w)
 
@@ -138,7 +154,9 @@ def relocate(
     back = solve_triangular(R[:3], np.column_stack([Q[:, :3].T @ Y, Q[:, :3].T @ w]))
     root = solve_triangular(R[:3], np.eye(3))
     gain = np.ascontiguousarray(-back[:, :-1])
-    moved = PoseGivenMap(pose.mean + back[:, -1], gain, root @ root.T)
+    moved = pose._replace(
+        mean=pose.mean + back[:, -1], gain=gain, covariance=root @ root.T
+    )
     return moved, MapReading(Q[:, 3:].T @ Y, Q[:, 3:].T @ w)
 
 
@@ -162,4 +180,4 @@ def cut_links(
     gain = np.zeros_like(pose.gain)
     gain[:, stays] = pose.gain[:, stays] - moved.T @ information[np.ix_(dropped, stays)]
     added = K_w @ moved
-    return PoseGivenMap(pose.mean, gain, pose.covariance + (added + added.T) / 2)
+    return pose._replace(gain=gain, covariance=pose.covariance + (added + added.T) / 2)

@@ -12,7 +12,7 @@ from ..angles import wrap_angle
 from ..interface import Belief, UpdateReport
 from ..validation import LandmarkIds
 from .coordinates import pairs
-from .information_matrix import Surroundings, surround
+from .information_matrix import Surroundings
 from .local_choice import (
     AROUND,
     choose_local,
@@ -23,7 +23,9 @@ from .local_choice import (
 )
 from .local_information import Map, begin, finish, link_count
 from .pose_given_map import PoseGivenMap, move
+from .sparse_elimination import surround_all
 from .sparse_information_state import SavedState, as_arrays, checked_state
+from .sparse_linearisation import ESTIMATE
 from .sparse_marginals import marginal, means
 from .sparse_scan import ScanRules
 from .sparse_update import Sparsity, consider
@@ -48,14 +50,17 @@ class SparseInformationSlam:
     more.
 
     Means and covariances near the robot come from a small dense matrix, in which the
-    landmarks around it are eliminated by a Cholesky factor; while the robot stays among
-    the same landmarks this factor holds.
+    landmarks around it are eliminated; while the robot stays among the same landmarks
+    this holds, and of the rest of the map all but the branches that it left or entered.
 
     Parameters
     ----------
     motion_std, measurement_std, initial_pose, initial_pose_std, range_std_per_metre, \
 range_noise_at, gate_probability, noise_at_rest, min_range
         As in :class:`EkfSlam`; ``measurement_std`` above 0.
+    base : {"ekf", "first_estimates", "observability_constrained"}
+        The filter whose Jacobians are taken: those of "ekf" make it overconfident on
+        long drives, the others do not.
     active_bound : int or None
         Γ, the largest number of landmarks linked with the pose; at least 2.  A scan
         that holds more itself, or fewer than two readings of mapped landmarks that
@@ -101,13 +106,14 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         *,
         initial_pose: ArrayLike = (0.0, 0.0, 0.0),
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        base: str = "ekf",
         active_bound: int | None = 20,
         sparsify: str = "relocate",
         tolerance: float = 1e-3,
         belief_limit: int = 5000,
         **settings: Any,
     ) -> None:
-        self._scan_rules = ScanRules(motion_std, measurement_std, **settings)
+        self._scan_rules = ScanRules(motion_std, measurement_std, base=base, **settings)
         self._sparsity = Sparsity(
             inf
             if active_bound is None
@@ -125,7 +131,9 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         self._slots: dict[int, int] = {}  # place of each landmark in the map
         self._free: list[int] = []
         self._world = Map()
-        self._pose = PoseGivenMap(first.copy(), np.zeros((3, 0)), np.diag(std**2))
+        self._pose = PoseGivenMap(
+            first.copy(), np.zeros((3, 0)), np.diag(std**2), first[:2].copy()
+        )
         self._local, self._pose = begin(
             self._world, self._pose, np.empty(0, dtype=np.int64), AROUND
         )
@@ -138,7 +146,12 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
         distance, turn = validation.pair("odometry", odometry)
         variance = self._scan_rules.motion_variance(distance, turn, dt)
-        self._pose = move(self._pose, np.array([distance, turn]), variance)
+        self._pose = move(
+            self._pose,
+            np.array([distance, turn]),
+            variance,
+            from_mean=self._scan_rules.base == ESTIMATE,
+        )
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -175,7 +188,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
             local = outcome.local
             if local.outer.unrest(local.shift) <= self._tolerance:
                 break
-            self._take(self._local.slots, wider(self._reach, len(self._slots)))
+            self._take(self._local.slots, wider(self._reach))
             self._widened = True
         for i, slot in zip(outcome.report.added_ids, outcome.added_slots, strict=True):
             self._slots[i] = slot
@@ -238,6 +251,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         self._world.information.put(self._local.slots, information)
         self._local, self._pose = rest
         self._others = None
+        self._world.elimination.dissection.nodes[[self._slots[i] for i in ids]] = 0
         for i in ids:
             self._free.append(self._slots.pop(i))
 
@@ -305,9 +319,10 @@ range_noise_at, gate_probability, noise_at_rest, min_range
     def nbytes(self) -> int:
         """Memory that the belief takes [bytes]."""
         local, world = self._local, self._world
-        arrays = (world.points, world.residual, local.information)
+        arrays = (world.points, world.first, world.residual, local.information)
         around = (local.surroundings.response, local.outer.response)
-        return world.information.nbytes + sum(a.nbytes for a in arrays + around)
+        kept = world.information.nbytes + world.elimination.nbytes
+        return kept + sum(a.nbytes for a in arrays + around)
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of everything, as arrays."""
@@ -323,11 +338,12 @@ range_noise_at, gate_probability, noise_at_rest, min_range
                 self._widened,
             ),
             type(self).__name__,
+            self._scan_rules.base,
         )
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, as :meth:`EkfSlam.load_state_dict`."""
-        saved = checked_state(state, type(self).__name__)
+        saved = checked_state(state, type(self).__name__, self._scan_rules.base)
         self._slots, self._free, self._world = saved.slots, saved.free, saved.world
         self._local, self._pose = saved.local, saved.pose
         self._origin, self._reach = saved.origin, saved.reach
@@ -354,7 +370,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
     def _first_reach(self) -> float:
         if not self._tolerance:
             return inf
-        return first_reach(self._reach, self._widened, len(self._slots))
+        return first_reach(self._reach, widened=self._widened)
 
     def _take(self, slots: Int, reach: float) -> None:
         """Hand the local map back, and take these landmarks in hand."""
@@ -367,13 +383,15 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         pose = pose._replace(gain=gain)
         self._local, self._pose = begin(self._world, pose, slots, reach)
         self._reach = reach
-        self._others = None if np.isfinite(reach) else self._local.surroundings
+        around = self._local.surroundings
+        self._others = None if len(around.response) else around
 
     def _everything(self) -> Surroundings:
         """All landmarks but the local ones, eliminated."""
         if self._others is None:
-            matrix, slots = self._world.information, self._local.slots
-            self._others = surround(matrix, slots, matrix.around(slots, inf))
+            self._others = surround_all(
+                self._world.elimination, self._world.information, self._local.slots
+            )
         return self._others
 
     def _vacant(self, count: int) -> Int:

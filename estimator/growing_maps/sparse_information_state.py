@@ -1,6 +1,7 @@
 """Save a sparse information filter, and check what was saved before taking it."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,15 +11,16 @@ from .. import validation
 from .information_matrix import InformationMatrix, Solver, Surroundings, solver
 from .local_information import LocalInformation, Map, Outer
 from .pose_given_map import PoseGivenMap
+from .sparse_elimination import Factor
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 _MATRIX = ("counts", "links", "blocks")
-_LOCAL = ("slots", "points", "information", "start")
+_LOCAL = ("slots", "points", "first", "information", "start")
 _AROUND = ("slots", "border", "response", "complement")
 _OUTER = ("slots", "response", "residual", "scale")
-_POSE = ("mean", "gain", "covariance")
+_POSE = ("mean", "gain", "covariance", "reference")
 _WHOLE = {"counts", "links", "border", "slots"}
 
 
@@ -40,17 +42,22 @@ class SavedState(NamedTuple):
     """Whether that is more than at first."""
 
 
-def as_arrays(saved: SavedState, name: str) -> dict[str, Any]:
+def as_arrays(saved: SavedState, name: str, base: str) -> dict[str, Any]:
     """Return copies of everything, as arrays."""
     world, local = saved.world, saved.local
+    world.elimination.dissection.grow(len(world.information))
     count = 2 * len(world.information)
     return {
         "estimator": np.array(name),
+        "base": np.array(base),
         "landmark_ids": np.array(list(saved.slots), dtype=np.int64),
         "slots": np.array(list(saved.slots.values()), dtype=np.int64),
         "free": np.array(saved.free, dtype=np.int64),
         "points": world.points[:count].copy(),
+        "first": world.first[:count].copy(),
         "residual": world.residual[:count].copy(),
+        "nodes": world.elimination.dissection.nodes.copy(),
+        "parted": np.array(world.elimination.dissection.parted),
         "origin": saved.origin.copy(),
         "reach": np.array(saved.reach),
         "widened": np.array(saved.widened),
@@ -62,9 +69,9 @@ def as_arrays(saved: SavedState, name: str) -> dict[str, Any]:
     }
 
 
-def checked_state(state: Mapping[str, Any], name: str) -> SavedState:
+def checked_state(state: Mapping[str, Any], name: str, base: str) -> SavedState:
     """Read what :func:`as_arrays` returned, or refuse it."""
-    _check_entries(state, name)
+    _check_entries(state, name, base)
     ids, slots, free = (
         np.asarray(state[key]).ravel().tolist()
         for key in ("landmark_ids", "slots", "free")
@@ -77,19 +84,20 @@ def checked_state(state: Mapping[str, Any], name: str) -> SavedState:
             f"state['slots'] and state['free'] must share out the {count} rows of the "
             f"matrix among {len(ids)} landmarks, got {len(slots)} and {len(free)}"
         )
-    world.points, world.residual = (
+    world.points, world.first, world.residual = (
         validation.finite_vector(f"state[{key!r}]", state[key], 2 * count).copy()
-        for key in ("points", "residual")
+        for key in ("points", "first", "residual")
     )
     pose = PoseGivenMap(**_part(state, "pose", _POSE))
     around = _part(state, "around", _AROUND)
-    matrix, others = world.information, around["slots"]
+    of_local = _part(state, "local", _LOCAL)
     local = LocalInformation(
-        **_part(state, "local", _LOCAL),
-        surroundings=Surroundings(**around, solve=_later(matrix, others)),
+        **of_local,
+        surroundings=_surroundings(world, of_local["slots"], around),
         outer=Outer(**_part(state, "outer", _OUTER)),
     )
     _check_fit(local, pose, count)
+    _take_dissection(state, world, local.slots)
     origin = validation.finite_vector("state['origin']", state["origin"], 2).copy()
     return SavedState(
         dict(zip(ids, slots, strict=True)),
@@ -103,13 +111,43 @@ def checked_state(state: Mapping[str, Any], name: str) -> SavedState:
     )
 
 
+def _surroundings(world: Map, local: Int, around: dict[str, Any]) -> Surroundings:
+    """Eliminate around the local map as before, when that is asked for."""
+    slots, response = around["slots"], around["response"]
+    if len(slots) and not len(response):
+        factor = Factor(world.elimination, world.information, local)
+        respond = partial(factor.respond, around["border"])
+        return Surroundings(**around, solve=factor.solve, respond=respond)
+    solve = _later(world.information, slots)
+    return Surroundings(**around, solve=solve, respond=response.__matmul__)
+
+
+def _take_dissection(state: Mapping[str, Any], world: Map, local: Int) -> None:
+    """Take the order of elimination, and put those in it that are in none."""
+    matrix, count = world.information, len(world.information)
+    nodes = np.asarray(state["nodes"])
+    if nodes.shape != (count,) or (nodes < 0).any() or (nodes >= 2**50).any():
+        raise ValueError(
+            f"state['nodes'] must be {count} whole numbers in [0, 2⁵⁰), got "
+            f"shape {nodes.shape}"
+        )
+    dissection = world.elimination.dissection
+    dissection.nodes = nodes.astype(np.int64)
+    dissection.parted = int(state["parted"])
+    others = np.setdiff1d(np.flatnonzero(dissection.nodes == 0), local)
+    others = others[matrix.filled(others)]
+    if len(others):
+        dissection.revise(matrix, world.first, others)
+    dissection.check(matrix, local)
+
+
 def _later(matrix: InformationMatrix, slots: Int) -> Solver:
     """Factorise only when asked."""
     return lambda right: solver(matrix, slots)(right)  # noqa: PLW0108
 
 
-def _check_entries(state: Mapping[str, Any], name: str) -> None:
-    entries = ["landmark_ids", "slots", "free", "points", "residual"]
+def _check_entries(state: Mapping[str, Any], name: str, base: str) -> None:
+    entries = ["landmark_ids", "slots", "free", "points", "first", "residual"]
     for prefix, keys in (
         ("matrix", _MATRIX),
         ("local", _LOCAL),
@@ -118,8 +156,8 @@ def _check_entries(state: Mapping[str, Any], name: str) -> None:
         ("pose", _POSE),
     ):
         entries += [f"{prefix}_{key}" for key in keys]
-    entries += ["origin", "reach", "widened"]
-    validation.refuse_other_state(state, entries, estimator=name)
+    entries += ["nodes", "parted", "origin", "reach", "widened"]
+    validation.refuse_other_state(state, entries, estimator=name, base=base)
 
 
 def _part(
@@ -145,10 +183,12 @@ def _check_fit(local: LocalInformation, pose: PoseGivenMap, count: int) -> None:
         ("pose_mean", pose.mean, (3,)),
         ("pose_gain", pose.gain, (3, k)),
         ("pose_covariance", pose.covariance, (3, 3)),
+        ("pose_reference", pose.reference, (2,)),
         ("local_points", local.points, (k,)),
+        ("local_first", local.first, (k,)),
         ("local_information", local.information, (k, k)),
         ("local_start", local.start, (c,)),
-        ("around_response", around.response, (h, c)),
+        ("around_response", around.response, (h if len(around.response) else 0, c)),
         ("around_complement", around.complement, (c, c)),
         ("outer_response", outer.response, (o, c)),
         ("outer_residual", outer.residual, (o,)),

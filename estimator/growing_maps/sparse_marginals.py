@@ -50,14 +50,16 @@ def marginal(
     here = np.append([0, 1, 2], 3 + pairs(place[slots[is_near]]))
     columns = pairs(np.searchsorted(everything.slots, slots[~is_near]))
     near = _near(local, everything, pose)  # the same bits whatever is asked for
-    border, T = 3 + everything.border, everything.response[columns]
+    border = 3 + everything.border
     covariance = np.empty((len(inside), len(inside)))
     covariance[np.ix_(inside, inside)] = near[np.ix_(here, here)]
     if len(outside):
         unit = np.zeros((2 * len(everything.slots), len(columns)))
         unit[columns, np.arange(len(columns))] = 1.0
-        own = everything.solve(unit)[columns]
-        own += T @ near[np.ix_(border, border)] @ T.T
+        solved = everything.solve(unit)
+        link = world.information.part(everything.slots, local.slots).tocsc()
+        T = (link[:, everything.border].T @ solved).T
+        own = solved[columns] + T @ near[np.ix_(border, border)] @ T.T
         covariance[np.ix_(outside, outside)] = (own + own.T) / 2
         cross = -T @ near[np.ix_(border, here)]
         covariance[np.ix_(outside, inside)] = cross
@@ -82,6 +84,8 @@ def means(world: Map, local: LocalInformation) -> Array:
     """Positions of all landmarks as they are known now, by slots, flat [m]."""
     points = world.points.copy()
     around = local.surroundings
-    points[pairs(around.slots)] -= around.response @ local.shift
+    shift = local.shift
+    if shift.any():
+        points[pairs(around.slots)] -= around.respond(shift)
     points[pairs(local.slots)] = local.points
     return points

@@ -7,9 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lapack, solve_triangular
 
+from .. import validation
 from ..ekf_slam import EkfSlam, not_positive_definite
-from .local_information import LocalInformation, linear_scan
+from .local_information import LocalInformation
 from .pose_given_map import LinearScan, PoseGivenMap, seen_from
+from .sparse_linearisation import BASES, linear_scan
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -36,8 +38,14 @@ class ScanRules:
     """Noise and acceptance of readings, set up and checked as by :class:`EkfSlam`."""
 
     def __init__(
-        self, motion_std: ArrayLike, measurement_std: ArrayLike, **settings: Any
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        base: str,
+        **settings: Any,
     ) -> None:
+        self.base = validation.one_of("base", base, BASES)
         unknown = set(settings) - {
             "range_std_per_metre",
             "range_noise_at",
@@ -88,7 +96,8 @@ class ScanRules:
         kept = ~skipped
         places, readings = places[kept], readings[kept]
         at = readings[:, 1] if self.rules.noise_as_read else expected[kept]
-        scan = linear_scan(pose.mean, local.points, places, readings, self.variance(at))
+        variance = self.variance(at)
+        scan = linear_scan(self.base, local, pose, places, readings, variance)
         S = _innovation_covariance(pose, local, scan)
         blocks = np.array(
             [S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(places))]

@@ -71,11 +71,15 @@ def consider(
     names = [ids[k] for k in mapped]
     screened = rules.screen(pose, local, places, readings[mapped], names)
     used = mapped[~(screened.skipped | screened.gated)]
-    local, pose = _absorb(state, screened, readings[used], sparsity, len(new))
+    crowded = not sparsity.prunes and _is_crowded(
+        pose, screened.scan.landmarks, len(new), sparsity
+    )
+    state = _absorb(rules.base, state, screened, readings[used], crowded=crowded)
+    local, pose = state
     seen, added = screened.scan.landmarks, vacant[: len(new)]
     if len(new):
         variance = rules.variance(readings[new, 1])
-        local, pose = add_landmarks(local, pose, added, readings[new], variance)
+        local, pose = add_landmarks(rules.base, state, added, readings[new], variance)
         count = len(local.slots)
         seen = np.append(seen, np.arange(count - len(new), count))
     if sparsity.prunes:
@@ -100,14 +104,14 @@ def consider(
 
 
 def _absorb(
-    state: State, screened: Screened, readings: Array, sparsity: Sparsity, new: int
+    base: str, state: State, screened: Screened, readings: Array, *, crowded: bool
 ) -> State:
     """Correct, and relocate the pose where its links would become too many."""
     scan = screened.scan
     if not len(scan.landmarks):
         return state
-    if not sparsity.prunes and _is_crowded(state[1], scan.landmarks, new, sparsity):
-        relocated = correct_and_relocate(*state, scan, readings)
+    if crowded:
+        relocated = correct_and_relocate(base, state, scan, readings)
         if relocated is not None:
             return relocated
     return correct_all(*state, scan)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bearing_range_model import locate_landmark
-from .local_information import LocalInformation, linear_scan
+from .local_information import LocalInformation
 from .pose_given_map import (
     LinearScan,
     PoseGivenMap,
@@ -14,6 +14,7 @@ from .pose_given_map import (
     cut_links,
     relocate,
 )
+from .sparse_linearisation import first_scan, linear_scan
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -34,20 +35,23 @@ def correct_all(local: LocalInformation, pose: PoseGivenMap, scan: LinearScan) -
 
 
 def correct_and_relocate(
-    local: LocalInformation, pose: PoseGivenMap, scan: LinearScan, readings: Array
+    base: str, state: State, scan: LinearScan, readings: Array
 ) -> State | None:
     """Correct with every other reading, forget the pose, take it from the others.
 
     The readings are parted in the order of their bearings, so that both parts look
-    around.  None where those for the pose do not determine it.
+    around.  The new pose is linearised where the correction left the old one.  None
+    where the readings for it do not determine it.
     """
+    local, pose = state
     order = np.lexsort(readings.T[::-1])
     for_pose = np.zeros(len(order), dtype=bool)
     for_pose[order[::2] if len(order) > 2 else order] = True
     if not for_pose.all():
         local, pose = correct_all(local, pose, scan.only(~for_pose))
     places, variance = scan.landmarks[for_pose], scan.variance[for_pose]
-    rest = linear_scan(pose.mean, local.points, places, readings[for_pose], variance)
+    pose = pose._replace(reference=pose.mean[:2].copy())
+    rest = linear_scan(base, local, pose, places, readings[for_pose], variance)
     relocated = relocate(pose, rest)
     if relocated is None:
         return None
@@ -56,19 +60,19 @@ def correct_and_relocate(
 
 
 def add_landmarks(
-    local: LocalInformation,
-    pose: PoseGivenMap,
+    base: str,
+    state: State,
     slots: Int,
     readings: Array,
     variance: Array,
 ) -> State:
     """Map landmarks seen first, where they were read, shape (n, 2)."""
+    local, pose = state
     points = locate_landmark(pose.mean, readings).position
     local = local.extended(slots, points.ravel())
     pose = pose._replace(gain=np.pad(pose.gain, ((0, 0), (0, 2 * len(slots)))))
     places = np.arange(len(local.slots) - len(slots), len(local.slots))
-    scan = linear_scan(pose.mean, local.points, places, readings, variance)
-    return correct_all(local, pose, scan._replace(innovation=np.zeros_like(readings)))
+    return correct_all(local, pose, first_scan(base, local, pose, places, variance))
 
 
 def prune(
@@ -108,13 +112,13 @@ def integrate_out(local: LocalInformation, pose: PoseGivenMap, gone: Flags) -> S
         local,
         slots=local.slots[~gone],
         points=local.points[~out],
+        first=local.first[~out],
         information=local.information[np.ix_(~out, ~out)] - (change + change.T) / 2,
         surroundings=around._replace(border=place[around.border]),
     )
-    return rest, PoseGivenMap(
-        pose.mean,
-        pose.gain[:, ~out] - K_0 @ solved[:, :-3],
-        pose.covariance + (added + added.T) / 2,
+    return rest, pose._replace(
+        gain=pose.gain[:, ~out] - K_0 @ solved[:, :-3],
+        covariance=pose.covariance + (added + added.T) / 2,
     )
 
 
@@ -140,8 +144,9 @@ def identify(
         local,
         slots=local.slots[~gone],
         points=local.points[~out],
+        first=local.first[~out],
         information=(information + information.T) / 2,
         surroundings=around._replace(border=place[around.border]),
     )
-    moved = PoseGivenMap(pose.mean + pose.gain @ d, pose.gain @ T, pose.covariance)
+    moved = pose._replace(mean=pose.mean + pose.gain @ d, gain=pose.gain @ T)
     return rest.settle(moved, -T.T @ (local.information @ d))
