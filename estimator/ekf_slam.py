@@ -28,6 +28,7 @@ from .joint_update import (
     update_belief,
 )
 from .kernels import ADDITIVE, AT_ESTIMATE, INVARIANT, predict
+from .memory import covariance_bytes, landmarks_that_fit
 from .validation import LandmarkIds
 from .workspace import INNOVATION, Workspace, aligned_zeros, new_workspace
 
@@ -219,6 +220,9 @@ class EkfSlam:
         numpy.linalg.LinAlgError
             Where an innovation covariance is not positive definite, naming the
             reading; the belief is then as before.
+        MemoryError
+            Where the landmarks would be more than memory holds; the belief is then as
+            before.
         """
         readings = validation.scan(measurements)
         count = len(readings)
@@ -277,12 +281,16 @@ class EkfSlam:
             together; the belief is then as before.
         """
         mean, covariance, reference, ids = _checked_state(state, type(self).__name__)
+        self._allocate(max(8, len(ids)))
         self._slots = {i: slot for slot, i in enumerate(ids)}
         self._size = len(mean)
-        self._allocate(max(8, len(ids)))
         self._mean[: len(mean)] = mean
         self._reference[: len(mean)] = reference
         self._covariance[: len(mean), : len(mean)] = covariance
+
+    def memory_for(self, landmarks: int) -> int:
+        """Return what a map of so many landmarks takes at least [bytes]."""
+        return self._covariances * covariance_bytes(landmarks)
 
     @property
     def rules(self) -> Rules:
@@ -304,16 +312,24 @@ class EkfSlam:
         """Length of a mean with room for so many landmarks, as the kernels need it."""
         return (3 + 2 * landmarks) // 4 * 4 + 4
 
+    @property
+    def _covariances(self) -> int:
+        """How many of the size of P an update fills: P, and copies to go back to."""
+        iterated = self._rules.iterations > 1
+        return 1 + iterated + (iterated or self._rules.sequential)
+
     def _adopt(self, rules: Rules) -> None:
         self._rules = rules
         self._rule_values = np.array(rules)
         self._scan_room = 0  # the rules say what a workspace holds
 
-    def _allocate(self, landmarks: int) -> None:
-        capacity = self.capacity_for(landmarks)
+    def _allocate(self, landmarks: int, more: int = 0) -> None:
+        """Make room for landmarks, and for more to come as far as memory allows."""
+        fitting = landmarks_that_fit(landmarks, landmarks + more, self._covariances)
+        capacity = self.capacity_for(fitting)
+        self._covariance = aligned_zeros(capacity, capacity)  # it may raise: first
         self._mean = np.zeros(capacity)
         self._reference = np.zeros(capacity)
-        self._covariance = aligned_zeros(capacity, capacity)
         self._scan_room = 0
 
     def _make_room(self, readings: int) -> None:
@@ -321,15 +337,14 @@ class EkfSlam:
         n = self._size
         if n + 2 * readings >= len(self._mean):
             mean, covariance, reference = self._mean, self._covariance, self._reference
-            self._allocate(2 * len(self._slots) + readings)
+            self._allocate(len(self._slots) + readings, more=len(self._slots))
             self._mean[:n], self._reference[:n] = mean[:n], reference[:n]
             self._covariance[:n, :n] = covariance[:n, :n]
         if readings >= self._scan_room:
-            self._scan_room = 8 + 2 * readings
-            self._ledger = np.zeros((3, self._scan_room), dtype=np.int64)
-            self._workspace = workspace_for(
-                self._rules, self._scan_room, len(self._mean)
-            )
+            room = 8 + 2 * readings
+            self._workspace = workspace_for(self._rules, room, len(self._mean))
+            self._ledger = np.zeros((3, room), dtype=np.int64)
+            self._scan_room = room
 
     def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
         return validation.given_identities(landmark_ids, count, self)

@@ -7,6 +7,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .memory import covariance_bytes
+
 Array = NDArray[np.float64]
 LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 
@@ -130,7 +132,7 @@ def refuse_other_state(
 def refuse_large_belief(landmarks: int, limit: int, instead: str) -> None:
     """Refuse a dense covariance of more landmarks than the limit, with its size."""
     if landmarks > limit:
-        gigabytes = 8e-9 * (3 + 2 * landmarks) ** 2
+        gigabytes = 1e-9 * covariance_bytes(landmarks)
         raise ValueError(
             f"belief() of {landmarks} landmarks has a dense covariance of "
             f"{gigabytes:.1f} GB, and belief_limit is {limit}: {instead}, or raise "

@@ -18,6 +18,7 @@ from ..estimator.landmark_management.map_access import (
 from .log_events import Scan
 from .log_steps import Step, predictions, steps_of
 from .map_history import MapHistory
+from .map_memory import refuse_large_map
 from .slamlog import SlamLog
 from .trace import RunTrace
 from .true_path import true_landmarks_of, true_poses_of
@@ -116,9 +117,12 @@ def replay(
     Raises
     ------
     ValueError
-        If the estimator refuses a reading, naming the time in the log.
+        If the estimator refuses a reading, naming the time in the log; before the
+        first step, if the log names more landmarks than a belief of it may hold.
     numpy.linalg.LinAlgError
         If its covariance degenerates, naming the time too.
+    MemoryError
+        If memory will not suffice for the landmarks that the log names.
 
     Examples
     --------
@@ -130,6 +134,7 @@ def replay(
     >>> replay(log, slam).readings
     ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1, ...
     """
+    refuse_large_map(log, estimator)
     steps = list(steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     tell_truth = _truth_teller(estimator, log, times)

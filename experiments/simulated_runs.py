@@ -9,6 +9,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from ..envs.world_batch import WorldBatch
+from ..estimator.memory import refuse_beyond_memory
 from ..sim_configs import Scenario, action_sequence, load_scenario
 
 Array = NDArray[np.float64]
@@ -72,6 +73,11 @@ def simulate_runs(
 
 def _room(batch: WorldBatch, scans: int) -> SimulatedRuns:
     runs, landmarks = batch.mask.shape
+    refuse_beyond_memory(
+        f"a block of {runs} runs of {scans} scans of {landmarks} landmarks",
+        17 * runs * scans * landmarks,  # a reading, and whether there is one
+        "take fewer runs at a time (block_size), or fewer steps",
+    )
     return SimulatedRuns(
         odometry=np.empty((runs, scans, 2)),
         measurements=np.empty((runs, scans, landmarks, 2)),

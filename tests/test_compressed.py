@@ -11,61 +11,32 @@ import pytest
 from drives import MEASUREMENT_STD
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
-from slamgym.estimator.bearing_range_model import predict_measurement
+from slamgym.estimator.growing_maps import local_map_choice
 from slamgym.estimator.growing_maps.compressed import BASES, CompressedEkfSlam
 from slamgym.estimator.growing_maps.local_map_storage import BLOCK, DeferredCovariance
 from slamgym.estimator.interface import Belief
 from slamgym.estimator.landmark_management.map_access import access_to
-from slamgym.estimator.unicycle_motion import predict_pose
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from growing_maps_peers import FullWithDsyrk
 
-MOTION_STD = (0.02, 0.01, 0.01)
-NOISE = (MOTION_STD, MEASUREMENT_STD)
+NOISE = (TOWN_MOTION_STD, MEASUREMENT_STD)
+WHOLE = local_map_choice.WHOLE
 
 
-def town(count, seed=0):
-    """Landmarks, one to 25 m²; half the side of the square they stand in."""
-    half = np.sqrt(25.0 * count) / 2
-    return np.random.default_rng(seed).uniform(-half, half, (count, 2)), half
+@pytest.fixture(autouse=True)
+def _small_maps_are_split_too(monkeypatch):
+    """So that what is put off is tested where tests are fast."""
+    monkeypatch.setattr(local_map_choice, "WHOLE", 0)
 
 
-def wander(count, steps, *, seed=0, seen=10, jumping=False):
-    """Yield (odometry, readings, ids) of a drive from place to place.
-
-    The nearest landmarks are seen, or, ``jumping``, any.
-    """
-    rng = np.random.default_rng(seed + 1)
-    landmarks, half = town(count, seed)
-    pose = np.zeros(3)
-    for step in range(steps):
-        if step % 100 == 0:
-            goal = rng.uniform(-0.9 * half, 0.9 * half, 2)
-        ahead = np.arctan2(*(goal - pose[:2])[::-1]) - pose[2]
-        turn = np.clip((ahead + np.pi) % (2 * np.pi) - np.pi, -0.3, 0.3)
-        motion = predict_pose(pose, np.array([0.5, turn]))
-        slip = MOTION_STD * rng.standard_normal(3)
-        pose = motion.pose + motion.jacobian_noise @ slip
-        distances = ((landmarks - pose[:2]) ** 2).sum(axis=1)
-        distances[distances < 1] = np.inf  # too close to have a bearing
-        ids = np.argpartition(distances, seen)[:seen]
-        if jumping:
-            ids = rng.choice(count, seen, replace=False)
-        readings = predict_measurement(pose, landmarks[ids]).measurement
-        noise = MEASUREMENT_STD * rng.standard_normal(readings.shape)
-        yield (0.5, float(turn)), readings + noise, ids
-
-
-def map_all(slam, count):
-    """Let a filter see everything from the origin, some at a time."""
-    landmarks, _ = town(count)
-    readings = predict_measurement(np.zeros(3), landmarks).measurement
-    for first in range(0, count, 50):
-        slam.update(readings[first : first + 50], range(count)[first : first + 50])
-    return slam
+@pytest.fixture
+def _small_maps_are_whole(monkeypatch):
+    """As the filter does unless told a local size."""
+    monkeypatch.setattr(local_map_choice, "WHOLE", WHOLE)
 
 
 def forget(full, ids):
@@ -488,9 +459,12 @@ def test_the_stored_covariance_is_that_of_a_dense_matrix(seed):
             rows = rng.standard_normal((len(taken), width))
             rows[:, taken] += rows[:, taken].T
             dense[taken], dense[:, taken] = rows, rows.T
-            store.put(taken, rows)
+            places = rng.permutation(len(taken))
+            store.put(taken, rows[np.argsort(places)], places)
         taken = np.sort(rng.choice(width, rng.integers(1, 9), replace=False))
-        np.testing.assert_allclose(store.rows(taken), dense[taken], atol=1e-10)
+        rows = np.empty((len(taken), width))
+        store.read(taken, rows)
+        np.testing.assert_allclose(rows, dense[taken], atol=1e-10)
         root = rng.standard_normal((width, rng.integers(1, 60)))
         signs = rng.choice([-1.0, 1.0], root.shape[1])
         store.defer(root.copy(), signs)
@@ -500,3 +474,63 @@ def test_the_stored_covariance_is_that_of_a_dense_matrix(seed):
         rng.shuffle(other)
         expected = dense[np.ix_(other, other)]
         np.testing.assert_allclose(store.marginal(other), expected, atol=1e-10)
+
+
+@pytest.mark.usefixtures("_small_maps_are_whole")
+@pytest.mark.parametrize("base", BASES)
+def test_in_a_small_map_it_has_the_bits_of_the_full_filter(base):
+    full, slam = BASES[base](*NOISE), CompressedEkfSlam(*NOISE, base=base)
+    for odometry, readings, ids in wander(100, 60, jumping=True):
+        for each in (full, slam):
+            each.predict(odometry)
+            each.update(readings, ids)
+    assert slam.local_ids == slam.landmark_ids
+    assert_same_bits(slam.belief(), full.belief())
+
+
+@pytest.mark.usefixtures("_small_maps_are_whole")
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_a_map_may_grow_beyond_a_small_one_and_become_small_again(base):
+    full, slam = BASES[base](*NOISE), CompressedEkfSlam(*NOISE, base=base)
+    resumed = CompressedEkfSlam(*NOISE, base=base)
+    for each in (full, slam):
+        map_all(each, WHOLE)
+    assert slam.local_ids == slam.landmark_ids
+    larger = map_all(slam, WHOLE + 40), map_all(full, WHOLE + 40)
+    for step, (odometry, readings, ids) in enumerate(wander(WHOLE + 40, 60)):
+        if step == 30:
+            assert len(slam.local_ids) < 60
+            gone = [i for i in range(WHOLE + 40) if i not in ids][: WHOLE // 2]
+            slam.remove(gone)
+            forget(full, gone)
+        for each in larger:
+            each.predict(odometry)
+            each.update(readings, ids)
+        if step % 10 == 9:
+            resumed.load_state_dict(slam.state_dict())
+            assert_same_bits(resumed.belief(), slam.belief())
+    assert set(slam.local_ids) == set(slam.landmark_ids)
+    assert_equal_beliefs(slam.belief(), full.belief())
+
+
+@pytest.mark.usefixtures("_small_maps_are_whole")
+def test_a_local_size_asked_for_holds_in_a_small_map_too():
+    slam = run(CompressedEkfSlam(*NOISE, local_size=12), wander(100, 60))
+    assert len(slam.local_ids) <= 18 + 10 < len(slam.landmark_ids)
+
+
+def test_a_filter_that_was_continued_from_a_saved_state_begins_phases_alike():
+    """Its arrays have another capacity, and must be as empty behind what is in use."""
+    drive = list(wander(300, 120))
+    slam = run(map_all(CompressedEkfSlam(*NOISE), 300), drive[:60])
+    other = CompressedEkfSlam(*NOISE)
+    other.load_state_dict(slam.state_dict())
+    for each in (slam, other):
+        near = each.local_ids
+        run(each, drive[60:])
+        assert each.local_ids != near
+        size = each._local._size
+        for array in (each._local._mean, each._local._covariance):
+            assert not array[size:].any()
+        assert not each._local._covariance[:, size:].any()
+    assert_same_bits(slam.belief(), other.belief())

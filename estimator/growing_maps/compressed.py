@@ -12,19 +12,27 @@ from ..interface import Belief, UpdateReport
 from ..invariant import InvariantEkfSlam
 from ..iterated import IteratedEkfSlam
 from ..landmark_management.map_access import access_to
+from ..memory import covariance_bytes, refuse_beyond_memory
 from ..observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
 from ..validation import LandmarkIds
+from . import local_map_choice
 from .coordinates import pairs
+from .local_map_choice import nearest_to, spare_landmarks
 from .local_map_extension import (
     Phase,
+    begin_phase,
     combine,
-    cut,
-    extend,
+    end_phase,
     roots,
     virtual_landmarks,
 )
 from .local_map_state import checked_state
-from .local_map_storage import DeferredCovariance, subtract, symmetric
+from .local_map_storage import (
+    DeferredCovariance,
+    stored_bytes,
+    subtract,
+    symmetric,
+)
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -39,8 +47,6 @@ BASES: dict[str, type[EkfSlam]] = {
 
 # Identities of the virtual landmarks: the lowest that 64 bits hold.
 _LOWEST, _RESERVED = -(2**63), 2**20
-# Steps that a phase must last to pay for its end.
-_SHORT = 4
 
 
 class CompressedEkfSlam:
@@ -53,6 +59,8 @@ class CompressedEkfSlam:
 
     The work that the end of a phase leaves for the large covariance is spread over the
     following steps, so that no step does more of it than a step of the full filter.
+    Up to 250 landmarks the local map is all of the map, and a step that of the full
+    filter.
 
     Parameters
     ----------
@@ -64,8 +72,8 @@ class CompressedEkfSlam:
     local_size : int, optional
         Landmarks in the local map when it is chosen, the nearest to the robot; those
         found later join until it holds half as many again.  Chosen by the filter where
-        not given: a few times those that a scan holds, fewer where the robot's readings
-        jump from place to place.
+        not given: all of a small map; of a large one a few times those that a scan
+        holds, fewer where the robot's readings jump from place to place.
     **settings
         The other keywords of the base filter.
 
@@ -141,6 +149,9 @@ class CompressedEkfSlam:
         numpy.linalg.LinAlgError
             Where an innovation covariance is not positive definite, naming the
             reading; the belief is then as before, up to rounding.
+        MemoryError
+            Where the landmarks are more than memory holds; the belief is then as
+            before.
         """
         readings = validation.scan(measurements)
         ids = self._identities(landmark_ids, len(readings))
@@ -208,8 +219,15 @@ class CompressedEkfSlam:
         ------
         ValueError
             Where one is not in the map.
+        MemoryError
+            Where memory does not hold their covariance.
         """
         ids = validation.mapped_identities(landmark_ids, self._slots)
+        refuse_beyond_memory(
+            f"belief() of {len(ids)} landmarks",
+            2 * covariance_bytes(len(ids)),  # of which it takes a copy
+            "give landmark_ids",
+        )
         now = self._phase()
         near = {i: place for place, i in enumerate(self._near)}
         mean = np.zeros(3 + 2 * len(ids))
@@ -249,7 +267,13 @@ class CompressedEkfSlam:
     @property
     def nbytes(self) -> int:
         """Memory that the belief takes [bytes]."""
-        return self._far.nbytes + self._strip.nbytes + 2 * self._points.nbytes
+        local = covariance_bytes(len(self._near) + self._virtual)
+        far = self._far.nbytes + self._strip.nbytes + 2 * self._points.nbytes
+        return local + far
+
+    def memory_for(self, landmarks: int) -> int:
+        """Return what a map of so many landmarks takes at least [bytes]."""
+        return min(stored_bytes(landmarks), covariance_bytes(landmarks))
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of everything, as arrays; of a large map, much."""
@@ -297,69 +321,64 @@ class CompressedEkfSlam:
                 f"local_size must be >= {len(wanted)}, the mapped landmarks of one "
                 f"scan, got {self._local_size}"
             )
-        near = self._near
+        near, mapped = self._near, len(self._slots)
+        is_small = self._local_size is None and mapped <= local_map_choice.WHOLE
+        if is_small and len(near) == mapped:
+            return
         size = self._local_size or max(len(wanted) + self._extra, 30)
         if all(i in near for i in wanted) and 2 * len(near) <= 3 * size:
             return
-        self._rest = self._age >= _SHORT
-        self._age = 0
+        rest, extra = self._age >= local_map_choice.SHORT, self._extra
         if self._local_size is None:
-            most = 5 * max(len(wanted), 4) // 2
-            more = min(self._extra * 2 + 8, most)
-            self._extra = more if self._rest else self._extra // 2
-            size = max(len(wanted), 4) + self._extra
+            extra = spare_landmarks(extra, len(wanted), mapped, self._age)
+            size = mapped if is_small else max(len(wanted), 4) + extra
         self._regroup(wanted, size)
+        self._age, self._rest, self._extra = 0, rest, extra
 
     def _regroup(self, wanted: Sequence[int], size: int) -> None:
         """End the phase: settle with the map, choose a new local map, begin anew."""
-        state = self._local.state_dict()
-        now = cut(state["mean"], state["covariance"], self._virtual)
-        rows = self._settle(now, state["reference"])
+        refuse_beyond_memory(
+            f"a local map of {size} landmarks",
+            covariance_bytes(3 * size),  # with those that are virtual
+            "take a smaller local_size",
+        )
+        now = self._phase()
+        rows = self._settle(now)
         chosen = self._choose(wanted, size, now.mean)
         near, slot = list(self._near), self._slots.__getitem__
         staying = [k for k, i in enumerate(near) if i in chosen]
         places = {slot(i): k for k, i in enumerate(near) if i not in chosen}
         leaving = sorted(places)
         entering = sorted((i for i in chosen if i not in self._near), key=slot)
-        departing = rows[3 + pairs([places[s] for s in leaving])]
-        self._far.put(pairs(leaving), departing)
+        self._far.put(pairs(leaving), rows, 3 + pairs([places[s] for s in leaving]))
         columns = self._places(entering)
-        fresh = self._far.rows(columns)
-        kept = rows[np.r_[0:3, 3 + pairs(staying)]]
+        kept = np.r_[0:3, 3 + pairs(staying)]
         self._near = dict.fromkeys([near[k] for k in staying] + entering)
-        fresh[:, self._places([near[k] for k in staying])] = kept[3:, columns].T
-        self._strip = np.concatenate([kept, fresh])
+        self._strip = np.empty((len(kept) + len(columns), self._far.width))
+        self._strip[: len(kept)] = rows[kept]
+        fresh = self._strip[len(kept) :]
+        self._far.read(columns, fresh)
+        fresh[:, self._places([near[k] for k in staying])] = rows[
+            kept[3:, None], columns
+        ].T
         self._origin = now.mean[:2].copy()
-        self._begin(now, state)
+        self._begin()
 
-    def _begin(self, now: Phase, state: Mapping[str, Any]) -> None:
-        """Give the local filter the pose and the landmarks near, as of now."""
+    def _begin(self) -> None:
+        """Give the local filter the landmarks near, as of now."""
         columns = self._places(list(self._near))
-        mean = np.concatenate([now.mean[:3], self._points[columns]])
-        covariance = np.empty((len(mean), len(mean)))
-        covariance[:3, :3] = now.covariance[:3, :3]
-        local = self._strip[:, columns]
-        covariance[3:, :3], covariance[3:, 3:] = local[:3].T, local[3:]
-        symmetric(covariance)
-        self._virtual = 0
-        if len(self._slots) > len(self._near):
-            self._virtual = virtual_landmarks(len(mean), self._invariant)
-            mean, covariance = extend(mean, covariance, self._invariant)
-        reference = np.zeros(len(mean))
-        reference[:3] = state["reference"][:3]
-        reference[3 + 2 * self._virtual :] = self._references[columns]
-        virtual_ids = range(_LOWEST, _LOWEST + self._virtual)
-        self._local.load_state_dict(
-            {
-                "estimator": state["estimator"],
-                "mean": mean,
-                "covariance": covariance,
-                "reference": reference,
-                "landmark_ids": np.array([*virtual_ids, *self._near], dtype=np.int64),
-            }
+        whole = len(self._near) == len(self._slots)
+        local = 3 + len(columns)  # coordinates
+        self._virtual = 0 if whole else virtual_landmarks(local, self._invariant)
+        begin_phase(
+            self._local,
+            self._points[columns],
+            self._strip[:, columns],
+            self._references[columns],
+            [*range(_LOWEST, _LOWEST + self._virtual), *self._near],
         )
 
-    def _settle(self, now: Phase, reference: Array) -> Array:
+    def _settle(self, now: Phase) -> Array:
         """Bring the map up to date; return the rows of the local coordinates in it.
 
         Shape (a, width); of what the map's covariance loses only its factor is made.
@@ -383,7 +402,7 @@ class CompressedEkfSlam:
             rows = np.zeros((a, width))
         rows[:, columns] = now.covariance[:, 3:]
         self._points[columns] = now.mean[3:]
-        self._references[columns] = reference[3 + 2 * self._virtual :]
+        self._references[columns] = now.reference[3:]
         return rows
 
     def _choose(self, wanted: Sequence[int], size: int, mean: Array) -> dict[int, None]:
@@ -394,21 +413,17 @@ class CompressedEkfSlam:
         ids, slots = list(self._slots), np.array(list(self._slots.values()))
         ahead = mean[:2] + (mean[:2] - self._origin) / 2  # where it may be going
         points = self._points.reshape(-1, 2)[slots]
-        distances = ((points - ahead) ** 2).sum(axis=1)
-        count = min(size + len(wanted), len(ids))
-        nearest = np.argpartition(distances, count - 1)[:count]
-        for k in nearest[np.argsort(distances[nearest], kind="stable")].tolist():
+        for i in nearest_to(ahead, ids, points, size + len(wanted)):
             if len(chosen) >= size:
                 break
-            chosen[ids[k]] = None
+            chosen[i] = None
         return chosen
 
     def _combine(self, coefficients: Array, strip: Array) -> Array:
         return combine(coefficients, strip, self._invariant)
 
     def _phase(self) -> Phase:
-        state = self._local.state_dict()
-        return cut(state["mean"], state["covariance"], self._virtual)
+        return end_phase(self._local, self._virtual)
 
     def _places(self, ids: Sequence[int]) -> Int:
         """Columns of landmarks in the map's arrays."""

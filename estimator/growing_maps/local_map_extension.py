@@ -25,13 +25,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..ekf_slam import EkfSlam
+from .local_map_kernels import fill_extended, unpivot
+
 Array = NDArray[np.float64]
+
+
+# A filter's arrays may be larger than needed by this factor.
+_ROOMY = 3
 
 
 class Phase(NamedTuple):
     """The end result of a phase, cut into its parts."""
 
     mean: Array  # (a,) of pose and local landmarks
+    reference: Array  # (a,) where they are linearised, if a filter keeps that
     covariance: Array  # P_aa, (a, a)
     gain: Array  # Φ, (a, e)
     loss: Array  # Ψ, (e, e)
@@ -43,30 +51,58 @@ def virtual_landmarks(coordinates: int, invariant: bool) -> int:
     return coordinates if invariant else (coordinates + 1) // 2
 
 
-def extend(mean: Array, covariance: Array, invariant: bool) -> tuple[Array, Array]:
-    """Put the extension between pose and landmarks; return mean and covariance."""
-    s = len(mean)
-    e = 2 * virtual_landmarks(s, invariant)
-    real = np.r_[0:3, 3 + e : s + e]
-    long_mean, extended = np.zeros(s + e), np.zeros((s + e, s + e))
-    long_mean[real] = mean
-    extended[np.ix_(real, real)] = covariance
-    columns = 3 + np.arange(s) * (2 if invariant else 1)
-    extended[real, columns] = extended[columns, real] = 1.0
-    return long_mean, extended
+def begin_phase(
+    slam: EkfSlam, mean: Array, rows: Array, reference: Array, ids: list[int]
+) -> None:
+    """Give a filter a local map in place of its map, and the extension between.
+
+    Parameters
+    ----------
+    slam : EkfSlam
+        It keeps pose and covariance of the pose.
+    mean, reference : ndarray, shape (2n,)
+        Of the n local landmarks.
+    rows : ndarray, shape (3 + 2n, 2n)
+        Covariance of pose and local landmarks with these; the lower half counts.
+    ids : list of int
+        Identities of the virtual landmarks, which may be none, then of the local ones.
+    """
+    before, size = slam._size, 3 + 2 * len(ids)
+    pose, pose_mean = slam._covariance[:3, :3].copy(), slam._mean[:3].copy()
+    fixed = slam._reference[:3].copy()
+    if not size < len(slam._mean) <= _ROOMY * size:
+        slam._allocate(len(ids), more=len(ids) // 2)
+        before = 0
+    virtual = size - len(rows)
+    step = 2 if virtual == 2 * len(rows) else 1
+    for array, head, tail in (
+        (slam._mean, pose_mean, mean),
+        (slam._reference, fixed, reference),
+    ):
+        array[:before] = 0.0
+        array[:3], array[3 + virtual : size] = head, tail
+    fill_extended(slam._covariance, before, pose, rows, virtual, step)
+    slam._slots = {i: slot for slot, i in enumerate(ids)}
+    slam._size = size
 
 
-def cut(mean: Array, covariance: Array, virtual: int) -> Phase:
-    """Take apart the belief of a filter that ran on an extended state."""
-    pose, extension, rest = slice(0, 3), slice(3, 3 + 2 * virtual), 3 + 2 * virtual
-    rows = np.concatenate([covariance[pose], covariance[rest:]])
+def end_phase(slam: EkfSlam, virtual: int) -> Phase:
+    """Take apart the belief of a filter that ran on an extended state; all copies."""
+    size, rest = slam._size, 3 + 2 * virtual
+    covariance = slam._covariance[:size, :size]
+    rows = np.concatenate([covariance[:3], covariance[rest:]])
     return Phase(
-        np.concatenate([mean[pose], mean[rest:]]),
-        np.concatenate([rows[:, pose], rows[:, rest:]], axis=1),
-        np.ascontiguousarray(rows[:, extension]),
-        -covariance[extension, extension],
-        mean[None, extension].copy(),
+        _without(slam._mean[:size], rest),
+        _without(slam._reference[:size], rest),
+        np.concatenate([rows[:, :3], rows[:, rest:]], axis=1),
+        rows[:, 3:rest].copy(),
+        -covariance[3:rest, 3:rest],
+        slam._mean[None, 3:rest].copy(),
     )
+
+
+def _without(vector: Array, rest: int) -> Array:
+    return np.concatenate([vector[:3], vector[rest:]])
 
 
 def combine(coefficients: Array, strip: Array, invariant: bool) -> Array:
@@ -91,21 +127,23 @@ def roots(loss: Array, invariant: bool) -> tuple[Array, Array]:
     signs : ndarray, shape (rank,)
         s, each 1 or -1.
     """
+    if not invariant:
+        return _by_pivots(loss)
     used = np.flatnonzero(loss.any(axis=0))
-    part = loss[used[:, None], used]  # of which the lower half is read
-    root, signs = _by_eigenvalues(part) if invariant else _by_pivots(part)
+    root, signs = _by_eigenvalues(loss[used[:, None], used])
     rows = np.zeros((len(root), len(loss)))
     rows[:, used] = root
     return rows, signs
 
 
-def _by_pivots(part: Array) -> tuple[Array, Array]:
+def _by_pivots(loss: Array) -> tuple[Array, Array]:
     """Pivoted Cholesky decomposition of a semidefinite matrix."""
     from scipy.linalg.lapack import dpstrf  # noqa: PLC0415 (slow to import)
 
-    factor, pivots, rank, _ = dpstrf(part, lower=True)
-    root = np.zeros((rank, len(part)))
-    root[:, pivots - 1] = np.tril(factor)[:, :rank].T
+    used = np.flatnonzero(loss.diagonal())
+    factor, pivots, rank, _ = dpstrf(loss[used[:, None], used], lower=True)
+    root = np.zeros((rank, len(loss)))
+    unpivot(factor.T, used[pivots - 1], root)
     return root, np.ones(rank)
 
 

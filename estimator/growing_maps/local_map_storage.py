@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..memory import refuse_beyond_memory
 from .local_map_kernels import read_columns, write_columns
 
 Array = NDArray[np.float64]
@@ -62,13 +63,26 @@ class DeferredCovariance:
         return sum(array.nbytes for array in self._blocks + roots)
 
     def make_room(self, columns: int) -> None:
-        """Append blocks of zeros until there are at least so many columns."""
+        """Append blocks of zeros until there are at least so many columns.
+
+        Raises
+        ------
+        MemoryError
+            Where they are more than memory holds; nothing is then appended.
+        """
+        if self.width >= columns:
+            return
+        refuse_beyond_memory(
+            f"half a covariance of {columns // 2} landmarks",
+            stored_bytes(columns // 2),
+            "'submaps' and 'sparse_information' take less",
+            held=stored_bytes(self.width // 2),
+        )
         while self.width < columns:
             self._blocks.append(np.zeros((BLOCK, self.width + BLOCK)))
 
-    def rows(self, columns: Int) -> Array:
-        """Return rows (c, width) of ascending columns, what is pending taken off."""
-        rows = np.empty((len(columns), self.width))
+    def read(self, columns: Int, rows: Array) -> None:
+        """Fill rows (c, width), of ascending columns, what is pending taken off."""
         bounds = self._bounds(columns)
         for (first, block), start, end in zip(
             self._enumerate(), bounds, bounds[1:], strict=False
@@ -82,17 +96,17 @@ class DeferredCovariance:
                 done = self._done * BLOCK
                 missing[columns < done, :done] = 0.0
             rows[:, : len(root)] -= missing
-        return rows
 
-    def put(self, columns: Int, rows: Array) -> None:
-        """Store rows (c, width) of ascending columns, complete as they are."""
+    def put(self, columns: Int, rows: Array, places: Int) -> None:
+        """Store the rows of ascending columns (c,), which stand at ``places`` (c,)."""
         bounds = self._bounds(columns)
         for (first, block), start, end in zip(
             self._enumerate(), bounds, bounds[1:], strict=False
         ):
             if end > start:
-                block[columns[start:end] - first] = rows[start:end, : first + BLOCK]
-            write_columns(block, first, columns[:end], rows)
+                own = rows[places[start:end], : first + BLOCK]
+                block[columns[start:end] - first] = own
+            write_columns(block, first, columns[:end], rows, places)
         for root, _ in self._pending:  # nothing is, any longer, for these
             root[columns[columns < len(root)]] = 0.0
 
@@ -227,6 +241,12 @@ class DeferredCovariance:
             trans_a=True,
             overwrite_c=True,
         )
+
+
+def stored_bytes(landmarks: int) -> int:
+    """Return the size of the blocks for so many landmarks [bytes]."""
+    blocks = -(-2 * landmarks // BLOCK)
+    return 8 * BLOCK**2 * blocks * (blocks + 1) // 2
 
 
 def _of(root: Array, columns: Int) -> Array:

@@ -121,7 +121,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
             validation.one_of("sparsify", sparsify, ("relocate", "prune")) == "prune",
         )
         self._tolerance = validation.at_least("tolerance", tolerance, 0.0)
-        self._belief_limit = validation.whole("belief_limit", belief_limit, 1)
+        self.belief_limit = validation.whole("belief_limit", belief_limit, 1)
         self.reset(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
@@ -272,9 +272,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
             Where one is not in the map, or they are more than ``belief_limit``.
         """
         ids = validation.mapped_identities(landmark_ids, self._slots)
-        validation.refuse_large_belief(
-            len(ids), self._belief_limit, "give landmark_ids"
-        )
+        validation.refuse_large_belief(len(ids), self.belief_limit, "give landmark_ids")
         slots = np.array([self._slots[i] for i in ids], dtype=np.int64)
         answer = marginal(
             self._world, self._local, self._everything(), self._pose, slots

@@ -118,7 +118,7 @@ class SubmapSlam:
         self._submap_size = validation.whole("submap_size", submap_size, 1)
         self._heading_limit = _limit("heading_limit", heading_limit)
         self._extent_limit = _limit("extent_limit", extent_limit)
-        self._belief_limit = validation.whole("belief_limit", belief_limit, 1)
+        self.belief_limit = validation.whole("belief_limit", belief_limit, 1)
         self._folder = None if folder is None else FolderStore(folder)
         self.reset(initial_pose, initial_pose_std)
 
@@ -252,7 +252,7 @@ class SubmapSlam:
         """
         ids = validation.mapped_identities(landmark_ids, self._run.slots)
         instead = "give landmark_ids, call local_belief()"
-        validation.refuse_large_belief(len(ids), self._belief_limit, instead)
+        validation.refuse_large_belief(len(ids), self.belief_limit, instead)
         return self._run.belief(tuple(ids), remember=landmark_ids is None)
 
     def local_belief(self) -> Belief:

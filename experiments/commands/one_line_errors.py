@@ -62,7 +62,7 @@ def message_of(error: Exception) -> str:
         return _one_line(error.format_message())
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    if isinstance(error, ValueError | OSError | ImportError):
+    if isinstance(error, ValueError | OSError | ImportError | MemoryError):
         return _one_line(str(error))
     what = f"{type(error).__name__}: {_one_line(str(error))}"
     return f"internal error, {what} (SLAMGYM_TRACEBACK=1 shows where)"

@@ -10,6 +10,7 @@ from ...estimator.batch import BatchSlam, BatchTrace, can_batch
 from ...estimator.ekf_slam import EkfSlam
 from ...estimator.interface import Belief, SlamEstimator
 from ..filter_settings import FilterSettings
+from ..map_memory import refuse_large_maps
 from ..simulated_runs import SimulatedRuns
 
 Array = NDArray[np.float64]
@@ -55,6 +56,7 @@ def filter_runs(
         Over which a batch is shared out; all cores where not given.
     """
     first = settings.make(runs.initial_poses[0])
+    refuse_large_maps(runs, first, at_once=can_batch(first))
     if can_batch(first):
         return _in_a_batch(cast(EkfSlam, first), settings, runs, threads)
     count, steps, _ = runs.visible.shape
