@@ -47,6 +47,7 @@ FULL = {  # of each filter the one that it is to be, None where it is another
         "compressed[base=invariant,local_size=8]": "invariant",
         "submaps[submap_size=8]": None,
         "sparse_information[active_bound=8]": None,
+        "sparse_information[base=observability_constrained,active_bound=8]": None,
     },
     "city": {
         "ekf": None,
@@ -55,6 +56,7 @@ FULL = {  # of each filter the one that it is to be, None where it is another
         "compressed[base=invariant,local_size=40]": "invariant",
         "submaps": None,
         "sparse_information": None,
+        "sparse_information[base=observability_constrained]": None,
     },
 }
 COLUMNS = (

@@ -65,6 +65,9 @@ KINDS = {
     "compressed, invariant": _kind(CompressedEkfSlam, 3000, base="invariant"),
     "submaps": _kind(SubmapSlam, 100_000, submap_size=50),
     "sparse_information": _kind(SparseInformationSlam, 100_000),
+    "sparse_information, constrained": _kind(
+        SparseInformationSlam, 3000, base="observability_constrained"
+    ),
 }
 
 

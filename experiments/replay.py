@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..estimator.interface import Belief, SlamEstimator, UpdateReport
 from ..estimator.landmark_management.map_access import (
     at_once,
-    looks_around,
+    joins,
     mapped_ids,
     view_of,
 )
@@ -138,7 +138,7 @@ def replay(
     steps = list(steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     tell_truth = _truth_teller(estimator, log, times)
-    most = _MOST_JOINED if looks_around(estimator) else _MOST_MAPS
+    most = _MOST_JOINED if joins(estimator) else _MOST_MAPS
     history = MapHistory(None if keep_history else most)
     recorder = _Recorder(estimator, len(steps), history)
     for number, step in enumerate(steps):
@@ -231,7 +231,7 @@ class _Recorder:
             self._meet_new(mapped_ids(self._slam))
         if step == self._steps - 1:
             self.belief = self._slam.belief()
-            if looks_around(self._slam):  # the last word is that of the joined map
+            if joins(self._slam):  # the last word is that of the joined map
                 self._updated.put(step, self.belief)
         if step == self._steps - 1 or self._history.is_due(step, self._ids):
             self._history.append(view_of(self._slam))

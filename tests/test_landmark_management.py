@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 from scipy.stats import chi2
+from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import check_estimator, list_estimators, make_estimator
 from slamgym.estimator.consistency import normalised_squared_error
@@ -18,6 +19,7 @@ from slamgym.estimator.landmark_management.landmark_policy import (
     LandmarkPolicy,
     as_policy,
 )
+from slamgym.estimator.landmark_management.managed import ManagedSlam
 from slamgym.estimator.landmark_management.map_editing import separation
 from slamgym.experiments.filter_settings import settings_for
 from slamgym.experiments.replay import replay
@@ -194,6 +196,52 @@ def test_a_reading_that_could_be_of_two_landmarks_is_left_out():
     assert report.row_ids == (None,)
     assert report.degrees_of_freedom == 0
     assert slam.update([(0.0, 1e-9)]).ambiguous_rows == (0,)  # too close to tell
+
+
+class WithoutAWindow:
+    """A filter as it is, but for its view of what is around the robot."""
+
+    def __init__(self, name, **options):
+        self._slam = make_estimator(name, **options)
+
+    def __getattr__(self, name):
+        if name == "view_around":
+            raise AttributeError(name)
+        return getattr(self._slam, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("compressed", {}),
+        ("compressed", {"base": "invariant"}),
+        ("sparse_information", {}),
+    ],
+)
+def test_to_look_around_the_robot_decides_the_same_as_to_look_at_the_whole_map(
+    name, options
+):
+    noise = {"motion_std": TOWN_MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    noise["initial_pose_std"] = (0.5, 0.5, 0.02)  # landmarks may be elsewhere
+    policy = LandmarkPolicy(**TIDY | {"capacity": 420, "view": FieldOfView(15.0)})
+    near = make_estimator(name, management=policy, **noise, **options)
+    whole = ManagedSlam(
+        partial(WithoutAWindow, name), management=policy, **noise, **options
+    )
+    for slam in (near, whole):
+        map_all(slam, 300)
+    changed = False
+    for odometry, readings, _ in wander(300, 30):
+        for slam in (near, whole):
+            slam.predict(odometry)
+        one, other = near.update(readings), whole.update(readings)
+        assert one.row_ids == other.row_ids
+        assert one.ambiguous_rows == other.ambiguous_rows
+        assert one.removed_ids == other.removed_ids
+        assert one.merged_ids == other.merged_ids
+        changed |= bool(one.removed_ids or one.merged_ids)
+    assert changed
+    assert len(near.filter.view_around(15.0).ids) < len(near.landmark_ids) - 100
 
 
 def test_new_identities_are_never_used_twice():

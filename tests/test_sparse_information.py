@@ -312,6 +312,21 @@ def test_what_waits_far_from_the_robot_is_within_the_tolerance():
     assert deviation(1e-6)[0] < 1e-3
 
 
+def test_a_map_of_separate_parts_can_be_asked_for_any_part():
+    """Scans of new landmarks alone leave the local map without a link to the rest."""
+    slam, rng = SparseInformationSlam(*NOISE), np.random.default_rng(0)
+    for first in range(0, 400, 50):
+        slam.belief([])
+        scan = np.column_stack([rng.uniform(-3, 3, 50), rng.uniform(5, 60, 50)])
+        slam.update(scan, range(first, first + 50))
+        whole, ids = slam.belief(), slam.landmark_ids[::7]
+        part, columns = slam.belief(ids), np.r_[0:3, 3 + pairs(np.array(ids))]
+        np.testing.assert_allclose(part.mean, whole.mean[columns], atol=1e-12)
+        np.testing.assert_allclose(
+            part.covariance, whole.covariance[np.ix_(columns, columns)], atol=1e-12
+        )
+
+
 def test_removing_landmarks_changes_nothing_about_the_others():
     slam = run(SparseInformationSlam(*NOISE, active_bound=12), wander(1000, 300))
     before = slam.belief()

@@ -11,7 +11,7 @@ from ..ekf_slam import FRAMES, EkfSlam
 from ..interface import Belief, UpdateReport
 from ..invariant import InvariantEkfSlam
 from ..iterated import IteratedEkfSlam
-from ..landmark_management.map_access import access_to
+from ..landmark_management.map_access import MapView, access_to
 from ..memory import covariance_bytes, refuse_beyond_memory
 from ..observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
 from ..validation import LandmarkIds
@@ -253,6 +253,21 @@ class CompressedEkfSlam:
             del block  # it may be large, and the belief takes a copy
         frame = FRAMES[self._local.rules.frame]
         return Belief(mean, covariance, tuple(ids), frame)
+
+    def view_around(self, within: float) -> MapView:
+        """Look at the pose, and at the landmarks that may be so near [m].
+
+        Up to 5σ nearer than they seem to be; those of the local map in any case.
+        """
+        pose, ids = self.belief([]), self.landmark_ids
+        far = [i for i in ids if i not in self._near]
+        columns = self._places(far)
+        away = np.hypot(*(self._points[columns].reshape(-1, 2) - pose.pose[:2]).T)
+        variances = self._far.diagonal()[columns].reshape(-1, 2).sum(axis=1)
+        std = np.sqrt(variances) + np.sqrt(np.trace(pose.covariance[:2, :2]))
+        left_out = {far[k] for k in np.flatnonzero(away > within + 5 * std)}
+        belief = self.belief([i for i in ids if i not in left_out])
+        return MapView(belief.mean, belief.covariance, belief.landmark_ids, ids)
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:

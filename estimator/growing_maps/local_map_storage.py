@@ -151,6 +151,11 @@ class DeferredCovariance:
             covariance[np.ix_(own, upto)] = part
         return symmetric(covariance)
 
+    def diagonal(self) -> Array:
+        """Return the variances as stored, shape (width,): nothing pending taken off."""
+        diagonals = [block.diagonal(first) for first, block in self._enumerate()]
+        return np.concatenate([np.empty(0), *diagonals])
+
     def state_dict(self) -> dict[str, Any]:
         """Return copies of everything, as arrays."""
         rank = [len(downdate.signs) for downdate in self._pending]

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import validation
 from ..angles import wrap_angle
 from ..interface import Belief, UpdateReport
+from ..landmark_management.map_access import MapView
 from ..validation import LandmarkIds
 from .coordinates import pairs
 from .information_matrix import Surroundings
@@ -279,6 +280,19 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         )
         return Belief(answer.mean, answer.covariance, tuple(ids), "additive")
 
+    def view_around(self, within: float) -> MapView:
+        """Look at the pose, and at the landmarks that may be so near [m].
+
+        Up to 10σ of the robot's position nearer than they seem to be: what is near the
+        robot is hardly known worse than the robot itself.
+        """
+        pose, ids = self.belief([]), self.landmark_ids
+        away = np.hypot(*(self.landmarks - pose.pose[:2]).T)
+        reach = within + 10 * np.sqrt(np.trace(pose.covariance[:2, :2]))
+        near = [ids[place] for place in np.flatnonzero(away <= reach)]
+        belief = self.belief(near)
+        return MapView(belief.mean, belief.covariance, belief.landmark_ids, ids)
+
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The mapped landmarks, in the order of the belief."""
@@ -382,7 +396,8 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         self._local, self._pose = begin(self._world, pose, slots, reach)
         self._reach = reach
         around = self._local.surroundings
-        self._others = None if len(around.response) else around
+        is_all = len(slots) + len(around.slots) == len(self._slots)
+        self._others = around if is_all and not len(around.response) else None
 
     def _everything(self) -> Surroundings:
         """All landmarks but the local ones, eliminated."""

@@ -25,6 +25,8 @@ from .scan_plan import Newcomers, ScanPlan
 Array = NDArray[np.float64]
 
 _PARTS = ("filter", "landmarks", "tentative")
+# What a filter may have besides, with which management does nothing.
+_DOORS = ("observe_truth", "view_around", "join", "memory_for", "belief_limit")
 
 
 class ManagedSlam:
@@ -97,10 +99,9 @@ class ManagedSlam:
         self._door = RememberedAccess(access_to(self._filter, merging=merging))
         self._upkeep = MapUpkeep(self._policy, self._door, noise)
         self._newcomers = Newcomers()
-        if hasattr(self._filter, "observe_truth"):
-            self.observe_truth = self._filter.observe_truth
-        if hasattr(self._filter, "view_around"):
-            self.view_around = self._filter.view_around
+        for name in _DOORS:
+            if hasattr(self._filter, name):
+                setattr(self, name, getattr(self._filter, name))
 
     @property
     def policy(self) -> LandmarkPolicy:

@@ -118,19 +118,19 @@ def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
 def at_once(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     """Return the same as the filter has it without joining anything, if it can tell.
 
-    Of a filter that looks around (``view_around``) it is what that view tells, so far
-    as it holds these landmarks; its error is then to be judged in the invariant frame.
+    Of one that joins its map (``join``) it is what ``view_around`` tells, so far as
+    that holds these landmarks; its error is then to be judged in the invariant frame.
     """
-    view = _around(slam, 0.0) if looks_around(slam) else None
+    view = _around(slam, 0.0) if joins(slam) else None
     if view is None or not set(ids) <= set(view.ids):
         return marginal(slam, ids)
     order = {i: slot for slot, i in enumerate(view.ids)}
     return _part(view.mean, view.covariance, order, ids, "invariant")
 
 
-def looks_around(slam: SlamEstimator) -> bool:
-    """Whether a filter can show the surroundings of the robot by themselves."""
-    return callable(getattr(slam, "view_around", None))
+def joins(slam: SlamEstimator) -> bool:
+    """Whether a filter has to join its map before it can tell of it."""
+    return callable(getattr(slam, "join", None))
 
 
 def _around(slam: Any, within: float) -> MapView:
@@ -192,15 +192,17 @@ class RememberedAccess:
         self._view: MapView | None = None
         self._within = 0.0
 
-    def map_view(self, within: float = 0.0) -> MapView:
-        """Look at pose and map, or remember."""
-        if self._view is None or within > self._within:
-            self._view, self._within = self._door.map_view(within), within
+    def map_view(self, within: float | None = None) -> MapView:
+        """Look at pose and map, or remember; as far as the last time where not said."""
+        reach = self._within if within is None else within
+        if self._view is None or reach > self._within:
+            self._view = self._door.map_view(reach)
+        self._within = reach
         return self._view
 
     def expire(self) -> None:
         """Forget the view: the filter has taken a step."""
-        self._view, self._within = None, 0.0
+        self._view = None
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks."""
@@ -253,7 +255,7 @@ class _OwnAccess:
         self._slam = slam
 
     def map_view(self, within: float = 0.0) -> MapView:
-        if looks_around(self._slam):
+        if callable(getattr(self._slam, "view_around", None)):
             return _around(self._slam, within)
         return view_of(self._slam)
 
