@@ -90,12 +90,19 @@ def given_identities(
     return []
 
 
-def mapped_identities(
+def asked_identities(
     landmark_ids: LandmarkIds | None, mapped: Mapping[int, int]
 ) -> list[int]:
     """Return ids of mapped landmarks without repetition, all of them for None."""
     if landmark_ids is None:
         return list(mapped)
+    return mapped_identities(landmark_ids, mapped)
+
+
+def mapped_identities(
+    landmark_ids: LandmarkIds, mapped: Mapping[int, int]
+) -> list[int]:
+    """Return ids of mapped landmarks, without repetition."""
     ids = identities(landmark_ids, np.size(landmark_ids))
     for i in ids:
         if i not in mapped:

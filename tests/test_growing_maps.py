@@ -253,6 +253,15 @@ REMOVING = {
 }
 
 
+@pytest.mark.parametrize("name", ["compressed", "sparse_information", "submaps"])
+def test_nobody_removes_everything_by_saying_nothing(name):
+    slam = of_city(name)
+    slam.update([(0.1, 3.0), (0.9, 4.0)], [7, 9])
+    with pytest.raises(ValueError, match="landmark_ids must be integers, got None"):
+        slam.remove(None)
+    assert slam.landmark_ids == (7, 9)
+
+
 @pytest.mark.parametrize("way", REMOVING)
 def test_removal_changes_no_other_marginal_near_or_far(way):
     name, options = REMOVING[way]

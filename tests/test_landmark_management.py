@@ -555,12 +555,39 @@ def test_a_foreign_state_is_refused():
     slam, other = make(management=TIDY), make(management=None)
     busy_run(slam, 8)
     before = slam.state_dict()
-    with pytest.raises(ValueError, match=r"state must hold 'filter\.estimator'"):
+    with pytest.raises(ValueError, match=r"state must hold 'landmarks\."):
         slam.load_state_dict(other.state_dict())
     with pytest.raises(ValueError, match=r"state is of InvariantEkfSlam"):
         slam.load_state_dict(make("invariant", TIDY).state_dict())
     after = slam.state_dict()
     assert all(np.array_equal(before[key], after[key]) for key in after)
+
+
+@pytest.mark.parametrize("name", MANAGEABLE)
+def test_a_filter_that_went_on_takes_back_what_it_saved(name):
+    slam = make(name, TIDY)
+    unrun = slam.state_dict()
+    busy_run(slam, 8)
+    early = slam.state_dict()
+    busy_run(slam, 17, start=8)
+    expected = slam.state_dict()
+    for saved, start in ((early, 8), (unrun, 0)):
+        slam.load_state_dict(saved)
+        busy_run(slam, 25 - start, start=start)
+        state = slam.state_dict()
+        assert all(np.array_equal(v, state[k]) for k, v in expected.items())
+
+
+def test_a_damaged_state_leaves_all_as_it_was():
+    slam = make(management=TIDY)
+    busy_run(slam, 8)
+    before = slam.state_dict()
+    busy_run(slam, 8, start=8)
+    now = slam.state_dict()
+    with pytest.raises(ValueError, match="unpack"):
+        slam.load_state_dict(before | {"landmarks.apart": np.zeros((2, 3), dtype=int)})
+    after = slam.state_dict()
+    assert all(np.array_equal(now[key], after[key]) for key in now)
 
 
 def test_reset_forgets_everything():

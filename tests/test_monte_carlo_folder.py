@@ -155,6 +155,19 @@ def test_a_folder_is_merged_from_while_it_is_written(at_work, tmp_path, whole):
         xr.testing.assert_equal(copied.load(), whole.isel(run=slice(0, 4)))
 
 
+def test_a_fresh_job_stopped_at_once_leaves_no_results_of_the_one_before(tmp_path):
+    monte_carlo(**JOB, runs=4, out=tmp_path).close()
+
+    def stop(done, runs):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        monte_carlo(
+            **JOB | {"seed": 99}, runs=4, out=tmp_path, fresh=True, progress=stop
+        )
+    assert not (tmp_path / "results.nc").exists()
+
+
 def test_the_same_process_does_not_write_twice_at_once(tmp_path, whole):
     told = []
 

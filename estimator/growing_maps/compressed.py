@@ -222,7 +222,7 @@ class CompressedEkfSlam:
         MemoryError
             Where memory does not hold their covariance.
         """
-        ids = validation.mapped_identities(landmark_ids, self._slots)
+        ids = validation.asked_identities(landmark_ids, self._slots)
         refuse_beyond_memory(
             f"belief() of {len(ids)} landmarks",
             2 * covariance_bytes(len(ids)),  # of which it takes a copy

@@ -272,7 +272,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             Where one is not in the map, or they are more than ``belief_limit``.
         """
-        ids = validation.mapped_identities(landmark_ids, self._slots)
+        ids = validation.asked_identities(landmark_ids, self._slots)
         validation.refuse_large_belief(len(ids), self.belief_limit, "give landmark_ids")
         slots = np.array([self._slots[i] for i in ids], dtype=np.int64)
         answer = marginal(

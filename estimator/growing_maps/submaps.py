@@ -250,7 +250,7 @@ class SubmapSlam:
             Where the submaps contradict each other so that they cannot be joined, or
             where their covariances are degenerate.
         """
-        ids = validation.mapped_identities(landmark_ids, self._run.slots)
+        ids = validation.asked_identities(landmark_ids, self._run.slots)
         instead = "give landmark_ids, call local_belief()"
         validation.refuse_large_belief(len(ids), self.belief_limit, instead)
         return self._run.belief(tuple(ids), remember=landmark_ids is None)

@@ -24,7 +24,6 @@ from .scan_plan import Newcomers, ScanPlan
 
 Array = NDArray[np.float64]
 
-_PARTS = ("filter", "landmarks", "tentative")
 # What a filter may have besides, with which management does nothing.
 _DOORS = ("observe_truth", "view_around", "join", "memory_for", "belief_limit")
 
@@ -201,15 +200,7 @@ class ManagedSlam:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filter's state and what is remembered of landmarks, as arrays."""
-        parts = (
-            self._filter.state_dict(),
-            self._upkeep.state_dict(),
-            self._newcomers.state_dict(),
-        )
-        state: dict[str, Any] = {"estimator": np.array(type(self).__name__)}
-        for name, part in zip(_PARTS, parts, strict=True):
-            state |= {f"{name}.{key}": value for key, value in part.items()}
-        return state
+        return self._remembered() | _named("filter", self._filter.state_dict())
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit under the same settings.
@@ -221,20 +212,25 @@ class ManagedSlam:
             before.
         """
         name = type(self).__name__
-        validation.refuse_other_state(state, self.state_dict(), estimator=name)
-        inner, landmarks, tentative = (_part_of(state, name) for name in _PARTS)
-        newcomers, before = (
-            Newcomers.from_state_dict(tentative),
-            self._upkeep.state_dict(),
-        )
-        self._upkeep.load_state_dict(landmarks)
+        validation.refuse_other_state(state, self._remembered(), estimator=name)
+        newcomers = Newcomers.from_state_dict(_part_of(state, "tentative"))
+        before = self._upkeep.state_dict()
         try:
-            self._filter.load_state_dict(inner)
+            self._upkeep.load_state_dict(_part_of(state, "landmarks"))
+            self._filter.load_state_dict(_part_of(state, "filter"))
         except Exception:
             self._upkeep.load_state_dict(before)
             raise
         self._door.expire()
         self._newcomers = newcomers
+
+    def _remembered(self) -> dict[str, Any]:
+        """Return all of the state but the filter's."""
+        return {
+            "estimator": np.array(type(self).__name__),
+            **_named("landmarks", self._upkeep.state_dict()),
+            **_named("tentative", self._newcomers.state_dict()),
+        }
 
     def _planned(self, readings: Array, landmark_ids: LandmarkIds | None) -> ScanPlan:
         plan = ScanPlan(self._policy, self._newcomers, len(readings))
@@ -272,6 +268,10 @@ class ManagedSlam:
         merged = self._upkeep.merge(seen)
         removed += self._upkeep.keep_capacity(seen)
         return report._replace(removed_ids=tuple(removed), merged_ids=tuple(merged))
+
+
+def _named(name: str, part: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"{name}.{key}": value for key, value in part.items()}
 
 
 def _part_of(state: Mapping[str, Any], name: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from ...envs.atomic_file import replace_when_written
 from ..sole_writer import sole_writer
 
 FORMAT = "slamgym monte carlo 1"
-JOB, BLOCKS = "job.json", "blocks"
+JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
 _WRITER = ".writer"
 _PARTIAL = re.compile(
     r"\.(job\.[0-9a-f]{8}\.json|results\.[0-9a-f]{8}\.nc"
@@ -56,8 +56,8 @@ def claimed(
             for rest in (*path.iterdir(), *(path / BLOCKS).glob(".*")):
                 if _PARTIAL.fullmatch(rest.name):
                     rest.unlink()
-            for block in blocks_in(path) if fresh else ():
-                block.unlink()
+            for old in (*blocks_in(path), path / RESULTS) if fresh else ():
+                old.unlink(missing_ok=True)
             with replace_when_written(path / JOB) as partial:
                 text = json.dumps(identity, indent=2, ensure_ascii=False)
                 partial.write_text(text + "\n", encoding="utf-8")

@@ -13,6 +13,7 @@ import xarray as xr
 
 from ... import __version__
 from ...envs.atomic_file import replace_when_written
+from .job_folder import RESULTS
 from .result_blocks import Job, Span
 from .run_measures import VARIABLES, Block
 
@@ -90,7 +91,7 @@ def load_results(path: str | Path) -> xr.Dataset:
         If the file is not one, or not whole.
     """
     file = Path(path)
-    file = file / "results.nc" if file.is_dir() else file
+    file = file / RESULTS if file.is_dir() else file
     if not file.exists():
         raise ValueError(f"{file} does not exist")
     try:

@@ -26,6 +26,7 @@ from ..filter_settings import FilterSettings
 from ..simulated_runs import simulate_runs
 from .estimator_choices import EstimatorChoice, estimator_choices
 from .filtered_runs import filter_runs
+from .job_folder import RESULTS
 from .result_blocks import BlockFolder, Job, Span
 from .results import dataset_of, load_results, write_results
 from .run_measures import Block, measure_runs
@@ -40,7 +41,6 @@ Workers = Callable[[Iterable[Call]], Iterable[Any]]
 BACKENDS = ("loky", "threading", "dask", "ray")
 BLOCK_SIZE = 64
 _LARGEST = 2**63  # what a file of results can hold
-RESULTS = "results.nc"
 
 
 @dataclass(frozen=True)
