@@ -50,6 +50,7 @@ def check_estimator(factory: Factory) -> None:
         _check_motion,
         _check_mapping,
         _check_update,
+        _check_second_reading,
         _check_empty_scan,
         _check_snapshots,
         _check_refusals,
@@ -200,6 +201,28 @@ def _check_update(factory: Factory) -> None:
         np.trace(after.covariance) <= np.trace(belief.covariance) + 1e-12,
         "update() must not make the belief less certain",
     )
+
+
+def _check_second_reading(factory: Factory) -> None:
+    """Read a landmark behind the robot from both sides of the jump of the bearing."""
+    for bearing in (3.13, -3.13):
+        estimator = _make(factory)
+        estimator.update([(bearing, 3.0)], [0])
+        variance = np.trace(estimator.belief().covariance)
+        nis = estimator.update([(-bearing, 3.0)], [0]).nis
+        belief = estimator.belief()
+        error = float(np.linalg.norm(belief.landmarks - (-3.0, 0.0)))
+        _expect(
+            nis < 10 and error < 0.1,
+            f"bearings {bearing} and {-bearing} rad are next to each other: update() "
+            f"must wrap the innovation to [-π, π), got NIS {nis:.2g} and a landmark "
+            f"{error:.2g} m off",
+        )
+        _expect(
+            np.trace(belief.covariance) < variance,
+            "update() must make the belief more certain: a second reading of a "
+            "landmark must shrink its covariance",
+        )
 
 
 def _check_empty_scan(factory: Factory) -> None:

@@ -110,6 +110,12 @@ def mapped_identities(
     return ids
 
 
+def two_landmarks(kept: int, gone: int) -> None:
+    """Refuse to make one landmark of one."""
+    if kept == gone:
+        raise ValueError(f"kept and gone must be two landmarks, got {kept} twice")
+
+
 def refuse_unusable(readings: Array, ids: Sequence[int]) -> None:
     """Refuse readings that are not finite or too large, naming the first."""
     for usable, rule in (

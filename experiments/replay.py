@@ -15,6 +15,7 @@ from ..estimator.landmark_management.map_access import (
     mapped_ids,
     view_of,
 )
+from .blas_threads import one_blas_thread
 from .log_events import Scan
 from .log_steps import Step, predictions, steps_of
 from .map_history import MapHistory
@@ -141,14 +142,15 @@ def replay(
     most = _MOST_JOINED if joins(estimator) else _MOST_MAPS
     history = MapHistory(None if keep_history else most)
     recorder = _Recorder(estimator, len(steps), history)
-    for number, step in enumerate(steps):
-        try:
-            tell_truth(number)
-            _take(step, log, estimator, recorder)
-        except ValueError as error:
-            raise _kind(error)(f"{log.name}, t = {step.t:g}: {error}") from error
-        if progress is not None:
-            progress(number + 1, len(steps))
+    with one_blas_thread():
+        for number, step in enumerate(steps):
+            try:
+                tell_truth(number)
+                _take(step, log, estimator, recorder)
+            except ValueError as error:
+                raise _kind(error)(f"{log.name}, t = {step.t:g}: {error}") from error
+            if progress is not None:
+                progress(number + 1, len(steps))
     trace = recorder.trace(name or _name_of(estimator), times, log)
     scans = sum(step.scan is not None for step in steps)
     return Replay(

@@ -1,3 +1,6 @@
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -12,6 +15,7 @@ from slamgym.estimator import (
     register_estimator,
 )
 
+TEXTBOOK = Path(__file__).parents[1] / "examples" / "05_your_own_estimator.py"
 NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
 
 
@@ -132,6 +136,15 @@ class RaisesAtNan(EkfSlam):
         return super().update(measurements, landmark_ids)
 
 
+class NeverGrowsCertain(EkfSlam):
+    def update(self, measurements, landmark_ids=None):
+        n = self._size
+        before = self._covariance[:n, :n].copy()
+        report = super().update(measurements, landmark_ids)
+        self._covariance[:n, :n] = before
+        return report
+
+
 @pytest.mark.parametrize(
     ("estimator", "complaint"),
     [
@@ -142,6 +155,7 @@ class RaisesAtNan(EkfSlam):
         (ForgetsItsMap, "bit for bit"),
         (IgnoresBearings, "must be mapped where it is"),
         (Overconfident, "must fit its covariance"),
+        (NeverGrowsCertain, "a second reading of a landmark must shrink"),
         (AddsNoNoise, "noise"),
         (KeepsItsMapOnReset, "reset"),
         (ReturnsNothing, "must return an UpdateReport, got NoneType"),
@@ -156,6 +170,28 @@ class RaisesAtNan(EkfSlam):
 def test_a_breach_of_the_contract_is_named(estimator, complaint):
     with pytest.raises(EstimatorContractError, match=complaint):
         check_estimator(estimator)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "bearings"),
+    [
+        (lambda angle: angle, "3.13 and -3.13"),
+        (lambda angle: np.where(angle > np.pi, angle - 2 * np.pi, angle), "3.13 and"),
+        (lambda angle: np.where(angle < -np.pi, angle + 2 * np.pi, angle), "-3.13 and"),
+    ],
+    ids=["not at all", "only above pi", "only below -pi"],
+)
+def test_a_filter_that_forgets_to_wrap_the_innovation_is_named(
+    monkeypatch, wrap, bearings
+):
+    spec = importlib.util.spec_from_file_location("textbook", TEXTBOOK)
+    textbook = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(textbook)
+    check_estimator(textbook.TextbookEkf)
+    monkeypatch.setattr(textbook, "wrap_angle", wrap)
+    complaint = rf"bearings {bearings}.* wrap the innovation to .* NIS 4\.9e\+04"
+    with pytest.raises(EstimatorContractError, match=complaint):
+        check_estimator(textbook.TextbookEkf)
 
 
 def test_unknown_estimator_is_refused_with_a_suggestion():

@@ -428,6 +428,28 @@ def test_landmarks_seen_side_by_side_are_never_one():
         assert slam.update(pair, [0, 1]).merged_ids == ()
 
 
+@pytest.mark.parametrize("name", MANAGEABLE)
+def test_landmarks_are_merged_and_removed_by_hand_too(name):
+    slam, places = (
+        make(name, {"merge_within": None}),
+        np.array([(4, 1), (4, -2), (6, 2)]),
+    )
+    for _ in range(5):
+        slam.update(polar(places), [0, 1, 2])
+    slam.update(polar(places[2:]), [7])
+    slam.merge(2, 7)
+    assert slam.update(polar(places[2:]), [7]).row_ids == (2,)
+    slam.remove([1])
+    assert slam.landmark_ids == (0, 2)
+    np.testing.assert_allclose(slam.belief([2]).landmarks, [(6, 2)], atol=0.01)
+    for refused in (lambda: slam.remove([0, 1]), lambda: slam.merge(0, 7)):
+        with pytest.raises(ValueError, match="mapped landmarks, got"):
+            refused()
+    with pytest.raises(ValueError, match="must be two landmarks, got 2 twice"):
+        slam.merge(2, 2)
+    assert slam.landmark_ids == (0, 2)
+
+
 def test_a_merged_landmark_answers_to_both_names():
     slam = make(management={"merge_within": 1.0})
     place = polar([(5, 1), (2, 2)])

@@ -129,9 +129,10 @@ def test_an_interrupted_job_says_that_it_goes_on(here):
     command = [
         sys.executable,
         "-c",
-        "from slamgym.experiments.command_line import main",
+        # Of a parent in the background a child inherits that interrupts are ignored.
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from slamgym.experiments.command_line import main; main()",
     ]
-    command[-1] += "; main()"
     job = ["monte-carlo", "loop", "--runs", "1000", "--block-size", "4", "--out", "out"]
     child = subprocess.Popen(command + job, stderr=subprocess.PIPE, text=True)
     blocks = here / "out" / "blocks"

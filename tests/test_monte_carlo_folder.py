@@ -1,5 +1,6 @@
 """The folder of a Monte Carlo: one writer, no rests of the killed, one job."""
 
+import ast
 import os
 import re
 import shutil
@@ -323,23 +324,46 @@ def test_a_job_is_of_the_filter_that_it_began_with(tmp_path, monkeypatch):
 # submaps on disk
 
 
-def test_a_folder_of_submaps_is_for_one_run(tmp_path):
-    filters = {
-        "on disk": ("submaps", {"folder": str(tmp_path / "maps"), "submap_size": 6}),
-        "in memory": ("submaps", {"submap_size": 6}),
-    }
-    results = monte_carlo("six_landmarks", filters, 3)
-    assert results.failed.sel(estimator="on disk").values.tolist() == [
-        False,
-        True,
-        True,
-    ]
-    assert not results.failed.sel(estimator="in memory").any()
-    message = str(results.message.sel(estimator="on disk", run=1).values)
-    assert "maps holds the submaps of another run" in message
-    first = results.isel(run=0, drop=True).drop_vars("estimator")
-    xr.testing.assert_equal(first.isel(estimator=0), first.isel(estimator=1))
-    assert (tmp_path / "maps" / "submaps.txt").exists()
+def test_a_folder_of_submaps_is_refused_for_many_runs(tmp_path):
+    on_disk = {"on disk": ("submaps", {"folder": str(tmp_path / "maps")})}
+    with pytest.raises(ValueError, match="folder holds the submaps of one run: leave"):
+        monte_carlo("six_landmarks", on_disk, 3, out=tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+THREADS = """
+from threadpoolctl import threadpool_info
+from slamgym.experiments.blas_threads import one_blas_thread
+from slamgym.experiments.monte_carlo import monte_carlo
+
+
+def threads():
+    pools = [pool for pool in threadpool_info() if pool["user_api"] == "blas"]
+    return [pool["num_threads"] for pool in pools]
+
+
+if __name__ == "__main__":
+    seen = []
+    monte_carlo(
+        "six_landmarks", "ekf", 2, progress=lambda done, runs: seen.append(threads())
+    )
+    print(seen[-1], threads())
+"""
+
+
+def test_runs_use_one_blas_thread_and_leave_the_others_as_they_were():
+    """Else the last bits would depend on how many workers share the cores."""
+    done = subprocess.run(
+        [sys.executable, "-c", THREADS],
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "2"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    within, after = map(
+        set, ast.literal_eval(f"[{done.stdout.replace('] [', '], [')}]")
+    )
+    assert (within, after) == ({1}, {2})
 
 
 def submap_settings(folder, **options):

@@ -199,6 +199,7 @@ class CompressedEkfSlam:
         ValueError
             Where one is not in the map; nothing is then merged.
         """
+        validation.two_landmarks(kept, gone)
         ids = validation.mapped_identities([kept, gone], self._slots)
         if not all(i in self._near for i in ids):
             self._regroup(ids, max(self._local_size or 0, len(self._near), 2))

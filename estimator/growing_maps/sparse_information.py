@@ -231,6 +231,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             Where one is not in the map, or they are the same; nothing is then merged.
         """
+        validation.two_landmarks(kept, gone)
         one, _ = validation.mapped_identities([kept, gone], self._slots)
         dropped = self._take_with_links([gone, kept])
         place = int(np.flatnonzero(self._local.slots == self._slots[one])[0])

@@ -180,6 +180,32 @@ class ManagedSlam:
             ambiguous_rows=tuple(plan.ambiguous_rows),
         )
 
+    def remove(self, landmark_ids: LandmarkIds) -> None:
+        """Marginalise landmarks by hand, shape (n,); all else stays as it was.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map.
+        """
+        self._upkeep.remove(self._mapped(landmark_ids))
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Make one of two landmarks by hand; it answers to both its identities.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map, or they are the same.
+        """
+        validation.two_landmarks(kept, gone)
+        self._mapped([kept, gone])
+        self._upkeep.join(kept, gone)
+
+    def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
+        mapped = {i: slot for slot, i in enumerate(self.landmark_ids)}
+        return validation.mapped_identities(landmark_ids, mapped)
+
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
         """Return the present belief, of the whole map or of pose and some landmarks.
 

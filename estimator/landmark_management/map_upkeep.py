@@ -74,22 +74,27 @@ class MapUpkeep:
         if self._policy.remove_after is None:
             return []
         self._records.note_misses(self._records.slots(missed))
-        return self._remove(self._records.overdue(self._policy.remove_after))
+        return self.remove(self._records.overdue(self._policy.remove_after))
 
     def merge(self, seen: set[int]) -> list[tuple[int, int]]:
         """Make one of landmarks just seen and others that are the same; kept, gone."""
         merged: list[tuple[int, int]] = []
         while (pair := self._double(seen)) is not None:
             kept, gone = pair
-            self._door.merge(kept, gone)
-            self._records.join(kept, gone)
-            self._records.follow(self._door.map_view().mapped)
-            earlier = {i: kept for i, j in self.aliases.items() if j == gone}
-            self.aliases |= {gone: kept, **earlier}
-            self._apart = {_renamed(pair, gone, kept) for pair in self._apart}
+            self.join(kept, gone)
             seen = (seen - {gone}) | {kept}
             merged.append(pair)
         return merged
+
+    def join(self, kept: int, gone: int) -> None:
+        """Make one landmark of two, which answers to both identities."""
+        self._records.follow(self._door.map_view().mapped)
+        self._door.merge(kept, gone)
+        self._records.join(kept, gone)
+        self._records.follow(self._door.map_view().mapped)
+        earlier = {i: kept for i, j in self.aliases.items() if j == gone}
+        self.aliases |= {gone: kept, **earlier}
+        self._apart = {_renamed(pair, gone, kept) for pair in self._apart}
 
     def keep_capacity(self, seen: set[int]) -> list[int]:
         """Give up the landmarks of least information, of those not seen if possible."""
@@ -98,7 +103,7 @@ class MapUpkeep:
             return []
         ranked = self._records.by_information(ids)
         ranked.sort(key=seen.__contains__)
-        return self._remove(ranked[: len(ids) - capacity])
+        return self.remove(ranked[: len(ids) - capacity])
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all that is remembered, as arrays."""
@@ -114,7 +119,8 @@ class MapUpkeep:
         self._apart = {(i, j) for i, j in np.asarray(state["apart"]).tolist()}
         self.aliases = dict(np.asarray(state["aliases"]).tolist())
 
-    def _remove(self, ids: list[int]) -> list[int]:
+    def remove(self, ids: list[int]) -> list[int]:
+        """Remove landmarks from the map and from what is remembered; return them."""
         if ids:
             self._door.remove(ids)
             self._records.follow(self._door.map_view().mapped)

@@ -22,6 +22,7 @@ from ...estimator.registry import (
 )
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_errors import closest
+from ..blas_threads import one_blas_thread
 from ..filter_settings import FilterSettings
 from ..simulated_runs import simulate_runs
 from .estimator_choices import EstimatorChoice, estimator_choices
@@ -150,7 +151,8 @@ def monte_carlo(
         job.seed,
         threads=None if workers is None else 1,
     )
-    with BlockFolder(job, None if out is None else Path(out), fresh=fresh) as folder:
+    path = None if out is None else Path(out)
+    with one_blas_thread(), BlockFolder(job, path, fresh=fresh) as folder:
         missing = folder.missing(asked)
         done = asked.size - sum(span.size for span in missing)
         report = progress or (lambda done, runs: None)
@@ -159,9 +161,9 @@ def monte_carlo(
             folder.add(span, blocks)
             done += span.size
             report(done, asked.size)
-        if out is None:
+        if path is None:
             return dataset_of(job, folder.blocks(asked), asked, command)
-        target = Path(out) / RESULTS
+        target = path / RESULTS
         write_results(target, job, folder.blocks(asked), asked, command)
         return load_results(target)
 
@@ -177,7 +179,8 @@ def _computed(
 
 
 def _do(work: _Work, span: Span) -> tuple[Span, list[Block]]:
-    return span, work.do(span)
+    with one_blas_thread():  # in a process of its own
+        return span, work.do(span)
 
 
 def _workers(jobs: int | None, backend: str | None) -> Workers | None:
@@ -228,6 +231,8 @@ def _call(call: Call) -> Any:
 
 def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:
     """Set up an estimator, and see that it can be made before any run."""
+    if choice.name == "submaps" and "folder" in choice.options:
+        raise ValueError("folder holds the submaps of one run: leave it out of many")
     settings = choice.settings(scenario)
     settings.make(scenario.start.pose)
     return settings
