@@ -459,6 +459,82 @@ def test_reset_deletes_the_submaps_of_the_run_it_forgets(tmp_path):
     assert_same_bits(run(slam, laps(40)).belief(), run(made(), laps(40)).belief())
 
 
+def test_an_earlier_state_of_a_longer_run_leaves_nothing_behind(tmp_path):
+    folder, drive = tmp_path / "run", list(laps(60))
+    slam = run(made(folder=folder), drive[:30])
+    state, early = slam.state_dict(), slam.closed_count
+    run(slam, drive[30:])
+    assert slam.closed_count > early > 0
+    (folder / f"submap_{slam.closed_count:06}.part").write_bytes(b"half of it")
+    (folder / "notes.txt").write_text("of somebody else")
+    slam.load_state_dict(state)
+    slam.reset(START, (0, 0, 0))
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    (folder / "notes.txt").unlink()
+    assert_same_bits(run(slam, drive).belief(), run(made(), drive).belief())
+
+
+@pytest.mark.parametrize("origin", ["own", "in memory"])
+def test_a_state_before_the_first_step_begins_again_in_the_filters_own_folder(
+    tmp_path, origin
+):
+    drive = list(laps(40))
+    slam = made(folder=tmp_path / "run")
+    first = {"own": slam, "in memory": made()}[origin].state_dict()
+    run(slam, drive)
+    slam.load_state_dict(first)
+    assert slam.closed_count == 0
+    expected = run(made(), drive)
+    assert_same_bits(run(slam, drive).belief(), expected.belief())
+    slam.reset(START, (0, 0, 0))
+    assert list((tmp_path / "run").iterdir()) == []
+    assert_same_bits(run(slam, drive).belief(), expected.belief())
+
+
+def test_a_state_before_the_first_step_is_refused_in_the_folder_of_another_run(
+    tmp_path,
+):
+    run(made(folder=tmp_path / "run"), laps(40))
+    other = made(folder=tmp_path / "run")
+    other.reset((5, 5, 0), (0, 0, 0))
+    before = other.belief()
+    with pytest.raises(ValueError, match="holds the submaps of another run"):
+        other.load_state_dict(made().state_dict())
+    assert_same_bits(before, other.belief())
+    assert (tmp_path / "run" / "submap_000000.npy").exists()
+
+
+def test_a_submap_that_cannot_be_written_is_told_before_the_next_scan_is_in(tmp_path):
+    folder, away, drive = tmp_path / "run", tmp_path / "away", list(laps(60))
+    slam, other = made(folder=folder), made()
+    step = 0
+    while other.closed_count < 4:
+        run(other, drive[step : step + 1])
+        step += 1
+    run(slam, drive[: step - 1])
+    folder.rename(away)
+    run(slam, drive[step - 1 : step])  # fills a submap
+    assert slam.closed_count == other.closed_count - 1
+    assert slam.landmark_ids == other.landmark_ids
+    odometry, readings, ids, _ = drive[step]
+    slam.predict(odometry)
+    before = slam.belief()
+    for _ in range(2):
+        with pytest.raises(FileNotFoundError, match="submap_000003"):
+            slam.update(readings, ids)
+        assert_same_bits(before, slam.belief())
+    away.rename(folder)
+    slam.update(readings, ids)
+    run(other, drive[step : step + 1])
+    assert slam.closed_count == other.closed_count
+    found = run(slam, drive[step + 1 :]).belief()
+    expected = run(other, drive[step + 1 :]).belief()
+    assert slam.closed_count == len(list(folder.glob("submap_*.npy")))
+    assert found.landmark_ids == expected.landmark_ids
+    shift = (found.mean - expected.mean) / np.sqrt(np.diag(expected.covariance))
+    assert np.abs(shift).max() < 0.5  # one submap ends a motion later
+
+
 # --- refusals -------------------------------------------------------------------------
 
 

@@ -111,8 +111,10 @@ class ClosedSubmaps:
             return Gaussian(known[0], np.zeros((3, 3)))
         return self.join(known).marginal(slots)
 
-    def near(self, slots: Int, count: int, extent: Extent, known: Array) -> Int:
-        """Return which of some landmarks lie within an extent, as joined.
+    def near(
+        self, slots: Int, count: int, extent: Extent, known: Array
+    ) -> tuple[Int, Extent]:
+        """Return which of some landmarks lie within an extent, and what it is then.
 
         Parameters
         ----------
@@ -125,9 +127,10 @@ class ClosedSubmaps:
             As for :meth:`join`.
         """
         if not len(slots):
-            return slots
+            return slots, extent
         points = points_seen(self.outlines, self.join(known).frames, count)[slots]
-        return slots[extent.chosen(points)]
+        chosen, extent = extent.chosen(points)
+        return slots[chosen], extent
 
     def everything(self, slots: Int, known: Array) -> Gaussian:
         """Return the same of so many landmarks that it is worth to be remembered."""

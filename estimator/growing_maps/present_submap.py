@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from ..ekf_slam import FRAMES, EkfSlam
 from ..landmark_management.map_access import access_to
-from ..validation import LandmarkIds
 from .submap_joining import Gaussian
 from .submap_slots import Slots, link_name
 
@@ -30,16 +29,10 @@ class PresentSubmap:
         self.filter = slam
         self.frame = FRAMES[slam.rules.frame]
         """Coordinates of the error."""
-        self._links: set[int] = set()
 
     def begin(self) -> None:
         """Begin anew: the robot at the origin of the frame, which is certain."""
         self.filter.reset(ORIGIN, ORIGIN)
-        self._links = set()
-
-    def adopt(self, slots: Slots) -> None:
-        """Take those for links who are in no map, after the filter was restored."""
-        self._links = slots.links(self.names)
 
     def __len__(self) -> int:
         return len(self.filter._slots)
@@ -72,13 +65,6 @@ class PresentSubmap:
         mean: Array = self.filter.state_dict()["mean"]
         return Gaussian(mean, self.filter.belief().error_covariance())
 
-    def refuse_links(self, landmark_ids: LandmarkIds | None) -> None:
-        """Refuse identities of a scan that are the names of links."""
-        if not self._links or landmark_ids is None:
-            return
-        if taken := self._links.intersection(np.asarray(landmark_ids).ravel().tolist()):
-            raise ValueError(f"landmark_ids must not be as low as {min(taken)}")
-
     def remove(self, ids: Collection[int], slots: Slots, tied: Collection[int]) -> None:
         """Marginalise landmarks, but for those that stay as links.
 
@@ -94,7 +80,6 @@ class PresentSubmap:
         here = [i for i in ids if i in self]
         links = {i: link_name(slots[i]) for i in here if slots[i] in tied}
         self._rename(links)
-        self._links.update(links.values())
         if alone := [i for i in here if i not in links]:
             access_to(self.filter).remove(alone)
 

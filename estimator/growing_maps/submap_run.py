@@ -38,6 +38,8 @@ class SubmapRun:
     ) -> None:
         self.slots, self.chain = slots, chain
         self.closed, self.present = closed, present
+        self.is_overdue = False
+        """Whether the present submap should be closed, but could not be written."""
 
     def belief(self, ids: tuple[int, ...], *, remember: bool) -> Belief:
         """Return the joined belief of some landmarks.
@@ -75,7 +77,7 @@ class SubmapRun:
         drift = float(np.sqrt(np.trace(start.covariance[:2, :2])))
         extent = Extent(robot[:2], reach, 3 * drift)
         mapped = self._of_closed(self.slots.of(tuple(self.slots)))
-        near = self.closed.near(mapped, self.slots.count, extent, known)
+        near, extent = self.closed.near(mapped, self.slots.count, extent, known)
         closed = np.union1d(near, self._of_closed(self._present_slots))
         held = {*closed.tolist(), *self._present_slots.tolist()}
         ids = tuple(i for i, slot in self.slots.items() if slot in held)
@@ -91,9 +93,17 @@ class SubmapRun:
         self.closed.forget_frames()
 
     def close(self) -> None:
-        """Close the present submap; the next begins at the robot."""
+        """Close the present submap; the next begins at the robot.
+
+        Raises
+        ------
+        OSError
+            Where it cannot be written; the belief is then as before.
+        """
         mean, covariance = self.present.gaussian()
+        self.is_overdue = True
         self.closed.append(Submap(self._present_slots, mean, covariance))
+        self.is_overdue = False
         self.chain.extend(mean[:3], self.present.pose_covariance)
         self.present.begin()
 

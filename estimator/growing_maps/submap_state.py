@@ -13,7 +13,7 @@ from .submap_chain import Chain
 from .submap_merging import merged
 from .submap_placing import outline_of
 from .submap_run import SubmapRun
-from .submap_slots import Slots, slot_of_link
+from .submap_slots import Slots, refuse_link_names, slot_of_link
 from .submap_store import FolderStore, MemoryStore, Submap, SubmapStore
 
 Array = NDArray[np.float64]
@@ -124,6 +124,7 @@ def _slots(state: Mapping[str, Any]) -> Slots:
     """Return who stands where in the map, in its order."""
     saved = np.asarray(state["landmark_ids"])
     ids = validation.identities(saved, saved.size)
+    refuse_link_names(ids)
     count = int(state["slot_count"])
     slots = _numbers(state, "slots", count).ravel()
     if len(slots) != len(ids) or (np.diff(slots) <= 0).any():
@@ -182,7 +183,7 @@ def _store(
             raise ValueError(
                 "state holds its submaps itself: make the estimator without folder"
             )
-        return FolderStore(folder.folder)
+        return folder.continued("", [])
     store = MemoryStore()
     for k in range(count):
         keys = [f"submap_{k}_{key}" for key in Submap._fields]

@@ -18,6 +18,11 @@ AT_HAND = 8
 """Submaps of a folder that are kept in memory."""
 MARK = "submaps.txt"
 FORMAT = "slamgym submaps 1"
+SUFFIX, PART = ".npy", ".part"
+
+
+class LostSubmapError(ValueError):
+    """A closed submap cannot be read any more."""
 
 
 class Submap(NamedTuple):
@@ -116,11 +121,7 @@ class FolderStore:
         """
         if self.run:
             return
-        if found := self._found_run():
-            raise ValueError(
-                f"folder {self.folder} holds the submaps of another run ({found}): "
-                "continue that one by load_state_dict, or give an empty folder"
-            )
+        self._refuse(self._found_run())
         self.folder.mkdir(parents=True, exist_ok=True)
         self.run = uuid4().hex
         (self.folder / MARK).write_text(f"{FORMAT}\nrun {self.run}\n", encoding="utf-8")
@@ -131,7 +132,7 @@ class FolderStore:
         Parameters
         ----------
         run : str
-            The run that was saved.
+            The run that was saved; "" where that was before its first step.
         digests : list of int
             Checksums of its submaps.
 
@@ -142,6 +143,10 @@ class FolderStore:
         """
         store = FolderStore(self.folder)
         found = store._found_run()
+        if not run:
+            if found != self.run:
+                self._refuse(found)
+            run = found
         if found != run:
             raise ValueError(
                 f"folder {self.folder} must hold the submaps of run {run}, but it "
@@ -153,8 +158,9 @@ class FolderStore:
     def clear(self) -> None:
         """Forget the run, and delete its files."""
         if self.run and self._found_run() == self.run:
-            for index in range(len(self.digests)):
-                self._path(index).unlink(missing_ok=True)
+            for path in self.folder.glob("submap_[0-9]*"):
+                if path.suffix in (SUFFIX, PART):  # also later ones than are known
+                    path.unlink()
             (self.folder / MARK).unlink()
         self.run, self.digests = "", []
         self._at_hand = OrderedDict()
@@ -163,7 +169,7 @@ class FolderStore:
         """Write one more submap."""
         content = _written(submap)
         path = self._path(len(self))
-        part = path.with_suffix(".part")
+        part = path.with_suffix(PART)
         part.write_bytes(content)
         part.replace(path)
         self._keep(len(self), submap)
@@ -174,7 +180,7 @@ class FolderStore:
 
         Raises
         ------
-        ValueError
+        LostSubmapError
             Where its file is missing, or is not the one written.
         """
         if index in self._at_hand:
@@ -184,9 +190,11 @@ class FolderStore:
         try:
             content = path.read_bytes()
         except OSError as error:
-            raise ValueError(f"submap {index} cannot be read: {error}") from None
+            raise LostSubmapError(f"submap {index} cannot be read: {error}") from None
         if zlib.crc32(content) != self.digests[index]:
-            raise ValueError(f"{path} is damaged, or not the submap that was written")
+            raise LostSubmapError(
+                f"{path} is damaged, or not the submap that was written"
+            )
         submap = _read(content)
         self._keep(index, submap)
         return submap
@@ -197,7 +205,14 @@ class FolderStore:
             self._at_hand.popitem(last=False)
 
     def _path(self, index: int) -> Path:
-        return self.folder / f"submap_{index:06}.npy"
+        return self.folder / f"submap_{index:06}{SUFFIX}"
+
+    def _refuse(self, found: str) -> None:
+        if found:
+            raise ValueError(
+                f"folder {self.folder} holds the submaps of another run ({found}): "
+                "continue that one by load_state_dict, or give an empty folder"
+            )
 
     def _found_run(self) -> str:
         """Return the run that the folder is of, "" where it is free."""

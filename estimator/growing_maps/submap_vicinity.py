@@ -18,6 +18,7 @@ from ..interface import Belief, UpdateReport
 from ..invariant import InvariantEkfSlam
 from ..landmark_management.map_access import MapView, access_to, view_of
 from ..validation import LandmarkIds
+from .submap_store import LostSubmapError
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -26,6 +27,8 @@ MOST = 1000
 """Landmarks of closed submaps that are looked at, the nearest."""
 FARTHER = 2.0
 """How much farther is looked than has been asked for, so that it holds for a while."""
+RECENT = 10
+"""Scans that tell how far is looked when it is taken anew."""
 
 
 class Extent(NamedTuple):
@@ -39,22 +42,32 @@ class Extent(NamedTuple):
     """By how much landmarks may be nearer than they seem to be [m]."""
     is_all: bool = False
     """Whether there is nothing farther away."""
+    farthest: float = np.inf
+    """Distance of the last landmark in it where there were too many [m]."""
 
     @property
     def radius(self) -> float:
         """Of the landmarks around the centre that it holds [m]."""
-        return np.inf if self.is_all else FARTHER * (self.reach + self.slack)
+        wanted = np.inf if self.is_all else FARTHER * (self.reach + self.slack)
+        return min(wanted, self.farthest)
 
     def covers(self, position: Array, within: float) -> bool:
         """Tell whether it holds all that is within a distance of a position (2,)."""
         away = float(np.hypot(*(position - self.centre)))
         return away + within + self.slack <= self.radius
 
-    def chosen(self, points: Array) -> Int:
-        """Return which of some landmarks (n, 2) lie within, the nearest if many."""
+    def chosen(self, points: Array) -> tuple[Int, "Extent"]:
+        """Return which of some landmarks (n, 2) lie within, the nearest if many.
+
+        Of many, also the extent that those have.
+        """
         distance = np.hypot(*(points - self.centre).T)
-        nearest = np.argsort(distance, kind="stable")[:MOST]
-        return np.sort(nearest[distance[nearest] <= self.radius])
+        inside = np.flatnonzero(distance <= self.radius)
+        if len(inside) <= MOST:
+            return inside, self
+        nearest = inside[np.argsort(distance[inside], kind="stable")[:MOST]]
+        farthest = float(distance[nearest[-1]])
+        return np.sort(nearest), self._replace(farthest=farthest)
 
 
 Survey = Callable[[float], tuple[Belief, Extent]]
@@ -81,7 +94,9 @@ class Vicinity:
         """Start a new run."""
         self._slam: InvariantEkfSlam | None = None
         self._extent = Extent(np.zeros(2), 0.0, 0.0)
-        self._reach = 0.0  # the farthest that has been asked for, or read
+        # The farthest that was asked for or read with each of the last scans, and
+        # since then [m].
+        self._reaches = RECENT * [0.0]
 
     @property
     def nbytes(self) -> int:
@@ -97,17 +112,16 @@ class Vicinity:
             How far from the robot to look at least [m].
         """
         slam = self._slam
-        reach = max(within, self._reach)
         if slam is None or not self._extent.covers(slam._mean[:2], within):
-            slam = self._take(*self._survey(reach))
-        self._reach = reach
+            slam = self._take(*self._survey(max(within, *self._reaches)))
+        self._reaches[-1] = max(within, self._reaches[-1])
         return view_of(slam)
 
     def renew(self) -> None:
         """Take it anew from the joined map; without one it goes on as it is."""
         if self._slam is not None:
-            with suppress(np.linalg.LinAlgError):
-                self._take(*self._survey(self._reach))
+            with suppress(np.linalg.LinAlgError, LostSubmapError):
+                self._take(*self._survey(max(self._reaches)))
 
     def predict(self, odometry: ArrayLike, dt: float) -> None:
         """Move the robot."""
@@ -135,7 +149,8 @@ class Vicinity:
         if not used:
             return
         before = self._slam
-        self._reach = max(self._reach, float(readings[:, 1].max()))
+        farthest = max(float(readings[:, 1].max()), self._reaches[-1])
+        self._reaches = [*self._reaches[1:-1], farthest, 0.0]
         if not before._slots.keys() | set(report.added_ids) >= set(used):
             self.renew()
         if self._slam is before:  # else the scan is in it already
@@ -169,7 +184,7 @@ class Vicinity:
             return {}
         extent = self._extent
         numbers = [*extent.centre, extent.reach, extent.slack, extent.is_all]
-        limits = np.array([*numbers, self._reach])
+        limits = np.array([*numbers, extent.farthest, *self._reaches])
         return self._slam.state_dict() | {"extent": limits}
 
     def restored(self, state: Mapping[str, Any]) -> "Vicinity":
@@ -178,10 +193,13 @@ class Vicinity:
         if state:
             validation.refuse_other_state(state, ["extent"])
             limits = validation.as_floats("state['extent']", state["extent"])
-            if limits.shape != (6,) or np.isnan(limits).any():
-                raise ValueError(f"state['extent'] must be 6 numbers, got {limits}")
-            x, y, reach, slack, is_all, other._reach = limits.tolist()
-            other._extent = Extent(np.array([x, y]), reach, slack, bool(is_all))
+            if limits.shape != (6 + RECENT,) or np.isnan(limits).any():
+                raise ValueError(
+                    f"state['extent'] must be {6 + RECENT} numbers, got {limits}"
+                )
+            x, y, reach, slack, is_all, farthest, *other._reaches = limits.tolist()
+            centre = np.array([x, y])
+            other._extent = Extent(centre, reach, slack, bool(is_all), farthest)
             other._slam = self._make()
             other._slam.load_state_dict(
                 {k: v for k, v in state.items() if k != "extent"}

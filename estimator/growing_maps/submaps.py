@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from math import hypot
 from typing import Any
@@ -21,7 +22,7 @@ from .present_submap import ORIGIN, PresentSubmap
 from .submap_chain import Chain
 from .submap_relation import compose
 from .submap_run import SubmapRun
-from .submap_slots import Slots
+from .submap_slots import Slots, refuse_link_names
 from .submap_state import as_arrays, checked_state
 from .submap_store import FolderStore, MemoryStore
 from .submap_vicinity import Extent, Vicinity
@@ -159,14 +160,19 @@ class SubmapSlam:
         numpy.linalg.LinAlgError
             Where an innovation covariance is not positive definite, naming the
             reading; the belief is then as before.
+        OSError
+            Where the submap that the scan before has filled cannot be written to the
+            folder; the belief is then as before.  It is tried again with every scan.
         """
         if np.size(measurements) > 2 * self._submap_size:
             raise ValueError(
                 f"submap_size must be >= {len(validation.scan(measurements))}, the "
                 f"landmarks of one scan, got {self._submap_size}"
             )
-        self._present.refuse_links(landmark_ids)
+        refuse_link_names(landmark_ids)
         self._claim_folder()
+        if self._run.is_overdue:
+            self._close()
         report = self._present.filter.update(measurements, landmark_ids)
         slots = self._run.slots
         new = tuple(i for i in report.added_ids if i not in slots)
@@ -174,8 +180,8 @@ class SubmapSlam:
         report = report._replace(added_ids=new)
         self._vicinity.update(measurements, landmark_ids, report)
         if np.size(measurements) and self._is_full():
-            self._run.close()
-            self._vicinity.renew()
+            with suppress(OSError):  # told before the next scan is in
+                self._close()
         return report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
@@ -213,10 +219,12 @@ class SubmapSlam:
         Raises
         ------
         ValueError
-            Where one is not in the map; nothing is then merged.
+            Where one is not in the map, they are the same, or the file of a submap is
+            lost; nothing is then merged.
         numpy.linalg.LinAlgError
             Where nothing can be said of their distance; nothing is then merged.
         """
+        validation.two_landmarks(kept, gone)
         validation.mapped_identities([kept, gone], self._run.slots)
         self._claim_folder()
         self._run.merge(kept, gone)
@@ -245,7 +253,8 @@ class SubmapSlam:
         Raises
         ------
         ValueError
-            Where one is not in the map, or they are more than ``belief_limit``.
+            Where one is not in the map, they are more than ``belief_limit``, or the
+            file of a submap is lost.
         numpy.linalg.LinAlgError
             Where the submaps contradict each other so that they cannot be joined, or
             where their covariances are degenerate.
@@ -274,7 +283,8 @@ class SubmapSlam:
         Parameters
         ----------
         within : float
-            How far from the robot to look at least [m].
+            How far from the robot to look at least [m]; of closed submaps no more
+            than the nearest 1000 landmarks are taken.
 
         Returns
         -------
@@ -283,7 +293,7 @@ class SubmapSlam:
 
         Raises
         ------
-        numpy.linalg.LinAlgError
+        ValueError, numpy.linalg.LinAlgError
             As :meth:`belief`; all is then as before.
         """
         return self._vicinity.view(within)._replace(whole=self.landmark_ids)
@@ -329,12 +339,13 @@ class SubmapSlam:
         ------
         ValueError
             Also where it was saved with a folder, and this filter's is of another run,
-            lacks a submap or holds another; the belief is then as before.
+            lacks a submap or holds another; or where it was saved before the first
+            step, and the folder holds a run that is not this filter's.  The belief is
+            then as before.
         """
         saved = checked_state(state, type(self).__name__, self._present, self._folder)
         vicinity = self._vicinity.restored(saved.vicinity)
         self._present.filter.load_state_dict(saved.local)
-        self._present.adopt(saved.slots)
         self._run = SubmapRun(saved.slots, saved.chain, saved.closed, self._present)
         self._vicinity = vicinity
         if isinstance(saved.closed.store, FolderStore):
@@ -343,6 +354,10 @@ class SubmapSlam:
     def _claim_folder(self) -> None:
         if self._folder is not None:
             self._folder.claim()
+
+    def _close(self) -> None:
+        self._run.close()
+        self._vicinity.renew()
 
     def _is_full(self) -> bool:
         x, y, _ = self._present.pose.tolist()
