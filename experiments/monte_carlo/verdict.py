@@ -136,12 +136,12 @@ def _judge_good_runs(report: ConsistencyReport) -> Verdict:
         return Verdict(NOT_CONSISTENT, refusal + _outliers(report))
     if verdict.accepted:
         return Verdict(CONSISTENT, f"{_NOT_REFUSED}, and {interval}, {_inside()}")
-    outside = verdict.verdict == NOT_CONSISTENT  # refuses in up to 10 %: not enough
-    lies = "lies outside" if outside else "is not inside"
-    return Verdict(
-        NOT_SHOWN,
-        f"{_NOT_REFUSED}, but {interval}, {lies} {_MARGIN}: more runs are needed",
-    )
+    if verdict.verdict == NOT_CONSISTENT:  # refuses in up to 10 %: not enough
+        kept = "no decision refuses it (5 %), but"
+        lies = f"{interval}, lies outside {_MARGIN}"
+    else:
+        kept, lies = f"{_NOT_REFUSED}, but", f"{interval}, is not inside {_MARGIN}"
+    return Verdict(NOT_SHOWN, f"{kept} {lies}: more runs are needed")
 
 
 def _refusal(report: ConsistencyReport) -> str:
