@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..envs.vector_episodes import (
     checked_reset_mask,
+    episode_steps,
     final_moments,
     with_masks,
     world_seeds,
@@ -90,7 +91,7 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self.single_observation_space = self.task.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._most_steps = _episode_steps(self.scenario, max_episode_steps)
+        self._most_steps = episode_steps(self.scenario, max_episode_steps)
         self._worlds = WorldBatch(self.scenario, num_envs)
         self._filters = choose_batch(
             estimator,
@@ -234,9 +235,3 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             "success": success.copy(),
         }
         return self.task.observe(progress), infos
-
-
-def _episode_steps(scenario: Scenario, most: int | None) -> int:
-    if most is None or most == -1:  # Gymnasium's word for no limit
-        return scenario.steps
-    return min(validation.whole("max_episode_steps", most, 1), scenario.steps)

@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..sim_configs import Scenario, load_scenario
 from .landmark_world import LandmarkWorldEnv
 from .snapshot import BeliefLike
-from .vector_episodes import checked_reset_mask, final_moments, with_masks, world_seeds
+from .vector_episodes import (
+    checked_reset_mask,
+    episode_steps,
+    final_moments,
+    with_masks,
+    world_seeds,
+)
 from .world_batch import WorldBatch
 from .world_spaces import action_space, observation_space
 from .world_views import WorldViews
@@ -92,7 +98,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         if render_mode is not None:
             fps = float(self.metadata["render_fps"])
             self._views = WorldViews(self.scenario, render_mode, fps, num_envs)
-        self._steps = _episode_steps(self.scenario, max_episode_steps)
+        self._steps = episode_steps(self.scenario, max_episode_steps)
         self._worlds = WorldBatch(self.scenario, num_envs)
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int] = [-1] * num_envs
@@ -269,11 +275,3 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
                 f"worlds {np.flatnonzero(ended).tolist()} have ended: reset them first "
                 '(options={"reset_mask": …})'
             )
-
-
-def _episode_steps(scenario: Scenario, most: int | None) -> int:
-    if most is None or most == -1:  # Gymnasium's word for no limit
-        return scenario.steps
-    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
-        raise ValueError(f"max_episode_steps must be an integer >= 1, got {most!r}")
-    return min(most, scenario.steps)

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..sim_configs import Scenario
+
 BoolArray = NDArray[np.bool_]
 Infos = dict[str, Any]
 
@@ -105,3 +107,18 @@ def final_moments(observations: Infos, infos: Infos, ended: BoolArray) -> Infos:
         "final_info": with_masks(infos, ended, count),
         "_final_info": ended.copy(),
     }
+
+
+def episode_steps(scenario: Scenario, most: int | None) -> int:
+    """Return how many steps an episode has: the scenario's, or ``max_episode_steps``.
+
+    Raises
+    ------
+    ValueError
+        If it is no whole number of steps.
+    """
+    if most is None or most == -1:  # Gymnasium's word for no limit
+        return scenario.steps
+    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
+        raise ValueError(f"max_episode_steps must be a whole number >= 1, got {most!r}")
+    return min(most, scenario.steps)

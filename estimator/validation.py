@@ -14,6 +14,8 @@ LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 
 # Largest reading or odometry [m, rad]; their squares, and products, stay finite.
 LARGEST = 1e12
+# The lowest identity that 64 bits hold, and how many from there on are no landmarks.
+LOWEST_ID, RESERVED_IDS = -(2**63), 2**20
 
 
 def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
@@ -75,6 +77,15 @@ def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
             f"landmark_ids must not repeat within a scan, got {twice} twice"
         )
     return ids
+
+
+def refuse_reserved(ids: Iterable[int]) -> None:
+    """Refuse identities that filters keep for what is no landmark."""
+    lowest = min(ids, default=0)
+    if lowest < LOWEST_ID + RESERVED_IDS:
+        raise ValueError(
+            f"landmark_ids must be >= {LOWEST_ID + RESERVED_IDS}, got {lowest}"
+        )
 
 
 def given_identities(

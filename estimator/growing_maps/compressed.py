@@ -14,7 +14,7 @@ from ..iterated import IteratedEkfSlam
 from ..landmark_management.map_access import MapView, access_to
 from ..memory import covariance_bytes, refuse_beyond_memory
 from ..observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
-from ..validation import LandmarkIds
+from ..validation import LOWEST_ID, LandmarkIds
 from . import local_map_choice
 from .coordinates import pairs
 from .local_map_choice import nearest_to, spare_landmarks
@@ -44,9 +44,6 @@ BASES: dict[str, type[EkfSlam]] = {
     "observability_constrained": ObservabilityConstrainedEkfSlam,
     "iterated": IteratedEkfSlam,
 }
-
-# Identities of the virtual landmarks: the lowest that 64 bits hold.
-_LOWEST, _RESERVED = -(2**63), 2**20
 
 
 class CompressedEkfSlam:
@@ -323,10 +320,7 @@ class CompressedEkfSlam:
 
     def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
         ids = validation.given_identities(landmark_ids, count, self)
-        if min(ids, default=0) < _LOWEST + _RESERVED:
-            raise ValueError(
-                f"landmark_ids must be >= {_LOWEST + _RESERVED}, got {min(ids)}"
-            )
+        validation.refuse_reserved(ids)
         return ids
 
     def _look_after(self, ids: Sequence[int]) -> None:
@@ -391,7 +385,7 @@ class CompressedEkfSlam:
             self._points[columns],
             self._strip[:, columns],
             self._references[columns],
-            [*range(_LOWEST, _LOWEST + self._virtual), *self._near],
+            [*range(LOWEST_ID, LOWEST_ID + self._virtual), *self._near],
         )
 
     def _settle(self, now: Phase) -> Array:

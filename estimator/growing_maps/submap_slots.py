@@ -10,11 +10,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..validation import LandmarkIds
+from ..validation import LOWEST_ID, LandmarkIds, refuse_reserved
 
 Int = NDArray[np.int64]
-
-_LOWEST, _RESERVED = -(2**63), 2**20
 
 
 class Slots(Mapping[int, int]):
@@ -85,18 +83,16 @@ def link_name(slot: int) -> int:
     >>> slot_of_link(link_name(5))
     5
     """
-    return slot + _LOWEST
+    return slot + LOWEST_ID
 
 
 def slot_of_link(name: int) -> int:
     """Return the slot of a link by its name."""
-    return name - _LOWEST
+    return name - LOWEST_ID
 
 
 def refuse_link_names(landmark_ids: LandmarkIds | None) -> None:
     """Refuse identities as low as the names of links are."""
     ids = np.asarray(() if landmark_ids is None else landmark_ids)
-    if ids.size and ids.dtype.kind == "i" and ids.min() < _LOWEST + _RESERVED:
-        raise ValueError(
-            f"landmark_ids must be >= {_LOWEST + _RESERVED}, got {ids.min()}"
-        )
+    if ids.dtype.kind == "i":
+        refuse_reserved(ids.ravel().tolist())
