@@ -11,10 +11,11 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from ..envs import LandmarkWorldEnv
-from ..envs.live_view import RENDER_MODES
+from ..envs.rendering.live_view import RENDER_MODES
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, Progress, Stakes
 from .belief_arrays import belief_in_rows
+from .coverage_grid import FloorPlan
 from .estimator_choice import (
     BeliefOfMap,
     EstimatorChoice,
@@ -22,7 +23,6 @@ from .estimator_choice import (
     checked_belief,
     choose_estimator,
 )
-from .floor_plan import FloorPlan
 
 Array = NDArray[np.float64]
 Observation = dict[str, Any]

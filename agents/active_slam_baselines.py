@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..envs.controllers import Waypoints
+from ..envs.controllers.single import Waypoints
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import Robot
 from ..sim_configs.scenario_errors import closest

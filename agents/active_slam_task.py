@@ -9,12 +9,8 @@ from numpy.typing import NDArray
 
 from ..sim_configs import Scenario
 from .belief_arrays import BeliefArrays, stored
-from .belief_features import (
-    belief_features,
-    belief_space,
-    largest_variances,
-)
-from .floor_plan import SECTORS, FloorPlan
+from .belief_features import belief_features, belief_space, largest_variances
+from .coverage_grid import SECTORS, FloorPlan
 from .information_reward import CRITERIA, effort, landmark_prior_std, uncertainty
 
 Array = NDArray[np.float64]

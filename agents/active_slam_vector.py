@@ -11,16 +11,16 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from ..envs.vector_episodes import (
+from ..envs.spaces import action_space
+from ..envs.vector.episodes import (
     checked_reset_mask,
     episode_steps,
     final_moments,
     with_masks,
     world_seeds,
 )
-from ..envs.world_batch import WorldBatch
-from ..envs.world_spaces import action_space
-from ..estimator import validation
+from ..envs.vector.world_batch import WorldBatch
+from ..estimator.support import argument_checks
 from ..sim_configs import Scenario, load_scenario
 from .active_slam import split_settings
 from .active_slam_task import ActiveSlamTask, Progress
@@ -77,7 +77,7 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             raise ValueError(
                 f"render_mode must be None for worlds side by side, got {render_mode!r}"
             )
-        num_envs = validation.whole("num_envs", num_envs, 1)
+        num_envs = argument_checks.whole("num_envs", num_envs, 1)
         stakes, changes = split_settings(settings)
         self.scenario = load_scenario(scenario)
         if changes:

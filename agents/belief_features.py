@@ -20,8 +20,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..envs.planned_path import planned_path
-from ..estimator.batch import BatchStorage
+from ..envs.controllers.planned_path import planned_path
+from ..estimator.filters.batch import BatchStorage
 from ..sim_configs import Scenario, place_landmarks
 from .belief_kernels import show_beliefs
 

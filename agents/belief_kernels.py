@@ -8,8 +8,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimator.angles import wrap_angle
-from ..estimator.compiled import compiled, part
+from ..estimator.models.angles import wrap_angle
+from ..estimator.support.jit import compiled, part
 
 Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]

@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from ..envs import LandmarkWorldEnv
-from ..estimator import validation
+from ..estimator.support import argument_checks
 from ..sim_configs import Scenario
 from .belief_arrays import BeliefArrays, belief_in_rows, stored
 from .belief_features import belief_features, belief_space, world_bounds
@@ -154,7 +154,7 @@ def count_landmark_rows(scenario: Scenario, max_landmarks: int | None) -> int:
     count = scenario.landmarks.count
     if max_landmarks is None:
         return count
-    rows = validation.whole("max_landmarks", max_landmarks, 1)
+    rows = argument_checks.whole("max_landmarks", max_landmarks, 1)
     if scenario.sensor.identities and rows < count:
         raise ValueError(
             f"max_landmarks must be >= the {count} landmarks of the world, got {rows}"

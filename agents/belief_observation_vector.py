@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 
 from .belief_arrays import BeliefArrays, beliefs_of_batch, take_scans
 from .belief_features import belief_features, world_bounds
-from .belief_observation import (
-    count_landmark_rows,
-    joined,
-    scenario_of,
-    with_belief,
-)
+from .belief_observation import count_landmark_rows, joined, scenario_of, with_belief
 from .estimator_choice import choose_batch
 
 Array = NDArray[np.float64]

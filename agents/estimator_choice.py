@@ -8,7 +8,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..estimator.batch import BatchSlam, make_batch
+from ..estimator.filters.batch import BatchSlam, make_batch
 from ..estimator.registry import accepted_options, find_estimator, make_estimator
 from ..sim_configs import Scenario
 

@@ -32,8 +32,8 @@ from rich.console import Console
 from rich.table import Table
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.stable_baselines import to_stable_baselines
-from slamgym.envs.vector_wrappers import FlattenBatch
+from slamgym.envs.vector.stable_baselines import to_stable_baselines
+from slamgym.envs.vector.wrappers import FlattenBatch
 
 Call = Callable[[], object]
 Worlds = VectorEnv[Any, Any, Any]

@@ -25,8 +25,8 @@ from interleaved import verdict
 from rich.table import Table
 
 from slamgym.agents import BeliefObservationVector
-from slamgym.estimator import batch
-from slamgym.estimator.batch_kernels import drive_runs
+from slamgym.estimator.filters import batch
+from slamgym.estimator.kernels.batch import drive_runs
 
 ID = "slamgym/LandmarkWorld-v0"
 GOAL = 3.0

@@ -21,7 +21,7 @@ import xarray as xr
 from rich.console import Console
 from rich.table import Table
 
-from slamgym.estimator.consistency import average_band
+from slamgym.evaluation.nees import average_band
 from slamgym.experiments.monte_carlo import monte_carlo
 
 SCENARIOS = (

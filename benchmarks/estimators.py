@@ -25,10 +25,10 @@ from rich.table import Table
 from second_core import two_processes
 
 from slamgym.estimator import EkfSlam, make_batch, make_estimator
-from slamgym.estimator.ekf_slam import workspace_for
-from slamgym.estimator.joint_update import update_belief
-from slamgym.estimator.kernels import predict
-from slamgym.estimator.workspace import aligned_zeros
+from slamgym.estimator.filters.ekf import workspace_for
+from slamgym.estimator.kernels.predict import predict
+from slamgym.estimator.kernels.scan_rows import aligned_zeros
+from slamgym.estimator.kernels.scan_update import update_belief
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.05, 0.02, 0.02]), np.array([0.02, 0.08])
 NOISE: dict[str, Any] = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}

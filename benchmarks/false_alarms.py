@@ -12,14 +12,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from slamgym.estimator.consistency import average_band
-from slamgym.estimator.decisions import (
+from slamgym.evaluation.hypothesis_tests import (
     family_decision,
     final_step_decision,
     nis_decision,
     whiteness_decision,
 )
-from slamgym.estimator.time_average_decisions import (
+from slamgym.evaluation.nees import average_band
+from slamgym.evaluation.time_average_tests import (
     bootstrap_decision,
     time_average_decision,
 )

@@ -37,9 +37,9 @@ from rich.table import Table
 from scipy.linalg.blas import dsyrk
 
 from slamgym.estimator import EkfSlam
-from slamgym.estimator.bearing_range_model import predict_measurement
-from slamgym.estimator.growing_maps.compressed import CompressedEkfSlam
-from slamgym.estimator.unicycle_motion import predict_pose
+from slamgym.estimator.large_maps.compressed.compressed_slam import CompressedEkfSlam
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
 
 Array = NDArray[np.float64]
 

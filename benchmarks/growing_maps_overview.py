@@ -24,8 +24,8 @@ from slamgym.estimator import (
     SparseInformationSlam,
     SubmapSlam,
 )
-from slamgym.estimator.consistency import average_band, pose_nees
-from slamgym.experiments.figure_style import (
+from slamgym.evaluation.nees import average_band, pose_nees
+from slamgym.experiments.figures.style import (
     GREY,
     PALE,
     dress,
@@ -33,7 +33,7 @@ from slamgym.experiments.figure_style import (
     save_figure,
     write_title,
 )
-from slamgym.experiments.monte_carlo.estimator_lines import log_ticks, look_of
+from slamgym.experiments.monte_carlo.report.estimator_lines import log_ticks, look_of
 
 Array = NDArray[np.float64]
 

@@ -29,12 +29,14 @@ from rich.table import Table
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from slamgym.estimator.bearing_range_model import predict_measurement
-from slamgym.estimator.consistency import pose_nees
-from slamgym.estimator.growing_maps.compressed import CompressedEkfSlam
-from slamgym.estimator.growing_maps.sparse_information import SparseInformationSlam
-from slamgym.estimator.unicycle_motion import predict_pose
-from slamgym.experiments.simulated_runs import SimulatedRuns, simulate_runs
+from slamgym.estimator.large_maps.compressed.compressed_slam import CompressedEkfSlam
+from slamgym.estimator.large_maps.sparse_information.sparse_information_slam import (
+    SparseInformationSlam,
+)
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.evaluation.nees import pose_nees
+from slamgym.experiments.runs.simulated_runs import SimulatedRuns, simulate_runs
 from slamgym.sim_configs import Scenario, load_scenario
 
 Array = NDArray[np.float64]

@@ -32,9 +32,9 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import KDTree
 
-from slamgym.estimator.bearing_range_model import predict_measurement
-from slamgym.estimator.growing_maps.submaps import SubmapSlam
-from slamgym.estimator.unicycle_motion import predict_pose
+from slamgym.estimator.large_maps.submaps.submap_slam import SubmapSlam
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
 from slamgym.experiments.monte_carlo import monte_carlo
 
 Array = NDArray[np.float64]

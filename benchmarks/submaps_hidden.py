@@ -22,9 +22,9 @@ from typing import NamedTuple, cast
 import numpy as np
 from submaps import MEASUREMENT_STD, MOTION_STD, SIZES, drive, print_table
 
-from slamgym.estimator.growing_maps.submaps import SubmapSlam
-from slamgym.estimator.landmark_management.managed import ManagedSlam
-from slamgym.estimator.landmark_management.map_access import at_once
+from slamgym.estimator.large_maps.submaps.submap_slam import SubmapSlam
+from slamgym.estimator.map_management.managed_slam import ManagedSlam
+from slamgym.estimator.map_management.map_editor import at_once
 
 
 class Row(NamedTuple):

@@ -1,4 +1,6 @@
 """Worlds that move and measure; they know nothing of estimators."""
 
 from .landmark_world import LandmarkWorldEnv as LandmarkWorldEnv
-from .landmark_world_vector import LandmarkWorldVectorEnv as LandmarkWorldVectorEnv
+from .vector.landmark_world_vector import (
+    LandmarkWorldVectorEnv as LandmarkWorldVectorEnv,
+)

@@ -11,19 +11,19 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from ..sim_configs import Scenario, load_scenario, place_landmarks
-from ..sim_configs.domain_randomisation import refuse_ranges
-from .bearing_range_sensor import BearingRangeSensor, hide_identities
-from .live_view import RENDER_MODES, LiveView, Moment
-from .noise_streams import (
+from ..sim_configs.randomisation import refuse_ranges
+from .rendering.live_view import RENDER_MODES, LiveView, Moment
+from .rendering.render_state import BeliefLike
+from .robot.unicycle_body import UnicycleBody
+from .sensors.bearing_range import BearingRangeSensor, hide_identities
+from .sensors.noise_streams import (
     NoiseRows,
     motion_noise_rows,
     sensor_noise_rows,
     spawn_streams,
 )
-from .odometry_sensor import OdometrySensor
-from .snapshot import BeliefLike
-from .unicycle_body import UnicycleBody
-from .world_spaces import action_space, observation_space
+from .sensors.odometry import OdometrySensor
+from .spaces import action_space, observation_space
 
 Array = NDArray[np.float64]
 Observation = dict[str, Any]

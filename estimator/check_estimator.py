@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .angles import wrap_angle
 from .interface import Belief, SlamEstimator, UpdateReport
+from .models.angles import wrap_angle
 
 Array = NDArray[np.float64]
 Factory = Callable[..., SlamEstimator]

@@ -17,7 +17,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from .angles import wrap_angle
+from .models.angles import wrap_angle
 
 Array = NDArray[np.float64]
 ErrorFrame = Literal["additive", "invariant"]

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .angles import wrap_angle
 from .error_frames import (
     ErrorFrame,
     additive_error,
     invariant_covariance,
     invariant_error,
 )
+from .models.angles import wrap_angle
 
 Array = NDArray[np.float64]
 

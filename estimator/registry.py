@@ -9,17 +9,20 @@ from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import ArrayLike
 
-from .ekf_slam import EkfSlam
-from .ideal import IdealEkfSlam
+from .filters.ekf import EkfSlam
+from .filters.first_estimates import (
+    FirstEstimatesEkfSlam,
+    ObservabilityConstrainedEkfSlam,
+)
+from .filters.ideal import IdealEkfSlam
+from .filters.invariant import InvariantEkfSlam
+from .filters.iterated import IteratedEkfSlam
+from .filters.robocentric import RobocentricEkfSlam
+from .filters.unscented import UnscentedSlam
 from .interface import SlamEstimator
-from .invariant import InvariantEkfSlam
-from .iterated import IteratedEkfSlam
-from .observability import FirstEstimatesEkfSlam, ObservabilityConstrainedEkfSlam
-from .robocentric import RobocentricEkfSlam
-from .unscented import UnscentedSlam
 
 if TYPE_CHECKING:
-    from .landmark_management.landmark_policy import LandmarkPolicy
+    from .map_management.policy import LandmarkPolicy
 
 EstimatorFactory = Callable[..., SlamEstimator]
 
@@ -119,7 +122,7 @@ def make_estimator(
     """
     factory = find_estimator(name)
     if management is not None and management is not False:
-        from .landmark_management.managed import ManagedSlam  # noqa: PLC0415 (heavy)
+        from .map_management.managed_slam import ManagedSlam  # noqa: PLC0415 (heavy)
 
         factory = partial(ManagedSlam, factory, management=management)
     return factory(
@@ -156,7 +159,7 @@ def accepted_options(
     return {key: value for key, value in options.items() if key in known}
 
 
-_GROWING = f"{__package__}.growing_maps"
+_LARGE = f"{__package__}.large_maps"
 
 _factories |= {
     "ekf": EkfSlam,
@@ -167,7 +170,9 @@ _factories |= {
     "unscented": UnscentedSlam,
     "robocentric": RobocentricEkfSlam,
     "ideal": IdealEkfSlam,
-    "compressed": f"{_GROWING}.compressed:CompressedEkfSlam",
-    "sparse_information": f"{_GROWING}.sparse_information:SparseInformationSlam",
-    "submaps": f"{_GROWING}.submaps:SubmapSlam",
+    "compressed": f"{_LARGE}.compressed.compressed_slam:CompressedEkfSlam",
+    "sparse_information": (
+        f"{_LARGE}.sparse_information.sparse_information_slam:SparseInformationSlam"
+    ),
+    "submaps": f"{_LARGE}.submaps.submap_slam:SubmapSlam",
 }

@@ -21,14 +21,14 @@ more certain than it may be.
 import sys
 from pathlib import Path
 
-from slamgym.envs.controllers import OpenLoop
-from slamgym.experiments.filter_settings import settings_for
-from slamgym.experiments.log_importers import read_log
-from slamgym.experiments.plots import map_figure, save_figure
-from slamgym.experiments.recording import record_episode
-from slamgym.experiments.replay import Replay, replay
-from slamgym.experiments.slamlog import SlamLog, write_slamlog
-from slamgym.experiments.summary import landmark_table
+from slamgym.envs.controllers.single import OpenLoop
+from slamgym.experiments.figures import map_figure, save_figure
+from slamgym.experiments.logs.importers import read_log
+from slamgym.experiments.logs.recording import record_episode
+from slamgym.experiments.logs.slamlog import SlamLog, write_slamlog
+from slamgym.experiments.runs.filter_settings import settings_for
+from slamgym.experiments.runs.replay import Replay, replay
+from slamgym.experiments.runs.summary import landmark_table
 from slamgym.sim_configs import action_sequence, load_scenario
 
 RESULTS = Path("results")

@@ -16,11 +16,11 @@ It prints the table and writes ``results/04_noise_study.png``.  The command
 
 from pathlib import Path
 
-from slamgym.envs.controllers import OpenLoop
-from slamgym.experiments.filter_settings import settings_for
-from slamgym.experiments.noise_study import study_log
-from slamgym.experiments.plots import NoisePanel, noise_study_figure, save_figure
-from slamgym.experiments.recording import record_episode
+from slamgym.envs.controllers.single import OpenLoop
+from slamgym.experiments.figures import NoisePanel, noise_study_figure, save_figure
+from slamgym.experiments.logs.recording import record_episode
+from slamgym.experiments.noise_study.one_run import study_log
+from slamgym.experiments.runs.filter_settings import settings_for
 from slamgym.sim_configs import action_sequence, load_scenario
 
 PICTURE = Path("results/04_noise_study.png")

@@ -29,11 +29,11 @@ from slamgym.estimator import (
     EstimatorContractError,
     UpdateReport,
     check_estimator,
-    validation,
 )
-from slamgym.estimator.angles import wrap_angle
-from slamgym.estimator.bearing_range_model import locate_landmark, predict_measurement
-from slamgym.estimator.unicycle_motion import predict_pose
+from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import locate_landmark, predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.support import argument_checks
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class TextbookEkf:
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move: x ← g(x, u),  P ← G P Gᵀ + F R Fᵀ dt."""
-        u = validation.finite_vector("odometry", odometry, 2)
+        u = argument_checks.finite_vector("odometry", odometry, 2)
         moved = predict_pose(self._x[:3], u)
         G, F = np.eye(len(self._x)), moved.jacobian_noise
         G[:3, :3] = moved.jacobian_pose
@@ -73,8 +73,8 @@ class TextbookEkf:
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
     ) -> UpdateReport:
         """Correct by the landmarks that are known, then add those that are new."""
-        z = validation.scan(measurements)
-        ids = validation.identities(
+        z = argument_checks.scan(measurements)
+        ids = argument_checks.identities(
             [] if landmark_ids is None else landmark_ids, len(z)
         )
         if not np.isfinite(z).all():
@@ -141,7 +141,7 @@ class TurnsFirst(TextbookEkf):
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Turn by α, then drive d."""
-        distance, turn = validation.finite_vector("odometry", odometry, 2)
+        distance, turn = argument_checks.finite_vector("odometry", odometry, 2)
         super().predict((0.0, turn), dt)
         super().predict((distance, 0.0), 0.0)
 

@@ -47,8 +47,8 @@ from slamgym.agents.active_slam_scores import (
     play_all,
     score_table,
 )
-from slamgym.envs.stable_baselines import to_stable_baselines
-from slamgym.envs.vector_wrappers import FlattenBatch
+from slamgym.envs.vector.stable_baselines import to_stable_baselines
+from slamgym.envs.vector.wrappers import FlattenBatch
 
 FOLDER = Path("results/09_train_active_slam")
 INK, PALE, RED = "#222222", "#bbbbbb", "#c0392b"

@@ -1,6 +1,6 @@
 """What to simulate, as data: validated scenarios, and presets in TOML files."""
 
-from .landmark_layouts import place_landmarks as place_landmarks
+from .layouts import place_landmarks as place_landmarks
 from .scenario import Scenario as Scenario
 from .scenario import action_sequence as action_sequence
 from .scenario_errors import ScenarioError as ScenarioError

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from .control_sequences import ControlSequence, command_cycle
-from .domain_randomisation import Randomise, refuse_impossible_ends
+from .controls import ControlSequence, command_cycle
 from .field_types import (
     CountOrZero,
     Flag,
@@ -28,7 +27,8 @@ from .field_types import (
     broken_rule,
     expect,
 )
-from .landmark_layouts import LandmarkLayout
+from .layouts import LandmarkLayout
+from .randomisation import Randomise, refuse_impossible_ends
 from .scenario_errors import ScenarioError, error_lines
 
 _Angle = Annotated[Positive, Field(le=2 * math.pi), expect("a number in (0, 2π] [rad]")]

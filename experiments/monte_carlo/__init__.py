@@ -4,10 +4,10 @@ scenario → simulated runs → filtered runs → run measures → result blocks
 → scores → summary, table, plots, html report
 """
 
-from .result_blocks import merge_blocks
-from .results import load_results
+from .report.summary import consistency_of, summarise_monte_carlo
 from .runner import monte_carlo
-from .summary import consistency_of, summarise_monte_carlo
+from .store.result_blocks import merge_blocks
+from .store.results import load_results
 
 __all__ = [
     "consistency_of",

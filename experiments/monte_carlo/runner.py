@@ -22,15 +22,15 @@ from ...estimator.registry import (
 )
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_errors import closest
-from ..blas_threads import one_blas_thread
-from ..filter_settings import FilterSettings
-from ..simulated_runs import simulate_runs
-from .estimator_choices import EstimatorChoice, estimator_choices
-from .filtered_runs import filter_runs
-from .job_folder import RESULTS
-from .result_blocks import BlockFolder, Job, Span
-from .results import dataset_of, load_results, write_results
-from .run_measures import Block, measure_runs
+from ..runs.blas_threads import one_blas_thread
+from ..runs.filter_settings import FilterSettings
+from ..runs.simulated_runs import simulate_runs
+from .measure.estimator_choices import EstimatorChoice, estimator_choices
+from .measure.filtered_runs import filter_runs
+from .measure.run_measures import Block, measure_runs
+from .store.job_folder import RESULTS
+from .store.result_blocks import BlockFolder, Job, Span
+from .store.results import dataset_of, load_results, write_results
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from gymnasium.utils import seeding
 
-from ...envs.controller_batch import make_controller_batch
-from ...envs.separate_worlds import SeparateWorlds
-from ...envs.world_batch import WorldBatch
+from ...envs.controllers.vector import make_controller_batch
+from ...envs.vector.mixed_worlds import SeparateWorlds
+from ...envs.vector.world_batch import WorldBatch
 from ...sim_configs import Scenario
-from ...sim_configs.domain_randomisation import drawn_scenario
+from ...sim_configs.randomisation import drawn_scenario
 from .trajectory import Trajectory
 
 _CONTROLLER_STREAM, _SCENARIO_STREAM = 1, 2  # beside the seed, so that all differ

@@ -5,8 +5,8 @@ from os import PathLike
 from pathlib import Path
 from reprlib import repr as short_repr
 
-from ...envs.controllers import CONTROLLERS
-from ...envs.world_spaces import count_rows
+from ...envs.controllers.single import CONTROLLERS
+from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_errors import closest
 from .dataset import is_whole

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from ... import __version__
-from ...envs.atomic_file import replace_when_written
 from ...sim_configs import Scenario, load_scenario
+from ...sim_configs.atomic_file import replace_when_written
 from ...sim_configs.scenario_files import scenario_text
 
 MANIFEST = "manifest.json"

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..sole_writer import sole_writer
+from ..runs.folder_lock import sole_writer
 from .manifest import MANIFEST
 
 _WRITING = ".writing-"

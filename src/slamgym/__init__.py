@@ -12,7 +12,7 @@ __version__ = "0.1.0"
 gymnasium.register(
     id="slamgym/LandmarkWorld-v0",
     entry_point="slamgym.envs.landmark_world:LandmarkWorldEnv",
-    vector_entry_point="slamgym.envs.landmark_world_vector:LandmarkWorldVectorEnv",
+    vector_entry_point="slamgym.envs.vector.landmark_world_vector:LandmarkWorldVectorEnv",
 )
 gymnasium.register(
     id="slamgym/ActiveSlam-v0",

@@ -23,7 +23,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 
-from ....envs.world_spaces import action_space, observation_space
+from ....envs.spaces import action_space, observation_space
 from ....sim_configs import Scenario, load_scenario
 from ....sim_configs.scenario_files import scenario_text
 from ..trajectory import Trajectory, array_of

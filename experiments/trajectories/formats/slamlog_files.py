@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ....envs.world_spaces import count_rows
+from ....envs.spaces import count_rows
 from ....sim_configs import Scenario
-from ...log_events import OdometryRow, Scan
-from ...recording import log_header
-from ...slamlog import SlamLog, read_slamlog, write_slamlog
+from ...logs.events import OdometryRow, Scan
+from ...logs.recording import log_header
+from ...logs.slamlog import SlamLog, read_slamlog, write_slamlog
 from ..trajectory import Trajectory, array_of
 from .episode_files import EpisodeNotes, read_notes, write_notes
 
@@ -43,7 +43,7 @@ def read(path: Path) -> Iterator[Trajectory]:
 def to_slamlog(trajectory: Trajectory) -> SlamLog:
     """Make the log of a trajectory, for filters that replay logs.
 
-    Time counts steps, as in :func:`~slamgym.experiments.recording.record_episode`,
+    Time counts steps, as in :func:`~slamgym.experiments.logs.recording.record_episode`,
     whose log of the same seed is equal.
 
     Raises

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ....estimator.angles import wrap_angle
+from ....estimator.models.angles import wrap_angle
 from ....sim_configs import Scenario
 from ..trajectory import Array, Trajectory
 from .dead_reckoning import dead_reckoning

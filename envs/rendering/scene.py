@@ -1,0 +1,173 @@
+"""What the live view shows: the world, the robot in it, and a belief about both."""
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ...sim_configs import Scenario
+from .artists import (
+    ALARM,
+    AXES_BOX,
+    INK,
+    NOWHERE,
+    POSE,
+    add_axes,
+    add_moving,
+    add_still,
+    arrow_key,
+    set_ellipses,
+)
+from .axes_limits import ViewLimits
+from .render_state import BeliefLike, WorldSnapshot
+
+Array = NDArray[np.floating]
+
+_ARROW = np.array([[1.0, 0.0], [-0.75, 0.7], [-0.35, 0.0], [-0.75, -0.7]])
+_ARROW_SHARE = 0.024  # of the view's width: small robots stay visible
+
+
+class WorldPicture:
+    """The artists of one world on one figure, made once and then moved.
+
+    Parameters
+    ----------
+    figure : Figure
+        Square and empty.
+    scenario : Scenario
+        Gives walls, robot, sensor and the length of the episode.
+    landmarks : ndarray, shape (N, 2)
+        True positions [m].
+    """
+
+    def __init__(self, figure: Figure, scenario: Scenario, landmarks: Array) -> None:
+        self._scenario = scenario
+        self._figure = figure
+        self._axes = add_axes(figure, scenario.name)
+        width, height = figure.get_size_inches() * AXES_BOX[2:]
+        self._limits = ViewLimits(scenario, landmarks, aspect=width / height)
+        self._still = add_still(self._axes, scenario, landmarks)
+        self._moving = add_moving(self._axes, scenario.robot.radius)
+        self._legend_names_belief = False
+        self._show_limits()
+        self._show_legend()
+
+    @property
+    def moving(self) -> tuple[Artist, ...]:
+        """The artists that `show` moves, from back to front."""
+        return tuple(self._moving)
+
+    def show(self, snapshot: WorldSnapshot) -> bool:
+        """Move the artists; return whether the still part has changed too."""
+        resized = self._limits.follow(snapshot)
+        if resized:
+            self._show_limits()
+        renamed = snapshot.belief is not None and not self._legend_names_belief
+        if renamed:
+            self._legend_names_belief = True
+            self._show_legend()
+        self._show_robot(snapshot.pose, snapshot.collision)
+        self._moving.path.set_data(*np.transpose(snapshot.path))
+        self._show_readings(snapshot.pose, snapshot.measurements)
+        self._show_belief(snapshot.belief)
+        self._show_clock(snapshot)
+        return resized or renamed
+
+    def _show_robot(self, pose: Array, collision: bool) -> None:
+        moving, colour = self._moving, ALARM if collision else INK
+        moving.arrow.set_xy(self._arrow_at(pose))
+        moving.arrow.set_facecolor(colour)
+        moving.body.set_offsets(pose[:2])
+        moving.body.set_edgecolor(colour)
+        moving.halo.set_offsets(pose[:2])
+        moving.halo.set_visible(collision)
+        moving.alarm.set_visible(collision)
+        diameter = 2.6 * max(self._scenario.robot.radius, self._arrow_length())
+        moving.halo.set(widths=[diameter], heights=[diameter])
+        moving.view.set_xy(self._area_in_view(pose))
+
+    def _show_readings(self, pose: Array, measurements: Array) -> None:
+        direction, distance = pose[2] + measurements[:, 0], measurements[:, 1]
+        along = np.stack([np.cos(direction), np.sin(direction)], axis=1)
+        ends = pose[:2] + distance[:, None] * along
+        starts = np.broadcast_to(pose[:2], ends.shape)
+        self._moving.rays.set_segments(list(np.stack([starts, ends], axis=1)))
+        self._moving.readings.set_data(*ends.T)
+
+    def _show_belief(self, belief: BeliefLike | None) -> None:
+        moving = self._moving
+        for artist in (
+            moving.map_ellipses,
+            moving.map,
+            moving.pose_ellipse,
+            moving.estimate,
+        ):
+            artist.set_visible(belief is not None)
+        if belief is None:
+            return
+        landmarks = np.reshape(belief.landmarks, (-1, 2))
+        n = len(landmarks)
+        blocks = np.reshape(np.asarray(belief.covariance)[3:, 3:], (n, 2, n, 2))
+        spread = np.einsum("iaib->iab", blocks)  # each landmark's own covariance
+        moving.map.set_data(*landmarks.T)
+        set_ellipses(moving.map_ellipses, landmarks, spread)
+        moving.estimate.set_xy(self._arrow_at(belief.pose))
+        spread = np.asarray(belief.pose_covariance)[None, :2, :2]
+        set_ellipses(moving.pose_ellipse, belief.pose[None, :2], spread)
+
+    def _show_clock(self, snapshot: WorldSnapshot) -> None:
+        """Tell the time; few characters, since every one costs 0.1 ms."""
+        self._moving.clock.set_text(
+            f"step {snapshot.step}/{self._scenario.steps}   {snapshot.time:.1f} s"
+        )
+
+    def _show_limits(self) -> None:
+        self._axes.set(xlim=self._limits.x, ylim=self._limits.y)
+
+    def _show_legend(self) -> None:
+        """Name what can be seen, below the axes, where it covers nothing."""
+        for legend in self._figure.legends[:]:
+            legend.remove()
+        moving = self._moving
+        named: list[Artist] = [arrow_key(INK, INK, "robot"), moving.path, *self._still]
+        named.append(moving.readings)
+        if self._sees_only_part():
+            named.append(moving.view)
+        if self._legend_names_belief:
+            named += [arrow_key("white", POSE, "pose belief, 3σ"), moving.map]
+        self._figure.legend(
+            handles=named,
+            loc="lower center",
+            bbox_to_anchor=(0.52, 0.0),
+            ncols=4,
+            fontsize=8.5,
+            frameon=False,
+            columnspacing=1.4,
+            handletextpad=0.5,
+        )
+
+    def _arrow_length(self) -> float:
+        left, right = self._limits.x
+        return max(_ARROW_SHARE * (right - left), 0.8 * self._scenario.robot.radius)
+
+    def _arrow_at(self, pose: Array) -> Array:
+        cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        shape = self._arrow_length() * _ARROW @ np.array([[cos, sin], [-sin, cos]])
+        return np.asarray(pose[:2] + shape)
+
+    def _sees_only_part(self) -> bool:
+        sensor = self._scenario.sensor
+        return bool(sensor.field_of_view < 2 * np.pi or np.isfinite(sensor.max_range))
+
+    def _area_in_view(self, pose: Array) -> Array:
+        """Outline of what the sensor reaches: a wedge, or a disc for all around."""
+        if not self._sees_only_part():
+            return NOWHERE
+        sensor = self._scenario.sensor
+        (left, right), (low, high) = self._limits.x, self._limits.y
+        reach = min(sensor.max_range, np.hypot(right - left, high - low))
+        angles = pose[2] + sensor.field_of_view * np.linspace(-0.5, 0.5, 65)
+        arc = pose[:2] + reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        if sensor.field_of_view < 2 * np.pi:
+            arc = np.concatenate([arc, pose[None, :2]])
+        return np.asarray(arc)

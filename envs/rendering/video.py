@@ -1,0 +1,127 @@
+"""Moving pictures of frames: GIF by Pillow, MP4 by ffmpeg."""
+
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from itertools import chain
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from ...sim_configs.atomic_file import replace_when_written
+
+Frame = NDArray[np.uint8]
+
+
+def write_video(frames: Iterable[Frame], path: str | Path, fps: float = 30.0) -> None:
+    """Write frames as a video, complete or not at all.
+
+    Parameters
+    ----------
+    frames : iterable of ndarray of uint8, shape (H, W, 3)
+        The pictures, all of one size; consumed one by one.
+    path : str or Path
+        Ends in .gif (Pillow; times in hundredths of a second) or .mp4 (H.264, needs
+        the extra ``slamgym[video]``; an odd last row or column is repeated).
+    fps : float, default 30
+        Frames per second [1/s].
+
+    Raises
+    ------
+    ValueError
+        For another suffix, an fps that is not positive, no frames at all, or frames of
+        wrong or unequal shape.
+    ImportError
+        For .mp4 without imageio-ffmpeg.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in (".gif", ".mp4"):
+        raise ValueError(f"path must end in .gif or .mp4, got {str(path)!r}")
+    if not 0 < fps < np.inf:
+        raise ValueError(f"fps must be a finite number > 0, got {fps}")
+    if target.suffix.lower() == ".mp4":
+        ffmpeg = _import_ffmpeg()
+        with replace_when_written(target) as partial:
+            _write_mp4(ffmpeg, _checked(frames), partial, fps)
+    else:
+        with replace_when_written(target) as partial:
+            _write_gif(_checked(frames), partial, fps)
+
+
+def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Pass the frames on, once each is known to look like the first."""
+    shape = None
+    for k, frame in enumerate(frames):
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+            raise ValueError(
+                f"frame {k} must be uint8 of shape (H, W, 3), "
+                f"got {frame.dtype} of shape {frame.shape}"
+            )
+        if shape is None:
+            shape = frame.shape
+        if frame.shape != shape:
+            raise ValueError(f"frame {k} must have shape {shape}, got {frame.shape}")
+        yield frame
+    if shape is None:
+        raise ValueError("frames must hold at least one frame, got none")
+
+
+def _write_gif(frames: Iterator[Frame], path: Path, fps: float) -> None:
+    first = next(frames)
+    palette = _palette(first)
+    # without dithering flat colours stay flat, and with one palette for all frames only
+    # what moves is stored
+    images = (
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in chain([first], frames)
+    )
+    next(images).save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=images,
+        duration=1000 / fps,
+        loop=0,
+    )
+
+
+def _palette(frame: Frame) -> Image.Image:
+    """Choose 128 colours of one frame, and 125 from everywhere for those to come."""
+    own = Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE).getpalette()
+    colours = np.reshape(own or [], (-1, 3))
+    colours[(colours >= 248).all(axis=1)] = 255  # Pillow would take grey for white
+    levels = np.linspace(0, 255, 5).round().astype(int)
+    cube = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(-1, 3)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate([colours[:128], cube]).ravel().tolist())
+    return palette
+
+
+def _write_mp4(
+    ffmpeg: ModuleType, frames: Iterator[Frame], path: Path, fps: float
+) -> None:
+    first = next(frames)
+    height, width = (size + size % 2 for size in first.shape[:2])
+    writer = ffmpeg.write_frames(
+        str(path), (width, height), fps=fps, macro_block_size=2
+    )
+    writer.send(None)
+    try:
+        for frame in chain([first], frames):
+            rows, columns = height - frame.shape[0], width - frame.shape[1]
+            padded = np.pad(frame, ((0, rows), (0, columns), (0, 0)), mode="edge")
+            writer.send(np.ascontiguousarray(padded))
+    finally:
+        writer.close()
+
+
+def _import_ffmpeg() -> ModuleType:
+    try:
+        return import_module("imageio_ffmpeg")
+    except ImportError as error:
+        raise ImportError(
+            "writing .mp4 needs imageio-ffmpeg (pip install 'slamgym[video]'); "
+            "a path ending in .gif needs nothing more"
+        ) from error

@@ -1,0 +1,1 @@
+"""The robot's body: how it moves, and how walls stop it."""

@@ -1,0 +1,1 @@
+"""What the robot measures: odometry, bearings and ranges, and their noise."""

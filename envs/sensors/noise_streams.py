@@ -1,0 +1,262 @@
+"""Noise drawn ahead: one random stream per source, handed out step by step.
+
+Every stream is drawn in one fixed layout, step after step, so that no setting of one
+source changes the noise of another, and the length of a block changes nothing.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from functools import partial
+from itertools import repeat
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim_configs import Scenario
+
+Array = NDArray[np.float64]
+Row = TypeVar("Row")
+
+MANY_STD = 10.0
+"""No normal noise exceeds so many standard deviations: the odds are 1e-23."""
+
+_FIRST_BLOCK = 16  # steps; short, so that a reset is quick
+_LONGEST_BLOCK = 128  # steps; later blocks grow to this
+
+SensorNoise = tuple[Array, Array, Array | None, Array | None]
+"""What chance does to the sensor in one step: (error, nearest, clutter, order).
+
+A plain tuple, since a named one would cost 1 % of a step. N landmarks, C rows for
+clutter; worlds simulated side by side add axes where the dots are.
+
+error : shape (2, …, N)
+    (εβ, εr) [rad, m]; εr in units of σr(r) where that grows with the range.
+nearest : shape (…, N)
+    A landmark is read above this true range [m]: at least min_range; more where a
+    negative εr would leave no range above zero; inf where the reading drops out.
+clutter : shape (2, …, C), or None with identities
+    False readings (β, r), zeros where there is none [rad, m].
+order : shape (…, N + C), or None with identities
+    Uniform numbers that sort the rows.
+"""
+
+
+class Streams(NamedTuple):
+    """The independent generators of one episode, in the order they are spawned."""
+
+    start: np.random.Generator
+    map: np.random.Generator
+    motion: np.random.Generator
+    measurement: np.random.Generator
+    dropout: np.random.Generator
+    clutter: np.random.Generator
+    order: np.random.Generator
+
+
+def spawn_streams(rng: np.random.Generator) -> Streams:
+    """Spawn the streams of one episode; the state of `rng` stays as it is.
+
+    Examples
+    --------
+    >>> streams = spawn_streams(np.random.default_rng(0))
+    >>> bool(streams.start.random() == streams.map.random())
+    False
+    """
+    return Streams(*rng.spawn(len(Streams._fields)))
+
+
+class NoiseRows(Generic[Row]):
+    """Endless rows of noise, one per step, drawn in blocks that grow.
+
+    Parameters
+    ----------
+    draw : callable
+        Takes a number of steps and draws the rows of as many steps to come.
+
+    Examples
+    --------
+    >>> rows = NoiseRows(np.random.default_rng(0).standard_normal)
+    >>> float(next(rows)) == np.random.default_rng(0).standard_normal()
+    True
+    """
+
+    def __init__(self, draw: Callable[[int], Iterable[Row]]) -> None:
+        self._draw = draw
+        self._block = _FIRST_BLOCK
+        self._to_come: list[Row] = []  # the next one last
+
+    def __next__(self) -> Row:
+        if not self._to_come:
+            self._to_come = list(self._draw(self._block))[::-1]
+            self._block = min(2 * self._block, _LONGEST_BLOCK)
+        return self._to_come.pop()
+
+
+def motion_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[list[float]]:
+    """Rows (εx, εy, εα) [m, m, rad], as the floats that a single robot needs."""
+    return NoiseRows(partial(_motion_floats, streams, scenario))
+
+
+def sensor_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[SensorNoise]:
+    """Rows of `SensorNoise`; the first belongs to the start, before any step."""
+    law = SensorNoiseLaw(scenario)
+    return NoiseRows(partial(_sensor_noise_by_step, streams, scenario, law))
+
+
+def draw_motion_noise(streams: Streams, scenario: Scenario, steps: int) -> Array:
+    """Draw the motion noise of the steps that come next.
+
+    Returns
+    -------
+    ndarray, shape (steps, 3)
+        Rows (εx, εy, εα) [m, m, rad].
+    """
+    return streams.motion.standard_normal((steps, 3)) * scenario.motion.std
+
+
+class UnitDraws(NamedTuple):
+    """What the generators yield for the sensor, before any setting scales it.
+
+    K steps or K worlds. What a scenario has no use for is None, and is not drawn.
+    """
+
+    measurement: Array
+    """Normal numbers, shape (2, K, N)."""
+    dropout: Array | None
+    """Uniform numbers, shape (K, N)."""
+    clutter: Array | None
+    """Uniform numbers, one for how many, two for each row, shape (K, 1 + 2 C)."""
+    order: Array | None
+    """Uniform numbers, shape (K, N + C)."""
+
+
+def unit_widths(scenario: Scenario) -> tuple[int, int, int, int]:
+    """Count the numbers that each field of `UnitDraws` takes per step, 0 for none.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> unit_widths(load_scenario("dropout"))[:2]
+    (24, 12)
+    """
+    sensor, count = scenario.sensor, scenario.landmarks.count
+    hidden, rows = not sensor.identities, sensor.max_clutter
+    return (
+        2 * count,
+        count if sensor.dropout else 0,
+        1 + 2 * rows if hidden and sensor.clutter else 0,
+        count + rows if hidden else 0,
+    )
+
+
+class SensorNoiseLaw:
+    """Turns unit draws into the noise that a scenario's sensor has.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Whose `sensor` is meant.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._sensor = sensor = scenario.sensor
+        bearing_std, self._std = sensor.std
+        self._growth = sensor.range_std_per_metre
+        range_std = 1.0 if self._growth else self._std
+        self._scale = np.array([[[bearing_std]], [[range_std]]])
+        self._nearest = np.nextafter(sensor.min_range, -1.0)
+        self._counts_below = _poisson_cdf(sensor.clutter, sensor.max_clutter)
+
+    def apply(self, draws: UnitDraws) -> SensorNoise:
+        """Scale the draws of some steps or worlds."""
+        sensor, unit = self._sensor, draws.measurement
+        nearest = _nearest_readable(unit[1], self._std, self._growth)
+        np.maximum(nearest, self._nearest, out=nearest)
+        if draws.dropout is not None:
+            nearest[draws.dropout < sensor.dropout] = np.inf
+        if sensor.identities:
+            return unit * self._scale, nearest, None, None
+        return unit * self._scale, nearest, self._clutter(draws), draws.order
+
+    def _clutter(self, draws: UnitDraws) -> Array:
+        """Place false readings, uniform over the bearings and ranges that are seen.
+
+        Per step one number chooses how many, then each reserved row draws (β, r).
+        Returns (β, r), shape (2, K, C), zeros where there is none.
+        """
+        sensor, rows = self._sensor, self._sensor.max_clutter
+        if draws.clutter is None:
+            return np.zeros((*draws.measurement.shape[:-1], rows))
+        drawn = draws.clutter
+        counts = np.searchsorted(self._counts_below, drawn[..., 0], side="right")
+        width = sensor.max_range - sensor.min_range
+        bearings = (drawn[..., 1::2] - 0.5) * sensor.field_of_view
+        ranges = sensor.max_range - drawn[..., 2::2] * width  # never min_range, maybe 0
+        present = np.arange(rows) < counts[..., None]
+        return np.where(present, np.stack([bearings, ranges]), 0.0)
+
+
+def draw_sensor_noise(streams: Streams, scenario: Scenario, steps: int) -> SensorNoise:
+    """Draw the sensor's noise of the steps that come next.
+
+    Returns
+    -------
+    SensorNoise
+        Its four arrays, with the steps as their first axis.
+    """
+    return _draw_and_scale(streams, scenario, SensorNoiseLaw(scenario), steps)
+
+
+def _draw_and_scale(
+    streams: Streams, scenario: Scenario, law: SensorNoiseLaw, steps: int
+) -> SensorNoise:
+    normal, *widths = unit_widths(scenario)
+    sources = streams.dropout, streams.clutter, streams.order
+    unit = streams.measurement.standard_normal((steps, 2, normal // 2))
+    uniform = [
+        source.random((steps, width)) if width else None
+        for source, width in zip(sources, widths, strict=True)
+    ]
+    draws = UnitDraws(unit.transpose(1, 0, 2), *uniform)
+    error, nearest, clutter, order = law.apply(draws)
+    if clutter is not None:
+        clutter = clutter.transpose(1, 0, 2)
+    return error.transpose(1, 0, 2), nearest, clutter, order
+
+
+def _motion_floats(
+    streams: Streams, scenario: Scenario, steps: int
+) -> list[list[float]]:
+    rows: list[list[float]] = draw_motion_noise(streams, scenario, steps).tolist()
+    return rows
+
+
+def _sensor_noise_by_step(
+    streams: Streams, scenario: Scenario, law: SensorNoiseLaw, steps: int
+) -> Iterable[SensorNoise]:
+    error, nearest, clutter, order = _draw_and_scale(streams, scenario, law, steps)
+    return zip(
+        error,
+        nearest,
+        repeat(None) if clutter is None else clutter,
+        repeat(None) if order is None else order,
+        strict=False,  # repeat has no end
+    )
+
+
+def _nearest_readable(unit: Array, std: float, per_metre: float) -> Array:
+    """Find the range r above which r + (σ + k r) ε is positive, with unit noise ε."""
+    if per_metre == 0.0:
+        return -std * unit
+    slope = 1.0 + per_metre * unit
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(slope > 0.0, -std * unit / slope, np.inf)
+
+
+def _poisson_cdf(mean: float, largest: int) -> Array:
+    """P(at most k false readings) for k < largest, where the law is cut off."""
+    if mean == 0.0:
+        return np.empty(0)
+    logs = [k * math.log(mean) - mean - math.lgamma(k + 1) for k in range(largest)]
+    return np.cumsum(np.exp(logs))

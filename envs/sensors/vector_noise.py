@@ -1,0 +1,132 @@
+"""Noise of many worlds, each from its own generators, drawn ahead and stepped together.
+
+A stream is drawn in the layout that a single world uses, so that world i has the noise
+of a single world with its generator, whatever happens to the others.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim_configs import Scenario
+from .noise_streams import SensorNoise, SensorNoiseLaw, Streams, UnitDraws, unit_widths
+
+Array = NDArray[np.float64]
+
+_BLOCK_NUMBERS = 1024  # drawn at once per world: stays in the cache, hides the calls
+_FEWEST_STEPS = 8
+_PAIR = np.array([[0], [1]])
+_UNIFORM = Streams._fields.index("dropout")  # this stream and those behind it
+
+
+class NoiseBlocks:
+    """Noise of B worlds, drawn some steps ahead of each.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of every world.
+    count : int
+        B.
+    """
+
+    def __init__(self, scenario: Scenario, count: int) -> None:
+        widths = (3, *unit_widths(scenario))
+        steps = max(_FEWEST_STEPS, _BLOCK_NUMBERS // sum(widths))
+        self._steps = min(steps, scenario.steps + 1)
+        self._law = SensorNoiseLaw(scenario)
+        self._motion_std = np.tile(scenario.motion.std, (count, 1))  # one loop
+        self._sources = [
+            _Source(name, count, self._steps, width)
+            for name, width in zip(Streams._fields[2:], widths, strict=True)
+        ]
+        self._motion, self._measurement, *self._uniform = self._sources
+        self._place = np.arange(count) * self._steps  # of each world's row
+        self._end = self._place + self._steps
+        self._at_least_left = self._steps
+
+    def begin(self, worlds: Sequence[int], streams: Sequence[Streams]) -> None:
+        """Give these worlds the streams of a new episode, and go to its start.
+
+        The start has noise for the sensor; the motion's row is left out there.
+        """
+        for world, generators in zip(worlds, streams, strict=True):
+            for source in self._sources:
+                source.begin(world, generators)
+        self._place[worlds] = self._end[worlds] - self._steps
+        self._at_least_left = int((self._end - self._place).min())
+
+    def advance(self, moving: NDArray[np.bool_] | None) -> None:
+        """Go to the next step of the worlds that move (all)."""
+        self._place += 1 if moving is None else moving
+        self._at_least_left -= 1
+        if self._at_least_left == 0:
+            self._draw_ahead()
+
+    def motion(self) -> Array:
+        """Return (εx, εy, εα) of this step, shape (B, 3) [m, m, rad]."""
+        noise: Array = self._motion.rows(self._place) * self._motion_std
+        return noise
+
+    def sensor(self, worlds: NDArray[np.intp] | slice | None) -> SensorNoise:
+        """Return the sensor's noise of this step in some worlds, None for all.
+
+        Its arrays hold until the next call.
+        """
+        place = self._place if worlds is None else self._place[worlds]
+        return self._law.apply(
+            UnitDraws(
+                self._measurement.pairs(place),
+                *(each.rows(place) if each.width else None for each in self._uniform),
+            )
+        )
+
+    def _draw_ahead(self) -> None:
+        worlds = np.flatnonzero(self._place == self._end)
+        for source in self._sources:
+            source.draw(worlds.tolist())
+        self._place[worlds] -= self._steps
+        self._at_least_left = int((self._end - self._place).min())
+
+
+class _Source:
+    """One stream of every world: K steps drawn ahead, `width` numbers in each."""
+
+    def __init__(self, name: str, count: int, steps: int, width: int) -> None:
+        self.width = width
+        self._steps = steps
+        self._stream = Streams._fields.index(name)
+        self._first = 1 if name == "motion" else 0
+        self._ahead = np.zeros((count * steps, width))  # world after world
+        self._rngs: list[np.random.Generator | None] = [None] * count
+        self._chosen = np.empty((count, width))
+
+    def begin(self, world: int, streams: Streams) -> None:
+        if self.width:
+            self._rngs[world] = streams[self._stream]
+            self._fill(world, self._first)
+
+    def draw(self, worlds: Iterable[int]) -> None:
+        if self.width:
+            for world in worlds:
+                self._fill(world, 0)
+
+    def rows(self, places: NDArray[np.intp]) -> Array:
+        chosen = self._chosen[: len(places)]
+        self._ahead.take(places, 0, chosen, "clip")
+        return chosen
+
+    def pairs(self, places: NDArray[np.intp]) -> Array:
+        """Take the two halves of the rows apart, shape (2, b, width / 2)."""
+        halves = self._ahead.reshape(-1, self.width // 2)
+        all_worlds = len(places) == len(self._chosen)
+        out = self._chosen.reshape(2, -1, self.width // 2) if all_worlds else None
+        chosen: Array = halves.take(2 * places + _PAIR, 0, out, "clip")
+        return chosen
+
+    def _fill(self, world: int, first: int) -> None:
+        rng, end = self._rngs[world], (world + 1) * self._steps
+        if rng is not None:  # else the world has not begun
+            draw = rng.random if self._stream >= _UNIFORM else rng.standard_normal
+            draw(out=self._ahead[end - self._steps + first : end])

@@ -1,0 +1,82 @@
+"""The action and observation spaces of a scenario's world, all bounds finite."""
+
+import math
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from ..sim_configs import Scenario, place_landmarks
+from .sensors.noise_streams import MANY_STD
+
+
+def action_space(scenario: Scenario) -> spaces.Box:
+    """Bound (v, ω) by the limits of the robot [m/s, rad/s]."""
+    limits = np.array(
+        [scenario.robot.max_speed, scenario.robot.max_turn_rate], dtype=np.float32
+    )
+    return spaces.Box(-limits, limits, dtype=np.float32)
+
+
+def observation_space(scenario: Scenario) -> spaces.Dict:
+    """Bound readings, mask and odometry; see `LandmarkWorldEnv`.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> list(observation_space(load_scenario("six_landmarks")))
+    ['landmarks', 'mask', 'odometry']
+    """
+    rows = count_rows(scenario)
+    highest = np.tile([np.pi, _longest_reading(scenario)], (rows, 1))
+    lowest = np.tile([-np.pi, 0.0], (rows, 1))
+    odometry = np.array(_largest_odometry(scenario))
+    return spaces.Dict(
+        {
+            "landmarks": spaces.Box(lowest, highest, dtype=np.float64),
+            "mask": spaces.Box(0, 1, (rows,), dtype=np.bool_),
+            "odometry": spaces.Box(-odometry, odometry, dtype=np.float64),
+        }
+    )
+
+
+def count_rows(scenario: Scenario) -> int:
+    """Count the rows of an observation: N, or N + max_clutter without identities."""
+    hidden = not scenario.sensor.identities
+    return scenario.landmarks.count + hidden * scenario.sensor.max_clutter
+
+
+def _largest_odometry(scenario: Scenario) -> tuple[float, float]:
+    robot, motion = scenario.robot, scenario.motion
+    errs = MANY_STD * (motion.noise_in == "odometry")
+    return (
+        robot.max_speed * scenario.dt + errs * motion.std[0],
+        robot.max_turn_rate * scenario.dt + errs * motion.std[2],
+    )
+
+
+def _longest_reading(scenario: Scenario) -> float:
+    sensor = scenario.sensor
+    reach = sensor.max_range
+    if math.isinf(reach):
+        reach = _farthest_landmark(scenario)
+    return reach + MANY_STD * (sensor.std[1] + sensor.range_std_per_metre * reach)
+
+
+def _farthest_landmark(scenario: Scenario) -> float:
+    """Bound the distance to any landmark of a robot that drives straight away [m]."""
+    start, motion = scenario.start, scenario.motion
+    away = _outermost_landmarks(scenario) - start.pose[:2]
+    step = scenario.robot.max_speed * scenario.dt
+    if motion.noise_in == "motion":
+        step += MANY_STD * math.hypot(*motion.std[:2])
+    drawn = MANY_STD * math.hypot(*start.std[:2])
+    return float(np.hypot(*away.T).max()) + drawn + scenario.steps * step
+
+
+def _outermost_landmarks(scenario: Scenario) -> NDArray[np.float64]:
+    layout = scenario.landmarks
+    if layout.layout == "random":
+        left, bottom, right, top = layout.bounds
+        return np.array([[left, bottom], [left, top], [right, bottom], [right, top]])
+    return place_landmarks(layout, np.random.default_rng(0))

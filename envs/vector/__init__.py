@@ -1,0 +1,1 @@
+"""Many worlds side by side, simulated together."""

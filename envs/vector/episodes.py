@@ -1,0 +1,124 @@
+"""What Gymnasium asks of vector environments around the episodes of their worlds."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...sim_configs import Scenario
+
+BoolArray = NDArray[np.bool_]
+Infos = dict[str, Any]
+
+
+def world_seeds(
+    seed: int | Sequence[int | None] | None, count: int
+) -> list[int | None]:
+    """Spread a seed s over the worlds as Gymnasium does: s, s + 1 and so on.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If `seed` is neither None, an integer nor a list of `count` of them.
+
+    Examples
+    --------
+    >>> world_seeds(7, 3)
+    [7, 8, 9]
+    """
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, int):
+        return [seed + world for world in range(count)]
+    if not isinstance(seed, list | tuple):
+        raise TypeError(f"seed must be None, an int or a list of them, got {seed!r}")
+    if len(seed) != count:
+        raise ValueError(f"seed must be {count} seeds, one per world, got {len(seed)}")
+    return list(seed)
+
+
+def checked_reset_mask(options: dict[str, Any] | None, count: int) -> BoolArray | None:
+    """Take the mask of worlds to reset out of the options, None for all.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If there is another option, or the mask is not a bool ndarray of shape (count,)
+        that is True somewhere.
+    """
+    if not options:
+        return None
+    unknown = set(options) - {"reset_mask"}
+    if unknown:
+        raise ValueError(f"options may hold 'reset_mask' alone, got {sorted(unknown)}")
+    mask = options["reset_mask"]
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        raise TypeError(f"reset_mask must be a bool ndarray, got {mask!r}")
+    if mask.shape != (count,) or not mask.any():
+        raise ValueError(
+            f"reset_mask must have shape ({count},) and be True somewhere, got {mask!r}"
+        )
+    return mask
+
+
+def with_masks(infos: Infos, worlds: BoolArray | None, count: int) -> Infos:
+    """Add to each key the mask ``_key`` of the worlds (all) that it tells of.
+
+    Where a world is not told of there are zeros, as from Gymnasium's own vectors.
+
+    Examples
+    --------
+    >>> with_masks({"collision": np.array([True, True])}, np.array([True, False]), 2)
+    {'collision': array([ True, False]), '_collision': array([ True, False])}
+    """
+    masked = {}
+    for key, value in infos.items():
+        if worlds is None:
+            masked[key], masked[f"_{key}"] = value, ~np.zeros(count, np.bool_)
+        else:
+            told = np.zeros_like(value)
+            told[worlds] = value[worlds]
+            masked[key], masked[f"_{key}"] = told, worlds.copy()
+    return masked
+
+
+def final_moments(observations: Infos, infos: Infos, ended: BoolArray) -> Infos:
+    """Form ``final_obs`` and ``final_info`` of the worlds whose episodes ended.
+
+    Parameters
+    ----------
+    observations, infos : dict of ndarray
+        Of all worlds, the worlds along the first axis.
+    ended : bool ndarray, shape (B,)
+
+    Returns
+    -------
+    dict
+        As the same-step mode of Gymnasium's vectors puts them into its infos.
+    """
+    count = len(ended)
+    last = np.full(count, None, dtype=object)
+    for world in np.flatnonzero(ended):
+        last[world] = {key: value[world].copy() for key, value in observations.items()}
+    return {
+        "final_obs": last,
+        "_final_obs": ended.copy(),
+        "final_info": with_masks(infos, ended, count),
+        "_final_info": ended.copy(),
+    }
+
+
+def episode_steps(scenario: Scenario, most: int | None) -> int:
+    """Return how many steps an episode has: the scenario's, or ``max_episode_steps``.
+
+    Raises
+    ------
+    ValueError
+        If it is no whole number of steps.
+    """
+    if most is None or most == -1:  # Gymnasium's word for no limit
+        return scenario.steps
+    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
+        raise ValueError(f"max_episode_steps must be a whole number >= 1, got {most!r}")
+    return min(most, scenario.steps)

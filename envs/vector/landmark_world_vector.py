@@ -1,0 +1,277 @@
+"""Many landmark worlds side by side, as one native Gymnasium vector environment."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import logger
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from ...sim_configs import Scenario, load_scenario
+from ..landmark_world import LandmarkWorldEnv
+from ..rendering.render_state import BeliefLike
+from ..rendering.vector_rendering import WorldViews
+from ..spaces import action_space, observation_space
+from .episodes import (
+    checked_reset_mask,
+    episode_steps,
+    final_moments,
+    with_masks,
+    world_seeds,
+)
+from .world_batch import WorldBatch
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Observations = dict[str, Any]
+Infos = dict[str, Any]
+
+
+class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
+    """B landmark worlds of one scenario, simulated together in numpy.
+
+    Under ``reset(seed=s)`` world i has the bits of a `LandmarkWorldEnv` under
+    ``reset(seed=s + i)``, in the first episode and in those that follow, whatever the
+    other worlds do. Spaces, observations and infos are those of `LandmarkWorldEnv` with
+    an axis of worlds in front. ``gymnasium.make_vec("slamgym/LandmarkWorld-v0", B)``
+    makes this class.
+
+    Parameters
+    ----------
+    num_envs : int, default 1
+        B, the number of worlds.
+    scenario : Scenario, mapping, str or Path, default "six_landmarks"
+        As for `LandmarkWorldEnv`.
+    render_mode : {"human", "rgb_array"}, optional
+        Whether each world has a window, or `render` returns a frame of each.
+    max_episode_steps : int, optional
+        Truncates episodes before the scenario's own steps are over.
+    autoreset_mode : AutoresetMode or str, default ``AutoresetMode.NEXT_STEP``
+        Whether a world whose episode has ended begins a new one at the next step, in
+        the same step (the last moment is then in ``infos["final_obs"]`` and
+        ``infos["final_info"]``), or not before ``reset(options={"reset_mask": …})``.
+    **changes
+        Fields of the scenario to replace, as in `Scenario.with_changes`.
+
+    Examples
+    --------
+    >>> import gymnasium, slamgym
+    >>> worlds = gymnasium.make_vec("slamgym/LandmarkWorld-v0", 3, scenario="corridor")
+    >>> observations, infos = worlds.reset(seed=0)
+    >>> observations["landmarks"].shape, infos["pose"].shape
+    ((3, 28, 2), (3, 3))
+    """
+
+    _views: WorldViews | None = None  # here, as close comes even after a refusal
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: Scenario | Mapping[str, object] | str | Path = "six_landmarks",
+        *,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **changes: object,
+    ) -> None:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs must be an integer >= 1, got {num_envs!r}")
+        self.scenario = load_scenario(scenario)
+        if changes:
+            self.scenario = self.scenario.with_changes(**changes)
+        self.num_envs = num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {
+            **LandmarkWorldEnv.metadata,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.single_action_space = action_space(self.scenario)
+        self.single_observation_space = observation_space(self.scenario)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.render_mode = render_mode
+        if render_mode is not None:
+            fps = float(self.metadata["render_fps"])
+            self._views = WorldViews(self.scenario, render_mode, fps, num_envs)
+        self._steps = episode_steps(self.scenario, max_episode_steps)
+        self._worlds = WorldBatch(self.scenario, num_envs)
+        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._seeds: list[int] = [-1] * num_envs
+        self._steps_left = np.zeros(num_envs, dtype=np.int64)
+        self._ended = np.zeros(num_envs, dtype=np.bool_)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Observations, Infos]:
+        """Begin an episode in every world, or in those of a mask.
+
+        Parameters
+        ----------
+        seed : int >= 0, or list of B of them, optional
+            World i is seeded ``seed + i``, or by its place in the list; None seeds
+            nothing anew.
+        options : dict, optional
+            ``{"reset_mask": mask}``, bool ndarray of shape (B,), chooses worlds. The
+            others stay as they are, and have no info.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If there are other options, or a mask or seeds of another form.
+        gymnasium.error.ResetNeeded
+            If a mask leaves out worlds that have never begun.
+        """
+        mask = checked_reset_mask(options, self.num_envs)
+        seeds = world_seeds(seed, self.num_envs)
+        self._begin(np.ones(self.num_envs, np.bool_) if mask is None else mask, seeds)
+        return self._observations(), with_masks(self._infos(), mask, self.num_envs)
+
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[Observations, Array, BoolArray, BoolArray, Infos]:
+        """Take one step in every world.
+
+        Parameters
+        ----------
+        actions : array_like, shape (B, 2)
+            Rows (v, ω) [m/s, rad/s].
+
+        Raises
+        ------
+        ValueError
+            If the actions are not B rows of two finite numbers; the worlds stay as they
+            are.
+        gymnasium.error.ResetNeeded
+            Before `reset`, and, without autoreset, for worlds that have ended.
+        """
+        resetting, moving = self._ended, None
+        if np.count_nonzero(resetting):
+            self._refuse_without_autoreset(resetting)
+            moving = ~resetting
+        self._worlds.step(actions, moving)
+        self._steps_left -= 1
+        if self._views is not None:
+            self._views.add(self._worlds, ~resetting)
+        if moving is not None:
+            self._begin(resetting)
+        truncated = self._steps_left <= 0
+        final = {}
+        if self.autoreset_mode != AutoresetMode.SAME_STEP:
+            self._ended = truncated
+        elif np.count_nonzero(truncated):
+            final = final_moments(self._observations(), self._infos(), truncated)
+            self._begin(truncated)
+        infos = {**final, **with_masks(self._infos(), None, self.num_envs)}
+        rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
+        return self._observations(), rewards, terminated, truncated.copy(), infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a frame of each world in mode "rgb_array", else None."""
+        self._refuse_before_reset()
+        if self._views is None:
+            logger.warn("render shows nothing without a render_mode")
+            return None
+        return self._views.draw() if self.render_mode == "rgb_array" else None
+
+    def show_beliefs(self, beliefs: Sequence[BeliefLike | None]) -> None:
+        """Let the frames of world i show belief i, from now on; None for none."""
+        if self._views is not None:
+            self._views.show_beliefs(beliefs)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the windows, if there are any."""
+        if self._views is not None:
+            self._views.close()
+
+    @property
+    def poses(self) -> Array:
+        """True (x, y, θ) of the worlds, shape (B, 3) [m, m, rad], a copy."""
+        self._refuse_before_reset()
+        return self._worlds.poses.copy()
+
+    @property
+    def landmarks(self) -> Array:
+        """True positions of the landmarks, shape (B, N, 2) [m], a copy."""
+        self._refuse_before_reset()
+        return self._worlds.landmarks
+
+    @property
+    def start_estimates(self) -> Array:
+        """Poses from which filters start, shape (B, 3) [m, m, rad], a copy."""
+        self._refuse_before_reset()
+        return self._worlds.start_estimates
+
+    @property  # type: ignore[misc]
+    def np_random(  # type: ignore[override]
+        self,
+    ) -> tuple[np.random.Generator, ...]:
+        """The generator of each world."""
+        return tuple(self._generators())
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """The seed of each world's generator."""
+        self._generators()
+        return tuple(self._seeds)
+
+    def _generators(self) -> list[np.random.Generator]:
+        """Seed what has no generator yet by the entropy of the machine."""
+        made = []
+        for world, rng in enumerate(self._rngs):
+            if rng is None:
+                rng, self._seeds[world] = seeding.np_random()  # noqa: PLW2901
+                self._rngs[world] = rng
+            made.append(rng)
+        return made
+
+    def _begin(self, worlds: BoolArray, seeds: Sequence[int | None] = ()) -> None:
+        fresh = {
+            world: seeding.np_random(seed)
+            for world, seed in enumerate(seeds)
+            if seed is not None and worlds[world]
+        }
+        for world, (rng, used) in fresh.items():
+            self._rngs[world], self._seeds[world] = rng, used
+        self._worlds.reset(self._generators(), worlds)
+        self._steps_left[worlds] = self._steps
+        self._ended = self._ended & ~worlds
+        if self._views is not None:
+            self._views.begin(self._worlds, worlds)
+
+    def _observations(self) -> Observations:
+        worlds = self._worlds
+        observations = {
+            "landmarks": worlds.measurements,
+            "mask": worlds.mask,
+            "odometry": worlds.odometry,
+        }
+        if self.autoreset_mode != AutoresetMode.DISABLED:
+            return observations
+        # there a later reset repeats them, whatever was written into these
+        return {key: value.copy() for key, value in observations.items()}
+
+    def _infos(self) -> Infos:
+        worlds = self._worlds
+        infos: Infos = {"pose": worlds.poses, "collision": worlds.collisions}
+        if worlds.landmark_ids is not None:
+            infos["landmark_ids"] = worlds.landmark_ids
+        return infos
+
+    def _refuse_before_reset(self) -> None:
+        if not self._worlds.begun:
+            raise ResetNeeded("call reset first: there are no worlds yet")
+
+    def _refuse_without_autoreset(self, ended: BoolArray) -> None:
+        if self.autoreset_mode == AutoresetMode.DISABLED:
+            raise ResetNeeded(
+                f"worlds {np.flatnonzero(ended).tolist()} have ended: reset them first "
+                '(options={"reset_mask": …})'
+            )

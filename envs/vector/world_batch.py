@@ -1,0 +1,289 @@
+"""Many worlds of one scenario side by side, simulated together in numpy."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from numpy.typing import ArrayLike, NDArray
+
+from ...sim_configs import Scenario, place_landmarks
+from ...sim_configs.randomisation import refuse_ranges
+from ..robot.vector_bodies import UnicycleBodies
+from ..sensors.bearing_range import BearingRangeSensor, hide_identities
+from ..sensors.noise_streams import Streams, spawn_streams
+from ..sensors.vector_noise import NoiseBlocks
+from ..spaces import count_rows
+from .actions import checked_actions
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Places = NDArray[np.intp]
+Scan = tuple[Array, BoolArray, NDArray[np.int64] | None]
+
+_READINGS_AT_ONCE = 8192
+_NO_ERROR = np.array(0.0)
+
+
+class WorldBatch:
+    """B worlds of one scenario, which share nothing but their code.
+
+    World i has the bits of a single `LandmarkWorldEnv` whose ``np_random`` is the
+    generator i, whatever the other worlds do.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What every world is; a random layout without a seed differs from world to world.
+    count : int
+        B, the number of worlds.
+
+    Attributes
+    ----------
+    measurements : ndarray, shape (B, M, 2)
+        Rows (β in [-π, π), r), zeros where unseen [rad, m].
+    mask : bool ndarray, shape (B, M)
+        Rows that hold a measurement.
+    odometry : ndarray, shape (B, 2)
+        (d, α) as the odometry tells it [m, rad].
+    poses : ndarray, shape (B, 3)
+        True (x, y, θ) [m, m, rad], θ not wrapped.
+    collisions : bool ndarray, shape (B,)
+        Where a wall held the robot back.
+    landmark_ids : int64 ndarray, shape (B, M), or None with identities
+        The true landmark of each row, -1 for clutter and empty rows.
+    begun : bool
+        Whether there has been a `reset`.
+
+    Notes
+    -----
+    `reset` and `step` assign new arrays and never write into those handed out before.
+    Nor does writing into them move a robot; but a world that takes no part in a `reset`
+    has its rows repeated from the last arrays.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> worlds = WorldBatch(load_scenario("six_landmarks"), count=2)
+    >>> worlds.reset([np.random.default_rng(seed) for seed in (0, 1)])
+    >>> worlds.step(np.array([[1.0, 0.0], [0.5, 0.1]]))
+    >>> worlds.odometry
+    array([[3. , 0. ],
+           [1.5, 0.3]])
+    """
+
+    def __init__(self, scenario: Scenario, count: int) -> None:
+        if count < 1:
+            raise ValueError(f"count must be >= 1, got {count}")
+        refuse_ranges(scenario)
+        self.scenario = scenario
+        self.count = count
+        self._noise = NoiseBlocks(scenario, count)
+        self._sensor = BearingRangeSensor(scenario)
+        robot, motion = scenario.robot, scenario.motion
+        self._bodies = UnicycleBodies(count, robot.radius, scenario.walls)
+        limits = robot.max_speed, robot.max_turn_rate
+        self._fastest = np.tile(limits, (count, 1))  # so that numpy runs one loop
+        self._slowest = -self._fastest
+        self._slips = motion.noise_in == "motion"
+        self._noise_at_rest = motion.noise_at_rest
+        self._hides_identities = not scenario.sensor.identities
+        self._no_slip = np.zeros((count, 3))
+        self.begun = False
+        self._clear()
+
+    def _clear(self) -> None:
+        count, rows = self.count, count_rows(self.scenario)
+        self.measurements = np.zeros((count, rows, 2))
+        self.mask = np.zeros((count, rows), dtype=np.bool_)
+        self.odometry = np.zeros((count, 2))
+        self.poses = np.zeros((count, 3))
+        self.collisions = np.zeros(count, dtype=np.bool_)
+        self.landmark_ids: NDArray[np.int64] | None = None
+        if self._hides_identities:
+            self.landmark_ids = np.full((count, rows), -1)
+        self._start_estimates = np.zeros((count, 3))
+        shape = (count, self.scenario.landmarks.count)
+        self._landmarks = np.zeros(shape, dtype=np.complex128)
+
+    @property
+    def landmarks(self) -> Array:
+        """True positions, shape (B, N, 2) [m], a copy."""
+        return self._landmarks.copy().view(np.float64).reshape(self.count, -1, 2)
+
+    @property
+    def start_estimates(self) -> Array:
+        """Poses from which filters start, shape (B, 3) [m, m, rad], a copy."""
+        return self._start_estimates.copy()
+
+    def reset(
+        self,
+        generators: Sequence[np.random.Generator],
+        worlds: BoolArray | None = None,
+    ) -> None:
+        """Begin an episode in some worlds (all), and measure from its start.
+
+        Parameters
+        ----------
+        generators : sequence of numpy.random.Generator, length B
+            Generator i is what ``np_random`` is to a single world; of the chosen worlds
+            alone they spawn.
+        worlds : bool ndarray, shape (B,), optional
+            Which worlds; at first all.
+
+        Raises
+        ------
+        ValueError
+            If there are not B generators, or the choice is not B truth values.
+        gymnasium.error.ResetNeeded
+            If some worlds have never begun and are not chosen.
+        """
+        chosen = self._chosen(worlds)
+        if len(generators) != self.count:
+            raise ValueError(
+                f"generators must be {self.count}, one per world, got {len(generators)}"
+            )
+        streams = [spawn_streams(generators[world]) for world in chosen.tolist()]
+        poses, estimates = self._draw_starts([each.start for each in streams])
+        self._place_landmarks(chosen, streams)
+        self._noise.begin(chosen.tolist(), streams)
+        self._start_estimates = _replaced(self._start_estimates, chosen, estimates)
+        self._bodies.place(chosen, poses)
+        self.poses = self._bodies.poses()
+        self.odometry = _replaced(self.odometry, chosen, 0.0)
+        self.collisions = _replaced(self.collisions, chosen, False)
+        self.begun = True
+        self._measure_some(chosen)
+
+    def step(self, actions: ArrayLike, moving: BoolArray | None = None) -> None:
+        """Drive and turn for one step, then measure.
+
+        Parameters
+        ----------
+        actions : array_like, shape (B, 2)
+            (v, ω) [m/s, rad/s]; what lies beyond the robot's limits is clipped.
+        moving : bool ndarray, shape (B,), optional
+            Which worlds take the step (all); the others stay as they are, and their
+            actions are not looked at.
+
+        Raises
+        ------
+        ValueError
+            If the actions of moving worlds are not finite numbers; no world moves then.
+        gymnasium.error.ResetNeeded
+            Before `reset`.
+        """
+        if not self.begun:
+            raise ResetNeeded("call reset before step")
+        if moving is not None:
+            moving = self._truth_values(moving, "moving")
+            if np.count_nonzero(moving) == self.count:
+                moving = None
+        checked = checked_actions(actions, self.count, moving)
+        self._noise.advance(moving)
+        self._drive(checked, moving)
+        self.measurements, self.mask, self.landmark_ids = self._scan_all()
+
+    def _truth_values(self, value: BoolArray, name: str) -> BoolArray:
+        array = np.asarray(value)
+        if array.shape != (self.count,) or array.dtype != np.bool_:
+            raise ValueError(
+                f"{name} must be a bool array of shape ({self.count},), "
+                f"got {array.dtype} of shape {array.shape}"
+            )
+        return array
+
+    def _chosen(self, worlds: BoolArray | None) -> Places:
+        if worlds is None:
+            return np.arange(self.count)
+        chosen = self._truth_values(worlds, "worlds")
+        if not self.begun and not chosen.all():
+            raise ResetNeeded("reset all worlds first: some have never begun")
+        return np.flatnonzero(chosen)
+
+    def _draw_starts(self, rngs: list[np.random.Generator]) -> tuple[Array, Array]:
+        """Return true and estimated start poses, each of shape (b, 3)."""
+        start = self.scenario.start
+        centre = np.tile(start.pose, (len(rngs), 1))
+        unit = np.array([rng.standard_normal(3) for rng in rngs]).reshape(-1, 3)
+        drawn = centre + start.std * unit
+        return (drawn, centre) if start.drawn == "truth" else (centre, drawn)
+
+    def _place_landmarks(self, chosen: Places, streams: list[Streams]) -> None:
+        layout = self.scenario.landmarks
+        if layout.layout == "random" and layout.seed is None:
+            placed = [place_landmarks(layout, each.map) for each in streams]
+            self._landmarks[chosen] = np.array(placed).view(np.complex128)[..., 0]
+        elif not self.begun:
+            placed_once = np.ascontiguousarray(place_landmarks(layout, streams[0].map))
+            self._landmarks[:] = placed_once.view(np.complex128)[:, 0]
+
+    def _drive(self, actions: Array, moving: BoolArray | None) -> None:
+        clipped = np.minimum(np.maximum(actions, self._slowest), self._fastest)
+        commands = clipped * self.scenario.dt
+        slip, error = self._place_noise(commands)
+        share = self._bodies.drive(commands, slip, moving)
+        collisions = np.zeros(self.count, dtype=np.bool_)
+        if share is not None:
+            commands[:, 0] *= share
+            np.less(share, 1.0, out=collisions)
+        odometry = commands + error
+        if moving is not None:
+            odometry = np.where(moving[:, None], odometry, self.odometry)
+            collisions = np.where(moving, collisions, self.collisions)
+        self.odometry, self.collisions = odometry, collisions
+        self.poses = self._bodies.poses()
+
+    def _place_noise(self, commands: Array) -> tuple[Array, Array]:
+        """Split the noise into slip, (B, 3), and odometry error, (B, 2) or ()."""
+        noise = self._noise.motion()
+        if not self._noise_at_rest:
+            noise[~commands.any(axis=1)] = 0.0
+        if self._slips:
+            return noise, _NO_ERROR
+        return self._no_slip, noise[:, ::2]
+
+    def _measure_some(self, worlds: Places) -> None:
+        measurements, mask, ids = self._scan(worlds)
+        self.measurements = _replaced(self.measurements, worlds, measurements)
+        self.mask = _replaced(self.mask, worlds, mask)
+        if self.landmark_ids is not None:
+            self.landmark_ids = _replaced(self.landmark_ids, worlds, ids)
+
+    def _scan_all(self) -> Scan:
+        """Scan part after part, so small that its arrays stay in the cache.
+
+        Worlds that did not move find the noise of their last scan, and so its readings.
+        """
+        size = max(1, _READINGS_AT_ONCE // self.mask.shape[1])
+        if self.count <= size:
+            return self._scan()
+        measurements, masks, ids = zip(
+            *(
+                self._scan(slice(first, first + size))
+                for first in range(0, self.count, size)
+            ),
+            strict=True,
+        )
+        all_ids = np.concatenate(ids) if self._hides_identities else None
+        return np.concatenate(measurements), np.concatenate(masks), all_ids
+
+    def _scan(self, worlds: Places | slice | None = None) -> Scan:
+        bodies, noise = self._bodies, self._noise.sensor(worlds)
+        poses = self._landmarks, bodies.position, bodies.inverse_heading
+        if worlds is not None:
+            poses = poses[0][worlds], poses[1][worlds], poses[2][worlds]
+        readings, mask = self._sensor.scan(*poses, noise)
+        ids = None
+        if self._hides_identities:
+            readings, mask, ids = hide_identities(readings, mask, noise)
+        measurements = np.empty((*mask.shape, 2))
+        measurements[..., 0], measurements[..., 1] = readings
+        return measurements, mask, ids
+
+
+def _replaced(old: NDArray[Any], worlds: Places, value: Any) -> NDArray[Any]:
+    """Return a copy with new values for some worlds."""
+    new = old.copy()
+    new[worlds] = value
+    return new

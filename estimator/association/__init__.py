@@ -1,0 +1,1 @@
+"""Data association: which landmark each reading belongs to."""

@@ -1,0 +1,143 @@
+"""Landmarks seen too rarely to be believed, kept outside the map until they are.
+
+Each is a place q in the robot's own frame with a covariance C, which odometry and
+further sightings move::
+
+    predict   q ← R(−α) (q − (d, 0)),   C ← R(−α) (C + diag(σx², σy²)) R(α)
+              C ← C + σα² (J q) (J q)ᵀ
+    sighting  H = ∂(β, r)/∂q,   S = H C Hᵀ + Q
+              q ← q + C Hᵀ S⁻¹ ν,   C ← C − C Hᵀ S⁻¹ H C
+
+so that the filter's belief, its jumps and its frame have no part in it, and nothing
+has to be taken back when a landmark turns out to be none.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.angles import wrap_angle
+from .nearest_neighbour import Distances, Noise, innovation_distances
+
+Array = NDArray[np.float64]
+Masks = NDArray[np.uint64]
+
+
+class TentativeLandmarks(NamedTuple):
+    """Some tentative landmarks; methods return what becomes of them.
+
+    Examples
+    --------
+    Three sightings within five scans make a landmark:
+
+    >>> noise, none = (0.1, 0.1, 0.0), TentativeLandmarks.none()
+    >>> one = none.with_new(np.array([[0.0, 4.0]]), noise)
+    >>> two = one.next_scan(5).with_sighting(0, np.array([0.1, 4.1]), noise)
+    >>> two.sightings.tolist()
+    [2]
+    """
+
+    places: Array
+    """q, shape (t, 2) [m]."""
+    covariances: Array
+    """C, shape (t, 2, 2) [m²]."""
+    seen: Masks
+    """Of each a bit per scan, the latest scan lowest: whether it was seen there."""
+
+    @classmethod
+    def none(cls) -> "TentativeLandmarks":
+        """Start without any."""
+        return cls(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0, np.uint64))
+
+    @property
+    def sightings(self) -> NDArray[np.int64]:
+        """How often each was seen within the scans that count, shape (t,)."""
+        return np.bitwise_count(self.seen).astype(np.int64)
+
+    def moved(
+        self, distance: float, turn: float, variance: Array
+    ) -> "TentativeLandmarks":
+        """Follow the robot along odometry (d, α) with noise (σx², σy², σα²)."""
+        if not len(self.seen):
+            return self
+        back = _rotation(-turn)
+        places = (self.places - (distance, 0.0)) @ back.T
+        spread = back @ (self.covariances + np.diag(variance[:2])) @ back.T
+        lever = places[:, ::-1] * (-1.0, 1.0)
+        spread += variance[2] * lever[:, :, None] * lever[:, None, :]
+        return self._replace(places=places, covariances=spread)
+
+    def next_scan(self, scans: int) -> "TentativeLandmarks":
+        """Begin a scan: forget sightings that are ``scans`` old, then who has none."""
+        if not len(self.seen):
+            return self
+        window = np.uint64((1 << scans) - 1)
+        seen = (self.seen << np.uint64(1)) & window
+        return self._replace(seen=seen).chosen(seen > 0)
+
+    def distances(self, readings: Array, noise: Noise, largest: float) -> Distances:
+        """Compare readings with all, see :func:`innovation_distances`."""
+        t = len(self.seen)
+        mean, covariance = np.zeros(3 + 2 * t), np.zeros((3 + 2 * t, 3 + 2 * t))
+        mean[3:] = self.places.ravel()
+        blocks = covariance[3:, 3:].reshape(t, 2, t, 2)
+        blocks[np.arange(t), :, np.arange(t), :] = self.covariances
+        return innovation_distances(mean, covariance, t, readings, noise, largest)
+
+    def with_sighting(
+        self, which: int, reading: Array, noise: Noise
+    ) -> "TentativeLandmarks":
+        """Correct a place by one more reading (β, r) of it."""
+        (x, y), C = self.places[which], self.covariances[which]
+        distance = np.hypot(x, y)
+        H = np.array(
+            [[-y / distance**2, x / distance**2], [x / distance, y / distance]]
+        )
+        nu = reading - (np.arctan2(y, x), distance)
+        nu[0] = wrap_angle(float(nu[0]))
+        S = H @ C @ H.T + np.diag(_variances(reading, noise))
+        gain = np.linalg.solve(S, H @ C).T
+        corrected = C - gain @ H @ C
+        places, spread = self.places.copy(), self.covariances.copy()
+        seen = self.seen.copy()
+        places[which] += gain @ nu
+        spread[which] = (corrected + corrected.T) / 2
+        seen[which] |= np.uint64(1)
+        return TentativeLandmarks(places, spread, seen)
+
+    def with_new(self, readings: Array, noise: Noise) -> "TentativeLandmarks":
+        """Add what was seen for the first time in rows (β, r)."""
+        if not len(readings):
+            return self
+        places, spread = [], []
+        for bearing, distance in readings:
+            across, along = _variances(np.array([bearing, distance]), noise)
+            direction = _rotation(bearing)
+            places.append(direction @ (distance, 0.0))
+            local = np.diag([along, across * distance**2])
+            spread.append(direction @ local @ direction.T)
+        return TentativeLandmarks(
+            np.concatenate([self.places, places]),
+            np.concatenate([self.covariances, spread]),
+            np.concatenate([self.seen, np.ones(len(readings), np.uint64)]),
+        )
+
+    def chosen(self, which: NDArray[np.bool_]) -> "TentativeLandmarks":
+        """Keep some of them."""
+        if which.all():
+            return self
+        return TentativeLandmarks(
+            self.places[which], self.covariances[which], self.seen[which]
+        )
+
+
+def _rotation(angle: float) -> Array:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+def _variances(reading: Array, noise: Noise) -> tuple[float, float]:
+    """Of bearing and range of a reading."""
+    bearing_std, range_std, per_metre = noise
+    return bearing_std**2, float(range_std + per_metre * reading[1]) ** 2

@@ -1,0 +1,1 @@
+"""The EKF-SLAM filters, and batches of them."""

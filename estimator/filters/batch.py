@@ -1,0 +1,423 @@
+"""Many independent runs of one filter at once, on the single filter's own kernels."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..interface import Belief
+from ..kernels.batch import NEVER, drive_runs
+from ..kernels.scan_rows import Workspace, aligned_zeros
+from ..models.angles import wrap_angle
+from ..registry import find_estimator
+from ..support import argument_checks
+from .ekf import FRAMES, EkfSlam, workspace_for
+
+Array = NDArray[np.float64]
+
+
+# So many that a thread which gets little of its core holds up the others but little.
+SHARES_PER_THREAD = 8
+
+
+class BatchTrace(NamedTuple):
+    """What every run believed after every step; B runs, T steps."""
+
+    poses: Array
+    """(x, y, θ), shape (B, T, 3) [m, m, rad], heading in [-π, π)."""
+    pose_covariances: Array
+    """Shape (B, T, 3, 3)."""
+    nis: Array
+    """νᵀ S⁻¹ ν of each scan, shape (B, T)."""
+    degrees_of_freedom: NDArray[np.int64]
+    """Of the NIS, shape (B, T)."""
+
+
+class BatchBeliefs(NamedTuple):
+    """What every run believes now; the state of all is (x, y, θ, l0x, l0y, l1x, …)."""
+
+    means: Array
+    """Shape (B, 3 + 2L), landmarks by id, zeros where not mapped; θ in [-π, π)."""
+    covariances: Array
+    """Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped."""
+    mapped: NDArray[np.bool_]
+    """Which landmarks are in the map, shape (B, L)."""
+
+
+class BatchStorage(NamedTuple):
+    """Where the beliefs of all runs stand: live, but not to be written to.
+
+    What lies beyond the mapped landmarks means nothing.
+    """
+
+    means: Array
+    """Shape (B, capacity): (x, y, θ), then the landmarks by slot; θ as it comes."""
+    covariances: Array
+    """Of the additive error, shape (B, capacity, capacity)."""
+    slots: NDArray[np.int64]
+    """Shape (B, L): landmark i stands at 3 + 2 slots[i]; -1 where not mapped."""
+
+    @classmethod
+    def of(
+        cls, means: Array, covariances: Array, slots: NDArray[np.int64]
+    ) -> "BatchStorage":
+        """Take views that cannot be written to."""
+        views = means.view(), covariances.view(), slots.view()
+        for view in views:
+            view.flags.writeable = False
+        return cls(*views)
+
+
+class BatchSlam:
+    """B runs of one filter, each with its own data, visibility and map.
+
+    Run i gives the same bits as a single filter fed the data of run i; landmark ids
+    are the rows 0 … L−1 of the measurement arrays.  The runs are shared out over
+    threads.  A run whose data is not finite, or beyond 1e12, or whose innovation
+    covariance fails stops there for good, with nan from that step on; the others go on.
+
+    Parameters
+    ----------
+    estimator : EkfSlam
+        Filter to copy rules and noise from; an ``ekf``, ``invariant``, ``iterated``,
+        ``first_estimates`` or ``observability_constrained``.
+    runs, landmarks : int
+        B, and L, the most landmarks a run can meet.
+    initial_poses : array_like, shape (3,) or (B, 3)
+        Means of the first poses [m, m, rad].
+    initial_pose_std : array_like, shape (3,)
+        Their standard deviation.
+    threads : int, optional
+        As many as the machine has cores where not given.
+
+    Raises
+    ------
+    ValueError
+        Where the filter cannot run in batches, or an argument has the wrong shape.
+
+    Examples
+    --------
+    >>> batch = make_batch(
+    ...     "ekf", runs=2, landmarks=1, motion_std=(0, 0, 0), measurement_std=(0.1, 0.1)
+    ... )
+    >>> trace = batch.run(
+    ...     odometry=np.array([[(1.0, 0.0)], [(2.0, 0.0)]]),
+    ...     measurements=np.full((2, 1, 1, 2), 1.0),
+    ...     visible=np.ones((2, 1, 1), dtype=bool),
+    ... )
+    >>> trace.poses[:, -1, 0]
+    array([1., 2.])
+    """
+
+    def __init__(
+        self,
+        estimator: EkfSlam,
+        runs: int,
+        landmarks: int,
+        *,
+        initial_poses: ArrayLike = (0.0, 0.0, 0.0),
+        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        threads: int | None = None,
+    ) -> None:
+        if not can_batch(estimator):
+            raise ValueError(f"{type(estimator).__name__} cannot run in batches")
+        self.runs = argument_checks.whole("runs", runs, 1)
+        self.landmarks = argument_checks.whole("landmarks", landmarks, 0)
+        self._rules = estimator.rules
+        self._rule_values = estimator.rule_values.copy()
+        self._motion_values = estimator.motion_values
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        self._threads = argument_checks.whole("threads", threads or cores, 1)
+        std = argument_checks.standard_deviations(
+            "initial_pose_std", initial_pose_std, 3
+        )
+        first = self._first_poses("initial_poses", initial_poses)
+        capacity = EkfSlam.capacity_for(self.landmarks)
+        self._means = np.zeros((self.runs, capacity))
+        self._references = np.zeros((self.runs, capacity))
+        self._covariances = aligned_zeros(self.runs, capacity, capacity)
+        self._means[:, :3] = self._references[:, :3] = first
+        self._covariances[:, range(3), range(3)] = std**2
+        self._slots = np.full((self.runs, self.landmarks), -1, dtype=np.int64)
+        self._mapped = np.zeros(self.runs, dtype=np.int64)
+        self._kept_room: Workspace | None = None
+        self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
+        """Step of the last :meth:`run` at which a run stopped, -1 where it did not.
+
+        A run that has stopped stays so, at step 0 of every later :meth:`run`.
+        """
+
+    def run(
+        self,
+        odometry: ArrayLike,
+        measurements: ArrayLike,
+        visible: ArrayLike,
+        dt: ArrayLike = 1.0,
+        *,
+        runs: ArrayLike | None = None,
+    ) -> BatchTrace:
+        """Take runs through T steps, each a predict and an update.
+
+        Parameters
+        ----------
+        odometry : array_like, shape (B, T, 2)
+            (d, α) before each scan [m, rad].
+        measurements : array_like, shape (B, T, L, 2)
+            Rows (β, r) of landmarks 0 … L−1 [rad, m]; what is not visible is not read.
+        visible : array_like of bool, shape (B, T, L)
+            Which readings there are.
+        dt : float or array_like, shape (T,)
+            Duration that the motion noise of each step counts.  A first scan before
+            any motion is odometry (0, 0) with dt = 0.
+        runs : array_like of bool, shape (B,), optional
+            The runs that take part, all where not given.  The others stay as they are,
+            and their data is not read; the trace has nan for them.
+
+        Returns
+        -------
+        BatchTrace
+        """
+        u = argument_checks.as_floats("odometry", odometry)
+        steps = u.shape[1] if u.ndim == 3 else 0
+        z = argument_checks.as_floats("measurements", measurements)
+        seen = np.ascontiguousarray(visible, dtype=np.bool_)
+        count, landmarks = self.runs, self.landmarks
+        for name, array, shape in (
+            ("odometry", u, (count, steps, 2)),
+            ("measurements", z, (count, steps, landmarks, 2)),
+            ("visible", seen, (count, steps, landmarks)),
+        ):
+            if array.shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+        durations = np.ascontiguousarray(
+            np.broadcast_to(np.asarray(dt, dtype=np.float64), (steps,))
+        )
+        if not (np.isfinite(durations) & (durations >= 0)).all():
+            raise ValueError(f"dt must be finite numbers >= 0, got {dt!r}")
+        trace = BatchTrace(
+            np.full((count, steps, 3), np.nan),
+            np.full((count, steps, 3, 3), np.nan),
+            np.full((count, steps), np.nan),
+            np.zeros((count, steps), dtype=np.int64),
+        )
+        chosen = self._chosen(runs)
+        failed_at = np.where(chosen, self.failed_at, 0)  # the kernel passes these over
+        data = u, z, seen
+        self._in_threads(partial(self._drive, data, durations, trace, failed_at))
+        self.failed_at = np.where(chosen, failed_at, self.failed_at)
+        trace.poses[..., 2] = wrap_angle(trace.poses[..., 2])
+        return trace
+
+    def reset(
+        self,
+        poses: ArrayLike,
+        pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        runs: ArrayLike | None = None,
+    ) -> None:
+        """Start runs anew, with empty maps; also those that had stopped.
+
+        Parameters
+        ----------
+        poses : array_like, shape (3,) or (B, 3)
+            Means of the first poses [m, m, rad].
+        pose_std : array_like, shape (3,)
+            Their standard deviation.
+        runs : array_like of bool, shape (B,), optional
+            The runs that start anew, all where not given; the others go on.
+        """
+        std = argument_checks.standard_deviations("pose_std", pose_std, 3)
+        first = self._first_poses("poses", poses)
+        chosen = self._chosen(runs)
+        self._means[chosen] = self._references[chosen] = 0.0
+        self._covariances[chosen] = 0.0
+        at = np.flatnonzero(chosen)
+        self._means[at, :3] = self._references[at, :3] = first[at]
+        self._covariances[at[:, None], range(3), range(3)] = std**2
+        self._slots[chosen] = -1
+        self._mapped[chosen] = 0
+        self.failed_at[chosen] = NEVER
+
+    def beliefs(self) -> BatchBeliefs:
+        """Return the beliefs of all runs side by side, as a snapshot.
+
+        A run that has stopped still has the belief it stopped with.
+        """
+        mapped = self._slots >= 0
+        places = 3 + 2 * np.where(mapped, self._slots, 0)
+        pose = np.broadcast_to(np.arange(3), (self.runs, 3))
+        pairs = (places[:, :, None] + np.arange(2)).reshape(self.runs, -1)
+        at = np.concatenate([pose, pairs], axis=1)
+        held = np.ones(at.shape, dtype=np.bool_)
+        held[:, 3:] = np.repeat(mapped, 2, axis=1)
+        row = np.arange(self.runs)[:, None]
+        means = self._means[row, at] * held
+        covariances = self._covariances[row[:, :, None], at[:, :, None], at[:, None]]
+        covariances *= held[:, :, None] & held[:, None]
+        means[:, 2] = wrap_angle(means[:, 2])
+        return BatchBeliefs(means, covariances, mapped)
+
+    def storage(self) -> BatchStorage:
+        """Return the arrays that the runs work on, without a copy.
+
+        They change with the next :meth:`run` or :meth:`reset`.
+        """
+        return BatchStorage.of(self._means, self._covariances, self._slots)
+
+    def belief(self, run: int) -> Belief:
+        """Return the belief of one run as a snapshot."""
+        n = 3 + 2 * int(self._mapped[run])
+        slots = self._slots[run]
+        order = np.argsort(slots[slots >= 0])
+        return Belief(
+            self._means[run, :n],
+            self._covariances[run, :n, :n],
+            tuple(np.flatnonzero(slots >= 0)[order].tolist()),
+            FRAMES[self._rules.frame],
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the beliefs of all runs take [bytes]."""
+        return sum(
+            array.nbytes
+            for array in (
+                self._means,
+                self._references,
+                self._covariances,
+                self._slots,
+                self._mapped,
+            )
+        )
+
+    def _chosen(self, runs: ArrayLike | None) -> NDArray[np.bool_]:
+        if runs is None:
+            return np.ones(self.runs, dtype=np.bool_)
+        chosen = np.asarray(runs)
+        if chosen.shape != (self.runs,) or chosen.dtype != np.bool_:
+            raise ValueError(
+                f"runs must be {self.runs} booleans, got {chosen.dtype} with shape "
+                f"{chosen.shape}"
+            )
+        return chosen
+
+    def _first_poses(self, name: str, poses: ArrayLike) -> Array:
+        first = argument_checks.as_floats(name, poses)
+        if first.shape not in ((3,), (self.runs, 3)) or not np.isfinite(first).all():
+            raise ValueError(
+                f"{name} must be finite with shape (3,) or ({self.runs}, 3), "
+                f"got shape {first.shape}"
+            )
+        return np.broadcast_to(first, (self.runs, 3))
+
+    def _drive(
+        self,
+        data: tuple[Array, Array, NDArray[np.bool_]],
+        dt: Array,
+        trace: BatchTrace,
+        failed_at: NDArray[np.int64],
+        part: slice,
+    ) -> None:
+        u, z, seen = data
+        drive_runs(
+            self._means[part],
+            self._covariances[part],
+            self._references[part],
+            self._slots[part],
+            self._mapped[part],
+            self._rule_values,
+            self._motion_values,
+            u[part],
+            z[part],
+            seen[part],
+            dt,
+            trace.poses[part],
+            trace.pose_covariances[part],
+            trace.nis[part],
+            trace.degrees_of_freedom[part],
+            failed_at[part],
+            *self._room(),
+        )
+
+    def _room(self) -> Workspace:
+        """Give each share a workspace of its own; kept where there is one thread."""
+        if self._threads > 1:
+            return self._new_room()
+        if self._kept_room is None:
+            self._kept_room = self._new_room()
+        return self._kept_room
+
+    def _new_room(self) -> Workspace:
+        return workspace_for(self._rules, self.landmarks, self._means.shape[1])
+
+    def _in_threads(self, work: Callable[[slice], None]) -> None:
+        """Do the work on small shares of the runs, each by whichever thread is free."""
+        threads = min(self._threads, self.runs)
+        if threads == 1:
+            work(slice(0, self.runs))
+            return
+        share = -(-self.runs // (SHARES_PER_THREAD * threads))
+        shares = [slice(a, a + share) for a in range(0, self.runs, share)]
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(work, shares))
+
+
+def can_batch(estimator: object) -> bool:
+    """Whether a filter is the shared kernels and nothing more, so that it can batch."""
+    return (
+        isinstance(estimator, EkfSlam)
+        and type(estimator).predict is EkfSlam.predict
+        and type(estimator).update is EkfSlam.update
+        and type(estimator).belief is EkfSlam.belief
+    )
+
+
+def make_batch(
+    name: str,
+    *,
+    runs: int,
+    landmarks: int,
+    motion_std: ArrayLike,
+    measurement_std: ArrayLike,
+    initial_poses: ArrayLike = (0.0, 0.0, 0.0),
+    initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+    threads: int | None = None,
+    **options: Any,
+) -> BatchSlam:
+    """Make a batch of runs of a registered filter.
+
+    Parameters
+    ----------
+    name : str
+        One of :func:`slamgym.estimator.list_estimators`.
+    runs, landmarks, initial_poses, initial_pose_std, threads
+        As in :class:`BatchSlam`.
+    motion_std, measurement_std, **options
+        As in :func:`slamgym.estimator.make_estimator`.
+
+    Raises
+    ------
+    ValueError
+        Where the filter is unknown or cannot run in batches.
+    """
+    if "initial_pose" in options:
+        raise ValueError(
+            "initial_pose must be given as initial_poses, one for each run"
+        )
+    estimator = find_estimator(name)(
+        motion_std=motion_std, measurement_std=measurement_std, **options
+    )
+    if not isinstance(estimator, EkfSlam):
+        raise ValueError(f"{name} cannot run in batches")
+    return BatchSlam(
+        estimator,
+        runs,
+        landmarks,
+        initial_poses=initial_poses,
+        initial_pose_std=initial_pose_std,
+        threads=threads,
+    )

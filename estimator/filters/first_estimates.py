@@ -1,0 +1,53 @@
+"""Filters whose Jacobians keep the map free to turn: first estimates, constrained."""
+
+from typing import ClassVar
+
+from ..kernels.predict import AT_REFERENCE, PROJECTED
+from .ekf import EkfSlam
+
+
+class FirstEstimatesEkfSlam(EkfSlam):
+    """First-estimates-Jacobian EKF: the standard filter, linearised at fixed points.
+
+    A Jacobian is taken at the first estimate of each landmark and at the predicted
+    pose, also when later estimates are better [1]_::
+
+        G = I + (−(ŷ⁻ₖ₊₁ − ŷ⁻ₖ), x̂⁻ₖ₊₁ − x̂⁻ₖ, 0, …) e_θᵀ,   x̂⁻ predicted
+        H = ∂h at (x̂⁻ₖ, first l̂)
+
+    All rows of the stacked observability matrix are then blind to the same turn of the
+    whole map, and the heading gains no information that is not there.  Poor first
+    estimates stay: with coarse sensors some runs diverge.
+
+    Parameters are those of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] G. Huang, A. Mourikis, S. Roumeliotis, Observability-based rules for
+       designing consistent EKF SLAM estimators, IJRR 29(5), 2010.
+    """
+
+    _linearisation: ClassVar[int] = AT_REFERENCE
+
+
+class ObservabilityConstrainedEkfSlam(EkfSlam):
+    """Observability-constrained EKF: the best linearisation, made blind by projection.
+
+    H is taken at the present estimate and projected off the direction w in which the
+    whole map turns, as it was when the landmark was first seen [1]_ [2]_::
+
+        H ← H − (H w) wᵀ / wᵀw
+
+    with G as in :class:`FirstEstimatesEkfSlam`.
+
+    Parameters are those of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] G. Huang, A. Mourikis, S. Roumeliotis, Observability-based rules for
+       designing consistent EKF SLAM estimators, IJRR 29(5), 2010.
+    .. [2] J. Hesch, D. Kottas, S. Bowman, S. Roumeliotis, Consistency analysis and
+       improvement of vision-aided inertial navigation, IEEE T-RO 30(1), 2014.
+    """
+
+    _linearisation: ClassVar[int] = PROJECTED

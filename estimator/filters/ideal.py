@@ -1,0 +1,122 @@
+"""The ideal EKF-SLAM: Jacobians at the ground truth, for study only."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..interface import UpdateReport
+from ..kernels.predict import AT_ESTIMATE, AT_TRUTH
+from ..support import argument_checks
+from ..support.argument_checks import LandmarkIds
+from .ekf import EkfSlam
+
+Array = NDArray[np.float64]
+
+
+class IdealEkfSlam(EkfSlam):
+    """The standard filter with its Jacobians taken at the ground truth: no real filter.
+
+    It shows how much of an inconsistency is the fault of the linearisation points [1]_.
+    The truth comes in by a door of its own, :meth:`observe_truth`, before each predict;
+    until it is first opened the filter linearises at its estimate like ``ekf``.  Where
+    the frame itself is uncertain it is no benchmark: Jacobians at the truth and
+    innovations at the estimate then live in different frames, and it diverges.
+
+    Parameters are those of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] G. Huang, A. Mourikis, S. Roumeliotis, Observability-based rules for
+       designing consistent EKF SLAM estimators, IJRR 29(5), 2010.
+    """
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run, the door for the truth closed."""
+        super().reset(pose, pose_std)
+        self._adopt(self._rules._replace(linearisation=AT_ESTIMATE))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of the state, and whether the truth has been told."""
+        told = self._rules.linearisation == AT_TRUTH
+        return {**super().state_dict(), "at_truth": np.array(told)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state; the truth of each step must be told again."""
+        super().load_state_dict(state)
+        where = AT_TRUTH if state.get("at_truth", False) else AT_ESTIMATE
+        self._adopt(self._rules._replace(linearisation=where))
+
+    @staticmethod
+    def _check_told(ids: Iterable[int], told: Mapping[int, Array]) -> None:
+        untold = [i for i in ids if i not in told]
+        if untold:
+            raise ValueError(
+                f"landmarks must hold the truth of all that are seen, got none of "
+                f"landmark {untold[0]}"
+            )
+
+    def observe_truth(
+        self, pose: ArrayLike, landmarks: Mapping[int, ArrayLike]
+    ) -> None:
+        """Tell the truth after a motion, before its predict (at the start: its update).
+
+        Parameters
+        ----------
+        pose : array_like, shape (3,)
+            True pose (x, y, θ) after the motion [m, m, rad].
+        landmarks : mapping from id to (2,)
+            True positions of all landmarks that may be seen [m].
+        """
+        truth = argument_checks.finite_vector("pose", pose, 3)
+        told = {
+            i: argument_checks.finite_vector(f"landmarks[{i}]", xy, 2)
+            for i, xy in landmarks.items()
+        }
+        self._check_told(self._slots, told)
+        self._true_landmarks = told
+        if self._rules.linearisation != AT_TRUTH:
+            self._adopt(self._rules._replace(linearisation=AT_TRUTH))
+            self._reference[:3] = truth
+        for i, slot in self._slots.items():
+            self._reference[3 + 2 * slot : 5 + 2 * slot] = self._true_landmarks[i]
+        self._true_pose = truth
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move by odometry (d, α) [m, rad], the covariance along the true way."""
+        if self._rules.linearisation != AT_TRUTH:
+            super().predict(odometry, dt)
+            return
+        distance, turn = argument_checks.pair("odometry", odometry)
+        variance = self._motion_variance_of(distance, turn, dt)
+        cos, sin = np.cos(self._mean[2]), np.sin(self._mean[2])
+        self._mean[:3] += distance * cos, distance * sin, turn
+        n, heading = self._size, self._reference[2]
+        dx, dy = self._true_pose[:2] - self._reference[:2]
+        G = np.eye(n)
+        G[:2, 2] = -dy, dx
+        F = np.eye(3)
+        F[:2, :2] = [
+            [np.cos(heading), -np.sin(heading)],
+            [np.sin(heading), np.cos(heading)],
+        ]
+        moved = G @ self._covariance[:n, :n] @ G.T
+        moved[:3, :3] += F @ np.diag(variance) @ F.T
+        self._covariance[:n, :n] = (moved + moved.T) / 2
+        self._reference[:3] = self._true_pose
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
+    ) -> UpdateReport:
+        """Correct the belief with one scan, linearised at the truth."""
+        if self._rules.linearisation == AT_TRUTH and landmark_ids is not None:
+            readings = argument_checks.scan(measurements)
+            self._make_room(len(readings))
+            self._check_told(landmark_ids, self._true_landmarks)
+            column = self._size
+            for i, distance in zip(landmark_ids, readings[:, 1], strict=False):
+                if i not in self._slots and distance >= self._rules.min_range:
+                    self._reference[column : column + 2] = self._true_landmarks[i]
+                    column += 2
+        return super().update(measurements, landmark_ids)

@@ -1,0 +1,73 @@
+"""The right-invariant EKF-SLAM: the filter that knows what it cannot know."""
+
+from typing import Any, ClassVar
+
+from numpy.typing import ArrayLike
+
+from ..kernels.predict import INVARIANT
+from ..support import argument_checks
+from .ekf import EkfSlam
+
+
+class InvariantEkfSlam(EkfSlam):
+    """Right-invariant EKF on SE_{1+n}(2), in ordinary coordinates; the recommended one.
+
+    The error is ξ = Log(χ χ̂⁻¹), in which a turn of the whole map is a straight line:
+    the filter gains no information about its absolute heading, however often it
+    linearises [1]_ [2]_.  It is the ordinary filter but for what follows the gain.
+    With δ = Aᵀ L⁻¹ ν, t = δθ, J = [0 −1; 1 0], for the position and every landmark q::
+
+        retraction   q ← R(t) q + V(t) (δq − t J q),   θ ← θ + t
+        transport    P ← P + v cᵀ + c vᵀ + c_θ v vᵀ,   v = J (q⁺ − q), c = P e_θ
+
+    so propagation costs O(n) and the additive covariance stays at hand.
+
+    Parameters
+    ----------
+    motion_std, measurement_std
+        As in :class:`EkfSlam`.
+    iterations : int
+        More than one: linearise again at each iterate, against the same prior; for
+        coarse sensors.  The heading column of H stays that of the prior, since the
+        exact Gauss-Newton column would let the filter see its heading.
+    sequential : bool
+        Take in one landmark after the other instead of the whole scan at once: for
+        heading errors of half a radian and more.  The order of readings then matters.
+    **settings
+        The other keywords of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] A. Barrau, S. Bonnabel, An EKF-SLAM algorithm with consistency properties,
+       arXiv 1510.06263, 2015.
+    .. [2] T. Zhang, K. Wu, J. Song, S. Huang, G. Dissanayake, Convergence and
+       consistency analysis for a 3-D invariant-EKF SLAM, RA-L 2017.
+
+    Examples
+    --------
+    A robot that stands and looks cannot learn its heading:
+
+    >>> slam = InvariantEkfSlam((0, 0, 0), (0.03, 0.1), initial_pose_std=(0, 0, 0.3))
+    >>> for _ in range(100):
+    ...     _ = slam.update([(0.5, 4.0)], [0])
+    >>> round(float(slam.belief().pose_covariance[2, 2]) ** 0.5, 12)
+    0.3
+    """
+
+    _frame: ClassVar[int] = INVARIANT
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        iterations: int = 1,
+        sequential: bool = False,
+        **settings: Any,
+    ) -> None:
+        super().__init__(motion_std, measurement_std, **settings)
+        rules = self._rules._replace(
+            iterations=argument_checks.whole("iterations", iterations, 1),
+            sequential=argument_checks.flag("sequential", sequential),
+        )
+        self._adopt(rules)

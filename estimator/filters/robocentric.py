@@ -1,0 +1,167 @@
+"""The robocentric EKF-SLAM: the map lives in the robot's own frame."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..interface import Belief, UpdateReport
+from ..support.argument_checks import LandmarkIds
+from ..support.jit import compiled, part
+from .ekf import EkfSlam
+
+Array = NDArray[np.float64]
+
+# The state of the shared kernels here: the way since the last scan where they keep the
+# pose, the origin of the world (x, y), its heading and a zero where they keep the first
+# two landmarks, then the landmarks, all in the robot's frame at the last scan.
+ORIGIN, HEADING, FIRST_LANDMARK = 3, 5, 7
+RESERVED = (-(2**63), 1 - 2**63)  # ids that hold these two places
+
+
+class RobocentricEkfSlam(EkfSlam):
+    """EKF-SLAM with world origin and landmarks estimated in the robot's frame.
+
+    After Castellanos et al. [1]_.  Between scans only the way w = (x, y, θ) driven
+    since the last one is estimated, starting from zero with no uncertainty; a scan is
+    linearised at w and the map in the frame of the last scan, and then the frame moves
+    along: every point q and the world's heading φ in the robot's frame become::
+
+        q ← R(−θ_w) (q − (x_w, y_w)),    φ ← φ − θ_w,    w ← 0
+
+    so no Jacobian is taken at an absolute pose.  The heading stays consistent; in long
+    loops the covariance of the map does not.  Beliefs are mapped to the world's frame.
+
+    Parameters are those of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] J. Castellanos, R. Martinez-Cantin, J. Tardós, J. Neira, Robocentric map
+       joining: improving the consistency of EKF-SLAM, Robotics and Autonomous Systems
+       55(1), 2007.
+    """
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run with an empty map at a pose (3,) known to (3,)."""
+        super().reset(pose, pose_std)
+        first, variance = self._mean[:3].copy(), np.diag(self._covariance)[:3].copy()
+        self._mean[:3] = self._covariance[:3, :3] = 0.0
+        self._slots = {i: slot for slot, i in enumerate(RESERVED)}
+        self._size = FIRST_LANDMARK
+        origin, jacobian = _inverse_pose(first)
+        self._mean[ORIGIN : HEADING + 1] = origin
+        self._covariance[ORIGIN : HEADING + 1, ORIGIN : HEADING + 1] = (
+            jacobian @ np.diag(variance) @ jacobian.T
+        )
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
+    ) -> UpdateReport:
+        """Correct map and way with one scan, then move the frame to the robot."""
+        report = super().update(measurements, landmark_ids)
+        if np.size(measurements):
+            move_frame(self._mean, self._covariance, self._size)
+        return report
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state, bit for bit in a filter of the same settings."""
+        ids = np.asarray(state.get("landmark_ids", ())).ravel().tolist()
+        if tuple(ids[: len(RESERVED)]) != RESERVED:
+            raise ValueError("state must begin with the world's origin, got landmarks")
+        super().load_state_dict(state)
+
+    def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
+        ids = super()._identities(landmark_ids, count)
+        if not set(RESERVED).isdisjoint(ids):
+            raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
+        return ids
+
+    def belief(self) -> Belief:
+        """Return the belief in the world's frame."""
+        ids = tuple(self._slots)[len(RESERVED) :]
+        mean, jacobian = _in_world(self._mean[: self._size])
+        covariance = self._covariance[: self._size, : self._size]
+        moved = jacobian @ covariance @ jacobian.T
+        return Belief(mean, (moved + moved.T) / 2, ids)
+
+
+@compiled
+def move_frame(mean: Array, covariance: Array, size: int) -> None:
+    """Express all in the robot's present frame: x ← f(x), P ← T P Tᵀ, in O(size²).
+
+    T turns every pair of rows by −θ_w, after taking from it the rows of (x_w, y_w), and
+    takes J q⁺ times the row of θ_w from it.
+    """
+    c, s = np.cos(mean[2]), np.sin(mean[2])
+    for i in range(ORIGIN, size, 2):
+        if i != HEADING:
+            x, y = mean[i] - mean[0], mean[i + 1] - mean[1]
+            mean[i], mean[i + 1] = c * x + s * y, c * y - s * x
+    mean[HEADING] -= mean[2]
+    _turn_rows(mean, covariance, size, c, s)
+    _transpose(covariance, size)
+    _turn_rows(mean, covariance, size, c, s)
+    for i in range(size):
+        for j in range(i):
+            covariance[j, i] = covariance[i, j]
+    for i in range(3):
+        mean[i] = 0.0
+        for j in range(size):
+            covariance[i, j] = covariance[j, i] = 0.0
+
+
+@part
+def _transpose(covariance: Array, size: int) -> None:
+    for i in range(size):
+        for j in range(i):
+            covariance[i, j], covariance[j, i] = covariance[j, i], covariance[i, j]
+
+
+@part
+def _turn_rows(mean: Array, covariance: Array, size: int, c: float, s: float) -> None:
+    """P ← T P, but for the rows of the way, which come to nothing."""
+    for i in range(ORIGIN, size, 2):
+        if i == HEADING:
+            for j in range(size):
+                covariance[i, j] -= covariance[2, j]
+            continue
+        x, y = mean[i], mean[i + 1]
+        for j in range(size):
+            p, q = (
+                covariance[i, j] - covariance[0, j],
+                covariance[i + 1, j] - covariance[1, j],
+            )
+            covariance[i, j] = c * p + s * q + y * covariance[2, j]
+            covariance[i + 1, j] = c * q - s * p - x * covariance[2, j]
+
+
+def _in_world(state: Array) -> tuple[Array, Array]:
+    """Bring a robot-centred state to the world's frame, with the derivative.
+
+    A point q lies at R(−φ) (q − o), the robot's heading is θ_w − φ.
+    """
+    origin, heading = state[ORIGIN:HEADING], state[HEADING]
+    c, s = np.cos(heading), np.sin(heading)
+    turn = np.array([[c, s], [-s, c]])
+    points = np.concatenate([state[None, :2], state[FIRST_LANDMARK:].reshape(-1, 2)])
+    moved = (points - origin) @ turn.T
+    mean = np.concatenate([moved[0], [state[2] - heading], moved[1:].ravel()])
+    jacobian = np.zeros((len(mean), len(state)))
+    jacobian[2, 2], jacobian[2, HEADING] = 1.0, -1.0
+    for k, (x, y) in enumerate(moved):
+        row = 3 + 2 * (k - 1) if k else 0
+        column = FIRST_LANDMARK + 2 * (k - 1) if k else 0
+        jacobian[row : row + 2, column : column + 2] = turn
+        jacobian[row : row + 2, ORIGIN:HEADING] = -turn
+        jacobian[row : row + 2, HEADING] = y, -x
+    return mean, jacobian
+
+
+def _inverse_pose(pose: Array) -> tuple[Array, Array]:
+    """Return the world seen from the robot, and its derivative by the pose."""
+    x, y, heading = pose
+    c, s = np.cos(heading), np.sin(heading)
+    inverse = np.array([-c * x - s * y, s * x - c * y, -heading])
+    jacobian = np.array([[-c, -s, inverse[1]], [s, -c, -inverse[0]], [0.0, 0.0, -1.0]])
+    return inverse, jacobian

@@ -1,0 +1,197 @@
+"""The unscented EKF-SLAM: cubature points instead of Jacobians."""
+
+from itertools import compress
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..interface import UpdateReport
+from ..models.angles import wrap_angle
+from ..support import argument_checks
+from ..support.argument_checks import LandmarkIds
+from .ekf import EkfSlam, not_positive_definite
+
+Array = NDArray[np.float64]
+
+
+class UnscentedSlam(EkfSlam):
+    """Unscented filter with cubature points, angles wrapped; dense, O(n³) per step.
+
+    The belief is carried through the models by the 2N points mean ± √N Lᵢ, L Lᵀ = P,
+    each of weight 1/2N [1]_ [2]_; the motion noise is part of the state it is carried
+    by.  New landmarks enter linearised as in ``ekf``.  It needs no Jacobian, and it
+    is as falsely certain of its heading as the EKF: for comparison, not for use.
+
+    Parameters are those of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] S. Julier, J. Uhlmann, A new extension of the Kalman filter to nonlinear
+       systems, SPIE AeroSense, 1997.
+    .. [2] I. Arasaratnam, S. Haykin, Cubature Kalman filters, IEEE TAC 54(6), 2009.
+    """
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move by odometry (d, α) [m, rad], through the cubature points."""
+        distance, turn = argument_checks.pair("odometry", odometry)
+        variance = self._motion_variance_of(distance, turn, dt)
+        n = self._size
+        root = np.zeros((n + 3, n + 3))
+        root[:n, :n] = _square_root(self._covariance[:n, :n])
+        root[n:, n:] = np.diag(np.sqrt(variance))
+        deviations = np.sqrt(n + 3) * np.concatenate([root, -root], axis=1)
+        x, y, heading = self._mean[:3, None] + deviations[:3]
+        along, across = distance + deviations[n], deviations[n + 1]
+        cos, sin = np.cos(heading), np.sin(heading)
+        poses = np.stack(
+            [
+                x + along * cos - across * sin,
+                y + along * sin + across * cos,
+                heading + turn + deviations[n + 2],
+            ]
+        )
+        self._mean[:3] = poses.mean(axis=1)
+        moved = poses - self._mean[:3, None]
+        share = deviations.shape[1]
+        self._covariance[:3, :3] = moved @ moved.T / share
+        self._covariance[:3, 3:n] = moved @ deviations[3:n].T / share
+        self._covariance[3:n, :3] = self._covariance[:3, 3:n].T
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
+    ) -> UpdateReport:
+        """Correct the belief with one scan, then map the landmarks seen first."""
+        readings = argument_checks.scan(measurements)
+        ids = self._identities(landmark_ids, len(readings))
+        argument_checks.refuse_unusable(readings, ids)
+        usable = np.array(
+            [
+                min(reading[1], self._expected_range(i)) >= self._rules.min_range
+                for i, reading in zip(ids, readings, strict=True)
+            ],
+            dtype=bool,
+        )
+        mapped = np.array([i in self._slots for i in ids], dtype=bool)
+        known, skipped = mapped & usable, mapped & ~usable
+        corrected = UpdateReport()
+        if known.any():
+            corrected = self._correct(
+                readings[known], [i for i, k in zip(ids, known, strict=True) if k]
+            )
+        others = list(compress(ids, ~mapped))
+        added = super().update(readings[~mapped], others)
+        return corrected._replace(
+            added_ids=added.added_ids,
+            skipped_ids=(*compress(ids, skipped), *added.skipped_ids),
+        )
+
+    def _expected_range(self, landmark_id: int) -> float:
+        """Range at which the belief expects a landmark [m]; infinite for a new one."""
+        if landmark_id not in self._slots:
+            return np.inf
+        return float(np.linalg.norm(self._place(landmark_id)[0]))
+
+    def _place(self, landmark_id: int) -> tuple[Array, Array]:
+        """Where a landmark lies from the robot, (2,), and the covariance of that.
+
+        In the robot's frame, but for its heading: e_l − e_p − J δ e_θ.
+        """
+        c = 3 + 2 * self._slots[landmark_id]
+        dx, dy = self._mean[c : c + 2] - self._mean[:2]
+        own = [0, 1, 2, c, c + 1]
+        H = np.array([[-1, 0, dy, 1, 0], [0, -1, -dx, 0, 1]])
+        return np.array([dx, dy]), H @ self._covariance[np.ix_(own, own)] @ H.T
+
+    def _is_near(self, landmark_id: int) -> bool:
+        offset, covariance = self._place(landmark_id)
+        return bool(offset @ offset < 100 * np.linalg.eigvalsh(covariance)[-1])
+
+    def _correct(self, readings: Array, ids: list[int]) -> UpdateReport:
+        n = self._size
+        near = {i for i in ids if self._is_near(i)}
+        columns = 3 + 2 * np.array([self._slots[i] for i in ids])
+        root = _square_root(self._covariance[:n, :n])
+        deviations = np.sqrt(n) * np.concatenate([root, -root], axis=1)
+        expected, spread = _through_sensor(self._mean[:n], deviations, columns)
+        innovation = readings - expected
+        innovation[:, 0] = wrap_angle(innovation[:, 0])
+        at = readings if self._rules.noise_as_read else expected
+        noise = self._noise_variances(at[:, 1])
+        kept = self._within_gate(innovation, spread, noise)
+        rows = np.repeat(kept, 2)
+        spread, nu = spread[rows], innovation.ravel()[rows]
+        S = spread @ spread.T / spread.shape[1] + np.diag(noise.ravel()[rows])
+        factor = _factor(S, list(compress(ids, kept)))
+        cross = spread @ deviations.T / spread.shape[1]
+        gains = np.linalg.solve(factor, cross)
+        white = np.linalg.solve(factor, nu)
+        self._mean[:n] += gains.T @ white
+        self._covariance[:n, :n] -= gains.T @ gains
+        return UpdateReport(
+            nis=float(white @ white),
+            degrees_of_freedom=len(nu),
+            associated_ids=tuple(i for i, k in zip(ids, kept, strict=True) if k),
+            rejected_ids=tuple(i for i, k in zip(ids, kept, strict=True) if not k),
+            near_ids=tuple(i for i in compress(ids, kept) if i in near),
+            innovation=innovation[kept],
+            factor=factor,
+        )
+
+    def _noise_variances(self, ranges: Array) -> Array:
+        """Diagonal of Q at these ranges [m], shape (m, 2)."""
+        rules = self._rules
+        range_std = rules.range_std + rules.range_std_per_metre * ranges
+        bearing_std = np.full(len(ranges), rules.bearing_std)
+        std: Array = np.stack([bearing_std, range_std], axis=1)
+        return std**2
+
+    def _within_gate(
+        self, innovation: Array, spread: Array, noise: Array
+    ) -> NDArray[np.bool_]:
+        if not np.isfinite(self._rules.gate):
+            return np.ones(len(innovation), dtype=bool)
+        pairs = spread.reshape(len(innovation), 2, -1)
+        own = pairs @ pairs.transpose(0, 2, 1) / pairs.shape[2]
+        own += noise[:, :, None] * np.eye(2)
+        weighted = np.linalg.solve(own, innovation[..., None])[..., 0]
+        return np.asarray((innovation * weighted).sum(axis=1) <= self._rules.gate)
+
+
+def _through_sensor(
+    mean: Array, deviations: Array, columns: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Carry points (n, N) through the sensor: mean (m, 2) and deviations (2m, N)."""
+    points = np.concatenate([mean[:, None], mean[:, None] + deviations], axis=1)
+    dx, dy = points[columns] - points[0], points[columns + 1] - points[1]
+    bearing = np.arctan2(dy, dx) - points[2]
+    turned = wrap_angle(bearing[:, 1:] - bearing[:, :1])
+    distance = np.hypot(dx, dy)
+    centre = np.stack(
+        [bearing[:, 0] + turned.mean(axis=1), distance[:, 1:].mean(axis=1)]
+    )
+    spread = np.stack(
+        [
+            turned - turned.mean(axis=1, keepdims=True),
+            distance[:, 1:] - centre[1][:, None],
+        ],
+        axis=1,
+    )
+    return centre.T, spread.reshape(2 * len(columns), -1)
+
+
+def _factor(S: Array, ids: list[int]) -> Array:
+    """Return the Cholesky factor of S, or name the reading at which it fails."""
+    try:
+        return np.asarray(np.linalg.cholesky(S))
+    except np.linalg.LinAlgError:
+        smallest = [
+            np.linalg.eigvalsh(S[: 2 * k, : 2 * k])[0] for k in range(1, len(ids))
+        ]
+        at = next((k for k, value in enumerate(smallest) if value <= 0), len(ids) - 1)
+        raise not_positive_definite(ids[at]) from None
+
+
+def _square_root(covariance: Array) -> Array:
+    """Return the symmetric square root of a positive semidefinite matrix."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)

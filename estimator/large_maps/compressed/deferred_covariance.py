@@ -1,0 +1,283 @@
+"""The covariance between the landmarks of a large map, downdated when there is time."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...support.memory_limit import refuse_beyond_memory
+from .row_exchange import read_columns, write_columns
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+# Rows of one block: of 64 landmarks.
+BLOCK = 128
+# Downdates of fewer rows than this wait for more: a thin product is bound by memory.
+WORTHWHILE = 40
+
+
+class Downdate(NamedTuple):
+    """A change that the stored covariance still lacks: P ← P − W diag(s) Wᵀ."""
+
+    root: Array  # W, shape (width, rank)
+    signs: Array  # s, shape (rank,), each 1 or -1
+
+
+class DeferredCovariance:
+    """Lower half of a growing covariance, in blocks of rows, with downdates pending.
+
+    Block k holds rows 128 k to 128 (k + 1) of P and its columns up to the last of them:
+    half the memory of a square, growth without a copy, and every block is contiguous,
+    so that BLAS changes it in place::
+
+        P = stored − W diag(s) Wᵀ
+
+    of which W is small and read with P, and taken off the blocks one by one by
+    :meth:`work`.  A local map may read the rows of its landmarks and keep better ones:
+    what is stored for these then has no meaning until it puts them back.
+    """
+
+    def __init__(self) -> None:
+        self._blocks: list[Array] = []
+        self._pending: list[Downdate] = []
+        self._under_way = False  # whether the first downdate is being taken off …
+        self._done = 0  # … and from how many blocks it has been
+        self._credit = 0.0  # multiplications granted and not yet spent
+
+    @property
+    def width(self) -> int:
+        """Number of rows and columns there is room for."""
+        return BLOCK * len(self._blocks)
+
+    @property
+    def pending_rank(self) -> int:
+        """Rank of what the stored covariance still lacks."""
+        return sum(len(downdate.signs) for downdate in self._pending)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that blocks and pending downdates take [bytes]."""
+        roots = [downdate.root for downdate in self._pending]
+        return sum(array.nbytes for array in self._blocks + roots)
+
+    def make_room(self, columns: int) -> None:
+        """Append blocks of zeros until there are at least so many columns.
+
+        Raises
+        ------
+        MemoryError
+            Where they are more than memory holds; nothing is then appended.
+        """
+        if self.width >= columns:
+            return
+        refuse_beyond_memory(
+            f"half a covariance of {columns // 2} landmarks",
+            stored_bytes(columns // 2),
+            "'submaps' and 'sparse_information' take less",
+            held=stored_bytes(self.width // 2),
+        )
+        while self.width < columns:
+            self._blocks.append(np.zeros((BLOCK, self.width + BLOCK)))
+
+    def read(self, columns: Int, rows: Array) -> None:
+        """Fill rows (c, width), of ascending columns, what is pending taken off."""
+        bounds = self._bounds(columns)
+        for (first, block), start, end in zip(
+            self._enumerate(), bounds, bounds[1:], strict=False
+        ):
+            if end > start:
+                rows[start:end, : first + BLOCK] = block[columns[start:end] - first]
+            read_columns(block, first, columns[:start], rows)
+        for index, (root, signs) in enumerate(self._pending):
+            missing = (_of(root, columns) * signs) @ root.T
+            if index == 0 and self._done:
+                done = self._done * BLOCK
+                missing[columns < done, :done] = 0.0
+            rows[:, : len(root)] -= missing
+
+    def put(self, columns: Int, rows: Array, places: Int) -> None:
+        """Store the rows of ascending columns (c,), which stand at ``places`` (c,)."""
+        bounds = self._bounds(columns)
+        for (first, block), start, end in zip(
+            self._enumerate(), bounds, bounds[1:], strict=False
+        ):
+            if end > start:
+                own = rows[places[start:end], : first + BLOCK]
+                block[columns[start:end] - first] = own
+            write_columns(block, first, columns[:end], rows, places)
+        for root, _ in self._pending:  # nothing is, any longer, for these
+            root[columns[columns < len(root)]] = 0.0
+
+    def defer(self, root: Array, signs: Array) -> None:
+        """Subtract W diag(s) Wᵀ, W of shape (width, rank), when there is time."""
+        if len(signs):
+            self._pending.append(Downdate(root, signs))
+
+    def work(self, rank: int) -> None:
+        """Take pending downdates off as many blocks as a downdate of some rank costs.
+
+        What is left of that grant, for blocks are taken whole, stays for the next call.
+        """
+        self._credit += rank * (self.width * (self.width + BLOCK) / 2)
+        while self._begin():
+            root, signs = self._pending[0]
+            cost = len(signs) * self._blocks[self._done].size
+            if cost > self._credit:
+                return
+            self._apply(self._done)
+            self._credit -= cost
+            self._done += 1
+            if self._done * BLOCK >= len(root):
+                self._pending.pop(0)
+                self._under_way, self._done = False, 0
+        self._credit = 0.0
+
+    def marginal(self, columns: Int) -> Array:
+        """Return the covariance (c, c) of some columns; exactly symmetric."""
+        covariance = np.empty((len(columns), len(columns)))
+        for first, block in self._enumerate():
+            own = np.flatnonzero((columns >= first) & (columns < first + BLOCK))
+            upto = np.flatnonzero(columns < first + BLOCK)
+            if not len(own):
+                continue
+            part = block[np.ix_(columns[own] - first, columns[upto])]
+            for index, (root, signs) in enumerate(self._pending):
+                if index == 0 and first < self._done * BLOCK:
+                    continue
+                part -= (_of(root, columns[own]) * signs) @ _of(root, columns[upto]).T
+            covariance[np.ix_(upto, own)] = part.T
+            covariance[np.ix_(own, upto)] = part
+        return symmetric(covariance)
+
+    def diagonal(self) -> Array:
+        """Return the variances as stored, shape (width,): nothing pending taken off."""
+        diagonals = [block.diagonal(first) for first, block in self._enumerate()]
+        return np.concatenate([np.empty(0), *diagonals])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of everything, as arrays."""
+        rank = [len(downdate.signs) for downdate in self._pending]
+        root = np.zeros((self.width, sum(rank)))
+        for downdate, last in zip(self._pending, np.cumsum(rank), strict=True):
+            first = last - len(downdate.signs)
+            root[: len(downdate.root), first:last] = downdate.root
+        signs = [downdate.signs for downdate in self._pending]
+        return {
+            "covariance": np.concatenate([np.empty(0), *map(np.ravel, self._blocks)]),
+            "pending_root": root,
+            "pending_signs": np.concatenate([np.empty(0), *signs]),
+            "pending_shapes": np.array(
+                [(len(d.root), len(d.signs)) for d in self._pending], dtype=np.int64
+            ).reshape(-1, 2),
+            "progress": np.array([self._under_way, self._done, self._credit]),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from what :meth:`state_dict` returned, bit for bit."""
+        flat = np.asarray(state["covariance"], dtype=np.float64)
+        root = np.asarray(state["pending_root"], dtype=np.float64)
+        signs = np.asarray(state["pending_signs"], dtype=np.float64)
+        shapes = np.asarray(state["pending_shapes"], dtype=np.int64).tolist()
+        count = round(np.sqrt(2 * flat.size / BLOCK**2 + 0.25) - 0.5)
+        if flat.shape != (BLOCK**2 * count * (count + 1) // 2,):
+            raise ValueError(
+                "the stored covariance must be whole blocks of rows, got shape "
+                f"{flat.shape}"
+            )
+        if root.shape != (BLOCK * count, len(signs)):
+            raise ValueError(
+                f"the pending downdates must have shape {(BLOCK * count, len(signs))}, "
+                f"got {root.shape}"
+            )
+        blocks: list[Array] = []
+        first = 0
+        while first < flat.size:
+            last = first + BLOCK * BLOCK * (len(blocks) + 1)
+            blocks.append(flat[first:last].reshape(BLOCK, -1).copy())
+            first = last
+        pending, first = [], 0
+        for width, rank in shapes:
+            own = slice(first, first + rank)
+            pending.append(Downdate(root[:width, own].copy(), signs[own].copy()))
+            first += rank
+        under_way, done, credit = np.asarray(state["progress"]).tolist()
+        self._blocks, self._pending = blocks, pending
+        self._under_way, self._done, self._credit = bool(under_way), int(done), credit
+
+    def _enumerate(self) -> list[tuple[int, Array]]:
+        """First row and array of each block."""
+        return [(k * BLOCK, block) for k, block in enumerate(self._blocks)]
+
+    def _bounds(self, columns: Int) -> list[int]:
+        """How many of ascending columns lie before each block, and in all."""
+        starts = np.arange(0, self.width + 1, BLOCK)
+        bounds: list[int] = np.searchsorted(columns, starts).tolist()
+        return bounds
+
+    def _begin(self) -> bool:
+        """Whether there is a downdate to take off: join those that wait for one."""
+        if not self._under_way and self.pending_rank >= WORTHWHILE:
+            width = max(len(downdate.root) for downdate in self._pending)
+            root = np.zeros((width, self.pending_rank))
+            last = 0
+            for downdate in self._pending:
+                first, last = last, last + len(downdate.signs)
+                root[: len(downdate.root), first:last] = downdate.root
+            signs = np.concatenate([downdate.signs for downdate in self._pending])
+            self._pending = [Downdate(root, signs)]
+            self._under_way, self._done = True, 0
+        return self._under_way
+
+    def _apply(self, k: int) -> None:
+        """Take the downdate under way off one block."""
+        from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
+
+        root, signs = self._pending[0]
+        first, last = k * BLOCK, (k + 1) * BLOCK
+        # Fortran order: the transpose of each of these is contiguous, nothing is copied
+        dgemm(
+            -1.0,
+            root[:last].T,
+            (root[first:last] * signs).T,
+            1.0,
+            self._blocks[k].T,
+            trans_a=True,
+            overwrite_c=True,
+        )
+
+
+def stored_bytes(landmarks: int) -> int:
+    """Return the size of the blocks for so many landmarks [bytes]."""
+    blocks = -(-2 * landmarks // BLOCK)
+    return 8 * BLOCK**2 * blocks * (blocks + 1) // 2
+
+
+def _of(root: Array, columns: Int) -> Array:
+    """Rows of W, zero beyond its end: those columns are younger than it."""
+    if len(root) > columns.max(initial=0):
+        chosen: Array = root[columns]
+        return chosen
+    rows = np.zeros((len(columns), root.shape[1]))
+    inside = columns < len(root)
+    rows[inside] = root[columns[inside]]
+    return rows
+
+
+def subtract(covariance: Array, root: Array, signs: Array) -> None:
+    """P ← P − W diag(s) Wᵀ in place, a few rows at a time: no second matrix."""
+    for first in range(0, len(covariance), BLOCK):
+        own = slice(first, first + BLOCK)
+        covariance[own] -= (root[own] * signs) @ root.T
+
+
+def symmetric(covariance: Array) -> Array:
+    """Copy the lower half into the upper one, in place."""
+    n = len(covariance)
+    for first in range(0, n, BLOCK):
+        last = min(first + BLOCK, n)
+        own = covariance[first:last, first:last]
+        own[:] = np.tril(own) + np.tril(own, -1).T
+        covariance[first:last, last:] = covariance[last:, first:last].T
+    return covariance

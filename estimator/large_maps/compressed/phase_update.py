@@ -1,0 +1,158 @@
+"""What a local map remembers of its phase for the rest of the map: exact deferral.
+
+Let S (s, width) be the covariance, at the beginning of a phase, of the s local
+coordinates x_a (pose and local landmarks) with everything else, x_b.  In the phase
+only x_a is read.  The ordinary filter then runs on an extended state (x_a, y)::
+
+    mean (x_a, 0),   covariance [P_aa  I; I  0]
+
+in which y stands for coordinates of which x_b is a linear function, x_b = S ᵀ y + what
+does not change.  Whatever the phase brought, with its end result [P_aa Φ; Φᵀ −Ψ]::
+
+    x_b ← x_b + Sᵀ y,   P_ab ← Φ S,   P_bb ← P_bb − Sᵀ Ψ S
+
+(Guivant and Nebot, 2001, in the form of an augmented state.)
+
+In the invariant frame a correction also turns and shears points,
+q⁺ = q + V(t) δq, and the covariance is transported, P ← T P Tᵀ, e_q⁺ = e_q + J (q⁺ − q)
+e_θ.  Both are linear in q read as a complex number, J = i.  So there y is a complex
+number for each of the s coordinates, a *virtual landmark* at the origin, and with x_b
+and the rows of S read as complex numbers all of the above holds as it stands.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...filters.ekf import EkfSlam
+from .row_exchange import fill_extended, unpivot
+
+Array = NDArray[np.float64]
+
+
+# A filter's arrays may be larger than needed by this factor.
+_ROOMY = 3
+
+
+class Phase(NamedTuple):
+    """The end result of a phase, cut into its parts."""
+
+    mean: Array  # (a,) of pose and local landmarks
+    reference: Array  # (a,) where they are linearised, if a filter keeps that
+    covariance: Array  # P_aa, (a, a)
+    gain: Array  # Φ, (a, e)
+    loss: Array  # Ψ, (e, e)
+    shift: Array  # y, (1, e)
+
+
+def virtual_landmarks(coordinates: int, invariant: bool) -> int:
+    """How many landmarks the extension takes the place of."""
+    return coordinates if invariant else (coordinates + 1) // 2
+
+
+def begin_phase(
+    slam: EkfSlam, mean: Array, rows: Array, reference: Array, ids: list[int]
+) -> None:
+    """Give a filter a local map in place of its map, and the extension between.
+
+    Parameters
+    ----------
+    slam : EkfSlam
+        It keeps pose and covariance of the pose.
+    mean, reference : ndarray, shape (2n,)
+        Of the n local landmarks.
+    rows : ndarray, shape (3 + 2n, 2n)
+        Covariance of pose and local landmarks with these; the lower half counts.
+    ids : list of int
+        Identities of the virtual landmarks, which may be none, then of the local ones.
+    """
+    before, size = slam._size, 3 + 2 * len(ids)
+    pose, pose_mean = slam._covariance[:3, :3].copy(), slam._mean[:3].copy()
+    fixed = slam._reference[:3].copy()
+    if not size < len(slam._mean) <= _ROOMY * size:
+        slam._allocate(len(ids), more=len(ids) // 2)
+        before = 0
+    virtual = size - len(rows)
+    step = 2 if virtual == 2 * len(rows) else 1
+    for array, head, tail in (
+        (slam._mean, pose_mean, mean),
+        (slam._reference, fixed, reference),
+    ):
+        array[:before] = 0.0
+        array[:3], array[3 + virtual : size] = head, tail
+    fill_extended(slam._covariance, before, pose, rows, virtual, step)
+    slam._slots = {i: slot for slot, i in enumerate(ids)}
+    slam._size = size
+
+
+def end_phase(slam: EkfSlam, virtual: int) -> Phase:
+    """Take apart the belief of a filter that ran on an extended state; all copies."""
+    size, rest = slam._size, 3 + 2 * virtual
+    covariance = slam._covariance[:size, :size]
+    rows = np.concatenate([covariance[:3], covariance[rest:]])
+    return Phase(
+        _without(slam._mean[:size], rest),
+        _without(slam._reference[:size], rest),
+        np.concatenate([rows[:, :3], rows[:, rest:]], axis=1),
+        rows[:, 3:rest].copy(),
+        -covariance[3:rest, 3:rest],
+        slam._mean[None, 3:rest].copy(),
+    )
+
+
+def _without(vector: Array, rest: int) -> Array:
+    return np.concatenate([vector[:3], vector[rest:]])
+
+
+def combine(coefficients: Array, strip: Array, invariant: bool) -> Array:
+    """Return Φ S, shape (k, width), of coefficients (k, e) and the strip (s, width)."""
+    if not invariant:
+        product: Array = coefficients[:, : len(strip)] @ strip
+        return product
+    turned = coefficients.view(np.complex128) @ strip.view(np.complex128)
+    return turned.view(np.float64)
+
+
+def roots(loss: Array, invariant: bool) -> tuple[Array, Array]:
+    """Factor Ψ = U diag(s) Uᵀ at its numerical rank.
+
+    Its rank is that of what was really read, well below its size.  Transport makes Ψ
+    indefinite.
+
+    Returns
+    -------
+    root : ndarray, shape (rank, e)
+        Uᵀ.
+    signs : ndarray, shape (rank,)
+        s, each 1 or -1.
+    """
+    if not invariant:
+        return _by_pivots(loss)
+    used = np.flatnonzero(loss.any(axis=0))
+    root, signs = _by_eigenvalues(loss[used[:, None], used])
+    rows = np.zeros((len(root), len(loss)))
+    rows[:, used] = root
+    return rows, signs
+
+
+def _by_pivots(loss: Array) -> tuple[Array, Array]:
+    """Pivoted Cholesky decomposition of a semidefinite matrix."""
+    from scipy.linalg.lapack import dpstrf  # noqa: PLC0415 (slow to import)
+
+    used = np.flatnonzero(loss.diagonal())
+    factor, pivots, rank, _ = dpstrf(loss[used[:, None], used], lower=True)
+    root = np.zeros((rank, len(loss)))
+    unpivot(factor.T, used[pivots - 1], root)
+    return root, np.ones(rank)
+
+
+def _by_eigenvalues(part: Array) -> tuple[Array, Array]:
+    """Eigenvalue decomposition of a symmetric matrix."""
+    if not len(part):
+        return part, np.empty(0)
+    values, vectors = np.linalg.eigh(part)
+    least = np.finfo(np.float64).eps * len(part) * np.abs(values).max()
+    large = np.abs(values) > least
+    root = (vectors[:, large] * np.sqrt(np.abs(values[large]))).T
+    return root, np.sign(values[large])

@@ -1,0 +1,70 @@
+"""Moving columns and rows between the arrays of a map and a local map, compiled."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...support.jit import compiled
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@compiled
+def read_columns(block: Array, first: int, columns: Int, rows: Array) -> None:
+    """Copy some columns of a block into rows (c, width), from column ``first`` on.
+
+    Row by row: neighbours lie in one cache line.
+    """
+    for i in range(len(block)):
+        for j in range(len(columns)):
+            rows[j, first + i] = block[i, columns[j]]
+
+
+@compiled
+def write_columns(
+    block: Array, first: int, columns: Int, rows: Array, places: Int
+) -> None:
+    """Copy rows, those at ``places``, from column ``first`` on, into some columns."""
+    for i in range(len(block)):
+        for j in range(len(columns)):
+            block[i, columns[j]] = rows[places[j], first + i]
+
+
+@compiled
+def fill_extended(
+    covariance: Array, before: int, pose: Array, rows: Array, virtual: int, step: int
+) -> None:
+    """Put a local map into the covariance of a filter, extended by what is deferred.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (capacity, capacity)
+        Overwritten; of its first ``before`` rows and columns something was in use.
+    pose : ndarray, shape (3, 3)
+        Covariance of the pose.
+    rows : ndarray, shape (a, a - 3)
+        That of pose and local landmarks with the landmarks, of which the lower half
+        of the last a - 3 rows counts.
+    virtual, step : int
+        Columns of the extension, of which each real coordinate has every ``step``-th.
+    """
+    size = max(before, len(rows) + virtual)
+    covariance[:size, :size] = 0.0
+    for i in range(len(rows)):
+        for j in range(i + 1):
+            value = pose[i, j] if i < 3 else rows[j, i - 3]
+            if j >= 3:
+                value = rows[i, j - 3]
+            k, m = i + virtual * (i >= 3), j + virtual * (j >= 3)
+            covariance[k, m] = covariance[m, k] = value
+        if virtual:
+            k, m = i + virtual * (i >= 3), 3 + step * i
+            covariance[k, m] = covariance[m, k] = 1.0
+
+
+@compiled
+def unpivot(factor: Array, places: Int, rows: Array) -> None:
+    """Move an upper triangular factor's columns to their places, its first rows."""
+    for i in range(len(rows)):
+        for j in range(i, len(places)):
+            rows[i, places[j]] = factor[i, j]

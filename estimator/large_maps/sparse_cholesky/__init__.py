@@ -1,0 +1,1 @@
+"""Sparse elimination: nested dissection and block Cholesky factors."""

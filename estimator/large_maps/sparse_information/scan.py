@@ -1,0 +1,151 @@
+"""One scan against a local information map: which readings to use, and their NIS."""
+
+from math import isfinite
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import lapack, solve_triangular
+
+from ...filters.ekf import EkfSlam, not_positive_definite
+from ...support import argument_checks
+from .conditional_pose import LinearScan, PoseGivenMap, seen_from
+from .linearisation import BASES, linear_scan
+from .local_information import LocalInformation
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+class Screened(NamedTuple):
+    """Readings of mapped landmarks, in their order; n of them, m to be used."""
+
+    skipped: Flags
+    """Expected too close, shape (n,)."""
+    gated: Flags
+    """Refused by the gate, shape (n,)."""
+    near: Flags
+    """Robot within 10 σ of the landmark, shape (n,)."""
+    scan: LinearScan
+    """Those to use, linearised at the prior, m readings."""
+    nis: float
+    factor: Array
+    """L, shape (2m, 2m), L Lᵀ = S."""
+
+
+class ScanRules:
+    """Noise and acceptance of readings, set up and checked as by :class:`EkfSlam`."""
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        base: str,
+        **settings: Any,
+    ) -> None:
+        self.base = argument_checks.one_of("base", base, BASES)
+        unknown = set(settings) - {
+            "range_std_per_metre",
+            "range_noise_at",
+            "gate_probability",
+            "noise_at_rest",
+            "min_range",
+        }
+        if unknown:
+            raise TypeError(f"SparseInformationSlam has no option {min(unknown)!r}")
+        checked = EkfSlam(motion_std, measurement_std, **settings)
+        self.rules = checked.rules
+        self._motion_values = checked.motion_values
+        if min(self.rules.bearing_std, self.rules.range_std) <= 0:
+            raise ValueError(
+                "measurement_std must be 2 finite numbers > 0: of an exact reading the "
+                f"information is infinite, got {measurement_std!r}"
+            )
+
+    def motion_variance(self, distance: float, turn: float, dt: float) -> Array:
+        """(σx², σy², σα²) of a motion, shape (3,)."""
+        if not (isfinite(dt) and dt >= 0):
+            raise ValueError(f"dt must be a finite number >= 0, got {dt!r}")
+        moves = distance or turn or self._motion_values[3]
+        return self._motion_values[:3] * (dt if moves else 0.0)
+
+    def variance(self, distance: Array) -> Array:
+        """Diagonal of Q of readings at these ranges, shape (n, 2)."""
+        rules = self.rules
+        range_std = rules.range_std + rules.range_std_per_metre * distance
+        bearing = np.full(len(distance), rules.bearing_std)
+        return np.column_stack([bearing, range_std]) ** 2
+
+    def screen(
+        self,
+        pose: PoseGivenMap,
+        local: LocalInformation,
+        places: Int,
+        readings: Array,
+        ids: list[int],
+    ) -> Screened:
+        """Linearise readings of local landmarks and decide which to use.
+
+        With Σ = (Λ_LL − C)⁻¹, S = H Σ Hᵀ + N, where H and N are the readings as a
+        function of the map (:func:`seen_from`).
+        """
+        expected = np.hypot(*(local.points.reshape(-1, 2)[places] - pose.mean[:2]).T)
+        skipped = expected < self.rules.min_range
+        kept = ~skipped
+        places, readings = places[kept], readings[kept]
+        at = readings[:, 1] if self.rules.noise_as_read else expected[kept]
+        variance = self.variance(at)
+        scan = linear_scan(self.base, local, pose, places, readings, variance)
+        S = _innovation_covariance(pose, local, scan)
+        blocks = np.array(
+            [S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(places))]
+        ).reshape(-1, 2, 2)
+        refused = _squared(scan.innovation, blocks) > self.rules.gate
+        gated, near = np.zeros_like(skipped), np.zeros_like(skipped)
+        gated[kept], near[kept] = refused, _meets(scan, blocks, expected[kept])
+        used = np.repeat(~refused, 2)
+        used_ids = [i for i, k in zip(ids, kept & ~gated, strict=True) if k]
+        factor, nis = np.empty((0, 0)), 0.0
+        scan = scan.only(~refused)
+        if used_ids:
+            factor = _factor(S[np.ix_(used, used)], used_ids)
+            white = solve_triangular(factor, scan.innovation.ravel(), lower=True)
+            nis = float(white @ white)
+        return Screened(skipped, gated, near, scan, nis, factor)
+
+
+def _innovation_covariance(
+    pose: PoseGivenMap, local: LocalInformation, scan: LinearScan
+) -> Array:
+    if not len(scan.landmarks):
+        return np.empty((0, 0))
+    H, N = seen_from(pose, scan)
+    spread = solve_triangular(local.solver()[0], H.T, lower=True, check_finite=False)
+    return np.asarray(spread.T @ spread + N)
+
+
+def _squared(innovation: Array, blocks: Array) -> Array:
+    """NIS of each reading by itself, shape (n,)."""
+    solved = np.linalg.solve(blocks, innovation[..., None])[..., 0]
+    return np.asarray((innovation * solved).sum(axis=1))
+
+
+def _meets(scan: LinearScan, blocks: Array, distance: Array) -> Flags:
+    """Whether the robot is within 10 σ of each landmark, as :class:`EkfSlam` has it.
+
+    The covariance of a landmark's place in the robot's frame is H_l⁻¹ (S − Q) H_l⁻ᵀ.
+    """
+    noise = np.einsum("ni,ij->nij", scan.variance, np.eye(2))
+    back = np.linalg.inv(scan.jacobian_landmark)
+    place = back @ (blocks - noise) @ back.transpose(0, 2, 1)
+    spread = np.linalg.eigvalsh(place)[:, -1] if len(place) else np.empty(0)
+    return np.asarray(distance**2 < 100 * spread)
+
+
+def _factor(S: Array, ids: list[int]) -> Array:
+    factor, failed = lapack.dpotrf(S, lower=1, clean=1)
+    if failed:
+        raise not_positive_definite(ids[(failed - 1) // 2])
+    return np.asarray(factor)

@@ -1,0 +1,1 @@
+"""Submaps: local maps in frames of their own, joined on demand."""

@@ -1,0 +1,76 @@
+"""Two landmarks that are one, within a submap: a reading of distance zero.
+
+A closed submap is never written again.  That two of its landmarks are one is worked
+into it whenever it is read, so that it depends on nothing but the submap and on which
+landmarks are one.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...error_frames import ErrorFrame
+from ...map_management.marginalise_and_merge import coincide, without_landmarks
+from .factor import retract
+from .store import Submap
+
+Array = NDArray[np.float64]
+
+
+def merged(submap: Submap, renamed: Mapping[int, int], frame: ErrorFrame) -> Submap:
+    """Return a submap in which landmarks that are one stand in one slot.
+
+    Where it holds both, it is conditioned on l_i = l_j.  In the coordinates of its
+    error that is linear, and H = [… I … −I …] whatever the frame::
+
+        0 = l_i − l_j = R(t) (l̂_i − l̂_j) + V(t) (ξ_i − ξ_j)
+
+    with t the error of the heading, which the reading must not tell.
+
+    Parameters
+    ----------
+    submap : Submap
+        As it was closed.
+    renamed : mapping
+        Slots that are of no more use, and those which stand for them.
+    frame : {"additive", "invariant"}
+        Coordinates of the submap's error.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where nothing can be said of the distance of two landmarks.
+
+    Examples
+    --------
+    >>> P = np.diag([1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+    >>> twice = Submap(np.array([3, 8]), np.array([0, 0, 0, 4.0, 0, 6.0, 0]), P)
+    >>> once = merged(twice, {8: 3}, "additive")
+    >>> once.slots, once.mean[3:], once.covariance.diagonal()[3:]
+    (array([3]), array([5., 0.]), array([0.5, 0.5]))
+    """
+    before = submap.slots.tolist()
+    slots = [renamed.get(slot, slot) for slot in before]
+    if slots == before:
+        return submap
+    mean, covariance = submap.mean, submap.covariance
+    first: dict[int, int] = {}
+    gone: list[int] = []
+    for place, slot in enumerate(slots):
+        kept = first.setdefault(slot, place)
+        if kept != place:
+            mean, covariance = _coincided(mean, covariance, kept, place, frame)
+            gone.append(place)
+    return Submap(
+        np.array(list(first), dtype=np.int64),
+        without_landmarks(mean, gone),
+        without_landmarks(covariance, gone),
+    )
+
+
+def _coincided(
+    mean: Array, covariance: Array, kept: int, gone: int, frame: ErrorFrame
+) -> tuple[Array, Array]:
+    corrected = coincide(mean, covariance, kept, gone)
+    return retract(mean, corrected.mean - mean, frame), corrected.covariance

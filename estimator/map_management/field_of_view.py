@@ -1,0 +1,104 @@
+"""What a robot should see: the part of the world its sensor reaches."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf, pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.angles import wrap_angle
+from ..support import argument_checks
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Visibility = Callable[[Array, Array], Mask]
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """The reach of a sensor, and what may stand in its way.
+
+    A landmark counts as one that should be seen only if it is within the reach by some
+    margin, not hidden, and not behind another reading.
+
+    Raises
+    ------
+    ValueError
+        Where a limit is not a number, or the limits leave nothing to see.
+
+    Examples
+    --------
+    >>> ahead = FieldOfView(max_range=8.0, angle=np.pi)
+    >>> landmarks = np.array([[5.0, 1.0], [-5.0, 1.0], [9.0, 0.0]])
+    >>> ahead.expects(np.zeros(3), landmarks, np.empty((0, 2))).tolist()
+    [True, False, False]
+    """
+
+    max_range: float
+    """Reach [m]."""
+    min_range: float = 0.0
+    """Landmarks nearer than this are not seen [m]."""
+    angle: float = 2 * pi
+    """Width, half of it to each side of the heading [rad]."""
+    range_margin: float = 0.5
+    """How far inside the range limits a landmark must lie to be missed [m]."""
+    bearing_margin: float = 0.05
+    """How far inside the edges of the angle a landmark must lie to be missed [rad]."""
+    shadow: float = 0.0
+    """A landmark within this angle of a nearer reading may be behind it [rad]."""
+    visible: Visibility | None = None
+    """Called with a pose (3,) and landmarks (n, 2): which of them nothing hides."""
+
+    def __post_init__(self) -> None:
+        for name in ("min_range", "range_margin", "bearing_margin", "shadow"):
+            argument_checks.at_least(name, getattr(self, name), 0.0)
+        if self.max_range != inf:
+            argument_checks.above("max_range", self.max_range, self.min_range)
+        argument_checks.above("angle", self.angle, 0.0)
+        if self.angle > 2 * pi:
+            raise ValueError(f"angle must be at most 2π, got {self.angle!r}")
+        if self.visible is not None and not callable(self.visible):
+            raise ValueError(f"visible must be callable or None, got {self.visible!r}")
+
+    def expects(self, pose: Array, landmarks: Array, readings: Array) -> Mask:
+        """Tell which landmarks a scan should hold.
+
+        Parameters
+        ----------
+        pose : ndarray, shape (3,)
+            From where (x, y, θ) [m, m, rad].
+        landmarks : ndarray, shape (n, 2)
+            Where they are believed to be [m].
+        readings : ndarray, shape (m, 2)
+            What the scan holds, rows (β, r), behind which others may hide.
+
+        Returns
+        -------
+        ndarray of bool, shape (n,)
+        """
+        dx, dy = (landmarks - pose[:2]).T
+        distance = np.hypot(dx, dy)
+        bearing = wrap_angle(np.arctan2(dy, dx) - pose[2])
+        expected = distance <= self.max_range - self.range_margin
+        if self.min_range > 0:
+            expected &= distance >= self.min_range + self.range_margin
+        if self.angle < 2 * pi:
+            expected &= np.abs(bearing) <= self.angle / 2 - self.bearing_margin
+        if self.shadow > 0 and len(readings):
+            aside = np.abs(wrap_angle(bearing[:, None] - readings[:, 0]))
+            in_front = readings[:, 1] < distance[:, None]
+            expected &= ~((aside <= self.shadow) & in_front).any(axis=1)
+        if self.visible is not None and expected.any():
+            expected[expected] = _asked(self.visible, pose, landmarks[expected])
+        return np.asarray(expected)
+
+
+def _asked(visible: Visibility, pose: Array, landmarks: Array) -> Mask:
+    answer = np.asarray(visible(pose.copy(), landmarks.copy()))
+    if answer.shape != (len(landmarks),) or answer.dtype != np.bool_:
+        raise ValueError(
+            f"visible must answer {len(landmarks)} landmarks with as many booleans, "
+            f"got {answer.dtype} of shape {answer.shape}"
+        )
+    return answer

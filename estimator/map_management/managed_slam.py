@@ -1,0 +1,314 @@
+"""Any filter, its landmarks managed by a policy."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..association.candidates import Newcomers, ScanPlan
+from ..interface import Belief, SlamEstimator, UpdateReport
+from ..support import argument_checks
+from ..support.argument_checks import LandmarkIds
+from .map_editor import (
+    MapView,
+    RememberedAccess,
+    access_to,
+    mapped_ids,
+    marginal,
+    view_of,
+)
+from .policy import LandmarkPolicy, as_policy
+from .pruning import MapUpkeep
+
+Array = NDArray[np.float64]
+
+# What a filter may have besides, with which management does nothing.
+_DOORS = ("observe_truth", "view_around", "join", "memory_for", "belief_limit")
+
+
+class ManagedSlam:
+    """A filter of any kind that associates, confirms, removes and merges landmarks.
+
+    Around the filter's own ``update`` a :class:`LandmarkPolicy` decides which landmark
+    each reading is of, when a new one has been seen often enough, which ones should
+    have been seen and were not, which two are one, and which to give up.
+
+    Parameters
+    ----------
+    estimator : callable
+        Makes the filter, from the keywords below; a class will do.
+    motion_std, measurement_std, initial_pose, initial_pose_std
+        As every filter takes them.
+    management : LandmarkPolicy, mapping or True
+        The policy, its fields, or True for the default one.
+    **options
+        Those of the filter.
+
+    Raises
+    ------
+    ValueError
+        Where filter or policy refuse a value.
+    TypeError
+        Where the filter's map cannot be edited.
+
+    Notes
+    -----
+    Tentative landmarks stay outside the filter's state: clutter then neither moves the
+    pose nor costs anything, and a landmark that comes to nothing leaves no trace.  The
+    price is that the readings before the one that confirms correct nothing.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import EkfSlam
+    >>> slam = ManagedSlam(EkfSlam, (0.1, 0.1, 0.05), (0.02, 0.1), management=True)
+    >>> for _ in range(3):
+    ...     report = slam.update([(0.5, 4.0)])
+    >>> report.confirmed_ids, slam.belief().landmark_ids
+    ((0,), (0,))
+    """
+
+    def __init__(
+        self,
+        estimator: Callable[..., SlamEstimator],
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        management: LandmarkPolicy | Mapping[str, Any] | bool = True,
+        initial_pose: ArrayLike = (0.0, 0.0, 0.0),
+        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        **options: Any,
+    ) -> None:
+        self._policy = as_policy(management)
+        self._filter = estimator(
+            motion_std=motion_std,
+            measurement_std=measurement_std,
+            initial_pose=initial_pose,
+            initial_pose_std=initial_pose_std,
+            **options,
+        )
+        bearing_std, range_std = np.asarray(measurement_std, dtype=np.float64).tolist()
+        noise = bearing_std, range_std, float(options.get("range_std_per_metre", 0.0))
+        self._noise = noise
+        self._motion_variance = np.asarray(motion_std, dtype=np.float64) ** 2
+        self._noise_at_rest = options.get("noise_at_rest", True)
+        self._min_range = options.get("min_range", 1e-3)
+        merging = self._policy.merge_within is not None
+        self._door = RememberedAccess(access_to(self._filter, merging=merging))
+        self._upkeep = MapUpkeep(self._policy, self._door, noise)
+        self._newcomers = Newcomers()
+        for name in _DOORS:
+            if hasattr(self._filter, name):
+                setattr(self, name, getattr(self._filter, name))
+
+    @property
+    def policy(self) -> LandmarkPolicy:
+        """What decides about landmarks."""
+        return self._policy
+
+    @property
+    def filter(self) -> SlamEstimator:
+        """The filter inside."""
+        return self._filter
+
+    @property
+    def tentative_landmarks(self) -> Array:
+        """Where landmarks not yet confirmed seem to be, shape (t, 2) [m]."""
+        places = self._newcomers.tentative.places
+        if not len(places):
+            return places.copy()
+        x, y, heading = self._door.map_view().mean[:3]
+        cos, sin = np.cos(heading), np.sin(heading)
+        return np.asarray(places @ np.array([[cos, sin], [-sin, cos]]) + (x, y))
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
+        self._filter.reset(pose, pose_std)
+        self._door.expire()
+        self._upkeep.forget()
+        self._newcomers = Newcomers()
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        self._filter.predict(odometry, dt)
+        self._door.expire()
+        distance, turn = argument_checks.pair("odometry", odometry)
+        has_noise = self._noise_at_rest or distance or turn
+        variance = self._motion_variance * (dt if has_noise else 0.0)
+        moved = self._newcomers.tentative.moved(distance, turn, variance)
+        self._newcomers = replace(self._newcomers, tentative=moved)
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
+    ) -> UpdateReport:
+        """Associate one scan, correct the belief with it, then tidy the map.
+
+        Parameters
+        ----------
+        measurements : array_like, shape (m, 2)
+            Rows (β, r) [rad, m], all seen at once.
+        landmark_ids : sequence of int, length m, optional
+            Identity of the landmark behind each row; None: find out.
+
+        Returns
+        -------
+        UpdateReport
+            Of the filter, and what was done to the map.
+
+        Raises
+        ------
+        ValueError
+            Where the arguments are malformed; all is then as before.
+        numpy.linalg.LinAlgError
+            Where the filter's covariance is degenerate; all is then as before.
+        """
+        readings = argument_checks.scan(measurements)
+        plan = self._planned(readings, landmark_ids)
+        rows = [row for row, i in enumerate(plan.row_ids) if i is not None]
+        ids = [i for i in plan.row_ids if i is not None]
+        missed = self._upkeep.expected(readings) - plan.explained
+        report = self._filter.update(readings[rows], ids)
+        self._door.expire()
+        self._newcomers = plan.newcomers
+        tidied = self._tidied(readings, plan, missed, report)
+        confirmed = set(plan.confirmed)
+        return tidied._replace(
+            confirmed_ids=tuple(i for i in report.added_ids if i in confirmed),
+            row_ids=tuple(plan.row_ids),
+            tentative_rows=tuple(plan.tentative_rows),
+            ambiguous_rows=tuple(plan.ambiguous_rows),
+        )
+
+    def remove(self, landmark_ids: LandmarkIds) -> None:
+        """Marginalise landmarks by hand, shape (n,); all else stays as it was.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map.
+        """
+        self._upkeep.remove(self._mapped(landmark_ids))
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Make one of two landmarks by hand; it answers to both its identities.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map, or they are the same.
+        """
+        argument_checks.two_landmarks(kept, gone)
+        self._mapped([kept, gone])
+        self._upkeep.join(kept, gone)
+
+    def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
+        mapped = {i: slot for slot, i in enumerate(self.landmark_ids)}
+        return argument_checks.mapped_identities(landmark_ids, mapped)
+
+    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
+        """Return the present belief, of the whole map or of pose and some landmarks.
+
+        Tentative landmarks are not in it.
+        """
+        if landmark_ids is None:
+            return self._filter.belief()
+        return marginal(self._filter, landmark_ids)
+
+    def map_view(self) -> MapView:
+        """Look at pose and map, perhaps without a copy: not to keep, not to change."""
+        return view_of(self._filter)
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return mapped_ids(self._filter)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the filter's state and what is remembered of landmarks, as arrays."""
+        return self._remembered() | _named("filter", self._filter.state_dict())
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state, bit for bit under the same settings.
+
+        Raises
+        ------
+        ValueError
+            Where the state lacks an entry, or is of another estimator; all is then as
+            before.
+        """
+        name = type(self).__name__
+        argument_checks.refuse_other_state(state, self._remembered(), estimator=name)
+        newcomers = Newcomers.from_state_dict(_part_of(state, "tentative"))
+        before = self._upkeep.state_dict()
+        try:
+            self._upkeep.load_state_dict(_part_of(state, "landmarks"))
+            self._filter.load_state_dict(_part_of(state, "filter"))
+        except Exception:
+            self._upkeep.load_state_dict(before)
+            raise
+        self._door.expire()
+        self._newcomers = newcomers
+
+    def _remembered(self) -> dict[str, Any]:
+        """Return all of the state but the filter's."""
+        return {
+            "estimator": np.array(type(self).__name__),
+            **_named("landmarks", self._upkeep.state_dict()),
+            **_named("tentative", self._newcomers.state_dict()),
+        }
+
+    def _planned(self, readings: Array, landmark_ids: LandmarkIds | None) -> ScanPlan:
+        plan = ScanPlan(self._policy, self._newcomers, len(readings))
+        view = self._door.map_view(self._reach(readings))
+        if landmark_ids is None:
+            _check_finite(readings)
+            plan.associate(readings, view, self._noise, self._min_range)
+        else:
+            given = argument_checks.identities(landmark_ids, len(readings))
+            plan.translate(given, view.mapped, self._upkeep.aliases)
+        return plan
+
+    def _reach(self, readings: Array) -> float:
+        """Return from how far away a landmark may matter for a scan [m]."""
+        policy, ranges = self._policy, readings[np.isfinite(readings[:, 1]), 1]
+        reach = float(ranges.max(initial=0.0))
+        if policy.remove_after is not None and policy.view is not None:
+            reach = max(reach, policy.view.max_range)
+        return reach + (policy.merge_within or 0.0)
+
+    def _tidied(
+        self,
+        readings: Array,
+        plan: ScanPlan,
+        missed: set[int],
+        report: UpdateReport,
+    ) -> UpdateReport:
+        """Remove and merge what the policy says, after a scan."""
+        refused = {*report.rejected_ids, *report.skipped_ids}
+        seen = set(self._door.map_view().ids).intersection(plan.row_ids) - refused
+        rows = [row for row, i in enumerate(plan.row_ids) if i in seen]
+        ids = [i for i in plan.row_ids if i is not None and i in seen]
+        self._upkeep.note_sightings(readings[rows], ids)
+        removed = self._upkeep.remove_missing(missed)
+        merged = self._upkeep.merge(seen)
+        removed += self._upkeep.keep_capacity(seen)
+        return report._replace(removed_ids=tuple(removed), merged_ids=tuple(merged))
+
+
+def _named(name: str, part: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"{name}.{key}": value for key, value in part.items()}
+
+
+def _part_of(state: Mapping[str, Any], name: str) -> dict[str, Any]:
+    start = f"{name}."
+    return {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}
+
+
+def _check_finite(readings: Array) -> None:
+    finite = np.isfinite(readings).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise ValueError(
+            f"measurements must be finite, got {readings[row].tolist()} in row {row}"
+        )

@@ -1,0 +1,152 @@
+"""The policy by which landmarks enter a map, stay in it, become one, and leave it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from math import sqrt
+from typing import Any, TypeVar
+
+from ..support import argument_checks
+from .field_of_view import FieldOfView
+
+MOST_SCANS = 63  # that fit one mask of a tentative landmark
+
+
+@dataclass(frozen=True)
+class LandmarkPolicy:
+    """What to do with the landmarks of any filter: one object, for ``management=``.
+
+    The default associates readings without identity and wants a new landmark confirmed;
+    it removes and merges nothing.
+
+    Raises
+    ------
+    ValueError
+        Where a value is out of range, or two do not go together.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import make_estimator
+    >>> slam = make_estimator(
+    ...     "invariant",
+    ...     motion_std=(0.1, 0.1, 0.05),
+    ...     measurement_std=(0.02, 0.1),
+    ...     management=LandmarkPolicy(confirm=(2, 3)),
+    ... )
+    >>> slam.update([(0.0, 5.0)]).added_ids  # nobody says of what
+    ()
+    >>> slam.update([(0.01, 5.1)]).confirmed_ids
+    (0,)
+    """
+
+    match_gate: float = 9.21
+    """A reading is of a landmark only up to this νᵀ S⁻¹ ν; χ² of 2 dof, here 99 %."""
+    new_gate: float = 25.0
+    """A reading is of a new landmark only beyond this from all that are known."""
+    ambiguity: float = 1.0
+    """Left out where two landmarks differ by less than this in −2 ln likelihood."""
+    confirm: tuple[int, int] = (3, 8)
+    """(k, n): seen in k of n successive scans, a landmark enters the map."""
+    trust_ids: bool = True
+    """Whether landmarks that come with an identity enter at first sight."""
+    view: FieldOfView | None = None
+    """What the sensor reaches; needed to tell who is missing."""
+    remove_after: int | None = None
+    """So many scans in turn that should have shown a landmark and did not remove it."""
+    merge_within: float | None = None
+    """Two landmarks are never closer than this [m]; those that seem so are merged."""
+    merge_gate: float = 9.21
+    """Two landmarks may be one only up to this Dᵀ C⁻¹ D of their offset D."""
+    capacity: int | None = None
+    """Most landmarks in the map; beyond it the least informative are removed."""
+
+    def __post_init__(self) -> None:
+        argument_checks.above("match_gate", self.match_gate, 0.0)
+        argument_checks.at_least("new_gate", self.new_gate, self.match_gate)
+        argument_checks.at_least("ambiguity", self.ambiguity, 0.0)
+        argument_checks.above("merge_gate", self.merge_gate, 0.0)
+        argument_checks.flag("trust_ids", self.trust_ids)
+        object.__setattr__(self, "confirm", _k_of_n(self.confirm))
+        for name in ("remove_after", "capacity"):
+            if getattr(self, name) is not None:
+                argument_checks.whole(name, getattr(self, name), 1)
+        if self.merge_within is not None:
+            argument_checks.above("merge_within", self.merge_within, 0.0)
+        if not isinstance(self.view, FieldOfView | None):
+            raise ValueError(f"view must be a FieldOfView or None, got {self.view!r}")
+        if self.remove_after is not None and self.view is None:
+            raise ValueError(
+                "view must be given with remove_after: without it nobody knows what "
+                "should have been seen"
+            )
+
+    @property
+    def worst_separation_std(self) -> float:
+        """Up to which σ of their offset two landmarks can be told apart [m].
+
+        Two that are ``merge_within`` apart must fail the test in 99.8 % of cases: their
+        offset is so many σ that even 3 σ less is outside the gate.
+        """
+        return (self.merge_within or 0.0) / (sqrt(self.merge_gate) + 3.0)
+
+
+def as_policy(value: "LandmarkPolicy | Mapping[str, Any] | bool") -> LandmarkPolicy:
+    """Return a policy from what may stand for one: itself, its fields, or True.
+
+    Raises
+    ------
+    ValueError
+        Where it is none, or names an unknown field.
+
+    Examples
+    --------
+    >>> as_policy({"confirm": [2, 3], "view": {"max_range": 8}}).view.max_range
+    8
+    """
+    if isinstance(value, LandmarkPolicy):
+        return value
+    if value is True:
+        return LandmarkPolicy()
+    if not isinstance(value, Mapping):
+        raise ValueError(
+            "management must be a LandmarkPolicy, its fields as a mapping, or True, "
+            f"got {value!r}"
+        )
+    given = dict(value)
+    if isinstance(given.get("view"), Mapping):
+        given["view"] = _made(FieldOfView, "management.view", given["view"])
+    return _made(LandmarkPolicy, "management", given)
+
+
+Made = TypeVar("Made", LandmarkPolicy, FieldOfView)
+
+
+def _made(kind: type[Made], name: str, given: Mapping[str, Any]) -> Made:
+    known = [field.name for field in fields(kind)]
+    for key in given:
+        if key not in known:
+            near = get_close_matches(str(key), known, n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise ValueError(f"{name} has no '{key}'{hint}")
+    try:
+        return kind(**given)
+    except TypeError as error:
+        raise ValueError(f"{name} is not complete: {error}") from error
+
+
+def _k_of_n(value: Any) -> tuple[int, int]:
+    try:
+        k, n = value
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"confirm must be two whole numbers (k, n), got {value!r}"
+        ) from None
+    k, n = (
+        argument_checks.whole("confirm[0]", k, 1),
+        argument_checks.whole("confirm[1]", n, 1),
+    )
+    if not k <= n <= MOST_SCANS:
+        raise ValueError(
+            f"confirm must be (k, n) with k <= n <= {MOST_SCANS}, got ({k}, {n})"
+        )
+    return k, n

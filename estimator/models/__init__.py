@@ -1,0 +1,1 @@
+"""Motion and measurement models: values, Jacobians and their compiled twins."""

@@ -1,0 +1,1 @@
+"""Argument checks, memory limits and compilation, shared by all estimators."""

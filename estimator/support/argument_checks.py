@@ -1,0 +1,231 @@
+"""Checks at the public door, in words that name the argument."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from math import isfinite
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .memory_limit import covariance_bytes
+
+Array = NDArray[np.float64]
+LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
+
+# Largest reading or odometry [m, rad]; their squares, and products, stay finite.
+LARGEST = 1e12
+# The lowest identity that 64 bits hold, and how many from there on are no landmarks.
+LOWEST_ID, RESERVED_IDS = -(2**63), 2**20
+
+
+def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
+    """Return ``value`` as float64 (size,), or refuse it."""
+    vector = as_floats(name, value)
+    if vector.shape != (size,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name} must be {size} finite numbers, got {value!r}")
+    return vector
+
+
+def standard_deviations(name: str, value: ArrayLike, size: int) -> Array:
+    """Return ``value`` as float64 (size,), finite and not negative, or refuse it."""
+    std = as_floats(name, value)
+    if std.shape != (size,) or not (np.isfinite(std) & (std >= 0)).all():
+        raise ValueError(f"{name} must be {size} finite numbers >= 0, got {value!r}")
+    return std
+
+
+def as_floats(name: str, value: ArrayLike) -> Array:
+    """Return ``value`` as a contiguous float64 array, or refuse it."""
+    if isinstance(value, np.ndarray):
+        _refuse_masked_and_complex(name, value)
+    try:
+        return np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, got {value!r}") from None
+
+
+def scan(measurements: ArrayLike) -> Array:
+    """Return ``measurements`` as float64 (m, 2), or refuse them."""
+    readings = as_floats("measurements", measurements)
+    if not readings.flags.writeable:  # another type to numba: it would compile anew
+        readings = readings.copy()
+    if readings.ndim == 2 and readings.shape[1] == 2:
+        return readings
+    if readings.size == 0:
+        return readings.reshape(0, 2)
+    raise ValueError(
+        "measurements must have shape (m, 2), rows (bearing, range), "
+        f"got shape {readings.shape}"
+    )
+
+
+def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
+    """Return ids as Python integers: one for each of ``count`` readings, no repeats."""
+    array = np.asarray(landmark_ids)
+    if array.size and (array.dtype.kind not in "iu" or array.ndim != 1):
+        raise ValueError(f"landmark_ids must be integers, got {landmark_ids!r}")
+    if array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any():
+        raise ValueError(f"landmark_ids must fit 64 bits, got {landmark_ids!r}")
+    ids: list[int] = array.ravel().tolist()
+    if len(ids) != count:
+        raise ValueError(
+            f"measurements has {count} rows but landmark_ids has {len(ids)} entries"
+        )
+    if len(set(ids)) < count:
+        twice = next(i for i in ids if ids.count(i) > 1)
+        raise ValueError(
+            f"landmark_ids must not repeat within a scan, got {twice} twice"
+        )
+    return ids
+
+
+def refuse_reserved(ids: Iterable[int]) -> None:
+    """Refuse identities that filters keep for what is no landmark."""
+    lowest = min(ids, default=0)
+    if lowest < LOWEST_ID + RESERVED_IDS:
+        raise ValueError(
+            f"landmark_ids must be >= {LOWEST_ID + RESERVED_IDS}, got {lowest}"
+        )
+
+
+def given_identities(
+    landmark_ids: LandmarkIds | None, count: int, estimator: object
+) -> list[int]:
+    """Return the ids of ``count`` readings for an estimator that needs them."""
+    if landmark_ids is not None:
+        return identities(landmark_ids, count)
+    if count:
+        raise ValueError(
+            f"landmark_ids must be given: {type(estimator).__name__} does not associate"
+        )
+    return []
+
+
+def asked_identities(
+    landmark_ids: LandmarkIds | None, mapped: Mapping[int, int]
+) -> list[int]:
+    """Return ids of mapped landmarks without repetition, all of them for None."""
+    if landmark_ids is None:
+        return list(mapped)
+    return mapped_identities(landmark_ids, mapped)
+
+
+def mapped_identities(
+    landmark_ids: LandmarkIds, mapped: Mapping[int, int]
+) -> list[int]:
+    """Return ids of mapped landmarks, without repetition."""
+    ids = identities(landmark_ids, np.size(landmark_ids))
+    for i in ids:
+        if i not in mapped:
+            raise ValueError(f"landmark_ids must be of mapped landmarks, got {i}")
+    return ids
+
+
+def two_landmarks(kept: int, gone: int) -> None:
+    """Refuse to make one landmark of one."""
+    if kept == gone:
+        raise ValueError(f"kept and gone must be two landmarks, got {kept} twice")
+
+
+def refuse_unusable(readings: Array, ids: Sequence[int]) -> None:
+    """Refuse readings that are not finite or too large, naming the first."""
+    for usable, rule in (
+        (np.isfinite(readings), "must be finite"),
+        (np.abs(readings) <= LARGEST, f"must not exceed {LARGEST:g}"),
+    ):
+        if not usable.all():
+            row = int(np.argmin(usable.all(axis=1)))
+            raise ValueError(
+                f"measurements {rule}, got {readings[row].tolist()} in row {row} "
+                f"(landmark {ids[row]})"
+            )
+
+
+def refuse_other_state(
+    state: Mapping[str, Any], entries: Iterable[str], **classes: str
+) -> None:
+    """Refuse a saved state that lacks an entry, or is of other classes than these."""
+    for key in (*classes, *entries):
+        if key not in state:
+            raise ValueError(f"state must hold {key!r}, got {sorted(state)}")
+    for key, name in classes.items():
+        if str(state[key]) != name:
+            raise ValueError(f"state is of {state[key]}, not of {name}")
+
+
+def refuse_large_belief(landmarks: int, limit: int, instead: str) -> None:
+    """Refuse a dense covariance of more landmarks than the limit, with its size."""
+    if landmarks > limit:
+        gigabytes = 1e-9 * covariance_bytes(landmarks)
+        raise ValueError(
+            f"belief() of {landmarks} landmarks has a dense covariance of "
+            f"{gigabytes:.1f} GB, and belief_limit is {limit}: {instead}, or raise "
+            "belief_limit"
+        )
+
+
+def pair(name: str, value: ArrayLike) -> tuple[float, float]:
+    """Return ``value`` as two finite floats of a usable size, or refuse it."""
+    given: object = value
+    if isinstance(value, np.ndarray):
+        _refuse_masked_and_complex(name, value)
+        given = value.tolist()  # in half the time that numpy's own numbers take
+    try:
+        first, second = cast("tuple[float, float]", given)
+        a, b = float(first), float(second)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} must be 2 finite numbers, got {value!r}") from None
+    if not (isfinite(a) and isfinite(b)):
+        raise ValueError(f"{name} must be 2 finite numbers, got {value!r}")
+    if max(abs(a), abs(b)) > LARGEST:
+        raise ValueError(f"{name} must not exceed {LARGEST:g}, got {value!r}")
+    return a, b
+
+
+def at_least(name: str, value: float, least: float) -> float:
+    """Return a finite number >= ``least``, or refuse it."""
+    if not (_is_finite(value) and value >= least):
+        raise ValueError(f"{name} must be a finite number >= {least:g}, got {value!r}")
+    return float(value)
+
+
+def above(name: str, value: float, least: float) -> float:
+    """Return a finite number > ``least``, or refuse it."""
+    if not (_is_finite(value) and value > least):
+        raise ValueError(f"{name} must be a finite number > {least:g}, got {value!r}")
+    return float(value)
+
+
+def whole(name: str, value: int, least: int) -> int:
+    """Return a whole number >= ``least``, or refuse it."""
+    is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_whole or value < least:
+        raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+    return int(value)
+
+
+def one_of(name: str, value: str, choices: tuple[str, ...]) -> str:
+    """Return one of a few words, or refuse another."""
+    if value not in choices:
+        wanted = " or ".join(repr(choice) for choice in choices)
+        raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    return value
+
+
+def flag(name: str, value: bool) -> bool:
+    """Return True or False, or refuse what is neither."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
+def _refuse_masked_and_complex(name: str, value: NDArray[Any]) -> None:
+    """Numpy would take what lies under a mask, and half of a complex number."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError(f"{name} must be an array without a mask, got {value!r}")
+    if value.dtype.kind == "c":
+        raise ValueError(f"{name} must be real numbers, got {value!r}")
+
+
+def _is_finite(value: float) -> bool:
+    return isinstance(value, int | float | np.number) and isfinite(value)

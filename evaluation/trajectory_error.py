@@ -1,0 +1,283 @@
+"""How far an estimated path or map lies from the truth.
+
+SLAM without a fixed start knows its map only up to one rigid motion of the plane, so
+positions are compared twice: as they are (raw), and after the rotation and translation
+that bring them closest to the truth (aligned). Scale is never adapted.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..estimator.models.angles import wrap_angle
+from ..estimator.support.argument_checks import as_floats
+
+Array = NDArray[np.float64]
+
+
+class Alignment(NamedTuple):
+    """A rigid motion of the plane, e ↦ C(φ) e + c."""
+
+    angle: float
+    """φ, counter-clockwise, in [-π, π] [rad]."""
+    translation: Array
+    """c, shape (2,) [m]."""
+
+    def apply(self, positions: Array) -> Array:
+        """Move positions, shape (n, 2)."""
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        rotation = np.array([[cos, -sin], [sin, cos]])
+        return np.asarray(positions @ rotation.T + self.translation)
+
+
+class PositionAccuracy(NamedTuple):
+    """Distances between estimated and true positions, raw and aligned."""
+
+    raw_errors: Array
+    """Shape (n,) [m]."""
+    aligned_errors: Array
+    """Shape (n,) [m]."""
+    alignment: Alignment
+    """The motion that takes the estimate onto the truth."""
+
+    @property
+    def raw_rmse(self) -> float:
+        """Root of the mean square of the raw errors [m]."""
+        return float(np.sqrt(np.mean(self.raw_errors**2)))
+
+    @property
+    def aligned_rmse(self) -> float:
+        """Root of the mean square of the aligned errors [m]."""
+        return float(np.sqrt(np.mean(self.aligned_errors**2)))
+
+
+class LandmarkDistances(NamedTuple):
+    """Distance of each landmark estimate to its ground truth."""
+
+    euclidean: Array
+    """‖e‖, shape (n,) [m]."""
+    mahalanobis: Array
+    """sqrt(eᵀ P⁻¹ e), shape (n,): the same distance in standard deviations."""
+
+
+def align_positions(estimate: ArrayLike, truth: ArrayLike) -> Alignment:
+    """Find the rigid motion that brings estimated positions closest to the true ones.
+
+    ::
+
+        min over φ, c of  Σ ‖C(φ) eₖ + c − gₖ‖²:
+        φ = atan2(Σ e'ₖ × g'ₖ,  Σ e'ₖ · g'ₖ),   c = ḡ − C(φ) ē
+
+    with e' = e − ē and g' = g − ḡ: the plane's closed form of [1]_, without scale.
+
+    Parameters
+    ----------
+    estimate, truth : array_like, shape (n, 2)
+        Positions eₖ and gₖ of the same n >= 1 things [m].
+
+    Returns
+    -------
+    Alignment
+        The motion; φ = 0 if the positions determine none, as a single one does.
+
+    Raises
+    ------
+    ValueError
+        If the arrays are not n finite positions each.
+
+    References
+    ----------
+    .. [1] S. Umeyama, Least-squares estimation of transformation parameters between two
+       point patterns, IEEE PAMI 13(4), 1991.
+
+    Examples
+    --------
+    >>> align_positions([[0, 0], [1, 0]], [[5, 5], [5, 6]])
+    Alignment(angle=1.5707963267948966, translation=array([5., 5.]))
+    """
+    e, g = _paired(estimate=estimate, truth=truth)
+    e_mean, g_mean = e.mean(axis=0), g.mean(axis=0)
+    e_centred, g_centred = e - e_mean, g - g_mean
+    cross = e_centred[:, 0] @ g_centred[:, 1] - e_centred[:, 1] @ g_centred[:, 0]
+    angle = float(np.arctan2(cross, np.sum(e_centred * g_centred)))
+    turned = Alignment(angle, np.zeros(2)).apply(e_mean)
+    return Alignment(angle, g_mean - turned)
+
+
+def position_accuracy(estimate: ArrayLike, truth: ArrayLike) -> PositionAccuracy:
+    """Compare estimated positions with the true ones, raw and aligned.
+
+    For a path this is the absolute trajectory error (ATE); for a map, landmark by
+    landmark, the error of its landmarks.
+
+    Parameters
+    ----------
+    estimate, truth : array_like, shape (n, 2)
+        Positions of the same n >= 1 things [m].
+
+    Returns
+    -------
+    PositionAccuracy
+        All errors, and their root mean squares ``raw_rmse`` and ``aligned_rmse``.
+
+    Raises
+    ------
+    ValueError
+        If the arrays are not n finite positions each.
+
+    Examples
+    --------
+    >>> accuracy = position_accuracy([[0, 0], [1, 0]], [[0, 2], [1, 2]])
+    >>> accuracy.raw_rmse, accuracy.aligned_rmse
+    (2.0, 0.0)
+    """
+    e, g = _paired(estimate=estimate, truth=truth)
+    alignment = align_positions(e, g)
+    return PositionAccuracy(
+        raw_errors=np.linalg.norm(e - g, axis=1),
+        aligned_errors=np.linalg.norm(alignment.apply(e) - g, axis=1),
+        alignment=alignment,
+    )
+
+
+def landmark_distances(
+    landmarks: ArrayLike, covariances: ArrayLike, truth: ArrayLike
+) -> LandmarkDistances:
+    """Distance of every landmark to its ground truth, in metres and in deviations.
+
+    ::
+
+        e = l − l_true,   ‖e‖,   sqrt(eᵀ P⁻¹ e)
+
+    Parameters
+    ----------
+    landmarks : array_like, shape (n, 2)
+        Estimated positions l [m].
+    covariances : array_like, shape (n, 2, 2)
+        Covariance P of each [m²], see :func:`landmark_covariances`.
+    truth : array_like, shape (n, 2)
+        True positions of the same landmarks [m].
+
+    Returns
+    -------
+    LandmarkDistances
+        Both distances, (n,) each.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit, or if a covariance is not positive definite.
+
+    Notes
+    -----
+    CMU 16-833, EKF-SLAM homework, part 2.
+
+    Examples
+    --------
+    >>> landmark_distances([[3, 4]], [[[25, 0], [0, 25]]], [[0, 0]])
+    LandmarkDistances(euclidean=array([5.]), mahalanobis=array([1.]))
+    """
+    estimate, true = _paired(landmarks=landmarks, truth=truth)
+    e = estimate - true
+    P = as_floats("covariances", covariances)
+    if P.shape != (len(e), 2, 2):
+        raise ValueError(f"covariances must be shape ({len(e)}, 2, 2), got {P.shape}")
+    if not (np.linalg.eigvalsh(P) > 0).all():
+        raise ValueError("covariances must be positive definite, got one that is not")
+    weighted = np.linalg.solve(P, e[..., None])[..., 0]
+    return LandmarkDistances(
+        euclidean=np.linalg.norm(e, axis=1),
+        mahalanobis=np.sqrt(np.sum(e * weighted, axis=1)),
+    )
+
+
+def landmark_covariances(covariance: ArrayLike) -> Array:
+    """Cut the blocks of the single landmarks out of a joint covariance.
+
+    Parameters
+    ----------
+    covariance : array_like, shape (3 + 2n, 3 + 2n)
+        Joint covariance in the order of the state (x, y, θ, l1x, l1y, …).
+
+    Returns
+    -------
+    ndarray, shape (n, 2, 2)
+        Covariance of each landmark's position [m²].
+
+    Examples
+    --------
+    >>> landmark_covariances(np.diag([0, 0, 0, 1, 2, 3, 4]))[1]
+    array([[3., 0.],
+           [0., 4.]])
+    """
+    P = as_floats("covariance", covariance)
+    size = len(P) if P.ndim else 0
+    if P.shape != (size, size) or size < 3 or size % 2 == 0:
+        raise ValueError(f"covariance must be shape (3 + 2n, 3 + 2n), got {P.shape}")
+    rows = np.arange(3, size).reshape(-1, 2)
+    return np.asarray(P[rows[:, :, None], rows[:, None, :]])
+
+
+def poses_at(times: ArrayLike, ground_truth: ArrayLike) -> Array:
+    """Interpolate a true path, its heading along the shorter way round.
+
+    Parameters
+    ----------
+    times : array_like, shape (k,)
+        When to know the pose [s].
+    ground_truth : array_like, shape (n, 4)
+        Rows (t, x, y, θ) [s, m, m, rad], t not decreasing; θ may be nan.
+
+    Returns
+    -------
+    ndarray, shape (k, 3)
+        Poses (x, y, θ), θ in [-π, π); rows of nan before the first and after the last
+        row of the path.
+
+    Examples
+    --------
+    >>> poses_at([0.5, 9.0], [[0, 0, 0, 3], [1, 2, 0, -3]])
+    array([[ 1.        ,  0.        , -3.14159265],
+           [        nan,         nan,         nan]])
+    """
+    t = as_floats("times", times)
+    path = as_floats("ground_truth", ground_truth)
+    if path.ndim != 2 or path.shape[1] != 4:
+        raise ValueError(f"ground_truth must be shape (n, 4), got {path.shape}")
+    if not len(path):
+        return np.full((len(t), 3), np.nan)
+    columns = (path[:, 1], path[:, 2], _unwrapped(path[:, 3]))
+    poses = np.stack(
+        [np.interp(t, path[:, 0], c, left=np.nan, right=np.nan) for c in columns],
+        axis=1,
+    )
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    return poses
+
+
+def _unwrapped(headings: Array) -> Array:
+    """Take out the jumps of 2π between the headings that are known."""
+    known = ~np.isnan(headings)
+    smooth = headings.copy()
+    smooth[known] = np.unwrap(headings[known])
+    return smooth
+
+
+def _paired(**positions: ArrayLike) -> tuple[Array, Array]:
+    """Check two arrays of positions; their names are those the caller knows."""
+    arrays = {name: as_floats(name, value) for name, value in positions.items()}
+    for name, array in arrays.items():
+        if array.ndim != 2 or array.shape[1] != 2 or not len(array):
+            raise ValueError(
+                f"{name} must be n >= 1 positions, got shape {array.shape}"
+            )
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} must be finite, got nan or inf")
+    first, second = arrays.values()
+    if len(first) != len(second):
+        raise ValueError(
+            f"{' and '.join(arrays)} must be as many positions, "
+            f"got {len(first)} and {len(second)}"
+        )
+    return first, second

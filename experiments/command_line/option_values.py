@@ -1,0 +1,78 @@
+"""Values of options as the user types them, turned into what they mean."""
+
+import math
+import tomllib
+from collections.abc import Iterable
+from typing import Any
+
+from .errors import BadInputError
+
+
+def standard_deviations(option: str, text: str, count: int) -> tuple[float, ...]:
+    """Read numbers with commas between.
+
+    Examples
+    --------
+    >>> standard_deviations("--motion-std", "0.2,.1,1e-2", 3)
+    (0.2, 0.1, 0.01)
+    >>> standard_deviations("--motion-std", "0.2,-1", 3)
+    Traceback (most recent call last):
+    slamgym.experiments.command_line.errors.BadInputError: --motion-std must be \
+3 numbers >= 0 with commas between, got '0.2,-1'
+    """
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(0 <= value < math.inf for value in values):
+        raise BadInputError(
+            f"{option} must be {count} numbers >= 0 with commas between, got {text!r}"
+        )
+    return values
+
+
+def assignments(option: str, texts: Iterable[str]) -> dict[str, Any]:
+    """Read "key=value", the value as in TOML; a bare word is text.
+
+    Examples
+    --------
+    >>> assignments("--option", ["gate_probability=0.99", "landmark_init=full"])
+    {'gate_probability': 0.99, 'landmark_init': 'full'}
+    """
+    values: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = (part.strip() for part in text.partition("="))
+        if not (equals and key and value):
+            raise BadInputError(f"{option} must be KEY=VALUE, got {text!r}")
+        if key in values:
+            raise BadInputError(f"{option} must name each key once, got {key} twice")
+        values[key] = _toml_value(value)
+    return values
+
+
+def changes(option: str, texts: Iterable[str]) -> dict[str, Any]:
+    """Read "part.key=value" into nested mappings.
+
+    Examples
+    --------
+    >>> changes("--set", ["sensor.max_range=4", "sensor.dropout=0.1", "steps=9"])
+    {'sensor': {'max_range': 4, 'dropout': 0.1}, 'steps': 9}
+    """
+    nested: dict[str, Any] = {}
+    for path, value in assignments(option, texts).items():
+        *parts, key = path.split(".")
+        place = nested
+        for part in parts:
+            place = place.setdefault(part, {})
+            if not isinstance(place, dict):
+                raise BadInputError(f"{option} sets {part} and a part of it, {path}")
+        place[key] = value
+    return nested
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        table = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return table["value"] if len(table) == 1 else text

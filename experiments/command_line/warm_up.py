@@ -1,0 +1,31 @@
+"""The first step of a filter, which compiles it."""
+
+from dataclasses import replace
+
+from ..runs.filter_settings import FilterSettings
+from .reporter import Reporter
+
+_NOTE = "compiling the filter, once after each installation …"
+
+
+def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
+    """Let an estimator take its first steps, and say so if it compiles for long.
+
+    Raises
+    ------
+    ValueError
+        If the estimator refuses its settings.
+    """
+    origin = (0.0, 0.0, 0.0)
+    settings.make(origin)
+    usual = replace(settings, motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2)
+    with reporter.patience(_NOTE):
+        estimator = usual.make(origin)
+        try:
+            for _ in range(2):
+                estimator.predict((0.1, 0.0))
+                estimator.update([(0.0, 5.0)], [0])
+            if settings.options.get("management"):
+                estimator.update([(0.0, 5.0)])
+        finally:
+            estimator.reset(origin, (0.0, 0.0, 0.0))  # deletes what it wrote

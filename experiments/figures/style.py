@@ -1,0 +1,168 @@
+"""The common look of all figures, and how they come to disk."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerPatch
+from matplotlib.patches import Ellipse
+from matplotlib.text import Text
+from numpy.typing import NDArray
+
+from ...envs.rendering.ellipses import covariance_ellipses
+from ...sim_configs.atomic_file import replace_when_written
+
+Array = NDArray[np.floating]
+
+INK, GREY, PALE = "#1b1f24", "#6b737c", "#e8eaed"
+BLUE, ORANGE, ALARM, TEAL = "#0072b2", "#e69f00", "#d55e00", "#009e73"  # Okabe, Ito
+
+_METADATA = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Make an empty figure [inches] that lays out itself, unknown to pyplot."""
+    figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    layout = figure.get_layout_engine()
+    if layout is not None:
+        layout.set(w_pad=0.1, h_pad=0.1, wspace=0.02, hspace=0.02)  # type: ignore[call-arg]
+    return figure
+
+
+def save_figure(figure: Figure, path: str | Path, dpi: float = 200) -> None:
+    """Write a figure to a file, complete or not at all, the same bytes each time.
+
+    Parameters
+    ----------
+    figure : Figure
+        Any figure of matplotlib.
+    path : str or Path
+        Its suffix chooses the format: .png, .pdf, .svg, …
+    dpi : float, default 200
+        Pixels per inch, for formats made of pixels.
+
+    Raises
+    ------
+    ValueError
+        When the suffix names no format.
+    """
+    target = Path(path)
+    formats = figure.canvas.get_supported_filetypes()
+    if target.suffix.lower().removeprefix(".") not in formats:
+        raise ValueError(
+            f"path must end in one of {', '.join(f'.{f}' for f in sorted(formats))}, "
+            f"got {str(path)!r}"
+        )
+    figure.draw_without_rendering()  # one layout is not enough where axes are equal
+    with replace_when_written(target) as partial:
+        metadata = _METADATA.get(target.suffix.lower())
+        with rc_context({"svg.hashsalt": "slamgym"}):  # else its ids are random
+            figure.savefig(partial, dpi=dpi, metadata=metadata)
+
+
+def dress(axes: Axes, *, size: float = 10.0) -> None:
+    """Give axes the common look: two spines, a pale grid, small grey ticks."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(GREY)
+    axes.set_axisbelow(True)
+    axes.grid(color=PALE, linewidth=0.8)
+    axes.tick_params(color=GREY, labelcolor=INK, labelsize=size - 1)
+    for label in (axes.xaxis.label, axes.yaxis.label):
+        label.set(fontsize=size, color=INK)
+
+
+def write_title(
+    axes: Axes, title: str, subtitle: str = "", *, size: float = 11.0
+) -> tuple[Text, Text]:
+    """Write what one sees above the axes: a bold line, and a grey one below it."""
+    small = size - 1.5
+    lift = 1.6 * small + 5 if subtitle else 5  # [points]
+    above = axes.set_title(
+        title, loc="left", fontsize=size, fontweight="bold", color=INK, pad=lift
+    )
+    below = axes.annotate(
+        subtitle,
+        (0, 1),
+        (0, 6),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=small,
+        color=GREY,
+    )
+    return above, below
+
+
+class EllipseKind(NamedTuple):
+    """How ellipses of one meaning look, in the picture and in the legend."""
+
+    label: str
+    colour: str
+    line: str | tuple[float, tuple[float, ...]] = "-"
+    fill: float = 0.0
+    width: float = 1.2
+    alpha: float = 1.0
+
+    def add_to(self, axes: Axes, scale: float = 1.0) -> EllipseCollection:
+        """Add a collection without ellipses, in data coordinates."""
+        shown = EllipseCollection(
+            [],
+            [],
+            [],
+            units="xy",
+            offsets=np.empty((0, 2)),
+            offset_transform=axes.transData,
+            facecolors=[to_rgba(self.colour, self.fill)],
+            edgecolors=[to_rgba(self.colour, self.alpha)],
+            linestyles=[self.line],
+            linewidths=self.width * scale,
+            label=self.label,
+        )
+        axes.add_collection(shown, autolim=False)
+        return shown
+
+    def legend_key(self) -> Ellipse:
+        """Stand for the ellipses in a legend drawn with `ELLIPSE_HANDLER`."""
+        return Ellipse(
+            (0, 0),
+            1,
+            1,
+            facecolor=to_rgba(self.colour, self.fill),
+            edgecolor=to_rgba(self.colour, self.alpha),
+            linestyle=self.line,
+            linewidth=self.width,
+            label=self.label,
+        )
+
+
+def set_ellipses(shown: EllipseCollection, means: Array, covariances: Array) -> None:
+    """Show the 3σ ellipses of n positions: means (n, 2) [m], covariances (n, 2, 2)."""
+    outline = covariance_ellipses(np.reshape(covariances, (-1, 2, 2)))
+    shown.set(
+        offsets=np.reshape(means, (-1, 2)),
+        widths=outline.widths,
+        heights=outline.heights,
+        angles=np.degrees(outline.angles),  # matplotlib's unit
+    )
+
+
+def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)
+    legend: object,
+    orig_handle: object,
+    xdescent: float,
+    ydescent: float,
+    width: float,
+    height: float,
+    fontsize: float,
+) -> Ellipse:
+    centre = (width / 2 - xdescent, height / 2 - ydescent)
+    return Ellipse(centre, width=width, height=height + ydescent + 2)
+
+
+ELLIPSE_HANDLER = {Ellipse: HandlerPatch(patch_func=_lying_ellipse)}

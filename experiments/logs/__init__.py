@@ -1,0 +1,1 @@
+"""Logs of odometry and measurements: the format, recording, and importers."""

@@ -1,0 +1,136 @@
+"""The truth of a log, at the moments and in the order of a run.
+
+A log's ground truth may be the path of an antenna at a place (a, b) on the robot,
+header ``groundtruth_offset: a,b`` in metres, forward and to the left::
+
+    antenna = position + C(θ) (a, b),    C(θ) = [cos θ, -sin θ; sin θ, cos θ]
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...evaluation.trajectory_error import PositionAccuracy, poses_at, position_accuracy
+from .events import Scan
+from .lines import LogError
+from .slamlog import SlamLog
+
+Array = NDArray[np.floating]
+
+
+def true_poses_of(log: SlamLog, times: Array) -> Array | None:
+    """Interpolate the true poses of the robot.
+
+    Parameters
+    ----------
+    log : SlamLog
+        A log, perhaps with ground truth.
+    times : ndarray, shape (k,)
+        When to know the pose [s].
+
+    Returns
+    -------
+    ndarray, shape (k, 3), or None
+        (x, y, θ) [m, m, rad], nan where unknown; None where the log knows none. Of an
+        antenna beside the robot's centre the heading must be known as well.
+    """
+    poses = poses_at(times, log.ground_truth)
+    offset = antenna_offset(log)
+    if offset.any():
+        poses[:, :2] -= _turned(offset, poses[:, 2])
+    return poses if np.isfinite(poses[:, :2]).any() else None
+
+
+def true_landmarks_of(
+    log: SlamLog, ids: Sequence[int], landmarks: Array
+) -> Array | None:
+    """Look up the true positions of some landmarks, in their order.
+
+    Where the log does not tell what its readings are of, the ids are the filter's own;
+    a landmark then is the true one that is nearest, if it is the nearest to that, too.
+
+    Parameters
+    ----------
+    log : SlamLog
+        A log, perhaps with true landmarks.
+    ids : sequence of int
+        The landmarks.
+    landmarks : ndarray, shape (n, 2)
+        Where they are estimated to be [m].
+
+    Returns
+    -------
+    ndarray, shape (n, 2), or None
+        Positions [m], nan where unknown; None where the log knows none of them.
+    """
+    scans = [event for event in log.events if isinstance(event, Scan)]
+    if len(ids) and len(log.landmarks) and any(s.landmark_ids is None for s in scans):
+        return _nearest(log.landmarks, landmarks)
+    known = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
+    if not any(i in known for i in ids):
+        return None
+    return np.array([known.get(i, np.full(2, np.nan)) for i in ids])
+
+
+def _nearest(truth: Array, landmarks: Array) -> Array:
+    """Pair each landmark (n, 2) with its true one (n, 2); nan where there is none."""
+    gaps = np.linalg.norm(landmarks[:, None] - truth, axis=2)
+    nearest = gaps.argmin(axis=1)
+    is_mutual = gaps.argmin(axis=0)[nearest] == np.arange(len(landmarks))
+    return np.where(is_mutual[:, None], truth[nearest], np.nan)
+
+
+def path_accuracy(log: SlamLog, times: Array, poses: Array) -> PositionAccuracy | None:
+    """Compare an estimated path with the ground truth, at the times of the truth.
+
+    Between its steps the estimate is interpolated; so the error weighs time evenly,
+    however the steps are spread. The positions compared are those of the antenna.
+
+    Parameters
+    ----------
+    log : SlamLog
+        A log, perhaps with ground truth.
+    times : ndarray, shape (k,)
+        Times of the steps [s].
+    poses : ndarray, shape (k, 3)
+        Estimated (x, y, θ) after the steps [m, m, rad].
+
+    Returns
+    -------
+    PositionAccuracy or None
+        None where no ground truth lies within the time of the steps.
+    """
+    estimate = poses_at(log.ground_truth[:, 0], np.column_stack([times, poses]))
+    inside = np.isfinite(estimate).all(axis=1)
+    if not inside.any():
+        return None
+    estimate, truth = estimate[inside], log.ground_truth[inside, 1:3]
+    antenna = estimate[:, :2] + _turned(antenna_offset(log), estimate[:, 2])
+    return position_accuracy(antenna, truth)
+
+
+def antenna_offset(log: SlamLog) -> Array:
+    """Return (a, b), where on the robot the ground truth was measured [m].
+
+    Raises
+    ------
+    LogError
+        If the header's ``groundtruth_offset`` is not two numbers.
+    """
+    text = log.header.get("groundtruth_offset", "0,0")
+    try:
+        forward, left = (float(number) for number in text.split(","))
+    except ValueError:
+        raise LogError(
+            f"{log.name}: groundtruth_offset must be two numbers a,b, got {text!r}"
+        ) from None
+    return np.array([forward, left])
+
+
+def _turned(offset: Array, headings: Array) -> Array:
+    """Turn an offset on the robot into the world, for each heading: (k, 2) [m]."""
+    cos, sin = np.cos(headings), np.sin(headings)
+    return np.stack(
+        [cos * offset[0] - sin * offset[1], sin * offset[0] + cos * offset[1]], axis=1
+    )

@@ -1,0 +1,95 @@
+"""Read a log whatever its format is."""
+
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..events import float_array
+from ..lines import LogLine, read_lines, shown
+from ..slamlog import SlamLog, read_slamlog
+from .course import read_course
+from .freiburg import read_freiburg
+from .isam import ISAM_TAGS, read_isam
+from .utias import read_utias
+
+EXPECTED = (
+    "a log: slamlog 1, a course data.txt, a Freiburg sensor.dat, "
+    "iSAM or g2o text, or a UTIAS MR.CLAM folder"
+)
+READERS = {
+    "slamlog": read_slamlog,
+    "course": read_course,
+    "freiburg": read_freiburg,
+    "isam": read_isam,
+}
+
+
+def read_log(
+    path: str | PathLike[str],
+    *,
+    landmarks: ArrayLike | None = None,
+    robot: int | None = None,
+) -> SlamLog:
+    """Read a log of any known format; the content tells which it is.
+
+    Parameters
+    ----------
+    path : path
+        A file in the format ``slamlog 1``, a course ``data.txt``, a Freiburg
+        ``sensor.dat`` (with ``world.dat`` beside it), an iSAM or g2o text, or the
+        folder of a UTIAS MR.CLAM data set.
+    landmarks : array_like, shape (n, 2), optional
+        True positions of the landmarks 0, 1, …, n - 1 [m], in place of those the log
+        brings along.
+    robot : int, optional
+        Which robot of a UTIAS folder; the lowest by default.
+
+    Returns
+    -------
+    SlamLog
+        The log.
+
+    Raises
+    ------
+    LogError
+        If the content is no log of a known format, or breaks its rules.
+    OSError
+        If a file cannot be opened.
+    ValueError
+        If ``robot`` is given for a format that knows one robot only.
+    """
+    source = Path(path)
+    if source.is_dir():
+        log = read_utias(source, robot=robot)
+    elif robot is not None:
+        raise ValueError(f"robot must be None for a log in one file, got {robot}")
+    else:
+        log = READERS[_format_of(read_lines(path)[0])](path)
+    if landmarks is None:
+        return log
+    positions = float_array("landmarks", landmarks, columns=2)
+    return replace(
+        log,
+        header={**log.header, "truth": "landmarks given by the caller"},
+        landmark_ids=np.arange(len(positions)),
+        landmarks=positions,
+    )
+
+
+def _format_of(line: LogLine) -> str:
+    """Tell the format from the first line of a file."""
+    fields = line.text.split()
+    if line.text.startswith("#") or "," in line.text:
+        return "slamlog"
+    if fields[0] == "SENSOR" or (fields[0] == "ODOMETRY" and len(fields) == 4):
+        return "freiburg"
+    if fields[0] in ISAM_TAGS:
+        return "isam"
+    try:
+        [float(field) for field in fields]
+    except ValueError:
+        raise line.error(EXPECTED, shown(line.text)) from None
+    return "course"

@@ -1,0 +1,217 @@
+"""The UTIAS multi-robot data sets (MR.CLAM): one folder of ``.dat`` files per drive.
+
+``Robot<k>_Odometry.dat`` (t, v, ω), ``Robot<k>_Measurement.dat`` (t, barcode, range,
+bearing), ``Robot<k>_Groundtruth.dat`` (t, x, y, θ; optional), ``Barcodes.dat``
+(subject, barcode) and ``Landmark_Groundtruth.dat`` (subject, x, y, σx, σy). Subjects 1
+to 5 are the robots, the others are landmarks.
+
+References
+----------
+K. Leung, Y. Halpern, T. Barfoot, H. Liu, The UTIAS multi-robot cooperative localization
+and mapping dataset, International Journal of Robotics Research 30(8), 2011.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....evaluation.trajectory_error import poses_at
+from ..events import EventRecorder, OdometryRow, Reading, Scan, wrap_bearing
+from ..lines import LogError, LogLine, read_lines
+from ..slamlog import SlamLog
+
+Array = NDArray[np.float64]
+
+ODOMETRY_STEP = 0.1  # [s]
+TRUTH_STEP = 0.2  # [s]
+LAST_ROBOT = 5
+TIME_DIGITS = 6  # stamps near 1.25e9 s are good to 2.4e-7 s in float64
+ODOMETRY_NAME = re.compile(r"Robot(\d+)_Odometry\.dat")
+MERGED = LogLine("merged odometry", 0, "")
+
+TimedReadings = list[tuple[LogLine, Reading]]
+
+
+def read_utias(folder: Path, *, robot: int | None = None) -> SlamLog:
+    """Read the drive of one robot.
+
+    Velocities are held between their stamps and integrated onto a grid of 10 Hz, which
+    is cut at each scan. Barcodes become subject numbers; readings of other robots, of
+    unknown barcodes, and from outside the time of the odometry are left out and counted
+    in the header (``left_out``). Time starts at the first odometry (``epoch`` in the
+    header), the ground truth is interpolated every 0.2 s.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of a data set.
+    robot : int, optional
+        Number of the robot; the lowest one with odometry by default.
+
+    Returns
+    -------
+    SlamLog
+        Motion midpoint, in seconds; the start is the true pose at the first odometry,
+        or the origin when that is not known (``start_from`` in the header).
+
+    Raises
+    ------
+    LogError
+        If a file of the folder is missing or malformed.
+    """
+    number = _choose_robot(folder, robot)
+    odometry = _timed_table(folder / f"Robot{number}_Odometry.dat", "t v ω")
+    epoch = float(odometry[0, 0])
+    odometry[:, 0] = np.round(odometry[:, 0] - epoch, TIME_DIGITS)
+    end = float(odometry[-1, 0])
+    readings, left_out = _read_measurements(folder, number, epoch=epoch, end=end)
+    truth = _read_truth(folder / f"Robot{number}_Groundtruth.dat", epoch)
+    start = poses_at([0.0], truth)[0]
+    is_known = bool(np.isfinite(start).all())
+    ids, landmarks = _read_landmarks(folder)
+    return SlamLog(
+        name=f"{folder.resolve().name}_r{number}",
+        header={
+            "source": f"UTIAS MR.CLAM, robot {number}",
+            "epoch": repr(epoch),
+            "left_out": left_out,
+            "start_from": "ground truth" if is_known else "origin (no truth then)",
+        },
+        motion="midpoint",
+        start=start if is_known else np.zeros(3),
+        landmark_ids=ids,
+        landmarks=landmarks,
+        events=_merge(odometry, readings),
+        ground_truth=_resample(truth, end),
+    )
+
+
+def _choose_robot(folder: Path, robot: int | None) -> int:
+    matches = (ODOMETRY_NAME.fullmatch(file.name) for file in folder.iterdir())
+    robots = sorted(int(match[1]) for match in matches if match)
+    if not robots:
+        raise LogError(f"{folder}: expected Robot<k>_Odometry.dat, got no such file")
+    if robot is None:
+        return robots[0]
+    if robot not in robots:
+        numbers = ", ".join(map(str, robots))
+        raise LogError(f"{folder}: expected one of the robots {numbers}, got {robot}")
+    return robot
+
+
+def _read_measurements(
+    folder: Path, robot: int, *, epoch: float, end: float
+) -> tuple[TimedReadings, str]:
+    """Read what the robot saw of landmarks, and count what is left out."""
+    subjects = _read_barcodes(folder)
+    readings: TimedReadings = []
+    robots = unknown = outside = 0
+    for line in _timed_lines(
+        folder / f"Robot{robot}_Measurement.dat", "t barcode range bearing"
+    ):
+        stamp, code, distance, bearing = line.text.split()
+        t = round(line.to_real(stamp) - epoch, TIME_DIGITS)
+        subject = subjects.get(line.to_id(code))
+        if subject is None:
+            unknown += 1
+        elif subject <= LAST_ROBOT:
+            robots += 1
+        elif not 0 <= t <= end:
+            outside += 1
+        else:
+            angle = wrap_bearing(line.to_real(bearing))
+            reading = Reading(t, subject, angle, line.to_real(distance))
+            readings.append((line, reading))
+    return readings, (
+        f"{robots} readings of robots, {unknown} of unknown barcodes, "
+        f"{outside} outside the time of the odometry"
+    )
+
+
+def _read_barcodes(folder: Path) -> dict[int, int]:
+    """Read which subject wears which barcode."""
+    lines = _lines(folder / "Barcodes.dat", "subject barcode")
+    pairs = ((line, line.text.split()) for line in lines)
+    return {line.to_id(code): line.to_id(subject) for line, (subject, code) in pairs}
+
+
+def _read_landmarks(folder: Path) -> tuple[NDArray[np.int64], Array]:
+    """Read subject numbers (n,) and true positions (n, 2) [m]."""
+    lines = _lines(folder / "Landmark_Groundtruth.dat", "subject x y σx σy")
+    rows = [(line, line.text.split()) for line in lines]
+    ids = [line.to_id(fields[0]) for line, fields in rows]
+    positions = [
+        [line.to_real(field) for field in fields[1:3]] for line, fields in rows
+    ]
+    return np.array(ids, dtype=np.int64), np.array(positions)
+
+
+def _read_truth(path: Path, epoch: float) -> Array:
+    """Read the true path (n, 4), rows (t, x, y, θ), t since the epoch."""
+    if not path.is_file():
+        return np.empty((0, 4))
+    truth = _timed_table(path, "t x y θ")
+    truth[:, 0] = np.round(truth[:, 0] - epoch, TIME_DIGITS)
+    return truth
+
+
+def _merge(odometry: Array, readings: TimedReadings) -> tuple[OdometryRow | Scan, ...]:
+    """Integrate the held velocities between the times of grid and readings."""
+    stamps, end = odometry[:, 0], odometry[-1, 0]
+    moved = odometry[:-1, 1:] * np.diff(stamps)[:, None]
+    travelled = np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
+    grid = np.round(np.arange(0, end, ODOMETRY_STEP), TIME_DIGITS)
+    times = np.unique([*grid, *(reading.t for _, reading in readings), end])
+    path = np.stack(
+        [np.interp(times, stamps, column) for column in travelled.T], axis=1
+    )
+    rows = np.column_stack([times, np.diff(path, axis=0, prepend=0)])
+    steps = np.diff(times, prepend=0)
+    seen: dict[float, TimedReadings] = {}
+    for line, reading in readings:
+        seen.setdefault(reading.t, []).append((line, reading))
+    recorder = EventRecorder()
+    for (t, d, alpha), dt in zip(rows.tolist(), steps.tolist(), strict=True):
+        recorder.add_odometry(MERGED, OdometryRow(t, d, alpha, dt))
+        for line, reading in seen.get(t, []):
+            recorder.add_reading(line, reading)
+    return recorder.finish()
+
+
+def _resample(truth: Array, end: float) -> Array:
+    """Interpolate the true path on a grid, as far as it and the odometry reach."""
+    times = np.round(np.arange(0, end + TRUTH_STEP / 2, TRUTH_STEP), TIME_DIGITS)
+    poses = poses_at(times, truth)
+    is_known = np.isfinite(poses).all(axis=1)
+    return np.column_stack([times, poses])[is_known]
+
+
+def _timed_table(path: Path, form: str) -> Array:
+    """Read rows of numbers (n, fields of the form), the first one a time."""
+    lines = _timed_lines(path, form)
+    return np.array([[line.to_real(x) for x in line.text.split()] for line in lines])
+
+
+def _timed_lines(path: Path, form: str) -> list[LogLine]:
+    """Read lines of which the first field is a time that never runs backwards."""
+    lines, before = _lines(path, form), -np.inf
+    for line in lines:
+        stamp = line.to_real(line.text.split()[0])
+        if stamp < before:
+            raise line.error(f"t >= {before}, the time before", str(stamp))
+        before = stamp
+    return lines
+
+
+def _lines(path: Path, form: str) -> list[LogLine]:
+    """Read the lines that are no comments, each with as many fields as the form."""
+    if not path.is_file():
+        raise LogError(f"{path.parent}: expected {path.name}, got no such file")
+    lines = [line for line in read_lines(path) if not line.text.startswith("#")]
+    for line in lines:
+        line.check_count(line.text.split(), (len(form.split()),), form)
+    if not lines:
+        raise LogError(f"{path}: expected rows {form}, got comments only")
+    return lines

@@ -1,0 +1,139 @@
+"""Drive a robot through a simulated world, and keep what it read as a log."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from ...envs.controllers.single import Controller
+from ...envs.landmark_world import LandmarkWorldEnv, Observation
+from ...sim_configs import Scenario, load_scenario
+from .events import OdometryRow, Scan
+from .slamlog import SlamLog
+
+Array = NDArray[np.float64]
+
+
+def record_episode(
+    scenario: Scenario | Mapping[str, object] | str | Path,
+    controller: Controller,
+    seed: int,
+    *,
+    progress: Callable[[int, int], object] | None = None,
+) -> SlamLog:
+    """Drive one episode and write down its readings and the truth.
+
+    The controller sees the true pose. Time counts steps: the first scan is at t = 0,
+    every odometry row has dt = 1, so that it carries the noise of one step.
+
+    Parameters
+    ----------
+    scenario : Scenario, mapping, str or Path
+        The world, as in :func:`slamgym.sim_configs.load_scenario`.
+    controller : Controller
+        What drives, see :mod:`slamgym.envs.controllers.single`.
+    seed : int
+        Fixes everything random in the world.
+    progress : callable, optional
+        Called with (steps done, steps) after every step.
+
+    Returns
+    -------
+    SlamLog
+        Starting at the pose that a filter starts from. The header holds the noise,
+        ``motion_std``, ``measurement_std`` and ``start_sigma``, under the names by
+        which :func:`~slamgym.experiments.runs.filter_settings.settings_for` finds it.
+        Scans carry no ids when the scenario hides identities.
+
+    Examples
+    --------
+    >>> from slamgym.envs.controllers.single import OpenLoop
+    >>> from slamgym.sim_configs import action_sequence, load_scenario
+    >>> scenario = load_scenario("six_landmarks").with_changes(steps=2)
+    >>> driver = OpenLoop(action_sequence(scenario), scenario.robot)
+    >>> log = record_episode(scenario, driver, seed=0)
+    >>> [type(event).__name__ for event in log.events]
+    ['Scan', 'OdometryRow', 'Scan', 'OdometryRow', 'Scan']
+    """
+    world = load_scenario(scenario)
+    env = gymnasium.make(
+        "slamgym/LandmarkWorld-v0", scenario=world, disable_env_checker=True
+    )
+    observation, info = env.reset(seed=seed)
+    events: list[OdometryRow | Scan] = [*_scan(0.0, observation, world)]
+    poses = [info["pose"]]
+    for step in range(world.steps):
+        action = controller.act(info["pose"], step)
+        observation, _, _, _, info = env.step(action)
+        distance, turn = observation["odometry"].tolist()
+        t = float(step + 1)
+        events.append(OdometryRow(t, distance, turn, dt=1.0))
+        events += _scan(t, observation, world)
+        poses.append(info["pose"])
+        if progress is not None:
+            progress(step + 1, world.steps)
+    log = _log(world, seed, env, events, np.array(poses))
+    env.close()
+    return log
+
+
+def _scan(t: float, observation: Observation, scenario: Scenario) -> list[Scan]:
+    """Make the scan of one moment, if anything was seen."""
+    seen = observation["mask"]
+    if not seen.any():
+        return []
+    ids = np.flatnonzero(seen) if scenario.sensor.identities else None
+    return [Scan(t, observation["landmarks"][seen], ids)]
+
+
+def _log(
+    scenario: Scenario,
+    seed: int,
+    env: gymnasium.Env[Any, Any],
+    events: list[OdometryRow | Scan],
+    poses: Array,
+) -> SlamLog:
+    world = cast(LandmarkWorldEnv, env.unwrapped)
+    times = np.arange(len(poses), dtype=np.float64)
+    return SlamLog(
+        name=scenario.name,
+        header=log_header(scenario, seed),
+        start=world.start_estimate,
+        landmark_ids=np.arange(len(world.landmarks)),
+        landmarks=world.landmarks,
+        events=tuple(events),
+        ground_truth=np.column_stack([times, poses]),
+    )
+
+
+def log_header(scenario: Scenario, seed: int) -> dict[str, str]:
+    """Say where a recorded log comes from, and what noise is in it.
+
+    Examples
+    --------
+    >>> log_header(load_scenario("six_landmarks"), seed=0)["motion_std"]
+    '0.25,0.1,0.1'
+    """
+    sensor, motion = scenario.sensor, scenario.motion
+    header = {
+        "source": "slamgym, simulated",
+        "scenario": scenario.name,
+        "seed": str(seed),
+        "time": f"steps of {scenario.dt!r} s",
+        "motion_std": _numbers(motion.std),
+        "measurement_std": _numbers(sensor.std),
+        "start_sigma": _numbers(scenario.start.std),
+    }
+    if sensor.range_std_per_metre:
+        header["range_std_per_metre"] = repr(sensor.range_std_per_metre)
+    if not sensor.identities:
+        header["identities"] = "false"
+    header["noise_at_rest"] = str(motion.noise_at_rest).lower()
+    return header
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return ",".join(repr(float(value)) for value in values)

@@ -1,0 +1,1 @@
+"""Filter the simulated runs and measure errors and consistency."""

@@ -1,0 +1,130 @@
+"""Which estimators a Monte Carlo compares, as code or the command line names them."""
+
+import hashlib
+import inspect
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ....estimator import registry
+from ....estimator.registry import find_estimator, list_estimators, register_estimator
+from ....sim_configs import Scenario
+from ...runs.filter_settings import FilterSettings, settings_for_scenario
+
+_PACKAGE = Path(registry.__file__).resolve().parents[1]
+_BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")
+_SPEC = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>[^\]]*)\])?")
+
+
+class EstimatorChoice(NamedTuple):
+    """An estimator under the label that results show."""
+
+    label: str
+    name: str
+    """Registered name or "module:Class"."""
+    options: Mapping[str, Any] = {}
+    """What its constructor takes besides the noise of the world."""
+
+    def code(self) -> str:
+        """Identify the source of an estimator of one's own; nothing of slamgym's."""
+        try:
+            source = inspect.getsourcefile(find_estimator(self.name))
+        except TypeError:
+            return ""
+        if source is None or Path(source).resolve().is_relative_to(_PACKAGE):
+            return ""
+        return hashlib.sha256(Path(source).read_bytes()).hexdigest()[:12]
+
+    def settings(self, scenario: Scenario) -> FilterSettings:
+        """Set it up with the noise of a world."""
+        return settings_for_scenario(
+            scenario, estimator=self.name, options=self.options
+        )
+
+
+def estimator_choices(
+    estimators: str | Iterable[str] | Mapping[str, Any],
+) -> tuple[EstimatorChoice, ...]:
+    """Read which estimators are meant.
+
+    Parameters
+    ----------
+    estimators : str, iterable of str, or mapping
+        Names with commas between, each perhaps with options in brackets; or several
+        such; or labels with a name, a class, or a pair (name, options) each.
+
+    Raises
+    ------
+    ValueError
+        If there is none, one is unknown or unreadable, or a label stands twice.
+
+    Examples
+    --------
+    >>> for choice in estimator_choices("ekf,invariant[iterations=3]"):
+    ...     print(choice)
+    EstimatorChoice(label='ekf', name='ekf', options={})
+    EstimatorChoice(label='invariant[iterations=3]', name='invariant', \
+options={'iterations': 3})
+    """
+    if not isinstance(estimators, Iterable):
+        raise ValueError(f"estimators must be names or labels, got {estimators!r}")
+    if isinstance(estimators, Mapping):
+        choices = [_labelled(label, what) for label, what in estimators.items()]
+    else:
+        texts = [estimators] if isinstance(estimators, str) else list(estimators)
+        choices = [_read(spec) for text in texts for spec in _split(text)]
+    if not choices:
+        raise ValueError("estimators must name at least one, got none")
+    labels = [choice.label for choice in choices]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise ValueError(f"estimators must differ, got '{label}' twice")
+    for choice in choices:
+        find_estimator(choice.name)
+    return tuple(choices)
+
+
+def _split(text: str) -> list[str]:
+    """Split at the commas that stand outside of brackets."""
+    parts = re.split(r",(?![^\[]*\])", text)
+    return [part.strip() for part in parts if part.strip()]
+
+
+def _read(spec: str) -> EstimatorChoice:
+    match = _SPEC.fullmatch(spec)
+    if match is None:
+        raise ValueError(
+            f"estimators must be like ekf or invariant[iterations=3], got '{spec}'"
+        )
+    options = _BARE_WORD.sub(r'\1"\2"', match["options"] or "")
+    try:
+        table = tomllib.loads(f"options = {{ {options} }}")["options"]
+    except tomllib.TOMLDecodeError:
+        raise ValueError(
+            f"options must be like [iterations=3,sequential=true], got '{spec}'"
+        ) from None
+    return EstimatorChoice(spec, match["name"].strip(), table)
+
+
+def _labelled(label: str, what: Any) -> EstimatorChoice:
+    if isinstance(what, str):
+        return EstimatorChoice(label, what)
+    if isinstance(what, tuple) and len(what) == 2:
+        name, options = what
+        return EstimatorChoice(label, _name_of(label, name), options)
+    return EstimatorChoice(label, _name_of(label, what))
+
+
+def _name_of(label: str, what: str | Callable[..., Any]) -> str:
+    """Name a class by its import path, or register what cannot be imported."""
+    if isinstance(what, str):
+        return what
+    module, name = getattr(what, "__module__", ""), getattr(what, "__qualname__", "")
+    path = f"{module}:{name}"
+    if module != "__main__" and name.isidentifier():
+        return path
+    if label not in list_estimators():
+        register_estimator(label, what)
+    return label

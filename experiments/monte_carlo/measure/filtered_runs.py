@@ -1,0 +1,185 @@
+"""One filter over many simulated runs: in a batch where it can, else one by one."""
+
+from collections.abc import Mapping
+from typing import NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....estimator.filters.batch import BatchSlam, BatchTrace, can_batch
+from ....estimator.filters.ekf import EkfSlam
+from ....estimator.interface import Belief, SlamEstimator
+from ...runs.filter_settings import FilterSettings
+from ...runs.memory_check import refuse_large_maps
+from ...runs.simulated_runs import SimulatedRuns
+
+Array = NDArray[np.float64]
+
+_NOT_FINITE = "the pose, its covariance or the NIS is not finite"
+_MAP_NOT_FINITE = "the belief about the map is not finite"
+
+
+class Failure(NamedTuple):
+    """How a run ended before its time."""
+
+    step: int
+    """At which step of the run."""
+    message: str
+
+
+class FilteredRuns(NamedTuple):
+    """What a filter believed in B runs."""
+
+    trace: BatchTrace
+    """After every step; nan from the step on at which a run failed."""
+    beliefs: list[Belief | None]
+    """At the end; None of a run that failed."""
+    failures: Mapping[int, Failure]
+    """By the row of the run."""
+
+
+def filter_runs(
+    settings: FilterSettings, runs: SimulatedRuns, *, threads: int | None = None
+) -> FilteredRuns:
+    """Feed every run to a filter of its own.
+
+    A filter made of the shared kernels runs in a batch, any other step by step; the
+    results are the same to the last bit.  An error in one run ends that run alone.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        Makes the filters.
+    runs : SimulatedRuns
+        What they are fed.
+    threads : int, optional
+        Over which a batch is shared out; all cores where not given.
+    """
+    first = settings.make(runs.initial_poses[0])
+    refuse_large_maps(runs, first, at_once=can_batch(first))
+    if can_batch(first):
+        return _in_a_batch(cast(EkfSlam, first), settings, runs, threads)
+    count, steps, _ = runs.visible.shape
+    trace = _empty_trace(count, steps)
+    beliefs: list[Belief | None] = []
+    failures: dict[int, Failure] = {}
+    for run in range(count):
+        failure = _one_by_one(settings, runs, run, trace, beliefs)
+        if failure is not None:
+            _erase(trace, run, failure.step)
+            beliefs.append(None)
+            failures[run] = failure
+    return FilteredRuns(trace, beliefs, failures)
+
+
+def _in_a_batch(
+    estimator: EkfSlam,
+    settings: FilterSettings,
+    runs: SimulatedRuns,
+    threads: int | None,
+) -> FilteredRuns:
+    count, _, landmarks = runs.visible.shape
+    batch = BatchSlam(
+        estimator,
+        count,
+        landmarks,
+        initial_poses=runs.initial_poses,
+        initial_pose_std=settings.initial_pose_std,
+        threads=threads,
+    )
+    trace = batch.run(runs.odometry, runs.measurements, runs.visible, runs.dt)
+    finite = np.isfinite(trace.poses).all(axis=2)
+    finite &= np.isfinite(trace.pose_covariances).all(axis=(2, 3))
+    finite &= np.isfinite(trace.nis)
+    beliefs: list[Belief | None] = [batch.belief(run) for run in range(count)]
+    finite[:, -1] &= [belief is None or _is_finite_map(belief) for belief in beliefs]
+    failures = {}
+    for run in np.flatnonzero(~finite.all(axis=1)).tolist():
+        failures[run] = _why(settings, runs, run, int(finite[run].argmin()))
+        _erase(trace, run, failures[run].step)
+        beliefs[run] = None
+    return FilteredRuns(trace, beliefs, failures)
+
+
+def _why(settings: FilterSettings, runs: SimulatedRuns, run: int, step: int) -> Failure:
+    """Repeat a run that failed in a batch, for what the single filter says of it."""
+    trace = _empty_trace(*runs.visible.shape[:2])
+    failure = _one_by_one(settings, runs, run, trace, [])
+    return failure or Failure(step, _NOT_FINITE)
+
+
+def _one_by_one(
+    settings: FilterSettings,
+    runs: SimulatedRuns,
+    run: int,
+    trace: BatchTrace,
+    beliefs: list[Belief | None],
+) -> Failure | None:
+    """Take one run through all steps, into its row of the trace; append its belief."""
+    step = 0
+    try:
+        slam = settings.make(runs.initial_poses[run])
+        landmarks = dict(enumerate(runs.landmarks[run]))
+        for step in range(runs.visible.shape[1]):
+            _tell_truth(slam, runs.true_poses[run, step], landmarks)
+            belief = _step(slam, runs, run, step, trace)
+            if not _is_finite(trace, run, step):
+                return Failure(step, _NOT_FINITE)
+    except (Exception, SystemExit) as error:
+        return Failure(step, f"{type(error).__name__}: {error}")
+    if not _is_finite_map(belief):
+        return Failure(step, _MAP_NOT_FINITE)
+    beliefs.append(belief)
+    return None
+
+
+def _step(
+    slam: SlamEstimator, runs: SimulatedRuns, run: int, step: int, trace: BatchTrace
+) -> Belief:
+    if step > 0:  # the first scan is before any motion
+        slam.predict(runs.odometry[run, step], runs.dt[step])
+    seen = np.flatnonzero(runs.visible[run, step])
+    report = slam.update(runs.measurements[run, step, seen], seen.tolist())
+    belief = slam.belief()
+    trace.poses[run, step] = belief.pose
+    trace.pose_covariances[run, step] = belief.pose_covariance
+    trace.nis[run, step] = report.nis
+    trace.degrees_of_freedom[run, step] = report.degrees_of_freedom
+    return belief
+
+
+def _tell_truth(
+    slam: SlamEstimator, pose: Array, landmarks: Mapping[int, Array]
+) -> None:
+    """Open the door for the truth of a filter that has one (``ideal``)."""
+    observe = getattr(slam, "observe_truth", None)
+    if observe is not None:
+        observe(pose, landmarks)
+
+
+def _is_finite(trace: BatchTrace, run: int, step: int) -> bool:
+    return bool(
+        np.isfinite(trace.nis[run, step])
+        and np.isfinite(trace.poses[run, step]).all()
+        and np.isfinite(trace.pose_covariances[run, step]).all()
+    )
+
+
+def _is_finite_map(belief: Belief) -> bool:
+    return bool(np.isfinite(belief.mean).all() and np.isfinite(belief.covariance).all())
+
+
+def _empty_trace(runs: int, steps: int) -> BatchTrace:
+    return BatchTrace(
+        np.full((runs, steps, 3), np.nan),
+        np.full((runs, steps, 3, 3), np.nan),
+        np.full((runs, steps), np.nan),
+        np.zeros((runs, steps), dtype=np.int64),
+    )
+
+
+def _erase(trace: BatchTrace, run: int, step: int) -> None:
+    """Forget a run from the step on at which it failed."""
+    for array in (trace.poses, trace.pose_covariances, trace.nis):
+        array[run, step:] = np.nan
+    trace.degrees_of_freedom[run, step:] = 0

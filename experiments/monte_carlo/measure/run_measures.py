@@ -1,0 +1,188 @@
+"""What is measured of every run of a Monte Carlo: how wrong, and how honest.
+
+Each run is measured by itself, so its figures do not depend on what runs beside it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....estimator.error_frames import ERROR_FRAMES
+from ....estimator.interface import Belief
+from ....estimator.models.angles import wrap_angle
+from ....evaluation import nees
+from ....evaluation.trajectory_error import position_accuracy
+from ...noise_study.one_run import ellipse_areas
+from ...runs.simulated_runs import SimulatedRuns
+from .filtered_runs import Failure, FilteredRuns
+
+Array = NDArray[np.float64]
+Block = dict[str, NDArray[np.generic]]
+
+Value = NDArray[np.generic] | float
+
+STEP, RUN, LANDMARK = ("run", "step"), ("run",), ("run", "landmark")
+
+
+class Variable(NamedTuple):
+    """One variable of the results."""
+
+    dims: tuple[str, ...]
+    """Beside ``estimator``."""
+    kind: str
+    """Of numpy: f8, i8, ?, or U for text."""
+    meaning: str
+
+
+VARIABLES: dict[str, Variable] = {
+    "pose_nees_invariant": Variable(STEP, "f8", "NEES of the pose, 3 degrees"),
+    "pose_nees_additive": Variable(STEP, "f8", "NEES of the pose, 3 degrees"),
+    "position_nees_invariant": Variable(STEP, "f8", "NEES of the position, 2 degrees"),
+    "position_nees_additive": Variable(STEP, "f8", "NEES of the position, 2 degrees"),
+    "heading_nees": Variable(STEP, "f8", "NEES of the heading, 1 degree, any frame"),
+    "nis": Variable(STEP, "f8", "NIS of the scan"),
+    "nis_dof": Variable(STEP, "i8", "its degrees of freedom"),
+    "position_error": Variable(STEP, "f8", "distance to the true position [m]"),
+    "heading_error": Variable(STEP, "f8", "true less estimated heading [rad]"),
+    "heading_std": Variable(STEP, "f8", "claimed deviation of the heading [rad]"),
+    "position_std": Variable(STEP, "f8", "root of the trace of the covariance [m]"),
+    "ate": Variable(RUN, "f8", "RMS distance of the path, not aligned [m]"),
+    "ate_aligned": Variable(RUN, "f8", "the same after the best rigid motion [m]"),
+    "pose_area": Variable(RUN, "f8", "final 3σ ellipse of the position [m²]"),
+    "state_nees_invariant": Variable(RUN, "f8", "final NEES of pose and map"),
+    "state_nees_additive": Variable(RUN, "f8", "final NEES of pose and map"),
+    "state_dof": Variable(RUN, "i8", "its degrees of freedom"),
+    "relative_map_nees": Variable(RUN, "f8", "final NEES of the map from the robot"),
+    "relative_map_dof": Variable(RUN, "i8", "its degrees of freedom"),
+    "landmark_rmse": Variable(RUN, "f8", "final RMS map error, not aligned [m]"),
+    "landmark_rmse_aligned": Variable(RUN, "f8", "the same after the best motion [m]"),
+    "landmark_area": Variable(RUN, "f8", "mean final 3σ ellipse of landmarks [m²]"),
+    "landmark_nees_invariant": Variable(LANDMARK, "f8", "final NEES, 2 degrees"),
+    "landmark_nees_additive": Variable(LANDMARK, "f8", "final NEES, 2 degrees"),
+    "landmark_error": Variable(LANDMARK, "f8", "final distance to the truth [m]"),
+    "landmark_mahalanobis": Variable(LANDMARK, "f8", "the same in deviations"),
+    "failed": Variable(RUN, "?", "whether the run ended before its time"),
+    "failed_at": Variable(RUN, "i8", "at which step, -1 if it did not"),
+    "message": Variable(RUN, "U", "why"),
+}
+
+
+def measure_runs(runs: SimulatedRuns, filtered: FilteredRuns) -> Block:
+    """Measure a filter's runs against the truth.
+
+    Parameters
+    ----------
+    runs : SimulatedRuns
+        B runs of T steps among L landmarks.
+    filtered : FilteredRuns
+        What the filter made of them.
+
+    Returns
+    -------
+    dict
+        The `VARIABLES`, shape (B,), (B, T) or (B, L) each; nan where there is none.
+    """
+    count, steps, landmarks = runs.visible.shape
+    sizes = {"run": count, "step": steps, "landmark": landmarks}
+    block = {name: _empty(variable, sizes) for name, variable in VARIABLES.items()}
+    failures = dict(filtered.failures)
+    for run, belief in enumerate(filtered.beliefs):
+        truth = runs.true_poses[run]
+        with np.errstate(all="ignore"):  # a diverged run may leave all numbers
+            measured = _measure_path(truth, filtered, run)
+            try:
+                if belief is not None:
+                    measured |= _measure_map(truth[-1], runs.landmarks[run], belief)
+            except Exception as error:  # of somebody's estimator, only at the end
+                said = f"the final belief is no map of this world: {error}"
+                failures[run] = Failure(steps - 1, said)
+        for name, value in measured.items():
+            block[name][run] = value
+    for run, failure in failures.items():
+        block["failed"][run] = True
+        block["failed_at"][run] = failure.step
+    messages = [
+        failures[run].message if run in failures else "" for run in range(count)
+    ]
+    block["message"] = np.array(messages)
+    return block
+
+
+def _empty(variable: Variable, sizes: dict[str, int]) -> NDArray[np.generic]:
+    shape = [sizes[dim] for dim in variable.dims]
+    blank = {"f8": np.nan, "i8": 0, "?": False, "U": ""}[variable.kind]
+    return np.full(shape, blank, dtype=variable.kind)
+
+
+def _measure_path(truth: Array, filtered: FilteredRuns, run: int) -> dict[str, Value]:
+    poses = filtered.trace.poses[run]
+    covariances = filtered.trace.pose_covariances[run]
+    posed = truth, poses, covariances
+    errors = truth - poses
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    measured: dict[str, Value] = {
+        "heading_nees": nees.heading_nees(*posed),
+        "nis": filtered.trace.nis[run],
+        "nis_dof": filtered.trace.degrees_of_freedom[run],
+        "position_error": np.hypot(errors[:, 0], errors[:, 1]),
+        "heading_error": wrap_angle(errors[:, 2]),
+        "heading_std": np.sqrt(variances[:, 2]),
+        "position_std": np.sqrt(variances[:, 0] + variances[:, 1]),
+        "failed_at": -1,
+    }
+    for frame in ERROR_FRAMES:
+        measured[f"pose_nees_{frame}"] = nees.pose_nees(*posed, frame=frame)
+        measured[f"position_nees_{frame}"] = nees.position_nees(*posed, frame=frame)
+    if run not in filtered.failures:
+        path = position_accuracy(poses[:, :2], truth[:, :2])
+        measured |= {
+            "ate": path.raw_rmse,
+            "ate_aligned": path.aligned_rmse,
+            "pose_area": float(ellipse_areas(covariances[-1:, :2, :2])[0]),
+        }
+    return measured
+
+
+def _measure_map(
+    true_pose: Array, true_landmarks: Array, belief: Belief
+) -> dict[str, Value]:
+    ids = list(belief.landmark_ids)
+    if len(set(ids)) < len(ids) or not set(ids) <= set(range(len(true_landmarks))):
+        raise ValueError(
+            f"landmark_ids must be different ones of 0 … {len(true_landmarks) - 1}, "
+            f"got {tuple(ids)}"
+        )
+    states = (
+        np.concatenate([true_pose, true_landmarks[ids].ravel()]),
+        belief.mean,
+        belief.covariance,
+    )
+    measured: dict[str, Value] = {
+        "state_dof": 3 + 2 * len(ids),
+        "relative_map_dof": 2 * len(ids),
+    }
+    for frame in ERROR_FRAMES:
+        value = nees.state_nees(*states, frame=frame)
+        measured[f"state_nees_{frame}"] = float(value)
+    if not ids:
+        return measured
+    for frame in ERROR_FRAMES:
+        values = nees.landmark_nees(*states, frame=frame)
+        measured[f"landmark_nees_{frame}"] = _by_id(values, ids, len(true_landmarks))
+    accuracy = position_accuracy(belief.landmarks, true_landmarks[ids])
+    return measured | {
+        "relative_map_nees": float(nees.relative_map_nees(*states)),
+        "landmark_rmse": accuracy.raw_rmse,
+        "landmark_rmse_aligned": accuracy.aligned_rmse,
+        "landmark_area": float(ellipse_areas(belief.landmark_covariances).mean()),
+        "landmark_error": _by_id(accuracy.raw_errors, ids, len(true_landmarks)),
+        "landmark_mahalanobis": np.sqrt(measured["landmark_nees_additive"]),
+    }
+
+
+def _by_id(values: Array, ids: list[int], count: int) -> Array:
+    """Put the values of mapped landmarks into rows of all, nan where not mapped."""
+    rows = np.full(count, np.nan)
+    rows[ids] = values
+    return rows

@@ -1,0 +1,284 @@
+"""What many runs look like: NEES, headings, NIS and errors over time, per estimator."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ....estimator.error_frames import ErrorFrame
+from ....evaluation.hypothesis_tests import family_band
+from ....evaluation.nees import average_band
+from ...figures.style import GREY, INK, dress, new_figure
+from .estimator_lines import (
+    EstimatorLook,
+    legend_above,
+    log_ticks,
+    look_of,
+    plain,
+    thinned,
+)
+from .nis_figures import nis_figure
+from .scores import POSE_FREEDOM, Array, EstimatorScores, labels_of, scores_of
+
+Shown = list[tuple[EstimatorScores, EstimatorLook]]
+
+_WIDTH = 4.8
+_LOG_FROM = 4.0
+_BINS = 70
+_MOST_DOTS, _FEW_DOTS = 300, 100
+
+
+class ReportFigure(NamedTuple):
+    """A figure and what to say of it."""
+
+    name: str
+    title: str
+    sentence: str
+    figure: Figure
+
+
+def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> list[ReportFigure]:
+    """Draw all figures of a report.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Results of ``monte_carlo``.
+    summary : dict
+        Theirs, of ``summarise_monte_carlo``.
+
+    Returns
+    -------
+    list of ReportFigure
+        Without the estimators none of whose runs went well; empty if no run did.
+    """
+    frame: ErrorFrame = summary["frame"]
+    each = [scores_of(dataset, label, frame) for label in labels_of(dataset)]
+    shown = [(scores, look_of(i)) for i, scores in enumerate(each) if scores.good.any()]
+    if not shown:
+        return []
+    runs = max(int(scores.good.sum()) for scores, _ in shown)
+    times = grid_steps(summary)
+    knowable = summary["knowable_heading_std"]
+    return [
+        ReportFigure(
+            "nees",
+            "Do the covariances tell the truth?",
+            f"NEES of the pose / 3, {frame} frame, averaged over {runs} runs: a "
+            "consistent filter stays near 1, in the grey band at most steps (95 % on "
+            f"average){_between(times)}.",
+            nees_figure(shown, frame, summary),
+        ),
+        ReportFigure(
+            "runs",
+            "Every run, or a few bad ones?",
+            f"Time average of NEES / 3, {frame} frame, one dot per run"
+            f"{_quantiles(runs)}; bars are medians. A consistent filter's runs scatter "
+            "around 1, hardly any is above 3.",
+            runs_figure(shown, frame),
+        ),
+        ReportFigure(
+            "heading",
+            "Does it know how well it knows its heading?",
+            "The claimed deviation should follow the true error (root mean squares "
+            "over the runs). No reading tells the direction of the whole, so the "
+            "heading cannot become better known than at the start: the dotted line.",
+            heading_figure(shown, knowable),
+        ),
+        ReportFigure(
+            "nis",
+            "Are the innovations as large as promised, and white?",
+            "NIS by its degrees of freedom, pooled over runs and neighbouring steps, "
+            "should stay near 1 and be uncorrelated. That is necessary, not enough: an "
+            "overconfident filter can pass.",
+            nis_figure(shown),
+        ),
+        ReportFigure(
+            "rmse",
+            "How far off is the position?",
+            "Root mean square error of the position over the runs, raw: in the frame "
+            "of the start, not aligned with the truth.",
+            rmse_figure(shown),
+        ),
+    ]
+
+
+def nees_figure(shown: Shown, frame: ErrorFrame, summary: dict[str, Any]) -> Figure:
+    """Draw ANEES / 3 over time, with the 95 % bands of one step and of the grid."""
+    figure = new_figure(_WIDTH, 2.9)
+    axes = figure.subplots()
+    runs = max(int(scores.good.sum()) for scores, _ in shown)
+    band = np.array(average_band(runs, POSE_FREEDOM)) / POSE_FREEDOM
+    axes.axhspan(*band, color=GREY, alpha=0.25, lw=0, label="95 % band")
+    if times := grid_steps(summary):
+        wide = np.array(family_band(runs, POSE_FREEDOM, times)) / POSE_FREEDOM
+        for end, label in zip(wide, (f"95 % band, {_steps(times)}", None), strict=True):
+            axes.axhline(end, color=GREY, lw=0.8, label=label)
+    extremes = [band]
+    for scores, look in shown:
+        average = scores.ratios(frame).mean(axis=0)
+        steps = np.arange(scores.first, scores.first + len(average))
+        axes.plot(*thinned(steps, average), **look.line(plain(scores.label)))
+        _mark_grid(axes, summary["estimators"][scores.label]["decisions"], look)
+        extremes.append(average)
+    everything = np.concatenate(extremes)
+    dress(axes)
+    if everything.max() > _LOG_FROM or everything.min() < 1 / _LOG_FROM:
+        log_ticks(axes, "y")
+    axes.margins(x=0.01)
+    axes.set(xlabel="step", ylabel="ANEES / 3")
+    legend_above(figure, axes)
+    return figure
+
+
+def runs_figure(shown: Shown, frame: ErrorFrame) -> Figure:
+    """Draw the time average of each run's NEES / 3, a row of dots per estimator."""
+    figure = new_figure(_WIDTH, 0.8 + 1.0 * len(shown))
+    axes = figure.subplots()
+    size = 3.4 if len(shown[0][0].good) <= _FEW_DOTS else 2.6
+    each = [_dots(scores.ratios(frame).mean(axis=1)) for scores, _ in shown]
+    logs = np.log10(np.concatenate(each))
+    edges = np.linspace(min(logs.min(), -0.5), max(logs.max(), 0.6), _BINS + 1)
+    for row, ((scores, look), dots) in enumerate(zip(shown, each, strict=True)):
+        x, lift = _swarm(np.log10(dots), edges)
+        axes.plot(10**x, row + lift, "o", color=look.colour, ms=size, mew=0, alpha=0.75)
+        median = np.median(scores.ratios(frame).mean(axis=1))
+        axes.plot([median] * 2, [row - 0.34, row + 0.34], color=INK, lw=1.6)
+        axes.annotate(
+            plain(scores.label),
+            (0.01, row - 0.5),
+            xycoords=("axes fraction", "data"),
+            va="center",
+            fontsize=10,
+            color=INK,
+        )
+    dress(axes)
+    axes.set_xlim(10 ** edges[0] / 1.1, 10 ** edges[-1] * 1.1)
+    log_ticks(axes, "x")
+    axes.axvline(1, color=GREY, lw=1.0)
+    axes.axvline(3, color=GREY, lw=1.0, ls=(0, (1.4, 1.6)))
+    axes.set_yticks([])
+    axes.set_ylim(len(shown) - 0.55, -0.7)
+    axes.grid(visible=False, axis="y")
+    axes.set_xlabel("time average of NEES / 3")
+    return figure
+
+
+def heading_figure(shown: Shown, knowable: float) -> Figure:
+    """Draw claimed and true deviation of the heading, a panel per estimator [°]."""
+    figure = new_figure(_WIDTH, 0.75 + 1.3 * len(shown))
+    panels = figure.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)
+    for axes, (scores, look) in zip(panels[:, 0], shown, strict=True):
+        claimed = _rms_over_runs(scores, "heading_std")
+        true = _rms_over_runs(scores, "heading_error")
+        axes.plot(*thinned(scores.steps, true), color=INK, lw=1.0, label="true error")
+        axes.plot(
+            *thinned(scores.steps, claimed),
+            **(look.line("claimed deviation") | {"ls": "-", "lw": 2.0}),
+        )
+        axes.axhline(
+            np.degrees(knowable),
+            color=GREY,
+            lw=1.2,
+            ls=(0, (1.4, 1.6)),
+            label="at the start",
+        )
+        dress(axes)
+        axes.margins(x=0.01)
+        axes.set_ylim(bottom=0)
+        axes.set_title(plain(scores.label), loc="left", fontsize=10, color=INK, pad=3)
+    panels[-1, 0].set_xlabel("step")
+    figure.supylabel("heading, RMS over runs [°]", fontsize=10, color=INK)
+    legend_above(figure, panels[0, 0])
+    return figure
+
+
+def rmse_figure(shown: Shown) -> Figure:
+    """Draw the root mean square of the position's raw error over time."""
+    figure = new_figure(_WIDTH, 2.5)
+    axes = figure.subplots()
+    for scores, look in shown:
+        rms = _root_mean_square(scores.over_time("position_error"))
+        axes.plot(*thinned(scores.steps, rms), **look.line(plain(scores.label)))
+    dress(axes)
+    axes.margins(x=0.01)
+    axes.set_ylim(bottom=0)
+    axes.set(xlabel="step", ylabel="RMS error, raw [m]")
+    legend_above(figure, axes)
+    return figure
+
+
+def grid_steps(summary: dict[str, Any]) -> int:
+    """Return how many steps are tested together, 0 where nothing was decided."""
+    decisions = [entry["decisions"] for entry in summary["estimators"].values()]
+    return max((len(found["grid"]["steps"]) for found in decisions if found), default=0)
+
+
+def _between(times: int) -> str:
+    if not times:
+        return ""
+    marked = "the marked step" if times == 1 else f"all {times} marked steps"
+    return f" and between the thin lines at {marked} (filled: refused)"
+
+
+def _steps(times: int) -> str:
+    return "1 step" if times == 1 else f"{times} steps"
+
+
+def _mark_grid(
+    axes: Axes, decisions: dict[str, Any] | None, look: EstimatorLook
+) -> None:
+    """Mark the steps that are tested, filled where refused."""
+    if decisions is None:
+        return
+    grid = decisions["grid"]
+    steps, ratios = np.array(grid["steps"]), np.array(grid["statistic"], dtype=float)
+    rejected = np.array(grid["rejected"])
+    for chosen, face in ((rejected, look.colour), (~rejected, "white")):
+        axes.plot(
+            steps[chosen],
+            ratios[chosen],
+            look.marker,
+            ms=4.5,
+            color=look.colour,
+            mfc=face,
+            mew=1.2,
+            zorder=3,
+        )
+
+
+def _rms_over_runs(scores: EstimatorScores, name: str) -> Array:
+    """Root mean square at each step, in degrees."""
+    return np.asarray(np.degrees(_root_mean_square(scores.over_time(name))))
+
+
+def _root_mean_square(values: Array) -> Array:
+    """Over runs; nan, which leaves a gap in a line, where it is beyond all numbers."""
+    with np.errstate(over="ignore"):
+        square = (values**2).mean(axis=0)
+    return np.sqrt(np.where(np.isfinite(square), square, np.nan))
+
+
+def _dots(values: Array) -> Array:
+    """Keep few runs as they are, and show many by their quantiles."""
+    if len(values) <= _MOST_DOTS:
+        return values
+    return np.asarray(np.quantile(values, (np.arange(_MOST_DOTS) + 0.5) / _MOST_DOTS))
+
+
+def _quantiles(runs: int) -> str:
+    return "" if runs <= _MOST_DOTS else f" (of {runs}, {_MOST_DOTS} quantiles)"
+
+
+def _swarm(values: Array, edges: Array) -> tuple[Array, Array]:
+    """Stack dots of the same bin around the middle of their row."""
+    bins = np.clip(np.searchsorted(edges, values, "right") - 1, 0, _BINS - 1)
+    order = np.argsort(values, kind="stable")
+    lift = np.zeros(len(values))
+    tallest = max(int(np.bincount(bins).max()), 8)
+    for b in np.unique(bins):
+        rows = order[bins[order] == b]
+        lift[rows] = (np.arange(len(rows)) - (len(rows) - 1) / 2) * 0.6 / tallest
+    return (edges[bins] + edges[bins + 1]) / 2, lift

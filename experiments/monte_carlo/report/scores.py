@@ -1,0 +1,123 @@
+"""What of a Monte Carlo's results counts: runs that did not fail, after the start.
+
+The first step is a scan before any motion.  A start known for certain leaves further
+leading steps without a NEES; they are left out as well.
+"""
+
+import json
+import tomllib
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from ....estimator.error_frames import ErrorFrame
+from .nan_statistics import quotient
+
+Array = NDArray[np.float64]
+
+POSE_FREEDOM, POINT_FREEDOM = 3, 2
+_FIRST = 1
+_LARGEST = 1e100  # squares of larger numbers would leave all numbers
+_NO_MESSAGE = "its NEES or NIS is not finite, or above 1e100"
+
+
+class FailedRun(NamedTuple):
+    """A run that no figure counts, and why."""
+
+    run: int
+    step: int
+    """-1 where unknown."""
+    message: str
+
+
+class EstimatorScores(NamedTuple):
+    """One estimator's results: M runs that did not fail, K steps after the start."""
+
+    label: str
+    first: int
+    """First step that has a NEES, >= 1."""
+    good: NDArray[np.bool_]
+    """Which of all runs did not fail, shape (runs,)."""
+    failures: tuple[FailedRun, ...]
+    results: xr.Dataset
+    """Of all runs and steps."""
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """Numbers of the steps after the start, shape (K,)."""
+        return np.arange(_FIRST, self.results.sizes["step"])
+
+    def over_time(self, name: str) -> Array:
+        """Return a variable of the runs and steps that count, shape (M, K)."""
+        return np.asarray(self.results[name].values[self.good, _FIRST:])
+
+    def per_run(self, name: str) -> Array:
+        """Return a variable of the runs that count, shape (M, ...)."""
+        return np.asarray(self.results[name].values[self.good])
+
+    def ratios(self, frame: ErrorFrame) -> Array:
+        """Return NEES of the pose divided by 3, shape (M, K + 1 − first)."""
+        nees = self.over_time(f"pose_nees_{frame}")[:, self.first - _FIRST :]
+        return np.asarray(nees / POSE_FREEDOM)
+
+    @property
+    def nis_per_degree(self) -> float | None:
+        """All NIS by all their degrees of freedom; None where nothing was read."""
+        freedom = self.over_time("nis_dof")
+        return quotient(np.where(freedom > 0, self.over_time("nis"), 0.0), freedom)
+
+
+def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorScores:
+    """Take one estimator's results, and find its failed runs.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Results of ``monte_carlo``.
+    label : str
+        Of the estimator.
+    frame : {"additive", "invariant"}
+        Error coordinates whose NEES must be finite, and below 1e100.
+    """
+    results = dataset.sel(estimator=label)
+    nees = results[f"pose_nees_{frame}"].values
+    nis, freedom = results["nis"].values, results["nis_dof"].values
+    known = nees < _LARGEST
+    first = _FIRST + int(known[:, _FIRST:].any(axis=0).argmax())
+    gaps = ~known
+    gaps[:, :first] = False
+    gaps |= ~(nis < _LARGEST) & (freedom > 0)
+    flagged = results["failed"].values.astype(bool)
+    good = ~(flagged | gaps.any(axis=1))
+    at = np.where(flagged, results["failed_at"].values, gaps.argmax(axis=1))
+    failures = [
+        FailedRun(
+            int(dataset["run"].values[row]),
+            int(at[row]),
+            str(results["message"].values[row]) or _NO_MESSAGE,
+        )
+        for row in np.flatnonzero(~good)
+    ]
+    return EstimatorScores(label, first, good, tuple(failures), results)
+
+
+def labels_of(dataset: xr.Dataset) -> tuple[str, ...]:
+    """Name the estimators, in their order."""
+    return tuple(str(label) for label in dataset["estimator"].values)
+
+
+def estimators_of(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return name and options of each estimator by its label."""
+    return dict(json.loads(dataset.attrs.get("estimators", "{}")))
+
+
+def start_heading_std(dataset: xr.Dataset) -> float:
+    """Return how well the heading is known at the start [rad].
+
+    Readings are relative to the robot and no landmark is known beforehand, so they tell
+    nothing of the direction of the whole: later headings cannot be known better.
+    """
+    table = tomllib.loads(dataset.attrs["scenario"])
+    return float(table.get("start", {}).get("std", (0.0, 0.0, 0.0))[2])

@@ -1,0 +1,256 @@
+"""The numbers of a Monte Carlo, as one dictionary of plain JSON types."""
+
+import json
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from ....estimator.error_frames import ErrorFrame
+from ....evaluation.consistency_report import ConsistencyReport, consistency_report
+from ....evaluation.nees import average_band
+from .decision_entries import decisions_table
+from .nan_statistics import finite, mean, quotient, root_mean_square
+from .scores import (
+    POINT_FREEDOM,
+    POSE_FREEDOM,
+    EstimatorScores,
+    estimators_of,
+    labels_of,
+    scores_of,
+    start_heading_std,
+)
+from .verdict import heading_sentence, judge, verdict_sentence
+from .warnings import failure_groups, notes_of
+
+_BOOTSTRAP_SEED = 0  # the same for each estimator: its figures do not hang on others
+
+
+def summarise_monte_carlo(
+    dataset: xr.Dataset, *, frame: ErrorFrame = "invariant"
+) -> dict[str, Any]:
+    """Gather what one wants to know of many runs.
+
+    Every number is finite; what is unknown is None.  The same results give the same
+    summary.  Failed runs are counted and named, and left out of all else, as is step 0,
+    a scan before any motion.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Results of ``monte_carlo``.
+    frame : {"invariant", "additive"}
+        Error coordinates of the decisions.
+
+    Returns
+    -------
+    dict
+        ``scenario`` (its name), ``scenario_toml``, ``assumed_toml`` (whose noise the
+        estimators were told, None where the same), ``seed``, ``runs``, ``first_run``
+        (number of the first of them), ``steps``, ``block_size`` (None where unknown),
+        ``versions``, ``command``; ``frame``; ``knowable_heading_std`` [rad], the
+        deviation of the heading at the start, below which it cannot fall;
+        ``estimators`` by label, see :func:`summarise_estimator`; and ``notes``,
+        sentences that nobody should miss, see :func:`.notes.notes_of`.
+    """
+    attrs = dataset.attrs
+    assumed = attrs.get("assumed", attrs["scenario"])
+    known = estimators_of(dataset)
+    knowable = start_heading_std(dataset)
+    entries = {
+        label: known.get(label, {})
+        | summarise_estimator(scores_of(dataset, label, frame), frame, knowable)
+        for label in labels_of(dataset)
+    }
+    block_size = attrs.get("block_size")
+    return {
+        "scenario": str(attrs["scenario_name"]),
+        "scenario_toml": str(attrs["scenario"]),
+        "assumed_toml": None if assumed == attrs["scenario"] else str(assumed),
+        "seed": int(attrs["seed"]),
+        "runs": dataset.sizes["run"],
+        "first_run": int(dataset["run"].values[0]),
+        "steps": dataset.sizes["step"] - 1,
+        "block_size": None if block_size is None else int(block_size),
+        "versions": json.loads(attrs.get("versions", "{}")),
+        "command": str(attrs.get("command", "")),
+        "frame": frame,
+        "knowable_heading_std": knowable,
+        "estimators": entries,
+        "notes": notes_of(entries, dataset.sizes["run"]),
+    }
+
+
+def summarise_estimator(
+    scores: EstimatorScores, frame: ErrorFrame, knowable: float
+) -> dict[str, Any]:
+    """Sum up one estimator's runs.
+
+    Averages and root mean squares (``rmse``, deviations) are over runs and steps unless
+    they say ``end``.  NEES and NIS are divided by their degrees of freedom: 1
+    is right.
+
+    Parameters
+    ----------
+    scores : EstimatorScores
+        Its results.
+    frame : {"invariant", "additive"}
+        Error coordinates of the decisions.
+    knowable : float
+        Deviation of the heading at the start [rad].
+
+    Returns
+    -------
+    dict
+        ``verdict`` with ``reason``, ``sentence`` and ``heading_sentence``; ``accepted``
+        and ``decisions`` (None where fewer than 2 runs did not fail), ``sentences``,
+        ``warnings``; ``good_runs``, ``failed_runs``, ``failure_groups`` (see
+        :func:`.notes.failure_groups`); by frame ``pose_nees`` and its
+        share of steps inside the 95 % band, and ``position_nees``;
+        ``heading_nees``; ``median_run`` and ``share_above_3`` of the runs' averages;
+        NEES at the end of ``state``, ``landmarks`` and ``relative_map``; ``nis``;
+        ``heading_std_end``, ``{claimed, true}`` [rad]; ``rmse`` of position [m] and
+        heading [rad]; ``ate`` and ``landmark_rmse``, ``{raw, aligned}`` [m];
+        ``landmark_mahalanobis``, root mean square; ``area`` of the 3σ ellipses at the
+        end [m²].
+    """
+    report = _decide(scores, frame)
+    failed = len(scores.failures)
+    verdict = judge(report, failed, len(scores.good))
+    heading = _heading_std_end(scores)
+    per_run = scores.ratios(frame).mean(axis=1)
+    return {
+        "verdict": verdict.word,
+        "reason": verdict.reason,
+        "sentence": verdict_sentence(scores.label, verdict),
+        "heading_sentence": heading_sentence(heading["claimed"], knowable),
+        "accepted": None if report is None else report.accepted,
+        "decisions": None if report is None else decisions_table(report),
+        "sentences": [] if report is None else list(report.sentences()),
+        "warnings": [] if report is None else list(report.warnings()),
+        "good_runs": int(scores.good.sum()),
+        "failed_runs": [failure._asdict() for failure in scores.failures],
+        "failure_groups": failure_groups(scores.failures),
+        "pose_nees": {name: _nees(scores, name) for name in ("invariant", "additive")},
+        "position_nees": {
+            name: mean(scores.over_time(f"position_nees_{name}") / POINT_FREEDOM)
+            for name in ("invariant", "additive")
+        },
+        "median_run": finite(np.median(per_run) if len(per_run) else np.nan),
+        "share_above_3": mean(per_run > POSE_FREEDOM),
+        "heading_nees": {
+            "mean": mean(scores.over_time("heading_nees")),
+            "end": mean(scores.over_time("heading_nees")[:, -1]),
+        },
+        "nees_end": _nees_at_the_end(scores, frame),
+        "nis": scores.nis_per_degree,
+        "heading_std_end": heading,
+        "rmse": {
+            "position": root_mean_square(scores.over_time("position_error")),
+            "position_end": root_mean_square(scores.over_time("position_error")[:, -1]),
+            "heading": root_mean_square(scores.over_time("heading_error")),
+        },
+        "ate": _raw_and_aligned(scores, "ate"),
+        "landmark_rmse": _raw_and_aligned(scores, "landmark_rmse"),
+        "landmark_mahalanobis": root_mean_square(
+            scores.per_run("landmark_mahalanobis")
+        ),
+        "area": {
+            "pose": mean(scores.per_run("pose_area")),
+            "landmark": mean(scores.per_run("landmark_area")),
+        },
+    }
+
+
+def consistency_of(
+    results: xr.Dataset, estimator: str, *, frame: ErrorFrame = "invariant"
+) -> ConsistencyReport:
+    """Decide whether an estimator's covariances tell the truth about its errors.
+
+    Parameters
+    ----------
+    results : xarray.Dataset
+        Of ``monte_carlo``.
+    estimator : str
+        Its label.
+    frame : {"invariant", "additive"}
+        Error coordinates of the NEES.
+
+    Raises
+    ------
+    ValueError
+        If there is no such label, or fewer than 2 runs did not fail.
+
+    Examples
+    --------
+    >>> from slamgym.experiments.monte_carlo import monte_carlo
+    >>> results = monte_carlo("six_landmarks", "ekf,invariant", runs=60)
+    >>> [consistency_of(results, label).accepted for label in ("ekf", "invariant")]
+    [False, True]
+    """
+    if estimator not in labels_of(results):
+        known = ", ".join(labels_of(results))
+        raise ValueError(f"estimator must be one of {known}, got '{estimator}'")
+    return _report_of(scores_of(results, estimator, frame), frame)
+
+
+def _decide(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport | None:
+    """Decide on the runs that did not fail, where these are enough."""
+    freedom = scores.results["nis_dof"].values[:, 1:]
+    if scores.good.sum() < 2 or not freedom[scores.good].any():
+        return None
+    return _report_of(scores, frame)
+
+
+def _report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
+    nees = scores.results[f"pose_nees_{frame}"].values[:, 1:].copy()
+    nees[~scores.good] = np.nan
+    return consistency_report(
+        nees,
+        scores.results["nis"].values[:, 1:],
+        scores.results["nis_dof"].values[:, 1:],
+        dof=POSE_FREEDOM,
+        frame=frame,
+        rng=np.random.default_rng(_BOOTSTRAP_SEED),
+    )
+
+
+def _nees(scores: EstimatorScores, frame: ErrorFrame) -> dict[str, float | None]:
+    ratios = scores.ratios(frame)
+    if not len(ratios):
+        return {"mean": None, "end": None, "share_inside_band": None}
+    average = ratios.mean(axis=0)
+    low, high = np.array(average_band(len(ratios), POSE_FREEDOM)) / POSE_FREEDOM
+    return {
+        "mean": mean(average),
+        "end": finite(average[-1]),
+        "share_inside_band": mean((average > low) & (average < high)),
+    }
+
+
+def _nees_at_the_end(
+    scores: EstimatorScores, frame: ErrorFrame
+) -> dict[str, float | None]:
+    """Divide NEES of maps by their degrees of freedom, which hang on what was seen."""
+    state = scores.per_run(f"state_nees_{frame}")
+    relative = scores.per_run("relative_map_nees")
+    each = scores.per_run(f"landmark_nees_{frame}")
+    return {
+        "state": quotient(state, scores.per_run("state_dof")),
+        "landmarks": quotient(each, np.full(each.shape, POINT_FREEDOM)),
+        "relative_map": quotient(relative, scores.per_run("relative_map_dof")),
+    }
+
+
+def _heading_std_end(scores: EstimatorScores) -> dict[str, float | None]:
+    return {
+        "claimed": root_mean_square(scores.over_time("heading_std")[:, -1]),
+        "true": root_mean_square(scores.over_time("heading_error")[:, -1]),
+    }
+
+
+def _raw_and_aligned(scores: EstimatorScores, name: str) -> dict[str, float | None]:
+    return {
+        "raw": root_mean_square(scores.per_run(name)),
+        "aligned": root_mean_square(scores.per_run(f"{name}_aligned")),
+    }

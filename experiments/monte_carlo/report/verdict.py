@@ -1,0 +1,193 @@
+"""What a consistency report comes to, in one word and one sentence."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ....evaluation.consistency_report import ConsistencyReport
+from ....evaluation.time_average_tests import EQUIVALENCE_MARGIN
+
+CONSISTENT = "consistent"
+NEARLY = "nearly consistent"
+NOT_CONSISTENT = "not consistent"
+NOT_SHOWN = "not shown"
+KINDS = {CONSISTENT: "good", NEARLY: "good", NOT_CONSISTENT: "bad", NOT_SHOWN: "open"}
+"""What each word means for the filter; colours follow it."""
+
+_ERROR_RATE = 0.05
+_DECIDING = 3  # final step, time averages and grid share the error rate
+_SMALLEST_P = 1e-16
+_MARGIN = f"[{EQUIVALENCE_MARGIN.low:g}, {EQUIVALENCE_MARGIN.high:g}]"
+_TOO_SURE = 0.9
+_NOT_REFUSED = "its errors agree with its covariances (5 %)"
+
+
+class Verdict(NamedTuple):
+    """One word, and why."""
+
+    word: str
+    """"consistent": no decision refuses, and the ratio is shown to be near 1;
+    "nearly consistent": refused, but shown to be near 1; "not consistent": refused,
+    which befalls a consistent filter in 5 % of cases at most; "not shown": neither, or
+    some runs failed."""
+    reason: str
+    """Goes on after the word; without a full stop."""
+
+
+def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
+    """Sum a report up.
+
+    Parameters
+    ----------
+    report : ConsistencyReport or None
+        None where fewer than 2 runs did not fail, or nothing could be decided.
+    failed, runs : int
+        Failed runs, and all.
+    """
+    if report is None:
+        used = runs - failed
+        what = "run that did not fail" if used == 1 else "runs that did not fail"
+        return Verdict(NOT_SHOWN, f"{used} {what} of {runs} decide nothing")
+    verdict = _judge_good_runs(report)
+    if not failed:
+        return verdict
+    word = verdict.word if verdict.word == NOT_CONSISTENT else NOT_SHOWN
+    others = f"{failed} of {runs} runs failed; of the others, {verdict.reason}"
+    return Verdict(word, others)
+
+
+def verdict_sentence(label: str, verdict: Verdict) -> str:
+    """Say a verdict in a plain sentence.
+
+    Examples
+    --------
+    >>> verdict_sentence("ekf", Verdict("not shown", "1 run of 1 decides nothing"))
+    'ekf: not shown: 1 run of 1 decides nothing.'
+    """
+    return f"{label}: {verdict.word}: {verdict.reason}."
+
+
+def heading_sentence(claimed: float | None, knowable: float) -> str:
+    """Say if a filter claims to know its heading better than anybody can.
+
+    Parameters
+    ----------
+    claimed : float or None
+        Standard deviation of the heading at the end that the filter claims [rad].
+    knowable : float
+        That of the start, the least there can be [rad].
+
+    Returns
+    -------
+    str
+        Empty where it does not.
+
+    Examples
+    --------
+    >>> heading_sentence(0.05, 0.1)
+    'It claims to know its heading to 2.9° at the end, but the start was known to...
+    >>> heading_sentence(0.12, 0.1)
+    ''
+    """
+    if claimed is None or claimed >= _TOO_SURE * knowable:
+        return ""
+    return (
+        f"It claims to know its heading to {in_degrees(claimed)} at the end, but the "
+        f"start was known to {in_degrees(knowable)} only, which no reading can improve."
+    )
+
+
+def in_degrees(angle: float) -> str:
+    """Write the size of an angle [rad] for people.
+
+    Examples
+    --------
+    >>> in_degrees(0.1), in_degrees(1e-4), in_degrees(0.035)
+    ('5.7°', '0.0057°', '2.0°')
+    """
+    degrees = abs(math.degrees(angle))
+    size = math.floor(math.log10(degrees)) if degrees else 0
+    return f"{degrees:.{min(max(1 - size, 0), 6)}f}°"
+
+
+def p_text(p_value: float) -> str:
+    """Write a p-value for people.
+
+    Examples
+    --------
+    >>> p_text(0.0), p_text(0.0123)
+    ('p < 1e-16', 'p = 0.012')
+    """
+    small = p_value < _SMALLEST_P
+    return f"p < {_SMALLEST_P:g}" if small else f"p = {p_value:.2g}"
+
+
+def _judge_good_runs(report: ConsistencyReport) -> Verdict:
+    """Judge as if no run had failed."""
+    verdict = report.equivalence
+    interval = f"the 90 % interval of the ratio, {_interval(verdict.interval)}"
+    refusal = _refusal(report)
+    if refusal and _is_near_everywhere(report):
+        return Verdict(
+            NEARLY, f"{refusal}, which is certain but small: {interval}, {_inside()}"
+        )
+    if refusal:
+        return Verdict(NOT_CONSISTENT, refusal + _outliers(report))
+    if verdict.accepted:
+        return Verdict(CONSISTENT, f"{_NOT_REFUSED}, and {interval}, {_inside()}")
+    if verdict.verdict == NOT_CONSISTENT:  # refuses in up to 10 %: not enough
+        kept = "no decision refuses it (5 %), but"
+        lies = f"{interval}, lies outside {_MARGIN}"
+    else:
+        kept, lies = f"{_NOT_REFUSED}, but", f"{interval}, is not inside {_MARGIN}"
+    return Verdict(NOT_SHOWN, f"{kept} {lies}: more runs are needed")
+
+
+def _refusal(report: ConsistencyReport) -> str:
+    """Say by how much the filter is wrong, if final step, averages or grid refuse."""
+    final, average, grid = report.final_step, report.time_average, report.family
+    p_value = min(final.p_value, report.average_p_value)
+    ratios = [final.statistic, average.statistic]
+    claims = "what its covariances claim"
+    amounts = "{} times {} at the end, {} times over all steps"
+    if p_value * _DECIDING < _ERROR_RATE:
+        what = amounts.format(_number(ratios[0]), claims, _number(ratios[1]))
+    elif grid.p_value * _DECIDING < _ERROR_RATE:
+        worst = int(abs(np.log(grid.statistic[grid.rejected])).argmax())
+        step = int(report.family_steps[grid.rejected][worst]) + 1  # it knows no step 0
+        ratios, p_value = [float(grid.statistic[grid.rejected][worst])], grid.p_value
+        what = f"{_number(ratios[0])} times {claims} at step {step}"
+    else:
+        return ""
+    cautious = ": it is too cautious" if max(ratios) < 1 else ""
+    return f"its squared errors are {what} ({p_text(p_value)}){cautious}"
+
+
+def _is_near_everywhere(report: ConsistencyReport) -> bool:
+    low, high = EQUIVALENCE_MARGIN
+    ratios = (report.final_step.statistic, *report.family.statistic)
+    return report.equivalence.accepted and all(low <= r <= high for r in ratios)
+
+
+def _outliers(report: ConsistencyReport) -> str:
+    """Point out that a few runs rule the average."""
+    most = EQUIVALENCE_MARGIN.high
+    if not report.median_ratio <= most < report.mean_ratio:
+        return ""
+    return (
+        f"; few runs make this average: the median is {report.median_ratio:.2f}, "
+        f"{report.share_above_3:.1%} of the runs are above 3"
+    )
+
+
+def _number(ratio: float) -> str:
+    return f"{ratio:.3g}" if ratio < 1e6 else f"{ratio:.0e}"
+
+
+def _interval(band: tuple[float, float]) -> str:
+    return f"[{max(band[0], 0.0):.3f}, {band[1]:.3f}]"  # no ratio is below 0
+
+
+def _inside() -> str:
+    return f"lies inside {_MARGIN}"

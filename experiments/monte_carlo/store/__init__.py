@@ -1,0 +1,1 @@
+"""The results of a Monte Carlo on disk: job folder, blocks, dataset."""

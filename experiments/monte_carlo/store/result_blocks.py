@@ -1,0 +1,247 @@
+"""The results of a Monte Carlo as they come: blocks of runs, in memory or in a folder.
+
+A folder holds ``job.json``, what is computed, and ``blocks/runs-*.npz``, each written
+whole or not at all, so that a job may be killed at any time and goes on after its last
+whole block.  Blocks of one job made on several machines may be put into one folder.
+"""
+
+import contextlib
+import warnings
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .... import __version__
+from ....sim_configs import Scenario
+from ....sim_configs.atomic_file import replace_when_written
+from ....sim_configs.scenario_files import scenario_text
+from ..measure.estimator_choices import EstimatorChoice
+from ..measure.run_measures import VARIABLES, Block
+from .job_folder import (
+    BLOCKS,
+    FORMAT,
+    blocks_in,
+    claimed,
+    digest_of,
+    identity_in,
+    refuse_other,
+)
+
+
+class Span(NamedTuple):
+    """Consecutive runs."""
+
+    first: int
+    stop: int
+
+    @property
+    def size(self) -> int:
+        """How many."""
+        return self.stop - self.first
+
+
+class Job(NamedTuple):
+    """What is computed, but for the number of runs."""
+
+    scenario: Scenario
+    assumed: Scenario
+    """Whose noise the estimators are told."""
+    estimators: tuple[EstimatorChoice, ...]
+    seed: int
+    block_size: int
+
+    def identity(self) -> dict[str, Any]:
+        """Describe the job in plain values; equal jobs have equal ones."""
+        return {
+            "format": FORMAT,
+            "scenario": scenario_text(self.scenario),
+            "assumed": scenario_text(self.assumed),
+            "estimators": {
+                choice.label: {"name": choice.name, "options": dict(choice.options)}
+                for choice in self.estimators
+            },
+            "code": {"slamgym": __version__}
+            | {
+                choice.label: digest
+                for choice in self.estimators
+                if (digest := choice.code())
+            },
+            "seed": self.seed,
+            "block_size": self.block_size,
+        }
+
+    def spans(self, runs: Span) -> list[Span]:
+        """Divide runs into blocks, the last one perhaps shorter."""
+        size = self.block_size
+        starts = range(runs.first, runs.stop, size)
+        return [Span(first, min(first + size, runs.stop)) for first in starts]
+
+
+class BlockFolder:
+    """The blocks of one job; within ``with``, no other process writes to its folder.
+
+    Parameters
+    ----------
+    job : Job
+        The job.
+    path : Path, optional
+        The folder; without one, blocks are kept in memory.
+    fresh : bool
+        Whether to remove what an earlier job, this one or another, left there.
+
+    Raises
+    ------
+    ValueError
+        If the folder is a file.  On entry: if it holds another job, or what slamgym did
+        not write, or another process writes to it.
+    OSError
+        On entry, if it cannot be written.
+    """
+
+    def __init__(self, job: Job, path: Path | None, *, fresh: bool = False) -> None:
+        if path is not None and path.exists() and not path.is_dir():
+            raise ValueError(f"out must be a folder, got the file {path}")
+        self._job = job
+        self._path = path
+        self._fresh = fresh
+        self._identity = job.identity()  # as the sources of its estimators are now
+        self._digest = digest_of(self._identity)
+        self._kept: dict[int, list[Block]] = {}
+        self._claim = contextlib.ExitStack()
+
+    def __enter__(self) -> "BlockFolder":
+        """Claim the folder."""
+        if self._path is not None:
+            claim = claimed(self._path, self._identity, fresh=self._fresh)
+            self._claim.enter_context(claim)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let other writers in."""
+        self._claim.close()
+
+    def missing(self, runs: Span) -> list[Span]:
+        """List the blocks that are still to be computed; warn of a broken one."""
+        return [span for span in self._job.spans(runs) if not self._has(span)]
+
+    def add(self, span: Span, blocks: list[Block]) -> None:
+        """Keep a block, one part for each estimator."""
+        if self._path is None:
+            self._kept[span.first] = blocks
+            return
+        arrays = {
+            f"{number}/{name}": array
+            for number, block in enumerate(blocks)
+            for name, array in block.items()
+        }
+        file = self._file(span)
+        try:
+            with replace_when_written(file) as partial:
+                np.savez(partial, allow_pickle=False, job=self._digest, **arrays)
+        except OSError as error:
+            whole = len(list(file.parent.glob("runs-*.npz")))
+            raise OSError(
+                f"{file} cannot be written: {error.strerror or error}; "
+                f"{whole} whole blocks stay there, to go on from"
+            ) from error
+        for shorter in self._files_from(span.first):
+            if shorter != file:
+                shorter.unlink()
+
+    def blocks(self, runs: Span) -> Iterator[tuple[Span, list[Block]]]:
+        """Give back all blocks in order, one at a time."""
+        for span in self._job.spans(runs):
+            if self._path is None:
+                yield span, self._kept.pop(span.first)
+            else:
+                yield span, self._read(span)
+
+    def _has(self, span: Span) -> bool:
+        if self._path is None:
+            return False
+        for file in self._files_from(span.first):
+            problem = _problem(file, self._digest)
+            if problem:
+                aside = file.replace(file.with_suffix(".broken"))
+                warnings.warn(
+                    f"{file} {problem}; it is put aside as {aside.name}, and its "
+                    "runs are done again",
+                    stacklevel=4,
+                )
+            elif _stop_of(file) >= span.stop:
+                return True
+        return False
+
+    def _read(self, span: Span) -> list[Block]:
+        file = self._files_from(span.first)[-1]  # the longest
+        with np.load(file, allow_pickle=False) as arrays:
+            return [
+                {name: arrays[f"{number}/{name}"][: span.size] for name in VARIABLES}
+                for number in range(len(self._job.estimators))
+            ]
+
+    def _file(self, span: Span) -> Path:
+        assert self._path is not None
+        return self._path / BLOCKS / f"runs-{span.first:07d}-{span.stop:07d}.npz"
+
+    def _files_from(self, first: int) -> list[Path]:
+        assert self._path is not None
+        return sorted((self._path / BLOCKS).glob(f"runs-{first:07d}-*.npz"))
+
+
+def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
+    """Copy the blocks of one job from several folders into one.
+
+    ``monte_carlo`` with ``out=target`` then has only the rest to compute.
+
+    Parameters
+    ----------
+    sources : sequence of str or Path
+        Folders that ``monte_carlo`` has written, at least one.
+    target : str or Path
+        A new folder, or one of the same job.
+
+    Raises
+    ------
+    ValueError
+        If a folder holds another job than the first, or a damaged block, or another
+        process writes to the target.
+    """
+    folders = [Path(source) for source in sources]
+    if not folders:
+        raise ValueError("sources must be at least one folder, got none")
+    place, identity = Path(target), identity_in(folders[0])
+    for source in folders:
+        refuse_other(source, identity_in(source), identity)
+    with claimed(place, identity):
+        digest = digest_of(identity)
+        for file in (f for source in folders for f in blocks_in(source)):
+            problem = _problem(file, digest)
+            if problem:
+                raise ValueError(f"{file} {problem}")
+            copy = place / BLOCKS / file.name
+            if not copy.exists():
+                with replace_when_written(copy) as partial:
+                    partial.write_bytes(file.read_bytes())
+
+
+def _problem(file: Path, digest: str) -> str:
+    """Say what is wrong with a block, nothing if it is whole."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if archive.testzip() is not None:
+                return "is damaged"
+        with np.load(file, allow_pickle=False) as arrays:
+            job = str(arrays["job"])
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        return f"is truncated or damaged ({error})"
+    if job != digest:
+        raise ValueError(f"{file} is of another job than its folder: move it away")
+    return ""
+
+
+def _stop_of(file: Path) -> int:
+    return int(file.stem.rpartition("-")[2])

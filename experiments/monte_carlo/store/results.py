@@ -1,0 +1,186 @@
+"""The results of a Monte Carlo as one dataset: estimator × run × step."""
+
+import json
+import platform
+from collections.abc import Iterator, Mapping, MutableMapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import xarray as xr
+
+from .... import __version__
+from ....sim_configs.atomic_file import replace_when_written
+from ..measure.run_measures import VARIABLES, Block
+from .job_folder import RESULTS
+from .result_blocks import Job, Span
+
+Blocks = Iterator[tuple[Span, list[Block]]]
+
+_PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
+_FROM_TRUTH = "of a consistent filter NEES and NIS are χ² with the degrees told"
+
+
+def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Dataset:
+    """Put the blocks of a job together in memory.
+
+    Parameters
+    ----------
+    job : Job
+        The job.
+    blocks : iterator
+        All of its blocks, in order.
+    runs : Span
+        The runs that they hold.
+    command : str
+        How to do it again.
+    """
+    sizes = _sizes(job, runs)
+    arrays: dict[str, Any] = {
+        name: np.empty(
+            [sizes[dim] for dim in _dims(name)],
+            object if variable.kind == "U" else variable.kind,
+        )
+        for name, variable in VARIABLES.items()
+    }
+    _fill(arrays, blocks, runs)
+    return xr.Dataset(
+        {
+            name: (_dims(name), arrays[name], {"long_name": variable.meaning})
+            for name, variable in VARIABLES.items()
+        },
+        {dim: (dim, values) for dim, values in _coordinates(job, runs).items()},
+        attributes(job, runs, command),
+    )
+
+
+def write_results(
+    path: Path, job: Job, blocks: Blocks, runs: Span, command: str = ""
+) -> None:
+    """Write the blocks of a job as one netCDF file, with one block in memory at a time.
+
+    Parameters
+    ----------
+    path : Path
+        The file, complete or as it was.
+    job, blocks, runs, command
+        As in :func:`dataset_of`.
+    """
+    try:
+        with replace_when_written(path) as partial:
+            _write(partial, job, blocks, runs, command)
+    except (OSError, RuntimeError) as error:  # netCDF raises the second on a full disk
+        raise OSError(
+            f"{path} cannot be written: {error}; its blocks stay, to go on from"
+        ) from error
+
+
+def load_results(path: str | Path) -> xr.Dataset:
+    """Open the results of a Monte Carlo; arrays are read when they are used.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ``results.nc``, or the folder that holds it.
+
+    Raises
+    ------
+    ValueError
+        If the file is not one, or not whole.
+    """
+    file = Path(path)
+    file = file / RESULTS if file.is_dir() else file
+    if not file.exists():
+        raise ValueError(f"{file} does not exist")
+    try:
+        results = xr.open_dataset(file, engine="netcdf4")
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(
+            f"{file} is truncated or no results: {error}; where blocks/ stands beside "
+            "it, the command that made it makes it anew from them"
+        ) from error
+    lacking = sorted(set(VARIABLES) - set(results.variables))
+    if lacking:
+        results.close()
+        raise ValueError(f"{file} is no result of a Monte Carlo: no {lacking[0]}")
+    return results
+
+
+def _write(path: Path, job: Job, blocks: Blocks, runs: Span, command: str) -> None:
+    with netCDF4.Dataset(path, "w") as file:
+        for dim, size in _sizes(job, runs).items():
+            file.createDimension(dim, size)
+        for dim, values in _coordinates(job, runs).items():
+            file.createVariable(dim, _stored(values.dtype.kind), (dim,))[:] = values
+        for name, variable in VARIABLES.items():
+            made = file.createVariable(name, _stored(variable.kind), _dims(name))
+            made.long_name = variable.meaning
+            if variable.kind == "?":
+                made.setncattr("dtype", "bool")  # xarray gives it back as such
+        _fill(file.variables, blocks, runs)
+        file.setncatts(attributes(job, runs, command))
+
+
+def attributes(job: Job, runs: Span, command: str) -> dict[str, Any]:
+    """Say where results come from: all that is needed to do it again."""
+    identity = job.identity()
+    return {
+        "title": f"Monte Carlo of {job.scenario.name}, {runs.size} runs",
+        "scenario_name": job.scenario.name,
+        "scenario": identity["scenario"],
+        "assumed": identity["assumed"],
+        "estimators": json.dumps(identity["estimators"]),
+        "seed": job.seed,
+        "runs": runs.size,
+        "block_size": job.block_size,
+        "versions": json.dumps(_versions()),
+        "command": command,
+        "comment": _FROM_TRUTH,
+    }
+
+
+def _versions() -> dict[str, str]:
+    own = {"slamgym": __version__, "python": platform.python_version()}
+    return own | {package: version(package) for package in _PACKAGES}
+
+
+def _fill(
+    arrays: MutableMapping[str, Any] | Mapping[str, Any], blocks: Blocks, runs: Span
+) -> None:
+    for span, parts in blocks:
+        rows = slice(span.first - runs.first, span.stop - runs.first)
+        for number, block in enumerate(parts):
+            for name, values in block.items():
+                text = VARIABLES[name].kind == "U"
+                part = values.astype(object) if text else values
+                arrays[name][number, rows] = part
+
+
+def _stored(kind: str) -> Any:
+    """Type in a netCDF file, which knows no truth values."""
+    return {"?": "i1", "i": "i8", "U": str}.get(kind, kind)
+
+
+def _dims(name: str) -> tuple[str, ...]:
+    return ("estimator", *VARIABLES[name].dims)
+
+
+def _sizes(job: Job, runs: Span) -> dict[str, int]:
+    return {
+        "estimator": len(job.estimators),
+        "run": runs.size,
+        "step": job.scenario.steps + 1,
+        "landmark": job.scenario.landmarks.count,
+    }
+
+
+def _coordinates(job: Job, runs: Span) -> dict[str, np.ndarray[Any, Any]]:
+    sizes = _sizes(job, runs)
+    return {
+        "estimator": np.array([choice.label for choice in job.estimators]),
+        "run": np.arange(runs.first, runs.stop),
+        "step": np.arange(sizes["step"]),
+        "landmark": np.arange(sizes["landmark"]),
+    }

@@ -1,0 +1,1 @@
+"""The noise study: every noise scaled up and down, one at a time."""

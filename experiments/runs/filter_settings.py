@@ -1,0 +1,214 @@
+"""How an estimator is set up for a log: what the log tells, and what the user says."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from ...estimator.interface import SlamEstimator
+from ...estimator.registry import (
+    EstimatorFactory,
+    accepted_options,
+    find_estimator,
+    make_estimator,
+)
+from ...sim_configs import Scenario
+from ..logs.events import Scan
+from ..logs.lines import LogError
+from ..logs.recording import log_header
+from ..logs.slamlog import SlamLog
+
+SIGMAS = ("σx", "σy", "σα", "σβ", "σr")
+"""The five noises of a run: of the motion in the robot's frame, of the sensor."""
+
+_COURSE_SOURCE = "course data.txt"
+_COURSE_NOISE = {  # as the homework publishes it
+    "motion_std": "0.25,0.1,0.1",
+    "measurement_std": "0.01,0.08",
+    "start_sigma": "0.02,0.02,0.1",
+}
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """An estimator by name, with the noise it assumes and its options.
+
+    Examples
+    --------
+    >>> settings = FilterSettings("ekf", (0.2, 0.1, 0.1), (0.01, 0.08))
+    >>> settings.scaled("σr", 10).measurement_std
+    (0.01, 0.8)
+    """
+
+    estimator: str
+    """Registered name or "module:Class"."""
+    motion_std: tuple[float, ...]
+    """(σx, σy, σα) per unit of the log's time [m, m, rad]."""
+    measurement_std: tuple[float, ...]
+    """(σβ, σr) [rad, m]."""
+    initial_pose_std: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """(σx, σy, σθ) of the first pose [m, m, rad]."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """What the estimator's constructor takes besides."""
+
+    def make(self, initial_pose: ArrayLike) -> SlamEstimator:
+        """Make the estimator at a first pose (3,) [m, m, rad].
+
+        Raises
+        ------
+        ValueError
+            If the name is unknown, or the estimator refuses a value or an option.
+        """
+        try:
+            return make_estimator(
+                self.estimator,
+                motion_std=self.motion_std,
+                measurement_std=self.measurement_std,
+                initial_pose=initial_pose,
+                initial_pose_std=self.initial_pose_std,
+                **self.options,
+            )
+        except TypeError as error:
+            raise ValueError(
+                f"estimator '{self.estimator}' refuses its options: {error}"
+            ) from error
+
+    def scaled(self, sigma: str, factor: float) -> "FilterSettings":
+        """Multiply one of `SIGMAS` by a factor, and keep all else."""
+        scaled = [
+            std * factor if name == sigma else std
+            for name, std in zip(
+                SIGMAS, (*self.motion_std, *self.measurement_std), strict=True
+            )
+        ]
+        return replace(
+            self, motion_std=tuple(scaled[:3]), measurement_std=tuple(scaled[3:])
+        )
+
+
+def settings_for(
+    log: SlamLog,
+    *,
+    estimator: str = "ekf",
+    motion_std: Sequence[float] | None = None,
+    measurement_std: Sequence[float] | None = None,
+    initial_pose_std: Sequence[float] | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> FilterSettings:
+    """Set up an estimator for a log: by what is given, else by what the log tells.
+
+    A log's header may hold ``motion_std``, ``measurement_std``, ``start_sigma``,
+    ``range_std_per_metre`` and ``noise_at_rest``; logs of the simulator do, and for the
+    course log its published values stand in. A log that says nothing of it starts
+    at a known pose, and its robot has no noise where it reports to rest.
+
+    Parameters
+    ----------
+    log : SlamLog
+        The log.
+    estimator : str
+        Registered name or "module:Class".
+    motion_std, initial_pose_std : sequence of 3 floats, optional
+        See :class:`FilterSettings`.
+    measurement_std : sequence of 2 floats, optional
+        See :class:`FilterSettings`.
+    options : mapping, optional
+        Further options of the estimator; they go before those of the header.
+
+    Raises
+    ------
+    ValueError
+        If neither the caller nor the log tells a noise, or the estimator is unknown.
+    LogError
+        If the header holds something else than numbers, or true and false.
+    """
+    factory = find_estimator(estimator)
+    header = dict(log.header)
+    if header.get("source") == _COURSE_SOURCE:
+        header = {**_COURSE_NOISE, **header}
+    return FilterSettings(
+        estimator=estimator,
+        motion_std=_std(log.name, header, "motion_std", motion_std),
+        measurement_std=_std(log.name, header, "measurement_std", measurement_std),
+        initial_pose_std=_std(
+            log.name, {"start_sigma": "0,0,0"} | header, "start_sigma", initial_pose_std
+        ),
+        options={
+            **_told_options(log.name, header, factory),
+            **_needed_options(log, header),
+            **(options or {}),
+        },
+    )
+
+
+def settings_for_scenario(
+    scenario: Scenario,
+    *,
+    estimator: str = "ekf",
+    options: Mapping[str, Any] | None = None,
+) -> FilterSettings:
+    """Set up an estimator with the noise of a world.
+
+    Raises
+    ------
+    ValueError
+        If the estimator is unknown.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> settings_for_scenario(load_scenario("six_landmarks")).motion_std
+    (0.25, 0.1, 0.1)
+    """
+    told = SlamLog(scenario.name, log_header(scenario, seed=0))
+    return settings_for(told, estimator=estimator, options=options)
+
+
+def _std(
+    name: str, header: Mapping[str, str], key: str, given: Sequence[float] | None
+) -> tuple[float, ...]:
+    if given is not None:
+        return tuple(map(float, given))
+    if key in header:
+        return tuple(_number(name, key, part) for part in header[key].split(","))
+    example = "0.1,0.1,0.05" if key == "motion_std" else "0.02,0.1"
+    raise ValueError(
+        f"{name} does not tell its {key}: give it, "
+        f"for example --{key.replace('_', '-')} {example}"
+    )
+
+
+def _told_options(
+    name: str, header: Mapping[str, str], factory: EstimatorFactory
+) -> dict[str, Any]:
+    """Read the options that the log tells, as far as the estimator knows them."""
+    told: dict[str, Any] = {}
+    if not _flag(name, "noise_at_rest", header.get("noise_at_rest", "false")):
+        told["noise_at_rest"] = False
+    if "range_std_per_metre" in header:
+        key = "range_std_per_metre"
+        told[key] = _number(name, key, header[key])
+    return accepted_options(factory, told)
+
+
+def _needed_options(log: SlamLog, header: Mapping[str, str]) -> dict[str, Any]:
+    """Let readings be associated where the log does not say what they are of."""
+    told = _flag(log.name, "identities", header.get("identities", "true"))
+    scans = (event for event in log.events if isinstance(event, Scan))
+    if told and all(scan.landmark_ids is not None for scan in scans):
+        return {}
+    return {"management": True}
+
+
+def _number(name: str, key: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise LogError(f"{name}: {key} must be numbers, got {text.strip()!r}") from None
+
+
+def _flag(name: str, key: str, text: str) -> bool:
+    if text not in ("true", "false"):
+        raise LogError(f"{name}: {key} must be true or false, got {text!r}")
+    return text == "true"

@@ -1,0 +1,212 @@
+"""The numbers of a run, as one dictionary of plain JSON types."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ... import __version__
+from ...evaluation import nees
+from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
+from ..logs.ground_truth import path_accuracy
+from .filter_settings import FilterSettings
+from .replay import Replay
+from .trace import RunTrace
+
+Array = NDArray[np.floating]
+
+_SHARE = 0.95  # of a consistent filter's NIS within its interval
+
+
+def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[str, Any]:
+    """Gather what one wants to know of a run.
+
+    Every number is finite; what is unknown, for want of ground truth, is None.
+
+    Parameters
+    ----------
+    replay : Replay
+        The run.
+    settings : FilterSettings, optional
+        How its estimator was set up, to be written down too.
+
+    Returns
+    -------
+    dict
+        ``landmarks``, see :func:`landmark_table`; ``pose``, ``pose_covariance``;
+        ``steps``, ``scans``, ``readings`` by what became of them; ``map_changes``, the
+        landmarks confirmed, removed and merged, and the most in the map; ``nis``, see
+        :func:`nis_summary`; ``nees``, see :func:`nees_summary`; ``ate``, the root mean
+        square distance of the path from the truth at the times of the truth, and
+        ``landmark_rmse``, that of the map, both ``{raw, aligned}`` [m]; ``log``,
+        ``estimator``, ``settings``, and ``slamgym``, the version.
+    """
+    log, trace = replay.log, replay.trace
+    return {
+        "slamgym": __version__,
+        "log": log.name,
+        "estimator": trace.estimator,
+        "settings": None if settings is None else settings_table(settings),
+        "steps": trace.last_step,
+        "scans": replay.scans,
+        "readings": replay.readings._asdict(),
+        "map_changes": replay.changes._asdict(),
+        "pose": _finite_list(trace.poses[-1]),
+        "pose_covariance": [_finite_list(row) for row in trace.pose_covariances[-1]],
+        "landmarks": landmark_table(trace),
+        "nis": nis_summary(trace),
+        "nees": nees_summary(trace),
+        "ate": _rmse(path_accuracy(log, trace.t, trace.poses)),
+        "landmark_rmse": _rmse(map_accuracy(trace)),
+    }
+
+
+def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
+    """List the final landmarks and their distances to the truth.
+
+    ::
+
+        e = l − l_true,    euclidean = ‖e‖,    mahalanobis = sqrt(eᵀ P⁻¹ e)
+
+    Returns
+    -------
+    list of dict
+        ``{id, x, y, euclidean, mahalanobis}`` [m, m, m, -] in the order of the state;
+        the distances are None where the truth is unknown, the last one also where the
+        covariance is singular.
+    """
+    truth = trace.true_landmarks
+    errors = trace.landmarks - (np.nan if truth is None else truth)
+    squared = nees.normalised_squared_error(
+        np.asarray(errors), np.asarray(trace.landmark_covariances)
+    )
+    return [
+        {
+            "id": landmark_id,
+            "x": _finite(x),
+            "y": _finite(y),
+            "euclidean": _finite(math.hypot(*error)),
+            "mahalanobis": _finite(math.sqrt(square)),
+        }
+        for landmark_id, (x, y), error, square in zip(
+            trace.landmark_ids.tolist(), trace.landmarks, errors, squared, strict=True
+        )
+    ]
+
+
+def nis_summary(trace: RunTrace) -> dict[str, Any] | None:
+    """Summarise the normalised innovations squared, ν S⁻¹ ν of whole scans.
+
+    Returns
+    -------
+    dict or None
+        ``mean`` over the ``scans`` that corrected something; ``total`` and its
+        ``degrees_of_freedom``, and their quotient ``per_degree``, near 1 for a
+        consistent filter; ``inside_95``, the share of scans within the two-sided 95 %
+        interval of χ². None where no scan corrected anything.
+    """
+    used = trace.nis_dof > 0
+    if not used.any():
+        return None
+    nis, dof = trace.nis[used], trace.nis_dof[used]
+    tail = (1 - _SHARE) / 2
+    inside = (nis >= chi2.ppf(tail, dof)) & (nis <= chi2.ppf(1 - tail, dof))
+    return {
+        "mean": _finite(nis.mean()),
+        "total": _finite(nis.sum()),
+        "degrees_of_freedom": int(dof.sum()),
+        "per_degree": _finite(nis.sum() / dof.sum()),
+        "inside_95": _finite(inside.mean()),
+        "scans": int(used.sum()),
+    }
+
+
+def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
+    """Summarise the normalised estimation error squared of the pose.
+
+    Returns
+    -------
+    dict or None
+        ``mean`` over the ``steps`` where it is defined, ``final`` at the last step
+        (None where undefined), ``degrees_of_freedom`` 3, ``per_degree``, the mean by 3,
+        near 1 for a consistent filter, and the ``frame`` of the error, the filter's
+        own. None where it is defined nowhere.
+    """
+    values = pose_nees(trace)
+    known = np.isfinite(values)
+    if not known.any():
+        return None
+    return {
+        "mean": _finite(values[known].mean()),
+        "final": _finite(values[-1]),
+        "degrees_of_freedom": 3,
+        "per_degree": _finite(values[known].mean() / 3),
+        "steps": int(known.sum()),
+        "frame": trace.frame,
+    }
+
+
+def pose_nees(trace: RunTrace) -> Array:
+    """NEES of the pose at every step, in the error frame of the filter.
+
+    Returns
+    -------
+    ndarray, shape (K + 1,)
+        nan where the true pose is unknown or P is singular, as it is at a start known
+        for certain.
+    """
+    if trace.true_poses is None:
+        return np.full(len(trace.t), np.nan)
+    return nees.pose_nees(
+        np.asarray(trace.true_poses, dtype=np.float64),
+        np.asarray(trace.poses, dtype=np.float64),
+        np.asarray(trace.pose_covariances, dtype=np.float64),
+        frame=trace.frame,
+    )
+
+
+def map_accuracy(trace: RunTrace) -> PositionAccuracy | None:
+    """Compare the final map with the truth; None where no landmark's is known."""
+    if trace.true_landmarks is None:
+        return None
+    known = np.isfinite(trace.true_landmarks).all(axis=1)
+    return position_accuracy(trace.landmarks[known], trace.true_landmarks[known])
+
+
+def settings_table(settings: FilterSettings) -> dict[str, Any]:
+    """Write an estimator's settings as plain JSON types."""
+    return {
+        "motion_std": list(settings.motion_std),
+        "measurement_std": list(settings.measurement_std),
+        "initial_pose_std": list(settings.initial_pose_std),
+        "options": {key: _plain(value) for key, value in settings.options.items()},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Keep what JSON can say; write down the rest as text."""
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError):
+        return str(value)
+    return value
+
+
+def _rmse(accuracy: PositionAccuracy | None) -> dict[str, float | None] | None:
+    if accuracy is None:
+        return None
+    return {
+        "raw": _finite(accuracy.raw_rmse),
+        "aligned": _finite(accuracy.aligned_rmse),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _finite_list(values: Array) -> list[float | None]:
+    return [_finite(value) for value in values]

@@ -1,0 +1,187 @@
+"""What the documents say is so: their code runs, their commands work, links resolve."""
+
+import re
+import shlex
+import shutil
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import slamgym
+from slamgym.estimator import list_estimators, make_estimator, registry
+from slamgym.sim_configs import list_presets
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text()
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md"))]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$(?:\n\n^```text\n(.*?)^```$)?", re.M | re.S)
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def name_of(document):
+    return str(document.relative_to(ROOT))
+
+
+def blocks(text, language):
+    """Yield (code, expected output or empty) of each block in a language."""
+    for found in BLOCK.finditer(text):
+        if found[1] == language:
+            yield found[2], found[3] or ""
+
+
+def commands(text):
+    """Yield the lines of the bash blocks."""
+    for code, _ in blocks(text, "bash"):
+        yield from code.splitlines()
+
+
+PYTHON = [
+    pytest.param(code, output, id=f"{name_of(document)}-{number}")
+    for document in DOCUMENTS
+    for number, (code, output) in enumerate(blocks(document.read_text(), "python"), 1)
+]
+MAIN_JOB = next(line for line in commands(README) if line.startswith("slamgym run"))
+
+
+@pytest.fixture(scope="module")
+def first_run(tmp_path_factory):
+    """Return the folder in which a reader has typed the README's main command."""
+    folder = tmp_path_factory.mktemp("reader")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        from slamgym.experiments.command_line.app import main
+
+        with pytest.raises(SystemExit) as end:
+            main(shlex.split(MAIN_JOB)[1:])
+    assert end.value.code in (0, None)
+    return folder / "results" / "first_run"
+
+
+@pytest.fixture
+def reader(first_run, tmp_path, monkeypatch):
+    """Stand where a reader stands: in a folder with a first run and some drive.csv."""
+    shutil.copytree(first_run, tmp_path / "results" / "first_run")
+    shutil.copy(first_run / "log.csv", tmp_path / "drive.csv")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "_factories", dict(registry._factories))
+    noise = {"motion_std": (0.25, 0.1, 0.1), "measurement_std": (0.01, 0.08)}
+    return {"__name__": "reader", "estimator": make_estimator("ekf", **noise)}
+
+
+@pytest.mark.parametrize(("code", "output"), PYTHON)
+def test_python_in_a_document_runs_and_prints_what_it_shows(
+    code, output, reader, capsys
+):
+    exec(compile(code, "document", "exec"), reader)
+    printed = capsys.readouterr().out
+    assert not output or printed == output
+
+
+def test_the_three_uses_fit_into_fifteen_lines_each():
+    uses = README.split("## Three uses")[1].split("\n## ")[0]
+    lengths = [
+        sum(bool(line.strip()) for line in code.splitlines())
+        for code, _ in blocks(uses, "python")
+    ]
+    assert len(lengths) == 3
+    assert max(lengths) <= 15
+
+
+def test_the_main_job_writes_what_the_readme_promises(first_run):
+    section = README.split("## Drive, filter, look")[1].split("\n## ")[0]
+    table = [line for line in section.splitlines() if line.startswith("| `")]
+    promised = {name for line in table for name in re.findall(r"`([^`]+)`", line)}
+    assert promised == {
+        entry.name + "/" * entry.is_dir() for entry in first_run.iterdir()
+    }
+
+
+def known_commands():
+    from slamgym.experiments.command_line.app import main
+
+    return {c.name or c.callback.__name__ for c in main.registered_commands}
+
+
+def test_the_readme_lists_all_commands():
+    table = README.split("## Commands")[1].split("\n## ")[0]
+    assert set(re.findall(r"^\| `slamgym ([\w-]+)", table, re.M)) == known_commands()
+
+
+def test_readme_and_filter_page_list_all_filters():
+    table = README.split("## Filters")[1].split("\n## ")[0]
+    assert set(list_estimators()) == {
+        name for name in re.findall(r"`(\w+)`", table) if not name.isdigit()
+    }
+    page = (ROOT / "docs" / "filters.md").read_text()
+    assert set(re.findall(r"^## `(\w+)`$", page, re.M)) == set(list_estimators())
+
+
+def test_every_command_in_a_document_is_known():
+    for document in DOCUMENTS:
+        typed = re.findall(r"`slamgym ([a-z-]+)", document.read_text())
+        assert set(typed) <= known_commands(), name_of(document)
+
+
+def test_scenarios_named_in_commands_exist():
+    named = re.findall(r"slamgym (?:run|render|noise-study) (\w+)", README)
+    assert set(named) - {"SCENARIO"} <= set(list_presets())
+
+
+def anchors(document):
+    """Return the anchors of a document's headings, as code hosts make them."""
+    headings = re.findall(r"^#+ (.+)$", document.read_text(), re.M)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
+def test_relative_links_resolve(document):
+    for link in LINK.findall(document.read_text()):
+        if re.match(r"https?://", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = document.parent / path if path else document
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_pictures_in_documents_are_small():
+    pictures = list((ROOT / "docs" / "images").iterdir())
+    assert pictures
+    assert all(picture.stat().st_size < 200_000 for picture in pictures)
+
+
+def test_ci_types_the_commands_of_the_readme():
+    ci = (ROOT / ".ci" / "run").read_text().splitlines()
+    set_up = README.split("## Set-up")[1].split("\n## ")[0]
+    test = README.split("## Test")[1].split("\n## ")[0]
+    typed = [*commands(set_up), *commands(test)]
+    assert typed == [line for line in ci if line in typed]
+    assert ci[-1] == "pytest"
+
+
+def test_contributing_lists_the_checks_of_ci():
+    ci = (ROOT / ".ci" / "run").read_text().splitlines()
+    checks = next(blocks((ROOT / "CONTRIBUTING.md").read_text(), "bash"))[0]
+    assert checks.splitlines() == [
+        line
+        for line in ci
+        if line in {"ruff check", "ruff format --check", "mypy", "pytest"}
+    ]
+
+
+def test_version_licence_and_python_agree_everywhere():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"version: {slamgym.__version__}\n" in citation
+    assert f"license: {project['license']}\n" in citation
+    assert (ROOT / "LICENSE").read_text().startswith(f"{project['license']} License")
+    assert slamgym.__version__ in (ROOT / "CHANGELOG.md").read_text()
+    oldest = project["requires-python"].removeprefix(">=")
+    assert f"Python {oldest} or newer" in README
+
+
+def test_hooks_use_what_is_installed():
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text()
+    assert set(re.findall(r"repo: (\S+)", hooks)) == {"local"}
+    assert set(re.findall(r"language: (\S+)", hooks)) == {"system"}

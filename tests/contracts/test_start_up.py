@@ -1,0 +1,134 @@
+"""What is loaded and compiled when; measured as what is imported, not by a clock."""
+
+import os
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+from drives import MEASUREMENT_STD, MOTION_STD, drive
+
+from slamgym.estimator import make_estimator
+
+NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+
+
+def run_python(code, *arguments, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env={**os.environ, **environment},
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+
+
+def test_importing_slamgym_loads_nothing_heavy():
+    code = "import sys, slamgym; print(*sys.modules)"
+    loaded = set(run_python(code).split())
+    heavy = {"numba", "scipy", "matplotlib", "pymunk", "pydantic", "typer", "rich"}
+    assert "gymnasium" in loaded
+    assert not heavy & loaded
+
+
+def test_importing_the_estimators_loads_no_statistics_and_no_pictures():
+    loaded = run_python("import sys, slamgym.estimator; print(*sys.modules)").split()
+    assert "numba" in loaded
+    assert not {"scipy.special", "scipy.stats", "matplotlib", "pymunk"} & set(loaded)
+
+
+def test_a_state_saved_here_continues_bit_for_bit_in_another_process(tmp_path):
+    slam = make_estimator("invariant", **NOISE)
+    for odometry, readings, _ in drive(0, 20):
+        slam.predict(odometry)
+        slam.update(readings, range(6))
+    (tmp_path / "state.pickle").write_bytes(pickle.dumps(slam.state_dict()))
+    np.savez(tmp_path / "state.npz", **slam.state_dict())
+    code = """
+import pickle, sys
+import numpy as np
+from slamgym.estimator import make_estimator
+
+folder, std, sensor = sys.argv[1], eval(sys.argv[2]), eval(sys.argv[3])
+beliefs = []
+for load in (np.load, lambda path: pickle.loads(open(path, "rb").read())):
+    kind = "npz" if load is np.load else "pickle"
+    slam = make_estimator("invariant", motion_std=std, measurement_std=sensor)
+    slam.load_state_dict(dict(load(f"{folder}/state.{kind}")))
+    slam.predict((0.5, 0.08))
+    slam.update([(0.3, 6.0), (1.0, 9.0)], [0, 3])
+    beliefs.append(slam.belief())
+    np.save(f"{folder}/{kind}.npy", np.column_stack([slam.belief().mean]))
+    np.save(f"{folder}/{kind}_covariance.npy", slam.belief().covariance)
+"""
+    run_python(
+        code, str(tmp_path), str(MOTION_STD.tolist()), str(MEASUREMENT_STD.tolist())
+    )
+    slam.predict((0.5, 0.08))
+    slam.update([(0.3, 6.0), (1.0, 9.0)], [0, 3])
+    for kind in ("npz", "pickle"):
+        mean = np.load(tmp_path / f"{kind}.npy")[:, 0]
+        covariance = np.load(tmp_path / f"{kind}_covariance.npy")
+        np.testing.assert_array_equal(mean, slam.belief().mean)
+        np.testing.assert_array_equal(covariance, slam.belief().covariance)
+
+
+def test_kernels_run_as_plain_python_for_a_debugger():
+    code = """
+from slamgym.estimator import make_estimator
+slam = make_estimator("invariant", motion_std=(.1, .1, .1), measurement_std=(.1, .1))
+for _ in range(3):
+    slam.predict((1.0, 0.1))
+    slam.update([(0.3, 6.0), (1.0, 9.0)], [0, 3])
+print(*slam.belief().mean.tolist())
+"""
+    plain = run_python(code, NUMBA_DISABLE_JIT="1").split()
+    np.testing.assert_allclose(
+        np.array(plain, dtype=float),
+        np.array(run_python(code).split(), dtype=float),
+        rtol=1e-12,
+    )
+
+
+def test_an_edited_kernel_is_compiled_again(tmp_path):
+    from slamgym.estimator.support.jit import discard_stale_cache
+
+    source, cache = tmp_path / "kernels.py", tmp_path / "__pycache__"
+    source.write_text("x = 1")
+    cache.mkdir()
+    for name in ("old.nbi", "old.nbc", "module.pyc"):
+        (cache / name).write_text("")
+    os.utime(source, (2e9, 2e9))
+    (cache / "new.nbi").write_text("")
+    os.utime(cache / "new.nbi", (3e9, 3e9))
+    discard_stale_cache(tmp_path, cache)
+    assert sorted(f.name for f in cache.iterdir()) == ["module.pyc", "new.nbi"]
+
+
+def test_kernels_compiled_and_kernels_loaded_give_the_same_bits(tmp_path):
+    code = """
+import sys
+import numpy as np
+from slamgym.estimator import make_batch, make_estimator
+
+noise = {"motion_std": (0.1, 0.05, 0.03), "measurement_std": (0.02, 0.1)}
+rng = np.random.default_rng(0)
+z = np.stack([rng.uniform(-3, 3, (1, 40, 13)), rng.uniform(1, 9, (1, 40, 13))], axis=3)
+z[:] = z[:, :1] + 0.03 * rng.standard_normal(z.shape)
+u = 0.01 * rng.standard_normal((1, 40, 2))
+for name in ("ekf", "invariant"):
+    batch = make_batch(name, runs=1, landmarks=13, **noise)
+    trace = batch.run(u, z, np.ones((1, 40, 13), dtype=bool))
+    slam = make_estimator(name, **noise)
+    for odometry, readings in zip(u[0], z[0], strict=True):
+        slam.predict(odometry)
+        report = slam.update(readings, range(13))
+    for belief in (slam.belief(), batch.belief(0)):
+        print(belief.mean.tobytes().hex(), belief.covariance.tobytes().hex())
+    print(report.nis.hex(), float(trace.nis[0, -1]).hex())
+"""
+    compiling, loading = (
+        run_python(code, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)
+    )
+    assert list(tmp_path.rglob("*.nbc"))
+    assert compiling == loading

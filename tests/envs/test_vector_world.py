@@ -1,0 +1,419 @@
+"""The native vector world, held against Gymnasium's own vector of single worlds."""
+
+import copy
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import FlattenObservation, RecordEpisodeStatistics
+
+import slamgym  # noqa: F401 (registers the environments)
+from slamgym.envs.vector.landmark_world_vector import LandmarkWorldVectorEnv
+from slamgym.envs.vector.wrappers import FlattenBatch
+from slamgym.sim_configs import list_presets, load_scenario
+
+ID = "slamgym/LandmarkWorld-v0"
+WORLDS, STEPS, SEED = 5, 400, 3
+WALLS = [[5.0, -2.0, 5.0, 2.0], [-4.0, 4.0, 9.0, 4.5], [1.0, -3.0, 3.0, -3.0]]
+EVERYTHING = {
+    "scenario": "hidden_identities",
+    "steps": 70,
+    "walls": WALLS,
+    "sensor": {"occlusion": True, "dropout": 0.2, "field_of_view": 3.0},
+    "landmarks": {"seed": None, "min_distance": 0.5},
+    "start": {"std": [0.1, 0.1, 0.1]},
+}
+WORLDS_TO_TEST = {
+    **{name: {"scenario": name} for name in list_presets()},
+    "everything": EVERYTHING,
+}
+MODES = list(AutoresetMode)
+
+
+def native(count=WORLDS, mode=AutoresetMode.NEXT_STEP, **changes):
+    return gym.make_vec(ID, count, autoreset_mode=mode, **changes)
+
+
+def sync(count=WORLDS, mode=AutoresetMode.NEXT_STEP, **changes):
+    options = {"autoreset_mode": mode}
+    return gym.make_vec(
+        ID, count, vectorization_mode="sync", vector_kwargs=options, **changes
+    )
+
+
+def same(value, other):
+    """Assert equality of keys, types, shapes and bits."""
+    assert type(value) is type(other)
+    if isinstance(value, dict):
+        assert set(value) == set(other)
+        for key in value:
+            same(value[key], other[key])
+    elif isinstance(value, tuple):
+        for each, its in zip(value, other, strict=True):
+            same(each, its)
+    elif isinstance(value, np.ndarray):
+        assert (value.dtype, value.shape) == (other.dtype, other.shape)
+        if value.dtype == object:
+            same(tuple(value), tuple(other))
+        else:
+            assert value.tobytes() == other.tobytes()
+    else:
+        assert value is other is None
+
+
+def actions(rng, count=WORLDS):
+    wild = rng.uniform((-0.8, -1.2), (1.6, 1.2), (count, 2)).astype(np.float32)
+    wild[rng.random(count) < 0.1] = 0.0
+    return wild
+
+
+def reset_some(vectors, mask):
+    results = [vec.reset(options={"reset_mask": mask.copy()}) for vec in vectors]
+    same(*results)
+
+
+# --- parity ---
+
+
+@pytest.mark.parametrize("mode", MODES, ids=str)
+@pytest.mark.parametrize("name", WORLDS_TO_TEST)
+def test_it_gives_what_gymnasiums_vector_of_single_worlds_gives(name, mode):
+    """All of it: observations, rewards, ends, infos with their masks, final ones."""
+    changes = WORLDS_TO_TEST[name]
+    steps = min(load_scenario(changes["scenario"]).steps, changes.get("steps", 150))
+    changes = {**changes, "steps": steps}
+    pair = [native(mode=mode, **changes), sync(mode=mode, **changes)]
+    same(*(vec.reset(seed=SEED) for vec in pair))
+    rng, ends = np.random.default_rng(1), 0
+    for _ in range(STEPS):
+        commands = actions(rng)
+        (_, _, terminated, truncated, _), _ = results = [
+            vec.step(commands.copy()) for vec in pair
+        ]
+        same(*results)
+        ended = terminated | truncated
+        ends += np.count_nonzero(ended)
+        if mode == AutoresetMode.DISABLED:
+            early = rng.random(WORLDS) < 0.003  # so that ends differ
+            if (ended | early).any():
+                reset_some(pair, ended | early)
+    assert ends >= WORLDS
+    pair[1].close()
+
+
+@pytest.mark.parametrize("mode", MODES, ids=str)
+def test_worlds_may_end_one_by_one(mode):
+    pair = [native(mode=mode, **EVERYTHING), sync(mode=mode, **EVERYTHING)]
+    same(*(vec.reset(seed=SEED) for vec in pair))
+    rng, when_ended = np.random.default_rng(1), []
+    for step in range(300):
+        commands = actions(rng)
+        results = [vec.step(commands.copy()) for vec in pair]
+        same(*results)
+        ended = results[0][3]
+        if ended.any():
+            when_ended.append(tuple(ended))
+        if step in {10, 25, 77}:
+            reset_some(pair, rng.random(WORLDS) < 0.4)
+        elif mode == AutoresetMode.DISABLED and ended.any():
+            reset_some(pair, ended)
+    assert len(set(when_ended)) > 2
+
+
+def test_it_is_what_make_vec_makes():
+    vector = gym.make_vec(ID, 4, scenario="corridor")
+    assert type(vector) is LandmarkWorldVectorEnv
+    assert vector.num_envs == 4
+    assert vector.scenario == load_scenario("corridor")
+    assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    other = sync(4, scenario="corridor")
+    for name in ("action_space", "observation_space"):
+        assert getattr(vector, name) == getattr(other, name)
+        single = f"single_{name}"
+        assert getattr(vector, single) == getattr(other, single)
+    for key in ("render_modes", "render_fps"):
+        assert vector.metadata[key] == other.metadata[key]
+
+
+def test_its_spec_survives_json():
+    changes = {"scenario": "loop", "sensor": {"max_range": 4.0}}
+    vector = gym.make_vec(ID, 2, **changes)
+    spec = gym.envs.registration.EnvSpec.from_json(gym.spec(ID).to_json())
+    rebuilt = gym.make_vec(spec, 2, **json.loads(json.dumps(changes)))
+    same(vector.reset(seed=0), rebuilt.reset(seed=0))
+
+
+# --- seeds ---
+
+
+def test_seeds_may_be_a_list_and_none_seeds_nothing_anew():
+    pair = [native(3), sync(3)]
+    same(*(vec.reset(seed=[5, 2, 2**64 - 1]) for vec in pair))
+    assert pair[0].np_random_seed == pair[1].np_random_seed == (5, 2, 2**64 - 1)
+    same(*(vec.reset() for vec in pair))
+    same(*(vec.reset(seed=[None, 8, None]) for vec in pair))
+    same(*(vec.reset() for vec in pair))
+
+
+def test_a_seed_seeds_the_worlds_of_the_mask_alone():
+    pair = [native(mode="Disabled"), sync(mode=AutoresetMode.DISABLED)]
+    same(*(vec.reset(seed=1) for vec in pair))
+    mask = np.array([True, False, False, True, False])
+    same(*(vec.reset(seed=9, options={"reset_mask": mask.copy()}) for vec in pair))
+    assert pair[0].np_random_seed == (9, 2, 3, 12, 5)
+    same(*(vec.reset() for vec in pair))
+
+
+def test_without_a_seed_worlds_differ():
+    observations, _ = native(2, sensor={"std": [0.1, 0.1]}).reset()
+    assert (observations["landmarks"][0] != observations["landmarks"][1]).any()
+
+
+# --- episodes ---
+
+
+@pytest.mark.parametrize(
+    ("most", "ends_at"), [(3, 3), (1000, 29), (-1, 29), (None, 29)]
+)
+def test_an_episode_ends_with_the_scenario_or_before(most, ends_at):
+    vector = native(2, max_episode_steps=most)
+    vector.reset(seed=0)
+    truncated = [vector.step(np.zeros((2, 2)))[3].tolist() for _ in range(29)]
+    assert truncated.index([True, True]) == ends_at - 1
+
+
+def test_the_action_of_a_world_that_begins_anew_is_not_looked_at():
+    vector = native(2, steps=2)
+    vector.reset(seed=0)
+    for _ in range(2):
+        vector.step(np.zeros((2, 2)))
+    vector.step(np.full((2, 2), np.nan))
+
+
+def test_without_autoreset_an_ended_world_must_be_reset():
+    vector = native(3, mode="Disabled", steps=2)
+    vector.reset(seed=0)
+    for _ in range(2):
+        vector.step(np.zeros((3, 2)))
+    mask = np.array([True, False, False])
+    vector.reset(options={"reset_mask": mask})
+    with pytest.raises(ResetNeeded, match=r"worlds \[1, 2\] have ended.*reset_mask"):
+        vector.step(np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize("mode", MODES, ids=str)
+def test_nothing_handed_out_is_shared_with_anything_else(mode):
+    vector, twin = native(mode=mode, **EVERYTHING), native(mode=mode, **EVERYTHING)
+    kept = []
+    for step in range(4):
+        results = []
+        for each in (vector, twin):
+            if step == 0:
+                results.append(each.reset(seed=0))
+            elif step == 2:
+                mask = np.array([True, False, True, False, False])
+                results.append(each.reset(options={"reset_mask": mask}))
+            else:
+                observations, *_, infos = each.step(np.full((WORLDS, 2), 0.3))
+                results.append((observations, infos))
+        if step != 2 or mode == AutoresetMode.DISABLED:
+            same(*results)
+        arrays = [*leaves(results[0]), vector.poses, vector.landmarks]
+        for k, array in enumerate(arrays):
+            others = [*kept, *arrays[:k]]
+            assert not any(np.shares_memory(array, other) for other in others)
+        kept += arrays
+        for array in arrays:
+            array[...] = 1
+
+
+def leaves(value):
+    if isinstance(value, dict | tuple):
+        parts = value.values() if isinstance(value, dict) else value
+        for part in parts:
+            yield from leaves(part)
+    else:
+        yield value
+
+
+def test_a_deep_copy_goes_on_as_the_original_would():
+    vector = native(**EVERYTHING)
+    vector.reset(seed=0)
+    vector.step(np.full((WORLDS, 2), 0.3))
+    other = copy.deepcopy(vector)
+    for _ in range(150):
+        same(*(each.step(np.full((WORLDS, 2), 0.4)) for each in (vector, other)))
+
+
+def test_gymnasiums_episode_statistics_go_on_top():
+    vector = RecordEpisodeStatistics(native(2, mode=AutoresetMode.SAME_STEP, steps=3))
+    vector.reset(seed=0)
+    *_, infos = [vector.step(np.zeros((2, 2))) for _ in range(3)][-1]
+    assert infos["episode"]["l"].tolist() == [3, 3]
+
+
+# --- pictures ---
+
+
+def test_frames_are_those_of_the_single_worlds():
+    changes = {"render_mode": "rgb_array", **EVERYTHING}
+    vector, other = native(2, **changes), sync(2, **changes)
+    for step in range(3):
+        for each in (vector, other):
+            each.reset(seed=0) if step == 0 else each.step(np.full((2, 2), 0.7))
+        frames = vector.render()
+        assert len(frames) == 2
+        for frame, expected in zip(frames, other.render(), strict=True):
+            np.testing.assert_array_equal(frame, expected)
+    vector.close()
+    other.close()
+
+
+@pytest.mark.parametrize("mode", MODES[:2], ids=str)
+def test_pictures_follow_the_worlds_from_episode_to_episode(mode):
+    changes = {"render_mode": "rgb_array", "steps": 3, "landmarks": EVERYTHING_MAP}
+    vector, other = native(2, mode, **changes), sync(2, mode, **changes)
+    for each in (vector, other):
+        each.reset(seed=0)
+        for _ in range(5):
+            each.step(np.full((2, 2), 0.3))
+    for frame, expected in zip(vector.render(), other.render(), strict=True):
+        np.testing.assert_array_equal(frame, expected)
+    vector.close()
+    other.close()
+
+
+EVERYTHING_MAP = {"layout": "random", "count": 5, "bounds": [-5, -5, 5, 5]}
+
+
+def test_rendering_without_a_mode_warns_and_draws_nothing():
+    vector = native()
+    with pytest.raises(ResetNeeded, match="no worlds"):
+        vector.render()
+    vector.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert vector.render() is None
+
+
+# --- bad input ---
+
+
+def test_actions_of_another_shape_are_refused():
+    vector = native()
+    with pytest.raises(ResetNeeded):
+        vector.step(np.zeros((WORLDS, 2)))
+    vector.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(5, 2\).* got shape \(2, 5\)"):
+        vector.step(np.zeros((2, WORLDS)))
+
+
+def test_an_action_that_is_no_number_names_its_world_and_the_worlds_stay():
+    vector, twin = native(), native()
+    commands = np.zeros((WORLDS, 2))
+    commands[2, 0] = np.nan
+    for each in (vector, twin):
+        each.reset(seed=0)
+    with pytest.raises(ValueError, match=r"got \[nan, 0\.0\] for world 2"):
+        vector.step(commands)
+    for _ in range(30):
+        same(*(each.step(np.zeros((WORLDS, 2))) for each in (vector, twin)))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "word"),
+    [
+        ({"mask": 1}, ValueError, "'reset_mask' alone"),
+        ({"reset_mask": [True] * WORLDS}, TypeError, "bool ndarray"),
+        ({"reset_mask": np.ones(WORLDS)}, TypeError, "bool ndarray"),
+        ({"reset_mask": np.ones(4, bool)}, ValueError, r"shape \(5,\)"),
+        ({"reset_mask": np.zeros(WORLDS, bool)}, ValueError, "True somewhere"),
+    ],
+)
+def test_options_of_another_form_are_refused(options, error, word):
+    vector = native()
+    vector.reset(seed=0)
+    with pytest.raises(error, match=word):
+        vector.reset(options=options)
+
+
+def test_a_mask_at_first_must_choose_all():
+    mask = np.array([True, False])
+    with pytest.raises(ResetNeeded, match="all worlds first"):
+        native(2).reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize(
+    ("seed", "error", "word"),
+    [
+        ([1, 2], ValueError, "5 seeds"),
+        (1.5, TypeError, "got 1.5"),
+        ("a", TypeError, "got 'a'"),
+        (-1, gym.error.Error, "-1"),
+    ],
+)
+def test_seeds_of_another_form_are_refused(seed, error, word):
+    with pytest.raises(error, match=word):
+        native().reset(seed=seed)
+
+
+@pytest.mark.parametrize("count", [0, -1, 2.0, True])
+def test_the_number_of_worlds_is_a_positive_integer(count):
+    with pytest.raises(ValueError, match=r"num_envs must be an integer >= 1"):
+        LandmarkWorldVectorEnv(count)
+
+
+def test_a_limit_of_steps_is_a_positive_integer():
+    with pytest.raises(ValueError, match=r"max_episode_steps must be .* got 0"):
+        native(max_episode_steps=0)
+
+
+# --- the flat observation ---
+
+
+@pytest.mark.parametrize("mode", MODES, ids=str)
+@pytest.mark.parametrize("changes", [{}, EVERYTHING], ids=["plain", "everything"])
+def test_flat_observations_are_gymnasiums(mode, changes):
+    flat, nested = (
+        FlattenBatch(native(mode=mode, **changes)),
+        native(mode=mode, **changes),
+    )
+    space = nested.single_observation_space
+    assert flat.single_observation_space == gym.spaces.flatten_space(space)
+
+    def flattened(observations, world):
+        one = {key: value[world] for key, value in observations.items()}
+        return gym.spaces.flatten(space, one)
+
+    (rows, _), (observations, _) = (each.reset(seed=0) for each in (flat, nested))
+    rng = np.random.default_rng(0)
+    for _ in range(75):
+        assert rows in flat.observation_space
+        for world, row in enumerate(rows):
+            np.testing.assert_array_equal(row, flattened(observations, world))
+        commands = actions(rng)
+        rows, *_, truncated, infos = flat.step(commands)
+        observations, *_, expected = nested.step(commands)
+        for world in np.flatnonzero(truncated) if "final_obs" in infos else ():
+            last = gym.spaces.flatten(space, expected["final_obs"][world])
+            np.testing.assert_array_equal(infos["final_obs"][world], last)
+        if mode == AutoresetMode.DISABLED and truncated.any():
+            options = {"reset_mask": truncated}
+            (rows, _), (observations, _) = (
+                each.reset(options=options) for each in (flat, nested)
+            )
+
+
+def test_flat_observations_are_those_of_gymnasiums_own_wrapper():
+    flat, other = FlattenBatch(native()), FlattenObservation(native())
+    same(flat.reset(seed=0), other.reset(seed=0))
+    commands = np.full((WORLDS, 2), 0.2)
+    same(flat.step(commands), other.step(commands))
+    assert flat.observation_space == other.observation_space
+
+
+def test_only_one_level_of_arrays_can_be_flattened():
+    with pytest.raises(ValueError, match="Dict observation"):
+        FlattenBatch(gym.make_vec("CartPole-v1", 2, vectorization_mode="sync"))

@@ -1,0 +1,260 @@
+"""Worlds side by side, held against single worlds with the same seeds, bit by bit."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
+
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.envs.robot.unicycle_body import WallContacts
+from slamgym.envs.vector.world_batch import WorldBatch
+from slamgym.sim_configs import list_presets, load_scenario
+
+WORLDS, STEPS, SEED = 5, 400, 11
+WALLS = [[5.0, -2.0, 5.0, 2.0], [-4.0, 4.0, 9.0, 4.5], [1.0, -3.0, 3.0, -3.0]]
+MAP = {
+    "layout": "random",
+    "count": 30,
+    "bounds": [-9, -9, 9, 9],
+    "min_distance": 0.1,
+    "seed": None,
+}
+ROAMING = load_scenario("six_landmarks").with_changes(
+    dt=0.5,
+    steps=60,
+    motion={"std": [0.05, 0.03, 0.04]},
+    landmarks=MAP,
+    controls={"sequence": "circle", "radius": 3.0, "speed": 0.8},
+)
+HALF_BLIND = {"occlusion": True, "max_range": 8.0, "field_of_view": 3.0, "dropout": 0.2}
+HIDDEN = {"clutter": 1.0, "max_clutter": 5, "identities": False}
+ENCODERS = {"noise_in": "odometry", "noise_at_rest": False, "std": [0.05, 0.0, 0.04]}
+VARIANTS = {
+    "walls": {"walls": WALLS},
+    "walls that hide": {"walls": WALLS, "sensor": HALF_BLIND},
+    "everything": {"walls": WALLS, "sensor": {**HALF_BLIND, **HIDDEN}},
+    "hidden, no clutter": {"sensor": {"identities": False}},
+    "noise grows": {"sensor": {"range_std_per_metre": 0.3, "min_range": 0.0}},
+    "coarse": {"sensor": {"std": [1.0, 1.0], "min_range": 0.0}},
+    "one landmark": {"landmarks": {"layout": "points", "points": [[1.0, 2.0]]}},
+    "silent at rest": {"motion": {"noise_at_rest": False}},
+    "encoders": {"motion": ENCODERS, "start": {"drawn": "estimate", "std": [1, 1, 1]}},
+}
+SCENARIOS = {name: load_scenario(name) for name in list_presets()} | {
+    name: ROAMING.with_changes(**changes) for name, changes in VARIANTS.items()
+}
+
+NAMES = (
+    "measurements",
+    "mask",
+    "odometry",
+    "poses",
+    "collisions",
+    "landmark_ids",
+    "landmarks",
+    "start_estimates",
+)
+
+
+def generators(count=WORLDS, seed=SEED):
+    return [seeding.np_random(seed + i)[0] for i in range(count)]
+
+
+def begun(scenario=ROAMING, count=WORLDS):
+    batch = WorldBatch(scenario, count)
+    batch.reset(generators(count))
+    return batch
+
+
+def actions(rng, count=WORLDS):
+    """Wild ones, some beyond the limits, some of rest, half of them in float32."""
+    wild = rng.uniform((-0.8, -1.2), (1.6, 1.2), (count, 2))
+    wild[rng.random(count) < 0.1] = 0.0
+    return wild.astype(np.float32) if rng.random() < 0.5 else wild
+
+
+def bits(value):
+    array = np.asarray(value)
+    return array.dtype, array.shape, array.tobytes()
+
+
+def of_single(env, observation, info):
+    return {
+        "measurements": observation["landmarks"],
+        "mask": observation["mask"],
+        "odometry": observation["odometry"],
+        "poses": info["pose"],
+        "collisions": info["collision"],
+        "landmark_ids": info.get("landmark_ids"),
+        "landmarks": env.landmarks,
+        "start_estimates": env.start_estimate,
+    }
+
+
+def of_batch(batch, world):
+    names = [name for name in NAMES if getattr(batch, name) is not None]
+    values = {name: getattr(batch, name)[world] for name in names}
+    return {"landmark_ids": None, **values}
+
+
+def assert_equal_worlds(batch, singles):
+    for world, moment in enumerate(singles):
+        of_this = of_batch(batch, world)
+        for name, value in of_single(*moment).items():
+            assert bits(value) == bits(of_this[name]), (name, world)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_each_world_is_the_single_world_of_its_generator(name):
+    """Through resets of some worlds, and steps that some worlds do not take."""
+    batch = begun(SCENARIOS[name])
+    rngs = generators()
+    batch.reset(rngs)
+    envs = [LandmarkWorldEnv(SCENARIOS[name]) for _ in range(WORLDS)]
+    singles = [(env, *env.reset(seed=SEED + i)) for i, env in enumerate(envs)]
+    rng = np.random.default_rng(0)
+    steps_left = rng.integers(10, 40, WORLDS)
+    for step in range(STEPS):
+        assert_equal_worlds(batch, singles)
+        commands = actions(rng)
+        moving = rng.random(WORLDS) < (1.0 if step < 50 else 0.9)
+        batch.step(commands, moving=None if moving.all() else moving)
+        for world in np.flatnonzero(moving):
+            observation, _, _, _, info = envs[world].step(commands[world])
+            singles[world] = envs[world], observation, info
+        steps_left -= 1
+        ended = steps_left < 0
+        if ended.any():
+            batch.reset(rngs, ended)
+        for world in np.flatnonzero(ended):
+            singles[world] = envs[world], *envs[world].reset()
+            steps_left[world] = rng.integers(10, 160)
+
+
+def test_variants_meet_walls_lose_readings_and_see_clutter():
+    """What the comparison above rests on."""
+    batch, rng = begun(SCENARIOS["everything"]), np.random.default_rng(0)
+    hits, clutter, seen = 0, 0, []
+    for _ in range(200):
+        batch.step(actions(rng))
+        hits += np.count_nonzero(batch.collisions)
+        clutter += np.count_nonzero(batch.mask & (batch.landmark_ids < 0))
+        seen.append(batch.mask.mean())
+    assert hits > 20
+    assert clutter > 100
+    assert 0.02 < np.mean(seen) < 0.5
+
+
+def test_the_number_of_worlds_changes_no_world():
+    few, many = begun(count=2), begun(count=40)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        commands = actions(rng, 40)
+        few.step(commands[:2])
+        many.step(commands)
+    for name in ("measurements", "mask", "poses"):
+        assert bits(getattr(few, name)) == bits(getattr(many, name)[:2])
+
+
+def test_nothing_handed_out_is_written_into_or_heeded_later():
+    batch, twin = begun(), begun()
+    kept, values = [], []
+    for _ in range(6):
+        for worlds in (batch, twin):
+            worlds.step(np.full((WORLDS, 2), 0.3))
+        arrays = handed_out(batch)
+        for array, other in zip(arrays, handed_out(twin), strict=True):
+            assert bits(array) == bits(other)
+            assert not any(np.shares_memory(array, old) for old in kept)
+            array[...] = 7
+        kept += arrays
+        values += [bits(array) for array in arrays]
+    assert [bits(array) for array in kept] == values
+
+
+def handed_out(batch):
+    return [getattr(batch, name) for name in NAMES if name != "landmark_ids"]
+
+
+def pickled(batch):
+    return pickle.loads(pickle.dumps(batch))
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, pickled])
+def test_a_copy_goes_on_as_the_original_would(duplicate):
+    batch = begun(SCENARIOS["everything"])
+    rng = np.random.default_rng(0)
+    batch.step(actions(rng))
+    other = duplicate(batch)
+    for _ in range(150):  # beyond the noise drawn ahead
+        commands = actions(rng)
+        batch.step(commands)
+        other.step(commands)
+        assert bits(batch.measurements) == bits(other.measurements)
+        assert bits(batch.poses) == bits(other.poses)
+
+
+# --- walls ---
+
+
+def test_free_shares_are_the_single_ones_near_and_far_from_walls():
+    contacts = WallContacts(0.2, WALLS)
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-8, 10, (2, 3000))
+    dx, dy = rng.normal(0.0, 1.0, (2, 3000)) * rng.choice([0.01, 0.3, 3.0], 3000)
+    expected = [contacts.free_share(*each) for each in zip(x, y, dx, dy, strict=True)]
+    assert 50 < np.count_nonzero(np.less(expected, 1.0)) < 2500
+    assert bits(contacts.free_shares(x, y, dx, dy)) == bits(expected)
+
+
+# --- bad input ---
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_an_action_that_is_no_number_names_its_world_and_moves_none(bad):
+    batch, twin = begun(), begun()
+    commands = np.zeros((WORLDS, 2))
+    commands[3, 1] = bad
+    with pytest.raises(ValueError, match=rf"finite.*\[0\.0, {bad}\] for world 3"):
+        batch.step(commands)
+    moving = np.arange(WORLDS) != 3
+    batch.step(commands, moving)
+    twin.step(np.zeros((WORLDS, 2)), moving)
+    assert bits(batch.poses) == bits(twin.poses)
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.zeros(2), np.zeros((4, 2)), np.zeros((5, 3)), [[0, 0]] * 4 + [[0]]]
+)
+def test_actions_of_another_shape_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"actions must be .* shape \(5, 2\)"):
+        begun().step(wrong)
+
+
+@pytest.mark.parametrize("dtype", [object, str, complex, bool])
+def test_actions_of_another_kind_are_refused(dtype):
+    with pytest.raises(ValueError, match=r"actions must be real numbers"):
+        begun().step(np.zeros((WORLDS, 2), dtype=dtype))
+
+
+def test_worlds_that_have_not_begun_do_not_step():
+    batch = WorldBatch(ROAMING, WORLDS)
+    with pytest.raises(ResetNeeded, match="reset before step"):
+        batch.step(np.zeros((WORLDS, 2)))
+    with pytest.raises(ResetNeeded, match="all worlds first"):
+        batch.reset(generators(), np.arange(WORLDS) < 3)
+
+
+def test_choices_and_generators_of_another_form_are_refused():
+    batch = begun()
+    with pytest.raises(ValueError, match=r"worlds must be a bool .* got int64"):
+        batch.reset(generators(), np.arange(WORLDS))
+    with pytest.raises(ValueError, match=r"moving must be .* \(5,\), .* \(4,\)"):
+        batch.step(np.zeros((WORLDS, 2)), np.ones(4, dtype=bool))
+    with pytest.raises(ValueError, match=r"generators must be 5.* got 4"):
+        batch.reset(generators(4))
+    with pytest.raises(ValueError, match="count must be >= 1, got 0"):
+        WorldBatch(ROAMING, 0)

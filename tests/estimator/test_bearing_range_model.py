@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numeric_jacobian import numeric_jacobian
+
+from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import locate_landmark, predict_measurement
+
+POSE = np.array([0.5, -1.0, 2.5])
+LANDMARKS = np.array([[3.0, 4.0], [-6.0, 1.0], [0.5, -9.0]])
+
+
+def test_pose_jacobian_equals_central_differences():
+    numeric = numeric_jacobian(
+        lambda p: predict_measurement(p, LANDMARKS).measurement, POSE
+    )
+    np.testing.assert_allclose(
+        predict_measurement(POSE, LANDMARKS).jacobian_pose, numeric, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("k", range(3))
+def test_landmark_jacobian_equals_central_differences(k):
+    numeric = numeric_jacobian(
+        lambda point: predict_measurement(POSE, point[None]).measurement[0],
+        LANDMARKS[k],
+    )
+    analytic = predict_measurement(POSE, LANDMARKS).jacobian_landmark[k]
+    np.testing.assert_allclose(analytic, numeric, atol=1e-7)
+
+
+def test_locating_a_prediction_returns_the_landmark():
+    readings = predict_measurement(POSE, LANDMARKS).measurement
+    np.testing.assert_allclose(
+        locate_landmark(POSE, readings).position, LANDMARKS, atol=1e-12
+    )
+
+
+def test_locate_jacobians_equal_central_differences():
+    readings = predict_measurement(POSE, LANDMARKS).measurement
+    located = locate_landmark(POSE, readings)
+    numeric = numeric_jacobian(lambda p: locate_landmark(p, readings).position, POSE)
+    np.testing.assert_allclose(located.jacobian_pose, numeric, atol=1e-7)
+    for k in range(3):
+        numeric = numeric_jacobian(
+            lambda z: locate_landmark(POSE, z[None]).position[0], readings[k]
+        )
+        np.testing.assert_allclose(located.jacobian_measurement[k], numeric, atol=1e-7)
+
+
+@given(st.floats(-1e6, 1e6))
+def test_a_wrapped_angle_points_the_same_way_within_the_half_open_interval(angle):
+    wrapped = float(wrap_angle(angle))
+    assert -np.pi <= wrapped < np.pi
+    np.testing.assert_allclose(
+        np.exp(1j * wrapped), np.exp(1j * angle), atol=1e-9, rtol=0
+    )
+
+
+@pytest.mark.parametrize("angle", [-np.pi - 1e-16, -np.pi, np.pi, 3 * np.pi])
+def test_angles_at_the_seam_are_minus_pi(angle):
+    assert wrap_angle(angle) == pytest.approx(-np.pi)
+    assert wrap_angle(np.nextafter(-np.pi, -4)) < np.pi

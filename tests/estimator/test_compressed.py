@@ -1,0 +1,542 @@
+"""The compressed filter is the full filter: whatever it puts off, nothing is lost."""
+
+import io
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drives import MEASUREMENT_STD
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from town_drives import TOWN_MOTION_STD, map_all, wander
+
+from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
+from slamgym.estimator.interface import Belief
+from slamgym.estimator.large_maps.compressed import active_set
+from slamgym.estimator.large_maps.compressed.compressed_slam import (
+    BASES,
+    CompressedEkfSlam,
+)
+from slamgym.estimator.large_maps.compressed.deferred_covariance import (
+    BLOCK,
+    DeferredCovariance,
+)
+from slamgym.estimator.map_management.map_editor import access_to
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from growing_maps_peers import FullWithDsyrk
+
+NOISE = (TOWN_MOTION_STD, MEASUREMENT_STD)
+WHOLE = active_set.WHOLE
+
+
+@pytest.fixture(autouse=True)
+def _small_maps_are_split_too(monkeypatch):
+    """So that what is put off is tested where tests are fast."""
+    monkeypatch.setattr(active_set, "WHOLE", 0)
+
+
+@pytest.fixture
+def _small_maps_are_whole(monkeypatch):
+    """As the filter does unless told a local size."""
+    monkeypatch.setattr(active_set, "WHOLE", WHOLE)
+
+
+def forget(full, ids):
+    """Marginalise landmarks out of a full filter, by way of its state."""
+    state = full.state_dict()
+    stays = ~np.isin(state["landmark_ids"], ids)
+    keep = np.concatenate([[True] * 3, np.repeat(stays, 2)])
+    full.load_state_dict(
+        state
+        | {
+            "mean": state["mean"][keep],
+            "reference": state["reference"][keep],
+            "covariance": state["covariance"][np.ix_(keep, keep)],
+            "landmark_ids": state["landmark_ids"][stays],
+        }
+    )
+
+
+def assert_equal_beliefs(one, other):
+    assert one.landmark_ids == other.landmark_ids
+    assert one.frame == other.frame
+    np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-10)
+
+
+def assert_same_bits(one, other):
+    assert one.landmark_ids == other.landmark_ids
+    np.testing.assert_array_equal(one.mean, other.mean)
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def run(slam, drive):
+    for odometry, readings, ids in drive:
+        slam.predict(odometry)
+        slam.update(readings, ids)
+    return slam
+
+
+def follow_both(
+    base, count, steps, *, mapped=False, jumping=False, every=50, **options
+):
+    """Run full and compressed filter side by side, landmarks removed on the way."""
+    rng = np.random.default_rng(3)
+    full, slam = BASES[base](*NOISE), CompressedEkfSlam(*NOISE, base=base, **options)
+    if mapped:
+        map_all(full, count)
+        map_all(slam, count)
+    phases = 0
+    for step, (odometry, readings, ids) in enumerate(
+        wander(count, steps, jumping=jumping)
+    ):
+        before = slam.local_ids
+        full.predict(odometry)
+        slam.predict(odometry)
+        expected, report = full.update(readings, ids), slam.update(readings, ids)
+        phases += not set(before) <= set(slam.local_ids)
+        assert report.associated_ids == expected.associated_ids
+        assert report.added_ids == expected.added_ids
+        assert report.nis == pytest.approx(expected.nis, rel=1e-6, abs=1e-6)
+        if step % every == every - 1:
+            assert_equal_beliefs(slam.belief(), full.belief())
+            near = list(slam.local_ids)[::4]
+            far = [i for i in slam.landmark_ids if i not in slam.local_ids]
+            gone = near + rng.permutation(far)[:3].tolist()
+            forget(full, gone)
+            slam.remove(gone)
+    assert_equal_beliefs(slam.belief(), full.belief())
+    return slam, phases
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_it_keeps_the_contract(base):
+    check_estimator(lambda **noise: CompressedEkfSlam(base=base, **noise))
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_it_equals_the_full_filter_while_300_landmarks_come_and_go(base):
+    slam, phases = follow_both(base, 300, 1000, mapped=True)
+    assert 50 < len(slam.landmark_ids) < 280
+    assert phases > 20
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_it_equals_the_full_filter_while_1000_landmarks_come_and_go(base):
+    _, phases = follow_both(base, 1000, 1000, mapped=True, every=100)
+    assert phases > 3
+
+
+def test_it_equals_the_full_filter_over_1000_steps_among_1000_landmarks():
+    """With a twin in numpy and BLAS for the full filter, not its own kernels."""
+    slam = map_all(CompressedEkfSlam(*NOISE), 1000)
+    start = slam.belief()
+    full = FullWithDsyrk(start.mean, start.covariance, *map(np.array, NOISE))
+    for odometry, readings, ids in wander(1000, 1000):
+        full.predict(odometry)
+        full.update(readings, ids)
+        slam.predict(odometry)
+        slam.update(readings, ids)
+    lower = np.tril(full.covariance)
+    covariance = lower + np.tril(lower, -1).T
+    assert_equal_beliefs(
+        slam.belief(), Belief(full.mean, covariance, tuple(range(1000)))
+    )
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_every_base_stays_itself_where_readings_jump_about_the_map(base):
+    follow_both(base, 100, 60, mapped=True, jumping=True, every=20)
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_it_equals_the_full_filter_while_it_explores(base):
+    slam, phases = follow_both(base, 1000, 900, every=450)
+    assert len(slam.landmark_ids) > 100
+    assert phases > 5
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_it_equals_the_full_filter_at_a_local_size_of_the_users_choice(base):
+    slam, phases = follow_both(base, 150, 200, mapped=True, local_size=12)
+    assert phases > 10
+    assert len(slam.local_ids) <= 18 + 10
+
+
+def test_over_20000_steps_it_stays_symmetric_and_positive_definite():
+    slam = run(CompressedEkfSlam(*NOISE), wander(120, 20_000, seen=4))
+    belief = slam.belief()
+    assert len(belief.landmark_ids) > 100
+    np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
+    assert np.linalg.eigvalsh(belief.covariance).min() > 0
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_a_part_of_the_belief_is_that_part_of_the_whole(base):
+    slam = map_all(CompressedEkfSlam(*NOISE, base=base), 300)
+    rng = np.random.default_rng(0)
+    for odometry, readings, ids in wander(300, 40):
+        slam.predict(odometry)
+        slam.update(readings, ids)
+        some = [*rng.permutation(slam.local_ids)[:2], *rng.permutation(300)[:4]]
+        some = list(dict.fromkeys(int(i) for i in some))
+        part, whole = slam.belief(some), slam.belief()
+        rows = [whole.landmark_ids.index(i) for i in some]
+        entries = [0, 1, 2, *(3 + 2 * r + axis for r in rows for axis in (0, 1))]
+        assert part.landmark_ids == tuple(some)
+        np.testing.assert_allclose(part.mean, whole.mean[entries], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(
+            part.covariance, whole.covariance[np.ix_(entries, entries)], atol=1e-13
+        )
+        np.testing.assert_array_equal(slam.belief([]).pose, whole.pose)
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_to_ask_for_the_belief_changes_nothing(base):
+    quiet, asked = (CompressedEkfSlam(*NOISE, base=base) for _ in range(2))
+    run(quiet, wander(200, 150))
+    for odometry, readings, ids in wander(200, 150):
+        asked.predict(odometry)
+        asked.update(readings, ids)
+        asked.belief([])
+        asked.belief()
+    assert_same_bits(quiet.belief(), asked.belief())
+
+
+@pytest.mark.parametrize("near", [True, False])
+def test_to_remove_landmarks_leaves_all_else_exactly_as_it_was(near):
+    slam = run(CompressedEkfSlam(*NOISE, base="invariant"), wander(200, 150))
+    before = slam.belief()
+    gone = [i for i in slam.landmark_ids if (i in slam.local_ids) == near][::3]
+    slam.remove(gone)
+    after = slam.belief()
+    stays = ~np.isin(before.landmark_ids, gone)
+    keep = np.concatenate([[True] * 3, np.repeat(stays, 2)])
+    assert after.landmark_ids == tuple(np.array(before.landmark_ids)[stays].tolist())
+    np.testing.assert_array_equal(after.mean, before.mean[keep])
+    np.testing.assert_allclose(
+        after.covariance, before.covariance[np.ix_(keep, keep)], rtol=0, atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant", "first_estimates"])
+@pytest.mark.parametrize("jumping", [False, True])
+def test_a_merge_is_that_of_the_full_filter(base, jumping):
+    count = 60
+    slam, full = CompressedEkfSlam(*NOISE, base=base), BASES[base](*NOISE)
+    for step, (odometry, readings, ids) in enumerate(
+        wander(count, 300, jumping=jumping)
+    ):
+        told = np.where((ids < 10) & (100 <= step < 200), ids + count, ids)
+        for each in (slam, full):
+            each.predict(odometry)
+            each.update(readings, told)
+        if step == 200:
+            twice = [i for i in range(10) if {i, i + count} <= set(slam.landmark_ids)]
+            assert len(twice) > 1
+            for i in twice:
+                slam.merge(i, i + count)
+                access_to(full).merge(i, i + count)
+            assert_equal_beliefs(slam.belief(), full.belief())
+    assert_equal_beliefs(slam.belief(), full.belief())
+
+
+def test_a_landmark_removed_and_seen_again_is_a_new_one():
+    slam = run(CompressedEkfSlam(*NOISE), wander(200, 150))
+    first, last = slam.landmark_ids[0], slam.local_ids[-1]
+    slam.remove([first, last])
+    report = slam.update([(0.1, 3.0), (0.5, 4.0)], [last, first])
+    assert report.added_ids == (last, first)
+    assert slam.landmark_ids[-2:] == (last, first)
+
+
+def through_pickle(state):
+    return pickle.loads(pickle.dumps(state))
+
+
+def through_npz(state):
+    file = io.BytesIO()
+    np.savez(file, **state)
+    file.seek(0)
+    return dict(np.load(file))
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+@pytest.mark.parametrize("jumping", [False, True])
+def test_a_run_stopped_at_any_step_continues_bit_for_bit(base, jumping):
+    drive = list(wander(300, 130, jumping=jumping))
+    slam = map_all(CompressedEkfSlam(*NOISE, base=base), 300)
+    saved = []
+    for odometry, readings, ids in drive:
+        slam.predict(odometry)
+        saved.append(slam.state_dict())
+        slam.update(readings, ids)
+    assert len({state["far_progress"][1] for state in saved}) > 1  # amid the work
+    assert len({len(state["far_pending_signs"]) for state in saved}) > 1
+    for step in range(0, 130, 9):
+        travel = (through_npz, through_pickle)[step % 2]
+        other = CompressedEkfSlam(*NOISE, base=base)
+        other.load_state_dict(travel(saved[step]))
+        other.update(*drive[step][1:])
+        run(other, drive[step + 1 :])
+        assert_same_bits(other.belief(), slam.belief())
+        found, expected = other.state_dict(), slam.state_dict()
+        assert found.keys() == expected.keys()
+        for key, value in found.items():
+            np.testing.assert_array_equal(value, expected[key], err_msg=key)
+
+
+def test_a_saved_run_continues_bit_for_bit_in_another_process(tmp_path):
+    code = """
+import pickle, sys
+sys.path.insert(0, sys.argv[2])
+from test_compressed import NOISE, CompressedEkfSlam, map_all, run, wander
+slam = CompressedEkfSlam(*NOISE, base="invariant")
+drive, saved = list(wander(300, 60)), sys.argv[1] + "/saved.pickle"
+if sys.argv[3] == "first":
+    run(map_all(slam, 300), drive[:25])
+    pickle.dump(slam.state_dict(), open(saved, "wb"))
+else:
+    slam.load_state_dict(pickle.load(open(saved, "rb")))
+run(slam, drive[25:])
+belief = slam.belief()
+print(belief.mean.tobytes().hex(), belief.covariance.tobytes().hex())
+"""
+    run(CompressedEkfSlam(*NOISE, base="invariant"), wander(300, 60))  # compiles
+    here = str(Path(__file__).parents[1] / "support")
+    first, second = (
+        subprocess.run(
+            [sys.executable, "-c", code, str(tmp_path), here, which],
+            check=True,
+            capture_output=True,
+        ).stdout
+        for which in ("first", "second")
+    )
+    assert len(first) > 600 * 600
+    assert first == second
+
+
+def test_a_state_is_shared_with_nobody():
+    slam = map_all(CompressedEkfSlam(*NOISE), 200)
+    drive = list(wander(200, 150))
+    run(slam, drive[:50])
+    state = slam.state_dict()
+    kept = pickle.dumps(state)
+    other = CompressedEkfSlam(*NOISE)
+    other.load_state_dict(state)
+    for each in (slam, other):
+        near = each.local_ids
+        run(each, drive[50:])
+        assert each.local_ids != near
+    assert pickle.dumps(state) == kept
+
+
+@pytest.mark.parametrize("jumping", [False, True])
+def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
+    count, seen = 400, 10
+    apply, done = DeferredCovariance._apply, []
+
+    def counted(self, k):
+        done[-1] += len(self._pending[0].signs) * self._blocks[k].size
+        apply(self, k)
+
+    slam = map_all(CompressedEkfSlam(*NOISE), count)
+    monkeypatch.setattr(DeferredCovariance, "_apply", counted)
+    waiting = []
+    for odometry, readings, ids in wander(count, 150, seen=seen, jumping=jumping):
+        slam.predict(odometry)
+        done.append(0)
+        slam.update(readings, ids)
+        waiting.append(slam._far.pending_rank)
+    full = 2 * seen * (2 * count) ** 2 / 2
+    assert max(done) < 2 * full
+    assert sum(step > 0 for step in done) > 5
+    assert max(waiting) < 150  # and nothing piles up
+
+
+def test_what_it_stores_is_about_half_a_covariance():
+    slam = map_all(CompressedEkfSlam(*NOISE), 1000)
+    run(slam, wander(1000, 20))
+    assert slam.nbytes < 0.65 * 8 * 2003**2
+
+
+def test_a_local_size_below_a_scan_is_refused():
+    slam = CompressedEkfSlam(*NOISE, local_size=5)
+    readings, ids = np.full((6, 2), 1.0), range(6)
+    slam.update(readings, ids)
+    before = slam.belief()
+    with pytest.raises(
+        ValueError, match=r"local_size must be >= 6, the mapped landmarks .*, got 5"
+    ):
+        slam.update(readings, ids)
+    assert_same_bits(before, slam.belief())
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: CompressedEkfSlam(*NOISE, base="robocentric"),
+         r"base must be 'ekf' or .*, got 'robocentric'"),
+        (lambda: CompressedEkfSlam(*NOISE, local_size=0),
+         r"local_size must be a whole number >= 1, got 0"),
+        (lambda: CompressedEkfSlam(*NOISE).belief([3]),
+         r"landmark_ids must be of mapped landmarks, got 3"),
+        (lambda: CompressedEkfSlam(*NOISE).remove([3]),
+         r"landmark_ids must be of mapped landmarks, got 3"),
+        (lambda: CompressedEkfSlam(*NOISE).update([(0.0, 1.0)], [-(2**63)]),
+         r"landmark_ids must be >= -\d+, got -9223372036854775808"),
+        (lambda: CompressedEkfSlam(*NOISE).update([(0.0, 1.0)]),
+         r"landmark_ids must be given: CompressedEkfSlam does not associate"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
+def test_a_refused_reading_leaves_everything_as_it_was_also_before_a_new_phase(bad):
+    slam = map_all(CompressedEkfSlam(*NOISE), 100)
+    run(slam, wander(100, 5))
+    far = next(i for i in slam.landmark_ids if i not in slam.local_ids)
+    before = slam.belief()
+    with pytest.raises(ValueError, match=rf"measurements must .*\(landmark {far}\)"):
+        slam.update([(0.0, bad)], [far])
+    assert_same_bits(before, slam.belief())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"estimator": np.array("EkfSlam")}, "state is of EkfSlam, not of Compressed"),
+        ({"base": np.array("EkfSlam")}, "state is of EkfSlam, not of InvariantEkfSlam"),
+        ({"strip": np.zeros((3, 3))}, r"state\['strip'\] must fit"),
+        ({"slots": np.zeros(3, dtype=int)}, r"state\['slots'\] must have one entry"),
+        ({"points": np.zeros(3)}, r"state\['points'\] must be \d+ finite numbers"),
+        ({"far_covariance": np.zeros(7)}, "must be whole blocks of rows"),
+        ({"far_pending_root": np.zeros((7, 0))}, "pending downdates must have shape"),
+        ({"local_mean": np.zeros(4)}, r"state\['mean'\] must be"),
+        ({"origin": None}, "state must hold 'origin'"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(change, message):
+    slam = run(CompressedEkfSlam(*NOISE, base="invariant"), wander(100, 60))
+    before, state = slam.belief(), slam.state_dict() | change
+    state = {key: value for key, value in state.items() if value is not None}
+    with pytest.raises(ValueError, match=message):
+        slam.load_state_dict(state)
+    assert_same_bits(before, slam.belief())
+
+
+def test_a_restart_forgets_the_map():
+    slam = run(CompressedEkfSlam(*NOISE, base="invariant"), wander(200, 100))
+    slam.reset((1.0, 2.0, 0.5), (0.1, 0.1, 0.1))
+    fresh = CompressedEkfSlam(
+        *NOISE,
+        base="invariant",
+        initial_pose=(1.0, 2.0, 0.5),
+        initial_pose_std=(0.1, 0.1, 0.1),
+    )
+    for each in (slam, fresh):
+        run(each, wander(200, 120))
+    assert_same_bits(slam.belief(), fresh.belief())
+
+
+def test_bases_are_what_they_say():
+    assert BASES["ekf"] is EkfSlam
+    assert BASES["invariant"] is InvariantEkfSlam
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_stored_covariance_is_that_of_a_dense_matrix(seed):
+    """Any order of reading, putting back, deferring and working."""
+    rng = np.random.default_rng(seed)
+    width = 3 * BLOCK
+    store, dense = DeferredCovariance(), np.zeros((width, width))
+    store.make_room(width)
+    taken = np.empty(0, dtype=np.int64)
+    for _ in range(12):
+        if len(taken):  # put back, changed
+            rows = rng.standard_normal((len(taken), width))
+            rows[:, taken] += rows[:, taken].T
+            dense[taken], dense[:, taken] = rows, rows.T
+            places = rng.permutation(len(taken))
+            store.put(taken, rows[np.argsort(places)], places)
+        taken = np.sort(rng.choice(width, rng.integers(1, 9), replace=False))
+        rows = np.empty((len(taken), width))
+        store.read(taken, rows)
+        np.testing.assert_allclose(rows, dense[taken], atol=1e-10)
+        root = rng.standard_normal((width, rng.integers(1, 60)))
+        signs = rng.choice([-1.0, 1.0], root.shape[1])
+        store.defer(root.copy(), signs)
+        dense -= (root * signs) @ root.T
+        store.work(int(rng.integers(0, 60)))
+        other = np.setdiff1d(rng.choice(width, 20, replace=False), taken)
+        rng.shuffle(other)
+        expected = dense[np.ix_(other, other)]
+        np.testing.assert_allclose(store.marginal(other), expected, atol=1e-10)
+
+
+@pytest.mark.usefixtures("_small_maps_are_whole")
+@pytest.mark.parametrize("base", BASES)
+def test_in_a_small_map_it_has_the_bits_of_the_full_filter(base):
+    full, slam = BASES[base](*NOISE), CompressedEkfSlam(*NOISE, base=base)
+    for odometry, readings, ids in wander(100, 60, jumping=True):
+        for each in (full, slam):
+            each.predict(odometry)
+            each.update(readings, ids)
+    assert slam.local_ids == slam.landmark_ids
+    assert_same_bits(slam.belief(), full.belief())
+
+
+@pytest.mark.usefixtures("_small_maps_are_whole")
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_a_map_may_grow_beyond_a_small_one_and_become_small_again(base):
+    full, slam = BASES[base](*NOISE), CompressedEkfSlam(*NOISE, base=base)
+    resumed = CompressedEkfSlam(*NOISE, base=base)
+    for each in (full, slam):
+        map_all(each, WHOLE)
+    assert slam.local_ids == slam.landmark_ids
+    larger = map_all(slam, WHOLE + 40), map_all(full, WHOLE + 40)
+    for step, (odometry, readings, ids) in enumerate(wander(WHOLE + 40, 60)):
+        if step == 30:
+            assert len(slam.local_ids) < 60
+            gone = [i for i in range(WHOLE + 40) if i not in ids][: WHOLE // 2]
+            slam.remove(gone)
+            forget(full, gone)
+        for each in larger:
+            each.predict(odometry)
+            each.update(readings, ids)
+        if step % 10 == 9:
+            resumed.load_state_dict(slam.state_dict())
+            assert_same_bits(resumed.belief(), slam.belief())
+    assert set(slam.local_ids) == set(slam.landmark_ids)
+    assert_equal_beliefs(slam.belief(), full.belief())
+
+
+@pytest.mark.usefixtures("_small_maps_are_whole")
+def test_a_local_size_asked_for_holds_in_a_small_map_too():
+    slam = run(CompressedEkfSlam(*NOISE, local_size=12), wander(100, 60))
+    assert len(slam.local_ids) <= 18 + 10 < len(slam.landmark_ids)
+
+
+def test_a_filter_that_was_continued_from_a_saved_state_begins_phases_alike():
+    """Its arrays have another capacity, and must be as empty behind what is in use."""
+    drive = list(wander(300, 120))
+    slam = run(map_all(CompressedEkfSlam(*NOISE), 300), drive[:60])
+    other = CompressedEkfSlam(*NOISE)
+    other.load_state_dict(slam.state_dict())
+    for each in (slam, other):
+        near = each.local_ids
+        run(each, drive[60:])
+        assert each.local_ids != near
+        size = each._local._size
+        for array in (each._local._mean, each._local._covariance):
+            assert not array[size:].any()
+        assert not each._local._covariance[:, size:].any()
+    assert_same_bits(slam.belief(), other.belief())

@@ -1,0 +1,210 @@
+"""Which landmark a reading is of, in the map and outside it."""
+
+import numpy as np
+import pytest
+from numeric_jacobian import numeric_jacobian
+
+from slamgym.envs.landmark_world import LandmarkWorldEnv
+from slamgym.estimator import make_estimator
+from slamgym.estimator.association.nearest_neighbour import (
+    AMBIGUOUS,
+    NEW,
+    Distances,
+    innovation_distances,
+    nearest_neighbours,
+)
+from slamgym.estimator.association.tentative_landmarks import TentativeLandmarks
+from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.sim_configs import action_sequence, load_scenario
+
+NOISE = (0.02, 0.1, 0.01)
+SHARP = (0.01, 0.05, 0.0)
+
+
+def random_belief(seed, landmarks=12):
+    rng = np.random.default_rng(seed)
+    size = 3 + 2 * landmarks
+    root = rng.standard_normal((size, size)) * rng.uniform(0.01, 0.2, size)
+    mean = rng.uniform(-10, 10, size)
+    return mean, root @ root.T
+
+
+def dense_distance(mean, P, slot, reading, noise):
+    """νᵀ S⁻¹ ν and ln det S from the model's own Jacobians, stacked over the state."""
+    landmark = mean[3 + 2 * slot : 5 + 2 * slot]
+    expected = predict_measurement(mean[:3], landmark[None])
+    H = np.zeros((2, len(mean)))
+    H[:, :3] = expected.jacobian_pose[0]
+    H[:, 3 + 2 * slot : 5 + 2 * slot] = expected.jacobian_landmark[0]
+    Q = np.diag([noise[0], noise[1] + noise[2] * reading[1]]) ** 2
+    S = H @ P @ H.T + Q
+    nu = reading - expected.measurement[0]
+    nu[0] = wrap_angle(nu[0])
+    return nu @ np.linalg.solve(S, nu), np.linalg.slogdet(S).logabsdet
+
+
+def noisy_readings(mean, slots, rng, spread):
+    landmarks = mean[3:].reshape(-1, 2)[slots]
+    exact = predict_measurement(mean[:3], landmarks).measurement
+    return exact + spread * rng.standard_normal(exact.shape)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_distances_are_those_of_the_dense_model_and_none_is_forgotten(seed):
+    mean, P = random_belief(seed)
+    rng = np.random.default_rng(seed)
+    readings = noisy_readings(mean, np.arange(12), rng, (0.3, 1.0))
+    readings[3, 0] += 4 * np.pi
+    room = np.zeros((40, 40))
+    room[:27, :27] = P
+    fit = innovation_distances(
+        np.append(mean, np.zeros(13)), room, 12, readings, NOISE, 25.0
+    )
+    within = 0
+    for k in range(12):
+        for j in range(12):
+            squared, log_det = dense_distance(mean, P, j, readings[k], NOISE)
+            if squared <= 25.0:
+                within += 1
+                assert fit.squared[k, j] == pytest.approx(squared, rel=1e-9)
+                assert fit.unlikelihood[k, j] == pytest.approx(
+                    squared + log_det, rel=1e-9
+                )
+            else:
+                assert fit.squared[k, j] == fit.unlikelihood[k, j] == np.inf
+    assert within > 12
+
+
+def fit_of(squared, log_det=0.0):
+    squared = np.array(squared, dtype=float)
+    return Distances(squared, squared + np.asarray(log_det))
+
+
+FAR = np.inf
+
+
+@pytest.mark.parametrize(
+    ("squared", "log_det", "ambiguity", "expected"),
+    [
+        ([[1, FAR], [FAR, 2]], 0, 0, [0, 1]),
+        ([[FAR, FAR]], 0, 0, [NEW]),
+        ([[12, FAR]], 0, 0, [AMBIGUOUS]),  # neither near enough nor far enough
+        ([[1, FAR], [4, FAR]], 0, 0, [0, AMBIGUOUS]),  # a landmark is seen but once
+        ([[1, 2]], 0, 0, [0]),
+        ([[1, 2]], 0, 3, [AMBIGUOUS]),
+        ([[1, 5]], 0, 3, [0]),
+        ([[2, 1]], [[0, 4]], 0, [0]),  # the likelier one, not the one fewer σ away
+        ([[1, 8], [2, 9]], 0, 0, [0, AMBIGUOUS]),
+        ([[], []], np.empty((2, 0)), 0, [NEW, NEW]),
+    ],
+)
+def test_every_reading_gets_one_landmark_or_none(squared, log_det, ambiguity, expected):
+    fit = fit_of(squared, log_det)
+    slots = nearest_neighbours(fit, match=9.21, new=25.0, ambiguity=ambiguity)
+    assert slots.tolist() == expected
+
+
+# --- tentative landmarks ---
+
+
+def tracked(readings):
+    return TentativeLandmarks.none().with_new(np.array(readings, dtype=float), NOISE)
+
+
+def test_a_tentative_landmark_starts_where_it_was_read():
+    reading = np.array([0.7, 6.0])
+    one = tracked([reading])
+
+    def place(z):
+        return z[1] * np.array([np.cos(z[0]), np.sin(z[0])])
+
+    J = numeric_jacobian(place, reading)
+    Q = np.diag([NOISE[0], NOISE[1] + NOISE[2] * 6.0]) ** 2
+    np.testing.assert_allclose(one.places[0], place(reading))
+    np.testing.assert_allclose(one.covariances[0], J @ Q @ J.T, rtol=1e-6)
+
+
+def test_odometry_moves_a_tentative_landmark_and_its_doubt():
+    one, motion_std = tracked([(0.7, 6.0)]), np.array([0.3, 0.2, 0.1])
+    moved = one.moved(1.5, 0.4, motion_std**2)
+
+    def in_robot_frame(values):
+        q, slip = values[:2], values[2:]
+        pose = predict_pose(np.zeros(3), np.array([1.5, 0.4]))
+        x, y, heading = pose.pose + pose.jacobian_noise @ slip
+        c, s = np.cos(heading), np.sin(heading)
+        return np.array([[c, s], [-s, c]]) @ (q - (x, y))
+
+    at = np.concatenate([one.places[0], np.zeros(3)])
+    J = numeric_jacobian(in_robot_frame, at)
+    P = np.zeros((5, 5))
+    P[:2, :2], P[2:, 2:] = one.covariances[0], np.diag(motion_std**2)
+    np.testing.assert_allclose(moved.places[0], in_robot_frame(at), atol=1e-12)
+    np.testing.assert_allclose(moved.covariances[0], J @ P @ J.T, rtol=1e-6)
+
+
+def test_a_sighting_corrects_a_tentative_landmark_like_any_filter():
+    one, reading = tracked([(0.7, 6.0)]).moved(1.0, 0.2, np.ones(3) * 0.01), (0.6, 5.2)
+    P = np.zeros((5, 5))
+    P[3:, 3:] = one.covariances[0]
+    expected = predict_measurement(np.zeros(3), one.places)
+    H = expected.jacobian_landmark[0]
+    S = H @ one.covariances[0] @ H.T
+    S += np.diag([NOISE[0], NOISE[1] + NOISE[2] * 5.2]) ** 2
+    K = one.covariances[0] @ H.T @ np.linalg.inv(S)
+    seen = one.with_sighting(0, np.array(reading), NOISE)
+    place = one.places[0] + K @ (np.array(reading) - expected.measurement[0])
+    np.testing.assert_allclose(seen.places[0], place, rtol=1e-10)
+    left = (np.eye(2) - K @ H) @ one.covariances[0]
+    np.testing.assert_allclose(seen.covariances[0], left, rtol=1e-9)
+
+
+def test_sightings_count_as_long_as_they_are_recent():
+    landmark = tracked([(0.0, 5.0)])
+    counts = []
+    for seen in (True, False, False, True, False, False, False, False):
+        landmark = landmark.next_scan(4)
+        if seen:
+            landmark = landmark.with_sighting(0, np.array([0.0, 5.0]), NOISE)
+        counts += landmark.sightings.tolist()
+    assert counts == [2, 2, 2, 2, 1, 1, 1]  # and at last it is forgotten
+
+
+# --- all of it ---
+
+
+def test_hidden_identities_are_found_out():
+    world = load_scenario("hidden_identities")
+    wrong = right = 0
+    for seed in range(3):
+        env = LandmarkWorldEnv(world)
+        observation, info = env.reset(seed=seed)
+        slam = make_estimator(
+            "invariant",
+            motion_std=world.motion.std,
+            measurement_std=world.sensor.std,
+            management=True,
+        )
+        true_ids = {}
+        for action in [*action_sequence(world), None]:
+            seen = observation["mask"]
+            report = slam.update(observation["landmarks"][seen])
+            for own, true in zip(
+                report.row_ids, info["landmark_ids"][seen].tolist(), strict=True
+            ):
+                if own is None:
+                    continue
+                is_right = true_ids.setdefault(own, true) == true >= 0
+                right, wrong = right + is_right, wrong + (not is_right)
+            if action is None:
+                break
+            observation, *_, info = env.step(action)
+            slam.predict(observation["odometry"])
+        belief = slam.belief()
+        assert sorted(true_ids.values()) == list(range(20))
+        places = env.landmarks[[true_ids[i] for i in belief.landmark_ids]]
+        assert np.abs(belief.landmarks - places).max() < 0.5
+    assert right > 5000
+    assert wrong < 0.002 * right

@@ -1,0 +1,128 @@
+import numpy as np
+import pytest
+from numeric_jacobian import numeric_jacobian
+from scipy.linalg import logm
+
+from slamgym.estimator import Belief
+from slamgym.estimator.error_frames import (
+    additive_error,
+    invariant_covariance,
+    invariant_error,
+)
+from slamgym.evaluation.nees import (
+    average_band,
+    heading_nees,
+    normalised_squared_error,
+    pose_nees,
+)
+
+MEAN = np.array([1.0, -2.0, 0.7, 3.0, 4.0, -5.0, 2.0])
+TRUTH = np.array([1.3, -1.5, 1.2, 2.0, 4.5, -5.5, 1.0])
+
+
+def group(state):
+    """The matrix of SE_{1+n}(2)."""
+    n = (len(state) - 3) // 2
+    X = np.eye(3 + n)
+    c, s = np.cos(state[2]), np.sin(state[2])
+    X[:2, :2] = [[c, -s], [s, c]]
+    X[:2, 2] = state[:2]
+    X[:2, 3:] = state[3:].reshape(-1, 2).T
+    return X
+
+
+def test_invariant_error_is_the_matrix_logarithm():
+    log = np.real(logm(group(TRUTH) @ np.linalg.inv(group(MEAN))))
+    expected = np.concatenate([log[:2, 2], [log[1, 0]], log[:2, 3:].T.ravel()])
+    np.testing.assert_allclose(invariant_error(TRUTH, MEAN), expected, atol=1e-12)
+
+
+def test_invariant_covariance_is_the_additive_one_to_first_order():
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((7, 7))
+    P = root @ root.T
+    D = numeric_jacobian(lambda truth: invariant_error(truth, MEAN), MEAN)
+    np.testing.assert_allclose(invariant_covariance(MEAN, P), D @ P @ D.T, atol=1e-6)
+
+
+def test_invariant_error_of_no_turn_is_the_difference():
+    shifted = MEAN + np.array([1, 2, 0, 1, 2, 1, 2])
+    np.testing.assert_allclose(
+        invariant_error(shifted, MEAN), [1, 2, 0, 1, 2, 1, 2], atol=1e-15
+    )
+
+
+def test_additive_error_wraps_the_heading():
+    far = MEAN.copy()
+    far[2] += 2 * np.pi + 0.1
+    np.testing.assert_allclose(additive_error(far, MEAN)[2], 0.1, atol=1e-12)
+
+
+def test_errors_work_over_leading_axes():
+    stack = np.stack([TRUTH, MEAN])
+    np.testing.assert_array_equal(
+        invariant_error(stack, MEAN)[0], invariant_error(TRUTH, MEAN)
+    )
+    P = np.stack([np.eye(7), 2 * np.eye(7)])
+    means = np.stack([MEAN, TRUTH])
+    np.testing.assert_array_equal(
+        invariant_covariance(means, P)[1], invariant_covariance(TRUTH, P[1])
+    )
+
+
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+def test_a_belief_gives_its_error_and_the_covariance_of_it(frame):
+    P = np.diag(np.arange(1.0, 8.0))
+    belief = Belief(MEAN, P, (4, 9), frame)
+    error = belief.error(TRUTH[:3], TRUTH[3:].reshape(2, 2))
+    by_hand = {"additive": additive_error, "invariant": invariant_error}[frame]
+    np.testing.assert_allclose(error, by_hand(TRUTH, MEAN), atol=1e-15)
+    expected = P if frame == "additive" else invariant_covariance(MEAN, P)
+    np.testing.assert_array_equal(belief.error_covariance(), expected)
+    other = belief.error(TRUTH[:3], TRUTH[3:], frame="additive")
+    np.testing.assert_allclose(other, additive_error(TRUTH, MEAN))
+
+
+def test_a_belief_refuses_what_does_not_fit():
+    belief = Belief(np.zeros(5), np.eye(5), (3,))
+    with pytest.raises(ValueError, match="the truth must be a pose"):
+        belief.error(np.zeros(3), np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="frame must be 'additive' or 'invariant'"):
+        belief.error(np.zeros(3), np.zeros(2), frame="local")
+    with pytest.raises(ValueError, match="a belief with 1 landmarks has mean"):
+        Belief(np.zeros(4), np.eye(4), (3,))
+    with pytest.raises(ValueError, match="read-only"):
+        belief.mean[0] = 1.0
+
+
+def test_pose_nees_names_its_frame_and_averages_its_dimension():
+    rng = np.random.default_rng(0)
+    P = np.diag([0.1, 0.2, 0.05]) ** 2
+    poses = np.tile([3.0, 4.0, 0.5], (4000, 1))
+    truth = poses + rng.multivariate_normal(np.zeros(3), P, 4000)
+    covariances = np.tile(P, (4000, 1, 1))
+    low, high = average_band(4000, 3, probability=0.999)
+    for frame in ("additive", "invariant"):
+        assert low < pose_nees(truth, poses, covariances, frame=frame).mean() < high
+    low, high = average_band(4000, 1, probability=0.999)
+    assert low < heading_nees(truth, poses, covariances).mean() < high
+
+
+def test_squared_error_of_a_singular_or_broken_covariance_is_nan():
+    covariances = np.stack([np.eye(2), np.zeros((2, 2)), np.full((2, 2), np.nan)])
+    found = normalised_squared_error(np.ones((3, 2)), covariances)
+    np.testing.assert_array_equal(found, [2.0, np.nan, np.nan])
+
+
+def test_band_holds_the_average_as_often_as_it_says():
+    rng = np.random.default_rng(1)
+    averages = rng.chisquare(3, (20000, 50)).mean(axis=1)
+    low, high = average_band(50, 3)
+    assert ((averages > low) & (averages < high)).mean() == pytest.approx(
+        0.95, abs=0.01
+    )
+
+
+def test_a_belief_in_an_unknown_frame_is_refused():
+    with pytest.raises(ValueError, match=r"frame must be .*, got 'rubbish'"):
+        Belief(np.zeros(3), np.eye(3), (), frame="rubbish")

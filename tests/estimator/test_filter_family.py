@@ -1,0 +1,439 @@
+"""Deterministic properties of every filter of the family."""
+
+import numpy as np
+import pytest
+from dense_ekf import DenseEkf
+from dense_family import (
+    DenseConstrained,
+    DenseFirstEstimates,
+    DenseIdeal,
+    DenseInvariant,
+    DenseIterated,
+    DenseRobocentric,
+    DenseSequentialInvariant,
+    DenseUnscented,
+)
+from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+
+from slamgym.estimator import EkfSlam, list_estimators, make_estimator
+from slamgym.estimator.models.angles import wrap_angle
+
+IDS = list(range(6))
+TRUE_MAP = dict(enumerate(SIX))
+START_STD = (0.05, 0.05, 0.02)
+
+
+class DenseIteratedInvariant(DenseInvariant):
+    iterations = 3
+
+
+# name, options, dense twin
+FAMILY = {
+    "ekf": ("ekf", {}, DenseEkf),
+    "invariant": ("invariant", {}, DenseInvariant),
+    "invariant iterated": ("invariant", {"iterations": 3}, DenseIteratedInvariant),
+    "invariant sequential": (
+        "invariant",
+        {"sequential": True},
+        DenseSequentialInvariant,
+    ),
+    "first_estimates": ("first_estimates", {}, DenseFirstEstimates),
+    "observability_constrained": ("observability_constrained", {}, DenseConstrained),
+    "iterated": ("iterated", {"iterations": 3}, DenseIterated),
+    "unscented": ("unscented", {}, DenseUnscented),
+    "robocentric": ("robocentric", {}, DenseRobocentric),
+    "ideal": ("ideal", {}, DenseIdeal),
+    "compressed": ("compressed", {}, DenseEkf),
+    "compressed invariant": (
+        "compressed",
+        {"base": "invariant"},
+        DenseInvariant,
+    ),
+    "submaps": ("submaps", {}, DenseInvariant),
+    "sparse_information": ("sparse_information", {"active_bound": None}, DenseEkf),
+}
+BLIND_TO_A_TURN = [
+    "invariant",
+    "invariant iterated",
+    "invariant sequential",
+    "first_estimates",
+    "observability_constrained",
+    "robocentric",
+    "ideal",
+    "compressed invariant",
+    "submaps",
+]
+
+
+def make(case, **changes):
+    name, options, _ = FAMILY[case]
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    return make_estimator(name, **{**noise, **options, **changes})
+
+
+def tell_truth(slam, pose, landmarks=TRUE_MAP):
+    if hasattr(slam, "observe_truth"):
+        slam.observe_truth(pose, landmarks)
+
+
+def test_every_registered_estimator_is_in_the_family():
+    assert {name for name, *_ in FAMILY.values()} == set(list_estimators())
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_equals_its_slow_dense_twin(case):
+    steps = 200 if case == "unscented" else 1000
+    twin = FAMILY[case][2](MOTION_STD, MEASUREMENT_STD, START_STD)
+    fast = make(case, initial_pose_std=START_STD)
+    rng = np.random.default_rng(1)
+    for each in (fast, twin):
+        tell_truth(each, np.zeros(3))
+    for odometry, readings, truth in drive(4, steps):
+        seen = np.flatnonzero(rng.random(6) < 0.6)
+        for each in (fast, twin):
+            tell_truth(each, truth)
+            each.predict(odometry)
+        report = fast.update(readings[seen], seen)
+        nis = twin.update(readings[seen], seen.tolist())
+        np.testing.assert_allclose(report.nis, nis, rtol=1e-6, atol=1e-9)
+    if case == "robocentric":
+        mean, covariance = twin.belief()
+    else:
+        mean, covariance = twin.mean.copy(), getattr(twin, "covariance", twin.P)
+    mean[2] = wrap_angle(mean[2])
+    belief = fast.belief()
+    assert list(belief.landmark_ids) == twin.ids
+    np.testing.assert_allclose(belief.mean, mean, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(belief.covariance, covariance, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("case", [c for c in FAMILY if c != "invariant sequential"])
+def test_the_order_of_readings_does_not_matter(case):
+    one, other = make(case), make(case)
+    rng = np.random.default_rng(0)
+    landmarks = rng.uniform(-12, 12, (13, 2))  # several blocks of readings
+    true_map = dict(enumerate(landmarks))
+    drives = drive(1, 60, landmarks=landmarks)
+    for step, (odometry, readings, truth) in enumerate(drives):
+        order = rng.permutation(13) if step else np.arange(13)
+        for each, rows in ((one, np.arange(13)), (other, order)):
+            tell_truth(each, truth, true_map)
+            each.predict(odometry)
+            each.update(readings[rows], rows)
+    one, other = one.belief(), other.belief()
+    np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_before_any_correction_the_belief_is_the_ekfs(case):
+    certain_heading = case == "unscented"  # whose points feel the curvature otherwise
+    motion = (0.05, 0.02, 0.0) if certain_heading else MOTION_STD
+    start = (0.05, 0.05, 0.0) if certain_heading else START_STD
+    settings = {"motion_std": motion, "initial_pose_std": start}
+    slam, ekf = make(case, **settings), make("ekf", **settings)
+    pose = np.zeros(3)
+    tell_truth(slam, pose, {})
+    for k in range(12):
+        # The truth told to `ideal` is this noise-free drive, so it linearises there.
+        pose = pose + np.array([0.5 * np.cos(pose[2]), 0.5 * np.sin(pose[2]), 0.2])
+        reading = np.array([[0.3 * k - 1.0, 2.0 + k]])
+        where = pose[:2] + reading[0, 1] * np.array(
+            [np.cos(pose[2] + reading[0, 0]), np.sin(pose[2] + reading[0, 0])]
+        )
+        tell_truth(slam, pose, {**getattr(slam, "_true_landmarks", {}), k: where})
+        for each in (slam, ekf):
+            each.predict((0.5, 0.2))
+            each.update(reading, [k])
+    slam, ekf = slam.belief(), ekf.belief()
+    np.testing.assert_allclose(slam.mean, ekf.mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(slam.covariance, ekf.covariance, rtol=0, atol=1e-12)
+
+
+def standing_robot(case, steps=500):
+    """Julier and Uhlmann: a robot that stands and looks at one landmark."""
+    rng = np.random.default_rng(0)
+    sensor = np.array([np.deg2rad(2.0), 0.1])
+    slam = make(
+        case,
+        motion_std=(0, 0, 0),
+        measurement_std=sensor,
+        initial_pose_std=(0.1, 0.1, 0.3),
+    )
+    tell_truth(slam, np.zeros(3), {0: (4.0, 3.0)})
+    for _ in range(steps):
+        reading = np.array([np.arctan2(3, 4), 5.0]) + sensor * rng.standard_normal(2)
+        slam.predict((0.0, 0.0))
+        slam.update(reading[None], [0])
+    return np.rad2deg(np.sqrt(slam.belief().pose_covariance[2, 2]))
+
+
+@pytest.mark.parametrize("case", BLIND_TO_A_TURN)
+def test_a_standing_robot_learns_nothing_of_its_heading(case):
+    assert standing_robot(case) == pytest.approx(np.rad2deg(0.3), abs=1e-9)
+
+
+@pytest.mark.parametrize("case", ["ekf", "iterated", "unscented"])
+def test_a_standing_robot_seems_to_learn_its_heading(case):
+    assert standing_robot(case) < 10.0
+
+
+def unobservable_directions(case, steps=150):
+    """Nullity of the observability Gramian along a loop, read off the filter itself.
+
+    A copy of the filter whose covariance is set to I is stepped without motion noise:
+    what it makes of I tells G, and Hᵀ Q⁻¹ H as the information it gains.
+    """
+    slam = make(case)
+    copy = make(case, motion_std=(0, 0, 0))
+    n = 3 + 2 * len(SIX)
+    gramian, way = np.zeros((n, n)), np.eye(n)
+    for step, (odometry, readings, truth) in enumerate(drive(7, steps)):
+        for each in (slam, copy):
+            tell_truth(each, truth)
+        if step:
+            copy.load_state_dict({**slam.state_dict(), "covariance": np.eye(n)})
+            copy.predict(odometry)
+            G = np.eye(n)
+            G[:2, 2] = copy.belief().covariance[:2, 2]
+            way = G @ way
+        slam.predict(odometry)
+        if step:
+            copy.load_state_dict({**slam.state_dict(), "covariance": np.eye(n)})
+            copy.update(readings, IDS)
+            T = transport(slam, copy)
+            back = np.linalg.inv(T)
+            posterior = back @ copy.belief().covariance @ back.T
+            gramian += way.T @ (np.linalg.inv(posterior) - np.eye(n)) @ way
+        before = slam.belief()
+        slam.update(readings, IDS)
+        if step:
+            way = transport_between(before, slam.belief()) @ way
+    values = np.linalg.eigvalsh(gramian)
+    return int((values < 1e-9 * values[-1]).sum()), values / values[-1]
+
+
+def transport(slam, copy):
+    return transport_between(slam.belief(), copy.belief())
+
+
+def transport_between(before, after):
+    T = np.eye(len(before.mean))
+    if before.frame == "invariant":
+        moved = (after.mean - before.mean)[np.r_[0:2, 3 : len(before.mean)]]
+        v = (moved.reshape(-1, 2) @ np.array([[0.0, 1.0], [-1.0, 0.0]])).ravel()
+        T[np.r_[0:2, 3 : len(before.mean)], 2] = v
+    return T
+
+
+@pytest.mark.parametrize(
+    ("case", "nullity"),
+    [
+        ("ekf", 2),
+        ("iterated", 2),
+        ("ideal", 3),
+        ("first_estimates", 3),
+        ("observability_constrained", 3),
+        ("invariant", 3),
+    ],
+)
+def test_nullity_of_the_observability_matrix_along_a_loop(case, nullity):
+    found, values = unobservable_directions(case)
+    assert found == nullity, values[:5]
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3, 7])
+@pytest.mark.parametrize("name", ["iterated", "invariant"])
+def test_a_scalar_linear_problem_keeps_its_answer_at_any_number_of_iterations(
+    name, iterations
+):
+    # Along a line, heading known: prior and reading equally sure, so the mean halves
+    # the difference and the variance.
+    slam = make_estimator(
+        name,
+        motion_std=(0.1, 0.0, 0.0),
+        measurement_std=(1e-3, 0.1),
+        iterations=iterations,
+    )
+    slam.update([(0.0, 5.0)], [0])
+    precise = slam.state_dict()
+    precise["covariance"][:] = 0.0
+    slam.load_state_dict(precise)
+    slam.predict((1.0, 0.0))
+    slam.update([(0.0, 3.9)], [0])
+    assert slam.belief().pose[0] == pytest.approx(1.05, abs=1e-12)
+    assert slam.belief().pose_covariance[0, 0] == pytest.approx(0.005, abs=1e-12)
+
+
+def test_invariant_filter_on_a_single_iteration_is_the_plain_one():
+    once, plain = make("invariant", iterations=1), make("invariant")
+    for odometry, readings, _ in drive(2, 30):
+        for each in (once, plain):
+            each.predict(odometry)
+            each.update(readings, IDS)
+    np.testing.assert_array_equal(once.belief().mean, plain.belief().mean)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_saved_state_continues_bit_for_bit(case, tmp_path):
+    slam, restored = make(case), make(case)
+    tell_truth(slam, np.zeros(3))
+    for odometry, readings, truth in drive(3, 15):
+        tell_truth(slam, truth)
+        slam.predict(odometry)
+        slam.update(readings, IDS)
+    np.savez(tmp_path / "state.npz", **slam.state_dict())
+    with np.load(tmp_path / "state.npz") as state:
+        restored.load_state_dict(state)
+    drive_both(slam, restored)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_reset_equals_a_new_filter(case):
+    slam, fresh = make(case), make(case)
+    tell_truth(slam, np.ones(3))
+    for odometry, readings, truth in drive(3, 5):
+        tell_truth(slam, truth)
+        slam.predict(odometry)
+        slam.update(readings, IDS)
+    slam.reset((0, 0, 0), (0, 0, 0))
+    drive_both(slam, fresh)
+
+
+def drive_both(slam, other):
+    """Feed two filters the same, and expect the same to the last bit."""
+    for odometry, readings, truth in drive(9, 15):
+        for each in (slam, other):
+            tell_truth(each, truth)
+            each.predict(odometry)
+            each.update(readings, IDS)
+    slam, other = slam.belief(), other.belief()
+    np.testing.assert_array_equal(slam.mean, other.mean)
+    np.testing.assert_array_equal(slam.covariance, other.covariance)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_the_report_agrees_with_itself(case):
+    slam = make(case)
+    for odometry, readings, truth in drive(3, 10):
+        tell_truth(slam, truth)
+        slam.predict(odometry)
+        report = slam.update(readings, IDS)
+    white = np.linalg.solve(report.innovation_factor, report.innovation.ravel())
+    assert white @ white == pytest.approx(report.nis, rel=1e-9)
+    np.testing.assert_allclose(
+        report.innovation_covariance,
+        report.innovation_factor @ report.innovation_factor.T,
+    )
+
+
+def solve_or_name(slam, scan):
+    try:
+        return slam.update(scan, range(len(scan)))
+    except np.linalg.LinAlgError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [case for case in FAMILY if case != "sparse_information"],  # refuses such a sensor
+)
+def test_a_scan_that_cannot_be_solved_is_refused_or_harmless(case):
+    """Without sensor noise rounding decides; nothing absurd may come of either."""
+    refused = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        slam = make(case, motion_std=(0.1, 0.1, 0.1), measurement_std=(0, 0))
+        scan = np.stack([rng.uniform(-3, 3, 9), rng.uniform(2, 9, 9)], axis=1)
+        tell_truth(slam, np.zeros(3), {i: (1.0 + i, 2.0) for i in range(9)})
+        slam.update(scan, range(9))
+        slam.predict((0.3, 0.1))
+        before = slam.belief()
+        outcome = solve_or_name(slam, scan[:8] + 0.01)
+        if isinstance(outcome, str):
+            refused += 1
+            assert "at the reading of landmark" in outcome
+            np.testing.assert_array_equal(slam.belief().mean, before.mean)
+            np.testing.assert_array_equal(slam.belief().covariance, before.covariance)
+        else:
+            assert np.isfinite(slam.belief().covariance).all()
+            assert outcome.nis < 1e9
+    assert refused > 20
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_a_reading_at_an_expected_range_below_the_minimum_is_skipped(case):
+    slam = make(case, min_range=0.5)
+    tell_truth(slam, np.zeros(3), {0: (2.0, 0.0), 1: (0.0, 4.0), 2: (0.4, 0.0)})
+    slam.update([(0.0, 2.0), (np.pi / 2, 4.0)], [0, 1])
+    tell_truth(slam, (1.7, 0.0, 0.0), {0: (2.0, 0.0), 1: (0.0, 4.0), 2: (2.1, 0.0)})
+    slam.predict((1.7, 0.0))
+    report = slam.update([(0.0, 0.6), (2.0, 4.3), (0.0, 0.4)], [0, 1, 2])
+    assert set(report.skipped_ids) == {0, 2}
+    assert report.associated_ids == (1,)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+@pytest.mark.parametrize("at", ["expected", "reading"])
+def test_range_noise_reaches_every_filter(case, at):
+    small = make(case)
+    large = make(case, range_std_per_metre=0.5, range_noise_at=at)
+    for each in (small, large):
+        tell_truth(each, np.zeros(3))
+        each.update(np.array([(0.3, 6.0), (1.0, 9.0)]), [0, 1])
+        each.predict((0.0, 0.0))
+    scan = np.array([(0.3, 3.0), (1.0, 4.5)])
+    plain = small.update(scan, [0, 1]).innovation_covariance
+    noisy = large.update(scan, [0, 1]).innovation_covariance
+    assert noisy[1, 1] > plain[1, 1] + (2.0 if at == "reading" else 4.0)
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_a_landmark_at_the_robot_is_reported_as_near(case):
+    slam = make(case)
+    true_map = {0: (0.9, 0.0), 1: (2.0, 3.0)}
+    tell_truth(slam, np.zeros(3), true_map)
+    slam.update([(0.0, 0.9), (np.arctan2(3, 2), 13**0.5)], [0, 1])
+    tell_truth(slam, (0.5, 0.0, 0.0), true_map)
+    slam.predict((0.5, 0.0))
+    assert slam.update([(0.0, 0.4)], [0]).near_ids == (0,)
+
+
+def test_the_ideal_filter_asks_for_the_truth_of_all_it_sees():
+    slam = make("ideal")
+    slam.observe_truth((0, 0, 0), {0: (1.0, 2.0)})
+    with pytest.raises(ValueError, match="got none of landmark 5"):
+        slam.update([(0.3, 2.0)], [5])
+    slam.update([(1.1, 2.2)], [0])
+    with pytest.raises(ValueError, match="got none of landmark 0"):
+        slam.observe_truth((0, 0, 0), {7: (1.0, 2.0)})
+
+
+@pytest.mark.parametrize("case", FAMILY)
+def test_gate_rejects_an_outlier_in_every_filter(case):
+    slam = make(case, gate_probability=0.9999)
+    for odometry, readings, truth in drive(0, 10):
+        tell_truth(slam, truth)
+        slam.predict(odometry)
+        slam.update(readings, IDS)
+    wrong = readings.copy()
+    wrong[3] += (0.5, 4.0)
+    assert slam.update(wrong, IDS).rejected_ids == (3,)
+
+
+@pytest.mark.parametrize("value", [0, 1.5, -2])
+def test_iterations_must_be_a_positive_whole_number(value):
+    with pytest.raises(ValueError, match="iterations must be a whole number >= 1"):
+        make("iterated", iterations=value)
+
+
+def test_beliefs_name_the_frame_of_their_error():
+    frames = {case: make(case).belief().frame for case in FAMILY}
+    assert {c for c, frame in frames.items() if frame == "invariant"} == {
+        "invariant",
+        "invariant iterated",
+        "invariant sequential",
+        "compressed invariant",
+        "submaps",
+    }
+    assert isinstance(make("ekf"), EkfSlam)

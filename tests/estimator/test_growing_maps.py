@@ -1,0 +1,364 @@
+"""What all filters for growing maps promise alike: honest, resumable, exact removal."""
+
+import hashlib
+import json
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from slamgym.estimator import make_estimator
+from slamgym.estimator.map_management.map_editor import access_to
+from slamgym.estimator.map_management.marginalise_and_merge import separation
+from slamgym.estimator.map_management.policy import LandmarkPolicy
+from slamgym.evaluation.nees import normalised_squared_error
+from slamgym.experiments.monte_carlo import (
+    consistency_of,
+    monte_carlo,
+    summarise_monte_carlo,
+)
+from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.sim_configs import load_scenario, place_landmarks
+
+
+def city(columns, rows, steps):
+    """A corner of the preset, of which the robot drives round every block."""
+    blocks = {"columns": columns, "rows": rows}
+    return load_scenario("city").with_changes(
+        steps=steps, landmarks=blocks, controls=blocks
+    )
+
+
+# --- honesty, by the laboratory: 64 landmarks, four blocks, each a loop closed ---
+
+RUNS = 10
+EXACT = {
+    "compressed[local_size=20]": "ekf",
+    "compressed[base=invariant,local_size=20]": "invariant",
+}
+OTHERS = ("submaps[submap_size=20]", "sparse_information[active_bound=12]")
+
+
+@pytest.fixture(scope="module")
+def results():
+    labels = (*EXACT.values(), *EXACT, *OTHERS)
+    results = monte_carlo(city(2, 2, 258), labels, RUNS)
+    assert not results.failed.any()
+    assert (results.state_dof == 3 + 2 * 64).all()  # everything is mapped
+    return results
+
+
+@pytest.mark.parametrize(("label", "full"), EXACT.items())
+def test_compressed_has_every_nees_of_its_base(results, label, full):
+    one, other = results.sel(estimator=label), results.sel(estimator=full)
+    for name in results.data_vars:
+        if "nees" in name or name == "nis":
+            np.testing.assert_allclose(one[name], other[name], rtol=1e-6, atol=1e-8)
+    np.testing.assert_array_equal(one.nis_dof, other.nis_dof)
+
+
+@pytest.mark.parametrize(("label", "full"), EXACT.items())
+def test_compressed_is_accepted_where_its_base_is(results, label, full):
+    one, other = consistency_of(results, label), consistency_of(results, full)
+    assert one.accepted == other.accepted
+    entries = summarise_monte_carlo(results)["estimators"]
+    assert entries[label]["verdict"] == entries[full]["verdict"]
+
+
+def in_band(total, dof):
+    """Whether a sum of independent NEES is where 99.9 % of consistent ones are."""
+    low, high = chi2.ppf([0.0005, 0.9995], dof)
+    return low < total < high
+
+
+@pytest.mark.parametrize("label", [*EXACT.values(), *OTHERS])
+def test_in_a_city_the_final_belief_is_honest(results, label):
+    one = results.sel(estimator=label)
+    for name, dof in (("state_nees_invariant", 131), ("pose_nees_invariant", 3)):
+        final = one[name] if name.startswith("state") else one[name].isel(step=-1)
+        assert in_band(float(final.sum()), dof * RUNS)
+
+
+# --- stopped at any step and continued ---
+
+TIDY = {
+    "trust_ids": False,
+    "confirm": (2, 4),
+    "view": {"max_range": 5.0},
+    "remove_after": 6,
+    "merge_within": 1.0,
+    "capacity": 45,
+}
+WAYS = {
+    "ekf, managed": ("ekf", {"management": TIDY}),
+    "compressed": ("compressed", {"local_size": 20}),
+    "compressed invariant": ("compressed", {"local_size": 20, "base": "invariant"}),
+    "compressed, managed": ("compressed", {"local_size": 20, "management": TIDY}),
+    "sparse_information": ("sparse_information", {"active_bound": 12}),
+    "sparse_information, managed": (
+        "sparse_information",
+        {"active_bound": 12, "management": TIDY},
+    ),
+    "submaps": ("submaps", {"submap_size": 20}),
+    "submaps, managed": ("submaps", {"submap_size": 20, "management": TIDY}),
+    "submaps in a folder": ("submaps", {"submap_size": 20, "folder": "submaps"}),
+}
+EVERY, ONWARD = 7, 10  # calls from one stop to the next, and after each
+
+
+def made(way, folder="."):
+    """Make a filter; its submaps, if on disk, lie in the folder."""
+    name, options = WAYS[way]
+    if "folder" in options:
+        options = options | {"folder": Path(folder) / options["folder"]}
+    return of_city(name, **options)
+
+
+def of_city(name, **options):
+    """Make a filter with the noise of the city."""
+    world = load_scenario("city")
+    noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+    return make_estimator(name, **noise, **options)
+
+
+def renaming():
+    """Make a function that calls landmarks by another name once long out of sight."""
+    names, last = {}, {}
+
+    def called(step, ids):
+        for i in ids:
+            if step - last.get(i, step) > 8:
+                names[i] = 1000 * (step + 1) + i
+            last[i] = step
+        return ids, [names.get(i, i) for i in ids]
+
+    return called
+
+
+def calls_of(way, steps=220):
+    """Return what a filter is told on a drive past 80 landmarks, call by call.
+
+    To a managed one each scan also has a reading of nothing, and landmarks that it has
+    not seen for long come back under other names.
+    """
+    runs = simulate_runs(city(5, 1, steps), 1, 0)
+    rng, calls, called = np.random.default_rng(0), [], renaming()
+    for step in range(steps + 1):
+        if step:
+            calls.append(("predict", runs.odometry[0, step]))
+        ids = np.flatnonzero(runs.visible[0, step]).tolist()
+        readings = runs.measurements[0, step, ids]
+        if "managed" in way:
+            ids = [*called(step, ids)[1], -1 - step]
+            readings = np.vstack([readings, rng.uniform((-3.0, 1.0), (3.0, 5.0))])
+        calls.append(("update", readings, ids))
+    return calls
+
+
+def tell(slam, calls):
+    """Make the calls; return the reports."""
+    reports = [getattr(slam, name)(*arguments) for name, *arguments in calls]
+    return [report for report in reports if report is not None]
+
+
+def digest(slam):
+    """Sum up all numbers of a filter's state and belief, to the last bit."""
+    belief, total = slam.belief(), hashlib.sha256()
+    parts = slam.state_dict() | {"mean": belief.mean, "P": belief.covariance}
+    for key, value in sorted(parts.items()):
+        array = np.asarray(value)
+        if array.dtype.kind in "biuf":
+            array = array.astype(np.float64)
+        total.update(f"{key} {array.shape}".encode() + array.tobytes())
+    return total.hexdigest()
+
+
+def stopped(way, folder):
+    """Run through; return the states on the way, and what came of each later."""
+    calls, slam = calls_of(way), made(way, folder)
+    stops = range(EVERY, len(calls) - ONWARD, EVERY)
+    states, later, reports, near = {}, [], [], set()
+    for k, call in enumerate(calls):
+        if k in stops:
+            states[k] = slam.state_dict()
+        if k - ONWARD in stops:
+            later.append(digest(slam))
+        reports += tell(slam, [call])
+        near.add(getattr(slam, "local_ids", ()))
+    assert len(states) > 50
+    for kind in ("confirmed_ids", "removed_ids", "merged_ids"):
+        assert any(getattr(report, kind) for report in reports) == ("managed" in way)
+    assert "managed" in way or len(near) > 3  # local maps came and went
+    return states, later
+
+
+def continued(way, folder, states):
+    """Go on from each state for a while; return what came of it."""
+    calls, later = calls_of(way), []
+    for stop, state in states.items():
+        slam = made(way, folder)
+        slam.load_state_dict(state)
+        tell(slam, calls[stop : stop + ONWARD])
+        later.append(digest(slam))
+    return later
+
+
+CHILD = """
+import json, pathlib, pickle, sys
+sys.path.insert(0, {tests!r})
+from test_growing_maps import continued
+found = {{}}
+for way in {ways!r}:
+    try:
+        saved = pathlib.Path({folder!r}, way, "states.pickle").read_bytes()
+        found[way] = continued(way, pathlib.Path({folder!r}, way), pickle.loads(saved))
+    except Exception as error:
+        found[way] = repr(error)
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def both_processes(tmp_path_factory):
+    """What came of each state, here and in another process, by way."""
+    folder, here = tmp_path_factory.mktemp("states"), {}
+    for way in WAYS:
+        (folder / way).mkdir()
+        states, here[way] = stopped(way, folder / way)
+        (folder / way / "states.pickle").write_bytes(pickle.dumps(states))
+    tests = str(Path(__file__).parents[1] / "support")
+    code = CHILD.format(tests=tests, ways=tuple(WAYS), folder=str(folder))
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+    return here, json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_stopped_after_any_call_it_goes_on_in_another_process(both_processes, way):
+    here, there = both_processes
+    assert there[way] == here[way]
+
+
+# --- removal ---
+
+REMOVING = {
+    "ekf": ("ekf", {}),
+    "compressed": ("compressed", {"local_size": 20}),
+    "compressed invariant": ("compressed", {"base": "invariant", "local_size": 20}),
+    "sparse_information": ("sparse_information", {"active_bound": 12}),
+    "submaps": ("submaps", {"submap_size": 20}),
+}
+
+
+@pytest.mark.parametrize("name", ["compressed", "sparse_information", "submaps"])
+def test_nobody_removes_everything_by_saying_nothing(name):
+    slam = of_city(name)
+    slam.update([(0.1, 3.0), (0.9, 4.0)], [7, 9])
+    with pytest.raises(ValueError, match="landmark_ids must be integers, got None"):
+        slam.remove(None)
+    assert slam.landmark_ids == (7, 9)
+
+
+@pytest.mark.parametrize("way", REMOVING)
+def test_removal_changes_no_other_marginal_near_or_far(way):
+    name, options = REMOVING[way]
+    slam = of_city(name, **options)
+    tell(slam, calls_of("alone", 290))
+    before = slam.belief()
+    gone = list(before.landmark_ids[1::3])
+    stays = [i for i in before.landmark_ids if i not in gone]
+    access_to(slam).remove(gone)
+    after = slam.belief()
+    assert set(after.landmark_ids) == set(stays)
+    rows = [
+        np.r_[0:3, [3 + 2 * b.landmark_ids.index(i) + a for i in stays for a in (0, 1)]]
+        for b in (before, after)
+    ]
+    np.testing.assert_allclose(
+        after.mean[rows[1]], before.mean[rows[0]], rtol=0, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        after.covariance[np.ix_(rows[1], rows[1])],
+        before.covariance[np.ix_(rows[0], rows[0])],
+        rtol=0,
+        atol=1e-12,
+    )
+
+
+# --- merging: true duplicates, and neighbours that are two ---
+
+MANAGED = {
+    "compressed": ("compressed", {"base": "invariant", "local_size": 16}),
+    "sparse_information": ("sparse_information", {"active_bound": 8}),
+    "submaps": ("submaps", {"submap_size": 16}),
+}
+DRIVES, STEPS = 6, 128  # past two blocks, round each of which a loop is closed
+
+
+PAIRS = ((2, 32), (13, 33), (19, 34))  # neighbours in street(), 0.3 m apart
+
+
+def street():
+    """Two blocks with 32 landmarks, and a neighbour to each of three."""
+    world = city(2, 1, STEPS)
+    fronts = place_landmarks(world.landmarks, np.random.default_rng(0))
+    points = np.vstack([fronts, fronts[[one for one, _ in PAIRS]] + (0.3, 0.0)])
+    return world.with_changes(landmarks={"layout": "points", "points": points})
+
+
+def tidied(slam, runs, run, called):
+    """Drive one run, the scans named by a function; NEES and its degrees, merges."""
+    merged = []
+    for step in range(STEPS + 1):
+        if step:
+            slam.predict(runs.odometry[run, step])
+        there = np.flatnonzero(runs.visible[run, step]).tolist()
+        shown, ids = called(step, there)
+        merged += slam.update(runs.measurements[run, step, shown], ids).merged_ids
+    belief = slam.belief()
+    places = runs.landmarks[run, [i % 1000 for i in belief.landmark_ids]]
+    error = belief.error(runs.true_poses[run, -1], places)
+    nees = normalised_squared_error(error, belief.error_covariance())
+    return float(nees), len(error), merged
+
+
+@pytest.mark.parametrize("way", MANAGED)
+def test_merging_true_duplicates_keeps_a_growing_map_honest(way):
+    name, options = MANAGED[way]
+    runs = simulate_runs(city(2, 1, STEPS), DRIVES, 0)
+    total, freedom = 0.0, 0
+    for run in range(DRIVES):
+        slam = of_city(name, management={"merge_within": 1.0}, **options)
+        nees, dof, merged = tidied(slam, runs, run, renaming())
+        assert len(merged) > 10
+        assert all(kept % 1000 == gone % 1000 for kept, gone in merged)
+        total, freedom = total + nees, freedom + dof
+    assert in_band(total, freedom)
+
+
+@pytest.mark.parametrize("way", MANAGED)
+def test_two_neighbours_in_a_growing_map_are_not_merged(way):
+    """0.3 m apart, never seen in one scan, so that only their distance tells."""
+    name, options = MANAGED[way]
+    policy = LandmarkPolicy(merge_within=0.3)
+    runs = simulate_runs(street(), DRIVES, 0)
+    total, freedom, tested = 0.0, 0, []
+
+    def alternating(step, ids):
+        ids = [i for i in ids if i not in [pair[step % 2] for pair in PAIRS]]
+        return ids, ids
+
+    for run in range(DRIVES):
+        slam = of_city(name, management=policy, **options)
+        nees, dof, merged = tidied(slam, runs, run, alternating)
+        assert not merged
+        for pair in PAIRS:
+            both = slam.belief(pair)
+            offset = separation(both.mean, both.covariance, 0, 1)
+            tested.append(offset.largest_std < policy.worst_separation_std)
+        total, freedom = total + nees, freedom + dof
+    assert np.mean(tested) > 0.9
+    assert in_band(total, freedom)

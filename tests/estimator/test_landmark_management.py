@@ -1,0 +1,822 @@
+"""The policy: who enters the map, who leaves it, who is one."""
+
+import re
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from scipy.stats import chi2
+from town_drives import TOWN_MOTION_STD, map_all, wander
+
+from slamgym.estimator import check_estimator, list_estimators, make_estimator
+from slamgym.estimator.map_management.field_of_view import FieldOfView
+from slamgym.estimator.map_management.managed_slam import ManagedSlam
+from slamgym.estimator.map_management.marginalise_and_merge import separation
+from slamgym.estimator.map_management.policy import LandmarkPolicy, as_policy
+from slamgym.evaluation.nees import normalised_squared_error
+from slamgym.experiments.logs.ground_truth import true_landmarks_of
+from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
+from slamgym.experiments.runs.filter_settings import settings_for
+from slamgym.experiments.runs.replay import replay
+from slamgym.experiments.runs.summary import summarise
+
+MANAGEABLE = list_estimators()
+
+IDS = list(range(6))
+AROUND = FieldOfView(30.0)
+TIDY = {
+    "confirm": (2, 4),
+    "view": AROUND,
+    "remove_after": 4,
+    "merge_within": 1.0,
+    "capacity": 8,
+}
+
+
+def make(name="ekf", management=True, **changes):
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    return make_estimator(name, management=management, **{**noise, **changes})
+
+
+def polar(points, pose=(0, 0, 0)):
+    """What a robot without noise reads of some points (n, 2)."""
+    dx, dy = (np.asarray(points, dtype=float) - pose[:2]).T
+    return np.column_stack([np.arctan2(dy, dx) - pose[2], np.hypot(dx, dy)])
+
+
+def same(one, other):
+    return (
+        one.landmark_ids == other.landmark_ids
+        and np.array_equal(one.mean, other.mean)
+        and np.array_equal(one.covariance, other.covariance)
+    )
+
+
+# --- the policy object ---
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"match_gate": 0.0}, "match_gate must be a finite number > 0, got 0.0"),
+        ({"new_gate": 5.0}, "new_gate must be a finite number >= 9.21, got 5.0"),
+        ({"ambiguity": -1}, "ambiguity must be a finite number >= 0, got -1"),
+        ({"merge_gate": np.nan}, "merge_gate must be a finite number > 0, got nan"),
+        ({"confirm": 3}, "confirm must be two whole numbers (k, n), got 3"),
+        ({"confirm": (0, 3)}, "confirm[0] must be a whole number >= 1, got 0"),
+        ({"confirm": (4, 3)}, "confirm must be (k, n) with k <= n <= 63, got (4, 3)"),
+        ({"confirm": (4, 64)}, "confirm must be (k, n) with k <= n <= 63, got (4, 64)"),
+        ({"trust_ids": 1}, "trust_ids must be True or False, got 1"),
+        ({"remove_after": 5}, "view must be given with remove_after"),
+        (
+            {"remove_after": 0, "view": AROUND},
+            "remove_after must be a whole number >= 1, got 0",
+        ),
+        ({"view": 30}, "view must be a FieldOfView or None, got 30"),
+        ({"merge_within": 0.0}, "merge_within must be a finite number > 0, got 0.0"),
+        ({"capacity": 0}, "capacity must be a whole number >= 1, got 0"),
+        ({"capcity": 9}, "management has no 'capcity'; did you mean 'capacity'?"),
+        ({"view": {"angle": 1.0}}, "management.view is not complete"),
+        ({"view": {"max_range": -1.0}}, "max_range must be a finite number > 0"),
+        ({"view": {"max_range": 5, "min_range": 6}}, "max_range must be a finite"),
+        ({"view": {"max_range": 5, "angle": 7.0}}, "angle must be at most 2π, got 7.0"),
+        ({"view": {"max_range": 5, "shadow": -1}}, "shadow must be a finite number >="),
+        (
+            {"view": {"max_range": 5, "visible": 3}},
+            "visible must be callable or None, got 3",
+        ),
+    ],
+)
+def test_a_bad_policy_is_refused(changes, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        as_policy(changes)
+
+
+def test_what_is_no_policy_is_refused():
+    with pytest.raises(ValueError, match="management must be a LandmarkPolicy"):
+        make(management="yes")
+
+
+def test_no_management_is_the_bare_filter():
+    assert type(make(management=None)) is type(make(management=False))
+    assert type(make(management=None)).__name__ == "EkfSlam"
+
+
+@pytest.mark.parametrize("management", [True, TIDY], ids=["default", "all"])
+@pytest.mark.parametrize("name", MANAGEABLE)
+def test_every_managed_filter_keeps_the_contract(name, management):
+    check_estimator(partial(make_estimator, name, management=management))
+
+
+@pytest.mark.parametrize("name", MANAGEABLE)
+def test_with_identities_the_default_policy_changes_nothing(name):
+    managed, bare = make(name), make(name, management=None)
+    for odometry, readings, _ in drive(0, 20):
+        for slam in (managed, bare):
+            slam.predict(odometry)
+        assert managed.update(readings, IDS).nis == bare.update(readings, IDS).nis
+    assert same(managed.belief(), bare.belief())
+
+
+# --- confirmation ---
+
+
+def test_a_landmark_enters_with_its_last_sighting_needed():
+    slam = make(management={"confirm": (3, 5)})
+    scan = polar([(5, 1), (4, -2)])
+    first, second = slam.update(scan), slam.update(scan)
+    assert first.tentative_rows == second.tentative_rows == (0, 1)
+    assert slam.belief().landmark_ids == ()
+    np.testing.assert_allclose(slam.tentative_landmarks, [(5, 1), (4, -2)])
+    third = slam.update(scan)
+    assert third.confirmed_ids == third.added_ids == third.row_ids == (0, 1)
+    assert slam.tentative_landmarks.shape == (0, 2)
+    assert slam.update(scan).associated_ids == (0, 1)
+
+
+def test_too_few_sightings_leave_no_trace():
+    slam, bare = make(management={"confirm": (3, 4)}), make(management=None)
+    clutter = [(1.0, 5.0)]
+    for step in range(12):
+        for each in (slam, bare):
+            each.predict((0.1, 0.0))
+        slam.update(clutter if step % 3 == 0 else np.empty((0, 2)))
+        assert len(slam.tentative_landmarks) == 1
+    assert same(slam.belief(), bare.belief())
+    for _ in range(4):
+        slam.update([])
+    assert len(slam.tentative_landmarks) == 0
+
+
+def test_a_tentative_landmark_is_followed_while_the_robot_drives_and_turns():
+    slam = make(management={"confirm": (4, 4)})
+    pose = np.zeros(3)
+    for _ in range(4):
+        report = slam.update(polar([(3, 4)], pose))
+        slam.predict((0.7, 0.5))
+        pose += [0.7 * np.cos(pose[2]), 0.7 * np.sin(pose[2]), 0.5]
+    assert report.confirmed_ids == (0,)
+    np.testing.assert_allclose(slam.belief().landmarks, [(3, 4)], atol=1e-6)
+
+
+def test_a_tentative_landmark_stays_as_it_is_while_a_robot_without_noise_rests():
+    slam = make(noise_at_rest=False)
+    slam.update(polar([(3, 4)]))
+    before = slam.state_dict()
+    slam.predict((0.0, 0.0))
+    after = slam.state_dict()
+    key = "tentative.covariances"
+    np.testing.assert_array_equal(before[key], after[key])
+    slam.predict((0.1, 0.0))
+    assert (np.linalg.det(slam.state_dict()[key]) > np.linalg.det(before[key])).all()
+
+
+def test_identities_need_confirmation_where_they_are_not_trusted():
+    slam = make(management={"confirm": (2, 3), "trust_ids": False})
+    scan = polar([(5, 1), (4, -2)])
+    assert slam.update(scan, [7, 9]).tentative_rows == (0, 1)
+    slam.update([], [])
+    assert slam.update(scan[:1], [7]).confirmed_ids == (7,)
+    assert slam.update(scan[1:], [9]).confirmed_ids == ()  # the first is too long ago
+    assert slam.update(scan[1:], [9]).confirmed_ids == (9,)
+
+
+def test_a_reading_that_could_be_of_two_landmarks_is_left_out():
+    slam = make(management={"ambiguity": 2.0})
+    slam.update(polar([(5, 0.1), (5, -0.1)]), [3, 4])
+    report = slam.update(polar([(5, 0.0)]))
+    assert report.ambiguous_rows == (0,)
+    assert report.row_ids == (None,)
+    assert report.degrees_of_freedom == 0
+    assert slam.update([(0.0, 1e-9)]).ambiguous_rows == (0,)  # too close to tell
+
+
+class WithoutAWindow:
+    """A filter as it is, but for its view of what is around the robot."""
+
+    def __init__(self, name, **options):
+        self._slam = make_estimator(name, **options)
+
+    def __getattr__(self, name):
+        if name == "view_around":
+            raise AttributeError(name)
+        return getattr(self._slam, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("compressed", {}),
+        ("compressed", {"base": "invariant"}),
+        ("sparse_information", {}),
+    ],
+)
+def test_to_look_around_the_robot_decides_the_same_as_to_look_at_the_whole_map(
+    name, options
+):
+    noise = {"motion_std": TOWN_MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    noise["initial_pose_std"] = (0.5, 0.5, 0.02)  # landmarks may be elsewhere
+    policy = LandmarkPolicy(**TIDY | {"capacity": 420, "view": FieldOfView(15.0)})
+    near = make_estimator(name, management=policy, **noise, **options)
+    whole = ManagedSlam(
+        partial(WithoutAWindow, name), management=policy, **noise, **options
+    )
+    for slam in (near, whole):
+        map_all(slam, 300)
+    changed = False
+    for odometry, readings, _ in wander(300, 30):
+        for slam in (near, whole):
+            slam.predict(odometry)
+        one, other = near.update(readings), whole.update(readings)
+        assert one.row_ids == other.row_ids
+        assert one.ambiguous_rows == other.ambiguous_rows
+        assert one.removed_ids == other.removed_ids
+        assert one.merged_ids == other.merged_ids
+        changed |= bool(one.removed_ids or one.merged_ids)
+    assert changed
+    assert len(near.filter.view_around(15.0).ids) < len(near.landmark_ids) - 100
+
+
+def test_new_identities_are_never_used_twice():
+    slam = make(management={"confirm": (1, 1), "view": AROUND, "remove_after": 2})
+    slam.update(polar([(5, 1)]), [11])
+    assert slam.update(polar([(5, 1), (4, -2)])).row_ids == (11, 12)
+    for _ in range(2):
+        slam.update(polar([(5, 1)]))
+    assert slam.belief().landmark_ids == (11,)
+    assert slam.update(polar([(5, 1), (4, -2)])).added_ids == (13,)
+
+
+# --- removal ---
+
+
+def removed_after(view, steps=6, scan=((5, 1),), pose=(0, 0, 0)):
+    """Scans until landmark 1 at (4, −2) is removed when only others are seen."""
+    slam = make(management={"view": view, "remove_after": 3}, initial_pose=pose)
+    slam.update(polar([(5, 1), (4, -2)], pose), [0, 1])
+    for step in range(1, steps + 1):
+        report = slam.update(polar(scan, pose), range(0, 2 * len(scan), 2))
+        if report.removed_ids:
+            assert report.removed_ids == (1,)
+            return step
+    return None
+
+
+def test_a_landmark_that_should_be_seen_and_is_not_is_removed():
+    assert removed_after(AROUND) == 3
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        FieldOfView(4.0),
+        FieldOfView(4.8),  # within the margin of the range
+        FieldOfView(30.0, min_range=4.2),
+        FieldOfView(30.0, angle=0.8),
+        FieldOfView(30.0, angle=0.95),  # within the margin of the angle
+        FieldOfView(30.0, visible=lambda pose, landmarks: landmarks[:, 1] > 0),
+    ],
+)
+def test_who_cannot_be_seen_is_not_missed(view):
+    assert removed_after(view) is None
+
+
+def test_who_may_stand_behind_another_is_not_missed():
+    in_front = [(5, 1), (2, -1.05)]
+    assert removed_after(FieldOfView(30.0, shadow=0.1), scan=in_front) is None
+    assert removed_after(FieldOfView(30.0, shadow=0.01), scan=in_front) == 3
+    behind = [(5, 1), (8, -4.05)]
+    assert removed_after(FieldOfView(30.0, shadow=0.1), scan=behind) == 3
+
+
+def test_the_visibility_model_is_asked_in_the_frame_of_the_map():
+    asked = []
+
+    def visible(pose, landmarks):
+        asked.append((pose, landmarks))
+        return np.zeros(len(landmarks), dtype=bool)
+
+    removed_after(FieldOfView(30.0, visible=visible), steps=1, pose=(1, 2, 0.5))
+    (pose, landmarks), *_ = asked
+    np.testing.assert_allclose(pose, (1, 2, 0.5))
+    np.testing.assert_allclose(landmarks, [(5, 1), (4, -2)], atol=1e-9)
+
+
+def test_a_visibility_model_that_answers_nonsense_is_refused():
+    slam = make(
+        management={
+            "view": FieldOfView(30.0, visible=lambda *_: np.ones(1)),
+            "remove_after": 2,
+        }
+    )
+    slam.update(polar([(5, 1), (4, -2)]), [0, 1])
+    before = slam.state_dict()
+    with pytest.raises(ValueError, match="visible must answer 2 landmarks"):
+        slam.update(polar([(5, 1)]), [0])
+    assert all(np.array_equal(before[k], v) for k, v in slam.state_dict().items())
+
+
+def test_a_sighting_forgives_earlier_misses():
+    slam = make(management={"view": AROUND, "remove_after": 3})
+    both = polar([(5, 1), (4, -2)])
+    slam.update(both, [0, 1])
+    for _ in range(4):
+        for ids in ([0], [0], [0, 1]):
+            assert slam.update(both[: len(ids)], ids).removed_ids == ()
+
+
+def test_a_landmark_whose_readings_are_refused_is_not_missing():
+    slam = make(management={"view": AROUND, "remove_after": 2}, gate_probability=0.99)
+    both = polar([(5, 1), (4, -2)])
+    slam.update(both, [0, 1])
+    for _ in range(5):
+        report = slam.update(both + np.array([(0, 0), (0, 3)]), [0, 1])
+        assert report.rejected_ids == (1,)
+        assert report.removed_ids == ()
+
+
+def test_a_landmark_that_an_ambiguous_reading_may_be_of_is_not_missing():
+    slam = make(management={"ambiguity": 2.0, "view": AROUND, "remove_after": 2})
+    slam.update(polar([(5, 0.1), (5, -0.1), (4, -3)]), [3, 4, 5])
+    for _ in range(4):
+        report = slam.update(polar([(5, 0.0), (4, -3)]))
+        assert report.ambiguous_rows == (0,)
+        assert report.removed_ids == ()
+
+
+def test_the_field_of_view_turns_with_the_robot():
+    ahead = FieldOfView(30.0, angle=1.0)
+    landmarks = np.array([(0.0, 5.0), (5.0, 0.0)])
+    seen = ahead.expects(np.array([0, 0, np.pi / 2]), landmarks, np.empty((0, 2)))
+    assert seen.tolist() == [True, False]
+
+
+# --- merging ---
+
+
+def state_nees(belief, true_pose, landmarks):
+    """NEES of pose and map per degree of freedom, in the filter's own frame."""
+    there = landmarks[[i % len(landmarks) for i in belief.landmark_ids]]
+    error, P = belief.error(true_pose, there), belief.error_covariance()
+    return float(normalised_squared_error(error, P)) / len(error)
+
+
+def in_band(nees, dof):
+    """Whether the average over runs is that of a consistent filter."""
+    low, high = chi2.ppf([0.0005, 0.9995], dof * len(nees)) / (dof * len(nees))
+    return low < np.mean(nees) < high
+
+
+def merged_runs(name, start_std, runs=150, steps=40):
+    """Drives in which landmark 0 gets another name for the second half."""
+    policy = LandmarkPolicy(merge_within=2.0)
+    errors, merges = [], 0
+    for seed in range(runs):
+        slam = make(name, policy, initial_pose_std=start_std)
+        steps_of_run = list(drive(seed, steps, start_std=start_std))
+        for step, (odometry, readings, _) in enumerate(steps_of_run):
+            slam.predict(odometry)
+            first = 0 if step < steps // 2 else 6
+            report = slam.update(readings, [first, *IDS[1:]])
+            merges += len(report.merged_ids)
+        errors.append(state_nees(slam.belief(), steps_of_run[-1][2], SIX))
+    return np.array(errors), merges / runs
+
+
+@pytest.mark.parametrize(
+    ("name", "start_std"), [("ekf", (0, 0, 0)), ("invariant", (0.1, 0.1, 0.1))]
+)
+def test_merging_true_duplicates_keeps_the_filter_consistent(name, start_std):
+    nees, merges = merged_runs(name, start_std)
+    assert merges > 0.95
+    assert in_band(nees, 15)
+
+
+@pytest.mark.parametrize("name", ["ekf", "invariant"])
+def test_two_neighbours_are_not_merged(name):
+    """0.3 m apart, never seen in one scan, so that only their distance tells."""
+    landmarks = np.vstack([SIX, SIX[0] + (0.3, 0.0)])
+    policy = LandmarkPolicy(merge_within=0.3)
+    nees, worst = [], []
+    for seed in range(100):
+        slam = make(name, policy)
+        steps_of_run = list(drive(seed, 80, landmarks=landmarks))
+        for step, (odometry, readings, _) in enumerate(steps_of_run):
+            slam.predict(odometry)
+            ids = [6 * (step % 2), *IDS[1:]]
+            assert not slam.update(readings[ids], ids).merged_ids
+        belief = slam.belief()
+        slots = [belief.landmark_ids.index(i) for i in (0, 6)]
+        between = separation(belief.mean, belief.covariance, *slots)
+        worst.append(between.largest_std)
+        nees.append(state_nees(belief, steps_of_run[-1][2], landmarks))
+    assert np.mean(np.array(worst) < policy.worst_separation_std) > 0.9  # were tested
+    assert in_band(nees, 17)
+
+
+def test_landmarks_seen_side_by_side_are_never_one():
+    slam = make(management={"merge_within": 2.0})
+    pair = polar([(5, 1), (5, 1.001)])
+    for _ in range(50):
+        assert slam.update(pair, [0, 1]).merged_ids == ()
+
+
+@pytest.mark.parametrize("name", MANAGEABLE)
+def test_landmarks_are_merged_and_removed_by_hand_too(name):
+    slam, places = (
+        make(name, {"merge_within": None}),
+        np.array([(4, 1), (4, -2), (6, 2)]),
+    )
+    for _ in range(5):
+        slam.update(polar(places), [0, 1, 2])
+    slam.update(polar(places[2:]), [7])
+    slam.merge(2, 7)
+    assert slam.update(polar(places[2:]), [7]).row_ids == (2,)
+    slam.remove([1])
+    assert slam.landmark_ids == (0, 2)
+    np.testing.assert_allclose(slam.belief([2]).landmarks, [(6, 2)], atol=0.01)
+    for refused in (lambda: slam.remove([0, 1]), lambda: slam.merge(0, 7)):
+        with pytest.raises(ValueError, match="mapped landmarks, got"):
+            refused()
+    with pytest.raises(ValueError, match="must be two landmarks, got 2 twice"):
+        slam.merge(2, 2)
+    assert slam.landmark_ids == (0, 2)
+
+
+def test_a_merged_landmark_answers_to_both_names():
+    slam = make(management={"merge_within": 1.0})
+    place = polar([(5, 1), (2, 2)])
+    for _ in range(30):
+        slam.update(place, [0, 1])
+    pairs = [pair for _ in range(30) for pair in slam.update(place, [8, 1]).merged_ids]
+    assert pairs == [(0, 8)]
+    assert slam.belief().landmark_ids == (0, 1)
+    assert slam.update(place[:1], [8]).associated_ids == (0,)
+    both = slam.update(np.vstack([place[:1], place[:1]]), [0, 8])
+    assert both.associated_ids == (0,)
+    assert both.ambiguous_rows == (1,)
+    slam.reset((0, 0, 0), (0, 0, 0))
+    assert slam.update(place[:1], [8]).added_ids == (8,)  # another run, other names
+
+
+# --- capacity ---
+
+
+def test_beyond_its_capacity_a_map_gives_up_what_it_knows_least_of():
+    slam = make(management={"capacity": 3})
+    scan = polar([(5, 1), (4, -2), (3, 3)])
+    slam.update(scan, [0, 1, 2])
+    slam.update(scan[:2], [0, 1])
+    report = slam.update(polar([(-3, 2)]), [3])
+    assert report.removed_ids == (2,)  # read once
+    assert slam.belief().landmark_ids == (0, 1, 3)
+    report = slam.update(polar([(-3, -2), (-3, 2)]), [4, 3])
+    assert report.removed_ids == (0,)  # as often read as 1, but from farther
+    assert slam.belief().landmark_ids == (1, 3, 4)
+
+
+def test_a_full_view_gives_up_the_newcomers():
+    slam = make(management={"capacity": 2})
+    slam.update(polar([(5, 1), (4, -2)]), [0, 1])
+    report = slam.update(polar([(5, 1), (4, -2), (3, 3)]), [0, 1, 2])
+    assert report.added_ids == report.removed_ids == (2,)
+
+
+# --- all together ---
+
+
+def busy_run(slam, steps, start=0):
+    """Readings without identity, with clutter; landmarks vanish and come back."""
+    beliefs = []
+    for step, (odometry, readings, _) in enumerate(drive(5, start + steps)):
+        if step < start:
+            continue
+        rng = np.random.default_rng([7, step])
+        slam.predict(odometry)
+        there = readings[:4] if 10 <= step < 27 else readings
+        clutter = rng.uniform((-3, 1), (3, 20), (2, 2))
+        report = slam.update(np.vstack([there, clutter]))
+        beliefs.append((report, slam.belief()))
+    return beliefs
+
+
+@pytest.mark.parametrize("name", ["ekf", "invariant", "robocentric", "unscented"])
+def test_a_saved_run_goes_on_bit_for_bit(name, tmp_path):
+    whole, first, second = (make(name, TIDY) for _ in range(3))
+    expected = busy_run(whole, 40)
+    busy_run(first, 23)
+    np.savez(tmp_path / "state.npz", **first.state_dict())
+    with np.load(tmp_path / "state.npz") as state:
+        second.load_state_dict(state)
+    for (report, belief), (other, again) in zip(
+        expected[23:], busy_run(second, 17, start=23), strict=True
+    ):
+        assert same(belief, again)
+        assert report._replace(factor=None, innovation=None) == other._replace(
+            factor=None, innovation=None
+        )
+    final = second.state_dict()
+    assert all(np.array_equal(v, final[k]) for k, v in whole.state_dict().items())
+    assert any(report.removed_ids for report, _ in expected)
+    assert any(report.confirmed_ids for report, _ in expected[23:])
+
+
+def test_a_saved_run_goes_on_in_another_process(tmp_path):
+    """Both processes find the kernels compiled, since this one has done so."""
+    script = (
+        "import sys, numpy as np\n"
+        "from test_landmark_management import TIDY, busy_run, make\n"
+        "slam, (begin, end, where) = make('invariant', TIDY), sys.argv[1:]\n"
+        "if int(begin):\n"
+        "    slam.load_state_dict(np.load(f'{where}/{begin}.npz'))\n"
+        "busy_run(slam, int(end) - int(begin), start=int(begin))\n"
+        "np.savez(f'{where}/{end}.npz', **slam.state_dict())\n"
+    )
+    busy_run(make("invariant", TIDY), 25)
+    states = []
+    for spans in ([(0, 25)], [(0, 15), (15, 25)]):
+        for begin, end in spans:
+            subprocess.run(
+                [sys.executable, "-c", script, str(begin), str(end), str(tmp_path)],
+                check=True,
+                cwd=Path(__file__).parents[1] / "support",
+            )
+        with np.load(tmp_path / "25.npz") as state:
+            states.append(dict(state))
+    one, other = states
+    assert set(one) == set(other)
+    assert all(np.array_equal(one[key], other[key]) for key in one)
+
+
+def test_a_refused_scan_leaves_all_as_it_was():
+    slam = make(management=TIDY)
+    busy_run(slam, 8)
+    before = slam.state_dict()
+    for scan, ids in (
+        ([(0.1, 2.0), (np.nan, 1.0)], None),
+        ([(0.1, 2.0), (np.inf, 1.0)], [0, 1]),
+        ([(0.1, 2.0), (0.2, 1.0)], [0, 0]),
+        ([(0.1, 2.0)], [0, 1]),
+    ):
+        with pytest.raises(ValueError, match=r"measurements|landmark_ids"):
+            slam.update(scan, ids)
+    with pytest.raises(ValueError, match="odometry"):
+        slam.predict((np.nan, 0.0))
+    after = slam.state_dict()
+    assert all(np.array_equal(before[key], after[key]) for key in after)
+
+
+def test_a_foreign_state_is_refused():
+    slam, other = make(management=TIDY), make(management=None)
+    busy_run(slam, 8)
+    before = slam.state_dict()
+    with pytest.raises(ValueError, match=r"state must hold 'landmarks\."):
+        slam.load_state_dict(other.state_dict())
+    with pytest.raises(ValueError, match=r"state is of InvariantEkfSlam"):
+        slam.load_state_dict(make("invariant", TIDY).state_dict())
+    after = slam.state_dict()
+    assert all(np.array_equal(before[key], after[key]) for key in after)
+
+
+@pytest.mark.parametrize("name", MANAGEABLE)
+def test_a_filter_that_went_on_takes_back_what_it_saved(name):
+    slam = make(name, TIDY)
+    unrun = slam.state_dict()
+    busy_run(slam, 8)
+    early = slam.state_dict()
+    busy_run(slam, 17, start=8)
+    expected = slam.state_dict()
+    for saved, start in ((early, 8), (unrun, 0)):
+        slam.load_state_dict(saved)
+        busy_run(slam, 25 - start, start=start)
+        state = slam.state_dict()
+        assert all(np.array_equal(v, state[k]) for k, v in expected.items())
+
+
+def test_a_damaged_state_leaves_all_as_it_was():
+    slam = make(management=TIDY)
+    busy_run(slam, 8)
+    before = slam.state_dict()
+    busy_run(slam, 8, start=8)
+    now = slam.state_dict()
+    with pytest.raises(ValueError, match="unpack"):
+        slam.load_state_dict(before | {"landmarks.apart": np.zeros((2, 3), dtype=int)})
+    after = slam.state_dict()
+    assert all(np.array_equal(now[key], after[key]) for key in now)
+
+
+def test_reset_forgets_everything():
+    slam = make(management=TIDY)
+    busy_run(slam, 25)
+    slam.reset((0, 0, 0), (0, 0, 0))
+    fresh = make(management=TIDY)
+    busy_run(slam, 25)
+    busy_run(fresh, 25)
+    state = fresh.state_dict()
+    assert all(np.array_equal(v, state[k]) for k, v in slam.state_dict().items())
+
+
+# --- what becomes of it in a replay ---
+
+
+def hidden_log(steps=30):
+    """A drive past six landmarks, the last two gone after ten steps; no identities."""
+    events = []
+    for step, (odometry, readings, _) in enumerate(drive(3, steps), start=1):
+        there = readings[:4] if step > 10 else readings
+        events.append(OdometryRow(float(step), *odometry.tolist(), 1.0))
+        events.append(Scan(float(step), there))
+    return SlamLog(
+        "hidden", landmark_ids=[10, 11, 12, 13, 14, 15], landmarks=SIX, events=events
+    )
+
+
+def hidden_settings(**options):
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    return settings_for(hidden_log(1), **noise, options=options)
+
+
+def test_a_log_without_identities_is_associated():
+    settings = hidden_settings()
+    assert settings.options["management"] is True
+    run = replay(hidden_log(), settings.make((0, 0, 0)))
+    summary = summarise(run, settings)
+    assert summary["estimator"] == "EkfSlam"
+    assert len(summary["landmarks"]) == 6
+    assert summary["readings"]["tentative"] == 12
+    assert summary["map_changes"] == {
+        "confirmed": 6,
+        "removed": 0,
+        "merged": 0,
+        "most": 6,
+    }
+
+
+def test_the_summary_counts_what_was_done_to_the_map():
+    settings = hidden_settings(management={**TIDY, "confirm": (1, 1)})
+    summary = summarise(replay(hidden_log(), settings.make((0, 0, 0))), settings)
+    assert summary["map_changes"]["removed"] == 2
+    assert summary["map_changes"]["most"] == 6
+    assert len(summary["landmarks"]) == 4
+
+
+def test_own_identities_are_scored_by_the_nearest_truth():
+    run = replay(hidden_log(), hidden_settings().make((0, 0, 0)))
+    errors = [row["euclidean"] for row in summarise(run)["landmarks"]]
+    assert max(errors) < 0.5
+    false_one = np.vstack([run.belief.landmarks, (3.4, 6.2)])
+    truth = true_landmarks_of(run.log, range(7), false_one)
+    assert np.isfinite(truth[:6]).all()
+    assert np.isnan(truth[6]).all()
+    np.testing.assert_array_equal(np.sort(truth[:6], axis=0), np.sort(SIX, axis=0))
+
+
+def test_the_replay_sees_the_same_with_and_without_a_door_to_parts():
+    class Closed:  # a filter that shows its belief as a whole only
+        def __init__(self, slam):
+            self.slam = slam
+
+        def predict(self, odometry, dt=1.0):
+            self.slam.predict(odometry, dt)
+
+        def update(self, measurements, landmark_ids=None):
+            return self.slam.update(measurements, landmark_ids)
+
+        def belief(self):
+            return self.slam.belief()
+
+    log, settings = hidden_log(), hidden_settings(management=TIDY)
+    one = replay(log, settings.make((0, 0, 0))).trace
+    other = replay(log, Closed(settings.make((0, 0, 0)))).trace
+    for key in ("poses", "predicted_poses", "pose_covariances", "landmarks"):
+        np.testing.assert_array_equal(getattr(one, key), getattr(other, key))
+    np.testing.assert_array_equal(one.first_landmarks, other.first_landmarks)
+    np.testing.assert_array_equal(one.first_covariance, other.first_covariance)
+    for mine, theirs in zip(one.landmark_history, other.landmark_history, strict=True):
+        for a, b in zip(mine, theirs, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+# --- a filter that joins its map only when it is asked ---
+
+
+SMALL = {"submap_size": 9, "extent_limit": 2.0}  # many submaps in a short drive
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_managed_submaps_keep_the_contract_also_when_they_are_closed(base):
+    options = {"base": base, "management": TIDY, **SMALL}
+    check_estimator(partial(make_estimator, "submaps", **options))
+
+
+def test_with_identities_the_default_policy_changes_nothing_in_closed_submaps():
+    managed, bare = (make("submaps", m, **SMALL) for m in (True, None))
+    for odometry, readings, _ in drive(0, 40):
+        for slam in (managed, bare):
+            slam.predict(odometry)
+        assert managed.update(readings, IDS).nis == bare.update(readings, IDS).nis
+    assert bare.closed_count > 5
+    assert same(managed.belief(), bare.belief())
+
+
+def test_submaps_associate_as_a_full_filter_does():
+    """Readings without identity, with clutter; landmarks vanish and come back."""
+    full, joined = make("invariant", TIDY), make("submaps", TIDY, **SMALL)
+    fates = "row_ids", "tentative_rows", "ambiguous_rows", "confirmed_ids"
+    for (one, _), (other, _) in zip(
+        busy_run(full, 60), busy_run(joined, 60), strict=True
+    ):
+        for name in (*fates, "removed_ids", "added_ids"):
+            assert getattr(one, name) == getattr(other, name)
+    assert joined.filter.closed_count > 10
+    one, other = full.belief(), joined.belief()
+    assert one.landmark_ids == other.landmark_ids
+    std = np.sqrt(np.diag(one.covariance))
+    np.testing.assert_allclose((one.mean - other.mean) / std, 0, atol=0.3)
+
+
+def test_landmarks_begun_in_a_new_submap_count_as_seen():
+    slam = make("submaps", {"view": AROUND, "remove_after": 3}, **SMALL)
+    others = IDS[:-1]
+    for step, (odometry, readings, _) in enumerate(drive(0, 20)):
+        slam.predict(odometry)
+        ids = IDS if step % 3 == 0 else others
+        assert slam.update(readings[ids], ids).removed_ids == ()
+    sightings = slam.state_dict()["landmarks.sightings"]
+    assert slam.filter.closed_count > 3
+    assert sightings.tolist() == [20] * 5 + [7]
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_a_saved_run_in_submaps_goes_on_bit_for_bit(tmp_path, folder):
+    options = {**SMALL, **({"folder": tmp_path / "run"} if folder else {})}
+    whole, first = make("submaps", TIDY, **SMALL), make("submaps", TIDY, **options)
+    expected = busy_run(whole, 60)
+    busy_run(first, 27)
+    np.savez(tmp_path / "state.npz", **first.state_dict())
+    second = make("submaps", TIDY, **options)
+    with np.load(tmp_path / "state.npz") as state:
+        second.load_state_dict(state)
+    for (report, belief), (other, again) in zip(
+        expected[27:], busy_run(second, 33, start=27), strict=True
+    ):
+        assert same(belief, again)
+        assert report.row_ids == other.row_ids
+        assert report.removed_ids == other.removed_ids
+    assert any(report.removed_ids for report, _ in expected)
+    if not folder:
+        final = second.state_dict()
+        assert all(np.array_equal(v, final[k]) for k, v in whole.state_dict().items())
+
+
+def test_merging_true_duplicates_keeps_submaps_consistent():
+    """Landmark 0 gets another name halfway, after submaps were closed."""
+    errors, merges, runs, steps = [], 0, 30, 40
+    for seed in range(runs):
+        slam = make("submaps", LandmarkPolicy(merge_within=2.0), **SMALL)
+        steps_of_run = list(drive(seed, steps))
+        for step, (odometry, readings, _) in enumerate(steps_of_run):
+            slam.predict(odometry)
+            first = 0 if step < steps // 2 else 6
+            report = slam.update(readings, [first, *IDS[1:]])
+            merges += len(report.merged_ids)
+        errors.append(state_nees(slam.belief(), steps_of_run[-1][2], SIX))
+    assert slam.filter.closed_count > 7
+    assert merges / runs > 0.95
+    assert in_band(np.array(errors), 15)
+
+
+def test_the_capacity_of_submaps_counts_the_landmarks_far_away_too():
+    landmarks = np.column_stack([np.arange(0, 42, 3.0), np.tile([3.0, -3.0], 7)])
+    slam, gone = make("submaps", {"capacity": 8}, **SMALL), []
+    for odometry, readings, _ in drive(1, 50, landmarks=landmarks, odometry=(0.75, 0)):
+        slam.predict(odometry)
+        ids = np.flatnonzero(readings[:, 1] < 5.0)
+        gone += slam.update(readings[ids], ids).removed_ids
+        assert len(slam.landmark_ids) <= 8
+    assert set(gone) | set(slam.landmark_ids) == set(range(14))
+    assert slam.belief().landmark_ids == slam.landmark_ids
+
+
+def test_a_replay_of_submaps_tells_what_they_could_say_at_once():
+    log = hidden_log(58)
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    runs = [
+        replay(
+            log,
+            settings_for(log, estimator=name, **noise, options=options).make((0, 0, 0)),
+        )
+        for name, options in (("invariant", {}), ("submaps", SMALL))
+    ]
+    full, joined = (run.trace for run in runs)
+    std = np.sqrt(np.diagonal(full.pose_covariances, axis1=1, axis2=2))[1:]
+    shift = joined.poses[1:] - full.poses[1:]
+    np.testing.assert_allclose(shift / std, 0, atol=0.3)
+    change = joined.pose_covariances[1:] - full.pose_covariances[1:]
+    np.testing.assert_allclose(change / (std[:, :, None] * std[:, None]), 0, atol=0.1)
+    np.testing.assert_array_equal(joined.poses[-1], runs[1].belief.pose)
+    assert runs[0].changes == runs[1].changes

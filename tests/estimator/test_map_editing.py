@@ -1,0 +1,257 @@
+"""Removal and merging of landmarks, as mathematics and in every filter."""
+
+import numpy as np
+import pytest
+from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from scipy.linalg import expm
+
+from slamgym.estimator import EkfSlam, list_estimators, make_estimator
+from slamgym.estimator.error_frames import invariant_covariance, invariant_error
+from slamgym.estimator.map_management.map_editor import access_to, marginal
+from slamgym.estimator.map_management.marginalise_and_merge import (
+    coincide,
+    separation,
+    without_landmarks,
+)
+
+MANAGEABLE = list_estimators()
+
+START_STD = (0.05, 0.05, 0.1)
+IDS = list(range(6))
+TRUE_MAP = dict(enumerate(SIX))
+
+
+def random_map(seed, landmarks=4):
+    rng = np.random.default_rng(seed)
+    size = 3 + 2 * landmarks
+    root = rng.standard_normal((size, size)) * 0.1
+    mean = rng.uniform(-5, 5, size)
+    mean[5:7] = mean[3:5] + 0.1 * rng.standard_normal(2)  # 0 and 1 may be one
+    return mean, root @ root.T
+
+
+def make(name, **changes):
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    return make_estimator(name, **{**noise, "initial_pose_std": START_STD, **changes})
+
+
+def driven(name, steps=25, seed=3, landmarks=SIX):
+    slam = make(name)
+    ids = list(range(len(landmarks)))
+    for odometry, readings, _ in drive(
+        seed, steps, landmarks=landmarks, start_std=START_STD
+    ):
+        slam.predict(odometry)
+        slam.update(readings, ids)
+    return slam
+
+
+def doubled(name, steps=25):
+    """Landmark 0 also has the name 6, from the middle of the drive on."""
+    slam = make(name)
+    for step, (odometry, readings, _) in enumerate(
+        drive(4, steps, start_std=START_STD)
+    ):
+        slam.predict(odometry)
+        slam.update(readings, [0 if step < steps // 2 else 6, *IDS[1:]])
+    return slam
+
+
+# --- the mathematics ---
+
+
+def test_dropping_landmarks_leaves_every_other_number_as_it_was():
+    mean, P = random_map(0)
+    left = [0, 1, 2, 5, 6, 9, 10]
+    np.testing.assert_array_equal(without_landmarks(mean, [0, 2]), mean[left])
+    np.testing.assert_array_equal(without_landmarks(P, [2, 0]), P[np.ix_(left, left)])
+
+
+def test_separation_is_the_marginal_of_a_difference():
+    mean, P = random_map(1)
+    H = np.zeros((2, 11))
+    H[:, 5:7], H[:, 9:11] = np.eye(2), -np.eye(2)
+    between = separation(mean, P, 1, 3)
+    C = H @ P @ H.T
+    np.testing.assert_allclose(between.offset, H @ mean, atol=1e-15)
+    np.testing.assert_allclose(between.covariance, C, atol=1e-15)
+    squared = between.offset @ np.linalg.solve(C, between.offset)
+    assert between.squared == pytest.approx(squared)
+    assert between.largest_std**2 == pytest.approx(np.linalg.eigvalsh(C)[-1])
+
+
+def test_additive_merge_is_the_textbook_update():
+    mean, P = random_map(2)
+    H = np.zeros((2, 11))
+    H[:, 3:5], H[:, 5:7] = np.eye(2), -np.eye(2)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T)
+    merged = coincide(mean, P, 0, 1)
+    np.testing.assert_allclose(merged.mean, mean - K @ H @ mean, atol=1e-12)
+    np.testing.assert_allclose(merged.covariance, P - K @ H @ P, atol=1e-12)
+    np.testing.assert_array_equal(merged.covariance, merged.covariance.T)
+
+
+def lie_moved(mean, xi):
+    """exp(ξ) χ by the matrix exponential of SE_{1+n}(2)."""
+    points = np.concatenate([mean[:2], mean[3:]]).reshape(-1, 2)
+    moves = np.concatenate([xi[:2], xi[3:]]).reshape(-1, 2)
+    n = len(points)
+    algebra, group = np.zeros((2 + n, 2 + n)), np.eye(2 + n)
+    algebra[:2, :2] = xi[2] * np.array([[0, -1], [1, 0]])
+    algebra[:2, 2:], group[:2, 2:] = moves.T, points.T
+    c, s = np.cos(mean[2]), np.sin(mean[2])
+    group[:2, :2] = [[c, -s], [s, c]]
+    moved = (expm(algebra) @ group)[:2, 2:].T.ravel()
+    return np.concatenate([moved[:2], [mean[2] + xi[2]], moved[2:]])
+
+
+def test_invariant_merge_is_the_update_in_invariant_coordinates():
+    mean, P = random_map(3)
+    mean[2] = 0.4
+    H = np.zeros((2, 11))
+    H[:, 3:5], H[:, 5:7] = np.eye(2), -np.eye(2)
+    P_xi = invariant_covariance(mean, P)
+    K = P_xi @ H.T @ np.linalg.inv(H @ P_xi @ H.T)
+    expected = lie_moved(mean, -K @ (mean[3:5] - mean[5:7]))
+    merged = coincide(mean, P, 0, 1, frame="invariant")
+    np.testing.assert_allclose(merged.mean, expected, atol=1e-12)
+    back = invariant_covariance(merged.mean, merged.covariance)
+    np.testing.assert_allclose(back, P_xi - K @ H @ P_xi, atol=1e-12)
+    np.testing.assert_array_equal(merged.covariance, merged.covariance.T)
+    assert abs(invariant_error(expected, mean)[2]) > 1e-3  # the heading has moved
+
+
+def test_merged_landmarks_have_one_place_and_one_covariance():
+    mean, P = coincide(*random_map(4), 0, 1)
+    np.testing.assert_allclose(mean[3:5], mean[5:7], atol=1e-12)
+    np.testing.assert_allclose(P[3:5], P[5:7], atol=1e-12)
+
+
+def test_what_cannot_differ_cannot_be_merged():
+    mean, P = random_map(5)
+    P[5:7] = P[3:5]
+    P[:, 5:7] = P[:, 3:5]
+    assert separation(mean, P, 0, 1).squared == np.inf
+    with pytest.raises(np.linalg.LinAlgError):
+        coincide(mean, P, 0, 1)
+
+
+# --- in the filters ---
+
+
+@pytest.mark.parametrize("name", MANAGEABLE)
+def test_removal_changes_no_other_marginal(name):
+    slam = driven(name)
+    before = slam.belief()
+    access_to(slam).remove([4, 1])
+    after = slam.belief()
+    assert after.landmark_ids == (0, 2, 3, 5)
+    kept = np.r_[0:5, 7:11, 13:15]
+    np.testing.assert_allclose(after.mean, before.mean[kept], rtol=0, atol=1e-12)
+    P = before.covariance[np.ix_(kept, kept)]
+    np.testing.assert_allclose(after.covariance, P, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "name",
+    # the cubature points of the unscented filter lie farther out, the larger its state
+    [name for name in MANAGEABLE if name != "unscented"],
+)
+def test_a_removed_landmark_is_not_missed_by_the_rest(name):
+    removed, kept = driven(name), driven(name)
+    access_to(removed).remove([2])
+    others = [0, 1, 3, 4, 5]
+    for odometry, readings, _ in drive(8, 30):
+        for slam in (removed, kept):
+            slam.predict(odometry)
+            slam.update(readings[others], others)
+    one, other = removed.belief(), marginal(kept, others)
+    assert one.landmark_ids == other.landmark_ids
+    rounding = 1e-11 if name == "sparse_information" else 1e-12  # Λ is ill-conditioned
+    np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=rounding)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=rounding)
+
+
+def volume(belief):
+    """Of pose and landmarks, the same in every error frame."""
+    return np.linalg.slogdet(belief.covariance).logabsdet
+
+
+@pytest.mark.parametrize("name", MANAGEABLE)
+def test_merging_keeps_the_information_of_both(name):
+    slam = doubled(name)
+    before = [volume(marginal(slam, [i])) for i in (0, 6)]
+    access_to(slam).merge(0, 6)
+    assert slam.belief().landmark_ids == tuple(IDS)
+    assert volume(marginal(slam, [0])) < min(before) - 0.1
+    assert np.linalg.eigvalsh(slam.belief().covariance).min() > 0
+    slam.predict((0.5, 0.08))
+    slam.update([(0.3, 5.0)], [0])  # and the filter goes on
+
+
+@pytest.mark.parametrize(
+    "name", ["invariant", "first_estimates", "observability_constrained", "robocentric"]
+)
+def test_merging_tells_no_filter_that_knows_better_its_heading(name):
+    """A robot that stands and looks cannot learn its heading, nor by a merge."""
+    slam = make(name, motion_std=(0, 0, 0), initial_pose_std=(0, 0, 0.3))
+    rng = np.random.default_rng(0)
+    truth = np.array([(0.5, 6.0), (0.5, 6.0), (-1.0, 3.0)])
+    for _ in range(20):
+        slam.update(truth + MEASUREMENT_STD * rng.standard_normal((3, 2)), [0, 1, 2])
+    access_to(slam).merge(0, 1)
+    for _ in range(20):
+        noise = MEASUREMENT_STD * rng.standard_normal((2, 2))
+        slam.update(truth[1:] + noise, [0, 2])
+    assert slam.belief().pose_covariance[2, 2] ** 0.5 == pytest.approx(0.3, abs=1e-9)
+
+
+def test_a_filter_of_ones_own_is_edited_through_its_state():
+    class Boxed:  # hides the filter it is made of
+        def __init__(self, slam):
+            self.slam = slam
+
+        def belief(self):
+            return self.slam.belief()
+
+        def state_dict(self):
+            return self.slam.state_dict()
+
+        def load_state_dict(self, state):
+            self.slam.load_state_dict(state)
+
+    boxed, open_one = Boxed(doubled("ekf")), doubled("ekf")
+    for slam in (boxed, open_one):
+        door = access_to(slam)
+        door.merge(0, 6)
+        door.remove([3])
+    assert boxed.belief().landmark_ids == open_one.belief().landmark_ids
+    np.testing.assert_array_equal(boxed.belief().mean, open_one.belief().mean)
+    np.testing.assert_array_equal(
+        boxed.belief().covariance, open_one.belief().covariance
+    )
+
+
+def test_a_filter_whose_map_cannot_be_edited_is_refused():
+    class Sealed(EkfSlam):
+        def belief(self):
+            return super().belief()
+
+        def state_dict(self):
+            return {"blob": np.zeros(1)}
+
+    with pytest.raises(TypeError, match=r"Sealed cannot be managed so.*'covariance'"):
+        access_to(Sealed(MOTION_STD, MEASUREMENT_STD))
+
+
+@pytest.mark.parametrize("name", MANAGEABLE)
+def test_marginal_is_a_part_of_the_belief(name):
+    slam = driven(name)
+    whole, part = slam.belief(), marginal(slam, [5, 1])
+    columns = [0, 1, 2, 13, 14, 5, 6]
+    assert part.landmark_ids == (5, 1)
+    assert part.frame == whole.frame
+    np.testing.assert_array_equal(part.mean, whole.mean[columns])
+    np.testing.assert_array_equal(
+        part.covariance, whole.covariance[np.ix_(columns, columns)]
+    )

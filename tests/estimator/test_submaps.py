@@ -1,0 +1,707 @@
+"""Submaps: independent pieces, joined into the map that all of the data make."""
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numeric_jacobian import numeric_jacobian
+from scipy.linalg import block_diag
+from scipy.optimize import least_squares
+
+from slamgym.estimator import check_estimator
+from slamgym.estimator.large_maps.sparse_cholesky.submap_elimination import (
+    Elimination,
+    dissect,
+)
+from slamgym.estimator.large_maps.submaps.factor import (
+    inverse_spread,
+    relation,
+    retract,
+)
+from slamgym.estimator.large_maps.submaps.fusion import fuse
+from slamgym.estimator.large_maps.submaps.joining import Gaussian
+from slamgym.estimator.large_maps.submaps.store import AT_HAND, MARK
+from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
+from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.experiments.monte_carlo import monte_carlo
+
+MOTION_STD, MEASUREMENT_STD = np.array([0.03, 0.02, 0.01]), np.array([0.02, 0.05])
+LANDMARKS = np.random.default_rng(0).uniform(-4, 16, (16, 2))
+START = (1.0, 2.0, 0.3)
+
+
+def laps(steps=90, *, scale=1.0, seed=0, landmarks=LANDMARKS, reach=7.0):
+    """Yield (odometry, readings, ids, pose) of a noisy drive in circles."""
+    rng = np.random.default_rng(seed)
+    pose = np.array(START)
+    for _ in range(steps):
+        motion = predict_pose(pose, np.array([0.5, 0.1]))
+        slip = scale * MOTION_STD * rng.standard_normal(3)
+        pose = motion.pose + motion.jacobian_noise @ slip
+        readings = predict_measurement(pose, landmarks).measurement
+        readings += scale * MEASUREMENT_STD * rng.standard_normal(readings.shape)
+        ids = np.flatnonzero((readings[:, 1] < reach) & (readings[:, 1] > 0.5))
+        yield (0.5, 0.1), readings[ids], ids, pose
+
+
+def made(scale=1.0, **options):
+    options = {"submap_size": 7, "initial_pose": START} | options
+    return SubmapSlam(scale * MOTION_STD, scale * MEASUREMENT_STD, **options)
+
+
+def run(slam, drive):
+    for odometry, readings, ids, _ in drive:
+        slam.predict(odometry)
+        slam.update(readings, ids)
+    return slam
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return run(made(), laps())
+
+
+def assert_same_bits(one, other):
+    assert one.landmark_ids == other.landmark_ids
+    np.testing.assert_array_equal(one.mean, other.mean)
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+@pytest.mark.parametrize("base", BASES)
+@pytest.mark.parametrize("limits", [{}, {"submap_size": 5}, {"extent_limit": 2.5}])
+def test_it_keeps_the_contract(base, limits):
+    check_estimator(lambda **noise: SubmapSlam(base=base, **limits, **noise))
+
+
+# --- the joined map against the full filter, and against a dense solution -------------
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_it_comes_nearer_to_the_full_filter_as_the_noise_shrinks(base):
+    differences = []
+    for scale in (1.0, 0.1, 0.01):
+        full = BASES[base](
+            scale * MOTION_STD, scale * MEASUREMENT_STD, initial_pose=START
+        )
+        slam = run(made(scale, base=base), laps(scale=scale))
+        one, other = slam.belief(), run(full, laps(scale=scale)).belief()
+        assert slam.closed_count >= 5
+        assert one.landmark_ids == other.landmark_ids
+        std = np.sqrt(np.diag(other.covariance))
+        shift = np.abs(one.mean - other.mean) / std
+        change = np.abs(one.covariance - other.covariance) / np.outer(std, std)
+        differences.append((shift.max(), change.max()))
+    differences = np.array(differences)
+    assert (differences[1:] < 0.4 * differences[:-1]).all()
+    assert (differences[-1] < 2e-3).all()
+
+
+def unwrapped(error):
+    error[2] = wrap_angle(error[2])
+    return error
+
+
+def seen_from(start, state):
+    """Return a state (pose, landmarks) as seen from a frame: the slow way."""
+    c, s = np.cos(start[2]), np.sin(start[2])
+    turn = np.array([[c, s], [-s, c]])
+    points = [turn @ (state[:2] - start[:2])]
+    points += [turn @ (q - start[:2]) for q in state[3:].reshape(-1, 2)]
+    return np.concatenate([points[0], [state[2] - start[2]], *points[1:]])
+
+
+def dense_join(slam):
+    """Solve for frames and landmarks with scipy, numeric derivatives and no sparsity.
+
+    For a base filter whose error is additive; every submap is closed.
+    """
+    submaps = [slam._run.closed.store.load(k) for k in range(slam.closed_count)]
+    count, known = len(submaps), len(slam.landmark_ids)
+    roots = [np.linalg.cholesky(np.linalg.inv(s.covariance)).T for s in submaps]
+
+    def errors(x):
+        frames = np.vstack([START, x[: 3 * count].reshape(-1, 3)])
+        points = x[3 * count :].reshape(-1, 2)
+        parts = []
+        for k, (submap, root) in enumerate(zip(submaps, roots, strict=True)):
+            world = np.concatenate([frames[k + 1], points[submap.slots].ravel()])
+            seen = seen_from(frames[k], world)
+            parts.append(root @ unwrapped(seen - submap.mean))
+        return np.concatenate(parts)
+
+    belief = slam.belief()
+    guess = np.concatenate([np.zeros(3 * count), belief.landmarks.ravel()])
+    guess[: 3 * count] = (
+        slam._run.closed.join(slam._run.chain.joined).frames[1:].ravel()
+    )
+    guess += 1e-3 * np.random.default_rng(0).standard_normal(len(guess))
+    x = least_squares(errors, guess, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    J = numeric_jacobian(errors, x)
+    keep = np.r_[3 * count - 3 : 3 * count, 3 * count : 3 * count + 2 * known]
+    return x[keep], np.linalg.inv(J.T @ J)[np.ix_(keep, keep)]
+
+
+def test_the_joined_map_is_the_dense_least_squares_solution():
+    slam = made(base="ekf", extent_limit=2.0)
+    drive = list(laps(60))
+    run(slam, drive)
+    if slam.local_ids:
+        slam._run.close()  # all of them are closed
+    mean, covariance = dense_join(slam)
+    belief = slam.belief()
+    mean[2] = wrap_angle(mean[2])
+    std = np.sqrt(np.diag(covariance))
+    assert slam.closed_count > 8
+    assert any(np.diff([len(o.slots) for o in slam._run.closed.outlines]))
+    np.testing.assert_allclose((belief.mean - mean) / std, 0, atol=1e-4)
+    scaled = (belief.covariance - covariance) / np.outer(std, std)
+    np.testing.assert_allclose(scaled, 0, atol=1e-4)
+
+
+def test_the_uncertainty_of_the_start_moves_the_map_as_a_whole():
+    std = (0.2, 0.1, 0.15)
+    sure, unsure = run(made(), laps()), run(made(initial_pose_std=std), laps())
+    one, other = sure.belief(), unsure.belief()
+    np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=1e-12)
+
+    def moved(start):
+        c, s = np.cos(start[2]), np.sin(start[2])
+        seen = seen_from(np.array(START), one.mean)
+        points = [np.array([[c, -s], [s, c]]) @ seen[:2] + start[:2]]
+        points += [
+            np.array([[c, -s], [s, c]]) @ q + start[:2] for q in seen[3:].reshape(-1, 2)
+        ]
+        return np.concatenate([points[0], [seen[2] + start[2]], *points[1:]])
+
+    G = numeric_jacobian(moved, np.array(START))
+    expected = one.covariance + G @ np.diag(np.square(std)) @ G.T
+    np.testing.assert_allclose(other.covariance, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_a_part_of_the_belief_is_that_part_of_the_whole(driven):
+    whole = driven.belief()
+    places = np.array([9, 0, 4, 7])
+    some = [whole.landmark_ids[k] for k in places]
+    part = driven.belief(some)
+    rows = np.r_[0:3, 3 + (2 * places[:, None] + [0, 1]).ravel()]
+    assert part.landmark_ids == tuple(some)
+    np.testing.assert_allclose(part.mean, whole.mean[rows], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        part.covariance, whole.covariance[np.ix_(rows, rows)], rtol=0, atol=1e-11
+    )
+    assert driven.belief([]).landmark_ids == ()
+
+
+def test_the_frame_of_the_present_submap_is_the_chain_of_the_others():
+    std = np.array([0.1, 0.2, 0.05])
+    slam = run(made(base="ekf", initial_pose_std=std), laps(50))
+    submaps = [slam._run.closed.store.load(k) for k in range(slam.closed_count)]
+
+    def end(parts):
+        pose = parts[:3]
+        for step in parts[3:].reshape(-1, 3):
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+            pose = pose + turn @ step
+        return pose
+
+    present = slam._present.filter.belief()
+    parts = [START, *(submap.mean[:3] for submap in submaps), present.pose]
+    noise = [np.diag(std**2), *(submap.covariance[:3, :3] for submap in submaps)]
+    G = numeric_jacobian(end, np.concatenate(parts))
+    expected = G @ block_diag(*noise, present.pose_covariance) @ G.T
+    belief = slam.local_belief()
+    mean = unwrapped(end(np.concatenate(parts)))
+    np.testing.assert_allclose(belief.pose, mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(slam.pose, mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(belief.pose_covariance, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_a_landmark_is_added_once_however_many_submaps_hold_it():
+    slam, added = made(), []
+    for odometry, readings, ids, _ in laps():
+        slam.predict(odometry)
+        added += slam.update(readings, ids).added_ids
+    assert tuple(added) == slam.landmark_ids
+    assert sum(len(o.slots) for o in slam._run.closed.outlines) > 3 * len(added)
+
+
+def test_asking_for_the_belief_leaves_no_trace():
+    asked, silent = made(), made()
+    for odometry, readings, ids, _ in laps():
+        for slam in (asked, silent):
+            slam.predict(odometry)
+            slam.update(readings, ids)
+        asked.belief()
+        asked.local_belief()
+    assert_same_bits(asked.belief(), silent.belief())
+    assert_same_bits(asked.local_belief(), silent.local_belief())
+
+
+def test_joining_halfway_changes_nothing_in_the_end():
+    joined, silent = made(), made()
+    for step, (odometry, readings, ids, _) in enumerate(laps()):
+        for slam in (joined, silent):
+            slam.predict(odometry)
+            slam.update(readings, ids)
+        if step % 20 == 19:
+            joined.join()
+    one, other = joined.belief(), silent.belief()
+    std = np.sqrt(np.diag(other.covariance))
+    np.testing.assert_allclose((one.mean - other.mean) / std, 0, atol=1e-3)
+    # … but where the robot is meanwhile, is known better.
+    assert np.trace(joined.local_belief().pose_covariance) < 0.7 * np.trace(
+        silent.local_belief().pose_covariance
+    )
+
+
+def test_a_submap_uses_nothing_of_what_came_before_it():
+    ids, later = range(7), list(laps(40))
+    slams = []
+    for bearing in (0.1, -0.8):
+        slam = made()
+        slam.predict((bearing, bearing))
+        slam.update([(bearing, 2.0 + k) for k in ids], ids)  # fills the first submap
+        slams.append(run(slam, later))
+    one, other = slams
+    assert one.closed_count == other.closed_count > 3
+    for k in range(1, one.closed_count):
+        for part, same in zip(
+            one._run.closed.store.load(k), other._run.closed.store.load(k), strict=True
+        ):
+            if part.dtype != np.int64:
+                np.testing.assert_array_equal(part, same)
+    assert not np.array_equal(
+        one._run.closed.store.load(0).mean, other._run.closed.store.load(0).mean
+    )
+
+
+def test_without_a_closed_submap_it_is_the_base_filter():
+    for base, make in BASES.items():
+        start = {"initial_pose": START, "initial_pose_std": (0.1, 0.2, 0.05)}
+        slam = SubmapSlam(MOTION_STD, MEASUREMENT_STD, base=base, **start)
+        run(slam, laps(1))
+        other = run(make(MOTION_STD, MEASUREMENT_STD, **start), laps(1)).belief()
+        assert slam.closed_count == 0
+        np.testing.assert_allclose(slam.belief().mean, other.mean, atol=1e-9)
+        np.testing.assert_allclose(
+            slam.belief().covariance, other.covariance, atol=1e-9
+        )
+        np.testing.assert_allclose(slam.pose, other.pose, atol=1e-9)
+
+
+# --- honesty --------------------------------------------------------------------------
+
+
+def test_the_landmarks_and_the_pose_are_where_the_covariance_says():
+    nees = []
+    for seed in range(25):
+        drive = list(laps(60, seed=seed))
+        belief = run(made(), drive).belief()
+        truth = LANDMARKS[list(belief.landmark_ids)]
+        error = belief.error(drive[-1][3], truth)
+        nees.append(error @ np.linalg.solve(belief.error_covariance(), error))
+    dof = 25 * len(error)
+    assert abs(np.sum(nees) - dof) < 4 * np.sqrt(2 * dof)
+
+
+def test_in_the_loop_it_is_honest_where_the_ekf_is_not():
+    choices = {
+        "ekf": ("ekf", {}),
+        "submaps": (SubmapSlam, {"submap_size": 8}),
+    }
+    results = monte_carlo("loop", choices, runs=5)
+    assert not results.failed.any()
+    nees = results.pose_nees_invariant.isel(step=slice(1, None)).mean(("run", "step"))
+    nees = dict(zip(results.estimator.values, nees.values / 3, strict=True))
+    assert nees["ekf"] > 4
+    assert nees["submaps"] < 1.8
+
+
+# --- the mathematics ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+@pytest.mark.parametrize("turn", [0.0, 1e-4, 0.7, -2.0])
+def test_the_derivative_of_a_relation_is_that_of_differences(frame, turn):
+    rng = np.random.default_rng(3)
+    start, state, mean = rng.normal(size=3), 3 * rng.normal(size=9), rng.normal(size=9)
+    state[2] = start[2] + mean[2] + turn
+
+    def error(x):
+        return relation(x[:3], x[3:], mean, frame).error
+
+    expected = numeric_jacobian(error, np.concatenate([start, state]))
+    found = relation(start, state, mean, frame).jacobian
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+def test_retraction_makes_the_error_it_is_given(frame):
+    rng = np.random.default_rng(4)
+    mean, error = rng.normal(size=9), 0.5 * rng.normal(size=9)
+    state = retract(mean, error, frame)
+    found = relation(np.zeros(3), state, mean, frame).error
+    np.testing.assert_allclose(found, error, rtol=0, atol=1e-12)
+
+
+def test_the_inverse_spread_has_no_jump_where_its_series_ends():
+    for turn in (1e-6, 1.9e-3, 2.1e-3, 1.0, -3.0):
+        exact = 1j * turn / (np.exp(1j * turn) - 1)
+        assert inverse_spread(turn)[0] == pytest.approx(exact, abs=1e-9)
+
+
+def random_problem(rng, count=9, size=40):
+    unknowns, matrices = [], []
+    for k in range(count):
+        mine = np.unique(np.r_[3 * k : 3 * k + 6, rng.integers(0, size, 6)]) % size
+        unknowns.append(np.unique(mine))
+        A = rng.normal(size=(len(unknowns[-1]) + 2, len(unknowns[-1])))
+        matrices.append((A.T @ A, rng.normal(size=len(unknowns[-1])), 1.0))
+    used = np.unique(np.concatenate(unknowns))
+    return [np.searchsorted(used, u) for u in unknowns], matrices, len(used)
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_elimination_solves_what_a_dense_solver_solves(count):
+    rng = np.random.default_rng(count)
+    unknowns, matrices, size = random_problem(rng, count)
+    H, g = np.zeros((size, size)), np.zeros(size)
+    for mine, (matrix, right, _) in zip(unknowns, matrices, strict=True):
+        H[np.ix_(mine, mine)] += matrix
+        g[mine] += right
+    parts = dissect(unknowns, rng.normal(size=(count, 2)))
+    done = Elimination(parts, size, lambda k: matrices[k])
+    rows = rng.normal(size=(4, size)) * (rng.random((4, size)) < 0.2)
+    np.testing.assert_allclose(done.solution(), np.linalg.solve(H, g), atol=1e-8)
+    np.testing.assert_allclose(
+        done.covariance(*np.nonzero(rows)[::-1], rows[np.nonzero(rows)], len(rows)),
+        rows @ np.linalg.solve(H, rows.T),
+        atol=1e-8,
+    )
+    assert done.decrement() == pytest.approx(g @ np.linalg.solve(H, g))
+    assert done.cost == count
+
+
+# --- saved and continued --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("base", BASES)
+@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_a_saved_run_continues_bit_for_bit(tmp_path, base, joined, on_disk):
+    options = {"base": base, "folder": tmp_path / "run" if on_disk else None}
+    drive = list(laps(70))
+    slam = run(made(**options), drive[:45])
+    if joined:
+        slam.join()
+    with (tmp_path / "state.npz").open("wb") as file:
+        np.savez(file, **slam.state_dict())
+    with np.load(tmp_path / "state.npz") as state:
+        other = made(**options)
+        other.load_state_dict(state)
+    assert_same_bits(slam.belief(), other.belief())
+    expected = run(slam, drive[45:])
+    found = run(other, drive[45:])
+    assert found.closed_count == expected.closed_count > 5
+    assert_same_bits(expected.belief(), found.belief())
+    assert_same_bits(expected.local_belief(), found.local_belief())
+
+
+CONTINUE = """
+import pickle, sys
+sys.path[:0] = [{tests!r}]
+from test_submaps import laps, made, run
+slam = made(folder={folder!r})
+slam.load_state_dict(pickle.load(open({state!r}, "rb")))
+run(slam, list(laps(70))[45:])
+pickle.dump(slam.belief(), open({result!r}, "wb"))
+"""
+
+
+def test_another_process_continues_from_the_folder(tmp_path):
+    folder, state, result = (
+        str(tmp_path / name) for name in ("run", "state", "result")
+    )
+    drive = list(laps(70))
+    slam = run(made(folder=folder), drive[:45])
+    with Path(state).open("wb") as file:
+        pickle.dump(slam.state_dict(), file)
+    tests = str(Path(__file__).parents[1] / "support")
+    code = CONTINUE.format(tests=tests, folder=folder, state=state, result=result)
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with Path(result).open("rb") as file:
+        found = pickle.load(file)
+    assert_same_bits(run(made(), drive).belief(), found)
+
+
+def test_submaps_on_disk_are_those_in_memory_and_few_are_at_hand(tmp_path):
+    drive = list(laps())
+    slam = run(made(folder=tmp_path / "run", submap_size=5), fewer(drive))
+    other = run(made(submap_size=5), fewer(drive))
+    assert slam.closed_count > AT_HAND + 3
+    assert len(slam._run.closed.store._at_hand) == AT_HAND
+    assert_same_bits(slam.belief(), other.belief())
+    assert slam.nbytes < other.nbytes
+    assert len(list((tmp_path / "run").glob("submap_*.npy"))) == slam.closed_count
+
+
+def fewer(drive, most=5):
+    return [(u, z[:most], ids[:most], pose) for u, z, ids, pose in drive]
+
+
+def test_reset_deletes_the_submaps_of_the_run_it_forgets(tmp_path):
+    slam = run(made(folder=tmp_path / "run"), laps(40))
+    slam.reset(START, (0, 0, 0))
+    assert list((tmp_path / "run").iterdir()) == []
+    assert_same_bits(run(slam, laps(40)).belief(), run(made(), laps(40)).belief())
+
+
+def test_an_earlier_state_of_a_longer_run_leaves_nothing_behind(tmp_path):
+    folder, drive = tmp_path / "run", list(laps(60))
+    slam = run(made(folder=folder), drive[:30])
+    state, early = slam.state_dict(), slam.closed_count
+    run(slam, drive[30:])
+    assert slam.closed_count > early > 0
+    (folder / f"submap_{slam.closed_count:06}.part").write_bytes(b"half of it")
+    (folder / "notes.txt").write_text("of somebody else")
+    slam.load_state_dict(state)
+    slam.reset(START, (0, 0, 0))
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    (folder / "notes.txt").unlink()
+    assert_same_bits(run(slam, drive).belief(), run(made(), drive).belief())
+
+
+@pytest.mark.parametrize("origin", ["own", "in memory"])
+def test_a_state_before_the_first_step_begins_again_in_the_filters_own_folder(
+    tmp_path, origin
+):
+    drive = list(laps(40))
+    slam = made(folder=tmp_path / "run")
+    first = {"own": slam, "in memory": made()}[origin].state_dict()
+    run(slam, drive)
+    slam.load_state_dict(first)
+    assert slam.closed_count == 0
+    expected = run(made(), drive)
+    assert_same_bits(run(slam, drive).belief(), expected.belief())
+    slam.reset(START, (0, 0, 0))
+    assert list((tmp_path / "run").iterdir()) == []
+    assert_same_bits(run(slam, drive).belief(), expected.belief())
+
+
+def test_a_state_before_the_first_step_is_refused_in_the_folder_of_another_run(
+    tmp_path,
+):
+    run(made(folder=tmp_path / "run"), laps(40))
+    other = made(folder=tmp_path / "run")
+    other.reset((5, 5, 0), (0, 0, 0))
+    before = other.belief()
+    with pytest.raises(ValueError, match="holds the submaps of another run"):
+        other.load_state_dict(made().state_dict())
+    assert_same_bits(before, other.belief())
+    assert (tmp_path / "run" / "submap_000000.npy").exists()
+
+
+def test_a_submap_that_cannot_be_written_is_told_before_the_next_scan_is_in(tmp_path):
+    folder, away, drive = tmp_path / "run", tmp_path / "away", list(laps(60))
+    slam, other = made(folder=folder), made()
+    step = 0
+    while other.closed_count < 4:
+        run(other, drive[step : step + 1])
+        step += 1
+    run(slam, drive[: step - 1])
+    folder.rename(away)
+    run(slam, drive[step - 1 : step])  # fills a submap
+    assert slam.closed_count == other.closed_count - 1
+    assert slam.landmark_ids == other.landmark_ids
+    odometry, readings, ids, _ = drive[step]
+    slam.predict(odometry)
+    before = slam.belief()
+    for _ in range(2):
+        with pytest.raises(FileNotFoundError, match="submap_000003"):
+            slam.update(readings, ids)
+        assert_same_bits(before, slam.belief())
+    away.rename(folder)
+    slam.update(readings, ids)
+    run(other, drive[step : step + 1])
+    assert slam.closed_count == other.closed_count
+    found = run(slam, drive[step + 1 :]).belief()
+    expected = run(other, drive[step + 1 :]).belief()
+    assert slam.closed_count == len(list(folder.glob("submap_*.npy")))
+    assert found.landmark_ids == expected.landmark_ids
+    shift = (found.mean - expected.mean) / np.sqrt(np.diag(expected.covariance))
+    assert np.abs(shift).max() < 0.5  # one submap ends a motion later
+
+
+# --- refusals -------------------------------------------------------------------------
+
+
+def test_a_folder_that_is_none_is_refused(tmp_path):
+    file = tmp_path / "file"
+    file.write_text("x")
+    with pytest.raises(ValueError, match="folder must be a folder, got the file"):
+        made(folder=file)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "letters.txt").write_text("x")
+    with pytest.raises(ValueError, match=f"other files and no {MARK}"):
+        made(folder=tmp_path / "other")
+    assert [p.name for p in (tmp_path / "other").iterdir()] == ["letters.txt"]
+
+
+def test_the_folder_of_another_run_is_refused_before_the_first_step(tmp_path):
+    first = run(made(folder=tmp_path / "run"), laps(30))
+    for call in (
+        lambda slam: slam.predict((1.0, 0.0)),
+        lambda slam: slam.update([(0.0, 2.0)], [1]),
+    ):
+        second = made(folder=tmp_path / "run")
+        before = second.belief()
+        with pytest.raises(ValueError, match=r"another run \(.*load_state_dict"):
+            call(second)
+        assert_same_bits(before, second.belief())
+    first.belief()
+
+
+def test_a_state_is_refused_where_the_folder_does_not_hold_its_run(tmp_path):
+    slam = run(made(folder=tmp_path / "one"), laps(40))
+    run(made(folder=tmp_path / "two"), laps(40))
+    state = slam.state_dict()
+    for folder, message in (
+        (tmp_path / "two", "but it is of run"),
+        (tmp_path / "empty", "but it holds none"),
+        (None, "make the estimator with that folder"),
+    ):
+        other = made(folder=folder)
+        with pytest.raises(ValueError, match=message):
+            other.load_state_dict(state)
+        assert other.belief().landmark_ids == ()
+    with pytest.raises(ValueError, match="without folder"):
+        made(folder=tmp_path / "new").load_state_dict(
+            run(made(), laps(40)).state_dict()
+        )
+
+
+@pytest.mark.parametrize(
+    ("harm", "message"),
+    [
+        (lambda path: path.unlink(), "submap 1 cannot be read"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-8]), "damaged"),
+        (lambda path: path.write_bytes(b"x" + path.read_bytes()[1:]), "damaged"),
+    ],
+)
+def test_a_missing_or_changed_submap_is_refused_by_name(tmp_path, harm, message):
+    slam = run(made(folder=tmp_path / "run"), laps(60))
+    harm(tmp_path / "run" / "submap_000001.npy")
+    with pytest.raises(ValueError, match=message):
+        made(folder=tmp_path / "run").load_state_dict(slam.state_dict())
+
+
+def test_a_state_that_does_not_fit_is_refused():
+    slam = run(made(), laps(40))
+    state = slam.state_dict()
+    for change, message in (
+        ({"estimator": "EkfSlam"}, "is of EkfSlam, not of SubmapSlam"),
+        ({"base": "EkfSlam"}, "is of EkfSlam, not of InvariantEkfSlam"),
+        ({"chain_joined": np.zeros((0, 3))}, "chain_joined"),
+        ({"chain_present": np.full((4, 3), np.nan)}, "must be finite"),
+        ({"submap_0_slots": state["submap_0_slots"] + 99}, "submap 0 .* does not fit"),
+        ({"submap_0_mean": state["submap_0_mean"][:-1]}, "submap 0 .* does not fit"),
+        ({"landmark_ids": state["landmark_ids"][:3]}, "must be 3 ascending numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            made().load_state_dict(state | change)
+    for key in (
+        "chain_start",
+        "landmark_ids",
+        "submap_1_covariance",
+        "local_estimator",
+    ):
+        with pytest.raises(ValueError, match=key):
+            made().load_state_dict({k: v for k, v in state.items() if k != key})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"submap_size": 0}, "submap_size must be a whole number >= 1, got 0"),
+        ({"heading_limit": 0.0}, "heading_limit must be a finite number > 0"),
+        ({"extent_limit": -1.0}, "extent_limit must be a finite number > 0"),
+        ({"base": "robocentric"}, "base must be 'ekf' or 'invariant'"),
+        ({"belief_limit": 0}, "belief_limit must be a whole number >= 1"),
+        ({"folder": 3}, "folder must be a path, got 3"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        made(**options)
+
+
+def test_a_world_without_noise_is_mapped_as_it_is():
+    slam = SubmapSlam(0 * MOTION_STD, (0.0, 0.0), submap_size=2)
+    for step in range(3):
+        slam.update([(0.0, 4.0 - step), (np.pi / 2, 3.0)], [0, 10 + step])
+        slam.predict((1.0, 0.0))
+    assert slam.closed_count == 3
+    expected = [[4, 0], [0, 3], [1, 3], [2, 3]]
+    np.testing.assert_allclose(slam.belief().landmarks, expected, atol=1e-6)
+
+
+def test_differences_that_cannot_be_solved_are_told():
+    world, local = (Gaussian(np.r_[0.0, 0, 0, 1, 1], np.zeros((5, 5))) for _ in "ab")
+    common = (np.array([0]), np.array([0]))
+    with pytest.raises(np.linalg.LinAlgError, match="measurement_std is degenerate"):
+        fuse(world, local, "additive", common)
+
+
+def test_an_empty_scan_closes_nothing_and_changes_nothing():
+    slam = made(extent_limit=1.0)
+    for _ in range(4):
+        slam.predict((0.5, 0.1))
+    before = slam.belief()
+    slam.update(np.empty((0, 2)), [])
+    assert slam.closed_count == 0
+    assert_same_bits(before, slam.belief())
+
+
+def test_submaps_without_landmarks_are_joined_too():
+    slam = SubmapSlam(MOTION_STD, MEASUREMENT_STD, extent_limit=1.0, min_range=0.1)
+    for _ in range(8):
+        slam.predict((0.5, 0.1))
+        slam.update([(0.0, 0.05)], [1])  # too close to use
+    other = SubmapSlam(MOTION_STD, MEASUREMENT_STD)
+    for _ in range(8):
+        other.predict((0.5, 0.1))
+    assert slam.closed_count == 2
+    one, expected = slam.belief(), other.belief()
+    np.testing.assert_allclose(one.mean, expected.mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(one.covariance, expected.covariance, rtol=1e-6)
+
+
+def test_a_scan_larger_than_a_submap_is_refused():
+    slam = run(made(), laps(5))
+    before = slam.belief()
+    with pytest.raises(ValueError, match=r"submap_size must be >= 8, .* got 7"):
+        slam.update(np.ones((8, 2)), range(8))
+    assert_same_bits(before, slam.belief())
+
+
+def test_a_belief_beyond_the_limit_names_the_memory_it_would_take():
+    slam = run(made(belief_limit=5), laps())
+    with pytest.raises(ValueError, match=r"of 10 landmarks .* 0\.0 GB.*local_belief"):
+        slam.belief()
+    assert len(slam.belief(slam.landmark_ids[:3]).landmark_ids) == 3
+    with pytest.raises(ValueError, match="mapped landmarks, got 99"):
+        slam.belief([99])
+
+
+def test_submaps_that_cannot_be_joined_are_told(driven, monkeypatch):
+    monkeypatch.setattr("slamgym.estimator.large_maps.submaps.joining.ITERATIONS", 1)
+    other = made()
+    other.load_state_dict(driven.state_dict())
+    with pytest.raises(np.linalg.LinAlgError, match="did not converge in 1 iterations"):
+        other.belief()

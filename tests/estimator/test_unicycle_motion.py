@@ -1,0 +1,41 @@
+import numpy as np
+import pytest
+from numeric_jacobian import numeric_jacobian
+
+from slamgym.estimator.models.unicycle_motion import predict_pose
+
+
+@pytest.mark.parametrize("heading", [-2.5, 0.0, 0.7, 3.1])
+@pytest.mark.parametrize("odometry", [(0.8, -0.3), (-1.5, 0.0), (0.0, 2.0)])
+def test_pose_jacobian_equals_central_differences(heading, odometry):
+    pose = np.array([1.0, -2.0, heading])
+    numeric = numeric_jacobian(lambda p: predict_pose(p, np.array(odometry)).pose, pose)
+    np.testing.assert_allclose(
+        predict_pose(pose, np.array(odometry)).jacobian_pose, numeric, atol=1e-7
+    )
+
+
+def test_noise_jacobian_equals_central_differences():
+    pose, (d, turn) = np.array([1.0, -2.0, 0.7]), (0.8, -0.3)
+
+    def moved(noise):
+        along, across, turned = noise
+        x, y, heading = pose
+        return np.array(
+            [
+                x + (d + along) * np.cos(heading) - across * np.sin(heading),
+                y + (d + along) * np.sin(heading) + across * np.cos(heading),
+                heading + turn + turned,
+            ]
+        )
+
+    np.testing.assert_allclose(
+        predict_pose(pose, np.array([d, turn])).jacobian_noise,
+        numeric_jacobian(moved, np.zeros(3)),
+        atol=1e-8,
+    )
+
+
+def test_the_robot_drives_before_it_turns():
+    pose = predict_pose(np.array([0.0, 0.0, np.pi / 2]), np.array([2.0, 1.0])).pose
+    np.testing.assert_allclose(pose, [0.0, 2.0, np.pi / 2 + 1.0], atol=1e-15)

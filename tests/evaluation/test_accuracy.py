@@ -1,0 +1,212 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slamgym.evaluation.trajectory_error import (
+    Alignment,
+    align_positions,
+    landmark_covariances,
+    landmark_distances,
+    poses_at,
+    position_accuracy,
+)
+
+POSITIONS = np.array([[0.0, 0.0], [4.0, 1.0], [5.0, -3.0], [-2.0, 6.0]])
+
+
+def kabsch(estimate, truth):
+    """Rotation and translation by singular values, as in Umeyama (1991), scale 1."""
+    e_mean, g_mean = estimate.mean(axis=0), truth.mean(axis=0)
+    left, _, right = np.linalg.svd((truth - g_mean).T @ (estimate - e_mean))
+    sign = np.diag([1.0, np.linalg.det(left @ right)])
+    rotation = left @ sign @ right
+    return rotation, g_mean - rotation @ e_mean
+
+
+@given(angle=st.floats(-3.1, 3.1), x=st.floats(-1e3, 1e3), y=st.floats(-1e3, 1e3))
+def test_a_rigid_motion_is_found_again(angle, x, y):
+    truth = Alignment(angle, np.array([x, y])).apply(POSITIONS)
+    found = align_positions(POSITIONS, truth)
+    assert found.angle == pytest.approx(angle, abs=1e-9)
+    np.testing.assert_allclose(found.translation, [x, y], atol=1e-8)
+
+
+def test_alignment_turns_counter_clockwise():
+    quarter = Alignment(math.pi / 2, np.array([10.0, 0.0]))
+    np.testing.assert_allclose(quarter.apply(np.array([[1.0, 0.0]])), [[10, 1]])
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("noise", [0.1, 30.0])
+def test_alignment_equals_that_by_singular_values(seed, noise):
+    rng = np.random.default_rng(seed)
+    estimate = rng.normal(size=(6, 2)) * 5 + 3
+    truth = rng.normal(size=(6, 2)) * noise - estimate[:, ::-1]
+    rotation, translation = kabsch(estimate, truth)
+    found = align_positions(estimate, truth)
+    np.testing.assert_allclose(found.translation, translation, atol=1e-9)
+    np.testing.assert_allclose(
+        found.apply(estimate), estimate @ rotation.T + translation, atol=1e-9
+    )
+
+
+def test_a_mirrored_map_is_not_unmirrored():
+    mirrored = POSITIONS * [1, -1]
+    assert position_accuracy(mirrored, POSITIONS).aligned_rmse > 1
+
+
+def test_scale_is_not_adapted():
+    accuracy = position_accuracy(2 * POSITIONS, POSITIONS)
+    centred = POSITIONS - POSITIONS.mean(axis=0)
+    expected = math.sqrt(np.mean(np.sum(centred**2, axis=1)))
+    assert accuracy.aligned_rmse == pytest.approx(expected)
+
+
+def test_no_other_rigid_motion_is_closer():
+    rng = np.random.default_rng(1)
+    truth = POSITIONS + rng.normal(size=POSITIONS.shape)
+    best = align_positions(POSITIONS, truth)
+
+    def cost(angle, translation):
+        moved = Alignment(angle, translation).apply(POSITIONS)
+        return np.sum((moved - truth) ** 2)
+
+    least = cost(best.angle, best.translation)
+    for step in (-0.01, 0.01):
+        assert cost(best.angle + step, best.translation) > least
+        assert cost(best.angle, best.translation + np.array([step, 0])) > least
+        assert cost(best.angle, best.translation + np.array([0, step])) > least
+
+
+def test_rmse_is_the_root_of_the_mean_square():
+    accuracy = position_accuracy([[0, 0], [1, 0]], [[3, 4], [1, 0]])
+    np.testing.assert_array_equal(accuracy.raw_errors, [5, 0])
+    assert accuracy.raw_rmse == pytest.approx(math.sqrt(12.5))
+    np.testing.assert_allclose(
+        accuracy.aligned_rmse, math.sqrt(np.mean(accuracy.aligned_errors**2))
+    )
+
+
+def test_a_moved_map_is_wrong_raw_and_right_aligned():
+    truth = Alignment(0.3, np.array([2.0, -1.0])).apply(POSITIONS)
+    accuracy = position_accuracy(POSITIONS, truth)
+    assert accuracy.raw_rmse > 1
+    assert accuracy.aligned_rmse == pytest.approx(0, abs=1e-12)
+
+
+def test_one_position_is_aligned_without_turning():
+    accuracy = position_accuracy([[1, 2]], [[4, 6]])
+    assert accuracy.raw_rmse == 5
+    assert accuracy.alignment.angle == 0
+    assert accuracy.aligned_rmse == 0
+
+
+def test_mahalanobis_distance_counts_standard_deviations_along_the_axes():
+    distances = landmark_distances(
+        [[3, 0], [0, 3]], [np.diag([9, 1])] * 2, np.zeros((2, 2))
+    )
+    np.testing.assert_allclose(distances.euclidean, [3, 3])
+    np.testing.assert_allclose(distances.mahalanobis, [1, 3])
+
+
+def test_mahalanobis_distance_does_not_depend_on_the_frame():
+    rng = np.random.default_rng(0)
+    estimate, truth = rng.normal(size=(2, 5, 2))
+    factors = rng.normal(size=(5, 2, 2))
+    P = factors @ factors.transpose(0, 2, 1) + 0.1 * np.eye(2)
+    T = np.array([[2.0, 0.3], [-1.0, 0.5]])
+    np.testing.assert_allclose(
+        landmark_distances(estimate @ T.T, T @ P @ T.T, truth @ T.T).mahalanobis,
+        landmark_distances(estimate, P, truth).mahalanobis,
+    )
+
+
+def test_squared_mahalanobis_distance_of_true_deviates_averages_two():
+    rng = np.random.default_rng(3)
+    P = np.array([[2.0, 0.9], [0.9, 1.0]])
+    estimate = rng.multivariate_normal([1, 2], P, size=4000)
+    distances = landmark_distances(
+        estimate, np.broadcast_to(P, (4000, 2, 2)), np.tile([1.0, 2.0], (4000, 1))
+    )
+    assert np.mean(distances.mahalanobis**2) == pytest.approx(2, abs=0.13)
+
+
+@pytest.mark.parametrize("P", [np.zeros((2, 2)), np.diag([1, -1]), np.ones((2, 2))])
+def test_covariance_that_is_not_positive_definite_is_refused(P):
+    with pytest.raises(ValueError, match="covariances must be positive definite"):
+        landmark_distances([[1, 2]], [P], [[0, 0]])
+
+
+def test_covariance_of_the_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match=r"covariances must be shape \(2, 2, 2\)"):
+        landmark_distances(np.zeros((2, 2)), np.eye(2), np.zeros((2, 2)))
+
+
+def test_landmark_covariances_are_the_blocks_behind_the_pose():
+    covariance = np.arange(49.0).reshape(7, 7)
+    np.testing.assert_array_equal(
+        landmark_covariances(covariance), [covariance[3:5, 3:5], covariance[5:7, 5:7]]
+    )
+    assert landmark_covariances(np.eye(3)).shape == (0, 2, 2)
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (5, 7), (2, 2), (5,), (1, 1)])
+def test_joint_covariance_of_the_wrong_shape_is_refused(shape):
+    with pytest.raises(ValueError, match=r"covariance must be shape \(3 \+ 2n"):
+        landmark_covariances(np.zeros(shape))
+
+
+def test_truth_is_interpolated_between_its_rows():
+    path = [[0, 0, 10, 0.1], [2, 4, 20, 0.5], [3, 4, 20, 0.5]]
+    np.testing.assert_allclose(poses_at([1, 2.5], path), [[2, 15, 0.3], [4, 20, 0.5]])
+
+
+def test_heading_takes_the_shorter_way_across_pi():
+    poses = poses_at([0.25, 0.75], [[0, 0, 0, 3.0], [1, 0, 0, -3.0]])
+    turned = 2 * math.pi - 6
+    np.testing.assert_allclose(
+        poses[:, 2], [3 + turned / 4, -3 - turned / 4], atol=1e-12
+    )
+
+
+def test_outside_its_time_the_truth_is_unknown():
+    poses = poses_at([-0.1, 0, 1, 1.1], [[0, 0, 0, 0], [1, 0, 0, 0]])
+    np.testing.assert_array_equal(
+        np.isnan(poses).all(axis=1), [True, False, False, True]
+    )
+    assert np.isnan(poses_at([0.0], np.empty((0, 4)))).all()
+
+
+def test_unknown_headings_stay_unknown_and_spoil_no_others():
+    path = [[0, 0, 0, 3.0], [1, 1, 0, math.nan], [2, 2, 0, -3.0], [3, 3, 0, -3.0]]
+    poses = poses_at([0.5, 2.5], path)
+    np.testing.assert_allclose(poses[:, 0], [0.5, 2.5])
+    assert np.isnan(poses[0, 2])
+    assert poses[1, 2] == pytest.approx(-3.0)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "truth", "message"),
+    [
+        (
+            [[1, 2, 3]],
+            [[1, 2]],
+            r"estimate must be n >= 1 positions, got shape \(1, 3\)",
+        ),
+        (np.empty((0, 2)), np.empty((0, 2)), "estimate must be n >= 1 positions"),
+        ([[1, 2]], [[1, math.nan]], "truth must be finite"),
+        ([[1, 2]], [[1, 2], [3, 4]], "as many positions, got 1 and 2"),
+        ([["a", "b"]], [[1, 2]], "estimate must be numbers"),
+    ],
+)
+def test_positions_that_do_not_fit_are_refused(estimate, truth, message):
+    with pytest.raises(ValueError, match=message):
+        position_accuracy(estimate, truth)
+
+
+def test_error_speaks_of_landmarks_where_the_caller_does():
+    with pytest.raises(ValueError, match="landmarks must be finite"):
+        landmark_distances([[math.inf, 0]], [np.eye(2)], [[0, 0]])

@@ -1,0 +1,67 @@
+"""Whether the filter is as sure as it may be: NEES over many runs.
+
+In a world anchored at the start, where the first pose is the origin by definition, the
+standard EKF is consistent; the sum of the final pose NEES of 200 runs is χ² with 600
+degrees of freedom.
+"""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from slamgym.envs.controllers.single import OpenLoop
+from slamgym.experiments.logs.recording import record_episode
+from slamgym.experiments.runs.filter_settings import settings_for
+from slamgym.experiments.runs.replay import replay
+from slamgym.experiments.runs.summary import pose_nees
+from slamgym.sim_configs import action_sequence, load_scenario
+
+RUNS = 200
+ACCEPTED = chi2.ppf([0.005, 0.995], 3 * RUNS)
+
+
+@pytest.fixture(scope="module")
+def drives():
+    world = load_scenario("six_landmarks").with_changes(start={"std": [0, 0, 0]})
+    driver = OpenLoop(action_sequence(world), world.robot)
+    return [record_episode(world, driver, seed) for seed in range(RUNS)]
+
+
+def final_nees(drives, doubt=1.0):
+    """Pose NEES at the end of each drive, of a filter that scales all noise."""
+    nees = []
+    for log in drives:
+        told = settings_for(log)
+        settings = settings_for(
+            log,
+            motion_std=doubt * np.array(told.motion_std),
+            measurement_std=doubt * np.array(told.measurement_std),
+        )
+        nees.append(pose_nees(replay(log, settings.make(log.start)).trace)[-1])
+    return np.array(nees)
+
+
+def test_final_nees_is_chi_square_in_a_world_anchored_at_the_start(drives):
+    nees = final_nees(drives)
+    low, high = ACCEPTED
+    assert low < nees.sum() < high
+    inside = np.mean(nees < chi2.ppf(0.95, 3))
+    assert inside == pytest.approx(0.95, abs=3 * np.sqrt(0.95 * 0.05 / RUNS))
+
+
+@pytest.mark.parametrize("doubt", [0.9, 1.1])
+def test_a_filter_that_errs_by_a_tenth_about_the_noise_is_refused(drives, doubt):
+    low, high = ACCEPTED
+    assert not low < final_nees(drives, doubt).sum() < high
+
+
+def test_the_nis_of_all_scans_is_chi_square_too(drives):
+    """The innovations of a filter are white, so those of one run add up too."""
+    total, dof = 0.0, 0
+    for log in drives:
+        trace = replay(log, settings_for(log).make(log.start)).trace
+        total += trace.nis.sum()
+        dof += trace.nis_dof.sum()
+    low, high = chi2.ppf([0.005, 0.995], dof)
+    assert low < total < high
+    assert dof == RUNS * 29 * 12

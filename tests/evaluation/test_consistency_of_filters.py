@@ -1,0 +1,91 @@
+"""Monte Carlo: what each filter claims to know, against what it knows.
+
+Seeds are fixed; the intervals are those within which the filters were measured by
+benchmarks/consistency_table.py over other seeds.
+"""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from slamgym.estimator import make_batch
+from slamgym.evaluation.nees import average_band, pose_nees
+from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.sim_configs import load_scenario
+
+RUNS = 200
+
+
+@cache
+def data_of(name, seed):
+    return simulate_runs(name, RUNS, seed)
+
+
+@cache
+def study(scenario, name, seed=0, **options):
+    """Return the invariant NEES / 3 (runs, steps) and final heading deviations [°]."""
+    world, data = load_scenario(scenario), data_of(scenario, seed)
+    batch = make_batch(
+        name,
+        runs=RUNS,
+        landmarks=data.visible.shape[2],
+        initial_poses=data.initial_poses,
+        initial_pose_std=world.start.std,
+        motion_std=world.motion.std,
+        measurement_std=world.sensor.std,
+        range_std_per_metre=world.sensor.range_std_per_metre,
+        **options,
+    )
+    trace = batch.run(data.odometry, data.measurements, data.visible, data.dt)
+    poses, covariances = trace.poses[:, 1:], trace.pose_covariances[:, 1:]
+    nees = pose_nees(data.true_poses[:, 1:], poses, covariances, frame="invariant")
+    return nees / 3, np.rad2deg(np.sqrt(covariances[:, -1, 2, 2]))
+
+
+def share_inside(nees):
+    low, high = np.array(average_band(RUNS, 3)) / 3
+    average = nees.mean(axis=0)
+    return ((average > low) & (average < high)).mean()
+
+
+def test_in_the_loop_the_invariant_filter_is_consistent_and_the_ekf_is_not():
+    # NEES is strongly correlated in time, so the share of steps inside the band varies
+    # from one 200 runs to the next (.73 to .98): the average of three is looked at.
+    studies = [study("loop", "invariant", seed)[0] for seed in (0, 1000, 2000)]
+    for nees in studies:
+        assert 0.95 < nees.mean() < 1.12
+    assert np.mean([share_inside(nees) for nees in studies]) >= 0.8
+    assert study("loop", "ekf")[0].mean() > 4
+
+
+def test_in_the_seed_world_the_ekf_believes_to_know_its_heading():
+    invariant, invariant_std = study("six_landmarks", "invariant")
+    ekf, ekf_std = study("six_landmarks", "ekf")
+    assert 0.93 < invariant.mean() < 1.07
+    assert 5.7 < invariant_std.mean() < 5.8
+    assert 2.4 < ekf.mean() < 2.8
+    assert ekf_std.mean() == pytest.approx(2.55, abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["ekf", "invariant", "first_estimates", "iterated"])
+def test_with_the_frame_anchored_every_filter_is_consistent(name):
+    assert 0.9 < study("anchored", name)[0].mean() < 1.1
+
+
+def test_with_a_coarse_sensor_the_iterated_invariant_filter_stays_sound():
+    nees, _ = study("coarse_loop", "invariant", iterations=3)
+    per_run = nees.mean(axis=1)
+    assert np.median(per_run) <= 1.1
+    assert (per_run > 3).mean() <= 0.03
+
+
+def test_an_unknown_first_heading_does_not_mislead_the_invariant_filter():
+    nees, std = study("unknown_heading", "invariant")
+    assert 1.0 <= nees.mean() < 1.25
+    assert std.mean() == pytest.approx(np.rad2deg(0.5), abs=0.1)
+
+
+def test_large_heading_jumps_need_one_landmark_after_the_other():
+    assert 1.0 <= study("slippery", "invariant", sequential=True)[0].mean() < 1.25
+    assert study("slippery", "invariant")[0].mean() > 3

@@ -1,0 +1,124 @@
+"""The report on many runs: what it counts, says and refuses."""
+
+import numpy as np
+import pytest
+from linear_filter import kalman_scores
+
+from slamgym.evaluation.consistency_report import assert_consistent, consistency_report
+
+RUNS, STEPS = 100, 40
+
+
+@pytest.fixture
+def scores():
+    nees, nis = kalman_scores(np.random.default_rng(1), RUNS, STEPS)
+    return nees, nis, np.ones((RUNS, STEPS), dtype=np.int64)
+
+
+def report(nees, nis, nis_dof, frame="invariant"):
+    rng = np.random.default_rng(0)
+    return consistency_report(nees, nis, nis_dof, frame=frame, rng=rng)
+
+
+def test_a_consistent_filter_passes(scores):
+    assert_consistent(report(*scores))
+    assert report(*scores).equivalence.verdict == "consistent"
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.6])
+def test_a_wrong_filter_raises_with_every_sentence(scores, factor):
+    nees, nis, freedom = scores
+    found = report(factor * nees, nis, freedom)
+    with pytest.raises(AssertionError) as error:
+        assert_consistent(found)
+    assert all(sentence in str(error.value) for sentence in found.sentences())
+
+
+def test_a_consistent_filter_is_accepted_in_95_of_100_cases():
+    nees, nis = kalman_scores(np.random.default_rng(2), 200 * 30, 20)
+    freedom = np.ones((30, 20), dtype=np.int64)
+    cases = zip(nees.reshape(200, 30, 20), nis.reshape(200, 30, 20), strict=True)
+    accepted = [report(*case, freedom).accepted for case in cases]
+    assert np.mean(accepted) >= 0.95 - 3 * np.sqrt(0.05 * 0.95 / 200)
+
+
+def test_failed_runs_are_named_left_out_and_not_accepted(scores):
+    nees, nis, freedom = scores
+    whole = report(nees[2:], nis[2:], freedom[2:])
+    nees[0, 30:], nis[1, 5] = np.nan, np.nan
+    found = report(nees, nis, freedom)
+    assert found.failed_runs == (0, 1)
+    assert found.final_step == whole.final_step
+    assert "2 of 100 runs failed and are left out: 0, 1." in found.sentences()
+    with pytest.raises(AssertionError, match="runs failed"):
+        assert_consistent(found)
+
+
+def test_a_start_known_for_certain_is_no_failure(scores):
+    nees, nis, freedom = scores
+    nees[:, 0] = np.nan
+    found = report(nees, nis, freedom)
+    assert (found.failed_runs, found.undefined_steps) == ((), 1)
+    assert found.family_steps[-1] == STEPS - 1
+
+
+def test_runs_that_all_end_early_have_failed(scores):
+    nees, nis, freedom = scores
+    nees[:, -1] = np.nan
+    with pytest.raises(ValueError, match="got 100 failed of 100"):
+        report(nees, nis, freedom)
+
+
+@pytest.mark.parametrize(("runs", "warned"), [(19, True), (20, False)])
+def test_few_runs_are_warned_of(scores, runs, warned):
+    found = report(*(array[:runs] for array in scores))
+    assert any("Only 19 runs" in line for line in found.warnings()) == warned
+
+
+def test_below_10_runs_the_time_averages_have_no_say():
+    nees = np.full((9, 5), 3.8) + 0.02 * np.arange(9)[:, None]  # far too much alike
+    nis, freedom = np.random.default_rng(3).chisquare(2, (9, 5)), np.full((9, 5), 2)
+    few = report(nees, nis, freedom)
+    assert few.time_average.p_value < 0.001
+    assert few.final_step.p_value > 0.02
+    assert few.accepted
+    many = report(*(np.concatenate([a, a[:1]]) for a in (nees, nis, freedom)))
+    assert not many.accepted
+
+
+def test_a_bootstrap_of_too_few_runs_says_so(scores):
+    lines = report(*(array[:3] for array in scores)).sentences()
+    (line,) = (line for line in lines if "bootstrap" in line)
+    assert line.endswith("nothing decided: too few runs, or all equal.")
+
+
+def test_many_failed_runs_are_not_all_named(scores):
+    nees, nis, freedom = scores
+    nees[:60, 5] = np.nan
+    assert report(nees, nis, freedom).warnings()[0] == (
+        "60 of 100 runs failed and are left out: 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 50 "
+        "more."
+    )
+
+
+def test_every_nees_sentence_names_the_frame(scores):
+    lines = report(*scores, frame="additive").sentences()
+    assert sum("additive frame" in line for line in lines) == 6
+    assert lines[-1].endswith("1.1: 767, 1.2: 209, 1.5: 42.")
+
+
+def test_mean_median_and_share_are_those_of_the_runs(scores):
+    nees, nis, freedom = scores
+    nees[:10] *= 10
+    found, ratios = report(nees, nis, freedom), nees.mean(axis=1) / 3
+    assert found.mean_ratio == pytest.approx(ratios.mean())
+    assert found.median_ratio == pytest.approx(np.median(ratios))
+    assert found.share_above_3 == 0.1
+
+
+def test_unknown_frames_and_misfit_shapes_are_refused(scores):
+    nees, nis, freedom = scores
+    with pytest.raises(ValueError, match="frame must be"):
+        report(*scores, frame="global")
+    with pytest.raises(ValueError, match="nis must be shape"):
+        report(nees, nis[:-1], freedom)

@@ -1,0 +1,197 @@
+"""The tests of the tests: error rates on a filter that is exactly consistent."""
+
+import numpy as np
+import pytest
+from linear_filter import kalman_scores
+from scipy.stats import chi2, norm
+
+from slamgym.evaluation.hypothesis_tests import (
+    family_band,
+    family_decision,
+    final_step_decision,
+    nis_decision,
+    normal_scores,
+    runs_to_detect,
+    whiteness_decision,
+)
+from slamgym.evaluation.nees import average_band, ljung_box
+from slamgym.evaluation.time_average_tests import (
+    bootstrap_decision,
+    equivalence_decision,
+    time_average_decision,
+)
+
+REPETITIONS, RUNS, STEPS, DOF = 2000, 50, 60, 3
+GRID = np.arange(STEPS // 10, STEPS + 1, STEPS // 10) - 1
+
+
+@pytest.fixture(scope="module")
+def repetitions():
+    rng = np.random.default_rng(1)
+    nees, nis = kalman_scores(rng, REPETITIONS * RUNS, STEPS)
+    shape = (REPETITIONS, RUNS, STEPS)
+    return list(zip(nees.reshape(shape), nis.reshape(shape), strict=True))
+
+
+def bootstrap(nees):
+    rng = np.random.default_rng(2)
+    return bootstrap_decision(nees.mean(axis=1), DOF, rng=rng, resamples=399)
+
+
+ONES = np.ones((RUNS, STEPS), dtype=np.int64)
+DECISIONS = {
+    "final step": lambda nees, _: final_step_decision(nees[:, -1], DOF),
+    "time average": lambda nees, _: time_average_decision(nees.mean(axis=1), DOF),
+    "bootstrap": lambda nees, _: bootstrap(nees),
+    "family": lambda nees, _: family_decision(nees[:, GRID], DOF),
+    "nis": lambda _, nis: nis_decision(nis, ONES),
+    "whiteness": lambda _, nis: whiteness_decision(nis, ONES),
+}
+
+
+@pytest.mark.parametrize("name", DECISIONS)
+def test_a_consistent_filter_is_refused_as_often_as_stated(name, repetitions):
+    decide = DECISIONS[name]
+    refused = np.mean([not decide(nees, nis).accepted for nees, nis in repetitions])
+    assert 0.035 <= refused <= 0.07
+
+
+@pytest.mark.parametrize("runs", [10, 20, 50])
+def test_averages_of_a_filter_that_never_forgets_are_refused_as_often(runs):
+    """One χ²(3) per run, the most skewed case; the plain t-test refuses 8 %."""
+    rng = np.random.default_rng(3)
+    averages = rng.chisquare(DOF, (REPETITIONS, runs))
+    refused = [not time_average_decision(row, DOF).accepted for row in averages]
+    assert 0.035 <= np.mean(refused) <= 0.07
+
+
+def test_the_interval_of_the_time_averages_ends_where_they_are_refused():
+    """Between them lies the correction for skewness and its inverse."""
+    rng = np.random.default_rng(8)
+    for averages in rng.chisquare(DOF, (2000, 8)):
+        decision = time_average_decision(averages, DOF)
+        low, high = decision.interval
+        assert (low <= decision.statistic <= high) == decision.accepted
+
+
+@pytest.mark.parametrize("ratio", [0.8, 1.25])
+def test_equivalence_is_claimed_at_the_margin_as_often_as_stated(ratio):
+    rng = np.random.default_rng(4)
+    averages = ratio * rng.chisquare(DOF, (REPETITIONS, 400))
+    claimed = [equivalence_decision(row, DOF).accepted for row in averages]
+    assert 0.035 <= np.mean(claimed) <= 0.07
+
+
+def test_covariances_too_small_by_a_fifth_are_found_with_the_stated_power():
+    rng = np.random.default_rng(5)
+    nees, _ = kalman_scores(rng, REPETITIONS * 209, 8, claimed=1.2)
+    rows = nees[:, -1].reshape(REPETITIONS, 209)
+    refused = np.mean([not final_step_decision(row, DOF).accepted for row in rows])
+    assert 0.85 <= refused <= 0.95
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("name", ["final step", "time average", "bootstrap", "family"])
+def test_a_factor_of_two_is_found_in_either_direction(name, factor, repetitions):
+    nees, nis = repetitions[0]
+    assert not DECISIONS[name](factor * nees, nis).accepted
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_pooled_nis_is_two_sided(factor, repetitions):
+    nees, nis = repetitions[0]
+    assert not DECISIONS["nis"](nees, factor * nis).accepted
+
+
+def test_repeated_innovations_are_not_white(repetitions):
+    _, nis = repetitions[0]
+    assert not whiteness_decision(np.repeat(nis, 2, axis=1)[:, :STEPS], ONES).accepted
+
+
+def test_steps_without_a_scan_are_left_out(repetitions):
+    _, nis = repetitions[0]
+    freedom, holes = ONES.copy(), nis.copy()
+    freedom[:, ::2], holes[:, ::2] = 0, np.nan
+    assert nis_decision(holes, freedom) == nis_decision(nis[:, 1::2], ONES[:, 1::2])
+    assert np.isfinite(whiteness_decision(holes, freedom).statistic)
+
+
+@pytest.mark.parametrize("name", ["final step", "time average", "bootstrap", "nis"])
+def test_accepted_says_the_same_as_the_interval(name, repetitions):
+    for nees, nis in repetitions[:200]:
+        decision = DECISIONS[name](nees, nis)
+        low, high = decision.interval
+        inside = low <= decision.statistic <= high
+        assert inside == decision.accepted or abs(decision.p_value - 0.05) < 0.01
+
+
+def test_the_family_band_holds_what_the_family_decision_accepts(repetitions):
+    for nees, _ in repetitions[:200]:
+        family = family_decision(nees[:, GRID], DOF)
+        low, high = family.interval
+        outside = (family.statistic < low) | (family.statistic > high)
+        assert outside.any() == (not family.accepted)
+
+
+def test_the_family_band_is_wider_for_more_times():
+    assert family_band(50, 3, 1) == average_band(50, 3)
+    assert family_band(50, 3, 10).high == pytest.approx(chi2.ppf(1 - 0.0025, 150) / 50)
+
+
+@pytest.mark.parametrize(
+    ("factor", "runs"),
+    [(1.05, 2933), (1.1, 767), (1.2, 209), (1.3, 101), (1.5, 42), (2.0, 15)],
+)
+def test_runs_to_detect_a_factor(factor, runs):
+    assert runs_to_detect(factor, DOF) == runs
+
+
+@pytest.mark.parametrize("runs", range(2, 8))
+def test_the_bootstrap_of_few_runs_is_finite_or_decides_nothing(runs):
+    rng = np.random.default_rng(9)
+    for averages in rng.chisquare(DOF, (30, runs)):
+        decision = bootstrap_decision(averages, DOF, rng=rng)
+        assert decision.statistic == pytest.approx(averages.mean() / DOF)
+        if runs < 5:
+            assert np.isnan(decision.p_value)
+            assert decision.accepted
+        else:
+            assert 0 < decision.p_value <= 1
+            assert np.abs(decision.interval).max() < 1e6
+
+
+def test_the_bootstrap_of_runs_that_are_all_equal_decides_nothing():
+    averages = np.full(7, 0.1)  # whose mean is not 0.1 to the last bit
+    decision = bootstrap_decision(averages, DOF, rng=np.random.default_rng(9))
+    assert np.isnan(decision.p_value)
+
+
+def test_normal_scores_have_the_quantiles_of_a_normal():
+    for dof in (10, 30, 100):
+        x = chi2.ppf([0.025, 0.5, 0.975], dof)
+        expected = norm.ppf([0.025, 0.5, 0.975])
+        np.testing.assert_allclose(normal_scores(x, [dof] * 3), expected, atol=0.03)
+    assert np.isnan(normal_scores([1.0], [0]))
+
+
+def test_equivalence_has_three_verdicts():
+    rng = np.random.default_rng(6)
+    averages = rng.chisquare(DOF, 400)
+    assert equivalence_decision(averages, DOF).verdict == "consistent"
+    assert equivalence_decision(2 * averages, DOF).verdict == "not consistent"
+    assert equivalence_decision(averages[:10], DOF).verdict == "not shown"
+
+
+def test_ljung_box_finds_correlated_innovations():
+    white = np.random.default_rng(7).standard_normal((20, 200))
+    assert ljung_box(white).p_value > 0.01
+    assert ljung_box(white[:, 1:] + 0.2 * white[:, :-1]).p_value < 1e-6
+
+
+def test_what_is_not_one_number_per_run_is_refused():
+    with pytest.raises(ValueError, match="nees must be at least 1 finite"):
+        final_step_decision(np.array([1.0, np.nan]), DOF)
+    with pytest.raises(ValueError, match="factor must differ from 1"):
+        runs_to_detect(1.0, DOF)
+    with pytest.raises(ValueError, match="lags must be in"):
+        ljung_box(np.ones((2, 5)), lags=5)

@@ -1,0 +1,73 @@
+"""NEES of positions, landmarks, whole states and relative maps."""
+
+import numpy as np
+import pytest
+
+from slamgym.evaluation.nees import (
+    autocorrelation,
+    landmark_nees,
+    pose_nees,
+    position_nees,
+    relative_map_nees,
+    state_nees,
+)
+
+RUNS = 20_000
+MEAN = np.array([3.0, -2.0, 0.7, 5.0, 1.0, -4.0, 6.0])
+
+
+@pytest.fixture(scope="module")
+def small_errors():
+    """Draw true states around the mean, with a full covariance, small enough."""
+    rng = np.random.default_rng(0)
+    root = 1e-4 * rng.standard_normal((7, 7))
+    truth = MEAN + rng.standard_normal((RUNS, 7)) @ root.T
+    return truth, np.tile(MEAN, (RUNS, 1)), np.tile(root @ root.T, (RUNS, 1, 1))
+
+
+def expect_chi_square(nees, dof):
+    assert nees.mean() == pytest.approx(dof, abs=4 * np.sqrt(2 * dof / RUNS))
+    assert nees.var() == pytest.approx(2 * dof, rel=0.15)
+
+
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+def test_nees_is_chi_square_in_either_frame(small_errors, frame):
+    expect_chi_square(position_nees(*small_errors, frame=frame), 2)
+    expect_chi_square(state_nees(*small_errors, frame=frame), 7)
+    for nees in landmark_nees(*small_errors, frame=frame).T:
+        expect_chi_square(nees, 2)
+
+
+def test_nees_of_the_relative_map_is_chi_square(small_errors):
+    expect_chi_square(relative_map_nees(*small_errors), 4)
+
+
+def test_the_relative_map_ignores_a_turn_of_the_whole_world(small_errors):
+    truth, means, covariances = (array[:50] for array in small_errors)
+    turn, shift = np.exp(0.9j), 4.0 - 7.0j
+    turned = truth.copy()
+    for x, y in ((0, 1), (3, 4), (5, 6)):
+        point = turn * (truth[:, x] + 1j * truth[:, y]) + shift
+        turned[:, x], turned[:, y] = point.real, point.imag
+    turned[:, 2] += 0.9
+    before = relative_map_nees(truth, means, covariances)
+    after = relative_map_nees(turned, means, covariances)
+    np.testing.assert_allclose(after, before, rtol=1e-6)
+
+
+def test_a_state_without_landmarks_is_a_pose(small_errors):
+    truth, means, covariances = small_errors
+    pose = (truth[:, :3], means[:, :3], covariances[:, :3, :3])
+    for frame in ("additive", "invariant"):
+        np.testing.assert_array_equal(
+            state_nees(*pose, frame=frame), pose_nees(*pose, frame=frame)
+        )
+
+
+def test_autocorrelation_of_a_moving_sum_and_across_gaps():
+    noise = np.random.default_rng(1).standard_normal((50, 1001))
+    series = noise[:, 1:] + noise[:, :-1]
+    series[:, 500] = np.nan
+    correlations, pairs = autocorrelation(series, lags=2)
+    np.testing.assert_allclose(correlations, [0.5, 0.0], atol=0.02)
+    np.testing.assert_array_equal(pairs, [50 * 997, 50 * 996])

@@ -1,0 +1,471 @@
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.experiments.command_line import reporter, run_and_replay
+from slamgym.experiments.command_line.app import main
+from slamgym.sim_configs import list_presets, load_scenario
+
+COMMANDS = (
+    "run",
+    "replay",
+    "generate",
+    "monte-carlo",
+    "noise-study",
+    "render",
+    "scenarios",
+    "estimators",
+)
+LOG = """# format: slamlog 1
+# name: little
+# motion_std: 0.1,0.1,0.05
+# measurement_std: 0.02,0.1
+landmark,7,5,0
+measurement,0,7,0.01,5.1
+odometry,1,1,0,1
+measurement,1,7,-0.01,4.1
+measurement,1,9,1.0,3.0
+"""
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def log(here):
+    path = here / "little.csv"
+    path.write_text(LOG)
+    return path
+
+
+@pytest.fixture
+def without_pictures(monkeypatch):
+    def leave_a_mark(folder, replay, **_):
+        (folder / "map.png").write_text("a picture")
+
+    monkeypatch.setattr(run_and_replay, "write_figures", leave_a_mark)
+
+
+def slamgym(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def printed(*arguments):
+    """What a command prints for people; it must succeed."""
+    result = slamgym(*arguments)
+    assert result.exit_code == 0, result.stderr
+    return result.stdout
+
+
+def answered(*arguments):
+    """The one object a command prints for programs; it must succeed."""
+    text = printed(*arguments, "--json")
+    assert text.count("\n") == 1
+    return json.loads(text)
+
+
+def refused(*arguments, code=2):
+    """The one line of an error; nothing may be left behind."""
+    before = sorted(os.walk("."))
+    result = slamgym(*arguments)
+    assert result.exit_code == code
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert sorted(os.walk(".")) == before
+    return result.stderr.removeprefix("slamgym: ").strip()
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    summary = answered(
+        "run", "six_landmarks", "--seed", 2, "--steps", 4, "--out", folder / "out"
+    )
+    return folder / "out", summary
+
+
+def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
+    folder, summary = finished_run
+    steps = [f"map_steps/step_{k:03d}.png" for k in range(5)]
+    names = ["covariance.png", "errors.png", "map.png", "truth.png", *steps]
+    for name in names:
+        with Image.open(folder / name) as picture:
+            assert min(picture.size) > 300
+    texts = ["log.csv", "scenario.toml", "summary.json"]
+    found = [p.relative_to(folder).as_posix() for p in folder.rglob("*.*")]
+    assert sorted(found) == sorted(names + texts) == summary["files"]
+
+
+def test_a_run_answers_with_the_numbers_of_its_summary_file(finished_run):
+    folder, summary = finished_run
+    saved = json.loads((folder / "summary.json").read_text())
+    assert {**saved, "out": str(folder)} == summary
+    assert summary["steps"] == 4
+    assert set(summary) >= {"landmarks", "pose", "pose_covariance", "nis", "nees"}
+    assert len(summary["landmarks"]) == 6
+    assert np.shape(summary["pose_covariance"]) == (3, 3)
+
+
+def test_the_scenario_of_a_run_is_saved_with_its_changes(finished_run):
+    folder, _ = finished_run
+    expected = load_scenario("six_landmarks").with_changes(steps=4)
+    assert load_scenario(folder / "scenario.toml") == expected
+
+
+def test_the_log_of_a_run_replays_to_the_same_numbers(finished_run, without_pictures):
+    folder, summary = finished_run
+    again = answered("replay", folder / "log.csv", "--out", "again")
+    for key in ("landmarks", "pose", "pose_covariance", "nis", "nees", "ate"):
+        assert again[key] == summary[key]
+
+
+def test_a_replay_prints_every_landmark_with_both_distances(log, without_pictures):
+    lines = printed("replay", log).splitlines()
+    rows = [line.split() for line in lines if line.strip().startswith(("7 ", "9 "))]
+    summary = json.loads((log.parent / "results/little-ekf/summary.json").read_text())
+    seven = summary["landmarks"][0]
+    assert rows[0] == [
+        "7",
+        f"{seven['x']:.4f}",
+        f"{seven['y']:.4f}",
+        f"{seven['euclidean']:.7f}",
+        f"{seven['mahalanobis']:.5f}",
+    ]
+    assert rows[1][3:] == ["-", "-"]
+    assert "Wrote results/little-ekf/" in lines
+
+
+def test_the_course_log_is_replayed_with_its_published_noise(
+    public_logs, without_pictures
+):
+    data = public_logs / "raw" / "cmu16833" / "data.txt"
+    full = answered("replay", data)["landmarks"]
+    independent = answered("replay", data, "--landmark-init", "independent")
+    assert full[0]["euclidean"] == pytest.approx(0.0042047, abs=1e-6)
+    first = independent["landmarks"][0]
+    assert first["euclidean"] == pytest.approx(0.0024197, abs=1e-6)
+    assert first["mahalanobis"] == pytest.approx(0.05452, abs=1e-5)
+
+
+def test_options_reach_the_filter(log, without_pictures):
+    summary = answered(
+        "replay",
+        log,
+        *("--motion-std", ".2,.1,.05", "--measurement-std", "0.5,1"),
+        *("--initial-pose-std", "1,1,0", "--gate-probability", 0.99),
+        *("--range-std-per-metre", 0.1, "--noise-at-rest", "--landmark-init", "full"),
+        *("--option", "min_range=0.5"),
+    )
+    assert summary["settings"] == {
+        "motion_std": [0.2, 0.1, 0.05],
+        "measurement_std": [0.5, 1.0],
+        "initial_pose_std": [1.0, 1.0, 0.0],
+        "options": {
+            "gate_probability": 0.99,
+            "range_std_per_metre": 0.1,
+            "noise_at_rest": True,
+            "landmark_init": "full",
+            "min_range": 0.5,
+        },
+    }
+
+
+def test_the_pictures_of_single_steps_can_be_left_out(log):
+    files = answered("replay", log, "--no-every-step")["files"]
+    assert not [name for name in files if name.startswith("map_steps")]
+
+
+@pytest.mark.parametrize("flag", ["--every-step", "--no-every-step"])
+def test_every_map_is_kept_where_every_step_is_drawn(log, flag, monkeypatch):
+    histories = []
+    monkeypatch.setattr(
+        run_and_replay,
+        "write_figures",
+        lambda folder, replay, **_: histories.append(replay.trace.landmark_history),
+    )
+    rows = "".join(f"odometry,{t},0.1,0,1\n" for t in range(2, 602))
+    log.write_text(LOG + rows)
+    answered("replay", log, flag)
+    distinct = {id(landmarks.means) for landmarks in histories[0]}
+    assert len(histories[0]) == 602
+    assert (len(distinct) == 602) == (flag == "--every-step")
+
+
+def test_a_random_controller_wanders_the_same_way_for_the_same_seed(without_pictures):
+    options = ("run", "loop", "--steps", 5, "--controller", "random")
+    assert answered(*options)["pose"] == answered(*options)["pose"]
+    assert answered(*options)["pose"] != answered(*options, "--seed", 1)["pose"]
+
+
+def test_an_older_output_is_replaced_as_a_whole(log, without_pictures):
+    first = answered("replay", log, "--out", "out")
+    (log.parent / "out" / "map.png").write_text("old")
+    second = answered("replay", log, "--out", "out", "--measurement-std", "1,1")
+    assert first["pose_covariance"] != second["pose_covariance"]
+    assert (log.parent / "out" / "map.png").read_text() == "a picture"
+    assert sorted(os.listdir()) == ["little.csv", "out"]
+
+
+def test_a_belief_that_degenerates_is_a_failure_and_no_wrong_input(log):
+    noise = ("--motion-std", "0,0,0", "--measurement-std", "0,0")
+    message = refused("replay", log, *noise, code=1)
+    assert message.startswith("little, t = 1: the innovation covariance is not")
+
+
+def test_a_folder_with_other_things_is_left_alone(log, without_pictures):
+    answered("replay", log, "--out", "out")
+    (log.parent / "out" / "notes.txt").write_text("mine")
+    message = refused("replay", log, "--out", "out")
+    assert "notes.txt, which slamgym did not write there" in message
+
+
+def test_ctrl_c_leaves_the_older_output_as_it_was(log, without_pictures, monkeypatch):
+    answered("replay", log, "--out", "out")
+
+    def interrupt(folder, replay):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_and_replay, "write_log", interrupt)
+    message = refused("replay", log, "--out", "out", code=130)
+    assert message == "interrupted; nothing was written"
+    message = refused("replay", log, "--out", "deep/down/out", code=130)
+    assert message == "interrupted; nothing was written"
+
+
+def test_a_bug_is_one_line_too(log, monkeypatch):
+    def stumble(folder, replay, **_):
+        raise KeyError("oops")
+
+    monkeypatch.setattr(run_and_replay, "write_figures", stumble)
+    message = refused("replay", log, code=1)
+    assert message.startswith("internal error, KeyError: 'oops'")
+
+
+@pytest.mark.parametrize("out", ["little.csv/out", "little.csv/deep/out"])
+def test_a_folder_that_cannot_be_written_is_refused(log, out):
+    message = refused("replay", log, "--out", out, code=1)
+    expected = f"the folder {log.parent / out} cannot be written: Not a directory"
+    assert message == expected
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(log):
+    message = refused("replay", log, "--out", "little.csv")
+    assert message.startswith("--out must be a folder, got the file")
+
+
+def test_a_log_that_is_not_there_is_refused():
+    message = refused("replay", "nowhere.csv")
+    assert message == "cannot read the log nowhere.csv: No such file or directory"
+
+
+def test_a_log_of_unknown_noise_asks_for_it(log):
+    log.write_text(LOG.replace("# motion_std", "# other_std"))
+    message = refused("replay", log)
+    assert message == (
+        "little does not tell its motion_std: give it, "
+        "for example --motion-std 0.1,0.1,0.05"
+    )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("odometry,1,1,0", "little.csv, line 7: expected odometry,t,d,alpha,dt"),
+        ("odometry,1,east,0,1", "line 7: expected a finite number, got 'east'"),
+        ("odometry,-1,1,0,1", "line 7: expected t >= 0.0, the time before, got -1.0"),
+    ],
+)
+def test_a_malformed_log_is_refused_with_its_line(log, wrong, message):
+    log.write_text(LOG.replace("odometry,1,1,0,1", wrong))
+    assert message in refused("replay", log)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ("--motion-std", "-1,0,0"),
+            "--motion-std must be 3 numbers >= 0 with commas between, got '-1,0,0'",
+        ),
+        (
+            ("--measurement-std", "1,2,3"),
+            "--measurement-std must be 2 numbers >= 0 with commas between, got '1,2,3'",
+        ),
+        (("--initial-pose-std", "a,b,c"), "--initial-pose-std must be 3 numbers >= 0"),
+        (("--gate-probability", "2"), "gate_probability must lie between 0 and 1"),
+        (("--landmark-init", "half"), "landmark_init must be 'full' or 'independent'"),
+        (("--estimator", "ekv"), "unknown estimator 'ekv'; did you mean 'ekf'?"),
+        (("--option", "gate"), "--option must be KEY=VALUE, got 'gate'"),
+        (("--option", "gate=1"), "estimator 'ekf' refuses its options"),
+        (("--every-steps",), "No such option: --every-steps"),
+    ],
+)
+def test_a_wrong_option_of_the_filter_is_refused(log, options, message):
+    assert message in refused("replay", log, *options)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("six_landmark",), "got 'six_landmark'; did you mean 'six_landmarks'?"),
+        (("nowhere.toml",), "cannot read the scenario 'nowhere.toml'"),
+        (
+            ("loop", "--set", "sensor.max_rage=4"),
+            "unknown key 'max_rage' in sensor; did you mean 'max_range'?",
+        ),
+        (
+            ("loop", "--set", "sensor.std=[-1, 0.1]"),
+            "sensor.std must be 2 ",
+        ),
+        (("loop", "--set", "motion.std=[0.1, 0.1]"), "motion.std must be 3 "),
+        (("loop", "--set", "sensor"), "--set must be KEY=VALUE, got 'sensor'"),
+        (("loop", "--steps", "1"), "steps must be an integer >= 2, got 1"),
+        (("loop", "--controller", "waypoint"), "did you mean 'waypoints'?"),
+        (("loop", "--estimator", "EKF"), "unknown estimator 'EKF'"),
+        (("loop", "--seed", "-1"), "Invalid value for '--seed'"),
+    ],
+)
+def test_a_wrong_world_is_refused(arguments, message):
+    assert message in refused("run", *arguments)
+
+
+def test_several_mistakes_of_a_scenario_stand_in_one_line(here):
+    (here / "mine.toml").write_text("name = 'mine'\ndt = 0\nsteps = 1\n")
+    message = refused("run", "mine.toml")
+    assert "mine.toml: dt must be" in message
+    assert "; mine.toml: steps must be" in message
+
+
+def test_a_noise_study_draws_one_figure_and_tables_eleven_runs(log):
+    summary = answered("noise-study", log, "--out", "study")
+    assert summary["files"] == ["noise_study.csv", "noise_study.png", "summary.json"]
+    with (log.parent / "study" / "noise_study.csv").open() as stream:
+        table = list(csv.DictReader(stream))
+    assert len(table) == len(summary["rows"]) == 11
+    for saved, row in zip(table, summary["rows"], strict=True):
+        assert saved["sigma"] == row["sigma"]
+        assert float(saved["pose_area"]) == row["pose_area"]
+        assert saved["ate"] == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("lop",), "no log and no scenario 'lop'; did you mean 'loop'?"),
+        (("loop", "--motion-std", "1,1,1"), "--motion-std is for the noise study of"),
+        (("little.csv", "--set", "steps=3"), "--set is for the noise study of"),
+    ],
+)
+def test_a_noise_study_refuses_what_has_no_meaning(log, arguments, message):
+    assert message in refused("noise-study", *arguments)
+
+
+def test_a_film_has_one_frame_per_step_and_one_of_the_start():
+    summary = answered("render", "dropout", "--steps", 3, "--out", "film.gif")
+    assert summary == {"out": "film.gif", "frames": 4, "fps": 4.0}
+    with Image.open("film.gif") as film:
+        assert film.n_frames == 4
+
+
+def test_a_film_shows_the_belief_of_a_replay(without_pictures, monkeypatch):
+    shown = []
+    monkeypatch.setattr(
+        LandmarkWorldEnv, "show_belief", lambda self, belief: shown.append(belief)
+    )
+    options = ("six_landmarks", "--steps", 3, "--seed", 5)
+    printed("render", *options, "--out", "film.gif")
+    summary = answered("run", *options)
+    assert len(shown) == 4
+    assert shown[-1].pose.tolist() == summary["pose"]
+
+
+def test_a_world_that_hides_identities_is_filmed_without_a_filter():
+    printed("render", "hidden_identities", "--steps", 2, "--out", "film.gif")
+
+
+@pytest.mark.parametrize(
+    ("out", "message", "code"),
+    [
+        ("film.avi", "path must end in .gif or .mp4, got 'film.avi'", 2),
+        ("nowhere/film.gif", "the folder of nowhere/film.gif does not exist", 1),
+    ],
+)
+def test_a_film_that_cannot_be_written_is_refused(out, message, code):
+    arguments = ("render", "dropout", "--steps", 2, "--out", out)
+    assert refused(*arguments, code=code) == message
+
+
+def test_every_scenario_and_estimator_is_listed():
+    names = [row["name"] for row in answered("scenarios")["scenarios"]]
+    assert names == list(list_presets())
+    assert "ekf" in [row["name"] for row in answered("estimators")["estimators"]]
+    assert "Extended Kalman filter" in printed("estimators")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_explains_each_command(command):
+    assert command in printed("--help")
+    text = printed(command, "--help")
+    assert "Usage:" in text
+    if command not in ("scenarios", "estimators"):
+        assert f"slamgym {command} " in text.partition("Examples:")[2]
+
+
+def test_without_a_command_the_help_is_shown():
+    assert printed() == printed("--help")
+
+
+def test_help_and_scenarios_load_neither_numba_nor_matplotlib():
+    program = (
+        "import sys\n"
+        "from slamgym.experiments.command_line.app import main\n"
+        "main(['scenarios'], standalone_mode=False)\n"
+        "heavy = {'numba', 'matplotlib', 'scipy', 'pymunk'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+
+
+def test_the_installed_program_answers_an_error_with_one_line():
+    program = [
+        sys.executable,
+        "-c",
+        "from slamgym.experiments.command_line.app import main; main()",
+    ]
+    result = subprocess.run(
+        [*program, "run", "lop"], check=False, capture_output=True, text=True
+    )
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(("patience", "note"), [(0.01, "compiling\n"), (60.0, "")])
+def test_a_long_silence_is_explained_on_standard_error(
+    patience, note, capsys, monkeypatch
+):
+    monkeypatch.setattr(reporter, "_PATIENCE", patience)
+    with reporter.Reporter(as_json=True).patience("compiling"):
+        time.sleep(0.2)
+    assert capsys.readouterr() == ("", note)
+
+
+def test_submaps_may_lie_in_a_folder(here, without_pictures):
+    summary = answered(
+        *("run", "six_landmarks", "--steps", 4, "--estimator", "submaps"),
+        *("--option", "folder=maps", "--out", "out"),
+    )
+    assert len(summary["landmarks"]) == 6
+    assert (here / "maps" / "submaps.txt").exists()

@@ -1,0 +1,387 @@
+"""The report as a web page: whole, safe, alone, and seen in a real browser."""
+
+import ast
+import html
+import json
+import re
+import tomllib
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import xarray as xr
+from chromium import find_chromium, requests_of, run_chromium, screenshot
+from monte_carlo_dataset import typical, with_failures
+from PIL import Image
+
+from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo.report import html_report as module
+from slamgym.experiments.monte_carlo.report.html_report import (
+    headline,
+    html_report,
+    write_html_report,
+)
+from slamgym.experiments.monte_carlo.report.summary import summarise_monte_carlo
+from slamgym.experiments.noise_study.one_run import scaled_scenario
+from slamgym.sim_configs import load_scenario
+
+needs_chromium = pytest.mark.skipif(
+    find_chromium() is None, reason="no chromium here (SLAMGYM_CHROMIUM may name one)"
+)
+HOSTILE = "</title></pre><script>alert(\"1\")</script> & '$x$' 100 %"
+
+
+class Outline(HTMLParser):
+    """Elements of a page, its texts, and whether it is nested as it should be."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.elements, self.texts = [], [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in {"meta", "link", "wbr"}:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, text):
+        self.texts.append(text)
+
+    def attributes(self, name):
+        return [found[name] for _, found in self.elements if name in found]
+
+
+def page_of(dataset):
+    return html_report(dataset, summarise_monte_carlo(dataset))
+
+
+def hostile_results():
+    failures = [("ekf", 3, 12, HOSTILE), ("ekf", 5, -1, "")]
+    dataset = with_failures(typical(), failures)
+    dataset = dataset.assign_coords(estimator=[HOSTILE, "_b<i>$\\frac$"])
+    dataset.attrs |= {"scenario_name": HOSTILE, "command": HOSTILE}
+    dataset.attrs["scenario"] = f"# {HOSTILE}\n" + dataset.attrs["scenario"]
+    dataset.attrs["assumed"] = f"# assumed {HOSTILE}"
+    dataset.attrs["versions"] = json.dumps({"a<b>": HOSTILE})
+    return dataset
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    dataset = with_failures(typical(), [("ekf", 3, 12, "LinAlgError: <lost>")])
+    write_html_report(dataset, summarise_monte_carlo(dataset), path)
+    return path
+
+
+def test_the_page_says_verdicts_numbers_and_how_to_do_it_again(report):
+    outline = Outline(report.read_text(encoding="utf-8"))
+    text = " ".join(outline.texts).replace("\xa0", " ")
+    assert not outline.open
+    for words in (
+        "six_landmarks: ekf not consistent; invariant consistent",
+        "1 of 40 runs failed; of the others",
+        "LinAlgError: <lost>",
+        "slamgym monte-carlo six_landmarks --estimators ekf,invariant --runs 40",
+        'name = "six_landmarks"',
+        "run i is the world of seed 0 + i",
+    ):
+        assert words in text
+    assert outline.elements[0] == ("html", {"lang": "en"})
+    assert [tag for tag, _ in outline.elements].count("h1") == 1
+    assert outline.texts.index("ekf") < text.index("In numbers")
+
+
+def test_numbers_on_the_page_are_those_of_the_summary():
+    dataset = typical()
+    page = page_of(dataset)
+    rows = dict(re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', page))
+    nees = (
+        dataset["pose_nees_invariant"].isel(step=slice(1, None)).mean(("run", "step"))
+    )
+    cells = re.findall(r"<td>(.*?)</td>", rows["NEES / 3, invariant frame"])
+    assert [float(cell) for cell in cells] == pytest.approx(nees.values / 3, abs=0.005)
+    std = np.sqrt((dataset["heading_std"].isel(step=-1) ** 2).mean("run"))
+    cells = re.findall(r"<td>(.*?)°</td>", rows["heading at the end, claimed"])
+    assert [float(c) for c in cells] == pytest.approx(np.degrees(std).values, abs=0.05)
+
+
+def test_every_figure_has_a_name_and_its_ids_are_its_own(report):
+    outline = Outline(report.read_text(encoding="utf-8"))
+    figures = [found for tag, found in outline.elements if tag == "svg"]
+    assert len(figures) == 5
+    assert all(found["role"] == "img" and found["aria-label"] for found in figures)
+    ids = outline.attributes("id")
+    assert len(ids) == len(set(ids))
+    page = report.read_text(encoding="utf-8")
+    assert set(re.findall(r'(?:url\(#|href="#)([^)"]+)', page)) == set(ids)
+
+
+def test_colours_and_fonts_of_figures_come_from_the_page(report):
+    page = report.read_text(encoding="utf-8")
+    drawn = "".join(re.findall(r"<svg.*?</svg>", page, re.DOTALL))
+    assert not re.findall(r"#[0-9a-fA-F]{3,6}\b(?!-)", re.sub(r'"#[^"]*"', "", drawn))
+    assert "font-family" not in drawn
+    used = set(re.findall(r"var\((--\w+)\)", page))
+    light, dark = page.split("prefers-color-scheme: dark")
+    assert all(f"{name}:" in light for name in used)
+    assert all(f"{name}:" in dark for name in used - {"--mono"})
+
+
+def test_the_page_asks_for_nothing_and_runs_nothing(report):
+    page = report.read_text(encoding="utf-8")
+    outline = Outline(page)
+    asked = [*outline.attributes("src"), *outline.attributes("href")]
+    assert all(where.startswith(("#", "data:")) for where in asked)
+    assert all(where.startswith("#") for where in re.findall(r"url\(([^)]*)\)", page))
+    assert "@import" not in page
+    tags = {tag for tag, _ in outline.elements}
+    assert not tags & {"script", "iframe", "object", "img", "form", "base"}
+    (policy,) = (
+        found["content"]
+        for _, found in outline.elements
+        if found.get("http-equiv") == "Content-Security-Policy"
+    )
+    assert policy.startswith("default-src 'none'")
+
+
+def test_whatever_names_and_messages_hold_is_shown_as_text():
+    page = page_of(hostile_results())
+    outline = Outline(page)
+    assert not outline.open
+    assert "script" not in {tag for tag, _ in outline.elements}
+    shown = [text.replace("\xa0", " ") for text in outline.texts]
+    assert sum(HOSTILE in text for text in shown) >= 8
+    assert html.escape(HOSTILE).replace(" %", "&nbsp;%") in page
+    drawn = re.findall(r"<text[^>]*>([^<]*)</text>", page)
+    assert HOSTILE in map(html.unescape, drawn)
+
+
+def test_the_scenario_can_be_taken_from_the_page():
+    page = page_of(typical())
+    (text,) = re.findall(r"toml</summary>\n<pre[^>]*><code>(.*?)</code>", page, re.S)
+    assert tomllib.loads(html.unescape(text))["name"] == "six_landmarks"
+
+
+def test_runs_that_all_failed_leave_a_page_without_figures():
+    failures = [
+        (label, run, 3, "boom") for label in ("ekf", "invariant") for run in range(40)
+    ]
+    page = page_of(with_failures(typical(), failures))
+    assert "<svg" not in page
+    assert "nothing to draw" in page
+    assert page.count("boom") == 80
+
+
+def call_on(page, folder):
+    """Follow the page: save the scenarios that it shows, and run its call there."""
+    (code,) = re.findall(r'<pre class="command"[^>]*><code>(.*?)</code>', page, re.S)
+    code = html.unescape(code)
+    titled = r"<summary>[^<]*, (\w+\.toml)</summary>\n<pre[^>]*><code>(.*?)</code>"
+    for name, text in re.findall(titled, page, re.S):
+        if repr(name) in code:
+            assert f"save {name!r}" in code or f"and {name!r}" in code
+            (folder / name).write_text(html.unescape(text), encoding="utf-8")
+    last = ast.parse(code).body.pop()
+    names = {}
+    exec(code.removesuffix(ast.get_source_segment(code, last)), names)
+    return eval(ast.get_source_segment(code, last), names), code
+
+
+@pytest.mark.parametrize("changes", [{}, {"steps": 5}, {"name": "my_own"}])
+@pytest.mark.parametrize("assumed", [False, True])
+@pytest.mark.parametrize(
+    "estimators",
+    [
+        "ekf,invariant",
+        "invariant[iterations=3]",
+        {"mine": ("ekf", {"gate_probability": 0.99})},
+    ],
+)
+def test_the_call_on_the_page_makes_the_same_results(
+    changes, assumed, estimators, tmp_path, monkeypatch
+):
+    world = load_scenario("six_landmarks").with_changes(**changes)
+    told = scaled_scenario(world, "σr", 10) if assumed else None
+    done = monte_carlo(world, estimators, 3, 4, assumed=told, block_size=2)
+    monkeypatch.chdir(tmp_path)
+    again, code = call_on(page_of(done), tmp_path)
+    xr.testing.assert_identical(again, done)
+    assert ("toml" in code) == (bool(changes) or assumed)
+
+
+def test_the_call_of_a_later_part_of_the_runs_makes_that_part(tmp_path):
+    done = monte_carlo("six_landmarks", "ekf", 5, 4, block_size=2, first_run=2)
+    again, _ = call_on(page_of(done), tmp_path)
+    xr.testing.assert_identical(again, done)
+
+
+def test_many_estimators_are_counted_in_the_headline():
+    entries = {str(i): {"verdict": "consistent"} for i in range(4)}
+    said = headline({"scenario": "loop", "estimators": entries})
+    assert said == "loop: 4 of 4 estimators consistent"
+
+
+def test_the_same_results_give_the_same_bytes():
+    assert page_of(typical()) == page_of(typical().copy(deep=True))
+
+
+def test_a_failure_leaves_the_old_report(report, tmp_path, monkeypatch):
+    path = tmp_path / "report.html"
+    path.write_text("old")
+    summary = summarise_monte_carlo(typical())
+    monkeypatch.setattr(module, "replace_when_written", broken_disk)
+    with pytest.raises(OSError, match="full"):
+        write_html_report(typical(), summary, path)
+    assert path.read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["report.html"]
+
+
+def broken_disk(path):
+    raise OSError("disk full")
+
+
+def test_long_runs_of_several_estimators_stay_below_2_megabytes():
+    short = typical()
+    rows = np.arange(1005) % 29 + 1
+    long = short.isel(step=np.concatenate([[0], rows]), estimator=[0, 1, 0, 1])
+    long = long.assign_coords(step=np.arange(1006), estimator=list("abcd"))
+    long.attrs["estimators"] = "{}"
+    assert len(page_of(long).encode()) < 2e6
+
+
+@needs_chromium
+def test_chromium_has_nothing_to_complain_of(report, tmp_path):
+    _, messages = run_chromium(report, "--dump-dom")
+    assert messages == []
+    broken = tmp_path / "broken.html"
+    broken.write_text("<script>undefined_function()</script>")
+    _, messages = run_chromium(broken, "--dump-dom")
+    assert any("undefined_function" in message for message in messages)
+
+
+@needs_chromium
+def test_chromium_asks_the_network_for_nothing(report, tmp_path):
+    asking = tmp_path / "asking.html"
+    asking.write_text('<img src="http://127.0.0.1:9/picture.png">')
+    assert requests_of(report, tmp_path) == []
+    assert requests_of(asking, tmp_path) == ["http://127.0.0.1:9/picture.png"]
+
+
+@needs_chromium
+def test_chromium_runs_no_script_of_hostile_results(tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text(page_of(hostile_results()), encoding="utf-8")
+    dom, messages = run_chromium(path, "--dump-dom")
+    assert "<script" not in dom
+    assert messages == []
+
+
+@needs_chromium
+@pytest.mark.parametrize("dark", [False, True])
+def test_chromium_shows_every_figure_in_light_and_dark(report, tmp_path, dark):
+    boxes = figure_boxes(report, tmp_path, width=1280)
+    assert len(boxes) == 5
+    path = tmp_path / "screen.png"
+    height = int(max(top + high for _, top, _, high in boxes)) + 50
+    screenshot(report, path, size=(1280, height), dark=dark)
+    with Image.open(path) as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(float)
+    paper = pixels[2, 2]
+    assert (paper.mean() < 60) == dark
+    for left, top, wide, high in boxes:
+        part = pixels[int(top) : int(top + high), int(left) : int(left + wide)]
+        apart = abs(part - paper).max(axis=2)
+        assert 0.005 < np.mean(apart > 60) < 0.5
+        assert len(np.unique(part.reshape(-1, 3), axis=0)) > 30
+
+
+@needs_chromium
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_page_does_not_scroll_sideways(report, tmp_path, width):
+    dom, _ = run_chromium(framed(report, tmp_path, width), "--dump-dom")
+    widths = json.loads(re.search(r"<pre>(.*?)</pre>", dom)[1])["scroll"]
+    assert widths == width
+    boxes = figure_boxes(report, tmp_path, width)
+    assert all(wide >= min(0.9 * (width - 32), 400) for _, _, wide, _ in boxes)
+
+
+@needs_chromium
+def test_two_estimators_fit_a_telephone_and_more_of_them_show_that_they_scroll(
+    report, tmp_path
+):
+    wide, room = number_table(framed(report, tmp_path, 390))
+    assert wide <= room
+    four = typical().isel(estimator=[0, 1, 0, 1]).assign_coords(estimator=list("abcd"))
+    four.attrs["estimators"] = "{}"
+    path = tmp_path / "four.html"
+    path.write_text(page_of(four), encoding="utf-8")
+    wide, room = number_table(framed(path, tmp_path, 390))
+    assert wide > room
+    assert shade_beside_the_table(path, tmp_path) > 60
+    assert shade_beside_the_table(report, tmp_path) < 20
+
+
+def number_table(page):
+    """Width of the main table, and the room that it has [px]."""
+    dom, _ = run_chromium(page, "--dump-dom")
+    table = json.loads(re.search(r"<pre>(.*?)</pre>", dom)[1])["table"]
+    return table["scroll"], table["client"]
+
+
+def shade_beside_the_table(report, folder):
+    """How much darker than the paper the table's right end is, where it is empty."""
+    page = framed(report, folder, 390)
+    dom, _ = run_chromium(page, "--dump-dom")
+    table = json.loads(re.search(r"<pre>(.*?)</pre>", dom)[1])["table"]
+    screenshot(page, folder / "table.png", size=(500, 3000))
+    with Image.open(folder / "table.png") as picture:
+        pixels = np.asarray(picture.convert("L")).astype(float)
+    top, right = int(table["top"]), int(table["left"] + table["client"])
+    column = pixels[top + 50 : top + 400, right - 3]
+    return pixels[2, 2] - np.median(column)
+
+
+def figure_boxes(report, folder, width):
+    """Place of every figure on a page so wide: (left, top, width, height) [px]."""
+    dom, _ = run_chromium(framed(report, folder, width), "--dump-dom")
+    return json.loads(re.search(r"<pre>(.*?)</pre>", dom)[1])["boxes"]
+
+
+def framed(report, folder, width):
+    """Put the page into a frame, which may be narrower than any window, and ask it."""
+    page = html.escape(report.read_text(encoding="utf-8"))
+    path = folder / "framed.html"
+    path.write_text(
+        f"""<!DOCTYPE html><meta charset="utf-8"><pre></pre>
+<iframe style="width:{width}px;height:9000px;border:0" srcdoc="{page}"></iframe>
+<script>
+const frame = document.querySelector("iframe");
+frame.onload = () => {{
+  const inner = frame.contentDocument;
+  const boxes = [...inner.querySelectorAll("figure svg")].map((svg) => {{
+    const box = svg.getBoundingClientRect();
+    return [box.left, box.top, box.width, box.height];
+  }});
+  const scroll = inner.documentElement.scrollWidth;
+  const wide = inner.querySelector(".wide"), place = wide.getBoundingClientRect();
+  const outer = frame.getBoundingClientRect();
+  const table = {{
+    client: wide.clientWidth,
+    scroll: wide.scrollWidth,
+    left: place.left + outer.left,
+    top: place.top + outer.top,
+  }};
+  document.querySelector("pre").textContent =
+    JSON.stringify({{ boxes, scroll, table }});
+}};
+</script>""",
+        encoding="utf-8",
+    )
+    return path

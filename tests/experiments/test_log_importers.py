@@ -1,0 +1,515 @@
+import math
+
+import numpy as np
+import pytest
+
+from slamgym.experiments.logs.importers import read_log
+from slamgym.experiments.logs.slamlog import LogError, OdometryRow, Scan, write_slamlog
+
+COURSE_FIRST_SCAN = (
+    "1.1072 6.7060 1.3257 12.3812 0.8520 10.6270 "
+    "1.1071 15.6513 0.4995 12.5422 0.8289 16.2816"
+)
+FREIBURG = """ODOMETRY 0.1 2 -0.3
+SENSOR 1 1.5 0.4
+SENSOR 2 -0.03 3.3
+ODOMETRY 0 1 0.2
+SENSOR 1 1.4 -0.5
+"""
+ISAM = """ODOMETRY 0 1 1 0 0.5 100 0 0 500 0 500
+LANDMARK 1 2 3 4 1.5 0 1.5
+ODOMETRY 1 3 -2 1 -0.25 100 0 0 500 0 500
+LANDMARK 3 2 0 -2 1.5 0 1.5
+LANDMARK 3 4 -1 0 1.5 0 1.5
+"""
+EPOCH = 1248444187.5
+UTIAS = {
+    "Barcodes.dat": "# Subject # Barcode #\n 3 \t 41\n 6 \t 63\n 7 \t 81\n",
+    "Landmark_Groundtruth.dat": "# comment\n6 1.5 -4 1e-4 1e-4\n7 2 3 1e-4 1e-4\n",
+    "Robot3_Odometry.dat": (
+        f"# comment\n{EPOCH:.3f} \t 0.5 \t 0.0\n{EPOCH + 0.15:.3f} 1.0 -0.2\n"
+        f"{EPOCH + 0.15:.3f} 2.0 0.4\n{EPOCH + 0.45:.3f} 0 0\n"
+    ),
+    "Robot3_Measurement.dat": (
+        f"# comment\n{EPOCH - 1:.3f} 63 1 0\n{EPOCH + 0.25:.3f} 63 7.05 -0.036\n"
+        f"{EPOCH + 0.25:.3f} 41 2 0\n{EPOCH + 0.25:.3f} 81 7.2 4\n"
+        f"{EPOCH + 0.3:.3f} 99 1 0\n{EPOCH + 9:.3f} 63 1 0\n"
+    ),
+    "Robot3_Groundtruth.dat": f"{EPOCH - 0.2:.3f} 1 2 3\n{EPOCH + 0.8:.3f} 2 2 -3\n",
+}
+
+
+@pytest.fixture
+def file(tmp_path):
+    def save(text, name="log.txt"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return save
+
+
+@pytest.fixture
+def utias(tmp_path):
+    for name, text in UTIAS.items():
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def odometry_rows(log):
+    return [event for event in log.events if isinstance(event, OdometryRow)]
+
+
+def scans(log):
+    return [event for event in log.events if isinstance(event, Scan)]
+
+
+def turn_last_pose(rows):
+    x = y = heading = 0.0
+    for row in rows:
+        x, y = x + row.d * math.cos(heading), y + row.d * math.sin(heading)
+        heading += row.alpha
+    return x, y, heading
+
+
+def assert_events_agree(ours, theirs, tolerance):
+    assert [type(event) for event in ours] == [type(event) for event in theirs]
+    for a, b in zip(ours, theirs, strict=True):
+        if isinstance(a, OdometryRow):
+            np.testing.assert_allclose(
+                (a.t, a.d, a.alpha, a.dt), (b.t, b.d, b.alpha, b.dt), 0, tolerance
+            )
+        else:
+            assert a.t == pytest.approx(b.t, abs=tolerance)
+            np.testing.assert_array_equal(a.landmark_ids, b.landmark_ids)
+            np.testing.assert_allclose(a.measurements, b.measurements, 0, tolerance)
+
+
+# Course data.txt
+
+
+def test_course_lines_alternate_between_readings_and_odometry(file):
+    log = read_log(file("0.1\t2\t-0.3\t4\t\n3\t0.5\t\n0.2\t3\t-0.2\t5\t\n", "data.txt"))
+    first, row, second = log.events
+    assert (log.name, log.motion, first.t, second.t) == ("data", "turn-last", 0, 1)
+    assert row == OdometryRow(t=1.0, d=3.0, alpha=0.5, dt=1.0)
+    np.testing.assert_array_equal(first.measurements, [[0.1, 2], [-0.3, 4]])
+    np.testing.assert_array_equal(second.measurements, [[0.2, 3], [-0.2, 5]])
+    assert second.landmark_ids.tolist() == [0, 1]
+
+
+def test_course_readings_of_one_landmark_are_not_taken_for_odometry(file):
+    log = read_log(file("0.1 2\n3 0.5\n0.2 3\n"))
+    assert [type(event) for event in log.events] == [Scan, OdometryRow, Scan]
+
+
+def test_course_bearing_is_wrapped(file):
+    (scan,) = read_log(file("3.5 2\n")).events
+    assert scan.measurements[0, 0] == pytest.approx(3.5 - 2 * math.pi)
+
+
+def test_published_ground_truth_is_attached_to_the_published_log(file):
+    log = read_log(file(COURSE_FIRST_SCAN))
+    np.testing.assert_array_equal(
+        log.landmarks, [[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12]]
+    )
+    assert log.header["truth"] == "CMU 16-833 course, matched to the first scan"
+
+
+@pytest.mark.parametrize(
+    "scan",
+    [
+        COURSE_FIRST_SCAN.replace("6.7060", "7.8"),  # 1.1 m off
+        COURSE_FIRST_SCAN.replace("1.1072", "-1.1072"),
+        COURSE_FIRST_SCAN.rsplit(" ", 2)[0],
+    ],
+)
+def test_published_ground_truth_is_not_guessed_for_another_world(file, scan):
+    log = read_log(file(scan))
+    assert log.landmarks.shape == (0, 2)
+    assert log.header["truth"] == "none"
+
+
+def test_world_file_beside_a_course_log_gives_its_truth(file):
+    file("1 5 6\n0 3 4\n", "world.dat")
+    log = read_log(file("0.1 2 -0.3 4\n"))
+    assert log.landmark_ids.tolist() == [1, 0]
+    np.testing.assert_array_equal(log.landmarks, [[5, 6], [3, 4]])
+    assert log.header["truth"] == "world.dat"
+
+
+def test_world_file_of_other_ids_is_refused_for_a_course_log(file):
+    file("1 5 6\n2 3 4\n", "world.dat")
+    with pytest.raises(LogError, match=r"expected landmarks 0 to 1 .* got 1, 2"):
+        read_log(file("0.1 2 -0.3 4\n"))
+
+
+def test_landmarks_of_the_caller_come_before_all_others(file):
+    log = read_log(file(COURSE_FIRST_SCAN), landmarks=[[1, 2], [3, 4]])
+    assert log.landmark_ids.tolist() == [0, 1]
+    np.testing.assert_array_equal(log.landmarks, [[1, 2], [3, 4]])
+    assert log.header["truth"] == "landmarks given by the caller"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0.1 2 0.3\n", "line 1: expected pairs of bearing and range, got 3 numbers"),
+        ("0.1 2\n3 0 1\n", "line 2: expected odometry d α, got 3 fields"),
+        ("0.1 2\n3 0\n0.1 2 0.2 3\n", "line 3: expected 1 pairs of bearing and range"),
+        ("0.1 2\n\n3 east\n", "line 3: expected a finite number, got 'east'"),
+        ("0.1 nan\n", "line 1: expected a finite number, got 'nan'"),
+    ],
+)
+def test_wrong_course_line_is_named(file, text, message):
+    with pytest.raises(LogError, match=message):
+        read_log(file(text))
+
+
+def test_public_course_log_equals_its_slamlog(public_logs):
+    log = read_log(public_logs / "raw" / "cmu16833" / "data.txt")
+    reference = read_log(public_logs / "cmu16833.csv")
+    assert_events_agree(log.events, reference.events, tolerance=0)
+    np.testing.assert_array_equal(log.landmark_ids, reference.landmark_ids)
+    np.testing.assert_array_equal(log.landmarks, reference.landmarks)
+    np.testing.assert_array_equal(log.start, reference.start)
+
+
+# Freiburg sensor.dat
+
+
+def test_freiburg_step_is_a_turn_and_a_drive_with_turn(file):
+    rows = odometry_rows(read_log(file(FREIBURG)))
+    assert rows == [
+        OdometryRow(t=1.0, d=0.0, alpha=0.1, dt=0.0),
+        OdometryRow(t=1.0, d=2.0, alpha=-0.3, dt=1.0),
+        OdometryRow(t=2.0, d=0.0, alpha=0.0, dt=0.0),
+        OdometryRow(t=2.0, d=1.0, alpha=0.2, dt=1.0),
+    ]
+
+
+def test_freiburg_readings_put_range_first_and_are_wrapped(file):
+    first, second = scans(read_log(file(FREIBURG)))
+    assert (first.t, second.t) == (1, 2)
+    assert first.landmark_ids.tolist() == [1, 2]
+    np.testing.assert_allclose(
+        first.measurements, [[0.4, 1.5], [3.3 - 2 * np.pi, -0.03]], atol=1e-15
+    )
+
+
+def test_freiburg_landmarks_come_from_the_world_file_beside(file):
+    assert read_log(file(FREIBURG)).landmarks.shape == (0, 2)
+    file("1 2 1\n2 0 4\n", "world.dat")
+    log = read_log(file(FREIBURG))
+    assert log.landmark_ids.tolist() == [1, 2]
+    np.testing.assert_array_equal(log.landmarks, [[2, 1], [0, 4]])
+
+
+def test_reading_before_the_first_odometry_is_at_time_zero(file):
+    scan, *_ = read_log(file("SENSOR 1 1.5 0.4\nODOMETRY 0 1 0\n")).events
+    assert scan.t == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("ODOMETRY 0 1 0\nSENSOR 1 2\n", "line 2: expected SENSOR id range bearing"),
+        (
+            "ODOMETRY 0 1 0\nSONAR 1 2 3\n",
+            "line 2: expected ODOMETRY r1 t r2 or SENSOR",
+        ),
+        (
+            "SENSOR 1 2 0\nSENSOR 1 2 0\n",
+            "line 2: expected each landmark once per scan",
+        ),
+        ("ODOMETRY 0 inf 0\n", "line 1: expected a finite number, got 'inf'"),
+    ],
+)
+def test_wrong_freiburg_line_is_named(file, text, message):
+    with pytest.raises(LogError, match=message):
+        read_log(file(text))
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    [
+        ("1 2\n", r"world.dat, line 1: expected id x y"),
+        ("1 2 3\n1 2 3\n", r"world.dat, line 2: expected each landmark once"),
+    ],
+)
+def test_wrong_world_line_is_named(file, world, message):
+    file(world, "world.dat")
+    with pytest.raises(LogError, match=message):
+        read_log(file(FREIBURG))
+
+
+def test_public_freiburg_log_equals_its_slamlog(public_logs):
+    log = read_log(public_logs / "raw" / "freiburg" / "sensor_data.dat")
+    reference = read_log(public_logs / "freiburg9.csv")
+    assert_events_agree(log.events, reference.events, tolerance=5e-6)
+    np.testing.assert_array_equal(log.landmark_ids, reference.landmark_ids)
+    np.testing.assert_array_equal(log.landmarks, reference.landmarks)
+    assert min(scan.measurements[:, 1].min() for scan in scans(log)) < 0
+
+
+# iSAM and g2o
+
+
+def test_isam_increments_compose_to_the_same_pose(file):
+    x, y, heading = turn_last_pose(odometry_rows(read_log(file(ISAM))))
+    expected = (
+        1 - 2 * math.cos(0.5) - math.sin(0.5),
+        -2 * math.sin(0.5) + math.cos(0.5),
+        0.25,
+    )
+    np.testing.assert_allclose((x, y, heading), expected, atol=1e-15)
+
+
+def test_isam_backward_increment_is_a_negative_distance(file):
+    *_, turn, drive = odometry_rows(read_log(file(ISAM)))
+    assert (turn.d, turn.dt, drive.dt) == (0, 0, 1)
+    assert drive.d == pytest.approx(-math.sqrt(5))
+    assert abs(turn.alpha) < math.pi / 2
+
+
+def test_isam_poses_are_counted_anew_and_landmarks_keep_their_ids(file):
+    log = read_log(file(ISAM))
+    assert [row.t for row in odometry_rows(log)] == [1, 1, 2, 2]
+    assert [(s.t, s.landmark_ids.tolist()) for s in scans(log)] == [
+        (1, [2]),
+        (2, [2, 4]),
+    ]
+
+
+def test_isam_landmark_becomes_bearing_and_range(file):
+    first, second = scans(read_log(file(ISAM)))
+    np.testing.assert_allclose(first.measurements, [[math.atan2(4, 3), 5]])
+    np.testing.assert_allclose(second.measurements, [[-np.pi / 2, 2], [-np.pi, 1]])
+
+
+def test_isam_readings_join_their_pose_wherever_they_stand(file):
+    lines = ISAM.splitlines()
+    ordered = read_log(file(ISAM)).events
+    assert_events_agree(
+        read_log(file("\n".join([*lines[::2], *lines[1::2]]))).events[:3],
+        ordered[:3],
+        0,
+    )
+
+
+def test_g2o_words_mean_the_same(file):
+    g2o = ISAM.replace("ODOMETRY", "EDGE_SE2").replace("LANDMARK", "EDGE_SE2_XY")
+    log = read_log(file("VERTEX_SE2 0 0 0 0\nFIX 0\n" + g2o))
+    assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (
+            "ODOMETRY 1 5 1 0 0 1 0 0 1 0 1",
+            "expected odometry from pose 3, got from pose 1",
+        ),
+        (
+            "ODOMETRY 3 0 1 0 0 1 0 0 1 0 1",
+            "expected odometry to a new pose, got to pose 0",
+        ),
+        ("LANDMARK 9 4 1 0 1 0 1", "expected a pose of the odometry, got pose 9"),
+        (
+            "LANDMARK 3 4 1 0 1 0 1",
+            "expected each landmark once per scan, got id 4 again",
+        ),
+        ("LANDMARK 3 7 1", "expected LANDMARK i j x y"),
+        ("EDGE_SE3 3 5 0 0 0", "expected ODOMETRY or EDGE_SE2 or"),
+        ("LANDMARK 3 7 east 1", "expected a finite number, got 'east'"),
+    ],
+)
+def test_wrong_isam_line_is_named(file, line, message):
+    with pytest.raises(LogError, match=f"line 6: {message}"):
+        read_log(file(ISAM + line + "\n"))
+
+
+def test_isam_text_without_odometry_is_refused(file):
+    with pytest.raises(LogError, match="line 1: expected odometry"):
+        read_log(file("LANDMARK 3 7 1 1\n"))
+
+
+def test_public_isam_sample_has_all_its_lines(public_logs):
+    log = read_log(public_logs / "raw" / "isam" / "victoria_park_first400.txt")
+    assert len(odometry_rows(log)) == 2 * 237
+    assert sum(len(scan.measurements) for scan in scans(log)) == 163
+    assert log.events[-1].t == 237
+
+
+# UTIAS MR.CLAM
+
+
+def test_utias_velocities_are_held_between_their_stamps(utias):
+    rows = odometry_rows(read_log(utias))
+    assert [row.t for row in rows] == [0, 0.1, 0.2, 0.25, 0.3, 0.4, 0.45]
+    np.testing.assert_allclose(
+        [row.dt for row in rows], [0, 0.1, 0.1, 0.05, 0.05, 0.1, 0.05], atol=1e-12
+    )
+    distances = [0, 0.05, 0.025 + 0.1, 0.1, 0.1, 0.2, 0.1]
+    np.testing.assert_allclose([row.d for row in rows], distances, atol=1e-12)
+    turns = [0, 0, 0.02, 0.02, 0.02, 0.04, 0.02]
+    np.testing.assert_allclose([row.alpha for row in rows], turns, atol=1e-12)
+
+
+def test_utias_scan_follows_the_odometry_of_its_time(utias):
+    events = read_log(utias).events
+    (k,) = (k for k, event in enumerate(events) if isinstance(event, Scan))
+    assert events[k].t == events[k - 1].t == 0.25
+
+
+def test_utias_barcodes_become_subjects_and_bearings_are_wrapped(utias):
+    (scan,) = scans(read_log(utias))
+    assert scan.landmark_ids.tolist() == [6, 7]
+    np.testing.assert_allclose(
+        scan.measurements, [[-0.036, 7.05], [4 - 2 * np.pi, 7.2]], atol=1e-15
+    )
+
+
+def test_utias_counts_what_it_leaves_out(utias):
+    assert read_log(utias).header["left_out"] == (
+        "1 readings of robots, 1 of unknown barcodes, "
+        "2 outside the time of the odometry"
+    )
+
+
+def test_utias_truth_is_interpolated_across_the_jump_of_the_heading(utias):
+    log = read_log(utias)
+    turned = 2 * math.pi - 6  # from 3 to -3 within the second from t = -0.2
+    np.testing.assert_allclose(log.start, [1.2, 2, 3 + 0.2 * turned], atol=1e-6)
+    np.testing.assert_allclose(log.ground_truth[:, 0], [0, 0.2, 0.4], atol=1e-12)
+    np.testing.assert_allclose(log.ground_truth[:, 1], [1.2, 1.4, 1.6], atol=1e-6)
+    assert log.motion == "midpoint"
+
+
+def test_utias_landmarks_are_those_of_the_folder(utias):
+    log = read_log(utias)
+    assert log.landmark_ids.tolist() == [6, 7]
+    np.testing.assert_array_equal(log.landmarks, [[1.5, -4], [2, 3]])
+
+
+def test_utias_without_truth_starts_at_the_origin_and_says_so(utias):
+    (utias / "Robot3_Groundtruth.dat").unlink()
+    log = read_log(utias)
+    np.testing.assert_array_equal(log.start, np.zeros(3))
+    assert log.ground_truth.shape == (0, 4)
+    assert "origin" in log.header["start_from"]
+
+
+def test_utias_robot_can_be_chosen_and_the_lowest_is_the_default(utias):
+    for name in ("Odometry", "Measurement"):
+        text = (utias / f"Robot3_{name}.dat").read_text()
+        (utias / f"Robot5_{name}.dat").write_text(text)
+    assert read_log(utias).name.endswith("_r3")
+    assert read_log(utias, robot=5).name.endswith("_r5")
+    with pytest.raises(LogError, match="expected one of the robots 3, 5, got 4"):
+        read_log(utias, robot=4)
+
+
+@pytest.mark.parametrize("name", sorted(set(UTIAS) - {"Robot3_Groundtruth.dat"}))
+def test_missing_utias_file_is_named(utias, name):
+    (utias / name).unlink()
+    expected = name.replace("Robot3", "Robot(3|<k>)")
+    with pytest.raises(LogError, match=f"expected {expected}, got no such file"):
+        read_log(utias)
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "message"),
+    [
+        (
+            "Robot3_Odometry.dat",
+            "1 0 0",
+            "line 6: expected t >= 1248444187.95, the time",
+        ),
+        ("Robot3_Odometry.dat", "1 0", "line 6: expected t v ω, got 2 fields"),
+        (
+            "Robot3_Measurement.dat",
+            f"{EPOCH + 0.1} 63 1 0",
+            "line 8: expected t >= 1248444196.5, the",
+        ),
+        ("Robot3_Measurement.dat", f"{EPOCH + 10} code 1 0", "line 8: expected an id"),
+        ("Barcodes.dat", "8 x", "line 5: expected an id"),
+        ("Landmark_Groundtruth.dat", "8 1 2", "line 4: expected subject x y σx σy"),
+        ("Robot3_Groundtruth.dat", "2e9 2 3 nan", "line 3: expected a finite number"),
+    ],
+)
+def test_wrong_utias_line_is_named(utias, name, line, message):
+    path = utias / name
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(LogError, match=f"{name}, {message}"):
+        read_log(utias)
+
+
+def test_public_utias_log_equals_its_slamlog(public_logs):
+    end = 89.9  # the sample holds 90 s
+    log = read_log(public_logs / "raw" / "utias_d6")
+    reference = read_log(public_logs / "utias_d6_r3.csv")
+    ours = [event for event in log.events if event.t <= end]
+    first, *others = [event for event in reference.events if event.t <= end]
+    # The grid of the reference runs 1e-6 fast: a scan on the grid leaves a rest.
+    others = [e for e in others if isinstance(e, Scan) or e.dt > 1.5e-4]
+    assert len(ours) > 1300
+    assert_events_agree(ours, [first, *others], tolerance=1.5e-4)
+    np.testing.assert_allclose(log.start, reference.start, atol=1e-5)
+    np.testing.assert_allclose(log.landmarks, reference.landmarks, atol=1e-5)
+    np.testing.assert_allclose(
+        log.ground_truth, reference.ground_truth[: len(log.ground_truth)], atol=1e-4
+    )
+
+
+# Telling the formats apart
+
+
+def test_slamlog_is_recognised(file):
+    log = read_log(file("# format: slamlog 1\nodometry,1,3,0,1\n", "drive.csv"))
+    assert log.events == (OdometryRow(1.0, 3.0, 0.0, 1.0),)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [COURSE_FIRST_SCAN + "\n3 0\n", FREIBURG, ISAM],
+    ids=["course", "frei", "isam"],
+)
+def test_an_imported_log_can_be_kept_as_slamlog(file, tmp_path, text):
+    log = read_log(file(text))
+    write_slamlog(log, tmp_path / "kept.csv")
+    kept = read_log(tmp_path / "kept.csv")
+    assert_events_agree(kept.events, log.events, tolerance=0)
+    assert kept.header == log.header
+
+
+def test_an_imported_folder_can_be_kept_as_slamlog(utias, tmp_path):
+    log = read_log(utias)
+    write_slamlog(log, tmp_path / "kept.csv")
+    assert_events_agree(read_log(tmp_path / "kept.csv").events, log.events, tolerance=0)
+
+
+@pytest.mark.parametrize("text", ["hello world\n", "{}\n", "\x00\x01\n", "1.0 two\n"])
+def test_what_is_no_log_is_refused_with_the_known_formats(file, text):
+    with pytest.raises(LogError, match=r"line 1: expected a log: slamlog 1, a course"):
+        read_log(file(text))
+
+
+def test_empty_file_is_refused(file):
+    with pytest.raises(LogError, match="expected a log, got an empty file"):
+        read_log(file(""))
+
+
+def test_folder_without_utias_files_is_refused(tmp_path):
+    with pytest.raises(LogError, match=r"expected Robot<k>_Odometry\.dat"):
+        read_log(tmp_path)
+
+
+def test_missing_file_is_an_os_error(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.csv"):
+        read_log(tmp_path / "nowhere.csv")
+
+
+def test_robot_is_refused_for_a_log_in_one_file(file):
+    with pytest.raises(ValueError, match="robot must be None"):
+        read_log(file(FREIBURG), robot=3)

@@ -1,0 +1,497 @@
+"""The Monte Carlo runner: same bits however it is run, and what it says of rubbish."""
+
+import errno
+import os
+import resource
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+import tracemalloc
+import zipfile
+
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+
+from slamgym.envs.controllers.single import make_controller
+from slamgym.estimator import Belief, EkfSlam, make_estimator
+from slamgym.evaluation.nees import pose_nees, state_nees
+from slamgym.experiments.logs.recording import record_episode
+from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
+from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES
+from slamgym.experiments.monte_carlo.store.result_blocks import merge_blocks
+from slamgym.experiments.monte_carlo.store.results import load_results
+from slamgym.experiments.runs.filter_settings import settings_for
+from slamgym.experiments.runs.replay import replay
+from slamgym.sim_configs import load_scenario
+
+RUNS = 20
+WORLD = load_scenario("six_landmarks")
+
+
+class OneByOne(EkfSlam):
+    """The textbook filter, with a method of its own, so that it does not batch."""
+
+    def belief(self):
+        return super().belief()
+
+
+class CrashesAtTimes(OneByOne):
+    """Fails in the runs that start left of the origin."""
+
+    def update(self, measurements, landmark_ids=None):
+        report = super().update(measurements, landmark_ids)
+        if self.belief().landmarks[0, 0] < 2.9:
+            raise RuntimeError("a wheel came off")
+        return report
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return monte_carlo("six_landmarks", "ekf,invariant", RUNS, block_size=8)
+
+
+def test_results_have_every_variable_and_say_where_they_come_from(whole):
+    assert set(whole.data_vars) == set(VARIABLES)
+    assert whole.pose_nees_invariant.shape == (2, RUNS, 30)
+    assert whole.landmark_error.shape == (2, RUNS, 6)
+    assert whole.attrs["seed"] == 0
+    assert load_scenario("six_landmarks").name in whole.attrs["scenario"]
+    assert not whole.failed.any()
+    assert np.isfinite(whole.nis).all()
+
+
+def test_a_run_depends_on_its_seed_alone(whole):
+    few = monte_carlo("six_landmarks", ["invariant"], 3, block_size=2)
+    xr.testing.assert_equal(few, whole.sel(estimator=["invariant"], run=slice(0, 2)))
+    later = monte_carlo("six_landmarks", ["ekf"], 2, seed=5)
+    xr.testing.assert_equal(
+        later.drop_vars("run"),
+        whole.sel(estimator=["ekf"], run=slice(5, 6)).drop_vars("run"),
+    )
+
+
+@pytest.mark.parametrize("backend", ["loky", "threading"])
+def test_workers_change_no_bit(whole, backend):
+    shared = monte_carlo(
+        "six_landmarks", "ekf,invariant", RUNS, block_size=8, jobs=2, backend=backend
+    )
+    xr.testing.assert_equal(shared, whole)
+
+
+def test_a_filter_that_cannot_batch_gives_the_same_numbers(whole):
+    single = monte_carlo("six_landmarks", {"ekf": OneByOne}, 4)
+    xr.testing.assert_equal(single, whole.sel(estimator=["ekf"], run=slice(0, 3)))
+
+
+def test_figures_are_those_of_a_replay_of_the_same_drive(whole):
+    run = 3
+    driver = make_controller("open_loop", WORLD, np.random.default_rng())
+    log = record_episode(WORLD, driver, run)
+    done = replay(log, settings_for(log, estimator="invariant").make(log.start))
+    row = whole.sel(estimator="invariant", run=run)
+    trace = done.trace
+    nees = pose_nees(
+        trace.true_poses, trace.poses, trace.pose_covariances, frame="invariant"
+    )
+    np.testing.assert_allclose(row.pose_nees_invariant, nees, rtol=1e-9)
+    np.testing.assert_array_equal(row.nis, trace.nis)
+    np.testing.assert_array_equal(row.nis_dof, trace.nis_dof)
+    gap = np.linalg.norm(trace.poses[:, :2] - trace.true_poses[:, :2], axis=1)
+    np.testing.assert_allclose(row.position_error, gap, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(row.ate, np.sqrt((gap**2).mean()), rtol=1e-12)
+    state = np.concatenate([trace.true_poses[-1], trace.true_landmarks.ravel()])
+    final = state_nees(
+        state, done.belief.mean, done.belief.covariance, frame="additive"
+    )
+    np.testing.assert_allclose(row.state_nees_additive, final, rtol=1e-12)
+    assert row.state_dof == 15
+    error = np.linalg.norm(trace.landmarks - trace.true_landmarks, axis=1)
+    by_id = error[np.argsort(trace.landmark_ids)]
+    np.testing.assert_allclose(row.landmark_error, by_id, rtol=1e-12)
+
+
+def test_the_ideal_filter_is_told_the_truth():
+    results = monte_carlo("six_landmarks", "ideal", 2)
+    assert not results.failed.any()
+
+
+def test_a_crash_ends_its_own_run_only():
+    results = monte_carlo(
+        "six_landmarks", {"fragile": CrashesAtTimes, "ekf": "ekf"}, RUNS
+    )
+    failed = results.failed.sel(estimator="fragile")
+    assert 0 < failed.sum() < RUNS
+    assert not results.failed.sel(estimator="ekf").any()
+    first = int(failed.values.argmax())
+    row = results.sel(estimator="fragile", run=first)
+    assert str(row.message.values) == "RuntimeError: a wheel came off"
+    assert np.isnan(row.pose_nees_invariant[int(row.failed_at) :]).all()
+    sound = np.flatnonzero(~failed.values)
+    xr.testing.assert_equal(
+        results.isel(estimator=0, run=sound).drop_vars("estimator"),
+        results.isel(estimator=1, run=sound).drop_vars("estimator"),
+    )
+
+
+def test_a_run_that_a_batch_stops_says_why():
+    blind = WORLD.with_changes(
+        start={"std": (0, 0, 0)}, motion={"std": (0, 0, 0)}, sensor={"std": (0, 0)}
+    )
+    results = monte_carlo(blind, "ekf", 2)
+    assert results.failed.all()
+    assert "not positive definite" in str(results.message[0, 0].values)
+
+
+def test_the_filters_may_be_told_another_noise(whole):
+    wrong = WORLD.with_changes(motion={"std": (0.025, 0.01, 0.01)})
+    told = monte_carlo("six_landmarks", "invariant", RUNS, assumed=wrong)
+    right = whole.sel(estimator=["invariant"])
+    assert (told.pose_area < right.pose_area).all()
+    assert told.nis.mean() > 2 * right.nis.mean()
+
+
+def test_results_on_disk_are_those_in_memory(whole, tmp_path):
+    with monte_carlo(
+        "six_landmarks", "ekf,invariant", RUNS, block_size=8, out=tmp_path, command="me"
+    ) as written:
+        xr.testing.assert_equal(written.load(), whole)
+        assert written.attrs["command"] == "me"
+        assert written.failed.dtype == bool
+        for name in whole.data_vars:
+            assert written[name].attrs == whole[name].attrs, name
+
+
+def test_more_runs_build_on_those_there_are(whole, tmp_path):
+    monte_carlo(
+        "six_landmarks", "ekf,invariant", 12, block_size=8, out=tmp_path
+    ).close()
+    first = tmp_path / "blocks" / "runs-0000000-0000008.npz"
+    before = first.stat().st_mtime_ns
+    with monte_carlo(
+        "six_landmarks", "ekf,invariant", RUNS, block_size=8, out=tmp_path
+    ) as more:
+        xr.testing.assert_equal(more.load(), whole)
+    assert first.stat().st_mtime_ns == before
+    names = sorted(file.name for file in (tmp_path / "blocks").iterdir())
+    assert names == [
+        f"runs-{a:07d}-{b:07d}.npz" for a, b in ((0, 8), (8, 16), (16, 20))
+    ]
+    with monte_carlo(
+        "six_landmarks", "ekf,invariant", 18, block_size=8, out=tmp_path
+    ) as fewer:
+        xr.testing.assert_equal(fewer.load(), whole.isel(run=slice(0, 18)))
+
+
+def test_parts_of_two_machines_are_one_job(whole, tmp_path):
+    job = {"estimators": "ekf,invariant", "block_size": 8}
+    one, two, both = (tmp_path / name for name in ("one", "two", "both"))
+    monte_carlo("six_landmarks", runs=12, out=one, **job).close()
+    with monte_carlo("six_landmarks", runs=RUNS, first_run=8, out=two, **job) as part:
+        xr.testing.assert_equal(part.load(), whole.isel(run=slice(8, None)))
+    merge_blocks([str(one), two], str(both))
+    done = []
+    with monte_carlo(
+        "six_landmarks",
+        runs=RUNS,
+        out=both,
+        progress=lambda runs, of: done.append(runs),
+        **job,
+    ) as merged:
+        xr.testing.assert_equal(merged.load(), whole)
+    assert done == [RUNS]  # there was nothing left to do
+
+
+def test_only_parts_of_one_job_are_merged(tmp_path):
+    monte_carlo("six_landmarks", "ekf", 1, out=tmp_path / "a").close()
+    monte_carlo("loop", "ekf", 1, out=tmp_path / "b").close()
+    with pytest.raises(ValueError, match="b holds results of scenario"):
+        merge_blocks([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+    with pytest.raises(ValueError, match="at least one folder"):
+        merge_blocks([], tmp_path / "c")
+    (block,) = (tmp_path / "a" / "blocks").iterdir()
+    block.write_bytes(block.read_bytes()[:-9])
+    with pytest.raises(ValueError, match="truncated"):
+        merge_blocks([tmp_path / "a"], tmp_path / "c")
+    with pytest.raises(ValueError, match="first_run must be a multiple"):
+        monte_carlo("six_landmarks", "ekf", 20, first_run=5)
+
+
+def test_a_filter_that_has_changed_is_not_mixed_with_what_it_was(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    source = tmp_path / "changing_filter.py"
+    text = "from slamgym.estimator import EkfSlam\nclass Mine(EkfSlam):\n    pass\n"
+    source.write_text(text)
+    asked = ("six_landmarks", "changing_filter:Mine", 2)
+    monte_carlo(*asked, out=tmp_path / "out").close()
+    monte_carlo(*asked, out=tmp_path / "out").close()
+    source.write_text(text + "# repaired\n")
+    with pytest.raises(ValueError, match=r"holds results of code .*ask for fresh"):
+        monte_carlo(*asked, out=tmp_path / "out")
+    done = []
+    monte_carlo(
+        *asked,
+        out=tmp_path / "out",
+        fresh=True,
+        progress=lambda runs, of: done.append(runs),
+    ).close()
+    assert done == [0, 2]
+
+
+class ForeignIds(OneByOne):
+    """Names a landmark that there is not, in some of the runs."""
+
+    def belief(self):
+        belief = super().belief()
+        ids = belief.landmark_ids
+        if belief.mean[0] < 7:
+            ids = (106, *ids[1:])
+        return Belief(belief.mean, belief.covariance, ids)
+
+
+class LeavesTheProgram(OneByOne):
+    def update(self, measurements, landmark_ids=None):
+        raise SystemExit(3)
+
+
+class UnknownMap(OneByOne):
+    """Its map's covariance is not a number."""
+
+    def belief(self):
+        belief = super().belief()
+        covariance = belief.covariance.copy()
+        covariance[3:, 3:] = np.nan
+        return Belief(belief.mean, covariance, belief.landmark_ids)
+
+
+def test_a_belief_that_is_no_map_of_the_world_ends_its_own_run_only(whole):
+    filters = {
+        "foreign": ForeignIds,
+        "gone": LeavesTheProgram,
+        "blind": UnknownMap,
+        "ekf": "ekf",
+    }
+    results = monte_carlo("six_landmarks", filters, RUNS)
+    failed = results.failed.sum("run")
+    assert 0 < failed.sel(estimator="foreign") < RUNS
+    assert failed.sel(estimator="gone") == RUNS
+    assert failed.sel(estimator="blind") == RUNS
+    said = [set(results.message.sel(estimator=name).values) for name in filters]
+    assert any("landmark_ids must be different ones of 0 … 5" in m for m in said[0])
+    assert said[1] == {"SystemExit: 3"}
+    assert said[2] == {"the belief about the map is not finite"}
+    xr.testing.assert_equal(
+        results.sel(estimator=["ekf"]), whole.sel(estimator=["ekf"])
+    )
+
+
+def test_a_block_that_cannot_be_read_for_now_is_not_touched(tmp_path, monkeypatch):
+    job = {"estimators": "ekf", "runs": 2, "out": tmp_path}
+    monte_carlo("six_landmarks", **job).close()
+    (block,) = (tmp_path / "blocks").iterdir()
+    before = block.read_bytes()
+
+    def busy(*_):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(zipfile.ZipFile, "testzip", busy)
+        with pytest.raises(OSError, match="Too many open files"):
+            monte_carlo("six_landmarks", **job)
+    assert block.read_bytes() == before
+
+
+def test_a_disk_that_fills_under_the_results_says_so(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise RuntimeError("NetCDF: HDF error")
+
+    monkeypatch.setattr(netCDF4, "Dataset", full)
+    with pytest.raises(OSError, match=r"results\.nc cannot be written: .*blocks stay"):
+        monte_carlo("six_landmarks", "ekf", 2, out=tmp_path)
+    assert list((tmp_path / "blocks").glob("runs-*.npz"))
+
+
+KILLED = textwrap.dedent(
+    """
+    import sys
+    from slamgym.experiments.monte_carlo import monte_carlo
+    monte_carlo("six_landmarks", "ekf,invariant", 20, block_size=1, out=sys.argv[1])
+    """
+)
+
+
+def test_a_job_killed_ten_times_ends_with_the_same_bits(whole, tmp_path):
+    rng = np.random.default_rng(0)
+    blocks = tmp_path / "blocks"
+    stood = []
+    for _ in range(10):
+        before = len(list(blocks.glob("runs-*.npz")))
+        with subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path)]) as child:
+            while child.poll() is None:
+                if len(list(blocks.glob("runs-*.npz"))) > before:
+                    time.sleep(float(rng.uniform(0, 0.004)))  # some time in the next
+                    child.send_signal(signal.SIGKILL)
+                    break
+        stood.append(len(list(blocks.glob("runs-*.npz"))))
+    assert len({count for count in stood if 0 < count < RUNS}) >= 5  # in the middle
+    with monte_carlo(
+        "six_landmarks", "ekf,invariant", RUNS, block_size=1, out=tmp_path
+    ) as resumed:
+        xr.testing.assert_equal(resumed.load(), whole)
+
+
+def test_a_broken_block_is_named_and_done_again(whole, tmp_path):
+    job = {"estimators": "ekf,invariant", "block_size": 8, "out": tmp_path}
+    monte_carlo("six_landmarks", runs=RUNS, **job).close()
+    block = tmp_path / "blocks" / "runs-0000008-0000016.npz"
+    block.write_bytes(block.read_bytes()[:-100])
+    done = []
+    with (
+        pytest.warns(UserWarning, match=r"runs-0000008-0000016\.npz is truncated"),
+        monte_carlo(
+            "six_landmarks",
+            runs=RUNS,
+            progress=lambda runs, of: done.append(runs),
+            **job,
+        ) as mended,
+    ):
+        xr.testing.assert_equal(mended.load(), whole)
+    assert done == [12, RUNS]
+
+
+def test_a_truncated_results_file_is_named_and_made_anew(whole, tmp_path):
+    job = {"estimators": "ekf,invariant", "block_size": 8, "out": tmp_path}
+    monte_carlo("six_landmarks", runs=RUNS, **job).close()
+    results = tmp_path / "results.nc"
+    results.write_bytes(results.read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"results\.nc is truncated"):
+        load_results(tmp_path)
+    with monte_carlo("six_landmarks", runs=RUNS, **job) as anew:
+        xr.testing.assert_equal(anew.load(), whole)
+
+
+def test_a_disk_that_is_full_leaves_the_blocks_before(whole, tmp_path):
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    job = {"estimators": "ekf,invariant", "block_size": 8, "out": tmp_path}
+    monte_carlo("six_landmarks", runs=8, **job).close()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="1 whole blocks stay there"):
+            monte_carlo("six_landmarks", runs=RUNS, **job)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert len(list((tmp_path / "blocks").iterdir())) == 1
+    with monte_carlo("six_landmarks", runs=RUNS, **job) as later:
+        xr.testing.assert_equal(later.load(), whole)
+
+
+def test_memory_grows_with_the_block_and_not_with_the_runs(tmp_path):
+    def peak(runs):
+        tracemalloc.start()
+        monte_carlo(
+            "anchored", "ekf", runs, block_size=8, out=tmp_path / str(runs)
+        ).close()
+        top = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return top
+
+    peak(8)
+    assert peak(64) < 1.3 * peak(16)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"runs": 0}, "runs must be an integer >= 1, got 0"),
+        ({"seed": -1}, "seed must be an integer >= 0"),
+        ({"scenario": "lop"}, "did you mean 'loop'"),
+        ({"estimators": "invarant"}, "did you mean 'invariant'"),
+        ({"estimators": "ekf,ekf"}, "'ekf' twice"),
+        ({"estimators": ""}, "must name at least one"),
+        ({"estimators": "ekf[iterations"}, "must be like ekf or invariant"),
+        ({"estimators": "ekf[speed=3]"}, "refuses its options"),
+        ({"jobs": 0}, "jobs must be an integer >= 1"),
+        ({"jobs": 2.5}, "jobs must be an integer >= 1"),
+        ({"seed": 2**63}, "seed must be"),
+        ({"estimators": None}, "estimators must be names"),
+        ({"backend": "lokey"}, "did you mean 'loky'"),
+        ({"block_size": 0}, "block_size must be"),
+        ({"scenario": "hidden_identities"}, "must not hide identities"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_anything_is_written(
+    changes, message, tmp_path
+):
+    asked = {"scenario": "six_landmarks", "estimators": "ekf", "runs": 2}
+    with pytest.raises(ValueError, match=message):
+        monte_carlo(**(asked | changes), out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_another_job_is_refused_untouched(tmp_path):
+    monte_carlo("six_landmarks", "ekf", 2, out=tmp_path).close()
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    for changes, message in (
+        ({"scenario": "anchored"}, "holds results of scenario .*six_landmarks"),
+        ({"estimators": "invariant"}, "estimators ekf, not of estimators invariant"),
+        ({"seed": 3}, "seed 0, not of seed 3"),
+    ):
+        asked = {"scenario": "six_landmarks", "estimators": "ekf", "runs": 2}
+        with pytest.raises(ValueError, match=message):
+            monte_carlo(**(asked | changes), out=tmp_path)
+    assert before == {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    with pytest.raises(ValueError, match="holds no Monte Carlo"):
+        monte_carlo("six_landmarks", "ekf", 2, out=tmp_path / "mine")
+
+
+def test_options_may_be_words():
+    (choice,) = estimator_choices("ekf[landmark_init=independent,noise_at_rest=false]")
+    assert choice.options == {"landmark_init": "independent", "noise_at_rest": False}
+    made = choice.settings(WORLD).make((0, 0, 0))
+    assert not made.rules.correlated
+    assert make_estimator("ekf", motion_std=(0, 0, 0), measurement_std=(0.1, 0.1))
+
+
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(whole, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
+    script = textwrap.dedent(
+        """
+        import os, signal, sys
+        from distributed import Client, LocalCluster
+        from slamgym.experiments.monte_carlo import monte_carlo
+        if __name__ == "__main__":
+            with LocalCluster(
+                2, threads_per_worker=1, dashboard_address=None
+            ) as cluster:
+                with Client(cluster) as client:
+                    pids = list(client.run(os.getpid).values())
+                    def kill_one(done, of):
+                        if done and pids:
+                            os.kill(pids.pop(), signal.SIGKILL)
+                            pids.clear()
+                    monte_carlo("six_landmarks", "ekf,invariant", 20, block_size=1,
+                                out=sys.argv[1], backend="dask", progress=kill_one)
+                    print("killed one" if not pids else "nobody died")
+        """
+    )
+    file = tmp_path / "on_dask.py"
+    file.write_text(script)
+    assert distributed is not None
+    done = subprocess.run(
+        [sys.executable, str(file), str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        env=os.environ | {"PYTHONWARNINGS": "default"},
+    )
+    assert done.stdout.strip() == "killed one", done.stderr
+    with load_results(tmp_path / "out") as results:
+        xr.testing.assert_equal(results.load(), whole)

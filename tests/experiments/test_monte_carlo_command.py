@@ -1,0 +1,180 @@
+"""``slamgym monte-carlo`` and ``slamgym noise-study --runs``, as a user types them."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+from slamgym.experiments.command_line.app import main
+from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo.store.results import load_results
+
+FRAGILE = '''
+from slamgym.estimator import EkfSlam
+
+class Fragile(EkfSlam):
+    """Crashes in one of the runs."""
+
+    def update(self, measurements, landmark_ids=None):
+        report = super().update(measurements, landmark_ids)
+        if self.belief().landmarks[0, 0] < 2.3:
+            raise RuntimeError("<b>a wheel</b> came off")
+        return report
+'''
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def slamgym(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def refused(*arguments):
+    result = slamgym(*arguments)
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    return result.stderr
+
+
+def test_results_summary_and_report_are_written_and_told(here):
+    arguments = ("monte-carlo", "six_landmarks", "--runs", 40, "--out", "out")
+    result = slamgym(*arguments)
+    assert result.exit_code == 0, result.stderr
+    assert "ekf: not consistent" in result.stdout
+    assert "report.html" in result.stdout
+    with load_results("out") as results:
+        expected = monte_carlo("six_landmarks", "ekf,invariant", 40)
+        xr.testing.assert_equal(results.load(), expected)
+    summary = json.loads((here / "out" / "summary.json").read_text())
+    again = slamgym(*arguments, "--json")
+    assert json.loads(again.stdout)["estimators"] == summary["estimators"]
+    page = (here / "out" / "report.html").read_text()
+    assert "not consistent" in page
+    assert "<svg" in page
+
+
+def test_a_filter_of_ones_own_is_found_and_its_crash_told(here):
+    (here / "fragile.py").write_text(FRAGILE)
+    script = shutil.which("slamgym", path=Path(sys.executable).parent)
+    done = subprocess.run(
+        [
+            *(script, "monte-carlo", "six_landmarks", "-e", "ekf,fragile:Fragile"),
+            *("--runs", "20", "--out", "out", "--jobs", "2", "--block-size", "5"),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((here / "out" / "summary.json").read_text())
+    failed = summary["estimators"]["fragile:Fragile"]["failed_runs"]
+    assert 0 < len(failed) < 20
+    assert failed[0]["message"] == "RuntimeError: <b>a wheel</b> came off"
+    assert not summary["estimators"]["ekf"]["failed_runs"]
+    page = (here / "out" / "report.html").read_text()
+    assert "<b>a wheel</b>" not in page
+    assert "&lt;b&gt;a wheel" in page
+
+
+def test_filters_may_be_told_another_noise():
+    result = slamgym(
+        *("monte-carlo", "six_landmarks", "-e", "invariant", "--runs", 30, "--json"),
+        *("--assume", "motion.std=[0.025,0.01,0.01]", "--out", "out"),
+    )
+    assert result.exit_code == 0, result.stderr
+    (found,) = json.loads(result.stdout)["estimators"].values()
+    assert found["verdict"] == "not consistent"
+    assert found["pose_nees"]["invariant"]["mean"] > 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("lop",), "did you mean 'loop'"),
+        (("loop", "-e", "ekg"), "did you mean 'ekf'"),
+        (("loop", "--runs", "0"), "runs must be an integer >= 1"),
+        (("loop", "--scheduler", "tcp://a:1"), "--scheduler is for"),
+        (("loop", "--backend", "spark"), "backend must be one of"),
+        (("loop", "--assume", "motion.sdt=1"), "sdt"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(here, arguments, message):
+    assert message in refused("monte-carlo", *arguments, "--out", "out")
+    assert not (here / "out").exists()
+
+
+def test_a_folder_of_another_scenario_is_refused(here):
+    assert (
+        slamgym("monte-carlo", "anchored", "--runs", 2, "--out", "out").exit_code == 0
+    )
+    before = (here / "out" / "results.nc").read_bytes()
+    told = refused("monte-carlo", "six_landmarks", "--runs", 2, "--out", "out")
+    assert "holds results of scenario" in told
+    assert (here / "out" / "results.nc").read_bytes() == before
+
+
+def test_an_interrupted_job_says_that_it_goes_on(here):
+    command = [
+        sys.executable,
+        "-c",
+        # Of a parent in the background a child inherits that interrupts are ignored.
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from slamgym.experiments.command_line.app import main; main()",
+    ]
+    job = ["monte-carlo", "loop", "--runs", "1000", "--block-size", "4", "--out", "out"]
+    child = subprocess.Popen(command + job, stderr=subprocess.PIPE, text=True)
+    blocks = here / "out" / "blocks"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and not list(blocks.glob("runs-*.npz")):
+        time.sleep(0.05)
+    child.send_signal(signal.SIGINT)
+    _, stderr = child.communicate(timeout=60)
+    assert child.returncode == 130
+    assert "the runs done lie in out, and the same command goes on" in stderr
+    assert list(blocks.glob("runs-*.npz"))
+
+
+def test_a_noise_study_over_many_runs_writes_figure_and_table(here):
+    result = slamgym(
+        *("noise-study", "anchored", "--runs", 3, "-e", "ekf,invariant"),
+        *("--change", "filter", "--out", "study", "--json"),
+    )
+    assert result.exit_code == 0, result.stderr
+    summary = json.loads(result.stdout)
+    assert len(summary["rows"]) == 2 * 11
+    assert summary["files"] == ["noise_study.csv", "noise_study.png", "summary.json"]
+    assert len((here / "study" / "noise_study.csv").read_text().splitlines()) == 23
+    assert "--change must be" in refused(
+        "noise-study", "anchored", "--runs", 3, "--change", "filtre"
+    )
+
+
+def test_dask_is_asked_for_by_name(here):
+    pytest.importorskip("distributed", reason="needs dask.distributed")
+    script = shutil.which("slamgym", path=Path(sys.executable).parent)
+    done = subprocess.run(
+        [
+            *(script, "monte-carlo", "six_landmarks", "-e", "ekf", "--runs", "6"),
+            *("--backend", "dask", "--jobs", "2", "--block-size", "2", "--out", "out"),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONWARNINGS": "default"},
+    )
+    assert done.returncode == 0, done.stderr
+    with load_results(here / "out") as results:
+        expected = monte_carlo("six_landmarks", "ekf", 6)
+        xr.testing.assert_equal(results.load(), expected)

@@ -1,0 +1,401 @@
+"""The folder of a Monte Carlo: one writer, no rests of the killed, one job."""
+
+import ast
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+from slamgym.experiments.command_line.app import main
+from slamgym.experiments.command_line.reporter import Reporter
+from slamgym.experiments.command_line.warm_up import warm_up
+from slamgym.experiments.monte_carlo import merge_blocks, monte_carlo
+from slamgym.experiments.runs.filter_settings import FilterSettings
+
+RUNS = 12
+JOB = {"scenario": "six_landmarks", "estimators": "ekf", "block_size": 4}
+BLOCKS = [f"runs-{a:07d}-{b:07d}.npz" for a, b in ((0, 4), (4, 8), (8, 12))]
+
+DIES = """
+    import os, signal, sys, time
+    import numpy as np
+    from slamgym.experiments.monte_carlo import job_folder, monte_carlo, runner
+
+    def die(file):
+        file.write_bytes(b"half a file")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def dies_at_the_second_block(file, write=np.savez, **arrays):
+        die(file) if "runs-0000004" in file.name else write(file, **arrays)
+
+    def dies_at_the_job(path, lend=job_folder.replace_when_written):
+        with lend(path) as file:
+            die(file)
+
+    def dies_at_the_results(path, *_):
+        die(path.with_name(".results.0123abcd.nc"))
+
+    def stays_after_a_block(done, runs):
+        if done:
+            print("one", flush=True)
+            time.sleep(600)
+
+    def dies_after_a_block(done, runs):
+        if done:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    job = {"scenario": "six_landmarks", "estimators": "ekf", "block_size": 4}
+    job |= {"runs": 12, "out": sys.argv[1]}
+    if sys.argv[2] == "block":
+        np.savez = dies_at_the_second_block
+    if sys.argv[2] == "job":
+        job_folder.replace_when_written = dies_at_the_job
+    if sys.argv[2] == "results":
+        runner.write_results = dies_at_the_results
+    if sys.argv[2] == "never":
+        job["progress"] = stays_after_a_block
+    if sys.argv[2] == "workers":
+        job |= {"progress": dies_after_a_block, "jobs": 2, "backend": "loky"}
+    monte_carlo(**job)
+"""
+
+pytestmark = pytest.mark.skipif(
+    os.name == "nt", reason="folders are not locked on Windows"
+)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return monte_carlo(**JOB, runs=RUNS)
+
+
+def writer(folder, dies_at):
+    """Begin a writer in a process of its own."""
+    code = textwrap.dedent(DIES)
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(folder), dies_at],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def killed(folder, dies_at):
+    """Let a writer die at some place, with rests left behind."""
+    with writer(folder, dies_at) as child:
+        assert child.wait() == -signal.SIGKILL
+
+
+@pytest.fixture(scope="module")
+def at_work(tmp_path_factory):
+    """Lend a folder that another process writes to, and that process."""
+    folder = tmp_path_factory.mktemp("at work") / "out"
+    with writer(folder, "never") as child:
+        try:
+            assert child.stdout.readline() == "one\n"
+            yield folder, child
+        finally:
+            child.kill()
+
+
+def tree(folder):
+    """All files below a folder, hidden ones too, and what they hold."""
+    files = (file for file in folder.rglob("*") if file.is_file())
+    return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
+
+
+def names(folder):
+    return sorted(tree(folder))
+
+
+def finished():
+    return sorted(["job.json", "results.nc", *(f"blocks/{name}" for name in BLOCKS)])
+
+
+# one writer
+
+
+def test_a_second_command_says_which_process_uses_the_folder(at_work):
+    folder, child = at_work
+    before = tree(folder)
+    second = CliRunner().invoke(
+        main,
+        [
+            *("monte-carlo", "six_landmarks", "-e", "ekf", "--block-size", "4"),
+            *("--runs", str(RUNS), "--out", str(folder)),
+        ],
+    )
+    assert second.exit_code == 2
+    said = second.stderr.splitlines()[-1]
+    assert f"another process is writing to {folder}: it is in use by" in said
+    assert re.search(rf"by process {child.pid} on .*wait for its end", said)
+    assert tree(folder) == before
+
+
+def test_nothing_is_merged_into_a_folder_in_use_nor_removed_from_it(at_work, tmp_path):
+    folder, child = at_work
+    monte_carlo(**JOB, runs=8, out=tmp_path / "part").close()
+    before = tree(folder)
+    with pytest.raises(ValueError, match=rf"in use by process {child.pid} on"):
+        merge_blocks([tmp_path / "part"], folder)
+    with pytest.raises(ValueError, match=rf"in use by process {child.pid} on"):
+        monte_carlo(**JOB, runs=RUNS, out=folder, fresh=True)
+    assert tree(folder) == before
+
+
+def test_a_folder_is_merged_from_while_it_is_written(at_work, tmp_path, whole):
+    folder, _ = at_work
+    merge_blocks([folder], tmp_path / "copy")
+    with monte_carlo(**JOB, runs=4, out=tmp_path / "copy") as copied:
+        xr.testing.assert_equal(copied.load(), whole.isel(run=slice(0, 4)))
+
+
+def test_a_fresh_job_stopped_at_once_leaves_no_results_of_the_one_before(tmp_path):
+    monte_carlo(**JOB, runs=4, out=tmp_path).close()
+
+    def stop(done, runs):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        monte_carlo(
+            **JOB | {"seed": 99}, runs=4, out=tmp_path, fresh=True, progress=stop
+        )
+    assert not (tmp_path / "results.nc").exists()
+
+
+def test_the_same_process_does_not_write_twice_at_once(tmp_path, whole):
+    told = []
+
+    def again(done, runs):
+        try:
+            monte_carlo(**JOB, runs=RUNS, out=tmp_path)
+        except ValueError as error:
+            told.append(str(error))
+
+    with monte_carlo(**JOB, runs=RUNS, out=tmp_path, progress=again) as results:
+        xr.testing.assert_equal(results.load(), whole)
+    assert len(told) == 1 + len(BLOCKS)
+    assert all(f"in use by process {os.getpid()} on" in text for text in told)
+
+
+def test_a_writer_that_fails_lets_the_next_one_in(tmp_path, whole):
+    def fails(done, runs):
+        raise RuntimeError("the bar broke")
+
+    with pytest.raises(RuntimeError, match="the bar broke"):
+        monte_carlo(**JOB, runs=RUNS, out=tmp_path, progress=fails)
+    assert names(tmp_path) == ["job.json"]
+    with monte_carlo(**JOB, runs=RUNS, out=tmp_path) as results:
+        xr.testing.assert_equal(results.load(), whole)
+
+
+def test_a_child_forked_meanwhile_does_not_keep_the_folder(tmp_path):
+    code = """
+        import os, pathlib, signal, sys, time
+        from slamgym.experiments.runs.folder_lock import sole_writer
+        folder = pathlib.Path(sys.argv[1])
+        with sole_writer(folder):
+            child = os.fork()
+            if child == 0:
+                time.sleep(600)
+                os._exit(0)
+        try:
+            with sole_writer(folder):
+                print("again")
+        finally:
+            os.kill(child, signal.SIGKILL)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code), str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "again\n"
+
+
+# rests of the killed
+
+
+@pytest.mark.parametrize(
+    ("dies_at", "rest"),
+    [
+        ("job", r"\.job\.[0-9a-f]{8}\.json"),
+        ("block", r"blocks/\.runs-0000004-0000008\.[0-9a-f]{8}\.npz"),
+        ("results", r"\.results\.0123abcd\.nc"),
+    ],
+)
+def test_what_a_killed_writer_left_is_gone_after_the_next_run(
+    dies_at, rest, tmp_path, whole
+):
+    killed(tmp_path, dies_at)
+    left = names(tmp_path)
+    assert ".writer" in left
+    assert [name for name in left if re.fullmatch(rest, name)]
+    with monte_carlo(**JOB, runs=RUNS, out=tmp_path) as resumed:
+        xr.testing.assert_equal(resumed.load(), whole)
+    assert names(tmp_path) == finished()
+
+
+def test_workers_that_outlive_a_killed_writer_do_not_keep_the_folder(tmp_path, whole):
+    killed(tmp_path, "workers")
+    done = []
+    with monte_carlo(
+        **JOB, runs=RUNS, out=tmp_path, progress=lambda runs, of: done.append(runs)
+    ) as resumed:
+        xr.testing.assert_equal(resumed.load(), whole)
+    assert done[0] > 0  # went on
+    assert names(tmp_path) == finished()
+
+
+def test_only_what_slamgym_began_is_removed(tmp_path):
+    monte_carlo(**JOB, runs=4, out=tmp_path).close()
+    rests = [".job.0123abcd.json", "blocks/.runs-0000004-0000008.89abcdef.npz"]
+    others = [
+        ".thesis.0123abcd.tex",
+        ".job.json",
+        "blocks/.runs-0000004-0000008.89abcdef.npz.xK2a9Q",  # of a copy under way
+        "blocks/runs-0000004-0000008.broken",
+    ]
+    for name in rests + others:
+        (tmp_path / name).write_text("half")
+    with pytest.raises(ValueError, match="seed 0, not of seed 3"):
+        monte_carlo(**JOB, runs=4, seed=3, out=tmp_path)
+    assert {*rests, *others} <= set(names(tmp_path))
+    monte_carlo(**JOB, runs=4, out=tmp_path).close()
+    assert set(others) <= set(names(tmp_path))
+    assert not set(rests) & set(names(tmp_path))
+
+
+def test_a_folder_with_something_else_stays_as_it_is(tmp_path):
+    (tmp_path / ".job.0123abcd.json").write_text("{}")
+    (tmp_path / "thesis.tex").write_text("years of work")
+    before = tree(tmp_path)
+    with pytest.raises(ValueError, match="holds no Monte Carlo"):
+        monte_carlo(**JOB, runs=RUNS, out=tmp_path)
+    assert tree(tmp_path) == before
+    with pytest.raises(ValueError, match="out must be a folder, got the file"):
+        monte_carlo(**JOB, runs=RUNS, out=tmp_path / "thesis.tex")
+
+
+def test_parts_of_two_machines_are_merged_without_their_rests(tmp_path, whole):
+    one, two, both = (tmp_path / name for name in ("one", "two", "both"))
+    killed(one, "block")
+    with monte_carlo(**JOB, runs=RUNS, first_run=4, out=two) as part:
+        xr.testing.assert_equal(part.load(), whole.isel(run=slice(4, None)))
+    ignored = shutil.ignore_patterns("runs-*")
+    shutil.copytree(one, both, ignore=ignored)  # but its rests
+    merge_blocks([one, two], both)
+    assert names(both) == sorted({*finished()} - {"results.nc"})
+    done = []
+    with monte_carlo(
+        **JOB, runs=RUNS, out=both, progress=lambda runs, of: done.append(runs)
+    ) as merged:
+        xr.testing.assert_equal(merged.load(), whole)
+    assert done == [RUNS]  # there was nothing left to do
+
+
+# one job
+
+
+def test_a_job_is_of_the_filter_that_it_began_with(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    source = tmp_path / "edited_filter.py"
+    text = "from slamgym.estimator import EkfSlam\nclass Mine(EkfSlam):\n    pass\n"
+    source.write_text(text)
+    job = JOB | {"estimators": "edited_filter:Mine", "out": tmp_path / "out"}
+    done = []
+
+    def edits(runs, of):
+        source.write_text(text + "# edited while the old one runs\n")
+
+    monte_carlo(**job, runs=RUNS, progress=edits).close()
+    source.write_text(text)
+    monte_carlo(**job, runs=RUNS, progress=lambda runs, of: done.append(runs)).close()
+    assert done == [RUNS]
+
+
+# submaps on disk
+
+
+def test_a_folder_of_submaps_is_refused_for_many_runs(tmp_path):
+    on_disk = {"on disk": ("submaps", {"folder": str(tmp_path / "maps")})}
+    with pytest.raises(ValueError, match="folder holds the submaps of one run: leave"):
+        monte_carlo("six_landmarks", on_disk, 3, out=tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+THREADS = """
+from threadpoolctl import threadpool_info
+from slamgym.experiments.runs.blas_threads import one_blas_thread
+from slamgym.experiments.monte_carlo import monte_carlo
+
+
+def threads():
+    pools = [pool for pool in threadpool_info() if pool["user_api"] == "blas"]
+    return [pool["num_threads"] for pool in pools]
+
+
+if __name__ == "__main__":
+    seen = []
+    monte_carlo(
+        "six_landmarks", "ekf", 2, progress=lambda done, runs: seen.append(threads())
+    )
+    print(seen[-1], threads())
+"""
+
+
+def test_runs_use_one_blas_thread_and_leave_the_others_as_they_were():
+    """Else the last bits would depend on how many workers share the cores."""
+    done = subprocess.run(
+        [sys.executable, "-c", THREADS],
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "2"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    within, after = map(
+        set, ast.literal_eval(f"[{done.stdout.replace('] [', '], [')}]")
+    )
+    assert (within, after) == ({1}, {2})
+
+
+def submap_settings(folder, **options):
+    return FilterSettings(
+        "submaps", (0.2,) * 3, (0.1,) * 2, options={"folder": folder} | options
+    )
+
+
+def test_warming_up_leaves_a_folder_of_submaps_empty(tmp_path):
+    settings = submap_settings(tmp_path / "maps", submap_size=1)
+    for _ in range(2):
+        warm_up(settings, Reporter(as_json=True))
+        assert names(tmp_path) == []
+    slam = settings.make((0.0, 0.0, 0.0))
+    slam.predict((1.0, 0.0))
+    slam.update([(0.0, 2.0)], [0])
+    before = tree(tmp_path)
+    with pytest.raises(ValueError, match="holds the submaps of another run"):
+        warm_up(settings, Reporter(as_json=True))
+    assert tree(tmp_path) == before
+
+
+def test_a_warm_up_interrupted_leaves_a_folder_of_submaps_empty(tmp_path, monkeypatch):
+    def interrupted(*_):
+        assert names(tmp_path) == ["maps/submaps.txt"]
+        raise KeyboardInterrupt
+
+    settings = submap_settings(tmp_path / "maps")
+    monkeypatch.setattr(
+        "slamgym.estimator.large_maps.submaps.submap_slam.SubmapSlam.update",
+        interrupted,
+    )
+    with pytest.raises(KeyboardInterrupt):
+        warm_up(settings, Reporter(as_json=True))
+    assert names(tmp_path) == []

@@ -1,0 +1,472 @@
+"""The numbers, the words, the table and the figures of a Monte Carlo."""
+
+import html
+import io
+import itertools
+import json
+import re
+
+import numpy as np
+import pytest
+from monte_carlo_dataset import FILTERS, typical, with_failures
+from rich.console import Console
+from scipy.stats import chi2
+
+from slamgym.evaluation.consistency_report import consistency_report
+from slamgym.evaluation.hypothesis_tests import family_band
+from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES
+from slamgym.experiments.monte_carlo.report.estimator_lines import look_of, thinned
+from slamgym.experiments.monte_carlo.report.figures import report_figures
+from slamgym.experiments.monte_carlo.report.html_report import html_report
+from slamgym.experiments.monte_carlo.report.nis_figures import (
+    nis_autocorrelation,
+    pooled_nis,
+)
+from slamgym.experiments.monte_carlo.report.scores import scores_of
+from slamgym.experiments.monte_carlo.report.summary import summarise_monte_carlo
+from slamgym.experiments.monte_carlo.report.table import measures, monte_carlo_table
+from slamgym.experiments.monte_carlo.report.verdict import KINDS, judge
+from slamgym.sim_configs import load_scenario
+
+FAILURES = (
+    ("invariant", 3, 12, "LinAlgError: not positive definite"),
+    ("invariant", 7, 0, "ValueError: <b>no</b> [red]landmark[/red]"),
+)
+
+
+def table_text(summary, width=80):
+    console = Console(file=io.StringIO(), width=width)
+    console.print(monte_carlo_table(summary))
+    return console.file.getvalue()
+
+
+def figure_of(dataset, name):
+    figures = report_figures(dataset, summarise_monte_carlo(dataset))
+    (found,) = (part.figure for part in figures if part.name == name)
+    return found
+
+
+def line_of(axes, label):
+    (line,) = (line for line in axes.lines if line.get_label() == label)
+    return line
+
+
+def white_report(factor, runs, steps=20, outliers=0):
+    """Report on runs whose NEES is white, exactly χ² times a factor."""
+    rng = np.random.default_rng(1)
+    nees = factor * rng.chisquare(3, (runs, steps))
+    nees[:outliers] *= 50
+    dof = np.full((runs, steps), 2)
+    nis = rng.chisquare(2, (runs, steps))
+    return consistency_report(nees, nis, dof, frame="invariant", rng=rng)
+
+
+def test_the_fixture_has_the_runners_schema():
+    dataset = typical()
+    assert set(dataset.data_vars) == set(VARIABLES)
+    for name, variable in VARIABLES.items():
+        assert dataset[name].dims == ("estimator", *variable.dims)
+
+
+@pytest.mark.parametrize("label", ["ekf", "invariant"])
+def test_averages_equal_the_plain_formulas(label):
+    dataset = typical()
+    entry = summarise_monte_carlo(dataset)["estimators"][label]
+    raw = {name: dataset[name].sel(estimator=label).values for name in dataset}
+    nees = raw["pose_nees_invariant"][:, 1:] / 3
+    average, per_run = nees.mean(axis=0), nees.mean(axis=1)
+    low, high = chi2.ppf([0.025, 0.975], 3 * 40) / (3 * 40)
+    expected = {
+        "mean": average.mean(),
+        "end": average[-1],
+        "share_inside_band": np.mean((low < average) & (average < high)),
+    }
+    assert entry["pose_nees"]["invariant"] == pytest.approx(expected)
+    additive = raw["pose_nees_additive"][:, 1:].mean() / 3
+    assert entry["pose_nees"]["additive"]["mean"] == pytest.approx(additive)
+    assert entry["median_run"] == pytest.approx(np.median(per_run))
+    assert entry["share_above_3"] == pytest.approx(np.mean(per_run > 3))
+    heading = raw["heading_nees"][:, 1:]
+    assert entry["heading_nees"]["mean"] == pytest.approx(heading.mean())
+    assert entry["nis"] == pytest.approx(raw["nis"].sum() / raw["nis_dof"].sum())
+    positions = raw["position_nees_additive"][:, 1:].mean() / 2
+    assert entry["position_nees"]["additive"] == pytest.approx(positions)
+
+
+def test_root_mean_squares_equal_the_plain_formulas():
+    dataset = typical()
+    entry = summarise_monte_carlo(dataset)["estimators"]["ekf"]
+    raw = {name: dataset[name].sel(estimator="ekf").values for name in dataset}
+
+    def rms(values):
+        return pytest.approx(np.sqrt(np.nanmean(values**2)))
+
+    assert entry["rmse"]["position"] == rms(raw["position_error"][:, 1:])
+    assert entry["rmse"]["heading"] == rms(raw["heading_error"][:, 1:])
+    assert entry["heading_std_end"]["claimed"] == rms(raw["heading_std"][:, -1])
+    assert entry["heading_std_end"]["true"] == rms(raw["heading_error"][:, -1])
+    for name in ("ate", "landmark_rmse"):
+        assert entry[name]["raw"] == rms(raw[name])
+        assert entry[name]["aligned"] == rms(raw[f"{name}_aligned"])
+    assert entry["landmark_mahalanobis"] == rms(raw["landmark_mahalanobis"])
+    end = entry["nees_end"]
+    state = raw["state_nees_invariant"].sum() / raw["state_dof"].sum()
+    assert end["state"] == pytest.approx(state)
+    landmarks = np.nanmean(raw["landmark_nees_invariant"]) / 2
+    assert end["landmarks"] == pytest.approx(landmarks)
+
+
+def test_the_final_decision_equals_the_chi_square_of_the_last_step():
+    dataset = typical()
+    entry = summarise_monte_carlo(dataset)["estimators"]["invariant"]
+    last = dataset["pose_nees_invariant"].sel(estimator="invariant", step=29)
+    total = float(last.sum())
+    p_value = 2 * min(chi2.cdf(total, 120), chi2.sf(total, 120))
+    decision = entry["decisions"]["final_step"]
+    assert decision["statistic"] == pytest.approx(total / 120)
+    assert decision["p_value"] == pytest.approx(p_value)
+
+
+def test_grid_steps_are_numbered_as_the_results_number_them():
+    dataset = typical()
+    entry = summarise_monte_carlo(dataset)["estimators"]["ekf"]
+    grid = entry["decisions"]["grid"]
+    nees = dataset["pose_nees_invariant"].sel(estimator="ekf", step=grid["steps"])
+    assert grid["statistic"] == pytest.approx((nees.mean("run") / 3).values)
+    assert grid["steps"][-1] == 29
+
+
+def test_the_ekf_is_refused_and_the_invariant_filter_is_consistent():
+    entries = summarise_monte_carlo(typical())["estimators"]
+    assert entries["ekf"]["verdict"] == "not consistent"
+    assert entries["ekf"]["sentence"].startswith("ekf: not consistent: its squared err")
+    assert "(p < 1e-16)" in entries["ekf"]["sentence"]
+    assert entries["invariant"]["verdict"] == "consistent"
+    assert "lies inside [0.8, 1.25]" in entries["invariant"]["sentence"]
+
+
+def test_a_heading_better_known_than_at_the_start_is_pointed_out():
+    summary = summarise_monte_carlo(typical())
+    entries = summary["estimators"]
+    assert summary["knowable_heading_std"] == 0.1
+    assert "the start was known to 5.7° only" in entries["ekf"]["heading_sentence"]
+    assert entries["invariant"]["heading_sentence"] == ""
+
+
+@pytest.mark.parametrize(
+    ("factor", "runs", "word", "said"),
+    [
+        (1.0, 400, "consistent", "lies inside [0.8, 1.25]"),
+        (1.5, 400, "not consistent", "over all steps (p < 1e-16)"),
+        (0.6, 400, "not consistent", "it is too cautious"),
+        (1.06, 2000, "nearly consistent", "certain but small"),
+        (1.0, 3, "not shown", "more runs are needed"),
+        (0.6, 4, "not shown", "no decision refuses it (5 %), but the 90 % interval"),
+    ],
+)
+def test_verdicts_on_white_nees(factor, runs, word, said):
+    verdict = judge(white_report(factor, runs), 0, runs)
+    assert verdict.word == word
+    assert said in verdict.reason
+
+
+@pytest.mark.parametrize("runs", [2, 3, 5, 10, 20])
+def test_few_runs_of_a_consistent_filter_are_called_wrong_in_5_percent(runs):
+    """NEES that never changes over time is the hardest case: as skewed as can be."""
+    repetitions = 1000
+    rng = np.random.default_rng(13)
+    dof = np.full((runs, 4), 2)
+    wrong = 0
+    for _ in range(repetitions):
+        nees = np.repeat(rng.chisquare(3, (runs, 1)), 4, axis=1)
+        nis = rng.chisquare(2, (runs, 4))
+        report = consistency_report(nees, nis, dof, frame="invariant", rng=rng)
+        found = judge(report, 0, runs).word == "not consistent"
+        assert not (found and report.accepted)
+        wrong += found
+    assert wrong <= 0.05 * repetitions
+
+
+@pytest.mark.parametrize("runs", [3, 5, 9])
+def test_few_runs_of_a_filter_that_is_far_off_are_found(runs):
+    assert judge(white_report(8.0, runs), 0, runs).word == "not consistent"
+
+
+@pytest.mark.parametrize("runs", range(2, 7))
+def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs):
+    world = load_scenario("six_landmarks").with_changes(steps=12)
+    for seed in (0, 5, 9):
+        dataset = monte_carlo(world, "ekf", runs, seed)
+        summary = summarise_monte_carlo(dataset)
+        json.dumps(summary, allow_nan=False)
+        bootstrap = summary["estimators"]["ekf"]["decisions"]["bootstrap"]
+        assert (bootstrap["p_value"] is None) == (runs < 5)
+        page = html_report(dataset, summary)
+        (row,) = re.findall(r"Time averages, bootstrap</th>(.*?)</tr>", page)
+        if runs < 5:
+            assert row.count("<td>–</td>") == 3
+        assert not re.findall(
+            r"\d{9}", html.unescape(re.sub(r"<svg.*?</svg>", "", row))
+        )
+        assert "nan" not in row
+        assert "None" not in row
+
+
+def test_a_few_bad_runs_that_make_the_average_are_pointed_out():
+    verdict = judge(white_report(1.0, 200, outliers=4), 0, 200)
+    assert verdict.word == "not consistent"
+    assert "few runs make this average" in verdict.reason
+    assert "2.0% of the runs are above 3" in verdict.reason
+
+
+def test_failed_runs_are_told_and_counted_nowhere_else():
+    dataset = with_failures(typical(), FAILURES)
+    entry = summarise_monte_carlo(dataset)["estimators"]["invariant"]
+    others = typical().isel(run=[run for run in range(40) if run not in (3, 7)])
+    expected = summarise_monte_carlo(others)["estimators"]["invariant"]
+    for name in ("pose_nees", "heading_nees", "nis", "rmse", "ate", "landmark_rmse"):
+        assert entry[name] == expected[name]
+    assert entry["decisions"] == expected["decisions"]
+    assert entry["good_runs"] == 38
+    assert entry["failed_runs"] == [
+        {"run": run, "step": step, "message": message}
+        for _, run, step, message in FAILURES
+    ]
+    assert entry["verdict"] == "not shown"
+    assert entry["reason"].startswith("2 of 40 runs failed; of the others, ")
+
+
+def test_notes_group_failures_and_warn_of_few_runs():
+    boom, odd = "ZeroDivisionError: boom", "ValueError: [red]odd[/red]\nsecond line"
+    failures = [("ekf", run, 3, boom) for run in range(30)]
+    failures += [("ekf", 31, -1, odd), ("ekf", 33, 5, "c"), ("ekf", 34, 5, "d")]
+    summary = summarise_monte_carlo(with_failures(typical(), failures))
+    groups = summary["estimators"]["ekf"]["failure_groups"]
+    assert groups[0] == {"count": 30, "message": boom, "run": 0, "step": 3}
+    assert [group["count"] for group in groups] == [30, 1, 1, 1]
+    assert summary["notes"] == [
+        "ekf: 33 of 40 runs failed: 30 × ZeroDivisionError: boom (first: run 0, "
+        "step 3); 1 × ValueError: [red]odd[/red] second line (first: run 31); "
+        "1 × c (first: run 33, step 5); 1 × other messages.",
+        "ekf: only 7 runs did not fail: below 20 little can be shown.",
+    ]
+    assert summarise_monte_carlo(typical())["notes"] == []
+
+
+def test_notes_tell_why_all_runs_failed():
+    failures = [(label, run, 3, "boom") for label in FILTERS for run in range(40)]
+    summary = summarise_monte_carlo(with_failures(typical(), failures))
+    for label in FILTERS:
+        said = f"{label}: 40 of 40 runs failed: 40 × boom (first: run 0, step 3)."
+        assert said in summary["notes"]
+
+
+def test_few_runs_are_noted_once_for_all_estimators():
+    summary = summarise_monte_carlo(typical().isel(run=slice(8)))
+    assert summary["notes"] == ["Only 8 runs: below 20 little can be shown."]
+
+
+def test_a_flagged_run_counts_as_failed_even_if_its_numbers_are_finite():
+    dataset = typical().copy(deep=True)
+    dataset["failed"].loc[{"estimator": "ekf", "run": 5}] = True
+    entry = summarise_monte_carlo(dataset)["estimators"]["ekf"]
+    assert entry["good_runs"] == 39
+    assert "1 of 40 runs failed and are left out: 5." in entry["warnings"]
+
+
+def test_gaps_that_nobody_flagged_are_found_with_their_step():
+    dataset = typical().copy(deep=True)
+    dataset["nis"].loc[{"estimator": "ekf", "run": 5, "step": 17}] = np.nan
+    (failure,) = summarise_monte_carlo(dataset)["estimators"]["ekf"]["failed_runs"]
+    assert (failure["run"], failure["step"]) == (5, 17)
+    assert "not finite" in failure["message"]
+
+
+@pytest.mark.parametrize("good", [0, 1])
+def test_fewer_than_two_good_runs_decide_nothing_and_break_nothing(good):
+    failures = [("ekf", run, 5, "boom") for run in range(good, 40)]
+    dataset = with_failures(typical(), failures)
+    summary = summarise_monte_carlo(dataset)
+    entry = summary["estimators"]["ekf"]
+    assert entry["verdict"] == "not shown"
+    assert f"{good} run" in entry["reason"]
+    assert entry["decisions"] is None
+    json.dumps(summary, allow_nan=False)
+    assert "not shown" in table_text(summary).replace("\n", " ")
+    report_figures(dataset, summary)
+
+
+def test_a_diverged_run_breaks_nothing():
+    dataset = typical().copy(deep=True)
+    row = {"estimator": "ekf", "run": 2, "step": slice(9, None)}
+    for name in ("pose_nees_invariant", "pose_nees_additive", "nis", "heading_nees"):
+        dataset[name].loc[row] = 1e250
+    dataset["position_error"].loc[row | {"run": 3}] = 1e200
+    summary = summarise_monte_carlo(dataset)
+    (failure,) = summary["estimators"]["ekf"]["failed_runs"]
+    assert (failure["run"], failure["step"]) == (2, 9)
+    json.dumps(summary, allow_nan=False)
+    table_text(summary)
+    for part in report_figures(dataset, summary):
+        part.figure.draw_without_rendering()
+
+
+def test_few_runs_are_warned_of():
+    dataset = typical().isel(run=slice(8))
+    entry = summarise_monte_carlo(dataset)["estimators"]["invariant"]
+    assert any("Only 8 runs" in line for line in entry["warnings"])
+
+
+def test_a_start_known_for_certain_is_no_failure():
+    dataset = typical().copy(deep=True)
+    for name in ("pose_nees_invariant", "pose_nees_additive", "heading_nees"):
+        dataset[name].loc[{"step": slice(0, 2)}] = np.nan
+    summary = summarise_monte_carlo(dataset)
+    entry = summary["estimators"]["ekf"]
+    assert entry["failed_runs"] == []
+    nees = dataset["pose_nees_invariant"].sel(estimator="ekf").values[:, 3:]
+    assert entry["pose_nees"]["invariant"]["mean"] == pytest.approx(nees.mean() / 3)
+    line = line_of(figure_of(dataset, "nees").axes[0], "ekf")
+    assert line.get_xdata()[0] == 3
+    json.dumps(summary, allow_nan=False)
+
+
+def test_an_estimator_alone_gets_the_same_figures_as_beside_others():
+    alone = summarise_monte_carlo(typical().sel(estimator=["invariant"]))
+    beside = summarise_monte_carlo(typical())
+    assert alone["estimators"]["invariant"] == beside["estimators"]["invariant"]
+
+
+def test_the_frame_can_be_chosen():
+    summary = summarise_monte_carlo(typical(), frame="additive")
+    decision = summary["estimators"]["ekf"]["decisions"]["final_step"]
+    last = typical()["pose_nees_additive"].sel(estimator="ekf", step=29)
+    assert decision["statistic"] == pytest.approx(float(last.mean()) / 3)
+    assert "additive frame" in table_text(summary, 100)
+
+
+def test_other_noise_than_the_worlds_is_told():
+    dataset = typical().copy()
+    dataset.attrs["assumed"] = dataset.attrs["scenario"]
+    assert summarise_monte_carlo(dataset)["assumed_toml"] is None
+    dataset.attrs["assumed"] += "# other"
+    assert summarise_monte_carlo(dataset)["assumed_toml"].endswith("# other")
+
+
+def test_the_table_fits_80_columns_and_keeps_brackets():
+    text = table_text(summarise_monte_carlo(typical()))
+    assert max(map(len, text.splitlines())) <= 80
+    for words in ("path (ATE), raw [m]", "not consistent", "≥ 5.7°", "failed runs"):
+        assert words in text
+
+
+def test_the_share_inside_the_band_is_not_expected_to_be_95_percent():
+    summary = summarise_monte_carlo(typical())
+    (row,) = (row for row in measures(summary) if "95 % band" in row.name)
+    assert row.right == "varies"
+
+
+@pytest.mark.parametrize(("std", "bound"), [(0.1, "≥ 5.7°"), (1e-4, "")])
+def test_a_bound_of_the_heading_too_small_to_matter_is_left_out(std, bound):
+    summary = summarise_monte_carlo(typical()) | {"knowable_heading_std": std}
+    (row,) = (row for row in measures(summary) if "claimed" in row.name)
+    assert row.right == bound
+
+
+def test_a_word_has_one_colour_on_terminal_and_page():
+    summary = summarise_monte_carlo(typical())
+    styles = {"good": "green", "bad": "red", "open": "yellow"}
+    for word, kind in KINDS.items():
+        summary["estimators"]["ekf"]["verdict"] = word
+        cell = monte_carlo_table(summary).columns[2]._cells[0]
+        assert (str(cell), cell.style) == (word, styles[kind])
+        page = html_report(typical(), summary)
+        assert f'<li class="{kind}"><h3><span>ekf</span>' in page
+    assert KINDS["nearly consistent"] == "good"
+
+
+def test_labels_with_markup_reach_the_table_as_they_are():
+    dataset = typical().assign_coords(estimator=["[red]x", "y[iterations=3]"])
+    text = table_text(summarise_monte_carlo(dataset), 100)
+    assert "[red]x" in text
+    assert "y[iterations=3]" in text
+
+
+def test_curves_are_averages_over_runs():
+    axes = figure_of(typical(), "nees").axes[0]
+    line = line_of(axes, "ekf")
+    nees = typical()["pose_nees_invariant"].sel(estimator="ekf").values[:, 1:]
+    np.testing.assert_array_equal(line.get_xdata(), np.arange(1, 30))
+    np.testing.assert_allclose(line.get_ydata(), nees.mean(axis=0) / 3)
+    errors = typical()["position_error"].sel(estimator="ekf").values[:, 1:]
+    line = line_of(figure_of(typical(), "rmse").axes[0], "ekf")
+    np.testing.assert_allclose(line.get_ydata(), np.sqrt((errors**2).mean(axis=0)))
+
+
+def test_the_legend_counts_the_steps_that_are_tested():
+    dataset = typical(steps=4)
+    (part,) = (
+        part
+        for part in report_figures(dataset, summarise_monte_carlo(dataset))
+        if part.name == "nees"
+    )
+    axes = part.figure.axes[0]
+    lines = [line_of(axes, "95 % band, 4 steps")]
+    assert lines[0].get_ydata()[0] == pytest.approx(family_band(40, 3, 4).low / 3)
+    assert "all 4 marked steps" in part.sentence
+    line_of(figure_of(typical(), "nees").axes[0], "95 % band, 10 steps")
+
+
+def test_the_heading_panels_show_claim_truth_and_what_is_knowable():
+    axes = figure_of(typical(), "heading").axes[0]
+    std = typical()["heading_std"].sel(estimator="ekf").values[:, 1:]
+    claimed = line_of(axes, "claimed deviation").get_ydata()
+    np.testing.assert_allclose(claimed, np.degrees(np.sqrt((std**2).mean(axis=0))))
+    assert line_of(axes, "at the start").get_ydata()[0] == pytest.approx(5.7296, 1e-4)
+
+
+def test_every_run_is_a_dot_of_its_own():
+    axes = figure_of(typical(), "runs").axes[0]
+    dots = [line for line in axes.lines if line.get_marker() == "o"]
+    for line, label in zip(dots, ("ekf", "invariant"), strict=True):
+        nees = typical()["pose_nees_invariant"].sel(estimator=label).values[:, 1:]
+        averages = np.sort(nees.mean(axis=1) / 3)
+        shown = np.column_stack(line.get_data())
+        assert len(np.unique(shown, axis=0)) == 40
+        np.testing.assert_allclose(np.sort(shown[:, 0]), averages, rtol=0.05)
+
+
+def test_autocorrelations_are_those_of_the_whiteness_decision():
+    dataset = typical().copy(deep=True)
+    dataset["nis_dof"][..., ::3] = 4  # else the normal scores' scale would not matter
+    dataset["nis_dof"][..., ::7] = 0
+    scores = scores_of(dataset, "ekf", "invariant")
+    correlations, pairs = nis_autocorrelation(scores)
+    statistic = (pairs * correlations**2).sum()
+    entry = summarise_monte_carlo(dataset)["estimators"]["ekf"]
+    assert statistic == pytest.approx(entry["decisions"]["whiteness"]["statistic"])
+
+
+def test_pooled_nis_adds_up_to_all_of_it():
+    scores = scores_of(typical(), "ekf", "invariant")
+    _, ratios, freedom = pooled_nis(scores)
+    nis = typical()["nis"].sel(estimator="ekf").values[:, 1:]
+    assert (ratios * freedom).sum() == pytest.approx(nis.sum())
+
+
+def test_thinned_lines_keep_ends_and_peaks():
+    x, y = np.arange(5000.0), np.zeros(5000)
+    y[1234], y[3777] = 9.0, -7.0
+    kept_x, kept_y = thinned(x, y, most=100)
+    assert len(kept_x) <= 102
+    assert (kept_x[0], kept_x[-1]) == (0, 4999)
+    assert kept_x[kept_y == 9].tolist() == [1234]
+    assert kept_x[kept_y == -7].tolist() == [3777]
+
+
+def test_no_two_of_many_estimators_look_alike():
+    looks = [look_of(place) for place in range(30)]
+    assert len({(look.colour, str(look.dashes)) for look in looks}) == 30
+    neighbours = itertools.pairwise(str(look.dashes) for look in looks)
+    assert all(one != two for one, two in neighbours)

@@ -1,0 +1,500 @@
+import functools
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.text import Text
+from PIL import Image
+from run_traces import make_trace
+from scipy.stats import chi2
+
+from slamgym.experiments.figures import (
+    NoisePanel,
+    covariance_figure,
+    errors_figure,
+    map_figure,
+    map_sequence,
+    noise_study_figure,
+    save_figure,
+    truth_figure,
+)
+from slamgym.experiments.figures.consistency import nis_band, pose_errors
+from slamgym.experiments.figures.covariance import correlations
+from slamgym.experiments.figures.map_picture import FIRST, LATER, PREDICTED, UPDATED
+from slamgym.experiments.figures.style import new_figure
+
+
+def noise_study(trace):
+    names = [f"σ{name} {by}" for name in "xyαβr" for by in ("× 10", "÷ 10")]
+    return noise_study_figure(
+        [NoisePanel("unchanged", trace), *(NoisePanel(name, trace) for name in names)]
+    )
+
+
+@functools.cache
+def typical(figure_of):
+    """Draw the figure of a typical run, once for all tests that only read it."""
+    return figure_of(make_trace())
+
+
+FIGURES = (map_figure, truth_figure, covariance_figure, errors_figure, noise_study)
+
+
+def ellipses_of(figure, kind):
+    (shown,) = (
+        artist
+        for artist in figure.axes[0].collections
+        if isinstance(artist, EllipseCollection) and artist.get_label() == kind.label
+    )
+    return shown
+
+
+def line_of(axes, label):
+    (line,) = (line for line in axes.lines if line.get_label() == label)
+    return line
+
+
+def pixels_of(figure):
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
+
+
+# ---- every figure
+
+
+def drawn_texts(figure, monkeypatch):
+    """Boxes [pixels] of all texts that reach the canvas."""
+    drawn, draw = {}, Text.draw
+
+    def note(text, renderer):
+        if text.get_visible() and text.get_text().strip():
+            drawn[text] = None
+        draw(text, renderer)
+
+    monkeypatch.setattr(Text, "draw", note)
+    figure.canvas.draw()
+    return [(text.get_text(), text.get_window_extent()) for text in drawn]
+
+
+@pytest.mark.parametrize("figure_of", FIGURES)
+@pytest.mark.parametrize(("steps", "count"), [(12, 6), (200, 20), (60, 200)])
+def test_texts_neither_overlap_nor_leave_the_figure(
+    figure_of, steps, count, monkeypatch
+):
+    figure = figure_of(make_trace(steps, count))
+    texts = drawn_texts(figure, monkeypatch)
+    assert len(texts) > 10
+    for text, box in texts:
+        assert min(box.x0, box.y0) >= 0, text
+        assert box.x1 <= figure.bbox.x1, text
+        assert box.y1 <= figure.bbox.y1, text
+    for (one, a), (other, b) in itertools.combinations(texts, 2):
+        overlap = min(a.x1 - b.x0, b.x1 - a.x0, a.y1 - b.y0, b.y1 - a.y0)
+        assert overlap <= 1, f"{one!r} overlaps {other!r}"
+
+
+@pytest.mark.parametrize("figure_of", [map_figure, truth_figure])
+def test_maps_are_in_metres_of_equal_length(figure_of):
+    axes = typical(figure_of).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
+    assert axes.get_aspect() == 1
+
+
+def test_errors_and_time_have_units():
+    axes = typical(errors_figure).axes
+    labels = [a.get_ylabel() for a in axes]
+    assert labels == ["x error [m]", "y error [m]", "θ error [rad]", "NIS"]
+    assert axes[-1].get_xlabel() == "time [s]"
+    counted = errors_figure(make_trace(time_unit="steps")).axes[-1]
+    assert counted.get_xlabel() == "time [steps]"
+
+
+def test_figures_are_made_without_pyplot():
+    code = "import slamgym.experiments.figures, sys; print(*sys.modules)"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert "matplotlib.figure" in result.stdout.split()
+    assert "matplotlib.pyplot" not in result.stdout.split()
+
+
+@pytest.mark.parametrize("figure_of", FIGURES)
+def test_run_that_never_saw_a_landmark_is_drawn(figure_of):
+    figure = figure_of(make_trace(count=0))
+    assert "nan" not in " ".join(text.get_text() for text in figure.findobj(Text))
+
+
+# ---- the map
+
+
+def test_the_four_kinds_of_ellipses_have_their_classic_colours():
+    figure = typical(map_figure)
+    magenta, blue, red, green = (
+        tuple(np.round(ellipses_of(figure, kind).get_edgecolor()[0, :3]))
+        for kind in (PREDICTED, UPDATED, FIRST, LATER)
+    )
+    assert magenta == (1, 0, 1)
+    assert blue == (0, 0, 1)
+    assert red == (1, 0, 0)
+    assert green == (0, 1, 0)
+
+
+def test_what_only_colour_would_tell_apart_differs_by_line_style():
+    figure = typical(map_figure)
+    dashes = {
+        kind.label: ellipses_of(figure, kind).get_linestyle()[0][1]
+        for kind in (PREDICTED, UPDATED, FIRST, LATER)
+    }
+    assert dashes[UPDATED.label] is dashes[LATER.label] is None
+    assert len(dashes[PREDICTED.label]) == 2
+    assert len(dashes[FIRST.label]) == 4
+
+
+@pytest.mark.parametrize("step", [0, 1, 12])
+def test_map_ellipses_are_three_sigma_of_their_covariances(step):
+    trace = make_trace()
+    seen = trace.first_steps() <= step
+    steps = slice(0, step + 1)
+    expected = {
+        PREDICTED: (trace.predicted_poses, trace.predicted_pose_covariances, steps),
+        UPDATED: (trace.poses, trace.pose_covariances, steps),
+        FIRST: (trace.first_landmarks, trace.first_landmark_covariances, seen),
+        LATER: (trace.map_at(step).means, trace.map_at(step).covariances, slice(None)),
+    }
+    figure = map_figure(trace, step)
+    for kind, (means, blocks, rows) in expected.items():
+        shown = ellipses_of(figure, kind)
+        np.testing.assert_array_equal(shown.get_offsets(), means[rows, :2])
+        axes = np.stack([shown.get_heights(), shown.get_widths()], axis=1)
+        roots = np.sqrt(np.linalg.eigvalsh(blocks[rows, :2, :2]))
+        np.testing.assert_allclose(axes, 6 * roots)
+
+
+def test_ellipse_in_the_picture_lies_along_its_eigenvector():
+    trace = make_trace(count=1)
+    figure = map_figure(trace)
+    shown = ellipses_of(figure, LATER)
+    _, vectors = np.linalg.eigh(trace.map_at(12).covariances[0])
+    angle = np.radians(shown.get_angles()[0])
+    assert abs(vectors[:, 1] @ [np.cos(angle), np.sin(angle)]) == pytest.approx(1)
+    assert shown._units == "xy"
+
+
+def test_path_ends_at_the_step():
+    trace = make_trace()
+    path = line_of(map_figure(trace, 4).axes[0], "estimated path")
+    np.testing.assert_array_equal(path.get_xydata(), trace.poses[:5, :2])
+
+
+def test_true_landmarks_are_crosses_and_absent_when_unknown():
+    trace = make_trace()
+    crosses = line_of(map_figure(trace).axes[0], "true landmark")
+    assert crosses.get_marker() == "+"
+    np.testing.assert_array_equal(crosses.get_xydata(), trace.true_landmarks)
+    figure = map_figure(make_trace(true_landmarks=None))
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "true landmark" not in names
+    assert UPDATED.label in names
+
+
+def test_long_runs_draw_fewer_poses_and_say_so():
+    figure = map_figure(make_trace(steps=600))
+    assert 40 <= len(ellipses_of(figure, UPDATED).get_widths()) <= 61
+    assert any("1 pose in 11 drawn" in text.get_text() for text in figure.axes[0].texts)
+
+
+def test_view_is_the_same_at_every_step_and_holds_the_whole_run():
+    trace = make_trace()
+    first, last = map_figure(trace, 0).axes[0], typical(map_figure).axes[0]
+    limits = first.get_xlim(), first.get_ylim()
+    assert limits == (last.get_xlim(), last.get_ylim())
+    low, high = np.transpose(limits)
+    points = np.concatenate([trace.poses[:, :2], trace.landmarks, trace.true_landmarks])
+    assert ((low < points) & (points < high)).all()
+
+
+def test_one_huge_ellipse_does_not_make_all_others_tiny():
+    huge = np.array([1e6 * np.eye(2), *make_trace().first_landmark_covariances[1:]])
+    calm = typical(map_figure).axes[0]
+    wild = map_figure(make_trace(first_landmark_covariances=huge)).axes[0]
+    assert np.ptp(wild.get_xlim()) < 2 * np.ptp(calm.get_xlim())
+
+
+@pytest.mark.parametrize("step", [-1, 13])
+def test_step_beyond_the_run_is_refused(step):
+    with pytest.raises(ValueError, match=rf"step must be in 0 … 12, got {step}"):
+        map_figure(make_trace(), step)
+
+
+def test_map_before_any_landmark_is_drawn():
+    nothing = (np.empty(0, int), np.empty((0, 2)), np.empty((0, 2, 2)))
+    trace = make_trace()
+    history = (nothing, *trace.landmark_history[1:])
+    figure = map_figure(make_trace(landmark_history=history), 0)
+    assert len(ellipses_of(figure, LATER).get_widths()) == 0
+    assert len(ellipses_of(figure, FIRST).get_widths()) == 0
+
+
+def test_sequence_saves_the_map_of_every_step(tmp_path):
+    trace = make_trace(steps=4)
+    files = map_sequence(trace, tmp_path / "maps", dpi=100)
+    assert [file.name for file in files] == [f"step_00{k}.png" for k in range(5)]
+    assert sorted((tmp_path / "maps").iterdir()) == files
+    for step in (0, 4):
+        saved = np.asarray(Image.open(files[step]))
+        expected = pixels_of(map_figure(trace, step))
+        assert saved.shape == expected.shape
+        assert np.mean((saved != expected).any(axis=-1)) < 0.02
+        assert np.abs(saved.astype(int) - expected).mean() < 0.5
+
+
+# ---- ground truth
+
+
+def test_error_lines_join_estimates_and_truth():
+    trace = make_trace()
+    lines = [
+        np.array(artist.get_segments())
+        for artist in truth_figure(trace).axes[0].collections
+        if isinstance(artist, LineCollection)
+    ]
+    path, landmarks = sorted(lines, key=len, reverse=True)
+    np.testing.assert_array_equal(path[:, 0], trace.poses[:, :2])
+    np.testing.assert_array_equal(path[:, 1], trace.true_poses[:, :2])
+    np.testing.assert_array_equal(landmarks[:, 0], trace.landmarks)
+    np.testing.assert_array_equal(landmarks[:, 1], trace.true_landmarks)
+
+
+def test_distances_are_euclidean_and_mahalanobis():
+    trace = make_trace()
+    _, metres, deviations = truth_figure(trace).axes
+    error = trace.landmarks - trace.true_landmarks
+    np.testing.assert_allclose(
+        metres.lines[0].get_xdata(), np.hypot(error[:, 0], error[:, 1])
+    )
+    inverse = np.linalg.inv(trace.landmark_covariances)
+    np.testing.assert_allclose(
+        deviations.lines[0].get_xdata(),
+        np.sqrt(np.einsum("ni,nij,nj->n", error, inverse, error)),
+    )
+    names = [label.get_text() for label in metres.get_yticklabels()]
+    assert names == ["l10", "l11", "l12", "l13", "l14", "l15"]
+
+
+def test_unknown_truth_is_left_out():
+    trace = make_trace()
+    poses, landmarks = trace.true_poses.copy(), trace.true_landmarks.copy()
+    poses[3:], landmarks[2:] = np.nan, np.nan
+    partly = truth_figure(make_trace(true_poses=poses, true_landmarks=landmarks))
+    assert len(partly.axes[1].lines[0].get_xdata()) == 2
+    assert "nan" not in " ".join(text.get_text() for text in partly.findobj(Text))
+    assert len(truth_figure(make_trace(true_landmarks=None)).axes) == 1
+    assert len(truth_figure(make_trace(true_poses=None)).axes) == 3
+
+
+def test_truth_figure_without_any_truth_is_refused():
+    unknown = np.full((6, 2), np.nan)
+    with pytest.raises(ValueError, match="true poses or true landmarks, got neither"):
+        truth_figure(make_trace(true_poses=None, true_landmarks=unknown))
+
+
+# ---- covariance
+
+
+def test_correlations_are_scaled_covariances():
+    P = np.array([[4.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    expected = [[1.0, -0.5, np.nan], [-0.5, 1.0, np.nan], [np.nan] * 3]
+    np.testing.assert_array_equal(correlations(P), expected)
+
+
+def test_heat_maps_show_first_and_final_correlations_on_one_scale():
+    trace = make_trace()
+    before, after, bar = covariance_figure(trace).axes
+    for axes, covariance in (
+        (before, trace.first_covariance),
+        (after, trace.final_covariance),
+    ):
+        image = axes.images[0]
+        np.testing.assert_allclose(image.get_array(), correlations(covariance))
+        assert image.get_clim() == (-1, 1)
+    assert bar.get_ylabel() == "correlation"
+
+
+def test_rows_are_named_after_the_state_and_carry_their_deviation():
+    trace = make_trace()
+    before, after, _ = covariance_figure(trace).axes
+    names = [label.get_text() for label in after.get_yticklabels()]
+    assert names[:6] == ["x", "y", "θ", "l10x", "l10y", "l11x"]
+    assert names[-1] == "l15y"
+    assert [label.get_text() for label in before.get_yticklabels()][3:] == [
+        "l10x",
+        "l10y",
+        "l13x",
+        "l13y",
+    ]  # the landmarks of the first scan
+    sigma = np.sqrt(trace.final_covariance[2, 2])
+    assert f"σ = {sigma:.2g} rad" in [text.get_text() for text in after.texts]
+
+
+def test_rows_of_large_maps_are_named_thinly():
+    axes = covariance_figure(make_trace(count=200)).axes[1]
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert labels[0] == "pose"
+    assert 5 < len(labels) < 20
+
+
+def test_certain_rows_are_grey_not_white():
+    certain = make_trace().first_covariance.copy()
+    certain[:3], certain[:, :3] = 0, 0
+    figure = covariance_figure(make_trace(first_covariance=certain))
+    image = figure.axes[0].images[0]
+    assert np.ma.getmaskarray(image.get_array())[:3].all()
+    assert image.axes.get_facecolor() != (1, 1, 1, 1)
+
+
+# ---- consistency
+
+
+def test_heading_errors_are_wrapped():
+    errors = pose_errors(np.array([[0.0, 0.0, 3.1]]), np.array([[0.0, 0.0, -3.1]]))
+    assert errors[0, 2] == pytest.approx(6.2 - 2 * np.pi)
+
+
+def test_error_lines_lie_in_bands_of_three_sigma():
+    trace = make_trace()
+    for k, axes in enumerate(errors_figure(trace).axes[:3]):
+        std = np.sqrt(trace.pose_covariances[:, k, k])
+        error = line_of(axes, "error").get_ydata()
+        np.testing.assert_allclose(error, (trace.poses - trace.true_poses)[:, k])
+        vertices = axes.collections[0].get_paths()[0].vertices
+        assert vertices[:, 1].max() == pytest.approx(3 * std.max())
+        assert vertices[:, 1].min() == pytest.approx(-3 * std.max())
+        share = np.mean(np.abs(error) <= 3 * std)
+        assert f"{share:.0%}" in axes.get_title(loc="left")
+
+
+def test_nis_band_holds_95_percent():
+    lower, upper = nis_band(np.array([2, 6, 0]))
+    np.testing.assert_allclose(
+        chi2.cdf(upper[:2], [2, 6]) - chi2.cdf(lower[:2], [2, 6]), 0.95
+    )
+    np.testing.assert_allclose(chi2.cdf(lower[:2], [2, 6]), 0.025)
+    assert np.isnan([lower[2], upper[2]]).all()
+
+
+def test_nis_outside_its_band_is_told_apart_and_idle_steps_are_left_out():
+    nis = np.full(13, 5.0)
+    nis[[0, 4, 7]] = [0.0, 0.01, 40.0]  # no update at step 0
+    axes = errors_figure(make_trace(nis=nis)).axes[-1]
+    np.testing.assert_array_equal(line_of(axes, "outside").get_xdata(), [2.0, 3.5])
+    assert len(line_of(axes, "inside").get_xdata()) == 10
+    assert axes.get_title(loc="left") == "NIS: 83% of the steps in the 95% band"
+
+
+def test_without_true_poses_only_the_nis_is_drawn():
+    for unknown in (None, np.full((13, 3), np.nan)):
+        (axes,) = errors_figure(make_trace(true_poses=unknown)).axes
+        assert axes.get_ylabel() == "NIS"
+
+
+def test_nis_far_off_gets_a_logarithmic_axis():
+    far = np.where(np.arange(13) == 5, 1e5, 6.0)
+    assert errors_figure(make_trace(nis=far)).axes[-1].get_yscale() == "log"
+    assert typical(errors_figure).axes[-1].get_yscale() == "linear"
+
+
+def test_run_without_any_update_has_an_empty_nis():
+    axes = errors_figure(make_trace(nis_dof=np.zeros(13, int))).axes[-1]
+    assert "no step" in axes.get_title(loc="left")
+
+
+# ---- noise study
+
+
+def test_noise_panels_share_one_view_and_come_in_reading_order():
+    figure = typical(noise_study)
+    shown = [axes for axes in figure.axes if axes.axison]
+    titles = [axes.get_title(loc="left") for axes in shown]
+    assert titles[:4] == ["unchanged", "σx × 10", "σx ÷ 10", "σy × 10"]
+    assert len(shown) == 11
+    assert len({(axes.get_xlim(), axes.get_ylim()) for axes in shown}) == 1
+    x = {round(axes.get_position().x0, 3) for axes in shown}
+    assert len(x) == 2
+
+
+def test_diverged_variation_does_not_shrink_the_reference():
+    wild = make_trace(poses=make_trace().poses * [50, 50, 1])
+    panels = [NoisePanel("unchanged", make_trace()), NoisePanel("wild", wild)]
+    width = np.ptp(noise_study_figure(panels).axes[0].get_xlim())
+    assert width <= 2.01 * max(
+        np.ptp(typical(map_figure).axes[0].get_xlim()),
+        np.ptp(typical(map_figure).axes[0].get_ylim()),
+    )
+
+
+def test_only_outer_panels_are_labelled():
+    figure = typical(noise_study)
+    labels = [(a.get_xlabel(), a.get_ylabel()) for a in figure.axes if a.axison]
+    assert labels[0] == ("", "y [m]")
+    assert labels[-2:] == [("x [m]", "y [m]"), ("x [m]", "")]
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_any_number_of_variations_is_laid_out(count):
+    figure = noise_study_figure(
+        [NoisePanel(str(k), make_trace()) for k in range(count)]
+    )
+    shown = [axes for axes in figure.axes if axes.axison]
+    assert [axes.get_title(loc="left") for axes in shown] == list("0123"[:count])
+    lowest = {}
+    for axes in shown:
+        lowest[axes.get_subplotspec().colspan.start] = axes.get_xlabel()
+    assert lowest == dict.fromkeys(range(2 if count > 2 else 1), "x [m]")
+
+
+def test_noise_study_needs_a_variation():
+    with pytest.raises(ValueError, match="a reference and a variation, got 1"):
+        noise_study_figure([NoisePanel("unchanged", make_trace())])
+
+
+# ---- files
+
+
+def small_figure():
+    figure = new_figure(2.0, 1.5)
+    figure.add_subplot().plot([0, 1])
+    return figure
+
+
+@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
+def test_saved_figures_are_complete_and_equal(tmp_path, suffix):
+    for name in ("one", "other"):
+        save_figure(small_figure(), tmp_path / f"{name}.{suffix}", dpi=50)
+    one, other = sorted(tmp_path.iterdir())
+    assert one.stat().st_size > 1000
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_failed_save_leaves_the_former_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "errors.png"
+    path.write_text("former")
+    figure = small_figure()
+
+    def half_written(partial, **_):
+        partial.write_text("half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(figure, "savefig", half_written)
+    with pytest.raises(OSError, match="disk full"):
+        save_figure(figure, path)
+    assert path.read_text() == "former"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_unknown_format_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"path must end in one of .*\.png.*'.*\.doc'"):
+        save_figure(small_figure(), tmp_path / "errors.doc")
+    assert list(tmp_path.iterdir()) == []

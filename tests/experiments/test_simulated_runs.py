@@ -1,0 +1,66 @@
+"""Simulated runs, held against single environments driven one by one."""
+
+import numpy as np
+import pytest
+
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.sim_configs import action_sequence, list_presets, load_scenario
+
+SEED = 30
+WALLED = load_scenario("corridor").with_changes(
+    steps=60, sensor={"occlusion": True, "dropout": 0.1}, start={"drawn": "estimate"}
+)
+SCENARIOS = [
+    preset for preset in list_presets() if load_scenario(preset).sensor.identities
+]
+
+
+def one_by_one(scenario, runs, seed):
+    """The slow twin: the fields of `SimulatedRuns`, environment after environment."""
+    columns = [[], [], [], [], [], []]
+    for run in range(runs):
+        env = LandmarkWorldEnv(scenario)
+        moments = [env.reset(seed=seed + run)]
+        for action in action_sequence(env.scenario):
+            observation, _, _, _, info = env.step(action)
+            moments.append((observation, info))
+        rows = (
+            [observation["odometry"] for observation, _ in moments],
+            [observation["landmarks"] for observation, _ in moments],
+            [observation["mask"] for observation, _ in moments],
+            [info["pose"] for _, info in moments],
+            env.landmarks,
+            env.start_estimate,
+        )
+        for column, row in zip(columns, rows, strict=True):
+            column.append(row)
+    return [np.array(column) for column in columns]
+
+
+@pytest.mark.parametrize("scenario", [*SCENARIOS, WALLED], ids=str)
+def test_runs_are_the_single_worlds_of_their_seeds_to_the_last_bit(scenario):
+    fast, slow = simulate_runs(scenario, 3, SEED), one_by_one(scenario, 3, SEED)
+    for name, array, other in zip(fast._fields, fast, slow, strict=True):
+        assert (array.dtype, array.shape) == (other.dtype, other.shape), name
+        assert array.tobytes() == other.tobytes(), name
+
+
+def test_a_run_depends_on_its_own_seed_alone():
+    many, few = simulate_runs("loop", 4, SEED), simulate_runs("loop", 2, SEED + 2)
+    for array, other in zip(many, few, strict=True):
+        np.testing.assert_array_equal(array[2:], other)
+
+
+def test_the_first_scan_comes_before_any_motion():
+    runs = simulate_runs("six_landmarks", 2, SEED)
+    assert runs.dt.tolist() == [0.0] + [1.0] * 29
+    assert not runs.odometry[:, 0].any()
+    assert runs.measurements[:, 0].any()
+
+
+def test_hidden_identities_and_no_runs_are_refused():
+    with pytest.raises(ValueError, match="must not hide identities"):
+        simulate_runs("hidden_identities", 2, SEED)
+    with pytest.raises(ValueError, match="runs must be >= 1, got 0"):
+        simulate_runs("loop", 0, SEED)

@@ -1,0 +1,309 @@
+import math
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slamgym.experiments.logs.slamlog import (
+    LogError,
+    OdometryRow,
+    Scan,
+    SlamLog,
+    read_slamlog,
+    write_slamlog,
+)
+
+TEXT = """# format: slamlog 1
+# name: corner
+# motion: midpoint
+# start: 1,-2,0.5
+# groundtruth_offset: 3.78,0.5
+landmark,4,3,6
+landmark,2,3,12
+measurement,0,4,1.1,6.7
+measurement,0,2,1.3,12.4
+
+odometry,1,3,0.1,1
+measurement,1,4,1.5,-0.2
+odometry,1,0,0.2,0
+measurement,1,4,1.2,5.9
+measurement,2.5,,0.3,9,0.35
+groundtruth,0,1,2,3
+groundtruth,0.5,1,2,
+"""
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def saved(folder, text):
+    path = folder / "drive.csv"
+    path.write_text(text)
+    return path
+
+
+def logged(*rows, header="# format: slamlog 1"):
+    return "\n".join([header, *rows]) + "\n"
+
+
+def assert_same_log(one, other):
+    assert (one.name, one.header, one.motion) == (
+        other.name,
+        other.header,
+        other.motion,
+    )
+    for name in ("start", "landmark_ids", "landmarks", "ground_truth"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert len(one.events) == len(other.events)
+    for a, b in zip(one.events, other.events, strict=True):
+        assert type(a) is type(b)
+        if isinstance(a, OdometryRow):
+            assert a == b
+        else:
+            assert a.t == b.t
+            np.testing.assert_array_equal(a.measurements, b.measurements)
+            np.testing.assert_equal(a.landmark_ids, b.landmark_ids)
+            np.testing.assert_equal(a.sizes, b.sizes)
+
+
+def test_header_is_parsed_and_its_other_keys_are_kept(tmp_path):
+    log = read_slamlog(saved(tmp_path, TEXT))
+    assert (log.name, log.motion) == ("corner", "midpoint")
+    np.testing.assert_array_equal(log.start, [1, -2, 0.5])
+    assert log.header == {"groundtruth_offset": "3.78,0.5"}
+
+
+def test_a_bare_header_means_file_name_turn_last_and_origin(tmp_path):
+    log = read_slamlog(saved(tmp_path, logged("odometry,1,3,0,1")))
+    assert (log.name, log.motion, log.header) == ("drive", "turn-last", {})
+    np.testing.assert_array_equal(log.start, np.zeros(3))
+
+
+def test_landmarks_keep_the_order_of_the_file(tmp_path):
+    log = read_slamlog(saved(tmp_path, TEXT))
+    assert log.landmark_ids.tolist() == [4, 2]
+    np.testing.assert_array_equal(log.landmarks, [[3, 6], [3, 12]])
+
+
+def test_equal_times_are_one_scan_until_an_odometry_row_comes(tmp_path):
+    events = read_slamlog(saved(tmp_path, TEXT)).events
+    kinds = [len(e.measurements) if isinstance(e, Scan) else "u" for e in events]
+    assert kinds == [2, "u", 1, "u", 1, 1]
+
+
+def test_fields_land_in_their_places(tmp_path):
+    first, row, *_, last = read_slamlog(saved(tmp_path, TEXT)).events
+    np.testing.assert_array_equal(first.measurements, [[1.1, 6.7], [1.3, 12.4]])
+    assert first.landmark_ids.tolist() == [4, 2]
+    assert row == OdometryRow(t=1.0, d=3.0, alpha=0.1, dt=1.0)
+    assert (last.t, last.landmark_ids, last.sizes.tolist()) == (2.5, None, [0.35])
+
+
+def test_unknown_true_heading_is_nan(tmp_path):
+    truth = read_slamlog(saved(tmp_path, TEXT)).ground_truth
+    np.testing.assert_array_equal(truth, [[0, 1, 2, 3], [0.5, 1, 2, math.nan]])
+
+
+def test_windows_line_ends_and_byte_order_mark_change_nothing(tmp_path):
+    plain = read_slamlog(saved(tmp_path, TEXT))
+    path = tmp_path / "windows.csv"
+    path.write_bytes(b"\xef\xbb\xbf" + TEXT.replace("\n", "\r\n").encode())
+    assert_same_log(plain, read_slamlog(path))
+
+
+def test_written_log_reads_back_equal(tmp_path):
+    log = read_slamlog(saved(tmp_path, TEXT))
+    write_slamlog(log, tmp_path / "copy.csv")
+    assert_same_log(log, read_slamlog(tmp_path / "copy.csv"))
+
+
+@given(numbers=st.tuples(*[FINITE] * 12), dt=st.floats(0, 1e300))
+def test_every_float_survives_the_round_trip(tmp_path_factory, numbers, dt):
+    t, d, alpha, bearing, distance, x, y, theta, *start, size = numbers
+    log = SlamLog(
+        name="any",
+        start=np.array(start),
+        landmark_ids=np.array([7]),
+        landmarks=np.array([[x, y]]),
+        events=(
+            OdometryRow(np.float64(t), np.float64(d), alpha, dt),
+            Scan(t, [[bearing, distance]], [7], [size]),
+        ),
+        ground_truth=np.array([[t, x, y, theta]]),
+    )
+    path = tmp_path_factory.getbasetemp() / "any.csv"
+    write_slamlog(log, path)
+    assert_same_log(log, read_slamlog(path))
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("odometry,1,east,0,1", "expected a finite number, got 'east'"),
+        ("odometry,1,nan,0,1", "expected a finite number, got 'nan'"),
+        ("odometry,1,1e999,0,1", "expected a finite number, got '1e999'"),
+        ("odometry,1,1_0,0,1", "expected a finite number, got '1_0'"),
+        ("odometry,1,3,0", "expected odometry,t,d,alpha,dt, got 3 fields"),
+        ("odometry,1,3,0,-1", "expected dt >= 0, got -1.0"),
+        ("odometry,0.5,3,0,1", "expected t >= 1.0, the time before, got 0.5"),
+        ("measurement,0.5,1,0,1", "expected t >= 1.0, the time before, got 0.5"),
+        ("measurement,1,0,0.1", "expected measurement,t,id,bearing,range"),
+        ("measurement,1,0,0.1,2,3,4", "expected measurement,t,id,bearing,range"),
+        ("measurement,1,-3,0.1,2", "expected an id (a whole number >= 0), got '-3'"),
+        ("measurement,1,1.0,0.1,2", "expected an id (a whole number >= 0), got '1.0'"),
+        (f"measurement,1,{'9' * 30},0,2", "expected an id"),
+        ("measurement,1,5,0,2", "expected each landmark once per scan, got id 5 again"),
+        (
+            "measurement,1,,0,2",
+            "expected ids in all rows of a scan or in none, got both",
+        ),
+        ("measurement,1,6,0,2,0.3", "expected sizes in all rows of a scan or in none"),
+        ("landmark,9,1,2", "expected each landmark once, got id 9 again"),
+        ("landmark,1,inf,2", "expected a finite number, got 'inf'"),
+        (
+            "groundtruth,0.5,1,2,3",
+            "expected t >= 1.0, the ground truth before, got 0.5",
+        ),
+        ("groundtruth,1,,2,3", "expected a finite number, got ''"),
+        ("odometer,1,3,0,1", "expected a row of landmark, odometry, measurement"),
+        ("# a note", "expected # key: value, got '# a note'"),
+        ("# unit: m", "expected each key of the header once, got unit again"),
+        ("# motion: arc", "expected turn-last or midpoint, got 'arc'"),
+        ("# start: 0,0", "expected # start: x,y,theta, got 2 fields"),
+        ("# start: 0,0,north", "expected a finite number, got 'north'"),
+    ],
+)
+def test_a_wrong_row_is_named_with_file_line_and_reason(tmp_path, row, message):
+    before = [
+        "# unit: mm",
+        "landmark,9,0,0",
+        "groundtruth,1,0,0,0",
+        "odometry,1,3,0,1",
+        "measurement,1,5,0.1,2",
+    ]
+    path = saved(tmp_path, logged(*before, row))
+    with pytest.raises(LogError) as caught:
+        read_slamlog(path)
+    assert str(caught.value).startswith(f"{path}, line 7: {message}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "line 1: expected a log, got an empty file"),
+        (b"\n \n", "line 1: expected a log, got an empty file"),
+        (b"odometry,1,3,0,1\n", "line 1: expected # format: slamlog 1, got 'odometry"),
+        (b"# format: slamlog 2\n", "line 1: expected # format: slamlog 1, got"),
+        (
+            b"# format: slamlog 1\nodometry\xff\n",
+            "line 2: expected UTF-8 text, got byte",
+        ),
+        (b"\x00\x01\x02\x03" * 50, r"line 1: expected # format: slamlog 1, got '\x00"),
+    ],
+)
+def test_what_is_no_log_is_refused(tmp_path, content, message):
+    path = tmp_path / "junk.csv"
+    path.write_bytes(content)
+    with pytest.raises(LogError) as caught:
+        read_slamlog(path)
+    assert f"{path}, {message}" in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 150
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"events": (OdometryRow(1.0, math.nan, 0.0, 1.0),)},
+            "expected a finite number",
+        ),
+        (
+            {"events": (Scan(1.0, [[0, 1]]), Scan(1.0, [[0, 2]]))},
+            "scans must differ in t",
+        ),
+        ({"header": {"name": "twice"}}, "expected each key of the header once"),
+        ({"header": {"note": "two\nlines"}}, "expected a row of landmark"),
+        ({"header": {"note": " margin"}}, "single lines without margins"),
+        ({"header": {"a:b": "c"}}, "single lines without margins"),
+        ({"motion": "arc"}, "expected turn-last or midpoint"),
+    ],
+)
+def test_a_log_that_would_not_read_back_is_not_written(tmp_path, change, message):
+    path = tmp_path / "bad.csv"
+    with pytest.raises(LogError, match=message):
+        write_slamlog(replace(SlamLog("bad"), **change), path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_failure_while_writing_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    path = saved(tmp_path, TEXT)
+
+    def full_disk(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(LogError, match=r"drive\.csv: cannot be written: No space left"):
+        write_slamlog(SlamLog("new"), path)
+    assert path.read_text() == TEXT
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_writing_into_a_missing_folder_is_a_one_line_error(tmp_path):
+    with pytest.raises(LogError, match="cannot be written: No such file or directory"):
+        write_slamlog(SlamLog("new"), tmp_path / "missing" / "new.csv")
+
+
+def test_writing_over_a_folder_is_refused(tmp_path):
+    with pytest.raises(LogError, match="cannot be written: not a regular file"):
+        write_slamlog(SlamLog("new"), tmp_path)
+
+
+def test_writing_through_a_link_keeps_the_link(tmp_path):
+    target, link = tmp_path / "target.csv", tmp_path / "link.csv"
+    target.write_text("old")
+    link.symlink_to(target)
+    write_slamlog(SlamLog("new"), link)
+    assert link.is_symlink()
+    assert read_slamlog(target).name == "new"
+
+
+def test_a_scan_without_readings_is_refused():
+    with pytest.raises(ValueError, match="measurements must be m >= 1 rows"):
+        Scan(1.0, np.empty((0, 2)))
+
+
+def test_ids_must_match_the_readings():
+    with pytest.raises(ValueError, match=r"landmark_ids must have one entry per"):
+        Scan(1.0, [[0.1, 2.0]], [1, 2])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"start": np.zeros(2)},
+        {"landmarks": np.zeros((1, 3))},
+        {"landmark_ids": np.arange(2)},
+        {"ground_truth": np.zeros((5, 3))},
+    ],
+)
+def test_a_log_of_wrong_shapes_is_refused(change):
+    with pytest.raises(ValueError, match=f"{next(iter(change))} must"):
+        SlamLog("odd", **change)
+
+
+def test_public_logs_survive_the_round_trip(public_logs, tmp_path):
+    for name in ("cmu16833", "freiburg9", "mrpt_kfslam_demo", "utias_d6_r3"):
+        log = read_slamlog(public_logs / f"{name}.csv")
+        write_slamlog(log, tmp_path / "copy.csv")
+        assert_same_log(log, read_slamlog(tmp_path / "copy.csv"))
+
+
+def test_victoria_park_has_sizes_and_no_identities(public_logs):
+    log = read_slamlog(public_logs / "victoria_park.csv")
+    scans = [event for event in log.events if isinstance(event, Scan)]
+    assert len(scans) == 7230
+    assert sum(len(scan.measurements) for scan in scans) == 52974
+    assert all(s.landmark_ids is None and s.sizes is not None for s in scans)
+    assert np.isnan(log.ground_truth[:, 3]).all()

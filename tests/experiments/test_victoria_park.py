@@ -1,0 +1,72 @@
+"""The trees of Victoria Park, whose identities nobody tells, by a managed filter."""
+
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from slamgym.experiments.logs.importers import read_log
+from slamgym.experiments.logs.slamlog import Scan
+from slamgym.experiments.runs.filter_settings import settings_for
+from slamgym.experiments.runs.replay import replay
+from slamgym.experiments.runs.summary import summarise
+
+DATA = os.environ.get("SLAMGYM_DATA")
+LOG = Path(DATA or ".") / "victoria_park.csv"
+pytestmark = pytest.mark.skipif(
+    DATA is None or not LOG.exists(),
+    reason="SLAMGYM_DATA names no folder with victoria_park.csv",
+)
+
+# Trees within 20 m ahead are seen again and again, unless one hides another.
+POLICY = {
+    "confirm": [3, 19],
+    "view": {"max_range": 20.0, "angle": math.pi, "shadow": 0.05, "range_margin": 0.0},
+    "remove_after": 20,
+}
+
+
+@pytest.fixture(scope="module")
+def log():
+    return read_log(LOG)
+
+
+def filtered(log, management, estimator="ekf"):
+    settings = settings_for(
+        log,
+        estimator=estimator,
+        motion_std=(0.075, 0.15, 0.0318),
+        measurement_std=(0.0098, 0.04),
+        options={"range_std_per_metre": 0.009, "management": management},
+    )
+    return summarise(replay(log, settings.make(log.start)), settings)
+
+
+@pytest.fixture(scope="module", params=["ekf", "invariant"])
+def summary(request, log):
+    return filtered(log, POLICY, request.param)
+
+
+def test_management_keeps_the_map_small_and_the_path_true(summary):
+    assert 350 <= len(summary["landmarks"]) <= 420
+    assert summary["map_changes"]["most"] <= 420
+    assert summary["map_changes"]["removed"] > 100
+    assert summary["ate"]["aligned"] < 2.6  # against GPS
+
+
+def test_every_reading_is_accounted_for(log, summary):
+    counts = summary["readings"]
+    scans = [event for event in log.events if isinstance(event, Scan)]
+    fates = ("associated", "added", "tentative", "ambiguous", "skipped", "rejected")
+    assert sum(counts[fate] for fate in fates) == sum(
+        len(scan.measurements) for scan in scans
+    )
+
+
+def test_without_confirmation_and_removal_the_map_grows_far_larger(log):
+    beginning = replace(log, events=tuple(e for e in log.events if e.t < 300))
+    managed = filtered(beginning, POLICY)
+    bare = filtered(beginning, {"confirm": [1, 1]})
+    assert len(bare["landmarks"]) > 1.6 * len(managed["landmarks"])

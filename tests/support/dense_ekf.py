@@ -1,0 +1,75 @@
+"""The textbook EKF-SLAM, dense and slow: the oracle of the compiled one.
+
+Stacked H over the whole state, K = P Hᵀ S⁻¹, P ← (I - K H) P, symmetrised; written
+from the equations alone, sharing no code with the kernels.
+"""
+
+import numpy as np
+
+from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import locate_landmark, predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
+
+
+class DenseEkf:
+    def __init__(self, motion_std, measurement_std, initial_pose_std=(0, 0, 0)):
+        self.R = np.diag(np.square(motion_std))
+        self.Q = np.diag(np.square(measurement_std))
+        self.mean = np.zeros(3)
+        self.P = np.diag(np.square(np.asarray(initial_pose_std, dtype=float)))
+        self.ids = []
+
+    def predict(self, odometry, dt=1.0):
+        motion = predict_pose(self.mean[:3], np.asarray(odometry, dtype=float))
+        G = np.eye(len(self.mean))
+        G[:3, :3] = motion.jacobian_pose
+        self.P = G @ self.P @ G.T
+        F = motion.jacobian_noise
+        self.P[:3, :3] += F @ self.R @ F.T * dt
+        self.mean[:3] = motion.pose
+
+    def linearise(self, readings, ids):
+        """Return stacked ν (2m,) and H (2m, n) at the mean."""
+        slots = [self.ids.index(i) for i in ids]
+        landmarks = self.mean[3:].reshape(-1, 2)[slots]
+        expected = predict_measurement(self.mean[:3], landmarks)
+        H = np.zeros((2 * len(ids), len(self.mean)))
+        for k, slot in enumerate(slots):
+            H[2 * k : 2 * k + 2, :3] = expected.jacobian_pose[k]
+            H[2 * k : 2 * k + 2, 3 + 2 * slot : 5 + 2 * slot] = (
+                expected.jacobian_landmark[k]
+            )
+        innovation = np.asarray(readings) - expected.measurement
+        innovation[:, 0] = wrap_angle(innovation[:, 0])
+        return innovation.ravel(), H
+
+    def update(self, readings, ids):
+        readings = np.asarray(readings, dtype=float)
+        known = np.array([i in self.ids for i in ids], dtype=bool)
+        nis = 0.0
+        if known.any():
+            nis = self.correct(readings[known], [i for i in ids if i in self.ids])
+        for reading, i in zip(readings[~known], np.array(ids)[~known], strict=True):
+            self.add(reading, int(i))
+        return nis
+
+    def correct(self, readings, ids):
+        nu, H = self.linearise(readings, ids)
+        S = H @ self.P @ H.T + np.kron(np.eye(len(ids)), self.Q)
+        K = np.linalg.solve(S, H @ self.P).T
+        self.mean = self.mean + K @ nu
+        self.P = (np.eye(len(self.mean)) - K @ H) @ self.P
+        self.P = (self.P + self.P.T) / 2
+        return float(nu @ np.linalg.solve(S, nu))
+
+    def add(self, reading, landmark_id):
+        located = locate_landmark(self.mean[:3], reading[None])
+        n = len(self.mean)
+        extend = np.zeros((n + 2, n))
+        extend[:n] = np.eye(n)
+        extend[n:, :3] = located.jacobian_pose[0]
+        Fz = located.jacobian_measurement[0]
+        self.P = extend @ self.P @ extend.T
+        self.P[n:, n:] += Fz @ self.Q @ Fz.T
+        self.mean = np.concatenate([self.mean, located.position[0]])
+        self.ids.append(landmark_id)

@@ -1,0 +1,308 @@
+"""Dense, slow twins of the filter family, written from the equations of their papers.
+
+Each shares the textbook filter's map keeping and nothing with the kernels: explicit
+matrices over the whole state, matrix exponentials, complex-step derivatives.
+"""
+
+import numpy as np
+from dense_ekf import DenseEkf
+from scipy.linalg import expm, sqrtm
+
+from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import locate_landmark, predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
+
+J = np.array([[0.0, -1.0], [1.0, 0.0]])
+
+
+def levers(mean):
+    """J q of robot position and landmarks, 0 at the heading."""
+    turned = np.zeros(len(mean))
+    turned[:2] = J @ mean[:2]
+    turned[3:] = (mean[3:].reshape(-1, 2) @ J.T).ravel()
+    return turned
+
+
+class DenseInvariant(DenseEkf):
+    """In invariant coordinates throughout: P is the covariance of ξ, G = I."""
+
+    iterations = 1
+
+    def to_invariant(self):
+        """D = I − (J q) e_θᵀ at the mean."""
+        D = np.eye(len(self.mean))
+        D[:, 2] -= levers(self.mean)
+        return D
+
+    @property
+    def covariance(self):
+        back = np.linalg.inv(self.to_invariant())
+        return back @ self.P @ back.T
+
+    def predict(self, odometry, dt=1.0):
+        motion = predict_pose(self.mean[:3], np.asarray(odometry, dtype=float))
+        self.mean[:3] = motion.pose
+        noise = np.zeros((len(self.mean), 3))
+        noise[:3] = motion.jacobian_noise
+        noise = self.to_invariant() @ noise
+        self.P = self.P + noise @ self.R @ noise.T * dt
+
+    def correct(self, readings, ids):
+        prior, total = self.mean.copy(), np.zeros(len(self.mean))
+        Q = np.kron(np.eye(len(ids)), self.Q)
+        for i in range(self.iterations):
+            nu, H = self.linearise(readings, ids)
+            H = H.copy()
+            H[:, 2] = 0.0  # in ξ the heading moves no reading, at any iterate
+            nu = nu + H @ total
+            S = H @ self.P @ H.T + Q
+            K = np.linalg.solve(S, H @ self.P).T
+            if i == 0:
+                nis = float(nu @ np.linalg.solve(S, nu))
+            total = K @ nu
+            self.mean = self.exponential(total, prior)
+        self.P = (np.eye(len(self.mean)) - K @ H) @ self.P
+        self.P = (self.P + self.P.T) / 2
+        return nis
+
+    @staticmethod
+    def exponential(xi, mean):
+        """χ ← Exp(ξ) χ by the matrix exponential of SE_{1+n}(2)."""
+        n = (len(mean) - 3) // 2
+        algebra = np.zeros((3 + n, 3 + n))
+        algebra[:2, :2] = xi[2] * J
+        algebra[:2, 2] = xi[:2]
+        algebra[:2, 3:] = xi[3:].reshape(-1, 2).T
+        group = expm(algebra)
+        points = np.concatenate([mean[None, :2], mean[3:].reshape(-1, 2)])
+        moved = points @ group[:2, :2].T + group[:2, 2:].T
+        return np.concatenate([moved[0], [mean[2] + xi[2]], moved[1:].ravel()])
+
+    def add(self, reading, landmark_id):
+        self.P = self.covariance
+        super().add(reading, landmark_id)
+        D = self.to_invariant()
+        self.P = D @ self.P @ D.T
+
+
+class DenseSequentialInvariant(DenseInvariant):
+    def correct(self, readings, ids):
+        one = super().correct
+        return sum(one(z[None], [i]) for z, i in zip(readings, ids, strict=True))
+
+
+class DenseIterated(DenseEkf):
+    """Bell and Cathey: Gauss-Newton on the prior and all readings together."""
+
+    iterations = 3
+
+    def correct(self, readings, ids):
+        prior = self.mean.copy()
+        Q = np.kron(np.eye(len(ids)), self.Q)
+        for i in range(self.iterations):
+            nu, H = self.linearise(readings, ids)
+            S = H @ self.P @ H.T + Q
+            if i == 0:
+                nis = float(nu @ np.linalg.solve(S, nu))
+            K = np.linalg.solve(S, H @ self.P).T
+            self.mean = prior + K @ (nu - H @ (prior - self.mean))
+        self.P = (np.eye(len(prior)) - K @ H) @ self.P
+        self.P = (self.P + self.P.T) / 2
+        return nis
+
+
+class DenseFirstEstimates(DenseEkf):
+    """Jacobians at the predicted pose and the first landmark estimates."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.fixed = self.mean.copy()
+
+    def predict(self, odometry, dt=1.0):
+        motion = predict_pose(self.mean[:3], np.asarray(odometry, dtype=float))
+        G = np.eye(len(self.mean))
+        G[:2, 2] = J @ (motion.pose[:2] - self.fixed[:2])
+        self.P = G @ self.P @ G.T
+        F = motion.jacobian_noise
+        self.P[:3, :3] += F @ self.R @ F.T * dt
+        self.mean[:3] = self.fixed[:3] = motion.pose
+
+    def linearise(self, readings, ids):
+        nu, _ = super().linearise(readings, ids)
+        estimate, self.mean = self.mean, self.fixed
+        _, H = super().linearise(readings, ids)
+        self.mean = estimate
+        return nu, H
+
+    def add(self, reading, landmark_id):
+        located = locate_landmark(self.mean[:3], reading[None])
+        position, Fz = located.position[0], located.jacobian_measurement[0]
+        n = len(self.mean)
+        extend = np.zeros((n + 2, n))
+        extend[:n] = np.eye(n)
+        extend[n:, :2] = np.eye(2)
+        extend[n:, 2] = J @ (self.first(position, landmark_id) - self.fixed[:2])
+        self.P = extend @ self.P @ extend.T
+        self.P[n:, n:] += Fz @ self.Q @ Fz.T
+        self.mean = np.concatenate([self.mean, position])
+        self.fixed = np.concatenate([self.fixed, self.first(position, landmark_id)])
+        self.ids.append(landmark_id)
+
+    def first(self, position, landmark_id):
+        return position
+
+
+class DenseConstrained(DenseFirstEstimates):
+    """H at the estimate, projected off the turn of the fixed points."""
+
+    def linearise(self, readings, ids):
+        nu, H = DenseEkf.linearise(self, readings, ids)
+        for k, i in enumerate(ids):
+            c = 3 + 2 * self.ids.index(i)
+            own = [0, 1, 2, c, c + 1]
+            N = np.zeros((5, 3))  # shifts and turn of robot and landmark together
+            N[:2, :2] = N[3:, :2] = np.eye(2)
+            N[:2, 2], N[2, 2] = J @ self.fixed[:2], 1.0
+            N[3:, 2] = J @ self.fixed[c : c + 2]
+            rows = slice(2 * k, 2 * k + 2)
+            off = np.eye(5) - N @ np.linalg.solve(N.T @ N, N.T)
+            H[rows, own] = H[rows][:, own] @ off
+        return nu, H
+
+
+class DenseIdeal(DenseFirstEstimates):
+    """Jacobians at the ground truth."""
+
+    def observe_truth(self, pose, landmarks):
+        if not hasattr(self, "truth"):
+            self.fixed[:3] = pose
+        self.truth, self.true_landmarks = np.asarray(pose, dtype=float), landmarks
+
+    def predict(self, odometry, dt=1.0):
+        motion = predict_pose(self.mean[:3], np.asarray(odometry, dtype=float))
+        F = predict_pose(self.fixed[:3], np.zeros(2)).jacobian_noise
+        G = np.eye(len(self.mean))
+        G[:2, 2] = J @ (self.truth[:2] - self.fixed[:2])
+        self.P = G @ self.P @ G.T
+        self.P[:3, :3] += F @ self.R @ F.T * dt
+        self.mean[:3] = motion.pose
+        self.fixed[:3] = self.truth
+
+    def first(self, position, landmark_id):
+        return np.asarray(self.true_landmarks[landmark_id], dtype=float)
+
+
+class DenseUnscented(DenseEkf):
+    """Cubature points one by one."""
+
+    def points(self, P):
+        root = np.real(sqrtm(P)) if P.any() else np.zeros_like(P)
+        n = len(P)
+        return [s * np.sqrt(n) * root[:, i] for s in (1, -1) for i in range(n)]
+
+    def predict(self, odometry, dt=1.0):
+        n = len(self.mean)
+        both = np.zeros((n + 3, n + 3))
+        both[:n, :n], both[n:, n:] = self.P, self.R * dt
+        moved = []
+        for offset in self.points(both):
+            state, noise = self.mean + offset[:n], offset[n:]
+            motion = predict_pose(state[:3], np.asarray(odometry, dtype=float))
+            state[:3] = motion.pose + motion.jacobian_noise @ noise
+            moved.append(state)
+        moved = np.array(moved)
+        self.mean = moved.mean(axis=0)
+        self.P = (moved - self.mean).T @ (moved - self.mean) / len(moved)
+
+    def correct(self, readings, ids):
+        slots = [self.ids.index(i) for i in ids]
+
+        def sense(state):
+            return predict_measurement(
+                state[:3], state[3:].reshape(-1, 2)[slots]
+            ).measurement
+
+        offsets = np.array(self.points(self.P))
+        centre = sense(self.mean)
+        seen = np.array([sense(self.mean + offset) - centre for offset in offsets])
+        seen[..., 0] = wrap_angle(seen[..., 0])
+        average = seen.mean(axis=0)
+        spread = (seen - average).reshape(len(seen), -1)
+        nu = readings - centre - average
+        nu[:, 0] = wrap_angle(nu[:, 0])
+        nu = nu.ravel()
+        S = spread.T @ spread / len(seen) + np.kron(np.eye(len(ids)), self.Q)
+        C = offsets.T @ spread / len(seen)
+        self.mean = self.mean + C @ np.linalg.solve(S, nu)
+        self.P = self.P - C @ np.linalg.solve(S, C.T)
+        self.P = (self.P + self.P.T) / 2
+        return float(nu @ np.linalg.solve(S, nu))
+
+
+class DenseRobocentric(DenseEkf):
+    """State (way, origin of the world, its heading, landmarks) in the robot's frame."""
+
+    def __init__(self, motion_std, measurement_std, initial_pose_std=(0, 0, 0)):
+        super().__init__(motion_std, measurement_std, initial_pose_std)
+        start, P = self.mean, self.P
+        M = complex_step(rigid_inverse, start)
+        self.mean = np.concatenate([np.zeros(3), rigid_inverse(start)])
+        self.P = np.zeros((6, 6))
+        self.P[3:, 3:] = M @ P @ M.T
+
+    def linearise(self, readings, ids):
+        nu, H = self.shifted(super().linearise, readings, ids)
+        return nu, np.insert(H, 3, np.zeros((3, 1)), axis=1)
+
+    def shifted(self, function, *args):
+        """Call a method of the textbook filter on the state without the world."""
+        full = self.mean
+        self.mean = np.delete(full, [3, 4, 5])
+        result = function(*args)
+        self.mean = full
+        return result
+
+    def add(self, reading, landmark_id):
+        super().add(reading, landmark_id)  # at the end of the state, wherever that is
+
+    def update(self, readings, ids):
+        nis = super().update(readings, ids)
+        if len(ids):
+            M = complex_step(self.moved, self.mean)
+            self.mean, self.P = self.moved(self.mean), M @ self.P @ M.T
+        return nis
+
+    @staticmethod
+    def moved(state):
+        way = state[:3]
+        back = turn(-way[2])
+        points = [back @ (q - way[:2]) for q in state[6:].reshape(-1, 2)]
+        origin = back @ (state[3:5] - way[:2])
+        return np.concatenate([0 * way, origin, [state[5] - way[2]], *points])
+
+    @staticmethod
+    def world(state):
+        back = turn(-state[5])
+        robot = back @ (state[:2] - state[3:5])
+        points = [back @ (q - state[3:5]) for q in state[6:].reshape(-1, 2)]
+        return np.concatenate([robot, [state[2] - state[5]], *points])
+
+    def belief(self):
+        M = complex_step(self.world, self.mean)
+        return self.world(self.mean), M @ self.P @ M.T
+
+
+def turn(angle):
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def rigid_inverse(pose):
+    return np.concatenate([-turn(-pose[2]) @ pose[:2], [-pose[2]]])
+
+
+def complex_step(function, point, step=1e-30):
+    """Exact derivative of an analytic function."""
+    columns = [
+        np.imag(function(point + 1j * step * e)) / step for e in np.eye(len(point))
+    ]
+    return np.stack(columns, axis=-1)
