@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..envs.controllers.single import Waypoints
-from ..sim_configs import Scenario
-from ..sim_configs.scenario import Robot
+from ..sim_configs import Robot, Scenario
 from ..sim_configs.scenario_errors import closest
 from .active_slam import Situation
 from .belief_features import largest_variances, world_bounds

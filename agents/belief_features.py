@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from ..envs.controllers.planned_path import planned_path
 from ..estimator.filters.batch import BatchStorage
-from ..sim_configs import Scenario, place_landmarks
+from ..sim_configs import Scenario
+from ..sim_configs.layouts import possible_positions
 from .belief_kernels import show_beliefs
 
 Array = NDArray[np.float64]
@@ -74,12 +75,9 @@ def world_bounds(scenario: Scenario) -> Bounds:
     if scenario.walls:
         points = np.reshape(scenario.walls, (-1, 2))
     else:
-        layout = scenario.landmarks
-        if layout.layout == "random":
-            places = np.reshape(layout.bounds, (2, 2))
-        else:
-            places = place_landmarks(layout, np.random.default_rng(0))
-        points = np.concatenate([planned_path(scenario)[:, :2], places])
+        points = np.concatenate(
+            [planned_path(scenario)[:, :2], possible_positions(scenario.landmarks)]
+        )
     low, high = points.min(axis=0), points.max(axis=0)
     flat = high - low < 1.0
     left, bottom = np.where(flat, low - 1.0, low).tolist()

@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from ..sim_configs import Scenario, load_scenario, place_landmarks
-from ..sim_configs.randomisation import refuse_ranges
+from ..sim_configs.scenario import refuse_ranges
 from .rendering.live_view import RENDER_MODES, LiveView, Moment
 from .rendering.render_state import BeliefLike
 from .robot.unicycle_body import UnicycleBody
@@ -225,7 +225,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
 
     def _place_landmarks(self, rng: np.random.Generator) -> None:
         layout = self.scenario.landmarks
-        changes = layout.layout == "random" and layout.seed is None
+        changes = layout.is_redrawn
         if changes or len(self._landmarks) == 0:
             landmarks = np.ascontiguousarray(place_landmarks(layout, rng))
             self._landmarks = landmarks.view(np.complex128)[:, 0]

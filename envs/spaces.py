@@ -1,17 +1,17 @@
-"""The action and observation spaces of a scenario's world, all bounds finite."""
+"""Action and observation spaces of a scenario's world; all bounds are finite."""
 
 import math
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from ..sim_configs import Scenario, place_landmarks
+from ..sim_configs import Scenario
+from ..sim_configs.layouts import possible_positions
 from .sensors.noise_streams import MANY_STD
 
 
 def action_space(scenario: Scenario) -> spaces.Box:
-    """Bound (v, ω) by the limits of the robot [m/s, rad/s]."""
+    """Return the space of actions (v, ω) within the robot's limits [m/s, rad/s]."""
     limits = np.array(
         [scenario.robot.max_speed, scenario.robot.max_turn_rate], dtype=np.float32
     )
@@ -19,7 +19,7 @@ def action_space(scenario: Scenario) -> spaces.Box:
 
 
 def observation_space(scenario: Scenario) -> spaces.Dict:
-    """Bound readings, mask and odometry; see `LandmarkWorldEnv`.
+    """Return the space of readings, mask and odometry; see `LandmarkWorldEnv`.
 
     Examples
     --------
@@ -41,7 +41,7 @@ def observation_space(scenario: Scenario) -> spaces.Dict:
 
 
 def count_rows(scenario: Scenario) -> int:
-    """Count the rows of an observation: N, or N + max_clutter without identities."""
+    """Return the rows of an observation: N, or N + max_clutter without identities."""
     hidden = not scenario.sensor.identities
     return scenario.landmarks.count + hidden * scenario.sensor.max_clutter
 
@@ -64,19 +64,11 @@ def _longest_reading(scenario: Scenario) -> float:
 
 
 def _farthest_landmark(scenario: Scenario) -> float:
-    """Bound the distance to any landmark of a robot that drives straight away [m]."""
+    """Bound the distance from the robot to any landmark during an episode [m]."""
     start, motion = scenario.start, scenario.motion
-    away = _outermost_landmarks(scenario) - start.pose[:2]
+    away = possible_positions(scenario.landmarks) - start.pose[:2]
     step = scenario.robot.max_speed * scenario.dt
     if motion.noise_in == "motion":
         step += MANY_STD * math.hypot(*motion.std[:2])
     drawn = MANY_STD * math.hypot(*start.std[:2])
     return float(np.hypot(*away.T).max()) + drawn + scenario.steps * step
-
-
-def _outermost_landmarks(scenario: Scenario) -> NDArray[np.float64]:
-    layout = scenario.landmarks
-    if layout.layout == "random":
-        left, bottom, right, top = layout.bounds
-        return np.array([[left, bottom], [left, top], [right, bottom], [right, top]])
-    return place_landmarks(layout, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all."""
+"""Atomic replacement of files: a reader sees the old file or the complete new one."""
 
 import secrets
 from collections.abc import Iterator
@@ -8,25 +8,25 @@ from pathlib import Path
 
 @contextmanager
 def replace_when_written(path: str | Path) -> Iterator[Path]:
-    """Lend a temporary path beside `path`, and move it there when all went well.
+    """Yield a temporary path beside `path`, and move it there at the end of the block.
 
-    An exception inside the block removes the temporary file; an older file at `path`
-    then stays as it was.
+    An exception inside the block removes the temporary file and leaves an older file at
+    `path` unchanged.
 
     Parameters
     ----------
     path : str or Path
-        Where the file shall appear; its folder must exist.
+        The final path; its folder must exist.
 
     Yields
     ------
     Path
-        A hidden path in the same folder, with the same suffix, to write to.
+        A hidden path in the same folder with the same suffix, for writing.
 
     Raises
     ------
     FileNotFoundError
-        When the folder does not exist.
+        If the folder does not exist.
     """
     target = Path(path)
     if not target.parent.is_dir():

@@ -1,4 +1,4 @@
-"""What the robot is told to do, open loop: sequences as data, and their commands.
+"""Open-loop control sequences as data, and the commands that they describe.
 
 A command is (d, α): drive d straight ahead [m], then turn by α [rad].
 """
@@ -12,11 +12,11 @@ from pydantic import Field, model_validator
 
 from .field_types import Command, Count, Part, Positive, broken_rule
 
-_LONGEST_CYCLE = 1_000_000  # steps: refuse a slip of the pen, do not fill the memory
+_LONGEST_CYCLE = 1_000_000  # steps; a typing error must not fill the memory
 
 
 class CommandSequence(Part):
-    """Given commands, each repeated a number of times."""
+    """A list of commands, each repeated a number of times."""
 
     sequence: Literal["commands"] = "commands"
     commands: tuple[Command, ...] = Field(
@@ -25,7 +25,7 @@ class CommandSequence(Part):
 
 
 class SquareSequence(Part):
-    """A square, counter-clockwise: four sides, with a quarter turn after each."""
+    """A counter-clockwise square: four sides, each followed by a quarter turn."""
 
     sequence: Literal["square"] = "square"
     side: Positive = Field(description="length of a side [m]")
@@ -34,7 +34,7 @@ class SquareSequence(Part):
 
 
 class CircleSequence(Part):
-    """A circle, counter-clockwise, as the regular polygon inscribed in it."""
+    """A counter-clockwise circle, approximated by an inscribed regular polygon."""
 
     sequence: Literal["circle"] = "circle"
     radius: Positive = Field(description="radius of the circle [m]")
@@ -50,11 +50,11 @@ class FigureEightSequence(Part):
 
 
 class SpiralSequence(Part):
-    """A counter-clockwise spiral; its radius grows evenly with the angle turned."""
+    """A counter-clockwise spiral; its radius grows linearly with the angle turned."""
 
     sequence: Literal["spiral"] = "spiral"
-    inner_radius: Positive = Field(description="radius of curvature at first [m]")
-    outer_radius: Positive = Field(description="radius of curvature at last [m]")
+    inner_radius: Positive = Field(description="initial radius of curvature [m]")
+    outer_radius: Positive = Field(description="final radius of curvature [m]")
     turns: Positive = Field(description="number of full turns")
     speed: Positive = Field(description="speed along the spiral [m/s]")
 
@@ -69,16 +69,17 @@ class SpiralSequence(Part):
 
 
 class BlocksSequence(Part):
-    """Round every block of a city in turn, row by row, to and fro.
+    """A drive around every block of a city, row by row, alternately east and west.
 
-    Eastward rows are driven counter-clockwise, westward rows clockwise: along each
-    block's four sides back to where they began, then on to the next block.
+    The robot follows the four sides of a block back to their start, then drives to
+    the next block. It circles the blocks of eastward rows counter-clockwise and those
+    of westward rows clockwise.
     """
 
     sequence: Literal["blocks"] = "blocks"
     columns: Count = Field(description="number of blocks along x")
     rows: Count = Field(description="number of blocks along y")
-    side: Positive = Field(description="distance of neighbouring streets [m]")
+    side: Positive = Field(description="distance between neighbouring streets [m]")
     speed: Positive = Field(description="highest speed along a street [m/s]")
     turn_steps: Count = Field(description="steps of each quarter turn")
 
@@ -133,30 +134,30 @@ def command_cycle(controls: ControlSequence, dt: float) -> NDArray[np.float64]:
 
 def _repeat(sequence: CommandSequence) -> NDArray[np.float64]:
     times = [times for _, _, times in sequence.commands]
-    _steps(sum(times), 1.0)  # refuses too many
+    _steps(sum(times), 1.0)  # checks the length
     return np.repeat([command[:2] for command in sequence.commands], times, axis=0)
 
 
 def _square(square: SquareSequence, dt: float) -> NDArray[np.float64]:
     steps = _steps(square.side, square.speed * dt)
-    _steps(square.turn_steps, 1.0)  # refuses too many
+    _steps(square.turn_steps, 1.0)  # checks the length
     straight = np.tile([square.side / steps, 0.0], (steps, 1))
     turn = np.tile([0.0, math.pi / 2 / square.turn_steps], (square.turn_steps, 1))
     return np.tile(np.concatenate([straight, turn]), (4, 1))
 
 
 def _circle(radius: float, longest_step: float) -> NDArray[np.float64]:
-    """Go round the regular polygon whose corners lie on the circle."""
+    """Follow the regular polygon whose corners lie on the circle."""
     steps = max(3, _steps(2 * math.pi * radius, longest_step))
     angle = 2 * math.pi / steps
     return np.tile([2 * radius * math.sin(angle / 2), angle], (steps, 1))
 
 
 def _spiral(spiral: SpiralSequence, dt: float) -> NDArray[np.float64]:
-    """Turn by α = d / r, where the radius r grows with the angle turned so far."""
+    """Turn by α = d / r; the radius r grows with the angle turned so far."""
     distance, full_angle = spiral.speed * dt, 2 * math.pi * spiral.turns
     growth = (spiral.outer_radius - spiral.inner_radius) / full_angle
-    _steps(full_angle * spiral.outer_radius, distance)  # refuses too many
+    _steps(full_angle * spiral.outer_radius, distance)  # checks the length
     turned, turns = 0.0, []
     while turned < full_angle:
         turns.append(distance / (spiral.inner_radius + growth * turned))
@@ -165,14 +166,16 @@ def _spiral(spiral: SpiralSequence, dt: float) -> NDArray[np.float64]:
 
 
 def _blocks(blocks: BlocksSequence, dt: float) -> NDArray[np.float64]:
-    """Drive the sides one by one, each with the quarter turn into it."""
+    """Drive the sides in turn, each preceded by the quarter turn into it."""
     steps, turns = _steps(blocks.side, blocks.speed * dt), blocks.turn_steps
     _steps(blocks.rows * (5.0 * blocks.columns + 1) * (steps + turns), 1.0)
     east, north, west, south = 0, 1, 2, 3  # quarter turns
-    to = [east, north, west, south, east] * blocks.columns + [north]
-    fro = [west, north, east, south, west] * blocks.columns + [north]
-    way = np.concatenate([fro if row % 2 else to for row in range(blocks.rows)])
-    quarters = (np.diff(way, prepend=east) + 1) % 4 - 1  # -1, 0 or 1: never back
+    eastward = [east, north, west, south, east] * blocks.columns + [north]
+    westward = [west, north, east, south, west] * blocks.columns + [north]
+    directions = np.concatenate(
+        [westward if row % 2 else eastward for row in range(blocks.rows)]
+    )
+    quarters = (np.diff(directions, prepend=east) + 1) % 4 - 1  # -1, 0 or 1: never back
     straight = np.tile([blocks.side / steps, 0.0], (steps, 1))
     turn = np.tile([0.0, math.pi / 2 / turns], (turns, 1))
     parts = [
@@ -184,7 +187,7 @@ def _blocks(blocks: BlocksSequence, dt: float) -> NDArray[np.float64]:
 
 
 def _steps(length: float, longest_step: float) -> int:
-    """Count the equal steps, none above the longest, that make up a length."""
+    """Count the equal steps, at most `longest_step` each, that add up to a length."""
     steps = length / longest_step * (1 - 1e-12)
     if steps > _LONGEST_CYCLE:
         raise broken_rule(

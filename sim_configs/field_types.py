@@ -1,7 +1,6 @@
-"""Kinds of scenario fields: strict numbers that say what they expect.
+"""Types of scenario fields: strict numbers whose error messages name the expectation.
 
-Every type refuses strings and booleans where a number is meant, and NaN everywhere;
-integers may stand for floats.
+Number types refuse strings, booleans and NaN; they accept integers for floats.
 """
 
 from reprlib import repr as short_repr
@@ -49,7 +48,7 @@ def broken_rule(message: str) -> PydanticCustomError:
 
 
 def expect(expectation: str) -> WrapValidator:
-    """Let whatever is wrong inside a field be told as one expectation."""
+    """Replace every error inside a field by one message with the expectation."""
 
     def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
         try:

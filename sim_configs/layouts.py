@@ -1,4 +1,4 @@
-"""Where the landmarks stand: layouts as data, and the positions they stand for."""
+"""Landmark layouts as data, and the positions that they describe."""
 
 from typing import Annotated, Literal, Self
 
@@ -21,7 +21,14 @@ from .scenario_errors import ScenarioError
 _TRIES_PER_LANDMARK = 2000
 
 
-class PointsLayout(Part):
+class _Layout(Part):
+    @property
+    def is_redrawn(self) -> bool:
+        """Whether every episode draws new positions."""
+        return False
+
+
+class PointsLayout(_Layout):
     """Landmarks at given positions."""
 
     layout: Literal["points"] = "points"
@@ -35,13 +42,13 @@ class PointsLayout(Part):
         return len(self.points)
 
 
-class GridLayout(Part):
+class GridLayout(_Layout):
     """Landmarks on a square grid, row by row."""
 
     layout: Literal["grid"] = "grid"
     rows: Count = Field(description="number of rows, along y")
     columns: Count = Field(description="number of columns, along x")
-    spacing: Positive = Field(description="distance of neighbours [m]")
+    spacing: Positive = Field(description="distance between neighbours [m]")
     origin: Point = Field(
         default=(0.0, 0.0), description="lower left landmark (x, y) [m]"
     )
@@ -52,7 +59,7 @@ class GridLayout(Part):
         return self.rows * self.columns
 
 
-class RingLayout(Part):
+class RingLayout(_Layout):
     """Landmarks evenly spaced on a circle, counter-clockwise from its +x side."""
 
     layout: Literal["ring"] = "ring"
@@ -63,33 +70,36 @@ class RingLayout(Part):
     )
 
 
-class CorridorLayout(Part):
-    """Landmarks along both sides of a corridor in +x direction, left and right in turn.
+class CorridorLayout(_Layout):
+    """Landmarks on alternating sides of a corridor along +x.
 
-    The first stands on the left (+y) side above the origin, the last at the far end.
+    The first is on the left (+y) side above the origin, the last at the far end.
     """
 
     layout: Literal["corridor"] = "corridor"
     count: Count = Field(description="number of landmarks")
     length: Positive = Field(description="length of the corridor [m]")
-    width: Positive = Field(description="distance of the two sides [m]")
+    width: Positive = Field(description="distance between the two sides [m]")
     origin: Point = Field(
-        default=(0.0, 0.0), description="start of the corridor's middle line (x, y) [m]"
+        default=(0.0, 0.0), description="start of the corridor's centre line (x, y) [m]"
     )
 
 
-class StreetsLayout(Part):
-    """Landmarks on the fronts of the blocks of a city with streets like a grid.
+class StreetsLayout(_Layout):
+    """Landmarks on the fronts of the blocks of a city with a street grid.
 
-    The middles of the streets lie `side` apart; the first two cross in the origin.
-    Blocks in rows along x, and around each counter-clockwise from its lower left.
+    The centre lines of the streets are `side` apart; the first two cross at the origin.
+    The blocks are numbered in rows along x. The landmarks of a block are numbered
+    counter-clockwise from its lower left corner.
     """
 
     layout: Literal["streets"] = "streets"
     columns: Count = Field(description="number of blocks along x")
     rows: Count = Field(description="number of blocks along y")
-    side: Positive = Field(description="distance of neighbouring streets [m]")
-    width: Positive = Field(description="distance of the fronts across a street [m]")
+    side: Positive = Field(description="distance between neighbouring streets [m]")
+    width: Positive = Field(
+        description="distance between the fronts across a street [m]"
+    )
     per_front: Count = Field(description="landmarks on each of a block's four fronts")
     origin: Point = Field(
         default=(0.0, 0.0), description="lower left crossing (x, y) [m]"
@@ -110,18 +120,18 @@ class StreetsLayout(Part):
         return self
 
 
-class RandomLayout(Part):
+class RandomLayout(_Layout):
     """Landmarks uniform in a rectangle, with a minimum distance between them."""
 
     layout: Literal["random"] = "random"
     count: Count = Field(description="number of landmarks")
     bounds: Bounds = Field(description="rectangle (xmin, ymin, xmax, ymax) [m]")
     min_distance: NotNegative = Field(
-        default=0.0, description="least distance of two landmarks [m]"
+        default=0.0, description="least distance between two landmarks [m]"
     )
     seed: CountOrZero | None = Field(
         default=None,
-        description="fixes the layout; without it every episode draws a new one",
+        description="seed of the layout; without it every episode draws a new one",
     )
 
     @model_validator(mode="after")
@@ -132,6 +142,11 @@ class RandomLayout(Part):
                 f"bounds must have xmin < xmax and ymin < ymax, got {self.bounds}"
             )
         return self
+
+    @property
+    def is_redrawn(self) -> bool:
+        """Whether every episode draws new positions."""
+        return self.seed is None
 
 
 LandmarkLayout = Annotated[
@@ -155,7 +170,7 @@ def place_landmarks(
     layout : LandmarkLayout
         The `landmarks` of a scenario.
     rng : numpy.random.Generator
-        Drawn from only by a random layout that has no seed of its own.
+        Used only by a random layout without its own seed.
 
     Returns
     -------
@@ -165,7 +180,7 @@ def place_landmarks(
     Raises
     ------
     ScenarioError
-        If a random layout finds no room for its landmarks.
+        If a random layout has no room for its landmarks.
 
     Examples
     --------
@@ -185,10 +200,25 @@ def place_landmarks(
         case StreetsLayout():
             return _streets(layout)
         case RandomLayout():
-            own = layout.seed is not None
-            return _throw_darts(
-                layout, np.random.default_rng(layout.seed) if own else rng
-            )
+            if not layout.is_redrawn:
+                rng = np.random.default_rng(layout.seed)
+            return _sample(layout, rng)
+
+
+def possible_positions(layout: LandmarkLayout) -> NDArray[np.float64]:
+    """Return points (K, 2) [m] whose convex hull holds every landmark of a layout.
+
+    They are the landmarks themselves, or the corners of a random layout's rectangle.
+
+    Examples
+    --------
+    >>> possible_positions(RandomLayout(count=9, bounds=(0.0, 1.0, 2.0, 3.0))).tolist()
+    [[0.0, 1.0], [0.0, 3.0], [2.0, 1.0], [2.0, 3.0]]
+    """
+    if layout.layout == "random":
+        left, bottom, right, top = layout.bounds
+        return np.array([[left, bottom], [left, top], [right, bottom], [right, top]])
+    return place_landmarks(layout, np.random.default_rng(0))  # draws nothing
 
 
 def _grid(layout: GridLayout) -> NDArray[np.float64]:
@@ -209,7 +239,7 @@ def _corridor(layout: CorridorLayout) -> NDArray[np.float64]:
 
 
 def _streets(layout: StreetsLayout) -> NDArray[np.float64]:
-    """Go along a block's four fronts, and copy them to every block."""
+    """Place landmarks on the four fronts of a block, and copy them to every block."""
     front = (np.arange(layout.per_front) + 0.5) / layout.per_front
     low, high = np.zeros_like(front), np.ones_like(front)
     x = np.concatenate([front, high, front[::-1], low])
@@ -220,14 +250,14 @@ def _streets(layout: StreetsLayout) -> NDArray[np.float64]:
     return layout.origin + (corners[:, None] + block).reshape(-1, 2)
 
 
-def _throw_darts(layout: RandomLayout, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw one landmark after the other, again where it is too near to an earlier."""
+def _sample(layout: RandomLayout, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw the landmarks in turn; reject one that is too near to an earlier one."""
     low, high = layout.bounds[:2], layout.bounds[2:]
     placed = np.empty((layout.count, 2))
     for index in range(layout.count):
         for _ in range(_TRIES_PER_LANDMARK):
-            dart = rng.uniform(low, high)
-            gaps = placed[:index] - dart
+            point = rng.uniform(low, high)
+            gaps = placed[:index] - point
             if (np.hypot(gaps[:, 0], gaps[:, 1]) >= layout.min_distance).all():
                 break
         else:
@@ -236,5 +266,5 @@ def _throw_darts(layout: RandomLayout, rng: np.random.Generator) -> NDArray[np.f
                 f"in {layout.bounds}, got {layout.min_distance} "
                 f"({index} placed, then {_TRIES_PER_LANDMARK} tries failed)"
             )
-        placed[index] = dart
+        placed[index] = point
     return placed

@@ -1,183 +1,52 @@
-"""What to simulate, as one immutable value per scenario."""
+"""The complete description of a simulated world, as one immutable value."""
 
-import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from .controls import ControlSequence, command_cycle
-from .field_types import (
-    CountOrZero,
-    Flag,
-    MeasurementStd,
-    MotionStd,
-    Name,
-    NotNegative,
-    Part,
-    Pose,
-    PoseStd,
-    Positive,
-    PositiveOrInfinite,
-    Probability,
-    Text,
-    Wall,
-    broken_rule,
-    expect,
-)
+from .field_types import Name, Part, Positive, Text, Wall, broken_rule, expect
 from .layouts import LandmarkLayout
-from .randomisation import Randomise, refuse_impossible_ends
+from .randomisation import RANGES, Randomise
 from .scenario_errors import ScenarioError, error_lines
+from .scenario_parts import Motion, Robot, Sensor, Start
 
-_Angle = Annotated[Positive, Field(le=2 * math.pi), expect("a number in (0, 2π] [rad]")]
 _Steps = Annotated[
     int, Field(strict=True, ge=2), expect("an integer >= 2")
 ]  # Gymnasium's checker refuses an episode that ends at its first step
 
 
-def _leave_out_default(schema: dict[str, Any]) -> None:
-    del schema["default"]  # JSON cannot say inf
-
-
-class Start(Part):
-    """Where the robot starts, and how well that is known.
-
-    With ``drawn = "truth"`` the true start is drawn around `pose` and a filter starts
-    from `pose`; with ``"estimate"`` the truth starts at `pose` and the filter's first
-    pose is drawn around it.
-    """
-
-    pose: Pose = Field(default=(0.0, 0.0, 0.0), description="(x, y, θ) [m, m, rad]")
-    std: PoseStd = Field(
-        default=(0.0, 0.0, 0.0),
-        description="standard deviations (σx, σy, σθ) [m, m, rad]",
-    )
-    drawn: Annotated[Literal["truth", "estimate"], expect("'truth' or 'estimate'")] = (
-        Field(
-            default="truth",
-            description="which of the two starts is drawn around `pose`",
-        )
-    )
-
-
-class Robot(Part):
-    """The body of the robot and the limits of its actions."""
-
-    radius: Positive = Field(default=0.2, description="radius of the round body [m]")
-    max_speed: Positive = Field(default=1.0, description="limit of |v| [m/s]")
-    max_turn_rate: Positive = Field(default=1.0, description="limit of |ω| [rad/s]")
-
-
-class Motion(Part):
-    """The noise of the motion.
-
-    With ``noise_in = "motion"`` the robot slips and the odometry reports the command;
-    with ``"odometry"`` the robot obeys and the encoders err.
-    """
-
-    std: MotionStd = Field(
-        description="(σx, σy, σα) per step in the robot's frame [m, m, rad]"
-    )
-    noise_in: Annotated[
-        Literal["motion", "odometry"], expect("'motion' or 'odometry'")
-    ] = Field(default="motion", description="what the noise disturbs")
-    noise_at_rest: Flag = Field(
-        default=True, description="whether a step commanded (0, 0) has noise too"
-    )
-
-    @model_validator(mode="after")
-    def _check_encoders(self) -> Self:
-        if self.noise_in == "odometry" and self.std[1] != 0:
-            raise broken_rule(
-                "std must have σy = 0 with noise_in = 'odometry', since encoders read "
-                f"no sideways motion, got {self.std}"
-            )
-        return self
-
-
-class Sensor(Part):
-    """The bearing-range sensor: its noise, its reach and its failures."""
-
-    std: MeasurementStd = Field(description="(σβ, σr) of one reading [rad, m]")
-    range_std_per_metre: NotNegative = Field(
-        default=0.0, description="k in σr(r) = σr + k r [m/m]"
-    )
-    min_range: NotNegative = Field(
-        default=0.05, description="nearest landmark it sees [m]"
-    )
-    max_range: PositiveOrInfinite = Field(
-        default=math.inf,
-        description="farthest landmark it sees [m], inf (the default) for all",
-        json_schema_extra=_leave_out_default,
-    )
-    field_of_view: _Angle = Field(
-        default=2 * math.pi,
-        description="full angle of view, centred on the heading [rad]",
-    )
-    occlusion: Flag = Field(default=False, description="whether walls hide landmarks")
-    dropout: Probability = Field(
-        default=0.0, description="probability of losing a reading"
-    )
-    clutter: NotNegative = Field(
-        default=0.0, description="mean number of false measurements per step (Poisson)"
-    )
-    max_clutter: CountOrZero = Field(
-        default=0,
-        description="rows reserved for false measurements when identities are hidden",
-    )
-    identities: Flag = Field(
-        default=True, description="whether a reading tells which landmark it is of"
-    )
-
-    @model_validator(mode="after")
-    def _check_reach(self) -> Self:
-        if self.min_range >= self.max_range:
-            raise broken_rule(
-                f"min_range must be < max_range = {self.max_range}, "
-                f"got {self.min_range}"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _check_clutter(self) -> Self:
-        if self.clutter == 0:
-            return self
-        if self.identities or math.isinf(self.max_range):
-            raise broken_rule(
-                "clutter must be 0 unless identities = false and max_range is finite, "
-                f"got {self.clutter}"
-            )
-        if self.max_clutter < self.clutter:
-            raise broken_rule(
-                f"max_clutter must be >= clutter = {self.clutter} "
-                f"(better mean + 4 √mean), got {self.max_clutter}"
-            )
-        return self
-
-
 class Scenario(Part):
-    """A robot, its sensor, the landmarks and walls around it, and what it is told.
+    """A robot, its sensor, the landmarks and walls around it, and its controls.
 
-    A value: frozen, comparable, hashable. Read one with `load_scenario`, vary it with
-    `with_changes`. The constructor itself raises pydantic's ``ValidationError``.
+    A scenario is a value: frozen, comparable and hashable. `load_scenario` reads one,
+    `with_changes` derives another. The constructor raises pydantic's
+    ``ValidationError``.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> load_scenario("six_landmarks")
+    <Scenario 'six_landmarks': 6 landmarks, 0 walls, 29 steps of 3 s>
     """
 
     name: Name = Field(description="short name, for titles and files")
-    description: Text = Field(default="", description="what the scenario is good for")
+    description: Text = Field(default="", description="purpose of the scenario")
     dt: Positive = Field(description="duration of one step [s]")
     steps: _Steps = Field(description="steps of an episode")
-    start: Start = Field(default=Start(), description="where the robot starts")
+    start: Start = Field(default=Start(), description="start pose of the robot")
     robot: Robot = Field(default=Robot(), description="body and limits of the robot")
     motion: Motion = Field(description="noise of the motion")
     sensor: Sensor = Field(description="bearing-range sensor")
-    landmarks: LandmarkLayout = Field(description="where the landmarks stand")
+    landmarks: LandmarkLayout = Field(description="positions of the landmarks")
     walls: tuple[Wall, ...] = Field(
         default=(), description="(x0, y0, x1, y1) of each [m]"
     )
     controls: ControlSequence = Field(
-        description="what the robot is told, open loop; cycled when short"
+        description="open-loop commands of the robot; repeated when short"
     )
     randomise: Randomise | None = Field(
         default=None, description="ranges from which every episode draws its own world"
@@ -208,8 +77,33 @@ class Scenario(Part):
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
-        refuse_impossible_ends(self)
+        """Check both ends of all ranges; every rule is a bound and holds in between."""
+        ranges = self.randomise
+        if ranges is None:
+            return self
+        if ranges.landmark_shift and self.landmarks.is_redrawn:
+            raise broken_rule(
+                "randomise.landmark_shift must be 0 where every episode has new "
+                f"landmarks anyway, got {ranges.landmark_shift}"
+            )
+        unmoved = np.zeros((self.landmarks.count, 2))
+        for share, end in ((0.0, "low"), (1.0, "high")):
+            try:
+                self.drawn_at(dict.fromkeys(RANGES, share), unmoved)
+            except ValueError as error:
+                raise broken_rule(
+                    "randomise must give valid scenarios, but at the "
+                    f"{end} ends {error}"
+                ) from None
         return self
+
+    def __repr__(self) -> str:
+        return (
+            f"<Scenario {self.name!r}: {self.landmarks.count} landmarks, "
+            f"{len(self.walls)} walls, {self.steps} steps of {self.dt:g} s>"
+        )
+
+    __str__ = __repr__
 
     def with_changes(self, **changes: object) -> Self:
         """Return a scenario with some fields replaced.
@@ -217,8 +111,8 @@ class Scenario(Part):
         Parameters
         ----------
         **changes : object
-            New values by field; a mapping changes only the keys it names, unless it
-            chooses another layout or sequence, which it then describes in full.
+            New values by field. A mapping replaces only the keys that it holds. A
+            mapping with another layout or sequence replaces the whole table.
 
         Raises
         ------
@@ -234,9 +128,25 @@ class Scenario(Part):
         """
         return self.from_table(_merge(self.model_dump(), changes))
 
+    def drawn_at(
+        self, shares: Mapping[str, float], directions: NDArray[np.float64]
+    ) -> Self:
+        """Return the scenario at one point of its ranges; see `Randomise.changes`."""
+        assert self.randomise is not None
+        return self.with_changes(
+            **self.randomise.changes(
+                shares,
+                directions,
+                motion=self.motion,
+                sensor=self.sensor,
+                start=self.start,
+                landmarks=self.landmarks,
+            )
+        )
+
     @classmethod
     def from_table(cls, table: Mapping[str, object]) -> Self:
-        """Validate a mapping of plain values (also arrays) as a scenario.
+        """Make a scenario from a mapping of plain values and arrays.
 
         Raises
         ------
@@ -255,8 +165,8 @@ def action_sequence(scenario: Scenario) -> NDArray[np.float64]:
     Returns
     -------
     ndarray of float64, shape (steps, 2)
-        Rows (v, ω) [m/s, rad/s]; v dt and ω dt are the commanded (d, α). A sequence
-        shorter than the episode starts again.
+        Rows (v, ω) [m/s, rad/s]; the commands are (d, α) = (v dt, ω dt). A sequence
+        that is shorter than the episode is repeated.
 
     Examples
     --------
@@ -266,6 +176,53 @@ def action_sequence(scenario: Scenario) -> NDArray[np.float64]:
     """
     cycle = command_cycle(scenario.controls, scenario.dt) / scenario.dt
     return np.resize(cycle, (scenario.steps, 2))
+
+
+def drawn_scenario(scenario: Scenario, rng: np.random.Generator) -> Scenario:
+    """Draw the scenario of one episode.
+
+    Every range has its own random number u, so no range affects the draw of another::
+
+        factor = low (high / low)^u,    value = low + u (high - low),    u ~ U[0, 1)
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With or without ``randomise``.
+    rng : numpy.random.Generator
+        Source of the random numbers.
+
+    Returns
+    -------
+    Scenario
+        Without ``randomise``. A scenario without ranges is returned unchanged. A map
+        that is scaled or shifted becomes a layout of points.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> ranges = {"motion_std": [0.5, 2.0], "start_heading": [-3.0, 3.0]}
+    >>> scenario = load_scenario("six_landmarks").with_changes(randomise=ranges)
+    >>> drawn = drawn_scenario(scenario, np.random.default_rng(0))
+    >>> [round(std / 0.1, 3) for std in drawn.motion.std]
+    [3.023, 1.209, 1.209]
+    >>> drawn == drawn_scenario(scenario, np.random.default_rng(0))
+    True
+    """
+    if scenario.randomise is None:
+        return scenario
+    shares = dict(zip(RANGES, rng.random(len(RANGES)).tolist(), strict=True))
+    directions = rng.uniform(-1.0, 1.0, (scenario.landmarks.count, 2))
+    return scenario.drawn_at(shares, directions)
+
+
+def refuse_ranges(scenario: Scenario) -> None:
+    """Raise a `ScenarioError` if a scenario has ranges (``randomise``)."""
+    if scenario.randomise is not None:
+        raise ScenarioError(
+            f"scenario '{scenario.name}' has ranges (randomise): draw a scenario from "
+            "them with drawn_scenario, as slamgym generate does for every episode"
+        )
 
 
 def _merge(table: dict[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a wrong scenario is told: one line per mistake, naming the field."""
+"""Error messages of invalid scenarios: one line per mistake, with the field's name."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -14,11 +14,11 @@ _CONTAINERS = {
 
 
 class ScenarioError(ValueError):
-    """A scenario that cannot be used; one line of text per mistake."""
+    """Raised for an invalid scenario; the message has one line per mistake."""
 
 
 def closest(word: str, words: Iterable[str]) -> str:
-    """Suggest the nearest of some words, as the end of an error message.
+    """Return the suggestion that ends an error message, empty if no word is similar.
 
     Examples
     --------
@@ -32,12 +32,12 @@ def closest(word: str, words: Iterable[str]) -> str:
 
 
 def error_lines(error: ValidationError) -> list[str]:
-    """Turn pydantic's report into one line per mistake.
+    """Convert a validation error of pydantic to one line per mistake.
 
     Parameters
     ----------
     error : ValidationError
-        Raised while a `Scenario` was validated.
+        Raised by the validation of a `Scenario`.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def error_lines(error: ValidationError) -> list[str]:
 
 
 def _is_echo(details: dict[str, Any]) -> bool:
-    """Tell a list said to be too short only because its items are wrong."""
+    """Report whether a list counts as too short only because its items are invalid."""
     return details["type"] == "too_short" and len(details["input"]) > 0
 
 
@@ -84,7 +84,7 @@ def _unknown_tag(path: str, context: dict[str, Any]) -> str:
 
 
 def _path(location: tuple[str | int, ...]) -> str:
-    """Write a location as in the file: ``walls[2]``, ``landmarks.radius``."""
+    """Format a location as in the file: ``walls[2]``, ``landmarks.radius``."""
     if len(location) > 1 and location[0] in ("landmarks", "controls"):
         location = (location[0], *location[2:])  # pydantic adds the layout's own name
     path = ""

@@ -16,7 +16,7 @@ SCHEMA_FILE = _FOLDER / "scenario.schema.json"
 
 
 def list_presets() -> tuple[str, ...]:
-    """Name the scenarios that come with the package, in alphabetical order.
+    """Return the names of the scenarios in the package, in alphabetical order.
 
     Examples
     --------
@@ -27,13 +27,13 @@ def list_presets() -> tuple[str, ...]:
 
 
 def load_scenario(source: Scenario | Mapping[str, object] | str | Path) -> Scenario:
-    """Read a scenario from whatever describes it.
+    """Load a scenario from a preset, a file or a mapping.
 
     Parameters
     ----------
     source : Scenario, mapping, str or Path
         The name of a preset, the path of a ``.toml`` file, a mapping of plain values,
-        or a scenario, which is returned as it is.
+        or a scenario, which is returned unchanged.
 
     Returns
     -------
@@ -42,8 +42,8 @@ def load_scenario(source: Scenario | Mapping[str, object] | str | Path) -> Scena
     Raises
     ------
     ScenarioError
-        If there is no such preset or file, or if it is not a valid scenario; one line
-        per mistake, with the file's name in front.
+        If there is no such preset or file, or if the scenario is invalid. The message
+        has one line per mistake, each with the file's name.
 
     Examples
     --------
@@ -70,12 +70,12 @@ def load_scenario(source: Scenario | Mapping[str, object] | str | Path) -> Scena
 
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
-    """Write a scenario as a TOML file that `load_scenario` reads back equal."""
+    """Write a scenario to a TOML file; `load_scenario` reads an equal one from it."""
     Path(path).write_text(scenario_text(scenario), encoding="utf-8")
 
 
 def scenario_text(scenario: Scenario) -> str:
-    """Write a scenario as TOML, every field, also those at their defaults.
+    """Format a scenario as TOML with every field, including the defaults.
 
     Examples
     --------
@@ -93,7 +93,7 @@ def scenario_text(scenario: Scenario) -> str:
 
 
 def scenario_schema() -> str:
-    """Describe scenario files as a JSON schema, for editors that complete and check."""
+    """Return the JSON schema of scenario files, by which editors complete and check."""
     schema = Scenario.model_json_schema()
     for part in schema["$defs"].values():
         tags = [key for key in ("layout", "sequence") if key in part["properties"]]
@@ -117,7 +117,7 @@ def _load_file(path: Path) -> Scenario:
 
 
 def _syntax_message(path: Path, message: str) -> str:
-    """Move the line's number, which tomllib appends to its message, to the front."""
+    """Move the line number from the end of tomllib's message to the front."""
     reason, _, place = message.rpartition(" (at ")
     line = re.match(r"line \d+", place)
     where = line[0] if line else place.removesuffix(")")

@@ -12,8 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...sim_configs import Scenario, action_sequence
-from ...sim_configs.scenario import Robot
+from ...sim_configs import Robot, Scenario, action_sequence
 from ...sim_configs.scenario_errors import closest
 from .planned_path import planned_path
 

@@ -8,7 +8,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from ...sim_configs import Scenario, place_landmarks
-from ...sim_configs.randomisation import refuse_ranges
+from ...sim_configs.scenario import refuse_ranges
 from ..robot.vector_bodies import UnicycleBodies
 from ..sensors.bearing_range import BearingRangeSensor, hide_identities
 from ..sensors.noise_streams import Streams, spawn_streams
@@ -211,7 +211,7 @@ class WorldBatch:
 
     def _place_landmarks(self, chosen: Places, streams: list[Streams]) -> None:
         layout = self.scenario.landmarks
-        if layout.layout == "random" and layout.seed is None:
+        if layout.is_redrawn:
             placed = [place_landmarks(layout, each.map) for each in streams]
             self._landmarks[chosen] = np.array(placed).view(np.complex128)[..., 0]
         elif not self.begun:

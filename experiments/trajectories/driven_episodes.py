@@ -8,8 +8,7 @@ from gymnasium.utils import seeding
 from ...envs.controllers.vector import make_controller_batch
 from ...envs.vector.mixed_worlds import SeparateWorlds
 from ...envs.vector.world_batch import WorldBatch
-from ...sim_configs import Scenario
-from ...sim_configs.randomisation import drawn_scenario
+from ...sim_configs import Scenario, drawn_scenario
 from .trajectory import Trajectory
 
 _CONTROLLER_STREAM, _SCENARIO_STREAM = 1, 2  # beside the seed, so that all differ

@@ -33,8 +33,7 @@ from slamgym.agents.coverage_grid import SECTORS, FloorPlan
 from slamgym.agents.information_reward import effort, map_covariances
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import EkfSlam, list_estimators
-from slamgym.sim_configs import load_scenario
-from slamgym.sim_configs.randomisation import drawn_scenario
+from slamgym.sim_configs import drawn_scenario, load_scenario
 
 ID = "slamgym/ActiveSlam-v0"
 LEVELS = ["active_easy", "active_medium", "active_hard"]

@@ -15,8 +15,7 @@ from slamgym.envs.controllers.vector import (
     WaypointsBatch,
     make_controller_batch,
 )
-from slamgym.sim_configs import list_presets, load_scenario
-from slamgym.sim_configs.scenario import Robot
+from slamgym.sim_configs import Robot, list_presets, load_scenario
 
 
 def generators(count):

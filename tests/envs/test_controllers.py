@@ -13,8 +13,7 @@ from slamgym.envs.controllers.single import (
     Waypoints,
     make_controller,
 )
-from slamgym.sim_configs import list_presets, load_scenario
-from slamgym.sim_configs.scenario import Robot
+from slamgym.sim_configs import Robot, list_presets, load_scenario
 
 ORIGIN = (0.0, 0.0, 0.0)
 ROBOT = Robot(max_speed=0.5, max_turn_rate=0.8)

@@ -484,7 +484,7 @@ class Recorder:
 
 @pytest.fixture
 def recorder(monkeypatch):
-    monkeypatch.setattr("slamgym.envs.rendering.WorldRenderer", Recorder)
+    monkeypatch.setattr("slamgym.envs.rendering.renderer.WorldRenderer", Recorder)
     monkeypatch.setattr(Recorder, "made", ())
     return Recorder
 

@@ -9,11 +9,12 @@ from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.vector.world_batch import WorldBatch
 from slamgym.sim_configs import (
     ScenarioError,
+    drawn_scenario,
     load_scenario,
     place_landmarks,
     save_scenario,
 )
-from slamgym.sim_configs.randomisation import Randomise, drawn_scenario
+from slamgym.sim_configs.randomisation import Randomise
 
 BASE = load_scenario("dropout")  # a random layout with a seed of its own, finite range
 FACTORS = {
