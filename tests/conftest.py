@@ -7,6 +7,12 @@ import pytest
 # products fifty times slower.  Subprocesses inherit it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Subprocesses of tests import the modules in tests/support, too.
+_SUPPORT = str(Path(__file__).parent / "support")
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [_SUPPORT, *filter(None, [os.environ.get("PYTHONPATH")])]
+)
+
 
 @pytest.fixture
 def public_logs():

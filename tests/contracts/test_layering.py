@@ -16,9 +16,9 @@ MAY_IMPORT = {
 }
 DRAWING = {  # the only files that may import matplotlib and what it writes with
     "envs": {
-        "rendering",
-        "world_artists",
-        "world_picture",
+        "renderer",
+        "artists",
+        "scene",
         "blitting",
         "window",
         "video",

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PARTS = ("agents", "envs", "estimator", "experiments", "sim_configs")
+PARTS = ("agents", "envs", "estimator", "evaluation", "experiments", "sim_configs")
 
 
 def call(*command, cwd):

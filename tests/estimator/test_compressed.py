@@ -307,7 +307,7 @@ belief = slam.belief()
 print(belief.mean.tobytes().hex(), belief.covariance.tobytes().hex())
 """
     run(CompressedEkfSlam(*NOISE, base="invariant"), wander(300, 60))  # compiles
-    here = str(Path(__file__).parents[1] / "support")
+    here = str(Path(__file__).parent)
     first, second = (
         subprocess.run(
             [sys.executable, "-c", code, str(tmp_path), here, which],

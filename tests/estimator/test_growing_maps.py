@@ -230,7 +230,7 @@ def both_processes(tmp_path_factory):
         (folder / way).mkdir()
         states, here[way] = stopped(way, folder / way)
         (folder / way / "states.pickle").write_bytes(pickle.dumps(states))
-    tests = str(Path(__file__).parents[1] / "support")
+    tests = str(Path(__file__).parent)
     code = CHILD.format(tests=tests, ways=tuple(WAYS), folder=str(folder))
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
     return here, json.loads(done.stdout)

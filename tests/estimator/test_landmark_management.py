@@ -543,7 +543,7 @@ def test_a_saved_run_goes_on_in_another_process(tmp_path):
             subprocess.run(
                 [sys.executable, "-c", script, str(begin), str(end), str(tmp_path)],
                 check=True,
-                cwd=Path(__file__).parents[1] / "support",
+                cwd=Path(__file__).parent,
             )
         with np.load(tmp_path / "25.npz") as state:
             states.append(dict(state))

@@ -432,7 +432,7 @@ def test_another_process_continues_from_the_folder(tmp_path):
     slam = run(made(folder=folder), drive[:45])
     with Path(state).open("wb") as file:
         pickle.dump(slam.state_dict(), file)
-    tests = str(Path(__file__).parents[1] / "support")
+    tests = str(Path(__file__).parent)
     code = CONTINUE.format(tests=tests, folder=folder, state=state, result=result)
     subprocess.run([sys.executable, "-c", code], check=True)
     with Path(result).open("rb") as file:

@@ -26,7 +26,8 @@ BLOCKS = [f"runs-{a:07d}-{b:07d}.npz" for a, b in ((0, 4), (4, 8), (8, 12))]
 DIES = """
     import os, signal, sys, time
     import numpy as np
-    from slamgym.experiments.monte_carlo import job_folder, monte_carlo, runner
+    from slamgym.experiments.monte_carlo import monte_carlo, runner
+    from slamgym.experiments.monte_carlo.store import job_folder
 
     def die(file):
         file.write_bytes(b"half a file")

@@ -9,9 +9,9 @@ import pytest
 from slamgym.experiments.command_line.noise_study_runs import study_effects
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.report.scores import scores_of
+from slamgym.experiments.noise_study import many_runs as noise_effects_module
 from slamgym.experiments.noise_study.figures import noise_effects_figure
 from slamgym.experiments.noise_study.many_runs import noise_effects
-from slamgym.experiments.noise_study.one_run import many_runs as noise_effects_module
 from slamgym.experiments.noise_study.one_run import scaled_scenario
 from slamgym.experiments.runs.filter_settings import SIGMAS
 from slamgym.sim_configs import load_scenario
