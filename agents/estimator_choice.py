@@ -8,8 +8,13 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..estimator.filters.batch import BatchSlam, make_batch
-from ..estimator.registry import accepted_options, find_estimator, make_estimator
+from ..estimator.filters.batch import BatchSlam
+from ..estimator.registry import (
+    accepted_options,
+    find_estimator,
+    make_batch,
+    make_estimator,
+)
 from ..sim_configs import Scenario
 
 Array = NDArray[np.float64]

@@ -24,7 +24,7 @@ from submaps import MEASUREMENT_STD, MOTION_STD, SIZES, drive, print_table
 
 from slamgym.estimator.large_maps.submaps.submap_slam import SubmapSlam
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
-from slamgym.estimator.map_management.map_editor import at_once
+from slamgym.estimator.map_management.map_view import marginal_without_joining
 
 
 class Row(NamedTuple):
@@ -70,7 +70,7 @@ def measure(count: int, size: int) -> Row:
         for i, truth in zip(report.row_ids, step.ids.tolist(), strict=True):
             readings += 1
             wrong += i is not None and taken_for.setdefault(i, truth) != truth
-        position = at_once(slam, ())
+        position = marginal_without_joining(slam, ())
         error = position.pose[:2] - pose[:2]
         P = position.pose_covariance[:2, :2]
         nees.append(float(error @ np.linalg.solve(P, error)) / 2)

@@ -11,21 +11,21 @@ from .check_estimator import check_estimator as check_estimator
 from .filters.batch import BatchSlam as BatchSlam
 from .filters.batch import BatchTrace as BatchTrace
 from .filters.batch import can_batch as can_batch
-from .filters.batch import make_batch as make_batch
 from .filters.ekf import EkfSlam as EkfSlam
 from .filters.first_estimates import FirstEstimatesEkfSlam as FirstEstimatesEkfSlam
-from .filters.first_estimates import (
-    ObservabilityConstrainedEkfSlam as ObservabilityConstrainedEkfSlam,
-)
 from .filters.ideal import IdealEkfSlam as IdealEkfSlam
 from .filters.invariant import InvariantEkfSlam as InvariantEkfSlam
 from .filters.iterated import IteratedEkfSlam as IteratedEkfSlam
+from .filters.observability_constrained import (
+    ObservabilityConstrainedEkfSlam as ObservabilityConstrainedEkfSlam,
+)
 from .filters.robocentric import RobocentricEkfSlam as RobocentricEkfSlam
 from .filters.unscented import UnscentedSlam as UnscentedSlam
 from .interface import Belief as Belief
 from .interface import SlamEstimator as SlamEstimator
 from .interface import UpdateReport as UpdateReport
 from .registry import list_estimators as list_estimators
+from .registry import make_batch as make_batch
 from .registry import make_estimator as make_estimator
 from .registry import register_estimator as register_estimator
 

@@ -1,4 +1,6 @@
-"""Estimators by name, yours included."""
+"""Make estimators by name, also those that users register."""
+
+from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -9,14 +11,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import ArrayLike
 
+from .filters.batch import BatchSlam
 from .filters.ekf import EkfSlam
-from .filters.first_estimates import (
-    FirstEstimatesEkfSlam,
-    ObservabilityConstrainedEkfSlam,
-)
+from .filters.first_estimates import FirstEstimatesEkfSlam
 from .filters.ideal import IdealEkfSlam
 from .filters.invariant import InvariantEkfSlam
 from .filters.iterated import IteratedEkfSlam
+from .filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from .filters.robocentric import RobocentricEkfSlam
 from .filters.unscented import UnscentedSlam
 from .interface import SlamEstimator
@@ -84,7 +85,7 @@ def make_estimator(
     measurement_std: ArrayLike,
     initial_pose: ArrayLike = (0.0, 0.0, 0.0),
     initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
-    management: "LandmarkPolicy | Mapping[str, Any] | bool | None" = None,
+    management: LandmarkPolicy | Mapping[str, Any] | bool | None = None,
     **options: Any,
 ) -> SlamEstimator:
     """Make an estimator by its registered name or by its import path.
@@ -131,6 +132,53 @@ def make_estimator(
         initial_pose=initial_pose,
         initial_pose_std=initial_pose_std,
         **options,
+    )
+
+
+def make_batch(
+    name: str,
+    *,
+    runs: int,
+    landmarks: int,
+    motion_std: ArrayLike,
+    measurement_std: ArrayLike,
+    initial_poses: ArrayLike = (0.0, 0.0, 0.0),
+    initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+    threads: int | None = None,
+    **options: Any,
+) -> BatchSlam:
+    """Make a batch of runs of a registered filter.
+
+    Parameters
+    ----------
+    name : str
+        One of :func:`list_estimators`.
+    runs, landmarks, initial_poses, initial_pose_std, threads
+        As in :class:`BatchSlam`.
+    motion_std, measurement_std, **options
+        As in :func:`make_estimator`.
+
+    Raises
+    ------
+    ValueError
+        Where the filter is unknown or cannot run in batches.
+    """
+    if "initial_pose" in options:
+        raise ValueError(
+            "initial_pose must be given as initial_poses, one for each run"
+        )
+    estimator = find_estimator(name)(
+        motion_std=motion_std, measurement_std=measurement_std, **options
+    )
+    if not isinstance(estimator, EkfSlam):
+        raise ValueError(f"{name} cannot run in batches")
+    return BatchSlam(
+        estimator,
+        runs,
+        landmarks,
+        initial_poses=initial_poses,
+        initial_pose_std=initial_pose_std,
+        threads=threads,
     )
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..map_management.map_editor import MapView
-from ..map_management.policy import LandmarkPolicy
+from ..belief import MapView
+from .association_policy import AssociationPolicy
 from .nearest_neighbour import (
     AMBIGUOUS,
     NEW,
@@ -27,7 +27,7 @@ Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Newcomers:
+class Candidates:
     """Who waits outside the map, and which identity is the next to give."""
 
     tentative: TentativeLandmarks = field(default_factory=TentativeLandmarks.none)
@@ -50,7 +50,7 @@ class Newcomers:
         }
 
     @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any]) -> "Newcomers":
+    def from_state_dict(cls, state: Mapping[str, Any]) -> "Candidates":
         """Take back what :meth:`state_dict` returned."""
         waiting: dict[int, list[int]] = {}
         for landmark_id, scan in np.asarray(state["waiting"]).tolist():
@@ -63,22 +63,24 @@ class Newcomers:
         return cls(tentative, waiting, int(state["next_id"]), int(state["scan"]))
 
 
-class ScanPlan:
+class ScanAssociation:
     """The plan for one scan of so many rows.
 
     Parameters
     ----------
-    policy : LandmarkPolicy
-    newcomers : Newcomers
+    policy : AssociationPolicy
+    candidates : Candidates
         Before the scan.
     rows : int
     """
 
-    def __init__(self, policy: LandmarkPolicy, newcomers: Newcomers, rows: int) -> None:
+    def __init__(
+        self, policy: AssociationPolicy, candidates: Candidates, rows: int
+    ) -> None:
         self._policy = policy
-        self._tentative = newcomers.tentative.next_scan(policy.confirm[1])
-        self._waiting = dict(newcomers.waiting)
-        self._next_id, self._scan = newcomers.next_id, newcomers.scan
+        self._tentative = candidates.tentative.next_scan(policy.confirm[1])
+        self._waiting = dict(candidates.waiting)
+        self._next_id, self._scan = candidates.next_id, candidates.scan
         self.row_ids: list[int | None] = [None] * rows
         """For each row the landmark whose reading the filter shall take it for."""
         self.confirmed: list[int] = []
@@ -89,9 +91,9 @@ class ScanPlan:
         """Landmarks that some row may be of: they are not missing."""
 
     @property
-    def newcomers(self) -> Newcomers:
+    def candidates(self) -> Candidates:
         """Who waits outside after the scan."""
-        return Newcomers(self._tentative, self._waiting, self._next_id, self._scan + 1)
+        return Candidates(self._tentative, self._waiting, self._next_id, self._scan + 1)
 
     def associate(
         self, readings: Array, view: MapView, noise: Noise, min_range: float

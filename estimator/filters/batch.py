@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,6 @@ from ..interface import Belief
 from ..kernels.batch import NEVER, drive_runs
 from ..kernels.scan_rows import Workspace, aligned_zeros
 from ..models.angles import wrap_angle
-from ..registry import find_estimator
 from ..support import argument_checks
 from .ekf import FRAMES, EkfSlam, workspace_for
 
@@ -101,6 +100,7 @@ class BatchSlam:
 
     Examples
     --------
+    >>> from slamgym.estimator import make_batch
     >>> batch = make_batch(
     ...     "ekf", runs=2, landmarks=1, motion_std=(0, 0, 0), measurement_std=(0.1, 0.1)
     ... )
@@ -373,51 +373,4 @@ def can_batch(estimator: object) -> bool:
         and type(estimator).predict is EkfSlam.predict
         and type(estimator).update is EkfSlam.update
         and type(estimator).belief is EkfSlam.belief
-    )
-
-
-def make_batch(
-    name: str,
-    *,
-    runs: int,
-    landmarks: int,
-    motion_std: ArrayLike,
-    measurement_std: ArrayLike,
-    initial_poses: ArrayLike = (0.0, 0.0, 0.0),
-    initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
-    threads: int | None = None,
-    **options: Any,
-) -> BatchSlam:
-    """Make a batch of runs of a registered filter.
-
-    Parameters
-    ----------
-    name : str
-        One of :func:`slamgym.estimator.list_estimators`.
-    runs, landmarks, initial_poses, initial_pose_std, threads
-        As in :class:`BatchSlam`.
-    motion_std, measurement_std, **options
-        As in :func:`slamgym.estimator.make_estimator`.
-
-    Raises
-    ------
-    ValueError
-        Where the filter is unknown or cannot run in batches.
-    """
-    if "initial_pose" in options:
-        raise ValueError(
-            "initial_pose must be given as initial_poses, one for each run"
-        )
-    estimator = find_estimator(name)(
-        motion_std=motion_std, measurement_std=measurement_std, **options
-    )
-    if not isinstance(estimator, EkfSlam):
-        raise ValueError(f"{name} cannot run in batches")
-    return BatchSlam(
-        estimator,
-        runs,
-        landmarks,
-        initial_poses=initial_poses,
-        initial_pose_std=initial_pose_std,
-        threads=threads,
     )

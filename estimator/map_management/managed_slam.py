@@ -7,25 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..association.candidates import Newcomers, ScanPlan
-from ..interface import Belief, SlamEstimator, UpdateReport
+from ..association.candidates import Candidates, ScanAssociation
+from ..interface import Belief, MapView, SlamEstimator, UpdateReport, optional_members
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
-from .map_editor import (
-    MapView,
-    RememberedAccess,
-    access_to,
-    mapped_ids,
-    marginal,
-    view_of,
-)
+from .map_editor import CachedEditor, edit_map
+from .map_view import mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
-from .pruning import MapUpkeep
+from .pruning import MapPruner
 
 Array = NDArray[np.float64]
-
-# What a filter may have besides, with which management does nothing.
-_DOORS = ("observe_truth", "view_around", "join", "memory_for", "belief_limit")
 
 
 class ManagedSlam:
@@ -95,12 +86,11 @@ class ManagedSlam:
         self._noise_at_rest = options.get("noise_at_rest", True)
         self._min_range = options.get("min_range", 1e-3)
         merging = self._policy.merge_within is not None
-        self._door = RememberedAccess(access_to(self._filter, merging=merging))
-        self._upkeep = MapUpkeep(self._policy, self._door, noise)
-        self._newcomers = Newcomers()
-        for name in _DOORS:
-            if hasattr(self._filter, name):
-                setattr(self, name, getattr(self._filter, name))
+        self._editor = CachedEditor(edit_map(self._filter, merging=merging))
+        self._pruning = MapPruner(self._policy, self._editor, noise)
+        self._candidates = Candidates()
+        for name, member in optional_members(self._filter).items():
+            setattr(self, name, member)
 
     @property
     def policy(self) -> LandmarkPolicy:
@@ -115,29 +105,29 @@ class ManagedSlam:
     @property
     def tentative_landmarks(self) -> Array:
         """Where landmarks not yet confirmed seem to be, shape (t, 2) [m]."""
-        places = self._newcomers.tentative.places
+        places = self._candidates.tentative.places
         if not len(places):
             return places.copy()
-        x, y, heading = self._door.map_view().mean[:3]
+        x, y, heading = self._editor.map_view().mean[:3]
         cos, sin = np.cos(heading), np.sin(heading)
         return np.asarray(places @ np.array([[cos, sin], [-sin, cos]]) + (x, y))
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
         self._filter.reset(pose, pose_std)
-        self._door.expire()
-        self._upkeep.forget()
-        self._newcomers = Newcomers()
+        self._editor.expire()
+        self._pruning.forget()
+        self._candidates = Candidates()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
         self._filter.predict(odometry, dt)
-        self._door.expire()
+        self._editor.expire()
         distance, turn = argument_checks.pair("odometry", odometry)
         has_noise = self._noise_at_rest or distance or turn
         variance = self._motion_variance * (dt if has_noise else 0.0)
-        moved = self._newcomers.tentative.moved(distance, turn, variance)
-        self._newcomers = replace(self._newcomers, tentative=moved)
+        moved = self._candidates.tentative.moved(distance, turn, variance)
+        self._candidates = replace(self._candidates, tentative=moved)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -167,10 +157,10 @@ class ManagedSlam:
         plan = self._planned(readings, landmark_ids)
         rows = [row for row, i in enumerate(plan.row_ids) if i is not None]
         ids = [i for i in plan.row_ids if i is not None]
-        missed = self._upkeep.expected(readings) - plan.explained
+        missed = self._pruning.expected(readings) - plan.explained
         report = self._filter.update(readings[rows], ids)
-        self._door.expire()
-        self._newcomers = plan.newcomers
+        self._editor.expire()
+        self._candidates = plan.candidates
         tidied = self._tidied(readings, plan, missed, report)
         confirmed = set(plan.confirmed)
         return tidied._replace(
@@ -188,7 +178,7 @@ class ManagedSlam:
         ValueError
             Where one is not in the map.
         """
-        self._upkeep.remove(self._mapped(landmark_ids))
+        self._pruning.remove(self._mapped(landmark_ids))
 
     def merge(self, kept: int, gone: int) -> None:
         """Make one of two landmarks by hand; it answers to both its identities.
@@ -200,7 +190,7 @@ class ManagedSlam:
         """
         argument_checks.two_landmarks(kept, gone)
         self._mapped([kept, gone])
-        self._upkeep.join(kept, gone)
+        self._pruning.join(kept, gone)
 
     def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
         mapped = {i: slot for slot, i in enumerate(self.landmark_ids)}
@@ -217,7 +207,7 @@ class ManagedSlam:
 
     def map_view(self) -> MapView:
         """Look at pose and map, perhaps without a copy: not to keep, not to change."""
-        return view_of(self._filter)
+        return view_map(self._filter)
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
@@ -239,34 +229,36 @@ class ManagedSlam:
         """
         name = type(self).__name__
         argument_checks.refuse_other_state(state, self._remembered(), estimator=name)
-        newcomers = Newcomers.from_state_dict(_part_of(state, "tentative"))
-        before = self._upkeep.state_dict()
+        candidates = Candidates.from_state_dict(_part_of(state, "tentative"))
+        before = self._pruning.state_dict()
         try:
-            self._upkeep.load_state_dict(_part_of(state, "landmarks"))
+            self._pruning.load_state_dict(_part_of(state, "landmarks"))
             self._filter.load_state_dict(_part_of(state, "filter"))
         except Exception:
-            self._upkeep.load_state_dict(before)
+            self._pruning.load_state_dict(before)
             raise
-        self._door.expire()
-        self._newcomers = newcomers
+        self._editor.expire()
+        self._candidates = candidates
 
     def _remembered(self) -> dict[str, Any]:
         """Return all of the state but the filter's."""
         return {
             "estimator": np.array(type(self).__name__),
-            **_named("landmarks", self._upkeep.state_dict()),
-            **_named("tentative", self._newcomers.state_dict()),
+            **_named("landmarks", self._pruning.state_dict()),
+            **_named("tentative", self._candidates.state_dict()),
         }
 
-    def _planned(self, readings: Array, landmark_ids: LandmarkIds | None) -> ScanPlan:
-        plan = ScanPlan(self._policy, self._newcomers, len(readings))
-        view = self._door.map_view(self._reach(readings))
+    def _planned(
+        self, readings: Array, landmark_ids: LandmarkIds | None
+    ) -> ScanAssociation:
+        plan = ScanAssociation(self._policy, self._candidates, len(readings))
+        view = self._editor.map_view(self._reach(readings))
         if landmark_ids is None:
             _check_finite(readings)
             plan.associate(readings, view, self._noise, self._min_range)
         else:
             given = argument_checks.identities(landmark_ids, len(readings))
-            plan.translate(given, view.mapped, self._upkeep.aliases)
+            plan.translate(given, view.mapped, self._pruning.aliases)
         return plan
 
     def _reach(self, readings: Array) -> float:
@@ -280,19 +272,19 @@ class ManagedSlam:
     def _tidied(
         self,
         readings: Array,
-        plan: ScanPlan,
+        plan: ScanAssociation,
         missed: set[int],
         report: UpdateReport,
     ) -> UpdateReport:
         """Remove and merge what the policy says, after a scan."""
         refused = {*report.rejected_ids, *report.skipped_ids}
-        seen = set(self._door.map_view().ids).intersection(plan.row_ids) - refused
+        seen = set(self._editor.map_view().ids).intersection(plan.row_ids) - refused
         rows = [row for row, i in enumerate(plan.row_ids) if i in seen]
         ids = [i for i in plan.row_ids if i is not None and i in seen]
-        self._upkeep.note_sightings(readings[rows], ids)
-        removed = self._upkeep.remove_missing(missed)
-        merged = self._upkeep.merge(seen)
-        removed += self._upkeep.keep_capacity(seen)
+        self._pruning.note_sightings(readings[rows], ids)
+        removed = self._pruning.remove_missing(missed)
+        merged = self._pruning.merge(seen)
+        removed += self._pruning.keep_capacity(seen)
         return report._replace(removed_ids=tuple(removed), merged_ids=tuple(merged))
 
 

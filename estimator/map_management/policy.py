@@ -6,14 +6,13 @@ from difflib import get_close_matches
 from math import sqrt
 from typing import Any, TypeVar
 
+from ..association.association_policy import AssociationPolicy
 from ..support import argument_checks
 from .field_of_view import FieldOfView
 
-MOST_SCANS = 63  # that fit one mask of a tentative landmark
-
 
 @dataclass(frozen=True)
-class LandmarkPolicy:
+class LandmarkPolicy(AssociationPolicy):
     """What to do with the landmarks of any filter: one object, for ``management=``.
 
     The default associates readings without identity and wants a new landmark confirmed;
@@ -39,16 +38,6 @@ class LandmarkPolicy:
     (0,)
     """
 
-    match_gate: float = 9.21
-    """A reading is of a landmark only up to this νᵀ S⁻¹ ν; χ² of 2 dof, here 99 %."""
-    new_gate: float = 25.0
-    """A reading is of a new landmark only beyond this from all that are known."""
-    ambiguity: float = 1.0
-    """Left out where two landmarks differ by less than this in −2 ln likelihood."""
-    confirm: tuple[int, int] = (3, 8)
-    """(k, n): seen in k of n successive scans, a landmark enters the map."""
-    trust_ids: bool = True
-    """Whether landmarks that come with an identity enter at first sight."""
     view: FieldOfView | None = None
     """What the sensor reaches; needed to tell who is missing."""
     remove_after: int | None = None
@@ -61,12 +50,8 @@ class LandmarkPolicy:
     """Most landmarks in the map; beyond it the least informative are removed."""
 
     def __post_init__(self) -> None:
-        argument_checks.above("match_gate", self.match_gate, 0.0)
-        argument_checks.at_least("new_gate", self.new_gate, self.match_gate)
-        argument_checks.at_least("ambiguity", self.ambiguity, 0.0)
+        super().__post_init__()
         argument_checks.above("merge_gate", self.merge_gate, 0.0)
-        argument_checks.flag("trust_ids", self.trust_ids)
-        object.__setattr__(self, "confirm", _k_of_n(self.confirm))
         for name in ("remove_after", "capacity"):
             if getattr(self, name) is not None:
                 argument_checks.whole(name, getattr(self, name), 1)
@@ -132,21 +117,3 @@ def _made(kind: type[Made], name: str, given: Mapping[str, Any]) -> Made:
         return kind(**given)
     except TypeError as error:
         raise ValueError(f"{name} is not complete: {error}") from error
-
-
-def _k_of_n(value: Any) -> tuple[int, int]:
-    try:
-        k, n = value
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"confirm must be two whole numbers (k, n), got {value!r}"
-        ) from None
-    k, n = (
-        argument_checks.whole("confirm[0]", k, 1),
-        argument_checks.whole("confirm[1]", n, 1),
-    )
-    if not k <= n <= MOST_SCANS:
-        raise ValueError(
-            f"confirm must be (k, n) with k <= n <= {MOST_SCANS}, got ({k}, {n})"
-        )
-    return k, n

@@ -7,29 +7,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..association.nearest_neighbour import Noise
+from ..filters.marginalise_and_merge import separation
+from ..interface import MapView
 from .landmark_records import LandmarkRecords
-from .map_editor import MapAccess, MapView
-from .marginalise_and_merge import separation
+from .map_editor import MapEditor
 from .policy import LandmarkPolicy
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-class MapUpkeep:
+class MapPruner:
     """Removes and merges the landmarks of one filter, as a policy has it.
 
     Parameters
     ----------
     policy : LandmarkPolicy
-    door : MapAccess
-        To the filter's map.
+    editor : MapEditor
+        Of the filter's map.
     noise : Noise
         Of the sensor.
     """
 
-    def __init__(self, policy: LandmarkPolicy, door: MapAccess, noise: Noise) -> None:
-        self._policy, self._door = policy, door
+    def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
+        self._policy, self._editor = policy, editor
         self._noise = np.maximum(noise, 1e-12)
         self.forget()
 
@@ -42,7 +43,7 @@ class MapUpkeep:
 
     def note_sightings(self, readings: Array, ids: Sequence[int]) -> None:
         """Remember which landmarks the scan (m, 2) has shown, and who side by side."""
-        view = self._door.map_view()
+        view = self._editor.map_view()
         self._records.follow(view.mapped)
         if not ids:
             return
@@ -60,7 +61,7 @@ class MapUpkeep:
 
     def expected(self, scan: Array) -> set[int]:
         """Return the landmarks that a scan (m, 2) should show; changes nothing."""
-        view, policy = self._door.map_view(), self._policy
+        view, policy = self._editor.map_view(), self._policy
         if policy.remove_after is None or policy.view is None or not view.ids:
             return set()
         mask = policy.view.expects(view.mean[:3].copy(), view.landmarks, scan)
@@ -88,17 +89,17 @@ class MapUpkeep:
 
     def join(self, kept: int, gone: int) -> None:
         """Make one landmark of two, which answers to both identities."""
-        self._records.follow(self._door.map_view().mapped)
-        self._door.merge(kept, gone)
+        self._records.follow(self._editor.map_view().mapped)
+        self._editor.merge(kept, gone)
         self._records.join(kept, gone)
-        self._records.follow(self._door.map_view().mapped)
+        self._records.follow(self._editor.map_view().mapped)
         earlier = {i: kept for i, j in self.aliases.items() if j == gone}
         self.aliases |= {gone: kept, **earlier}
         self._apart = {_renamed(pair, gone, kept) for pair in self._apart}
 
     def keep_capacity(self, seen: set[int]) -> list[int]:
         """Give up the landmarks of least information, of those not seen if possible."""
-        capacity, ids = self._policy.capacity, list(self._door.map_view().mapped)
+        capacity, ids = self._policy.capacity, list(self._editor.map_view().mapped)
         if capacity is None or len(ids) <= capacity:
             return []
         ranked = self._records.by_information(ids)
@@ -122,15 +123,15 @@ class MapUpkeep:
     def remove(self, ids: list[int]) -> list[int]:
         """Remove landmarks from the map and from what is remembered; return them."""
         if ids:
-            self._door.remove(ids)
-            self._records.follow(self._door.map_view().mapped)
+            self._editor.remove(ids)
+            self._records.follow(self._editor.map_view().mapped)
             gone = set(ids)
             self._apart = {both for both in self._apart if gone.isdisjoint(both)}
         return ids
 
     def _double(self, seen: set[int]) -> tuple[int, int] | None:
         """Find two landmarks that are one, the first of them in the map to be kept."""
-        view, within = self._door.map_view(), self._policy.merge_within
+        view, within = self._editor.map_view(), self._policy.merge_within
         if within is None:
             return None
         slots = self._places(view, [i for i in view.ids if i in seen])

@@ -6,8 +6,7 @@ from typing import overload
 
 import numpy as np
 
-from ...estimator.interface import Belief
-from ...estimator.map_management.map_editor import MapView
+from ...estimator.interface import Belief, MapView
 from .trace import MapEstimate
 
 

@@ -1,11 +1,14 @@
 """Whether the maps of a job fit into memory: told before the filters run."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...estimator.interface import SlamEstimator
+from ...estimator.interface import (
+    SlamEstimator,
+    SupportsBeliefLimit,
+    SupportsMemoryEstimate,
+)
 from ...estimator.support.argument_checks import refuse_large_belief
 from ...estimator.support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ..logs.events import Scan
@@ -35,11 +38,11 @@ def refuse_large_map(log: SlamLog, estimator: SlamEstimator) -> None:
         return
     landmarks = len(np.unique(np.concatenate(named)))
     _refuse_beyond_limit(landmarks, estimator)
-    if (memory_for := _memory_of(estimator)) is None:
+    if not isinstance(estimator, SupportsMemoryEstimate):
         return
     refuse_beyond_memory(
         f"a map of the {landmarks} landmarks that {log.name} reads",
-        memory_for(landmarks) + covariance_bytes(landmarks),
+        estimator.memory_for(landmarks) + covariance_bytes(landmarks),
         "take fewer steps, or landmarks",
     )
 
@@ -67,9 +70,9 @@ def refuse_large_maps(
     """
     read = runs.visible.any(axis=1).sum(axis=1).tolist()  # by each run
     _refuse_beyond_limit(max(read), estimator)
-    if (memory_for := _memory_of(estimator)) is None:
+    if not isinstance(estimator, SupportsMemoryEstimate):
         return
-    maps = [memory_for(landmarks) for landmarks in read]
+    maps = [estimator.memory_for(landmarks) for landmarks in read]
     beliefs = sum(covariance_bytes(landmarks) for landmarks in read)
     refuse_beyond_memory(
         f"a block of {len(read)} runs that read up to {max(read)} landmarks each",
@@ -78,13 +81,7 @@ def refuse_large_maps(
     )
 
 
-def _memory_of(estimator: SlamEstimator) -> Callable[[int], int] | None:
-    """Find what tells the memory that a filter takes, where it has that."""
-    memory_for: Callable[[int], int] | None = getattr(estimator, "memory_for", None)
-    return memory_for
-
-
 def _refuse_beyond_limit(landmarks: int, estimator: SlamEstimator) -> None:
     """Refuse a run at whose end the belief would be one that the filter refuses."""
-    limit: int = getattr(estimator, "belief_limit", landmarks)
-    refuse_large_belief(landmarks, limit, "take fewer steps")
+    if isinstance(estimator, SupportsBeliefLimit):
+        refuse_large_belief(landmarks, estimator.belief_limit, "take fewer steps")

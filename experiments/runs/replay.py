@@ -8,8 +8,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...estimator.interface import Belief, SlamEstimator, UpdateReport
-from ...estimator.map_management.map_editor import at_once, joins, mapped_ids, view_of
+from ...estimator.interface import (
+    Belief,
+    SlamEstimator,
+    SupportsJoin,
+    SupportsTruth,
+    UpdateReport,
+)
+from ...estimator.map_management.managed_slam import ManagedSlam
+from ...estimator.map_management.map_view import (
+    mapped_ids,
+    marginal_without_joining,
+    view_map,
+)
 from ..logs.events import Scan
 from ..logs.ground_truth import true_landmarks_of, true_poses_of
 from ..logs.slamlog import SlamLog
@@ -134,7 +145,7 @@ def replay(
     steps = list(steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     tell_truth = _truth_teller(estimator, log, times)
-    most = _MOST_JOINED if joins(estimator) else _MOST_MAPS
+    most = _MOST_JOINED if isinstance(estimator, SupportsJoin) else _MOST_MAPS
     history = MapHistory(None if keep_history else most)
     recorder = _Recorder(estimator, len(steps), history)
     with one_blas_thread():
@@ -155,22 +166,24 @@ def replay(
 
 def _name_of(estimator: SlamEstimator) -> str:
     """Name its class, of a managed filter that of the filter."""
-    return type(getattr(estimator, "filter", estimator)).__name__
+    inner = estimator.filter if isinstance(estimator, ManagedSlam) else estimator
+    return type(inner).__name__
 
 
 def _truth_teller(
     estimator: SlamEstimator, log: SlamLog, times: Array
 ) -> Callable[[int], None]:
-    """Make what opens the door for the truth at a step, where an estimator has one."""
-    observe = getattr(estimator, "observe_truth", None)
+    """Return what passes the truth of a step to an estimator that takes it."""
     poses = true_poses_of(log, times)
     seen = {i for e in log.events if isinstance(e, Scan) for i in _ids(e) or ()}
     landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
-    if observe is None or poses is None or not seen <= set(landmarks):
+    if not isinstance(estimator, SupportsTruth):
+        return lambda _: None
+    if poses is None or not seen <= set(landmarks):
         return lambda _: None
     if not np.isfinite(poses).all():
         return lambda _: None
-    return lambda step: observe(poses[step], landmarks)
+    return lambda step: estimator.observe_truth(poses[step], landmarks)
 
 
 def _take(
@@ -179,7 +192,7 @@ def _take(
     for row in step.motions:
         for odometry, dt in predictions(row, log.motion):
             estimator.predict(odometry, dt)
-    predicted = at_once(estimator, ())
+    predicted = marginal_without_joining(estimator, ())
     report = None
     if step.scan is not None:
         report = estimator.update(step.scan.measurements, _ids(step.scan))
@@ -219,19 +232,20 @@ class _Recorder:
         """Take in one step, after the scan at its end."""
         step = len(self._history)
         self._predicted.put(step, predicted)
-        updated = predicted if report is None else at_once(self._slam, ())
-        self._updated.put(step, updated)
+        updated = predicted
         if report is not None:
+            updated = marginal_without_joining(self._slam, ())
             self._nis[step] = report.nis
             self._dof[step] = report.degrees_of_freedom
             self._count(report)
             self._meet_new(mapped_ids(self._slam))
+        self._updated.put(step, updated)
         if step == self._steps - 1:
             self.belief = self._slam.belief()
-            if joins(self._slam):  # the last word is that of the joined map
+            if isinstance(self._slam, SupportsJoin):
                 self._updated.put(step, self.belief)
         if step == self._steps - 1 or self._history.is_due(step, self._ids):
-            self._history.append(view_of(self._slam))
+            self._history.append(view_map(self._slam))
         else:
             self._history.leave_out()
 
@@ -289,7 +303,7 @@ class _Recorder:
         if ids == self._ids:
             return
         new = [i for i in ids if i not in self._first]
-        belief = at_once(self._slam, new)
+        belief = marginal_without_joining(self._slam, new)
         if self._first_covariance is None:
             self._first_covariance = belief.covariance
         pairs = zip(belief.landmarks, belief.landmark_covariances, strict=True)

@@ -24,7 +24,7 @@ from slamgym.estimator.large_maps.compressed.deferred_covariance import (
     BLOCK,
     DeferredCovariance,
 )
-from slamgym.estimator.map_management.map_editor import access_to
+from slamgym.estimator.map_management.map_editor import edit_map
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from growing_maps_peers import FullWithDsyrk
@@ -240,7 +240,7 @@ def test_a_merge_is_that_of_the_full_filter(base, jumping):
             assert len(twice) > 1
             for i in twice:
                 slam.merge(i, i + count)
-                access_to(full).merge(i, i + count)
+                edit_map(full).merge(i, i + count)
             assert_equal_beliefs(slam.belief(), full.belief())
     assert_equal_beliefs(slam.belief(), full.belief())
 

@@ -13,9 +13,9 @@ from scipy.stats import chi2
 from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import check_estimator, list_estimators, make_estimator
+from slamgym.estimator.filters.marginalise_and_merge import separation
 from slamgym.estimator.map_management.field_of_view import FieldOfView
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
-from slamgym.estimator.map_management.marginalise_and_merge import separation
 from slamgym.estimator.map_management.policy import LandmarkPolicy, as_policy
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments.logs.ground_truth import true_landmarks_of
@@ -202,7 +202,7 @@ class WithoutAWindow:
         self._slam = make_estimator(name, **options)
 
     def __getattr__(self, name):
-        if name == "view_around":
+        if name == "local_view":
             raise AttributeError(name)
         return getattr(self._slam, name)
 
@@ -238,7 +238,7 @@ def test_to_look_around_the_robot_decides_the_same_as_to_look_at_the_whole_map(
         assert one.merged_ids == other.merged_ids
         changed |= bool(one.removed_ids or one.merged_ids)
     assert changed
-    assert len(near.filter.view_around(15.0).ids) < len(near.landmark_ids) - 100
+    assert len(near.filter.local_view(15.0).ids) < len(near.landmark_ids) - 100
 
 
 def test_new_identities_are_never_used_twice():

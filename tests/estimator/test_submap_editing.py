@@ -19,11 +19,11 @@ from test_submaps import (
     run,
 )
 
-from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
-from slamgym.estimator.map_management.marginalise_and_merge import (
+from slamgym.estimator.filters.marginalise_and_merge import (
     coincide,
     without_landmarks,
 )
+from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.angles import wrap_angle
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.unicycle_motion import predict_pose
@@ -319,7 +319,7 @@ def test_around_the_robot_it_believes_what_the_joined_map_does():
     for odometry, readings, ids, _ in laps(80):
         slam.predict(odometry)
         slam.update(readings, ids)
-        view, whole = slam.view_around(8.0), slam.belief()
+        view, whole = slam.local_view(8.0), slam.belief()
         n = 3 + 2 * len(view.ids)
         std = np.sqrt(np.diag(view.covariance[:n, :n]))
         part = part_of(whole, tuple(view.ids))
@@ -345,7 +345,7 @@ def test_looking_around_changes_nothing_in_the_submaps():
         for slam in (watched, silent):
             slam.predict(odometry)
             slam.update(readings, ids)
-        watched.view_around(5.0)
+        watched.local_view(5.0)
     assert_same_bits(watched.belief(), silent.belief())
     assert_same_bits(watched.local_belief(), silent.local_belief())
 
@@ -370,11 +370,11 @@ def test_what_lies_around_is_a_part_of_a_large_map_and_moves_with_the_robot():
     seen, nees = [], []
     for odometry, readings, ids, pose in wide_laps(250):
         slam.predict(odometry)
-        view = slam.view_around(8.0)
+        view = slam.local_view(8.0)
         gaps = view.mean[:2] - pose[:2]
         nees.append(gaps @ np.linalg.solve(view.covariance[:2, :2], gaps))
         slam.update(readings, ids)
-        seen.append(len(slam.view_around(8.0).ids))
+        seen.append(len(slam.local_view(8.0).ids))
     assert len(slam.landmark_ids) > 80
     assert max(seen[100:]) < 0.75 * len(slam.landmark_ids)
     assert np.mean(nees) < 6  # one run; of the order of 2
@@ -382,19 +382,19 @@ def test_what_lies_around_is_a_part_of_a_large_map_and_moves_with_the_robot():
     away = np.hypot(*(whole.landmarks - whole.pose[:2]).T)
     for reach in (8.0, 40.0):  # the second is farther than it held until now
         near = {i for i, d in zip(whole.landmark_ids, away, strict=True) if d < reach}
-        assert near <= set(slam.view_around(reach + 0.1).ids)
+        assert near <= set(slam.local_view(reach + 0.1).ids)
 
 
 def test_what_lies_around_learns_of_a_merge_and_of_a_removal():
     drive = list(laps(50))
     other, one = seen_often(drive)
     slam = run(made(submap_size=9), list(doubled(drive, {one: range(20, 50)}))[:-3])
-    slam.view_around(8.0)
+    slam.local_view(8.0)
     run(slam, list(doubled(drive, {one: range(20, 50)}))[-3:])
     before = slam.closed_count
     slam.merge(one, one + ALIAS)
     slam.remove([other])
-    view, whole = slam.view_around(8.0), slam.belief()
+    view, whole = slam.local_view(8.0), slam.belief()
     assert slam.closed_count == before
     assert {one + ALIAS, other}.isdisjoint(view.ids)
     part, n = part_of(whole, tuple(view.ids)), 3 + 2 * len(view.ids)
@@ -408,7 +408,7 @@ def test_what_lies_around_learns_of_a_merge_and_of_a_removal():
 
 def assert_as_joined(slam, tolerance):
     """Compare the view with the joined map, in standard deviations."""
-    view, whole = slam.view_around(0.0), slam.belief()
+    view, whole = slam.local_view(0.0), slam.belief()
     part, n = part_of(whole, tuple(view.ids)), 3 + 2 * len(view.ids)
     std = np.sqrt(np.diag(part.covariance))
     shift = view.mean[:n] - part.mean
@@ -439,7 +439,7 @@ def test_a_scan_for_which_it_is_taken_anew_counts_once():
         before, closed = len(surveys), slam.closed_count
         slam.update(readings, ids)
         if step == 120:
-            slam.view_around(1.0)
+            slam.local_view(1.0)
         elif len(surveys) > before and slam.closed_count == closed:
             assert_as_joined(slam, 1e-9)
             taken += 1
@@ -451,9 +451,9 @@ def test_what_was_asked_once_is_not_held_for_ever():
     surveys = surveys_of(slam)
     for step, (odometry, readings, ids, _) in enumerate(wide_laps(250)):
         slam.predict(odometry)
-        slam.view_around(5000.0 if step == 120 else 8.0)
+        slam.local_view(5000.0 if step == 120 else 8.0)
         slam.update(readings, ids)
-        sizes.append(len(slam.view_around(8.0).ids))
+        sizes.append(len(slam.local_view(8.0).ids))
         if step == 120:
             assert sizes[-1] == len(slam.landmark_ids) > 40
     assert max(sizes[160:]) < 0.75 * len(slam.landmark_ids)
@@ -467,7 +467,7 @@ def test_when_it_is_taken_anew_it_holds_what_scans_tell_of():
     for odometry, readings, ids, _ in wide_laps(250):
         slam.predict(odometry)
         slam.update(readings, ids)
-        view = slam.view_around(0.0)
+        view = slam.local_view(0.0)
         if slam.closed_count > closed:
             closed, met = slam.closed_count, met + len(ids)
             assert set(ids.tolist()) <= set(view.ids)
@@ -479,7 +479,7 @@ def test_it_is_taken_as_far_as_has_been_asked_lately():
     surveys = surveys_of(slam)
     for odometry, readings, ids, _ in wide_laps(100):
         slam.predict(odometry)
-        slam.view_around(30.0)
+        slam.local_view(30.0)
         slam.update(readings, ids)
     assert slam.closed_count > 2
     assert min(surveys) == 30.0
@@ -490,7 +490,7 @@ def test_a_look_at_all_there_is_holds_until_a_submap_is_closed():
     surveys = surveys_of(slam)
     for _ in range(3):
         for within in (20.0, 1e6):
-            assert set(slam.view_around(within).ids) == set(slam.landmark_ids)
+            assert set(slam.local_view(within).ids) == set(slam.landmark_ids)
     assert len(surveys) == 1
 
 
@@ -500,7 +500,7 @@ def test_where_there_are_too_many_it_claims_no_more_than_it_holds(monkeypatch):
     for odometry, readings, ids, _ in wide_laps(120):
         slam.predict(odometry)
         slam.update(readings, ids)
-        held, extent = set(slam.view_around(25.0).ids), slam._vicinity._extent
+        held, extent = set(slam.local_view(25.0).ids), slam._vicinity._extent
         whole = slam.belief()
         away = np.hypot(*(whole.landmarks - whole.pose[:2]).T)
         cut += len(held) < len(whole.landmark_ids)
@@ -544,7 +544,7 @@ def test_it_learns_of_a_merge_with_what_it_does_not_hold(monkeypatch, held_is_ke
     for odometry, readings, ids, _ in doubled(list(laps(72)), names):
         slam.predict(odometry)
         slam.update(readings, ids)
-        held = set(slam.view_around(0.0).ids)
+        held = set(slam.local_view(0.0).ids)
     assert slam.closed_count == 3
     known = set(slam.landmark_ids)
     one, other = next(
@@ -554,7 +554,7 @@ def test_it_learns_of_a_merge_with_what_it_does_not_hold(monkeypatch, held_is_ke
     )
     kept, gone = (one, other) if (one in held) == held_is_kept else (other, one)
     slam.merge(kept, gone)
-    assert kept in slam.view_around(0.0).ids
+    assert kept in slam.local_view(0.0).ids
     assert_as_joined(slam, 1e-9)
 
 
@@ -562,13 +562,13 @@ def test_it_goes_on_where_the_file_of_a_submap_is_lost(tmp_path):
     slam, drive = made(folder=tmp_path / "run", submap_size=5), list(laps(90))
     few = [(u, z[:5], ids[:5], pose) for u, z, ids, pose in drive]
     run(slam, few[:60])
-    slam.view_around(8.0)
+    slam.local_view(8.0)
     slam._run.closed.store._at_hand.clear()
     (tmp_path / "run" / "submap_000001.npy").unlink()
     closed = slam.closed_count
     run(slam, few[60:])
     assert slam.closed_count > closed + 2
-    gap = slam.view_around(0.0).mean[:2] - drive[-1][3][:2]
+    gap = slam.local_view(0.0).mean[:2] - drive[-1][3][:2]
     assert np.hypot(*gap) < 0.3
     with pytest.raises(ValueError, match="submap 1 cannot be read"):
         slam.belief()
@@ -579,10 +579,10 @@ def test_it_goes_on_where_the_map_cannot_be_joined(monkeypatch):
     for odometry, readings, ids, _ in drive[:20]:
         slam.predict(odometry)
         slam.update(readings, ids)
-        slam.view_around(8.0)
+        slam.local_view(8.0)
     monkeypatch.setattr("slamgym.estimator.large_maps.submaps.joining.ITERATIONS", 0)
     run(slam, drive[20:])
-    gap = slam.view_around(0.0).mean[:2] - drive[-1][3][:2]
+    gap = slam.local_view(0.0).mean[:2] - drive[-1][3][:2]
     assert np.hypot(*gap) < 0.3
     with pytest.raises(np.linalg.LinAlgError, match="did not converge"):
         slam.belief()
@@ -599,7 +599,7 @@ def edited_run(slam, drive, start=0):
             continue
         slam.predict(odometry)
         slam.update(readings, ids)
-        slam.view_around(6.0)
+        slam.local_view(6.0)
         if step in (14, 40):
             slam.remove([i for i in slam.landmark_ids if i % ALIAS not in (9, 12)][-3:])
         if step == 30:

@@ -7,14 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...filters.ekf import FRAMES, EkfSlam
-from ...filters.first_estimates import (
-    FirstEstimatesEkfSlam,
-    ObservabilityConstrainedEkfSlam,
-)
+from ...filters.first_estimates import FirstEstimatesEkfSlam
 from ...filters.invariant import InvariantEkfSlam
 from ...filters.iterated import IteratedEkfSlam
-from ...interface import Belief, UpdateReport
-from ...map_management.map_editor import MapView, access_to
+from ...filters.observability_constrained import ObservabilityConstrainedEkfSlam
+from ...interface import Belief, MapView, UpdateReport
+from ...map_management.map_editor import edit_map
 from ...support import argument_checks
 from ...support.argument_checks import LOWEST_ID, LandmarkIds
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
@@ -176,7 +174,7 @@ class CompressedEkfSlam:
             Where one is not in the map; nothing is then removed.
         """
         ids = argument_checks.mapped_identities(landmark_ids, self._slots)
-        access_to(self._local).remove([i for i in ids if i in self._near])
+        edit_map(self._local).remove([i for i in ids if i in self._near])
         for i in ids:
             self._near.pop(i, None)
             self._free.append(self._slots.pop(i))
@@ -198,7 +196,7 @@ class CompressedEkfSlam:
         ids = argument_checks.mapped_identities([kept, gone], self._slots)
         if not all(i in self._near for i in ids):
             self._regroup(ids, max(self._local_size or 0, len(self._near), 2))
-        access_to(self._local).merge(kept, gone)
+        edit_map(self._local).merge(kept, gone)
         self._near.pop(gone)
         self._free.append(self._slots.pop(gone))
 
@@ -250,7 +248,7 @@ class CompressedEkfSlam:
         frame = FRAMES[self._local.rules.frame]
         return Belief(mean, covariance, tuple(ids), frame)
 
-    def view_around(self, within: float) -> MapView:
+    def local_view(self, within: float) -> MapView:
         """Look at the pose, and at the landmarks that may be so near [m].
 
         Up to 5σ nearer than they seem to be; those of the local map in any case.

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...interface import Belief, UpdateReport
-from ...map_management.map_editor import MapView
+from ...interface import Belief, MapView, UpdateReport
 from ...models.angles import wrap_angle
 from ...support import argument_checks
 from ...support.argument_checks import LandmarkIds
@@ -277,7 +276,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         )
         return Belief(answer.mean, answer.covariance, tuple(ids), "additive")
 
-    def view_around(self, within: float) -> MapView:
+    def local_view(self, within: float) -> MapView:
         """Look at the pose, and at the landmarks that may be so near [m].
 
         Up to 10σ of the robot's position nearer than they seem to be: what is near the

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...filters.ekf import FRAMES, EkfSlam
-from ...map_management.map_editor import access_to
+from ...map_management.map_editor import edit_map
 from .joining import Gaussian
 from .landmark_index import Slots, link_name
 
@@ -81,12 +81,12 @@ class PresentSubmap:
         links = {i: link_name(slots[i]) for i in here if slots[i] in tied}
         self._rename(links)
         if alone := [i for i in here if i not in links]:
-            access_to(self.filter).remove(alone)
+            edit_map(self.filter).remove(alone)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being one, where it holds both; or rename one."""
         if kept in self and gone in self:
-            access_to(self.filter).merge(kept, gone)
+            edit_map(self.filter).merge(kept, gone)
         elif gone in self:
             self._rename({gone: kept})
 

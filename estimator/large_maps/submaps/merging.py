@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...error_frames import ErrorFrame
-from ...map_management.marginalise_and_merge import coincide, without_landmarks
+from ...filters.marginalise_and_merge import coincide, without_landmarks
 from .factor import retract
 from .store import Submap
 

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...filters.invariant import InvariantEkfSlam
-from ...interface import Belief, UpdateReport
-from ...map_management.map_editor import MapView, access_to, view_of
+from ...interface import Belief, MapView, UpdateReport
+from ...map_management.map_editor import edit_map
+from ...map_management.map_view import view_map
 from ...support import argument_checks
 from ...support.argument_checks import LandmarkIds
 from .store import LostSubmapError
@@ -115,7 +116,7 @@ class Vicinity:
         if slam is None or not self._extent.covers(slam._mean[:2], within):
             slam = self._take(*self._survey(max(within, *self._reaches)))
         self._reaches[-1] = max(within, self._reaches[-1])
-        return view_of(slam)
+        return view_map(slam)
 
     def renew(self) -> None:
         """Take it anew from the joined map; without one it goes on as it is."""
@@ -164,7 +165,7 @@ class Vicinity:
         if self._slam is None:
             return
         if held := [i for i in ids if i in self._slam._slots]:
-            access_to(self._slam).remove(held)
+            edit_map(self._slam).remove(held)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being one, after the submaps have been."""
@@ -173,7 +174,7 @@ class Vicinity:
         held = {kept, gone}.intersection(self._slam._slots)
         if len(held) == 2:
             with suppress(np.linalg.LinAlgError):
-                access_to(self._slam).merge(kept, gone)
+                edit_map(self._slam).merge(kept, gone)
         elif held:
             self.renew()
         self.remove([gone])

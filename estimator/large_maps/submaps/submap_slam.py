@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...filters.ekf import EkfSlam
 from ...filters.invariant import InvariantEkfSlam
-from ...interface import Belief, UpdateReport
-from ...map_management.map_editor import MapView
+from ...interface import Belief, MapView, UpdateReport
 from ...models.angles import wrap_angle
 from ...support import argument_checks
 from ...support.argument_checks import LandmarkIds
@@ -274,7 +273,7 @@ class SubmapSlam:
         """
         return self._run.local_belief()
 
-    def view_around(self, within: float = 0.0) -> MapView:
+    def local_view(self, within: float = 0.0) -> MapView:
         """Look at pose and near landmarks as the joined map has them, in every step.
 
         From the first call on, the filter follows the robot in a part of the joined

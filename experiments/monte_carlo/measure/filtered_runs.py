@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ....estimator.filters.batch import BatchSlam, BatchTrace, can_batch
 from ....estimator.filters.ekf import EkfSlam
-from ....estimator.interface import Belief, SlamEstimator
+from ....estimator.interface import Belief, SlamEstimator, SupportsTruth
 from ...runs.filter_settings import FilterSettings
 from ...runs.memory_check import refuse_large_maps
 from ...runs.simulated_runs import SimulatedRuns
@@ -151,10 +151,9 @@ def _step(
 def _tell_truth(
     slam: SlamEstimator, pose: Array, landmarks: Mapping[int, Array]
 ) -> None:
-    """Open the door for the truth of a filter that has one (``ideal``)."""
-    observe = getattr(slam, "observe_truth", None)
-    if observe is not None:
-        observe(pose, landmarks)
+    """Pass the truth to a filter that linearises there (``ideal``)."""
+    if isinstance(slam, SupportsTruth):
+        slam.observe_truth(pose, landmarks)
 
 
 def _is_finite(trace: BatchTrace, run: int, step: int) -> bool:

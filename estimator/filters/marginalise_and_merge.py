@@ -15,8 +15,8 @@ from ..error_frames import ErrorFrame
 Array = NDArray[np.float64]
 
 
-class GaussianMap(NamedTuple):
-    """Mean and covariance of a robot and its map."""
+class ConditionedMap(NamedTuple):
+    """Mean and covariance of robot and map after a condition."""
 
     mean: Array
     """Shape (3 + 2n,)."""
@@ -99,7 +99,7 @@ def coincide(
     *,
     frame: ErrorFrame = "additive",
     reference: Array | None = None,
-) -> GaussianMap:
+) -> ConditionedMap:
     """Condition a map on two of its landmarks being one: a reading of distance zero.
 
     The reading 0 = l_i − l_j has no noise.  With D = l̂_i − l̂_j::
@@ -127,7 +127,7 @@ def coincide(
 
     Returns
     -------
-    GaussianMap
+    ConditionedMap
         In it both landmarks have the same mean and covariance; drop either.
 
     Raises
@@ -160,11 +160,11 @@ def coincide(
     gains, shift = white[:, :-1], white[:, :-1].T @ white[:, -1]
     P = covariance - np.outer(gains[0], gains[0]) - np.outer(gains[1], gains[1])
     if frame == "additive":
-        return GaussianMap(mean + shift, P)
+        return ConditionedMap(mean + shift, P)
     return _composed(mean, P, shift)
 
 
-def _composed(mean: Array, covariance: Array, shift: Array) -> GaussianMap:
+def _composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
     """Compose an invariant correction with the state, and carry P along.
 
     ::
@@ -181,7 +181,7 @@ def _composed(mean: Array, covariance: Array, shift: Array) -> GaussianMap:
     way = _state(1j * (moved - points), 0.0)
     cross = np.outer(way, covariance[2])
     P = covariance + (cross + cross.T) + covariance[2, 2] * np.outer(way, way)
-    return GaussianMap(_state(moved, mean[2] + turn), P)
+    return ConditionedMap(_state(moved, mean[2] + turn), P)
 
 
 def _points(state: Array) -> NDArray[np.complex128]:
