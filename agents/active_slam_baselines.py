@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..envs.controllers.single import Waypoints
+from ..envs.controllers import Waypoints
 from ..sim_configs import Robot, Scenario
 from ..sim_configs.scenario_errors import closest
 from .active_slam import Situation

@@ -20,7 +20,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..envs.controllers.planned_path import planned_path
+from ..envs.controllers import planned_path
 from ..estimator.filters.batch import BatchStorage
 from ..sim_configs import Scenario
 from ..sim_configs.layouts import possible_positions

@@ -19,7 +19,7 @@ import gymnasium as gym
 from matplotlib.image import imsave
 
 import slamgym  # noqa: F401 (registers slamgym/LandmarkWorld-v0)
-from slamgym.envs.controllers.single import Waypoints
+from slamgym.envs.controllers import Waypoints
 from slamgym.sim_configs import load_scenario
 
 CORNERS = [(12.0, 0.0), (12.0, 12.0), (0.0, 12.0), (0.0, 2.0)]

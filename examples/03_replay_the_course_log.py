@@ -21,7 +21,7 @@ more certain than it may be.
 import sys
 from pathlib import Path
 
-from slamgym.envs.controllers.single import OpenLoop
+from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.figures import map_figure, save_figure
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.recording import record_episode

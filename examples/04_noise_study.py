@@ -16,7 +16,7 @@ It prints the table and writes ``results/04_noise_study.png``.  The command
 
 from pathlib import Path
 
-from slamgym.envs.controllers.single import OpenLoop
+from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.figures import NoisePanel, noise_study_figure, save_figure
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.noise_study.one_run import study_log

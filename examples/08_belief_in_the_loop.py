@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from slamgym.agents import BeliefObservation, BeliefObservationVector, InformationReward
-from slamgym.envs.controllers.single import Waypoints
+from slamgym.envs.controllers import Waypoints
 
 PICTURE = Path("results/08_belief_in_the_loop.png")
 ROUND = [(6, -6), (6, 6), (-6, 6), (-6, -6)]

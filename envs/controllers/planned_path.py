@@ -1,22 +1,19 @@
-"""The path that a scenario's controls mean to take."""
+"""The path of a scenario's controls without noise and walls."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...sim_configs import Scenario, action_sequence
+from ..robot.drive_equation import displacement
 
 
 def planned_path(scenario: Scenario) -> NDArray[np.float64]:
     """Compute the poses of the scenario's controls, without noise and walls.
 
-    ::
-
-        x' = x + d cos θ,    y' = y + d sin θ,    θ' = θ + α
-
     Returns
     -------
     ndarray of float64, shape (steps + 1, 3)
-        Poses (x, y, θ) [m, m, rad], the start first, headings not wrapped.
+        Poses (x, y, θ) [m, m, rad] from the start on; headings are not wrapped.
 
     Examples
     --------
@@ -27,10 +24,6 @@ def planned_path(scenario: Scenario) -> NDArray[np.float64]:
     distances, turns = (action_sequence(scenario) * scenario.dt).T
     x, y, heading = scenario.start.pose
     headings = np.cumsum([heading, *turns])
-    return np.column_stack(
-        [
-            np.cumsum([x, *(distances * np.cos(headings[:-1]))]),
-            np.cumsum([y, *(distances * np.sin(headings[:-1]))]),
-            headings,
-        ]
-    )
+    cos, sin = np.cos(headings[:-1]), np.sin(headings[:-1])
+    dx, dy = displacement(distances, np.zeros(len(distances)), cos, sin)
+    return np.column_stack([np.cumsum([x, *dx]), np.cumsum([y, *dy]), headings])

@@ -1,1 +1,1 @@
-"""The robot's body: how it moves, and how walls stop it."""
+"""The robot's body: its motion, and the walls that stop it."""

@@ -1,10 +1,6 @@
-"""Many robots' bodies at once, in numpy: the twin of `UnicycleBody` for batches.
+"""The bodies of many robots in numpy: the vector form of `UnicycleBody`.
 
-Symbols
--------
-p = (x, y, θ)     true robot pose in the world frame [m, m, rad]
-u = (d, α)        command: distance driven, then heading turned [m, rad]
-ε = (εx, εy, εα)  slip, in the frame of the old heading [m, m, rad]
+Symbols are those of `drive_equation`.
 """
 
 from collections.abc import Sequence
@@ -12,17 +8,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .unicycle_body import Wall, WallContacts
+from .drive_equation import displacement
+from .wall_contacts import Wall, WallContacts
 
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]
 
 
 class UnicycleBodies:
-    """B round bodies that move side by side, each in a world of its own.
+    """B round bodies, each in its own world.
 
-    Sums and products are those of `UnicycleBody`, number by number, so that their bits
-    agree; walls are asked by the same queries.
+    The results equal those of `UnicycleBody` to the bit: sums, products and queries of
+    walls are the same.
 
     Parameters
     ----------
@@ -53,8 +50,6 @@ class UnicycleBodies:
     def __init__(self, count: int, radius: float, walls: Sequence[Wall] = ()) -> None:
         self._contacts = WallContacts(radius, walls) if walls else None
         self._pose = np.zeros((3, count))  # rows x, y, θ
-        self._ahead = np.zeros((2, count))  # (cos θ, sin θ)
-        self._left = np.zeros((2, count))  # (-sin θ, cos θ)
         self.position = np.zeros((count, 1), dtype=np.complex128)
         self.inverse_heading = np.zeros((count, 1), dtype=np.complex128)
         self._arrive(self._pose)
@@ -64,7 +59,7 @@ class UnicycleBodies:
         return self._pose.T.copy()
 
     def place(self, worlds: Places, poses: Array) -> None:
-        """Put some bodies at rows (x, y, θ) [m, m, rad]."""
+        """Put some bodies at poses, rows (x, y, θ) [m, m, rad]."""
         pose = self._pose.copy()
         pose[:, worlds] = poses.T
         self._arrive(pose)
@@ -86,16 +81,16 @@ class UnicycleBodies:
         Returns
         -------
         ndarray, shape (B,), or None
-            Shares of the displacements, in [0, 1], that no wall held back; None where
-            there are no walls.
+            Shares of the displacements, in [0, 1], that the walls allowed; None without
+            walls.
         """
         change = np.empty(self._pose.shape)
-        ahead = (commands[:, 0] + slip[:, 0]) * self._ahead
-        displacement = np.add(ahead, slip[:, 1] * self._left, out=change[:2])
+        forward, sideways = commands[:, 0] + slip[:, 0], slip[:, 1]
+        change[0], change[1] = displacement(forward, sideways, self._cos, self._sin)
         share = None
         if self._contacts is not None:
-            share = self._contacts.free_shares(*self._pose[:2], *displacement)
-            displacement *= share
+            share = self._contacts.free_shares(*self._pose[:2], *change[:2])
+            change[:2] *= share
         np.add(commands[:, 1], slip[:, 2], out=change[2])
         change += self._pose
         if moving is not None:
@@ -104,15 +99,13 @@ class UnicycleBodies:
         return share
 
     def _arrive(self, pose: Array) -> None:
-        """Take the poses, and face their headings."""
+        """Set positions and headings."""
         self._pose = pose
-        cos, sin = np.cos(pose[2], out=self._ahead[0]), self._ahead[1]
-        np.sin(pose[2], out=sin)
-        np.negative(sin, out=self._left[0])
-        self._left[1] = cos
+        self._cos, self._sin = np.cos(pose[2]), np.sin(pose[2])
         _as_pairs(self.position)[...] = pose[:2].T
         heading = _as_pairs(self.inverse_heading)
-        heading[:, 0], heading[:, 1] = cos, self._left[0]
+        heading[:, 0] = self._cos
+        np.negative(self._sin, out=heading[:, 1])
 
 
 def _as_pairs(numbers: NDArray[np.complex128]) -> Array:

@@ -1,4 +1,4 @@
-"""The bearing-range sensor: which landmarks it sees, and what it reads of them.
+"""The bearing-range sensor: which landmarks it sees, and its readings.
 
 Symbols
 -------
@@ -6,8 +6,8 @@ p = (x, y, θ)  true robot pose in the world frame [m, m, rad]
 l = (lx, ly)   landmark [m, m], as the complex number lx + i ly
 z = (β, r)     reading: bearing from the robot's heading, and range [rad, m]
 
-Readings are kept as (all bearings, all ranges) here, so that each is contiguous.
-Every function takes leading axes too, for worlds simulated side by side.
+Here readings are stored as (all bearings, all ranges), so that both are contiguous.
+Every function accepts leading axes for worlds that are simulated together.
 """
 
 import math
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim_configs import Scenario
+from ..angles import wrap_bearings
 from .line_of_sight import LineOfSight
 from .noise_streams import MANY_STD, SensorNoise
 
@@ -26,31 +27,31 @@ BoolArray = NDArray[np.bool_]
 
 _PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
 _UNSEEN = np.array(0.0)
-_LAST = np.array(np.inf)  # sorts behind every other row
+_LAST = np.array(np.inf)  # sorts after every other row
 
 
 class AnonymousScan(NamedTuple):
-    """Readings without identities, packed at the front in random order."""
+    """Readings without identities, in random order, empty rows last."""
 
     readings: Array
     """(β, r), zeros in empty rows, shape (2, …, M) [rad, m]."""
     mask: BoolArray
-    """Which rows hold a reading, shape (…, M)."""
+    """Rows with a reading, shape (…, M)."""
     landmark_ids: NDArray[np.int64]
     """The true landmark of each row, -1 for clutter and empty rows, shape (…, M)."""
 
 
 class BearingRangeSensor:
-    """Measures N landmarks as a scenario's sensor does.
+    """Simulates the sensor of a scenario.
 
-    A landmark is read when its true range lies in [min_range, max_range] and its true
-    bearing within half the field of view of the heading, no wall hides it, the reading
-    does not drop out, and its noisy range is above zero.
+    The sensor reads a landmark if its true range is in [min_range, max_range], its true
+    bearing is within half the field of view, no wall hides it, the reading does not
+    drop out, and the noisy range is positive.
 
     Parameters
     ----------
     scenario : Scenario
-        Whose sensor and walls are meant.
+        Source of the sensor's settings and the walls.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -70,7 +71,7 @@ class BearingRangeSensor:
         inverse_heading: ComplexArray,
         noise: SensorNoise,
     ) -> tuple[Array, BoolArray]:
-        """Measure the landmarks from one pose.
+        """Measure the landmarks from one pose per world.
 
         ::
 
@@ -85,83 +86,67 @@ class BearingRangeSensor:
         inverse_heading : complex ndarray, shape () or (…, 1)
             cos θ - i sin θ.
         noise : SensorNoise
-            Of this step.
+            Noise of this step.
 
         Returns
         -------
         readings : ndarray, shape (2, …, N)
             (β in [-π, π), r), zeros where unseen [rad, m].
         mask : bool ndarray, shape (…, N)
-            Which landmarks are seen.
+            Landmarks that the sensor reads.
         """
         error, nearest, _, _ = noise
         relative = (landmarks - position) * inverse_heading
-        readings = np.empty(error.shape)  # true ones first
+        readings = np.empty(error.shape)  # without noise at first
         y, x = relative.imag, relative.real
-        if y.ndim > 1:  # twice as fast, when there are many
+        if y.ndim > 1:  # contiguous copies are twice as fast for many
             y, x = y.copy(), x.copy()
         bearings = np.arctan2(y, x, readings[0])
-        ranges = np.abs(relative, readings[1])
-        mask: BoolArray = ranges > nearest
-        if self._max_range is not None:
-            mask &= ranges <= self._max_range
-        if self._half_view is not None:
-            mask &= np.abs(bearings) <= self._half_view
+        np.abs(relative, readings[1])
+        mask = self._in_view(readings, nearest)
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
-        if self._growth:
-            error = np.stack([error[0], error[1] * (self._std + self._growth * ranges)])
-        readings += error
+        readings += self._scaled(error, readings[1])
         if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
             wrap_bearings(bearings)
-        if mask.ndim > 1:
-            return _only_seen(readings, mask), mask
-        seen = np.zeros(readings.shape)
-        np.copyto(seen, readings, where=mask)
-        return seen, mask
+        if np.count_nonzero(mask) < mask.size:
+            readings = np.where(mask, readings, _UNSEEN)
+        return readings, mask
+
+    def _in_view(self, readings: Array, nearest: Array) -> BoolArray:
+        """Return which noise-free readings, (2, …, N), the sensor can take."""
+        mask: BoolArray = readings[1] > nearest
+        if self._max_range is not None:
+            mask &= readings[1] <= self._max_range
+        if self._half_view is not None:
+            mask &= np.abs(readings[0]) <= self._half_view
+        return mask
+
+    def _scaled(self, error: Array, ranges: Array) -> Array:
+        """Scale the range error where its standard deviation grows with the range."""
+        if not self._growth:
+            return error
+        return np.stack([error[0], error[1] * (self._std + self._growth * ranges)])
 
 
 def _limit(value: float, above: float) -> Array | None:
-    """Keep a limit in the form that compares fastest, or None if it has no effect."""
+    """Return a limit as a 0-d array, or None if it has no effect."""
     return np.array(value) if value < above else None
-
-
-def _only_seen(readings: Array, mask: BoolArray) -> Array:
-    """Put zeros where the mask is False, in the way that is fastest for many."""
-    if np.count_nonzero(mask) == mask.size:
-        return readings
-    return np.where(mask, readings, _UNSEEN)
-
-
-def wrap_bearings(bearings: Array) -> None:
-    """Bring angles into [-π, π) in place; those that lie there keep every bit.
-
-    Examples
-    --------
-    >>> bearings = np.array([0.1, np.pi, 1.0 - 2 * np.pi])
-    >>> wrap_bearings(bearings)
-    >>> bearings.round(12)
-    array([ 0.1       , -3.14159265,  1.        ])
-    """
-    outside = (bearings >= np.pi) | (bearings < -np.pi)
-    wrapped = (bearings[outside] + np.pi) % (2 * np.pi) - np.pi
-    wrapped[wrapped >= np.pi] = -np.pi  # a tiny negative remainder rounds up to 2π
-    bearings[outside] = wrapped
 
 
 def hide_identities(
     readings: Array, mask: BoolArray, noise: SensorNoise
 ) -> AnonymousScan:
-    """Mix readings with clutter and pack them at the front in random order.
+    """Mix readings with clutter in random order, empty rows last.
 
     Parameters
     ----------
     readings : ndarray, shape (2, …, N)
         (β, r) of each landmark, zeros where unseen [rad, m].
     mask : bool ndarray, shape (…, N)
-        Which landmarks are seen.
+        Landmarks that the sensor reads.
     noise : SensorNoise
-        Of this step; its clutter and its order are used.
+        Noise of this step; only its clutter and order are used.
 
     Returns
     -------
@@ -183,7 +168,7 @@ def hide_identities(
 
 
 def _take(rows: Array, places: NDArray[np.intp]) -> Array:
-    """Sort the last axis of rows, (3, …, M), by places, (…, M)."""
+    """Reorder the last axis of rows, (3, …, M), by places, (…, M)."""
     if places.ndim == 1:
         return rows[:, places]  # 20 µs faster
     return np.take_along_axis(rows, places[None], axis=-1)

@@ -1,4 +1,4 @@
-"""Which landmarks a robot sees, and which a wall hides."""
+"""Occlusion: which landmarks a wall hides from the robot."""
 
 from collections.abc import Sequence
 
@@ -9,11 +9,11 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
-_MOUNTED = 1e-6  # a landmark so near to a wall's line hangs on the wall [m]
+_MOUNTED = 1e-6  # a landmark this near to the line of a wall is mounted on it [m]
 
 
 class LineOfSight:
-    """Straight walls without thickness that hide what is behind them.
+    """Straight walls without thickness that hide the landmarks behind them.
 
     A landmark mounted on a wall (within 1 µm of its line) is not hidden by that wall.
 
@@ -40,7 +40,7 @@ class LineOfSight:
         self._mounted = _MOUNTED * np.abs(self._along)
 
     def blocked(self, landmarks: ComplexArray, position: ComplexArray) -> BoolArray:
-        """Tell which lines of sight cross a wall; its end points belong to it.
+        """Return which lines of sight cross a wall; its end points belong to it.
 
         With δ = l - p, and the ends a and b of a wall relative to p, the line from p
         to l passes between them if δ × a and δ × b differ in sign, and l lies behind

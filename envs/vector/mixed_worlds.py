@@ -11,7 +11,7 @@ from ..landmark_world import LandmarkWorldEnv, Observation
 Array = NDArray[np.float64]
 
 
-class SeparateWorlds:
+class MixedWorlds:
     """B single worlds, stepped one after the other.
 
     For worlds whose scenarios differ. All have equally many landmarks, and either all
@@ -32,7 +32,7 @@ class SeparateWorlds:
     >>> from slamgym.sim_configs import load_scenario
     >>> scenario = load_scenario("six_landmarks")
     >>> other = scenario.with_changes(start={"pose": [1.0, 0.0, 0.0]})
-    >>> worlds = SeparateWorlds([scenario, other])
+    >>> worlds = MixedWorlds([scenario, other])
     >>> worlds.reset([np.random.default_rng(seed) for seed in (0, 1)])
     >>> worlds.start_estimates[:, 0]
     array([0., 1.])

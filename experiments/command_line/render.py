@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from ...envs.controllers.single import Controller
+from ...envs.controllers import Controller
 from ...envs.landmark_world import LandmarkWorldEnv, Observation
 from ...envs.rendering.renderer import write_video
 from ...estimator.interface import SlamEstimator

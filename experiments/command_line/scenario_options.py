@@ -5,7 +5,7 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from ...envs.controllers.single import CONTROLLERS, Controller, make_controller
+from ...envs.controllers import CONTROLLERS, Controller, make_controller
 from ...sim_configs import Scenario, load_scenario
 from ..logs.recording import record_episode
 from ..logs.slamlog import SlamLog

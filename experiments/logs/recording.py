@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from ...envs.controllers.single import Controller
+from ...envs.controllers import Controller
 from ...envs.landmark_world import LandmarkWorldEnv, Observation
 from ...sim_configs import Scenario, load_scenario
 from .events import OdometryRow, Scan
@@ -34,7 +34,7 @@ def record_episode(
     scenario : Scenario, mapping, str or Path
         The world, as in :func:`slamgym.sim_configs.load_scenario`.
     controller : Controller
-        What drives, see :mod:`slamgym.envs.controllers.single`.
+        What drives, see :mod:`slamgym.envs.controllers`.
     seed : int
         Fixes everything random in the world.
     progress : callable, optional
@@ -50,7 +50,7 @@ def record_episode(
 
     Examples
     --------
-    >>> from slamgym.envs.controllers.single import OpenLoop
+    >>> from slamgym.envs.controllers import OpenLoop
     >>> from slamgym.sim_configs import action_sequence, load_scenario
     >>> scenario = load_scenario("six_landmarks").with_changes(steps=2)
     >>> driver = OpenLoop(action_sequence(scenario), scenario.robot)

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from gymnasium.utils import seeding
 
-from ...envs.controllers.vector import make_controller_batch
-from ...envs.vector.mixed_worlds import SeparateWorlds
+from ...envs.controllers import make_vector_controller
+from ...envs.vector.mixed_worlds import MixedWorlds
 from ...envs.vector.world_batch import WorldBatch
 from ...sim_configs import Scenario, drawn_scenario
 from .trajectory import Trajectory
@@ -64,7 +64,7 @@ def drive_episodes(
     worlds = _worlds(scenario, scenarios)
     worlds.reset([seeding.np_random(seed)[0] for seed in seeds])
     rngs = [np.random.default_rng([seed, _CONTROLLER_STREAM]) for seed in seeds]
-    drivers = make_controller_batch(controller, scenarios, rngs)
+    drivers = make_vector_controller(controller, scenarios, rngs)
     record = _Record(worlds, scenario.steps)
     for step in range(scenario.steps):
         actions = drivers.act(worlds.poses, step)
@@ -80,16 +80,16 @@ def drive_episodes(
 
 def _worlds(
     scenario: Scenario, scenarios: Sequence[Scenario]
-) -> WorldBatch | SeparateWorlds:
+) -> WorldBatch | MixedWorlds:
     if scenario.randomise is None:
         return WorldBatch(scenario, len(scenarios))
-    return SeparateWorlds(scenarios)
+    return MixedWorlds(scenarios)
 
 
 class _Record:
     """What happened to B worlds, as arrays that are filled step by step."""
 
-    def __init__(self, worlds: WorldBatch | SeparateWorlds, steps: int) -> None:
+    def __init__(self, worlds: WorldBatch | MixedWorlds, steps: int) -> None:
         self._worlds = worlds
         count, rows = worlds.mask.shape
         self._landmarks = worlds.landmarks

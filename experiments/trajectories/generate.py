@@ -5,7 +5,7 @@ from os import PathLike
 from pathlib import Path
 from reprlib import repr as short_repr
 
-from ...envs.controllers.single import CONTROLLERS
+from ...envs.controllers import CONTROLLERS
 from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_errors import closest

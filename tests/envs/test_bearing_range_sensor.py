@@ -4,10 +4,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from slamgym.envs.angles import wrap_bearings
 from slamgym.envs.sensors.bearing_range import (
     BearingRangeSensor,
     hide_identities,
-    wrap_bearings,
 )
 from slamgym.envs.sensors.line_of_sight import LineOfSight
 from slamgym.envs.sensors.noise_streams import (

@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.controllers.single import (
+from slamgym.envs.controllers import (
     CONTROLLERS,
     OpenLoop,
+    VectorOpenLoop,
+    VectorWaypoints,
     Waypoints,
     make_controller,
-)
-from slamgym.envs.controllers.vector import (
-    OpenLoopBatch,
-    WaypointsBatch,
-    make_controller_batch,
+    make_vector_controller,
 )
 from slamgym.sim_configs import Robot, list_presets, load_scenario
 
@@ -34,7 +32,7 @@ def test_every_robot_drives_as_with_a_controller_of_its_own(preset, name):
     envs = [LandmarkWorldEnv(scenario) for _ in range(3)]
     poses = [env.reset(seed=seed)[1]["pose"] for seed, env in enumerate(envs)]
     singles = [make_controller(name, scenario, rng) for rng in generators(3)]
-    batch = make_controller_batch(name, [scenario] * 3, generators(3))
+    batch = make_vector_controller(name, [scenario] * 3, generators(3))
     for step in range(scenario.steps):
         actions = batch.act(poses, step)
         assert actions.tolist() == one_by_one(singles, poses, step)
@@ -51,7 +49,7 @@ def test_worlds_may_differ_in_start_and_limits(name):
     ]
     rngs = generators(3)
     singles = [make_controller(name, scenarios[k], rngs[k]) for k in range(3)]
-    batch = make_controller_batch(name, scenarios, generators(3))
+    batch = make_vector_controller(name, scenarios, generators(3))
     poses = np.array(starts)
     rng = np.random.default_rng(5)
     for step in range(200):
@@ -66,7 +64,7 @@ def test_waypoints_that_loop_and_that_end_go_side_by_side():
         lambda loop=loop: Waypoints(points, Robot(), dt=0.5, tolerance=0.2, loop=loop)
         for loop in (True, False)
     ]
-    singles, batch = [make() for make in made], WaypointsBatch([m() for m in made])
+    singles, batch = [make() for make in made], VectorWaypoints([m() for m in made])
     rng, ended = np.random.default_rng(0), 0
     for step in range(300):
         poses = np.column_stack([rng.uniform(-0.3, 1.5, (2, 2)), rng.uniform(-4, 4, 2)])
@@ -81,20 +79,20 @@ def test_a_waypoint_just_within_tolerance_counts_as_reached():
     driver, batched = (
         Waypoints(points, Robot(), dt=1.0, tolerance=0.5) for _ in range(2)
     )
-    batch = WaypointsBatch([batched])
+    batch = VectorWaypoints([batched])
     assert batch.act([pose], 0).tolist() == one_by_one([driver], [pose], 0)
 
 
 def test_step_zero_starts_anew():
     points = [(1.0, 0.0), (0.0, 0.0)]
-    batch = WaypointsBatch([Waypoints(points, Robot(), dt=1.0, tolerance=0.1)])
+    batch = VectorWaypoints([Waypoints(points, Robot(), dt=1.0, tolerance=0.1)])
     first = batch.act([(0.0, 0.0, 0.0)], 0)
     batch.act([(1.0, 0.0, 0.0)], 1)
     assert batch.act([(0.0, 0.0, 0.0)], 0).tolist() == first.tolist() == [[1.0, 0.0]]
 
 
 def test_actions_handed_out_are_not_touched_again():
-    batch = OpenLoopBatch([OpenLoop([(1.0, 0.0), (0.5, 0.1)], Robot())])
+    batch = VectorOpenLoop([OpenLoop([(1.0, 0.0), (0.5, 0.1)], Robot())])
     actions = batch.act([(0.0, 0.0, 0.0)], 0)
     actions[:] = 7.0
     assert batch.act([(0.0, 0.0, 0.0)], 0).tolist() == [[1.0, 0.0]]
@@ -102,12 +100,12 @@ def test_actions_handed_out_are_not_touched_again():
 
 def test_wrong_poses_and_names_are_named():
     scenario = load_scenario("loop")
-    batch = make_controller_batch("waypoints", [scenario] * 2, generators(2))
+    batch = make_vector_controller("waypoints", [scenario] * 2, generators(2))
     with pytest.raises(ValueError, match=r"poses must be finite.* each of 2 robots"):
         batch.act(np.zeros((3, 3)), 0)
     with pytest.raises(ValueError, match="poses must be finite"):
         batch.act([(0.0, 0.0, np.nan), (0.0, 0.0, 0.0)], 0)
     with pytest.raises(ValueError, match="did you mean 'waypoints'"):
-        make_controller_batch("waypoint", [scenario], generators(1))
+        make_vector_controller("waypoint", [scenario], generators(1))
     with pytest.raises(ValueError, match="equally many, at least 1, got 1 and 2"):
-        make_controller_batch("random", [scenario], generators(2))
+        make_vector_controller("random", [scenario], generators(2))

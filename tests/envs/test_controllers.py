@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slamgym.envs.controllers.planned_path import planned_path
-from slamgym.envs.controllers.single import (
+from slamgym.envs.controllers import (
     CONTROLLERS,
     OpenLoop,
-    RandomSmooth,
+    RandomWalk,
     Waypoints,
     make_controller,
+    planned_path,
 )
 from slamgym.sim_configs import Robot, list_presets, load_scenario
 
@@ -193,7 +193,7 @@ def test_a_plan_that_stays_put_is_followed_by_standing_still():
 
 
 def wander(*, steps, dt, correlation_time=5.0, seed=0):
-    driver = RandomSmooth(rng(seed), ROBOT, dt=dt, correlation_time=correlation_time)
+    driver = RandomWalk(rng(seed), ROBOT, dt=dt, correlation_time=correlation_time)
     return np.array([driver.act(ORIGIN, step) for step in range(steps)])
 
 
@@ -221,14 +221,14 @@ def test_wandering_goes_forwards_only():
 
 
 def test_wandering_starts_anew_at_step_zero():
-    driver = RandomSmooth(rng(), ROBOT, dt=0.01, correlation_time=100.0)
+    driver = RandomWalk(rng(), ROBOT, dt=0.01, correlation_time=100.0)
     starts = np.array([driver.act(ORIGIN, 0)[1] for _ in range(500)])
     assert abs(np.corrcoef(starts[:-1], starts[1:])[0, 1]) < 0.15
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_beyond_its_reach_a_wanderer_turns_home(side):
-    driver = RandomSmooth(rng(), ROBOT, dt=0.5, home=(5.0, 0.0), reach=2.0)
+    driver = RandomWalk(rng(), ROBOT, dt=0.5, home=(5.0, 0.0), reach=2.0)
     pose = (5.0, 3.0 * side, 0.0)
     turns = np.array([driver.act(pose, step)[1] for step in range(200)])
     assert (turns * side < 0).all()
@@ -237,14 +237,14 @@ def test_beyond_its_reach_a_wanderer_turns_home(side):
 @given(seed=st.integers(0, 1000))
 @settings(max_examples=10, deadline=None)
 def test_a_wanderer_stays_near_its_home(seed):
-    driver = RandomSmooth(rng(seed), ROBOT, dt=0.5, home=(3.0, 4.0), reach=5.0)
+    driver = RandomWalk(rng(seed), ROBOT, dt=0.5, home=(3.0, 4.0), reach=5.0)
     path = drive(driver, 1000, dt=0.5)
     assert np.linalg.norm(path[:, :2] - (3.0, 4.0), axis=1).max() < 5.0 + 3.0
 
 
 def test_within_its_reach_a_wanderer_is_free():
     free, bound = (
-        RandomSmooth(rng(), ROBOT, dt=0.5, reach=reach) for reach in (math.inf, 9.0)
+        RandomWalk(rng(), ROBOT, dt=0.5, reach=reach) for reach in (math.inf, 9.0)
     )
     for step in range(20):
         pose = (8.0, 0.0, 0.1)
@@ -273,4 +273,4 @@ def test_bad_settings_are_refused(bad):
     with pytest.raises(ValueError, match="tolerance must be finite and > 0"):
         Waypoints([(1.0, 0.0)], ROBOT, dt=0.5, tolerance=bad)
     with pytest.raises(ValueError, match="correlation_time must be finite and > 0"):
-        RandomSmooth(rng(), ROBOT, dt=0.5, correlation_time=bad)
+        RandomWalk(rng(), ROBOT, dt=0.5, correlation_time=bad)

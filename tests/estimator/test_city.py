@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slamgym.envs.controllers.planned_path import planned_path
+from slamgym.envs.controllers import planned_path
 from slamgym.sim_configs import ScenarioError, load_scenario, place_landmarks
 from slamgym.sim_configs.controls import BlocksSequence, command_cycle
 from slamgym.sim_configs.layouts import StreetsLayout

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from slamgym.envs.controllers.single import OpenLoop
+from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.runs.filter_settings import settings_for
 from slamgym.experiments.runs.replay import replay

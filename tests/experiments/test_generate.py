@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from slamgym.envs.controllers.single import CONTROLLERS
+from slamgym.envs.controllers import CONTROLLERS
 from slamgym.experiments.command_line import generate as generate_command
 from slamgym.experiments.command_line import reporter
 from slamgym.experiments.command_line.errors import InterruptedRunError

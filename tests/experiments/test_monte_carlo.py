@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from slamgym.envs.controllers.single import make_controller
+from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, make_estimator
 from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.logs.recording import record_episode

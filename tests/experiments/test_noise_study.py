@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slamgym.envs.controllers.single import OpenLoop
+from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import Scan
 from slamgym.experiments.noise_study.one_run import (

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 import slamgym  # noqa: F401 (registers the environment)
-from slamgym.envs.controllers.single import OpenLoop, Waypoints, make_controller
+from slamgym.envs.controllers import OpenLoop, Waypoints, make_controller
 from slamgym.estimator import make_estimator
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import (

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slamgym.envs.controllers.planned_path import planned_path
+from slamgym.envs.controllers import planned_path
 from slamgym.sim_configs import (
     ScenarioError,
     action_sequence,
