@@ -1,12 +1,16 @@
-"""Whether a covariance fits into memory: told before it is filled, with the figures."""
+"""Refuse a covariance that does not fit into memory, before it is filled."""
+
+from __future__ import annotations
 
 from math import inf, sqrt
 from pathlib import Path
 
-# What takes less than this is not worth the question [bytes].
+import psutil
+
+# Less than this is not checked [bytes].
 SMALL = 2**24
 
-_SYSTEM, _CONTAINER = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
+_CONTAINER = Path("/sys/fs/cgroup")
 
 
 def covariance_bytes(landmarks: int) -> int:
@@ -21,21 +25,19 @@ def covariance_bytes(landmarks: int) -> int:
 
 
 def available_memory() -> float:
-    """Return what may be filled without swapping [bytes], inf where nobody tells.
-
-    Linux tells, of the machine and of a container.  Where a system refuses to allocate
-    what it does not have, as Windows does, numpy raises the error by itself.
-    """
+    """Return what may be filled without swapping [bytes], inf where it is unknown."""
     try:
-        lines = (line.split() for line in _SYSTEM.read_text().splitlines())
-        free = next(1024.0 * int(n) for name, n, *_ in lines if name == "MemAvailable:")
-        return min(free, _left_to_container())
-    except (OSError, StopIteration, ValueError):
-        return inf
+        free = float(psutil.virtual_memory().available)
+    except (OSError, KeyError):
+        free = inf
+    return min(free, _left_to_container())
 
 
 def _left_to_container() -> float:
-    """Return what a control group's limit leaves [bytes]; cached files give way."""
+    """Return what the limit of a control group leaves [bytes].
+
+    Cached files count as free.
+    """
     try:
         limit, used = (
             float((_CONTAINER / name).read_text().strip().replace("max", "inf"))
@@ -51,21 +53,23 @@ def _left_to_container() -> float:
 def refuse_beyond_memory(
     what: str, needed: float, instead: str, *, held: float = 0.0
 ) -> None:
-    """Refuse what takes more memory than there is.
+    """Refuse what takes more memory than is available.
 
     Parameters
     ----------
     what : str
-        What takes it.
+        What takes the memory.
     needed : float
-        How much, of which ``held`` is held already [bytes].
+        How much it takes [bytes].
     instead : str
-        What to do.
+        What the user may do.
+    held : float
+        How much of it is held already [bytes].
 
     Raises
     ------
     MemoryError
-        Where it does not suffice, with both figures.
+        Where it does not fit, with both figures.
     """
     if needed < SMALL:
         return
@@ -78,19 +82,19 @@ def refuse_beyond_memory(
 
 
 def landmarks_that_fit(least: int, wished: int, copies: int = 1) -> int:
-    """Return for how many landmarks to make room: the wished, or what memory allows.
+    """Return the number of landmarks to allocate for, as far as memory allows.
 
     Parameters
     ----------
     least, wished : int
-        How many there must be room for, and how many there would better be.
+        Smallest and desired number of landmarks.
     copies : int
-        How many covariances of that size there will be.
+        Number of covariances of that size.
 
     Raises
     ------
     MemoryError
-        Where there is no room for the least.
+        Where the smallest number does not fit.
     """
     if copies * covariance_bytes(wished) < SMALL:
         return wished

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 LAYERS = ("estimator", "sim_configs", "envs", "agents", "experiments")
 MAY_IMPORT = {
-    "estimator": {"numpy", "scipy", "numba", "estimator"},
+    "estimator": {"numpy", "scipy", "numba", "psutil", "estimator"},
     "sim_configs": {"numpy", "pydantic", "pydantic_core", "sim_configs"},
     "envs": {"numpy", "gymnasium", "pymunk", "sim_configs", "envs"},
     "agents": {"numpy", "gymnasium", "sim_configs", "envs", "estimator", "agents"},

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import psutil
 import pytest
 from town_drives import TOWN_MOTION_STD, map_all, town, wander
 
@@ -135,18 +136,23 @@ def test_a_belief_that_memory_does_not_hold_is_refused(leave):
 def test_what_is_available_is_that_of_machine_and_container(
     limit, current, expected, tmp_path, monkeypatch
 ):
-    (tmp_path / "meminfo").write_text("MemTotal: 9000 kB\nMemAvailable: 4000 kB\n")
+    sizes = {"MemTotal": 9000, "MemFree": 1000, "MemAvailable": 4000}
+    others = ("Buffers", "Cached", "Shmem", "Active", "Inactive", "Slab")
+    sizes |= dict.fromkeys(others, 100)
+    lines = [f"{name}: {size} kB\n" for name, size in sizes.items()]
+    (tmp_path / "meminfo").write_text("".join(lines))
     if limit:
         (tmp_path / "memory.max").write_text(f"{limit}\n")
         (tmp_path / "memory.current").write_text(f"{current}\n")
         (tmp_path / "memory.stat").write_text("anon 2100000\nfile 400000\n")
-    monkeypatch.setattr(memory_limit, "_SYSTEM", tmp_path / "meminfo")
+    monkeypatch.setattr(psutil, "PROCFS_PATH", str(tmp_path))
     monkeypatch.setattr(memory_limit, "_CONTAINER", tmp_path)
     assert memory_limit.available_memory() == expected
 
 
 def test_where_the_system_does_not_tell_nothing_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(memory_limit, "_SYSTEM", tmp_path / "missing")
+    monkeypatch.setattr(psutil, "PROCFS_PATH", str(tmp_path))
+    monkeypatch.setattr(memory_limit, "_CONTAINER", tmp_path)
     assert memory_limit.available_memory() == np.inf
     memory_limit.refuse_beyond_memory("a map", 1e15, "take less")
 
