@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimator.filters.batch import BatchSlam, BatchStorage
+from ..estimator.filters.batch import BatchSlam
+from ..estimator.filters.batch_results import BatchStorage
 from .estimator_choice import BeliefOfMap
 
 Array = NDArray[np.float64]

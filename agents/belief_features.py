@@ -21,7 +21,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..envs.controllers import planned_path
-from ..estimator.filters.batch import BatchStorage
+from ..estimator.filters.batch_results import BatchStorage
 from ..sim_configs import Scenario
 from ..sim_configs.layouts import possible_positions
 from .belief_kernels import show_beliefs

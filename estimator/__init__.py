@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from .check_estimator import EstimatorContractError as EstimatorContractError
 from .check_estimator import check_estimator as check_estimator
 from .filters.batch import BatchSlam as BatchSlam
-from .filters.batch import BatchTrace as BatchTrace
 from .filters.batch import can_batch as can_batch
+from .filters.batch_results import BatchTrace as BatchTrace
 from .filters.ekf import EkfSlam as EkfSlam
 from .filters.first_estimates import FirstEstimatesEkfSlam as FirstEstimatesEkfSlam
 from .filters.ideal import IdealEkfSlam as IdealEkfSlam

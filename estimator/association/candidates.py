@@ -1,7 +1,10 @@
-"""What each row of a scan is of: a landmark of the map, a tentative one, or unclear.
+"""Associate each row of a scan with a landmark, a candidate for one, or neither.
 
-A plan changes nothing: it is carried out after the filter has accepted the scan.
+An association changes no belief.  It takes effect after the filter has accepted the
+scan.
 """
+
+from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,16 +31,16 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Candidates:
-    """Who waits outside the map, and which identity is the next to give."""
+    """Landmarks that are not in the map yet, and the next identity to assign."""
 
     tentative: TentativeLandmarks = field(default_factory=TentativeLandmarks.none)
     """Landmarks without an identity."""
     waiting: Mapping[int, Sequence[int]] = field(default_factory=dict)
-    """Given identities that are not trusted yet, and in which scans they were seen."""
+    """Given identities that are not trusted yet, and the scans that showed them."""
     next_id: int = 0
     """Above all identities so far."""
     scan: int = 0
-    """How many scans there were."""
+    """Number of scans so far."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
@@ -50,8 +53,8 @@ class Candidates:
         }
 
     @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any]) -> "Candidates":
-        """Take back what :meth:`state_dict` returned."""
+    def from_state_dict(cls, state: Mapping[str, Any]) -> Candidates:
+        """Restore what :meth:`state_dict` returned."""
         waiting: dict[int, list[int]] = {}
         for landmark_id, scan in np.asarray(state["waiting"]).tolist():
             waiting.setdefault(landmark_id, []).append(scan)
@@ -64,7 +67,7 @@ class Candidates:
 
 
 class ScanAssociation:
-    """The plan for one scan of so many rows.
+    """Association of the rows of one scan.
 
     Parameters
     ----------
@@ -72,6 +75,7 @@ class ScanAssociation:
     candidates : Candidates
         Before the scan.
     rows : int
+        Number of readings in the scan.
     """
 
     def __init__(
@@ -82,25 +86,26 @@ class ScanAssociation:
         self._waiting = dict(candidates.waiting)
         self._next_id, self._scan = candidates.next_id, candidates.scan
         self.row_ids: list[int | None] = [None] * rows
-        """For each row the landmark whose reading the filter shall take it for."""
+        """For each row the landmark that the filter associates it with, if any."""
         self.confirmed: list[int] = []
-        """Landmarks that have been tentative until now."""
+        """Landmarks that were tentative before this scan."""
         self.tentative_rows: list[int] = []
         self.ambiguous_rows: list[int] = []
         self.explained: set[int] = set()
-        """Landmarks that some row may be of: they are not missing."""
+        """Landmarks that some row may belong to, so that they are not missing."""
 
     @property
     def candidates(self) -> Candidates:
-        """Who waits outside after the scan."""
+        """The candidates after the scan."""
         return Candidates(self._tentative, self._waiting, self._next_id, self._scan + 1)
 
     def associate(
         self, readings: Array, view: MapView, noise: Noise, min_range: float
     ) -> None:
-        """Find out what readings (m, 2) without identity are of.
+        """Associate readings (m, 2) that have no identity.
 
-        Readings closer than ``min_range`` [m] have no bearing to tell them by.
+        Readings closer than ``min_range`` [m] have no usable bearing: they are
+        ambiguous.
         """
         policy = self._policy
         is_near = readings[:, 1] < min_range
@@ -123,14 +128,14 @@ class ScanAssociation:
         self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         new = rows[slots == NEW]
         if len(new):
-            self._consider(new, readings, noise)
+            self._match_tentative(new, readings, noise)
         self.ambiguous_rows.sort()
         self.tentative_rows.sort()
 
     def translate(
         self, ids: Sequence[int], mapped: Sequence[int], aliases: Mapping[int, int]
     ) -> None:
-        """Take given identities, but for those merged or not yet to be trusted."""
+        """Associate by given identities, except those merged or not yet trusted."""
         known = set(mapped)
         for row, given in enumerate(ids):
             landmark_id = aliases.get(given, given)
@@ -155,31 +160,28 @@ class ScanAssociation:
             ambiguity=policy.ambiguity,
         )
 
-    def _consider(self, rows: Int, readings: Array, noise: Noise) -> None:
-        """Count rows that no landmark explains for tentative ones; confirm these."""
-        needed, tentative = self._policy.confirm[0], self._tentative
+    def _match_tentative(self, rows: Int, readings: Array, noise: Noise) -> None:
+        """Match rows that no landmark explains with tentative ones; confirm these."""
+        tentative = self._tentative
         fit = tentative.distances(readings[rows], noise, self._policy.new_gate)
         slots = self._neighbours(fit)
+        self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         pairs = list(zip(rows.tolist(), slots.tolist(), strict=True))
         for row, slot in pairs:
             if slot >= 0:
                 tentative = tentative.with_sighting(slot, readings[row], noise)
+        needed = self._policy.confirm[0]
         enough = tentative.sightings >= needed
-        fresh = []
         for row, slot in pairs:
-            if slot == AMBIGUOUS:
-                self.ambiguous_rows.append(row)
-            elif needed == 1 or (slot >= 0 and enough[slot]):
+            if (slot >= 0 and enough[slot]) or (slot == NEW and needed == 1):
                 self._confirm(row, self._next_id)
-            else:
+            elif slot != AMBIGUOUS:
                 self.tentative_rows.append(row)
-                if slot == NEW:
-                    fresh.append(row)
-        tentative = tentative.chosen(~enough)
-        self._tentative = tentative.with_new(readings[fresh], noise)
+        fresh = rows[(slots == NEW) & (needed > 1)]
+        self._tentative = tentative.chosen(~enough).with_new(readings[fresh], noise)
 
     def _has_waited(self, landmark_id: int) -> bool:
-        """Count one more sighting of an identity; true if it has been seen enough."""
+        """Count a sighting of an identity; return whether it has been seen enough."""
         needed, scans = self._policy.confirm
         earlier = self._waiting.pop(landmark_id, ())
         recent = [*(scan for scan in earlier if scan > self._scan - scans), self._scan]

@@ -1,10 +1,8 @@
-"""Many independent runs of one filter at once, on the single filter's own kernels."""
+"""Many independent runs of one filter at once, on the single filter's kernels."""
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from __future__ import annotations
+
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,61 +12,11 @@ from ..kernels.batch import NEVER, drive_runs
 from ..kernels.scan_rows import Workspace, aligned_zeros
 from ..models.angles import wrap_angle
 from ..support import argument_checks
+from ..support.threads import share_out, usable_cores
+from .batch_results import BatchBeliefs, BatchStorage, BatchTrace
 from .ekf import FRAMES, EkfSlam, workspace_for
 
 Array = NDArray[np.float64]
-
-
-# So many that a thread which gets little of its core holds up the others but little.
-SHARES_PER_THREAD = 8
-
-
-class BatchTrace(NamedTuple):
-    """What every run believed after every step; B runs, T steps."""
-
-    poses: Array
-    """(x, y, θ), shape (B, T, 3) [m, m, rad], heading in [-π, π)."""
-    pose_covariances: Array
-    """Shape (B, T, 3, 3)."""
-    nis: Array
-    """νᵀ S⁻¹ ν of each scan, shape (B, T)."""
-    degrees_of_freedom: NDArray[np.int64]
-    """Of the NIS, shape (B, T)."""
-
-
-class BatchBeliefs(NamedTuple):
-    """What every run believes now; the state of all is (x, y, θ, l0x, l0y, l1x, …)."""
-
-    means: Array
-    """Shape (B, 3 + 2L), landmarks by id, zeros where not mapped; θ in [-π, π)."""
-    covariances: Array
-    """Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped."""
-    mapped: NDArray[np.bool_]
-    """Which landmarks are in the map, shape (B, L)."""
-
-
-class BatchStorage(NamedTuple):
-    """Where the beliefs of all runs stand: live, but not to be written to.
-
-    What lies beyond the mapped landmarks means nothing.
-    """
-
-    means: Array
-    """Shape (B, capacity): (x, y, θ), then the landmarks by slot; θ as it comes."""
-    covariances: Array
-    """Of the additive error, shape (B, capacity, capacity)."""
-    slots: NDArray[np.int64]
-    """Shape (B, L): landmark i stands at 3 + 2 slots[i]; -1 where not mapped."""
-
-    @classmethod
-    def of(
-        cls, means: Array, covariances: Array, slots: NDArray[np.int64]
-    ) -> "BatchStorage":
-        """Take views that cannot be written to."""
-        views = means.view(), covariances.view(), slots.view()
-        for view in views:
-            view.flags.writeable = False
-        return cls(*views)
 
 
 class BatchSlam:
@@ -130,8 +78,7 @@ class BatchSlam:
         self._rules = estimator.rules
         self._rule_values = estimator.rule_values.copy()
         self._motion_values = estimator.motion_values
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-        self._threads = argument_checks.whole("threads", threads or cores, 1)
+        self._threads = argument_checks.whole("threads", threads or usable_cores(), 1)
         std = argument_checks.standard_deviations(
             "initial_pose_std", initial_pose_std, 3
         )
@@ -207,7 +154,8 @@ class BatchSlam:
         chosen = self._chosen(runs)
         failed_at = np.where(chosen, self.failed_at, 0)  # the kernel passes these over
         data = u, z, seen
-        self._in_threads(partial(self._drive, data, durations, trace, failed_at))
+        drive = partial(self._drive, data, durations, trace, failed_at)
+        share_out(drive, self.runs, self._threads)
         self.failed_at = np.where(chosen, failed_at, self.failed_at)
         trace.poses[..., 2] = wrap_angle(trace.poses[..., 2])
         return trace
@@ -353,17 +301,6 @@ class BatchSlam:
 
     def _new_room(self) -> Workspace:
         return workspace_for(self._rules, self.landmarks, self._means.shape[1])
-
-    def _in_threads(self, work: Callable[[slice], None]) -> None:
-        """Do the work on small shares of the runs, each by whichever thread is free."""
-        threads = min(self._threads, self.runs)
-        if threads == 1:
-            work(slice(0, self.runs))
-            return
-        share = -(-self.runs // (SHARES_PER_THREAD * threads))
-        shares = [slice(a, a + share) for a in range(0, self.runs, share)]
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, shares))
 
 
 def can_batch(estimator: object) -> bool:

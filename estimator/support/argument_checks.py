@@ -1,8 +1,13 @@
-"""Checks at the public door, in words that name the argument."""
+"""Checks of public arguments, with messages that name the argument.
+
+Those of every step take well-formed arguments through without a copy.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +21,8 @@ LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 LARGEST = 1e12
 # The lowest identity that 64 bits hold, and how many from there on are no landmarks.
 LOWEST_ID, RESERVED_IDS = -(2**63), 2**20
+
+_FLOAT64 = np.dtype(np.float64)
 
 
 def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
@@ -45,7 +52,14 @@ def as_floats(name: str, value: ArrayLike) -> Array:
 
 
 def scan(measurements: ArrayLike) -> Array:
-    """Return ``measurements`` as float64 (m, 2), or refuse them."""
+    """Return ``measurements`` as a writeable float64 array (m, 2), or refuse them."""
+    if (
+        type(measurements) is np.ndarray
+        and measurements.dtype is _FLOAT64
+        and measurements.flags.carray
+        and measurements.shape[1:] == (2,)
+    ):
+        return measurements
     readings = as_floats("measurements", measurements)
     if not readings.flags.writeable:  # another type to numba: it would compile anew
         readings = readings.copy()
@@ -62,11 +76,9 @@ def scan(measurements: ArrayLike) -> Array:
 def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
     """Return ids as Python integers: one for each of ``count`` readings, no repeats."""
     array = np.asarray(landmark_ids)
-    if array.size and (array.dtype.kind not in "iu" or array.ndim != 1):
-        raise ValueError(f"landmark_ids must be integers, got {landmark_ids!r}")
-    if array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any():
-        raise ValueError(f"landmark_ids must fit 64 bits, got {landmark_ids!r}")
-    ids: list[int] = array.ravel().tolist()
+    if array.dtype.kind != "i" or array.ndim != 1:
+        array = _as_signed(array, landmark_ids)
+    ids: list[int] = array.tolist()
     if len(ids) != count:
         raise ValueError(
             f"measurements has {count} rows but landmark_ids has {len(ids)} entries"
@@ -77,6 +89,15 @@ def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
             f"landmark_ids must not repeat within a scan, got {twice} twice"
         )
     return ids
+
+
+def _as_signed(array: NDArray[Any], given: LandmarkIds) -> NDArray[Any]:
+    """Return ids that are unsigned or none at all, or refuse what is neither."""
+    if array.size and (array.dtype.kind not in "iu" or array.ndim != 1):
+        raise ValueError(f"landmark_ids must be integers, got {given!r}")
+    if array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any():
+        raise ValueError(f"landmark_ids must fit 64 bits, got {given!r}")
+    return array.ravel()
 
 
 def refuse_reserved(ids: Iterable[int]) -> None:
@@ -166,20 +187,25 @@ def refuse_large_belief(landmarks: int, limit: int, instead: str) -> None:
 
 def pair(name: str, value: ArrayLike) -> tuple[float, float]:
     """Return ``value`` as two finite floats of a usable size, or refuse it."""
-    given: object = value
-    if isinstance(value, np.ndarray):
-        _refuse_masked_and_complex(name, value)
-        given = value.tolist()  # in half the time that numpy's own numbers take
+    given: Any = value
+    if isinstance(given, np.ndarray):
+        if given.dtype is not _FLOAT64 or type(given) is not np.ndarray:
+            _refuse_masked_and_complex(name, given)
+        given = given.tolist()  # in half the time that numpy's own numbers take
     try:
-        first, second = cast("tuple[float, float]", given)
+        first, second = given
         a, b = float(first), float(second)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} must be 2 finite numbers, got {value!r}") from None
-    if not (isfinite(a) and isfinite(b)):
-        raise ValueError(f"{name} must be 2 finite numbers, got {value!r}")
-    if max(abs(a), abs(b)) > LARGEST:
+        raise _not_a_pair(name, value) from None
+    if -LARGEST <= a <= LARGEST and -LARGEST <= b <= LARGEST:
+        return a, b
+    if isfinite(a) and isfinite(b):
         raise ValueError(f"{name} must not exceed {LARGEST:g}, got {value!r}")
-    return a, b
+    raise _not_a_pair(name, value)
+
+
+def _not_a_pair(name: str, value: ArrayLike) -> ValueError:
+    return ValueError(f"{name} must be 2 finite numbers, got {value!r}")
 
 
 def at_least(name: str, value: float, least: float) -> float:

@@ -479,6 +479,14 @@ def test_beyond_its_capacity_a_map_gives_up_what_it_knows_least_of():
     assert slam.belief().landmark_ids == (1, 3, 4)
 
 
+def test_a_reading_from_afar_informs_less_where_noise_grows_with_the_range():
+    """The nearer landmark has the smaller σr + k r, not the smaller σr − k r."""
+    policy = {"capacity": 2}
+    slam = make(management=policy, range_std_per_metre=0.2 * MEASUREMENT_STD[1])
+    slam.update(polar([(4, 0), (0, 2)]), [0, 1])
+    assert slam.update(polar([(-3, 2)]), [2]).removed_ids == (0,)
+
+
 def test_a_full_view_gives_up_the_newcomers():
     slam = make(management={"capacity": 2})
     slam.update(polar([(5, 1), (4, -2)]), [0, 1])

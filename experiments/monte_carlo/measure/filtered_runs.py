@@ -6,7 +6,8 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ....estimator.filters.batch import BatchSlam, BatchTrace, can_batch
+from ....estimator.filters.batch import BatchSlam, can_batch
+from ....estimator.filters.batch_results import BatchTrace
 from ....estimator.filters.ekf import EkfSlam
 from ....estimator.interface import Belief, SlamEstimator, SupportsTruth
 from ...runs.filter_settings import FilterSettings
