@@ -219,6 +219,18 @@ def landmark_covariances(covariance: ArrayLike) -> Array:
     return np.asarray(P[rows[:, :, None], rows[:, None, :]])
 
 
+def ellipse_areas(covariances: NDArray[np.floating]) -> Array:
+    """Return the areas 9 π √det P of 3σ ellipses, for covariances (k, 2, 2) [m²].
+
+    Examples
+    --------
+    >>> ellipse_areas(np.eye(2)[None]) / np.pi
+    array([9.])
+    """
+    determinants = np.maximum(np.linalg.det(covariances), 0.0)
+    return np.asarray(9 * np.pi * np.sqrt(determinants))
+
+
 def poses_at(times: ArrayLike, ground_truth: ArrayLike) -> Array:
     """Interpolate a true path, its heading along the shorter way round.
 

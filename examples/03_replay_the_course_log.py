@@ -27,7 +27,7 @@ from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import SlamLog, write_slamlog
 from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.replay import Replay, replay
+from slamgym.experiments.runs.log_replay import Replay, replay
 from slamgym.experiments.runs.summary import landmark_table
 from slamgym.sim_configs import action_sequence, load_scenario
 

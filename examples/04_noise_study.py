@@ -17,7 +17,7 @@ It prints the table and writes ``results/04_noise_study.png``.  The command
 from pathlib import Path
 
 from slamgym.envs.controllers import OpenLoop
-from slamgym.experiments.figures import NoisePanel, noise_study_figure, save_figure
+from slamgym.experiments.figures import noise_study_figure, save_figure
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.noise_study.one_run import study_log
 from slamgym.experiments.runs.filter_settings import settings_for
@@ -41,8 +41,8 @@ def main() -> None:
             f"{row.nis_per_degree:5.2f} {row.nees_per_degree:6.2f}"
         )
     PICTURE.parent.mkdir(exist_ok=True)
-    panels = [NoisePanel(run.title, run.trace) for run in runs]
-    save_figure(noise_study_figure(panels), PICTURE, dpi=100)
+    maps = noise_study_figure([(run.title, run.trace) for run in runs])
+    save_figure(maps, PICTURE, dpi=100)
     print(f"wrote {PICTURE}")
 
 

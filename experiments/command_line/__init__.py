@@ -1,3 +1,5 @@
-"""The command line ``slamgym``, one module per command; they load what is heavy."""
+"""The command line ``slamgym``, one module per command."""
 
-from .app import main as main
+from .app import main
+
+__all__ = ["main"]

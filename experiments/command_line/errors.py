@@ -11,22 +11,22 @@ FAILURE, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
 class BadInputError(ValueError):
-    """What the user asked for cannot be done; the message says why, in one line."""
+    """The user's input cannot be used; the message gives the reason in one line."""
 
 
 class InterruptedRunError(Exception):
-    """The user pressed Ctrl-C; the message may say what is left of the work."""
+    """The user pressed Ctrl-C; the message may name the work that remains."""
 
 
 class OneLineErrors(TyperGroup):
-    """A group of commands that answers an error with one line.
+    """A group of commands that reports an error in one line.
 
     Bad input ends with exit code 2, a failure with 1, Ctrl-C with 130. The traceback
     is shown when the environment variable ``SLAMGYM_TRACEBACK`` is set.
     """
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
-        """Run a command, and leave the program when standing alone."""
+        """Run a command, and exit the program unless in another one."""
         stands_alone = kwargs.pop("standalone_mode", True)
         kwargs["standalone_mode"] = False
         if not stands_alone:
@@ -41,7 +41,7 @@ class OneLineErrors(TyperGroup):
         sys.exit(result if isinstance(result, int) else 0)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that was asked for."""
+        """Run the chosen command."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as error:
@@ -49,7 +49,7 @@ class OneLineErrors(TyperGroup):
 
 
 def message_of(error: Exception) -> str:
-    r"""Say an error in one line.
+    r"""Return the message of an error as one line.
 
     Examples
     --------
@@ -69,7 +69,7 @@ def message_of(error: Exception) -> str:
 
 
 def exit_code_of(error: Exception) -> int:
-    """Tell bad input from failures.
+    """Return the exit code of an error: bad input, failure or interruption.
 
     Examples
     --------

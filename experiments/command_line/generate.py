@@ -1,68 +1,100 @@
-"""``slamgym generate``: many drives through a scenario, written as a data set."""
+"""``slamgym generate``: write many drives through a scenario as a data set."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from rich.console import Console
-from rich.text import Text
+import typer
 
-from ...sim_configs import Scenario
-from ..trajectories.generate import generate_trajectories
-from ..trajectories.manifest import Manifest
+from . import options
 from .errors import InterruptedRunError
-from .output_folder import default_folder
-from .reporter import Reporter
+from .program import command
+
+if TYPE_CHECKING:
+    from ..trajectories.manifest import Manifest
 
 
-def write_trajectories(
-    scenario: Scenario,
+@command(
+    "Write trajectories by the million.",
+    "Drive many episodes of a scenario and write them as a data set: the actions, the "
+    "readings, and the truth. After an interruption, the same command continues where "
+    "it stopped, and the same command always writes the same bytes.",
+    "slamgym generate loop --episodes 1000",
+    "slamgym generate corridor --episodes 50 --controller random --format parquet",
+    "slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]",
+)
+def generate(
+    scenario: options.ScenarioName,
     *,
-    episodes: int,
-    controller: str,
-    seed: int,
-    format: str,
-    episodes_per_shard: int | None,
-    out: Path | None,
-    as_json: bool,
+    episodes: Annotated[
+        int,
+        typer.Option(
+            min=1, metavar="N", help="How many to drive; episode i has seed SEED + i."
+        ),
+    ],
+    controller: options.ControllerName = "waypoints",
+    seed: options.Seed = 0,
+    format_: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="npz, parquet and minari hold everything; slamlog, g2o and tum hold "
+            "what their readers know.",
+        ),
+    ] = "npz",
+    shard: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Episodes in each file or folder of the data set.",
+            show_default="100, fewer if they are large",
+        ),
+    ] = None,
+    steps: options.Steps = None,
+    set_: options.ScenarioChanges = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="The folder to write: new, empty, or begun by the same command, which "
+            "then continues.",
+            show_default="results/<name>-<controller>-<format>",
+        ),
+    ] = None,
+    as_json: options.AsJson = False,
 ) -> None:
-    """Generate trajectories, or go on where that was stopped, and tell where they lie.
+    """Generate trajectories, or continue, and report where they are."""
+    from ..trajectories import generate_trajectories
+    from .output_folder import default_folder
+    from .reporter import Reporter
+    from .scenario_options import chosen_scenario
 
-    Parameters
-    ----------
-    scenario : Scenario
-        The world.
-    episodes, controller, seed, format, episodes_per_shard
-        As in `generate_trajectories`.
-    out : Path or None
-        The folder to write; None chooses one below results.
-    as_json : bool
-        Whether to print the summary for programs.
-    """
-    place = out or default_folder(scenario.name, controller, format)
+    world = chosen_scenario(scenario, steps, set_)
+    place = out or default_folder(world.name, controller, format_)
     reporter = Reporter(as_json=as_json)
     with reporter.progress("driving", unit="steps") as tick:
         try:
             manifest = generate_trajectories(
-                scenario,
+                world,
                 place,
                 episodes=episodes,
                 controller=controller,
                 seed=seed,
-                format=format,
-                episodes_per_shard=episodes_per_shard,
+                format=format_,
+                episodes_per_shard=shard,
                 progress=tick,
             )
         except KeyboardInterrupt:
             raise InterruptedRunError(
-                f"interrupted; whole shards stay in {place}, the same command goes on"
+                f"interrupted; whole shards stay in {place}, the same command continues"
             ) from None
     size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
-    if not as_json:  # in lines as they are: two of them are meant to be copied
-        message = Text(_message(manifest, place, size))
-        Console(highlight=False).print(message, soft_wrap=True)
+    reporter.show_verbatim(_message(manifest, place, size))
     reporter.finish(_summary(manifest, place, size))
 
 
-def _message(manifest: Manifest, place: Path, size: int) -> str:
+def _message(manifest: "Manifest", place: Path, size: int) -> str:
     job, shards = manifest.job, len(manifest.shards)
     return (
         f"{place}: {job.episodes:,} episodes of {job.scenario.steps:,} steps as "
@@ -72,7 +104,7 @@ def _message(manifest: Manifest, place: Path, size: int) -> str:
     )
 
 
-def _summary(manifest: Manifest, place: Path, size: int) -> dict[str, object]:
+def _summary(manifest: "Manifest", place: Path, size: int) -> dict[str, object]:
     job = manifest.job
     return {
         "slamgym": manifest.versions["slamgym"],

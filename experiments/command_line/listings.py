@@ -1,16 +1,18 @@
-"""``slamgym scenarios`` and ``slamgym estimators``: what there is."""
+"""``slamgym scenarios`` and ``slamgym estimators``: list what there is."""
 
 import inspect
 from typing import Any
 
-from rich.table import Table
-
-from ...sim_configs import list_presets, load_scenario
-from .reporter import Reporter
+from . import options
+from .program import command
 
 
-def show_scenarios(*, as_json: bool) -> None:
-    """List the presets."""
+@command("List the worlds there are.")
+def scenarios(as_json: options.AsJson = False) -> None:
+    """List the scenarios that come with slamgym, to run, to film, or to vary."""
+    from ...sim_configs import list_presets, load_scenario
+
+    each = [(name, load_scenario(name)) for name in list_presets()]
     rows = [
         {
             "name": name,
@@ -18,14 +20,15 @@ def show_scenarios(*, as_json: bool) -> None:
             "steps": scenario.steps,
             "description": scenario.description,
         }
-        for name, scenario in ((name, load_scenario(name)) for name in list_presets())
+        for name, scenario in each
     ]
     _show("scenarios", rows, as_json=as_json)
 
 
-def show_estimators(*, as_json: bool) -> None:
-    """List the registered estimators by the first lines of their docstrings."""
-    from ...estimator.registry import find_estimator, list_estimators  # noqa: PLC0415 (loads numba)
+@command("List the filters there are.")
+def estimators(as_json: options.AsJson = False) -> None:
+    """List the filters that come with slamgym."""
+    from ...estimator.registry import find_estimator, list_estimators
 
     rows = [
         {"name": name, "description": _first_line(find_estimator(name))}
@@ -35,6 +38,10 @@ def show_estimators(*, as_json: bool) -> None:
 
 
 def _show(what: str, rows: list[dict[str, Any]], *, as_json: bool) -> None:
+    from rich.table import Table
+
+    from .reporter import Reporter
+
     reporter = Reporter(as_json=as_json)
     table = Table(box=None, pad_edge=False)
     for key in rows[0]:

@@ -1,185 +1,204 @@
-"""``slamgym monte-carlo``: many runs, and whether the filters told the truth."""
+"""``slamgym monte-carlo``: many runs, and whether the filters are consistent."""
 
 import contextlib
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
-from rich.text import Text
+import typer
 
-from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.atomic_file import replace_when_written
-from ..monte_carlo import merge_blocks, monte_carlo
-from ..monte_carlo.measure.estimator_choices import estimator_choices
-from ..monte_carlo.report.html_report import write_html_report
-from ..monte_carlo.report.summary import summarise_monte_carlo
-from ..monte_carlo.report.table import monte_carlo_table
-from .errors import FAILURE, BadInputError, InterruptedRunError
-from .output_folder import default_folder
-from .reporter import Reporter
-from .run_files import as_json_text
-from .tables import written
+from . import options
+from .errors import FAILURE, InterruptedRunError
+from .option_values import changes
+from .program import command
+
+if TYPE_CHECKING:
+    from .reporter import Reporter
 
 REPORT, SUMMARY = "report.html", "summary.json"
 
-_NOTE = "getting the filters ready …"
 
-
-class Workers(NamedTuple):
-    """Who does the work."""
-
-    jobs: int | None = None
-    backend: str | None = None
-    scheduler: str | None = None
-    """Address of a Dask cluster, or of a Ray cluster."""
-
-
-class Blocks(NamedTuple):
-    """Which part of the work, and what becomes of earlier results."""
-
-    size: int
-    """Runs in a block."""
-    first_run: int = 0
-    """Those below are another machine's."""
-    merged: Sequence[Path] = ()
-    """Folders of other machines, to take over."""
-    fresh: bool = False
-    """Whether to remove earlier results."""
-
-
-def run_monte_carlo(
-    scenario: Scenario,
-    estimators: str,
+@command(
+    "Many runs: are the filters consistent?",
+    "Run filters many times over a scenario, all on the same random numbers, and "
+    "decide with known error rates whether their covariances agree with their errors. "
+    "Writes results.nc (estimator x run x step, for xarray), summary.json and a report "
+    "to open in a browser, report.html.",
+    "slamgym monte-carlo loop --estimators ekf,invariant --runs 200 --out loop",
+    "slamgym monte-carlo six_landmarks -e mine:MyFilter --runs 100 --jobs 4",
+    "slamgym monte-carlo loop --assume motion.std=[0.1,0.1,0.1]",
+    "slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://boss:8786",
+)
+def monte_carlo(
+    scenario: options.ScenarioName,
     *,
-    runs: int,
-    seed: int,
-    assumed: Mapping[str, Any],
-    workers: Workers,
-    blocks: Blocks,
-    out: Path | None,
-    as_json: bool,
+    estimators: Annotated[
+        str,
+        typer.Option(
+            "--estimators",
+            "-e",
+            metavar="NAMES",
+            help="Filters with commas between, such as "
+            '"ekf,invariant[iterations=3]" or "module:Class" of your own; options '
+            "stand in brackets.",
+        ),
+    ] = "ekf,invariant",
+    runs: Annotated[
+        int,
+        typer.Option(
+            help="How many; run i is the world of seed SEED + i, so that seeds closer "
+            "than this share worlds."
+        ),
+    ] = 200,
+    seed: options.Seed = 0,
+    steps: options.Steps = None,
+    set_: options.ScenarioChanges = None,
+    assume: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--assume",
+            metavar="KEY=VALUE",
+            help="A change of the scenario that only the filters assume, such as "
+            f"motion.std=[0.1,0.1,0.1]. {options.REPEATED}",
+        ),
+    ] = None,
+    jobs: options.Jobs = None,
+    backend: Annotated[
+        str | None,
+        typer.Option(
+            metavar="loky|dask|ray",
+            help="Where the workers are: loky, on this machine; dask or ray, on a "
+            "cluster.",
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Of the Dask or Ray cluster.",
+            show_default="a cluster of this machine",
+        ),
+    ] = None,
+    block_size: Annotated[
+        int, typer.Option(metavar="N", help="Runs done and written at a time.")
+    ] = 64,
+    first_run: Annotated[
+        int,
+        typer.Option(
+            metavar="N",
+            help="Leave the runs below N, a multiple of the block size, to others.",
+        ),
+    ] = 0,
+    merge: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--merge",
+            metavar="DIR",
+            help=f"Take over what another machine has done of this job. "
+            f"{options.REPEATED}",
+        ),
+    ] = None,
+    fresh: Annotated[
+        bool,
+        typer.Option("--fresh", help="Remove earlier results in the folder first."),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="The folder to write. A job that was stopped there continues, and "
+            "more runs build on those there are.",
+            show_default="results/monte-carlo-<scenario>",
+        ),
+    ] = None,
+    as_json: options.AsJson = False,
 ) -> int:
-    """Run, measure, decide, and write results.nc, summary.json and report.html.
+    """Run, measure and decide; the exit code is 1 if every run failed."""
+    from ...sim_configs.atomic_file import replace_when_written
+    from .. import monte_carlo
+    from ..monte_carlo.measure.estimator_choices import estimator_choices
+    from ..monte_carlo.report.html_report import write_html_report
+    from .cluster import connected
+    from .output_folder import as_json_text, default_folder
+    from .reporter import Reporter
+    from .scenario_options import chosen_scenario
 
-    Parameters
-    ----------
-    scenario : Scenario
-        The world.
-    estimators : str
-        Which, as in `estimator_choices`.
-    runs, seed : int
-        As in `monte_carlo`.
-    assumed : mapping
-        Changes of the scenario whose noise the filters are told.
-    workers : Workers
-        Who does the work.
-    blocks : Blocks
-        Which part of it.
-    out : Path or None
-        The folder to write; None chooses one below results.
-    as_json : bool
-        Whether to print the summary for programs.
-
-    Returns
-    -------
-    int
-        Exit code: 1 if no run of any estimator went well.
-    """
+    world = chosen_scenario(scenario, steps, set_)
+    assumed = changes("--assume", assume)
     reporter = Reporter(as_json=as_json)
-    estimator_choices(estimators)  # a wrong name is told before any work
-    place = out or default_folder("monte-carlo", scenario.name)
-    told = scenario.with_changes(**assumed) if assumed else scenario
-    with reporter.patience(_NOTE):
+    estimator_choices(estimators)  # refuses a wrong name before any work
+    place = out or default_folder("monte-carlo", world.name)
+    told = world.with_changes(**assumed) if assumed else world
+    with reporter.note_if_slow("preparing the filters …"):
         _compile(estimators)
-    if blocks.merged:
-        merge_blocks(blocks.merged, place)
+    if merge:
+        monte_carlo.merge_blocks(merge, place)
     with (
-        _cluster(workers),
+        connected(backend, scheduler, jobs),
         reporter.warnings(),
         reporter.progress("running", unit="runs") as tick,
         _resumable(place),
-        monte_carlo(
-            scenario,
+        monte_carlo.monte_carlo(
+            world,
             estimators,
             runs,
             seed,
             assumed=told,
             out=place,
-            jobs=workers.jobs,
-            backend=workers.backend,
-            block_size=blocks.size,
-            first_run=blocks.first_run,
-            fresh=blocks.fresh,
+            jobs=jobs,
+            backend=backend,
+            block_size=block_size,
+            first_run=first_run,
+            fresh=fresh,
             command=shlex.join(["slamgym", *sys.argv[1:]]),
             progress=tick,
         ) as results,
     ):
-        summary = summarise_monte_carlo(results)
+        summary = monte_carlo.summarise_monte_carlo(results)
         summary["files"] = ["results.nc", SUMMARY, REPORT]
         write_html_report(results, summary, place / REPORT)
     with replace_when_written(place / SUMMARY) as partial:
         partial.write_text(as_json_text(summary), encoding="utf-8")
-    sentences = [entry["sentence"] for entry in summary["estimators"].values()]
-    reporter.show(monte_carlo_table(summary), "")
-    reporter.show(*(Text(sentence) for sentence in sentences), "")
-    if summary["notes"]:
-        reporter.show(*(Text(note) for note in summary["notes"]), "")
-    reporter.show(written(str(place), summary["files"]))
-    reporter.finish({**summary, "out": str(place)})
+    _show(summary, place, reporter)
     went_well = any(entry["good_runs"] for entry in summary["estimators"].values())
     return 0 if went_well else FAILURE
 
 
+def _show(summary: dict[str, Any], place: Path, reporter: "Reporter") -> None:
+    """Print the table, a sentence for each estimator, the notes, and the files."""
+    from rich.text import Text
+
+    from ..monte_carlo.report.table import monte_carlo_table
+    from .tables import written
+
+    sentences = [entry["sentence"] for entry in summary["estimators"].values()]
+    reporter.show(monte_carlo_table(summary), "")
+    for lines in (sentences, summary["notes"]):
+        if lines:
+            reporter.show(*map(Text, lines), "")
+    reporter.show(written(str(place), summary["files"]))
+    reporter.finish({**summary, "out": str(place)})
+
+
 def _compile(estimators: str) -> None:
-    """Run all estimators for two steps, so that their kernels are there."""
+    """Run all estimators for two steps, which compiles their kernels."""
+    from ...sim_configs import load_scenario
+    from ..monte_carlo import monte_carlo
+
     small = load_scenario("six_landmarks").with_changes(steps=2)
-    with contextlib.suppress(Exception):  # what fails here fails there, and says so
+    with contextlib.suppress(Exception):  # the job itself fails too, and reports it
         monte_carlo(small, estimators, 1)
 
 
 @contextlib.contextmanager
-def _cluster(workers: Workers) -> Iterator[None]:
-    """Join the cluster that the work is for, or start one on this machine."""
-    if workers.backend == "dask":
-        with _dask_client(workers):
-            yield
-        return
-    if workers.scheduler is not None and workers.backend != "ray":
-        raise BadInputError("--scheduler is for --backend dask or ray")
-    if workers.scheduler is not None:
-        try:
-            import ray  # noqa: PLC0415 (an extra)
-        except ImportError:
-            raise BadInputError("--backend ray needs ray: pip install ray") from None
-        ray.init(address=workers.scheduler)
-    yield
-
-
-def _dask_client(workers: Workers) -> contextlib.AbstractContextManager[Any]:
-    try:
-        import distributed  # noqa: PLC0415 (an extra)
-    except ImportError:
-        raise BadInputError(
-            "--backend dask needs dask.distributed: pip install 'slamgym[dask]'"
-        ) from None
-    client: Any = distributed.Client
-    if workers.scheduler is not None:
-        joined: contextlib.AbstractContextManager[Any] = client(workers.scheduler)
-        return joined
-    started: contextlib.AbstractContextManager[Any] = client(
-        n_workers=workers.jobs, threads_per_worker=1, dashboard_address=None
-    )
-    return started
-
-
-@contextlib.contextmanager
 def _resumable(place: Path) -> Iterator[None]:
-    """Say after Ctrl-C where the runs done so far lie."""
+    """Report after Ctrl-C where the finished runs are."""
     try:
         yield
     except KeyboardInterrupt:
         raise InterruptedRunError(
-            f"interrupted; the runs done lie in {place}, and the same command goes on"
+            f"interrupted; the finished runs are in {place}, "
+            "and the same command continues"
         ) from None

@@ -1,45 +1,254 @@
 """``slamgym noise-study``: every noise times 10 and divided by 10."""
 
-from collections.abc import Callable
+import csv
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-from ... import __version__
-from ...sim_configs import Scenario, list_presets
-from ...sim_configs.scenario_errors import closest
-from ..figures import NoisePanel, noise_study_figure, save_figure
-from ..logs.slamlog import SlamLog
-from ..noise_study.one_run import NoiseRow, NoiseRun, study_log, study_scenario
-from ..runs.filter_settings import FilterSettings
-from ..runs.summary import settings_table
+import typer
+
+from . import options
 from .errors import BadInputError
-from .output_folder import default_folder, output_folder
-from .reporter import Reporter, Tick
-from .run_files import write_summary, write_table
-from .scenario_options import driver, recorded
-from .tables import noise_table, written
-from .warm_up import warm_up
+from .option_values import assignments, standard_deviations
+from .program import command
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ...sim_configs import Scenario
+    from ..noise_study.many_runs import NoiseEffect
+    from ..noise_study.one_run import NoiseRow, NoiseRun
+    from ..runs.filter_settings import FilterSettings
+    from .reporter import Reporter, Tick
+
+
+@command(
+    "Every noise times 10 and divided by 10.",
+    "Multiply and divide each of σx, σy, σα, σβ, σr by 10, one by one. For a log, only "
+    "the filter's assumed noise changes; for a scenario, world and filter change "
+    "together, with the same random numbers. Draws all maps in one figure, and lists "
+    "the areas of the final 3σ ellipses, the errors, and the NEES and NIS, which are 1 "
+    "per degree of freedom for a consistent filter.",
+    "slamgym noise-study data.txt",
+    "slamgym noise-study six_landmarks --seed 3 --out study",
+    "slamgym noise-study six_landmarks --runs 100 -e ekf,invariant",
+)
+def noise_study(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO|LOG", help="A preset, a .toml file, or a log."
+        ),
+    ],
+    *,
+    estimator: options.EstimatorName = "ekf",
+    motion_std: options.MotionStd = None,
+    measurement_std: options.MeasurementStd = None,
+    initial_pose_std: options.InitialPoseStd = None,
+    option: options.EstimatorOptions = None,
+    seed: options.Seed = 0,
+    steps: options.Steps = None,
+    controller: options.ControllerName = "open_loop",
+    set_: options.ScenarioChanges = None,
+    runs: Annotated[
+        int,
+        typer.Option(
+            help="For a scenario: more than one runs a Monte Carlo for each change."
+        ),
+    ] = 1,
+    change: Annotated[
+        str,
+        typer.Option(
+            metavar="both|world|filter|all",
+            help="With --runs: whether noises change in world and filter, in the world "
+            "alone, or in what the filter assumes.",
+        ),
+    ] = "all",
+    jobs: options.Jobs = None,
+    out: options.OutFolder = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Run the study, and write figure and tables."""
+    from ..runs.filter_settings import settings_for, settings_for_scenario
+    from .reporter import Reporter
+    from .run_files import read_any_log
+    from .scenario_options import chosen_scenario
+
+    chosen = assignments("--option", option)
+    stds = standard_deviations(motion_std, measurement_std, initial_pose_std)
+    if not _is_scenario(source):
+        _refuse({"steps": steps, "set": set_}, "a scenario, not of a log")
+        log = read_any_log(Path(source))
+        settings = settings_for(log, estimator=estimator, options=chosen, **stds)
+        study = log_study(log, settings)
+    else:
+        _refuse(stds, "a log; the filter knows the noise of a scenario")
+        world = chosen_scenario(source, steps, set_)
+        if runs == 1:
+            settings = settings_for_scenario(world, estimator=estimator, options=chosen)
+            study = scenario_study(world, settings, controller, seed)
+        else:
+            study = effects_study(world, estimator, runs, seed, change, jobs)
+    write_study(study, out, Reporter(as_json=as_json))
+
+
+class Results(NamedTuple):
+    """What a noise study found."""
+
+    rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]"
+    titles: Sequence[str]
+    """Of the rows in the summary; empty where they have none."""
+    figure: "Figure"
+    dpi: int
+    shown: Sequence[Any]
+    """What to print, one below the other."""
 
 
 class Study(NamedTuple):
-    """A noise study to be run."""
+    """A noise study to run and to write."""
 
-    name: str
-    """Of its scenario or log."""
-    settings: FilterSettings
-    """Of the reference."""
-    run: Callable[[Tick], list[NoiseRun]]
-    """Runs it, given what is to be told of the progress."""
+    names: tuple[str, str]
+    """Of its folder, by default."""
+    about: dict[str, Any]
+    """The head of its summary."""
+    run: "Callable[[Reporter], Results]"
 
 
-def is_scenario(source: str) -> bool:
-    """Tell a scenario from a log.
+def log_study(log: Any, settings: "FilterSettings") -> Study:
+    """Prepare the study of a log; only the filter changes."""
+    from ..noise_study.one_run import study_log
 
-    Raises
-    ------
-    BadInputError
-        If there is neither.
-    """
+    return _one_run_study(
+        log.name, settings, lambda tick: study_log(log, settings, progress=tick)
+    )
+
+
+def scenario_study(
+    world: "Scenario", settings: "FilterSettings", controller: str, seed: int
+) -> Study:
+    """Prepare the study of one run of a scenario; world and filter change together."""
+    from ..noise_study.one_run import study_scenario
+    from .scenario_options import chosen_controller, recorded
+
+    def run(tick: "Tick") -> "list[NoiseRun]":
+        return study_scenario(
+            world,
+            lambda changed: recorded(changed, controller, seed),
+            estimator=settings.estimator,
+            options=settings.options,
+            progress=tick,
+        )
+
+    chosen_controller(controller, world, seed)  # refuses a wrong name
+    return _one_run_study(world.name, settings, run)
+
+
+def _one_run_study(
+    name: str, settings: "FilterSettings", study: "Callable[[Tick], list[NoiseRun]]"
+) -> Study:
+    from ... import __version__
+    from ..figures import noise_study_figure
+    from ..runs.summary import settings_table
+    from .noise_tables import runs_table
+    from .warm_up import warm_up
+
+    estimator = settings.estimator
+
+    def run(reporter: "Reporter") -> Results:
+        warm_up(settings, reporter)
+        with reporter.progress("filtering") as tick:
+            runs = study(tick)
+        with reporter.progress("drawing"):
+            figure = noise_study_figure([(run.title, run.trace) for run in runs])
+        title = f"[bold]{name}[/], noise study of [bold]{estimator}[/]\n"
+        rows, titles = [run.row for run in runs], [run.title for run in runs]
+        return Results(rows, titles, figure, 130, (title, runs_table(runs)))
+
+    about = {
+        "slamgym": __version__,
+        "name": name,
+        "estimator": estimator,
+        "settings": settings_table(settings),
+    }
+    return Study((name, estimator), about, run)
+
+
+def effects_study(
+    world: "Scenario",
+    estimators: str,
+    runs: int,
+    seed: int,
+    change: str,
+    jobs: int | None,
+) -> Study:
+    """Prepare the study of a scenario over many runs."""
+    from ... import __version__
+    from ..noise_study.figures import noise_effects_figure
+    from ..noise_study.many_runs import CHANGED, noise_effects
+    from .noise_tables import effects_table
+
+    if change != "all" and change not in CHANGED:
+        raise BadInputError(
+            f"--change must be all, {', '.join(CHANGED)}, got '{change}'"
+        )
+    places = [place for place in CHANGED if change in ("all", place)]
+
+    def run(reporter: "Reporter") -> Results:
+        with reporter.progress("running", unit="runs") as tick:
+            effects = noise_effects(
+                world, estimators, runs, seed, changed=places, jobs=jobs, progress=tick
+            )
+        shown = [effects_table(world.name, runs, effects)]
+        return Results(effects, (), noise_effects_figure(effects), 150, shown)
+
+    about = {"slamgym": __version__, "name": world.name, "runs": runs, "seed": seed}
+    return Study((world.name, f"{runs}-runs"), about, run)
+
+
+def write_study(study: Study, out: Path | None, reporter: "Reporter") -> None:
+    """Run a study, write its figure, table and summary, and print its results."""
+    from ..figures import save_figure
+    from .output_folder import default_folder, output_folder, write_summary
+    from .tables import written
+
+    place = out or default_folder("noise-study", *study.names)
+    with output_folder(place) as folder:
+        found = study.run(reporter)
+        save_figure(found.figure, folder / "noise_study.png", dpi=found.dpi)
+        _write_table(folder / "noise_study.csv", found.rows)
+        rows = [_plain(row) for row in found.rows]
+        if found.titles:
+            titles = zip(found.titles, rows, strict=True)
+            rows = [{"title": title, **row} for title, row in titles]
+        summary = write_summary(folder, {**study.about, "rows": rows})
+    reporter.show(*found.shown, "", written(str(place), summary["files"]))
+    reporter.finish({**summary, "out": str(place)})
+
+
+def _write_table(
+    path: Path, rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]"
+) -> None:
+    """Write rows as CSV below the names of their columns, empty where None."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(rows[0]._fields)
+        writer.writerows(rows)
+
+
+def _plain(row: "NoiseRow | NoiseEffect") -> dict[str, Any]:
+    """Return a row for JSON, with None for nan."""
+    return {
+        name: None if isinstance(value, float) and math.isnan(value) else value
+        for name, value in row._asdict().items()
+    }
+
+
+def _is_scenario(source: str) -> bool:
+    """Whether a source is a scenario; refuse what is neither scenario nor log."""
+    from ...sim_configs import list_presets
+    from ...sim_configs.scenario_errors import closest
+
     if source in list_presets() or source.endswith(".toml"):
         return True
     if Path(source).exists():
@@ -50,65 +259,9 @@ def is_scenario(source: str) -> bool:
     )
 
 
-def scenario_study(
-    scenario: Scenario, settings: FilterSettings, *, controller: str, seed: int
-) -> Study:
-    """Prepare the study of a scenario; world and filter change together."""
-
-    def run(tick: Tick) -> list[NoiseRun]:
-        return study_scenario(
-            scenario,
-            lambda changed: recorded(changed, controller, seed),
-            estimator=settings.estimator,
-            options=settings.options,
-            progress=tick,
-        )
-
-    driver(controller, scenario, seed)
-    return Study(scenario.name, settings, run)
-
-
-def log_study(log: SlamLog, settings: FilterSettings) -> Study:
-    """Prepare the study of a log; only the filter changes."""
-    return Study(
-        log.name, settings, lambda tick: study_log(log, settings, progress=tick)
-    )
-
-
-def write_study(study: Study, folder: Path | None, *, as_json: bool) -> None:
-    """Run a noise study, and write its figure and its table.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-    folder : Path or None
-        The folder to write; None chooses one below results.
-    as_json : bool
-        Whether to print the summary for programs.
-    """
-    reporter = Reporter(as_json=as_json)
-    estimator = study.settings.estimator
-    place = folder or default_folder("noise-study", study.name, estimator)
-    about = {
-        "slamgym": __version__,
-        "name": study.name,
-        "estimator": estimator,
-        "settings": settings_table(study.settings),
-    }
-    with output_folder(place) as partial:
-        warm_up(study.settings, reporter)
-        with reporter.progress("filtering") as tick:
-            runs = study.run(tick)
-        with reporter.progress("drawing"):
-            panels = [NoisePanel(run.title, run.trace) for run in runs]
-            figure = noise_study_figure(panels)
-            save_figure(figure, partial / "noise_study.png", dpi=130)
-        table = partial / "noise_study.csv"
-        write_table(table, NoiseRow._fields, [run.row for run in runs])
-        rows = [{"title": run.title, **run.row._asdict()} for run in runs]
-        summary = write_summary(partial, {**about, "rows": rows})
-    title = f"[bold]{study.name}[/], noise study of [bold]{estimator}[/]\n"
-    files = written(str(place), summary["files"])
-    reporter.show(title, noise_table(rows), "", files)
-    reporter.finish({**summary, "out": str(place)})
+def _refuse(options: Mapping[str, object], meant_for: str) -> None:
+    """Refuse options that have no meaning here."""
+    for name, value in options.items():
+        if value is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise BadInputError(f"{option} is for the noise study of {meant_for}")

@@ -1,4 +1,4 @@
-"""Values of options as the user types them, turned into what they mean."""
+"""Parse the values of options."""
 
 import math
 import tomllib
@@ -8,18 +8,33 @@ from typing import Any
 from .errors import BadInputError
 
 
-def standard_deviations(option: str, text: str, count: int) -> tuple[float, ...]:
-    """Read numbers with commas between.
+def standard_deviations(
+    motion_std: str | None, measurement_std: str | None, initial_pose_std: str | None
+) -> dict[str, tuple[float, ...]]:
+    """Parse the standard deviations that the user gave, by the names of their options.
 
     Examples
     --------
-    >>> standard_deviations("--motion-std", "0.2,.1,1e-2", 3)
-    (0.2, 0.1, 0.01)
-    >>> standard_deviations("--motion-std", "0.2,-1", 3)
+    >>> standard_deviations("0.2,.1,1e-2", None, None)
+    {'motion_std': (0.2, 0.1, 0.01)}
+    >>> standard_deviations(None, "0.2,-1", None)
     Traceback (most recent call last):
-    slamgym.experiments.command_line.errors.BadInputError: --motion-std must be \
-3 numbers >= 0 with commas between, got '0.2,-1'
+    slamgym.experiments.command_line.errors.BadInputError: --measurement-std must be \
+2 numbers >= 0 with commas between, got '0.2,-1'
     """
+    texts = {
+        "motion_std": (motion_std, 3),
+        "measurement_std": (measurement_std, 2),
+        "initial_pose_std": (initial_pose_std, 3),
+    }
+    return {
+        name: _numbers(f"--{name.replace('_', '-')}", text, count)
+        for name, (text, count) in texts.items()
+        if text is not None
+    }
+
+
+def _numbers(option: str, text: str, count: int) -> tuple[float, ...]:
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -31,8 +46,8 @@ def standard_deviations(option: str, text: str, count: int) -> tuple[float, ...]
     return values
 
 
-def assignments(option: str, texts: Iterable[str]) -> dict[str, Any]:
-    """Read "key=value", the value as in TOML; a bare word is text.
+def assignments(option: str, texts: Iterable[str] | None) -> dict[str, Any]:
+    """Parse "key=value" with the value as in TOML; a bare word is a string.
 
     Examples
     --------
@@ -40,7 +55,7 @@ def assignments(option: str, texts: Iterable[str]) -> dict[str, Any]:
     {'gate_probability': 0.99, 'landmark_init': 'full'}
     """
     values: dict[str, Any] = {}
-    for text in texts:
+    for text in texts or ():
         key, equals, value = (part.strip() for part in text.partition("="))
         if not (equals and key and value):
             raise BadInputError(f"{option} must be KEY=VALUE, got {text!r}")
@@ -50,8 +65,8 @@ def assignments(option: str, texts: Iterable[str]) -> dict[str, Any]:
     return values
 
 
-def changes(option: str, texts: Iterable[str]) -> dict[str, Any]:
-    """Read "part.key=value" into nested mappings.
+def changes(option: str, texts: Iterable[str] | None) -> dict[str, Any]:
+    """Parse "part.key=value" into nested mappings.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The folder a command writes: there when complete, or not at all."""
+"""The folder that a command writes: it appears complete or not at all."""
 
 import contextlib
 import json
@@ -7,6 +7,7 @@ import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from .errors import BadInputError
 
@@ -16,20 +17,20 @@ SUMMARY = "summary.json"
 
 @contextlib.contextmanager
 def output_folder(path: Path) -> Iterator[Path]:
-    """Lend a new folder, which takes its place at `path` when all went well.
+    """Provide a new folder, and move it to `path` when the block ends without error.
 
-    What slamgym wrote to `path` earlier is replaced; a folder that holds anything else
-    is refused at once. After an error or Ctrl-C all is as before.
+    It replaces what slamgym wrote to `path` earlier; a folder that holds anything else
+    is refused at once. An error or Ctrl-C leaves everything as it was.
 
     Parameters
     ----------
     path : Path
-        Where the folder shall appear; missing folders above it are made.
+        Where the folder appears; missing folders above it are made.
 
     Yields
     ------
     Path
-        An empty folder beside it, to write to.
+        An empty folder beside `path`.
 
     Raises
     ------
@@ -39,7 +40,7 @@ def output_folder(path: Path) -> Iterator[Path]:
         If the folder cannot be written.
     """
     path = path.absolute()
-    _refuse_what_is_not_ours(path)
+    _refuse_foreign_files(path)
     with _parents(path):
         partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
         _make(partial, path)
@@ -51,7 +52,7 @@ def output_folder(path: Path) -> Iterator[Path]:
 
 
 def default_folder(*names: str) -> Path:
-    """Choose a folder below results by names, of which odd characters are replaced.
+    """Return a folder below results, its name safe for every file system.
 
     Examples
     --------
@@ -62,12 +63,30 @@ def default_folder(*names: str) -> Path:
 
 
 def files_in(folder: Path) -> list[str]:
-    """List the files below a folder by their paths from there, sorted."""
+    """List the files below a folder by their paths relative to it, sorted."""
     files = (entry for entry in folder.rglob("*") if not entry.is_dir())
     return sorted(file.relative_to(folder).as_posix() for file in files)
 
 
-def _refuse_what_is_not_ours(path: Path) -> None:
+def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
+    """Write summary.json with the list of all files in the folder.
+
+    Returns
+    -------
+    dict
+        The summary with ``files``.
+    """
+    complete = {**summary, "files": sorted([*files_in(folder), SUMMARY])}
+    (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
+    return complete
+
+
+def as_json_text(summary: dict[str, Any]) -> str:
+    """Write a summary as indented JSON."""
+    return json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _refuse_foreign_files(path: Path) -> None:
     if path.exists() and not path.is_dir():
         raise BadInputError(f"--out must be a folder, got the file {path}")
     if not path.exists():
@@ -81,7 +100,7 @@ def _refuse_what_is_not_ours(path: Path) -> None:
 
 
 def _listed_in_summary(folder: Path) -> set[str]:
-    """Read which files slamgym wrote to a folder, none if it did not."""
+    """Return the files that slamgym wrote to a folder according to its summary."""
     try:
         summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -92,7 +111,7 @@ def _listed_in_summary(folder: Path) -> set[str]:
 
 @contextlib.contextmanager
 def _parents(path: Path) -> Iterator[None]:
-    """Make the folders above a path; remove those still empty after an error."""
+    """Make the folders above a path; after an error, remove those that are empty."""
     missing = [folder for folder in path.parents if not folder.exists()]
     try:
         for folder in reversed(missing):
@@ -114,7 +133,7 @@ def _make(folder: Path, path: Path) -> None:
 
 
 def _swap(partial: Path, path: Path) -> None:
-    """Put the new folder in the place of the old one, if there is one."""
+    """Move the new folder to `path`, and remove the old one."""
     if not path.exists():
         partial.replace(path)
         return

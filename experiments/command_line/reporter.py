@@ -1,4 +1,4 @@
-"""Where a command talks: progress to standard error, results to standard output."""
+"""What a command prints: progress to standard error, results to standard output."""
 
 import contextlib
 import json
@@ -23,17 +23,17 @@ from rich.text import Text
 
 Tick = Callable[[int, int], None]
 
-_PATIENCE = 1.0  # [s] of silence before a note is printed
-_BETWEEN = 0.1  # [s] between two moves of a bar
+_SLOW = 1.0  # [s] without output before a note is printed
+_BETWEEN = 0.1  # [s] between two updates of a bar
 
 
 class Reporter:
-    """Talks to people, or to a program: then all it prints is one JSON object.
+    """Print results as text, or as one JSON object and nothing else.
 
     Parameters
     ----------
     as_json : bool
-        Whether a program listens.
+        Whether to print JSON.
     """
 
     def __init__(self, *, as_json: bool) -> None:
@@ -42,33 +42,38 @@ class Reporter:
         self._notes = Console(stderr=True, highlight=False)
 
     def show(self, *results: RenderableType) -> None:
-        """Print results for people, one below the other."""
+        """Print results as text, one below the other."""
         if not self._as_json:
             for result in results:
                 self._results.print(result)
 
+    def show_verbatim(self, text: str) -> None:
+        """Print text without wrapping or markup, so that its lines can be copied."""
+        if not self._as_json:
+            self._results.print(Text(text), soft_wrap=True)
+
     def finish(self, summary: dict[str, Any]) -> None:
-        """Print the object for programs."""
+        """Print the JSON object."""
         if self._as_json:
             text = json.dumps(summary, allow_nan=False, ensure_ascii=False)
             sys.stdout.write(text + "\n")
 
     @contextlib.contextmanager
     def progress(self, doing: str, unit: str = "") -> Iterator[Tick]:
-        """Show a bar on a terminal, moved by the function lent, until all is done.
+        """Show a progress bar on a terminal during the block.
 
         Parameters
         ----------
         doing : str
             What goes on, such as "filtering".
         unit : str, optional
-            What is counted; the bar then tells the rate and the time left too.
+            What is counted; the bar then shows the rate and the time left too.
 
         Yields
         ------
         callable
-            To be called with (done, total), as often as one likes. What is done at the
-            first call, as when a stopped job goes on, counts for no rate.
+            Updates the bar with (done, total), at any rate of calls. The rate excludes
+            what is done at the first call, as when a stopped job continues.
         """
         columns = (
             TextColumn("{task.description:<10}"),
@@ -99,7 +104,7 @@ class Reporter:
 
     @contextlib.contextmanager
     def warnings(self) -> Iterator[None]:
-        """Print warnings that come meanwhile as plain lines on standard error."""
+        """Print the warnings of the block as plain lines on standard error."""
 
         def show(message: Warning | str, *_: object, **__: object) -> None:
             self._notes.print(f"note: {message}", markup=False)
@@ -110,9 +115,9 @@ class Reporter:
             yield
 
     @contextlib.contextmanager
-    def patience(self, note: str) -> Iterator[None]:
-        """Print a note to standard error if what happens meanwhile takes long."""
-        timer = threading.Timer(_PATIENCE, self._notes.print, [note])
+    def note_if_slow(self, note: str) -> Iterator[None]:
+        """Print a note to standard error if the block takes long."""
+        timer = threading.Timer(_SLOW, self._notes.print, [note])
         timer.daemon = True
         timer.start()
         try:
@@ -122,13 +127,13 @@ class Reporter:
 
 
 class _Rate(ProgressColumn):
-    """How many of something are done in a second."""
+    """Column of a progress bar: how many units are done per second."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
         self._unit = unit
 
     def render(self, task: Task) -> Text:
-        """Write the rate, once it is known."""
+        """Return the rate, empty until it is known."""
         speed = task.speed or task.finished_speed
         return Text(f"{speed:,.0f} {self._unit}/s" if speed else "")

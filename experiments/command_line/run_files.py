@@ -1,8 +1,6 @@
-"""The files of a run: figures, the log, the numbers."""
+"""A log filtered by one estimator: the files of the run, and what is printed of it."""
 
-import csv
-import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,32 +12,103 @@ from ..figures import (
     save_figure,
     truth_figure,
 )
-from ..logs.slamlog import write_slamlog
-from ..runs.replay import Replay
-from .output_folder import SUMMARY, files_in
+from ..logs.importers import read_log
+from ..logs.slamlog import SlamLog, write_slamlog
+from ..logs.steps import steps_of
+from ..runs.filter_settings import FilterSettings
+from ..runs.log_replay import replay
+from ..runs.summary import summarise
+from ..runs.trace import RunTrace
+from .errors import BadInputError
+from .output_folder import write_summary
+from .reporter import Reporter
+from .tables import key_figures, landmark_table, written
+from .warm_up import warm_up
+
+_FEW_STEPS = 60  # of a run whose every step is drawn by default
+
+
+def read_any_log(path: Path, robot: int | None = None) -> SlamLog:
+    """Read a log of any known format.
+
+    Raises
+    ------
+    BadInputError
+        If it cannot be opened.
+    LogError
+        If it is malformed.
+    """
+    try:
+        return read_log(path, robot=robot)
+    except OSError as error:
+        reason = error.strerror or error
+        raise BadInputError(f"cannot read the log {path}: {reason}") from error
+
+
+def filter_and_write(
+    log: SlamLog,
+    settings: FilterSettings,
+    folder: Path,
+    every_step: bool | None,
+    reporter: Reporter,
+) -> dict[str, Any]:
+    """Filter a log, and write figures, log.csv (slamlog 1) and summary.json.
+
+    Parameters
+    ----------
+    log : SlamLog
+        The log.
+    settings : FilterSettings
+        Of the filter.
+    folder : Path
+        The folder to write to.
+    every_step : bool or None
+        Whether to draw the map after every step; None: if there are few steps.
+    reporter : Reporter
+        Shows the progress.
+
+    Returns
+    -------
+    dict
+        The summary that was written.
+    """
+    warm_up(settings, reporter)
+    if every_step is None:
+        every_step = sum(1 for _ in steps_of(log)) <= _FEW_STEPS + 1
+    with reporter.progress("filtering") as tick:
+        run = replay(
+            log,
+            settings.make(log.start),
+            name=settings.estimator,
+            keep_history=every_step,
+            progress=tick,
+        )
+    with reporter.progress("drawing") as tick:
+        write_figures(folder, run.trace, every_step=every_step, progress=tick)
+    write_slamlog(run.log, folder / "log.csv")
+    return write_summary(folder, summarise(run, settings))
 
 
 def write_figures(
     folder: Path,
-    replay: Replay,
+    trace: RunTrace,
     *,
     every_step: bool,
     progress: Callable[[int, int], object],
 ) -> None:
-    """Draw the run: map.png, truth.png, covariance.png, errors.png, map_steps/.
+    """Draw map.png, truth.png, covariance.png, errors.png and map_steps/.
 
     Parameters
     ----------
     folder : Path
-        Where to.
-    replay : Replay
-        The run; with its history kept where every step is drawn.
+        The folder to write to.
+    trace : RunTrace
+        The run; it holds every map where every step is drawn.
     every_step : bool
         Whether to draw the map after every step too.
     progress : callable
         Called with (figures done, figures).
     """
-    trace = replay.trace
     figures = {"map": map_figure, "covariance": covariance_figure}
     figures["errors"] = errors_figure
     if trace.true_poses is not None or trace.true_landmarks is not None:
@@ -54,34 +123,15 @@ def write_figures(
     progress(count, count)
 
 
-def write_log(folder: Path, replay: Replay) -> None:
-    """Write what the estimator was driven through, as log.csv in slamlog 1."""
-    write_slamlog(replay.log, folder / "log.csv")
-
-
-def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
-    """Write summary.json, which also lists the files of the folder.
-
-    Returns
-    -------
-    dict
-        The summary with ``files``.
-    """
-    complete = {**summary, "files": sorted([*files_in(folder), SUMMARY])}
-    (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
-    return complete
-
-
-def write_table(
-    path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]
-) -> None:
-    """Write rows as CSV below the names of their columns, empty where None."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(rows)
-
-
-def as_json_text(summary: dict[str, Any]) -> str:
-    """Write a summary as people and programs can read it."""
-    return json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
+    """Print a run's landmarks, key figures and files."""
+    title = f"[bold]{summary['log']}[/] filtered by [bold]{summary['estimator']}[/]\n"
+    reporter.show(
+        title,
+        landmark_table(summary),
+        "",
+        key_figures(summary),
+        "",
+        written(str(place), summary["files"]),
+    )
+    reporter.finish({**summary, "out": str(place)})

@@ -1,4 +1,4 @@
-"""The numbers of a run as people like to read them."""
+"""The numbers of a run as tables for the terminal."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def landmark_table(summary: dict[str, Any]) -> Table:
 
 
 def key_figures(summary: dict[str, Any]) -> Table:
-    """Lay out the few numbers that tell how good a run was."""
+    """Lay out the few numbers that describe the quality of a run."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
@@ -54,7 +54,7 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
             rows.append((name, _rmse(summary[key])))
     frame = (summary["nees"] or {}).get("frame", "additive")
     for name, key, hint in (
-        (f"pose NEES, {frame}", "nees", ("too cautious", "too sure of itself")),
+        (f"pose NEES, {frame}", "nees", ("too cautious", "overconfident")),
         ("NIS", "nis", ("it assumes too much noise", "it assumes too little noise")),
     ):
         if summary[key] is not None:
@@ -88,49 +88,21 @@ def _pose(pose: Sequence[float | None], covariance: Sequence[Sequence[float]]) -
 
 
 def _rmse(errors: dict[str, float | None]) -> str:
-    raw, aligned = (_significant(errors[key]) for key in ("raw", "aligned"))
+    raw, aligned = (significant(errors[key]) for key in ("raw", "aligned"))
     return f"{raw} m RMS; {aligned} m once best fitted to the truth"
 
 
 def _ratio(numbers: dict[str, Any], hint: tuple[str, str]) -> str:
-    """Judge a ratio that is 1 for a filter as sure as it may be."""
+    """Rate NEES or NIS per degree of freedom, which is 1 for a consistent filter."""
     ratio = numbers["per_degree"]
-    text = f"{_significant(ratio)} per degree of freedom; 1 is expected"
+    text = f"{significant(ratio)} per degree of freedom; 1 is expected"
     if ratio is None or ratio > _TOO_LITTLE:
         return f"{text}: {hint[1]}"
     return f"{text}: {hint[0]}" if ratio < _TOO_MUCH else text
 
 
-def noise_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Lay out the runs of a noise study."""
-    table = Table(
-        title="Final 3σ areas and RMS errors; of an honest filter NEES and NIS are 1",
-        title_justify="left",
-        box=None,
-        pad_edge=False,
-    )
-    columns = {
-        "pose_area": "pose\n[m²]",
-        "landmark_area": "landmark\n[m²]",
-        "landmark_rmse": "map\n[m]",
-        "landmark_rmse_aligned": "fitted\n[m]",
-        "ate": "path\n[m]",
-        "nees_per_degree": "NEES\nper dof",
-        "nis_per_degree": "NIS\nper dof",
-    }
-    shown = [key for key in columns if any(row[key] is not None for row in rows)]
-    table.add_column("noise", no_wrap=True)
-    table.add_column("which is", no_wrap=True)
-    for key in shown:
-        table.add_column(Text(columns[key]), justify="right", no_wrap=True)
-    for row in rows:
-        change, _, value = row["title"].partition(" = ")
-        table.add_row(change, value, *(_significant(row[key]) for key in shown))
-    return table
-
-
 def written(folder: str, files: Sequence[str]) -> Text:
-    """Say what was written where; the pictures of single steps in one line."""
+    """List the written files; the pictures of single steps take one line."""
     steps = [file for file in files if file.startswith("map_steps/")]
     lines = [file for file in files if file not in steps]
     if steps:
@@ -145,5 +117,6 @@ def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _significant(value: float | None) -> str:
+def significant(value: float | None) -> str:
+    """Write three significant digits; a dash where unknown."""
     return "-" if value is None else f"{value:.3g}"

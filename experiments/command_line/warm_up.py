@@ -1,4 +1,4 @@
-"""The first step of a filter, which compiles it."""
+"""Compile a filter by its first steps."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ _NOTE = "compiling the filter, once after each installation …"
 
 
 def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
-    """Let an estimator take its first steps, and say so if it compiles for long.
+    """Take a filter's first steps, and print a note if it compiles for long.
 
     Raises
     ------
@@ -19,7 +19,7 @@ def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
     origin = (0.0, 0.0, 0.0)
     settings.make(origin)
     usual = replace(settings, motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2)
-    with reporter.patience(_NOTE):
+    with reporter.note_if_slow(_NOTE):
         estimator = usual.make(origin)
         try:
             for _ in range(2):
@@ -28,4 +28,4 @@ def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
             if settings.options.get("management"):
                 estimator.update([(0.0, 5.0)])
         finally:
-            estimator.reset(origin, (0.0, 0.0, 0.0))  # deletes what it wrote
+            estimator.reset(origin, (0.0, 0.0, 0.0))  # deletes the files it wrote

@@ -7,11 +7,10 @@ Every function takes plain arrays and returns a matplotlib Figure, unknown to py
 from .accuracy import truth_figure
 from .consistency import errors_figure
 from .covariance import covariance_figure
-from .maps import NoisePanel, map_figure, map_sequence, noise_study_figure
+from .maps import map_figure, map_sequence, noise_study_figure
 from .style import save_figure
 
 __all__ = [
-    "NoisePanel",
     "covariance_figure",
     "errors_figure",
     "map_figure",

@@ -20,13 +20,6 @@ from .style import ELLIPSE_HANDLER, dress, new_figure, write_title
 Array = NDArray[np.floating]
 
 
-class NoisePanel(NamedTuple):
-    """One small map of a noise study."""
-
-    title: str
-    trace: RunTrace
-
-
 def map_figure(trace: RunTrace, step: int | None = None) -> Figure:
     """Draw poses and landmarks up to a step, with their 3σ ellipses.
 
@@ -93,34 +86,33 @@ def map_sequence(
     return files
 
 
-def noise_study_figure(panels: Sequence[NoisePanel]) -> Figure:
+def noise_study_figure(runs: Sequence[tuple[str, RunTrace]]) -> Figure:
     """Compare the maps of runs that differ in their noise.
 
-    The reference comes first; below it the others, two to a row, for example each of
-    σx, σy, σα, σβ, σr times 10 (left) and divided by 10 (right). All panels show the
+    The reference comes first; the others follow below, two to a row, for example each
+    of σx, σy, σα, σβ, σr times 10 (left) and divided by 10 (right). All panels show the
     same area, at most twice as wide as that of the reference.
 
     Parameters
     ----------
-    panels : sequence of NoisePanel
-        The unchanged reference, then the variations in reading order.
+    runs : sequence of (str, RunTrace)
+        Title and trace of the unchanged reference, then of the variations in reading
+        order.
 
     Raises
     ------
     ValueError
         When there is no variation to compare.
     """
-    if len(panels) < 2:
-        raise ValueError(
-            f"panels must hold a reference and a variation, got {len(panels)}"
-        )
-    limits = _shared_limits([panel.trace for panel in panels])
-    rows = 1 + len(panels) // 2
+    if len(runs) < 2:
+        raise ValueError(f"runs must hold a reference and a variation, got {len(runs)}")
+    limits = _shared_limits([trace for _, trace in runs])
+    rows = 1 + len(runs) // 2
     width, height = limits[1] - limits[0]
     figure = new_figure(7.6, (3.15 * height / width + 0.55) * rows + 0.4)
     grid = figure.subplots(rows, 2, squeeze=False)
     reference, beside, *others = grid.flat
-    picture = _draw_panel(reference, panels[0], limits)
+    picture = _draw_panel(reference, *runs[0], limits)
     beside.set_axis_off()
     beside.legend(
         handles=picture.legend_keys(),
@@ -133,11 +125,11 @@ def noise_study_figure(panels: Sequence[NoisePanel]) -> Figure:
         title_fontsize=10,
         alignment="left",
     )
-    for axes, panel in zip(others, panels[1:], strict=False):
-        _draw_panel(axes, panel, limits)
-    for axes in others[len(panels) - 1 :]:
+    for axes, run in zip(others, runs[1:], strict=False):
+        _draw_panel(axes, *run, limits)
+    for axes in others[len(runs) - 1 :]:
         axes.set_axis_off()
-    _label_outer_axes(grid, len(panels))
+    _label_outer_axes(grid, len(runs))
     return figure
 
 
@@ -212,11 +204,11 @@ def _prepare(axes: Axes, limits: Array, *, size: float = 10.0) -> None:
     axes.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
 
 
-def _draw_panel(axes: Axes, panel: NoisePanel, limits: Array) -> MapPicture:
+def _draw_panel(axes: Axes, title: str, trace: RunTrace, limits: Array) -> MapPicture:
     _prepare(axes, limits, size=9)
-    picture = MapPicture(axes, panel.trace, scale=0.75)
-    picture.show(panel.trace.last_step)
-    write_title(axes, panel.title, _outcome(panel.trace), size=10)
+    picture = MapPicture(axes, trace, scale=0.75)
+    picture.show(trace.last_step)
+    write_title(axes, title, _outcome(trace), size=10)
     return picture
 
 

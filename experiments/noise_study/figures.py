@@ -1,4 +1,4 @@
-"""The picture of a noise study over many runs."""
+"""The figure of a noise study over many runs."""
 
 import math
 from collections.abc import Sequence
@@ -12,11 +12,12 @@ from ..figures.style import GREY, INK, dress, new_figure, write_title
 from ..monte_carlo.report.estimator_lines import log_ticks, look_of, plain
 from ..runs.filter_settings import SIGMAS
 from .many_runs import NoiseEffect
+from .variations import REFERENCE
 
 _TITLES = {
-    "both": ("World and filter change", "the filter stays told the truth"),
-    "world": ("Only the world changes", "the filter is told the old noise"),
-    "filter": ("Only the filter changes", "it is told a wrong noise"),
+    "both": ("World and filter change", "the filter assumes the right noise"),
+    "world": ("Only the world changes", "the filter assumes the old noise"),
+    "filter": ("Only the filter changes", "it assumes a wrong noise"),
 }
 _SHIFT = 0.28  # of the rows, between × 10 and ÷ 10
 
@@ -39,15 +40,15 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
         _draw(axes, [e for e in effects if e.changed in (place, "nothing")], labels)
         write_title(axes, *_TITLES[place])
         log_ticks(axes, "x")
-    rows = ("none", *SIGMAS)
-    all_axes[0, 0].set_yticks(range(len(rows)), ("unchanged", *SIGMAS))
-    all_axes[0, 0].set_ylim(len(rows) - 0.5, -0.5)
+    names = (str(REFERENCE), *SIGMAS)
+    all_axes[0, 0].set_yticks(range(len(names)), names)
+    all_axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
     figure.supxlabel(
-        "mean pose NEES / 3 ± standard error; 1 is right",
+        "mean pose NEES / 3 ± standard error; 1 is expected",
         fontsize=10,
     )
     figure.legend(
-        handles=[*_keys(labels)],
+        handles=_keys(labels),
         loc="outside upper left",
         ncols=len(labels) + 2,
         frameon=False,
@@ -59,7 +60,7 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
 def _draw(axes: Axes, effects: Sequence[NoiseEffect], labels: list[str]) -> None:
     dress(axes)
     axes.axvline(1.0, color=GREY, lw=1.0, ls=(0, (4, 3)))
-    rows = {sigma: row for row, sigma in enumerate(("none", *SIGMAS))}
+    rows = {sigma: row for row, sigma in enumerate((REFERENCE.sigma, *SIGMAS))}
     for effect in effects:
         look = look_of(labels.index(effect.estimator))
         shift = 0.0 if effect.factor == 1 else -_SHIFT if effect.factor > 1 else _SHIFT
@@ -79,7 +80,7 @@ def _draw(axes: Axes, effects: Sequence[NoiseEffect], labels: list[str]) -> None
 
 
 def _keys(labels: list[str]) -> list[Line2D]:
-    """Explain the marks."""
+    """Return the keys of the legend."""
     keys = [
         Line2D([], [], ls="", marker=look.marker, color=look.colour, label=plain(label))
         for label, look in ((label, look_of(k)) for k, label in enumerate(labels))

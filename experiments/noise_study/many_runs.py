@@ -1,7 +1,7 @@
-"""What each noise does to filters, over many runs: the noise study with error bars.
+"""The noise study over many runs, with standard errors.
 
-Every σ of `SIGMAS` times 10 and divided by 10, one by one: in the world and in what the
-filters are told of it ("both", so that they stay right), in the world alone, or in the
+Each σ of `SIGMAS` is multiplied and divided by 10, in turn: in the world and in what
+the filters assume ("both", so that they stay right), in the world alone, or in the
 filters alone, which then trust their odometry or their sensor too much or too little.
 """
 
@@ -14,60 +14,50 @@ import numpy as np
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_errors import closest
 from ..monte_carlo import monte_carlo
-from ..monte_carlo.report.nan_statistics import mean, root_mean_square, standard_error
 from ..monte_carlo.report.scores import EstimatorScores, labels_of, scores_of
-from ..runs.filter_settings import SIGMAS
-from .one_run import FACTORS, scaled_scenario
+from ..runs.nan_statistics import mean, root_mean_square, standard_error
+from .variations import CHANGES, REFERENCE, Variation, scaled_scenario
 
 Changed = Literal["both", "world", "filter"]
 CHANGED: tuple[Changed, ...] = get_args(Changed)
 
 
 class NoiseEffect(NamedTuple):
-    """What an estimator made of one change; averages over runs and steps.
+    """The effect of one change on one estimator: averages over runs and steps.
 
-    nan where too few runs did not fail.
+    A figure is nan where too few runs succeeded.
     """
 
     changed: str
-    """Where: both, world or filter; "nothing" for the reference."""
+    """Place of the change: both, world or filter; "nothing" for the reference."""
     sigma: str
-    """Which noise, one of `SIGMAS`; "none" for the reference."""
+    """The noise, one of `SIGMAS`; "none" for the reference."""
     factor: float
-    """By how much; 1 for the reference."""
+    """Its factor; 1 for the reference."""
     estimator: str
-    """Its label."""
+    """Label of the estimator."""
     runs: int
-    """That the figures are made of."""
+    """Number of runs behind the figures."""
     failed: int
-    """That failed, or whose NEES or NIS is not finite or above 1e100: left out."""
+    """Runs left out: they failed, or their NEES or NIS is not finite or above 1e100."""
     nees_per_degree: float
-    """Of the pose, invariant frame; 1 is right."""
+    """NEES of the pose divided by 3, in the invariant frame; 1 is expected."""
     nees_per_degree_error: float
-    """Its standard error: of the mean of the runs' own averages, which alone are
-    independent."""
+    """Its standard error, from the averages of the runs, which are independent."""
     nees_per_degree_median: float
-    """Of the runs' own averages, which a few bad runs do not rule."""
+    """Median of the runs' averages, which a few bad runs do not dominate."""
     nis_per_degree: float
-    """1 is expected."""
+    """NIS by its degrees of freedom; 1 is expected."""
     position_rmse: float
-    """Not aligned [m]."""
+    """Root mean square error of the position, not aligned [m]."""
     ate_aligned: float
     """Root mean square error of the path after the best rigid motion [m]."""
     landmark_rmse_aligned: float
     """The same of the final map [m]."""
     pose_area: float
-    """Of the final 3σ ellipse [m²]."""
+    """Mean area of the final 3σ ellipse of the position [m²]."""
     landmark_area: float
-    """Mean of the landmarks' final 3σ ellipses [m²]."""
-
-
-class _Variation(NamedTuple):
-    changed: str
-    sigma: str
-    factor: float
-    world: Scenario
-    told: Scenario
+    """Mean area of the landmarks' final 3σ ellipses [m²]."""
 
 
 def noise_effects(
@@ -111,68 +101,67 @@ def noise_effects(
     >>> len(effects), effects[1].sigma, effects[1].factor
     (11, 'σx', 10.0)
     """
-    variations = list(_variations(load_scenario(scenario), list(changed)))
+    world = load_scenario(scenario)
+    jobs_to_do = [("nothing", REFERENCE, world, world), *_changes(world, changed)]
     effects: list[NoiseEffect] = []
-    for done, variation in enumerate(variations):
+    for done, (place, variation, changed_world, assumed) in enumerate(jobs_to_do, 1):
         results = monte_carlo(
-            variation.world,
+            changed_world,
             estimators,
             runs,
             seed,
-            assumed=variation.told,
+            assumed=assumed,
             jobs=jobs,
             backend=backend,
         )
         effects += [
-            _effect(variation, scores_of(results, label, "invariant"))
+            _effect(place, variation, scores_of(results, label, "invariant"))
             for label in labels_of(results)
         ]
         if progress is not None:
-            progress((done + 1) * runs, len(variations) * runs)
+            progress(done * runs, len(jobs_to_do) * runs)
     return effects
 
 
-def _variations(world: Scenario, changed: list[Changed]) -> Iterator[_Variation]:
-    for place in changed:
+def _changes(
+    world: Scenario, places: Iterable[str]
+) -> Iterator[tuple[str, Variation, Scenario, Scenario]]:
+    """Yield (place of the change, variation, world, what the filters assume)."""
+    for place in places:
         if place not in CHANGED:
             hint = closest(place, CHANGED)
             raise ValueError(
                 f"changed must be of {', '.join(CHANGED)}, got '{place}'{hint}"
             )
-    yield _Variation("nothing", "none", 1.0, world, world)
-    for place in changed:
-        for sigma in SIGMAS:
-            for factor in FACTORS:
-                scaled = scaled_scenario(world, sigma, factor)
-                yield _Variation(
-                    place,
-                    sigma,
-                    factor,
-                    world if place == "filter" else scaled,
-                    world if place == "world" else scaled,
-                )
+        for variation in CHANGES:
+            scaled = scaled_scenario(world, *variation)
+            yield (
+                place,
+                variation,
+                world if place == "filter" else scaled,
+                world if place == "world" else scaled,
+            )
 
 
-def _effect(variation: _Variation, scores: EstimatorScores) -> NoiseEffect:
+def _effect(place: str, variation: Variation, scores: EstimatorScores) -> NoiseEffect:
     per_run = scores.ratios("invariant").mean(axis=1)
+    found = {
+        "nees_per_degree": mean(per_run),
+        "nees_per_degree_error": standard_error(per_run),
+        "nis_per_degree": scores.nis_per_degree,
+        "position_rmse": root_mean_square(scores.over_time("position_error")),
+        "pose_area": mean(scores.per_run("pose_area")),
+        "landmark_area": mean(scores.per_run("landmark_area")),
+    }
+    for name in ("ate_aligned", "landmark_rmse_aligned"):
+        found[name] = root_mean_square(scores.per_run(name))
     return NoiseEffect(
-        *variation[:3],
-        estimator=scores.label,
+        place,
+        variation.sigma,
+        variation.factor,
+        scores.label,
         runs=len(per_run),
         failed=len(scores.failures),
-        nees_per_degree=_known(mean(per_run)),
-        nees_per_degree_error=_known(standard_error(per_run)),
         nees_per_degree_median=float(np.median(per_run)) if len(per_run) else np.nan,
-        nis_per_degree=_known(scores.nis_per_degree),
-        position_rmse=_known(root_mean_square(scores.over_time("position_error"))),
-        ate_aligned=_known(root_mean_square(scores.per_run("ate_aligned"))),
-        landmark_rmse_aligned=_known(
-            root_mean_square(scores.per_run("landmark_rmse_aligned"))
-        ),
-        pose_area=_known(mean(scores.per_run("pose_area"))),
-        landmark_area=_known(mean(scores.per_run("landmark_area"))),
+        **{name: np.nan if value is None else value for name, value in found.items()},
     )
-
-
-def _known(value: float | None) -> float:
-    return np.nan if value is None else value

@@ -1,40 +1,38 @@
-"""What each noise does to a filter: all five times 10 and divided by 10, one by one.
+"""The noise study of one run: each noise times 10 and divided by 10, in turn.
 
-Section 3.2 of the CMU 16-833 EKF-SLAM homework. Of a log, only the filter's assumption
-changes: the readings are what they are, so a wrong σ shows as a belief that is too wide
-or too sure. Of a scenario, world and filter change together, with the same random
-numbers: the filter's assumption stays right, and one sees what a better or worse robot
-would achieve.
+Section 3.2 of the CMU 16-833 EKF-SLAM homework. For a log, only the filter's assumed
+noise changes: the readings stay as they are, so a wrong σ shows as a belief that is too
+wide or too narrow. For a scenario, world and filter change together, with the same
+random numbers: the filter's assumption stays right, and the study shows what a better
+or worse robot would achieve.
 """
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ...evaluation.trajectory_error import ellipse_areas
 from ...sim_configs import Scenario
 from ..logs.ground_truth import path_accuracy
 from ..logs.slamlog import SlamLog
 from ..runs.filter_settings import SIGMAS, FilterSettings, settings_for
-from ..runs.replay import Replay, replay
+from ..runs.log_replay import Replay, replay
+from ..runs.nan_statistics import finite
 from ..runs.summary import map_accuracy, nees_summary, nis_summary
 from ..runs.trace import RunTrace
+from .variations import CHANGES, REFERENCE, Variation, scaled_scenario
 
 Progress = Callable[[int, int], object]
 
-FACTORS = (10.0, 0.1)
 _UNITS = dict(zip(SIGMAS, ("m", "m", "rad", "rad", "m"), strict=True))
 
 
 class NoiseRow(NamedTuple):
-    """One run of a noise study in numbers; None where the truth is unknown."""
+    """The numbers of one run of a noise study; None where the truth is unknown."""
 
     sigma: str
-    """Which noise was changed, one of `SIGMAS`; "none" for the reference."""
+    """The noise that was changed, one of `SIGMAS`; "none" for the reference."""
     factor: float
-    """By how much; 1 for the reference."""
+    """Its factor; 1 for the reference."""
     std: float | None
     """Its value then [m or rad]; None for the reference."""
     pose_area: float
@@ -48,16 +46,16 @@ class NoiseRow(NamedTuple):
     ate: float | None
     """Root mean square error of the path [m]."""
     nees_per_degree: float | None
-    """Mean pose NEES by its 3 degrees of freedom: 1 is expected of a true belief."""
+    """Mean NEES of the pose divided by 3; 1 is expected of a consistent filter."""
     nis_per_degree: float | None
-    """The same of the NIS, which needs no truth."""
+    """NIS by its degrees of freedom, which needs no truth; 1 is expected."""
 
 
 class NoiseRun(NamedTuple):
     """One run of a noise study."""
 
     title: str
-    """For its panel, such as "σx × 10 = 2.5 m"."""
+    """Of its panel, for example "σx × 10 = 2.5 m"."""
     row: NoiseRow
     trace: RunTrace
 
@@ -82,11 +80,10 @@ def study_log(
         The reference, then two runs for each of `SIGMAS`.
     """
 
-    def run(sigma: str, factor: float) -> tuple[Replay, FilterSettings]:
-        changed = settings.scaled(sigma, factor)
-        return replay(log, changed.make(log.start), name=settings.estimator), changed
+    def varied(variation: Variation) -> tuple[SlamLog, FilterSettings]:
+        return log, settings.scaled(*variation)
 
-    return _study(run, progress)
+    return _study(varied, progress)
 
 
 def study_scenario(
@@ -108,7 +105,7 @@ def study_scenario(
         differs by the factor alone; see
         :func:`~slamgym.experiments.logs.recording.record_episode`.
     estimator : str
-        Name of the filter; its noise is that of the world.
+        Name of the filter; it assumes the noise of the world.
     options : mapping, optional
         Its further options.
     progress : callable, optional
@@ -120,98 +117,45 @@ def study_scenario(
         The reference, then two runs for each of `SIGMAS`.
     """
 
-    def run(sigma: str, factor: float) -> tuple[Replay, FilterSettings]:
-        log = record(scaled_scenario(scenario, sigma, factor))
-        settings = settings_for(log, estimator=estimator, options=options)
-        return replay(log, settings.make(log.start), name=estimator), settings
+    def varied(variation: Variation) -> tuple[SlamLog, FilterSettings]:
+        log = record(scaled_scenario(scenario, *variation))
+        return log, settings_for(log, estimator=estimator, options=options)
 
-    return _study(run, progress)
-
-
-def scaled_scenario(scenario: Scenario, sigma: str, factor: float) -> Scenario:
-    """Multiply one of `SIGMAS` of a world by a factor, and keep all else.
-
-    Examples
-    --------
-    >>> from slamgym.sim_configs import load_scenario
-    >>> scaled_scenario(load_scenario("six_landmarks"), "σβ", 10).sensor.std
-    (0.1, 0.08)
-    """
-    settings = FilterSettings("", scenario.motion.std, scenario.sensor.std)
-    scaled = settings.scaled(sigma, factor)
-    return scenario.with_changes(
-        motion={"std": scaled.motion_std}, sensor={"std": scaled.measurement_std}
-    )
-
-
-def ellipse_areas(covariances: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Areas 9 π √det P of 3σ ellipses, for covariances (k, 2, 2) [m²].
-
-    Examples
-    --------
-    >>> ellipse_areas(np.eye(2)[None]) / np.pi
-    array([9.])
-    """
-    determinants = np.maximum(np.linalg.det(covariances), 0.0)
-    return np.asarray(9 * np.pi * np.sqrt(determinants))
+    return _study(varied, progress)
 
 
 def _study(
-    run: Callable[[str, float], tuple[Replay, FilterSettings]],
+    varied: Callable[[Variation], tuple[SlamLog, FilterSettings]],
     progress: Progress | None,
 ) -> list[NoiseRun]:
     runs: list[NoiseRun] = []
-    variations = list(_variations())
-    for sigma, factor in variations:
-        done, settings = run(sigma, factor)
-        std = _std_of(settings, sigma)
-        runs.append(
-            NoiseRun(
-                _title(sigma, factor, std), _row(done, sigma, factor, std), done.trace
-            )
-        )
+    variations = (REFERENCE, *CHANGES)
+    for variation in variations:
+        log, settings = varied(variation)
+        done = replay(log, settings.make(log.start), name=settings.estimator)
+        runs.append(_measured(done, variation, settings))
         if progress is not None:
             progress(len(runs), len(variations))
     return runs
 
 
-def _variations() -> Iterator[tuple[str, float]]:
-    yield "none", 1.0
-    for sigma in SIGMAS:
-        for factor in FACTORS:
-            yield sigma, factor
-
-
-def _std_of(settings: FilterSettings, sigma: str) -> float | None:
-    stds: Sequence[float] = (*settings.motion_std, *settings.measurement_std)
-    return dict(zip(SIGMAS, stds, strict=True)).get(sigma)
-
-
-def _title(sigma: str, factor: float, std: float | None) -> str:
-    if std is None:
-        return "unchanged"
-    change = f"× {factor:g}" if factor > 1 else f"÷ {1 / factor:g}"
-    return f"{sigma} {change} = {std:.3g} {_UNITS[sigma]}"
-
-
-def _row(done: Replay, sigma: str, factor: float, std: float | None) -> NoiseRow:
+def _measured(done: Replay, variation: Variation, settings: FilterSettings) -> NoiseRun:
+    stds = (*settings.motion_std, *settings.measurement_std)
+    std = dict(zip(SIGMAS, stds, strict=True)).get(variation.sigma)
+    value = "" if std is None else f" = {std:.3g} {_UNITS[variation.sigma]}"
     trace = done.trace
     landmarks, path = map_accuracy(trace), path_accuracy(done.log, trace.t, trace.poses)
     nees, nis = nees_summary(trace), nis_summary(trace)
     areas = ellipse_areas(trace.landmark_covariances)
-    return NoiseRow(
-        sigma=sigma,
-        factor=factor,
+    row = NoiseRow(
+        *variation,
         std=std,
         pose_area=float(ellipse_areas(trace.pose_covariances[-1:, :2, :2])[0]),
-        landmark_area=_finite(areas.mean()) if len(areas) else None,
-        landmark_rmse=_finite(landmarks.raw_rmse) if landmarks else None,
-        landmark_rmse_aligned=_finite(landmarks.aligned_rmse) if landmarks else None,
-        ate=_finite(path.raw_rmse) if path else None,
+        landmark_area=finite(areas.mean()) if len(areas) else None,
+        landmark_rmse=finite(landmarks.raw_rmse) if landmarks else None,
+        landmark_rmse_aligned=finite(landmarks.aligned_rmse) if landmarks else None,
+        ate=finite(path.raw_rmse) if path else None,
         nees_per_degree=nees["per_degree"] if nees else None,
         nis_per_degree=nis["per_degree"] if nis else None,
     )
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
+    return NoiseRun(f"{variation}{value}", row, trace)

@@ -1,4 +1,4 @@
-"""A folder that one process at a time writes to."""
+"""Lock a folder, so that one process at a time writes to it."""
 
 import contextlib
 import os
@@ -6,70 +6,59 @@ import platform
 from collections.abc import Iterator
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
+WRITER = ".writer"
+"""The lock file; it names the process that writes to the folder."""
+
 
 @contextlib.contextmanager
-def sole_writer(folder: Path, note: Path | None = None) -> Iterator[None]:
-    """Keep other writers out of a folder meanwhile.
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Keep other writers out of a folder during the block.
 
-    The lock is one of the operating system: it ends with the process at the latest,
-    and holds among the processes of one machine.  (On Windows, nobody is kept out.)
+    The operating system holds the lock. It ends with the process at the latest, and
+    works among the processes of one machine. A killed writer leaves the file `WRITER`
+    behind, which locks nobody out.
 
     Parameters
     ----------
     folder : Path
         A folder that exists.
-    note : Path, optional
-        A file that says meanwhile who the writer is, for those kept out to tell.  A
-        killed writer leaves it behind, where it keeps nobody out.
 
     Raises
     ------
     ValueError
-        If another process writes to it, or this one elsewhere.
+        If another process, or this one elsewhere, writes to the folder.
     OSError
-        If the folder cannot be opened.
+        If the folder cannot be written.
     """
+    file = folder / WRITER
+    lock = FileLock(file, timeout=0)
     try:
-        import fcntl  # noqa: PLC0415 (not on Windows)
-    except ImportError:
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
+        lock.acquire()
+    except Timeout:
+        raise ValueError(
+            f"another process is writing to {folder}{_named(file)}"
+        ) from None
+    except OSError as error:
+        reason = error.strerror or error
+        raise OSError(f"the folder {folder} cannot be written: {reason}") from error
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(
-                f"another process is writing to {folder}{_who(note)}"
-            ) from None
-        with _shown(note):
-            yield
-    finally:
-        fcntl.flock(handle, fcntl.LOCK_UN)  # in forked children too
-        os.close(handle)
-
-
-@contextlib.contextmanager
-def _shown(note: Path | None) -> Iterator[None]:
-    """Say who the writer is, where there is room for that."""
-    if note is None:
-        yield
-        return
-    with contextlib.suppress(OSError):
-        text = f"process {os.getpid()} on {platform.node() or 'this machine'}\n"
-        note.write_text(text, encoding="utf-8")
-    try:
+        with contextlib.suppress(OSError):  # on Windows the locked file is not writable
+            text = f"process {os.getpid()} on {platform.node() or 'this machine'}\n"
+            file.write_text(text, encoding="utf-8")
         yield
     finally:
         with contextlib.suppress(OSError):
-            note.unlink()
+            file.unlink()
+        lock.release()
 
 
-def _who(note: Path | None) -> str:
+def _named(file: Path) -> str:
     try:
-        said = "" if note is None else note.read_text(encoding="utf-8").strip()
+        writer = file.read_text(encoding="utf-8").strip()
     except OSError:
-        said = ""
-    if not said:
+        writer = ""
+    if not writer:
         return ""
-    return f": it is in use by {said}; wait for its end, or choose another folder"
+    return f": it is in use by {writer}; wait for its end, or choose another folder"

@@ -13,7 +13,8 @@ from ...evaluation import nees
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
 from ..logs.ground_truth import path_accuracy
 from .filter_settings import FilterSettings
-from .replay import Replay
+from .log_replay import Replay
+from .nan_statistics import finite
 from .trace import RunTrace
 
 Array = NDArray[np.floating]
@@ -86,10 +87,10 @@ def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
     return [
         {
             "id": landmark_id,
-            "x": _finite(x),
-            "y": _finite(y),
-            "euclidean": _finite(math.hypot(*error)),
-            "mahalanobis": _finite(math.sqrt(square)),
+            "x": finite(x),
+            "y": finite(y),
+            "euclidean": finite(math.hypot(*error)),
+            "mahalanobis": finite(math.sqrt(square)),
         }
         for landmark_id, (x, y), error, square in zip(
             trace.landmark_ids.tolist(), trace.landmarks, errors, squared, strict=True
@@ -115,11 +116,11 @@ def nis_summary(trace: RunTrace) -> dict[str, Any] | None:
     tail = (1 - _SHARE) / 2
     inside = (nis >= chi2.ppf(tail, dof)) & (nis <= chi2.ppf(1 - tail, dof))
     return {
-        "mean": _finite(nis.mean()),
-        "total": _finite(nis.sum()),
+        "mean": finite(nis.mean()),
+        "total": finite(nis.sum()),
         "degrees_of_freedom": int(dof.sum()),
-        "per_degree": _finite(nis.sum() / dof.sum()),
-        "inside_95": _finite(inside.mean()),
+        "per_degree": finite(nis.sum() / dof.sum()),
+        "inside_95": finite(inside.mean()),
         "scans": int(used.sum()),
     }
 
@@ -140,10 +141,10 @@ def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
     if not known.any():
         return None
     return {
-        "mean": _finite(values[known].mean()),
-        "final": _finite(values[-1]),
+        "mean": finite(values[known].mean()),
+        "final": finite(values[-1]),
         "degrees_of_freedom": 3,
-        "per_degree": _finite(values[known].mean() / 3),
+        "per_degree": finite(values[known].mean() / 3),
         "steps": int(known.sum()),
         "frame": trace.frame,
     }
@@ -199,14 +200,10 @@ def _rmse(accuracy: PositionAccuracy | None) -> dict[str, float | None] | None:
     if accuracy is None:
         return None
     return {
-        "raw": _finite(accuracy.raw_rmse),
-        "aligned": _finite(accuracy.aligned_rmse),
+        "raw": finite(accuracy.raw_rmse),
+        "aligned": finite(accuracy.aligned_rmse),
     }
 
 
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
 def _finite_list(values: Array) -> list[float | None]:
-    return [_finite(value) for value in values]
+    return [finite(value) for value in values]

@@ -22,7 +22,7 @@ from .manifest import (
     versions_now,
     write_manifest,
 )
-from .shard_folder import claimed, written_whole
+from .shard_folder import claimed, replace_shard
 
 Progress = Callable[[int, int], object]
 
@@ -172,7 +172,7 @@ def _make_shard(
     trajectories = drive_episodes(
         job.scenario, job.controller, seeds, progress=bar.advance
     )
-    with written_whole(out / name) as partial:
+    with replace_shard(out / name) as partial:
         layout.write(trajectories, partial)
         entry = ShardEntry(name, episodes.start, len(episodes), checksum(partial))
         if promised is not None and promised != entry:

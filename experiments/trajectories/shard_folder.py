@@ -1,4 +1,4 @@
-"""The folder of a data set while it is written: one writer, whole shards, no rests."""
+"""The folder of a data set while it is written: one writer, only complete shards."""
 
 import contextlib
 import re
@@ -7,46 +7,45 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..runs.folder_lock import sole_writer
+from ..runs.folder_lock import WRITER, locked_folder
 from .manifest import MANIFEST
 
 _WRITING = ".writing-"
-_RESTS = re.compile(r"\.writing-[0-9a-f]{8}|\.manifest\.[0-9a-f]{8}\.json")
+_LEFTOVERS = re.compile(r"\.writing-[0-9a-f]{8}|\.manifest\.[0-9a-f]{8}\.json")
 
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Make a folder if need be, and keep other writers out of it meanwhile.
+    """Make a folder if it does not exist, and lock it during the block.
 
-    What a killed writer left half done is removed. (On Windows, nobody is kept out.)
+    Files that a killed writer left half written are removed.
 
     Raises
     ------
     ValueError
-        If the folder is a file, or holds what is no data set, or another process
-        writes to it.
+        If the folder is a file, or holds something other than a data set, or another
+        process writes to it.
     """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"out must be a folder, got the file {folder}")
     folder.mkdir(parents=True, exist_ok=True)
-    with sole_writer(folder):
-        foreign = sorted(
-            entry.name for entry in folder.iterdir() if not _RESTS.fullmatch(entry.name)
-        )
+    with locked_folder(folder):
+        entries = [entry for entry in folder.iterdir() if entry.name != WRITER]
+        leftovers = [entry for entry in entries if _LEFTOVERS.fullmatch(entry.name)]
+        foreign = sorted(entry.name for entry in set(entries) - set(leftovers))
         if foreign and MANIFEST not in foreign:
             raise ValueError(
                 f"out must be a new or empty folder, or hold a {MANIFEST}: "
                 f"{folder} holds {foreign[0]}"
             )
-        for entry in folder.iterdir():
-            if _RESTS.fullmatch(entry.name):
-                _remove(entry)
+        for entry in leftovers:
+            _remove(entry)
         yield
 
 
 @contextlib.contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
-    """Lend a path of the same name elsewhere; when all went well, move it to `path`.
+def replace_shard(path: Path) -> Iterator[Path]:
+    """Provide a temporary path of the same name, and move it to `path` after the block.
 
     Works for files and for folders, and replaces what is there.
 
@@ -55,15 +54,15 @@ def written_whole(path: Path) -> Iterator[Path]:
     Path
         Where to write the file, or make the folder.
     """
-    workshop = path.with_name(f"{_WRITING}{secrets.token_hex(4)}")
-    workshop.mkdir()
+    temporary = path.with_name(f"{_WRITING}{secrets.token_hex(4)}")
+    temporary.mkdir()
     try:
-        partial = workshop / path.name
+        partial = temporary / path.name
         yield partial
         _remove(path)
         partial.replace(path)
     finally:
-        shutil.rmtree(workshop, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _remove(path: Path) -> None:

@@ -21,7 +21,7 @@ from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments.logs.ground_truth import true_landmarks_of
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
 from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.replay import replay
+from slamgym.experiments.runs.log_replay import replay
 from slamgym.experiments.runs.summary import summarise
 
 MANAGEABLE = list_estimators()

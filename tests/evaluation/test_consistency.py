@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.replay import replay
+from slamgym.experiments.runs.log_replay import replay
 from slamgym.experiments.runs.summary import pose_nees
 from slamgym.sim_configs import action_sequence, load_scenario
 

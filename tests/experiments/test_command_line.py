@@ -11,7 +11,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.experiments.command_line import reporter, run_and_replay
+from slamgym.experiments.command_line import reporter, run_files
 from slamgym.experiments.command_line.app import main
 from slamgym.sim_configs import list_presets, load_scenario
 
@@ -52,10 +52,10 @@ def log(here):
 
 @pytest.fixture
 def without_pictures(monkeypatch):
-    def leave_a_mark(folder, replay, **_):
+    def leave_a_mark(folder, trace, **_):
         (folder / "map.png").write_text("a picture")
 
-    monkeypatch.setattr(run_and_replay, "write_figures", leave_a_mark)
+    monkeypatch.setattr(run_files, "write_figures", leave_a_mark)
 
 
 def slamgym(*arguments):
@@ -191,9 +191,9 @@ def test_the_pictures_of_single_steps_can_be_left_out(log):
 def test_every_map_is_kept_where_every_step_is_drawn(log, flag, monkeypatch):
     histories = []
     monkeypatch.setattr(
-        run_and_replay,
+        run_files,
         "write_figures",
-        lambda folder, replay, **_: histories.append(replay.trace.landmark_history),
+        lambda folder, trace, **_: histories.append(trace.landmark_history),
     )
     rows = "".join(f"odometry,{t},0.1,0,1\n" for t in range(2, 602))
     log.write_text(LOG + rows)
@@ -234,10 +234,10 @@ def test_a_folder_with_other_things_is_left_alone(log, without_pictures):
 def test_ctrl_c_leaves_the_older_output_as_it_was(log, without_pictures, monkeypatch):
     answered("replay", log, "--out", "out")
 
-    def interrupt(folder, replay):
+    def interrupt(log, path):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_and_replay, "write_log", interrupt)
+    monkeypatch.setattr(run_files, "write_slamlog", interrupt)
     message = refused("replay", log, "--out", "out", code=130)
     assert message == "interrupted; nothing was written"
     message = refused("replay", log, "--out", "deep/down/out", code=130)
@@ -245,10 +245,10 @@ def test_ctrl_c_leaves_the_older_output_as_it_was(log, without_pictures, monkeyp
 
 
 def test_a_bug_is_one_line_too(log, monkeypatch):
-    def stumble(folder, replay, **_):
+    def stumble(folder, trace, **_):
         raise KeyError("oops")
 
-    monkeypatch.setattr(run_and_replay, "write_figures", stumble)
+    monkeypatch.setattr(run_files, "write_figures", stumble)
     message = refused("replay", log, code=1)
     assert message.startswith("internal error, KeyError: 'oops'")
 
@@ -452,12 +452,12 @@ def test_the_installed_program_answers_an_error_with_one_line():
     assert result.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(("patience", "note"), [(0.01, "compiling\n"), (60.0, "")])
+@pytest.mark.parametrize(("slow_after", "note"), [(0.01, "compiling\n"), (60.0, "")])
 def test_a_long_silence_is_explained_on_standard_error(
-    patience, note, capsys, monkeypatch
+    slow_after, note, capsys, monkeypatch
 ):
-    monkeypatch.setattr(reporter, "_PATIENCE", patience)
-    with reporter.Reporter(as_json=True).patience("compiling"):
+    monkeypatch.setattr(reporter, "_SLOW", slow_after)
+    with reporter.Reporter(as_json=True).note_if_slow("compiling"):
         time.sleep(0.2)
     assert capsys.readouterr() == ("", note)
 

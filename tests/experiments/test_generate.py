@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from slamgym.envs.controllers import CONTROLLERS
-from slamgym.experiments.command_line import generate as generate_command
 from slamgym.experiments.command_line import reporter
 from slamgym.experiments.command_line.errors import InterruptedRunError
+from slamgym.experiments.command_line.generate import generate as generate_command
 from slamgym.experiments.command_line.scenario_options import recorded
 from slamgym.experiments.logs.slamlog import write_slamlog
 from slamgym.experiments.trajectories import generate, shard_folder
@@ -464,9 +464,8 @@ def test_progress_counts_all_steps_also_those_done_earlier(tmp_path):
 
 
 def command(out, **changes):
-    options = {"episodes": 2, "controller": "random", "seed": 0, "format": "npz"}
-    options |= {"episodes_per_shard": None, "as_json": False, **changes}
-    generate_command.write_trajectories(LOOP, out=out, **options)
+    options = {"episodes": 2, "controller": "random", "as_json": False, **changes}
+    generate_command("loop", steps=30, out=out, **options)
 
 
 def test_the_command_says_where_the_data_lie_and_how_to_load_them(tmp_path, capsys):

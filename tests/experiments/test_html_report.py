@@ -22,7 +22,7 @@ from slamgym.experiments.monte_carlo.report.html_report import (
     write_html_report,
 )
 from slamgym.experiments.monte_carlo.report.summary import summarise_monte_carlo
-from slamgym.experiments.noise_study.one_run import scaled_scenario
+from slamgym.experiments.noise_study.variations import scaled_scenario
 from slamgym.sim_configs import load_scenario
 
 needs_chromium = pytest.mark.skipif(

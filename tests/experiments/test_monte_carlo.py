@@ -26,7 +26,7 @@ from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES
 from slamgym.experiments.monte_carlo.store.result_blocks import merge_blocks
 from slamgym.experiments.monte_carlo.store.results import load_results
 from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.replay import replay
+from slamgym.experiments.runs.log_replay import replay
 from slamgym.sim_configs import load_scenario
 
 RUNS = 20

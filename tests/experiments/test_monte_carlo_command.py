@@ -142,7 +142,7 @@ def test_an_interrupted_job_says_that_it_goes_on(here):
     child.send_signal(signal.SIGINT)
     _, stderr = child.communicate(timeout=60)
     assert child.returncode == 130
-    assert "the runs done lie in out, and the same command goes on" in stderr
+    assert "the finished runs are in out, and the same command continues" in stderr
     assert list(blocks.glob("runs-*.npz"))
 
 

@@ -199,15 +199,15 @@ def test_a_writer_that_fails_lets_the_next_one_in(tmp_path, whole):
 def test_a_child_forked_meanwhile_does_not_keep_the_folder(tmp_path):
     code = """
         import os, pathlib, signal, sys, time
-        from slamgym.experiments.runs.folder_lock import sole_writer
+        from slamgym.experiments.runs.folder_lock import locked_folder
         folder = pathlib.Path(sys.argv[1])
-        with sole_writer(folder):
+        with locked_folder(folder):
             child = os.fork()
             if child == 0:
                 time.sleep(600)
                 os._exit(0)
         try:
-            with sole_writer(folder):
+            with locked_folder(folder):
                 print("again")
         finally:
             os.kill(child, signal.SIGKILL)

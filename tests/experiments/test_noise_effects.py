@@ -6,13 +6,14 @@ import json
 import numpy as np
 import pytest
 
-from slamgym.experiments.command_line.noise_study_runs import study_effects
+from slamgym.experiments.command_line.noise_study import effects_study, write_study
+from slamgym.experiments.command_line.reporter import Reporter
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.report.scores import scores_of
-from slamgym.experiments.noise_study import many_runs as noise_effects_module
+from slamgym.experiments.noise_study import many_runs
 from slamgym.experiments.noise_study.figures import noise_effects_figure
 from slamgym.experiments.noise_study.many_runs import noise_effects
-from slamgym.experiments.noise_study.one_run import scaled_scenario
+from slamgym.experiments.noise_study.variations import scaled_scenario
 from slamgym.experiments.runs.filter_settings import SIGMAS
 from slamgym.sim_configs import load_scenario
 
@@ -105,7 +106,7 @@ def test_runs_have_failed_where_the_report_says_so(monkeypatch):
     results["nis"].loc[{"run": 1, "step": 7}] = np.nan
     results["pose_nees_invariant"].loc[{"run": 2, "step": 9}] = 1e200
     results["position_error"].loc[{"run": 3, "step": 9}] = 1e7  # far off, yet a number
-    monkeypatch.setattr(noise_effects_module, "monte_carlo", lambda *_, **__: results)
+    monkeypatch.setattr(many_runs, "monte_carlo", lambda *_, **__: results)
     reference = noise_effects("six_landmarks", "ekf", 4)[0]
     scores = scores_of(results, "ekf", "invariant")
     assert reference.failed == len(scores.failures) == 2
@@ -118,16 +119,9 @@ def test_runs_have_failed_where_the_report_says_so(monkeypatch):
 def test_table_csv_and_summary_show_the_error_where_there_is_one(
     runs, tmp_path, capsys
 ):
-    study_effects(
-        load_scenario("six_landmarks"),
-        "ekf",
-        runs=runs,
-        seed=0,
-        changed="filter",
-        jobs=None,
-        out=tmp_path / "study",
-        as_json=True,
-    )
+    world = load_scenario("six_landmarks")
+    study = effects_study(world, "ekf", runs, seed=0, change="filter", jobs=None)
+    write_study(study, tmp_path / "study", Reporter(as_json=True))
     with (tmp_path / "study" / "noise_study.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     told = json.loads((tmp_path / "study" / "summary.json").read_text("utf-8"))["rows"]

@@ -12,7 +12,6 @@ from run_traces import make_trace
 from scipy.stats import chi2
 
 from slamgym.experiments.figures import (
-    NoisePanel,
     covariance_figure,
     errors_figure,
     map_figure,
@@ -30,7 +29,7 @@ from slamgym.experiments.figures.style import new_figure
 def noise_study(trace):
     names = [f"σ{name} {by}" for name in "xyαβr" for by in ("× 10", "÷ 10")]
     return noise_study_figure(
-        [NoisePanel("unchanged", trace), *(NoisePanel(name, trace) for name in names)]
+        [("unchanged", trace), *((name, trace) for name in names)]
     )
 
 
@@ -427,8 +426,8 @@ def test_noise_panels_share_one_view_and_come_in_reading_order():
 
 def test_diverged_variation_does_not_shrink_the_reference():
     wild = make_trace(poses=make_trace().poses * [50, 50, 1])
-    panels = [NoisePanel("unchanged", make_trace()), NoisePanel("wild", wild)]
-    width = np.ptp(noise_study_figure(panels).axes[0].get_xlim())
+    runs = [("unchanged", make_trace()), ("wild", wild)]
+    width = np.ptp(noise_study_figure(runs).axes[0].get_xlim())
     assert width <= 2.01 * max(
         np.ptp(typical(map_figure).axes[0].get_xlim()),
         np.ptp(typical(map_figure).axes[0].get_ylim()),
@@ -444,9 +443,7 @@ def test_only_outer_panels_are_labelled():
 
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_any_number_of_variations_is_laid_out(count):
-    figure = noise_study_figure(
-        [NoisePanel(str(k), make_trace()) for k in range(count)]
-    )
+    figure = noise_study_figure([(str(k), make_trace()) for k in range(count)])
     shown = [axes for axes in figure.axes if axes.axison]
     assert [axes.get_title(loc="left") for axes in shown] == list("0123"[:count])
     lowest = {}
@@ -457,7 +454,7 @@ def test_any_number_of_variations_is_laid_out(count):
 
 def test_noise_study_needs_a_variation():
     with pytest.raises(ValueError, match="a reference and a variation, got 1"):
-        noise_study_figure([NoisePanel("unchanged", make_trace())])
+        noise_study_figure([("unchanged", make_trace())])
 
 
 # ---- files

@@ -13,7 +13,7 @@ from slamgym.experiments.logs.slamlog import (
     write_slamlog,
 )
 from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.replay import replay
+from slamgym.experiments.runs.log_replay import replay
 from slamgym.sim_configs import action_sequence, load_scenario
 
 

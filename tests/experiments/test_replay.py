@@ -10,8 +10,8 @@ from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.slamlog import LogError, OdometryRow, Scan, SlamLog
 from slamgym.experiments.logs.steps import steps_of
 from slamgym.experiments.runs.filter_settings import FilterSettings, settings_for
+from slamgym.experiments.runs.log_replay import replay
 from slamgym.experiments.runs.map_history import MapHistory
-from slamgym.experiments.runs.replay import replay
 from slamgym.experiments.runs.summary import pose_nees, summarise
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}

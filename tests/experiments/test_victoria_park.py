@@ -10,7 +10,7 @@ import pytest
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.slamlog import Scan
 from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.replay import replay
+from slamgym.experiments.runs.log_replay import replay
 from slamgym.experiments.runs.summary import summarise
 
 DATA = os.environ.get("SLAMGYM_DATA")

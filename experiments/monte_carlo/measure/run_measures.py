@@ -12,8 +12,7 @@ from ....estimator.error_frames import ERROR_FRAMES
 from ....estimator.interface import Belief
 from ....estimator.models.angles import wrap_angle
 from ....evaluation import nees
-from ....evaluation.trajectory_error import position_accuracy
-from ...noise_study.one_run import ellipse_areas
+from ....evaluation.trajectory_error import ellipse_areas, position_accuracy
 from ...runs.simulated_runs import SimulatedRuns
 from .filtered_runs import Failure, FilteredRuns
 

@@ -6,7 +6,7 @@ from typing import Any
 from ....evaluation.consistency_report import ConsistencyReport
 from ....evaluation.hypothesis_tests import Decision
 from ....evaluation.time_average_tests import EQUIVALENCE_MARGIN
-from .nan_statistics import finite
+from ...runs.nan_statistics import finite
 
 
 def decisions_table(report: ConsistencyReport) -> dict[str, Any]:

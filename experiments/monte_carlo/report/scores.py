@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ....estimator.error_frames import ErrorFrame
-from .nan_statistics import quotient
+from ...runs.nan_statistics import quotient
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import xarray as xr
 from ....estimator.error_frames import ErrorFrame
 from ....evaluation.consistency_report import ConsistencyReport, consistency_report
 from ....evaluation.nees import average_band
+from ...runs.nan_statistics import finite, mean, quotient, root_mean_square
 from .decision_entries import decisions_table
-from .nan_statistics import finite, mean, quotient, root_mean_square
 from .scores import (
     POINT_FREEDOM,
     POSE_FREEDOM,

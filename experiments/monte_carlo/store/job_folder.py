@@ -1,4 +1,4 @@
-"""The folder of a Monte Carlo: of one job, told in ``job.json``, and of one writer."""
+"""The folder of a Monte Carlo: it belongs to one job (``job.json``) and one writer."""
 
 import contextlib
 import hashlib
@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from ....sim_configs.atomic_file import replace_when_written
-from ...runs.folder_lock import sole_writer
+from ...runs.folder_lock import WRITER, locked_folder
 
 FORMAT = "slamgym monte carlo 1"
 JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
-_WRITER = ".writer"
 _PARTIAL = re.compile(
     r"\.(job\.[0-9a-f]{8}\.json|results\.[0-9a-f]{8}\.nc"
     r"|runs-\d{7,}-\d{7,}\.[0-9a-f]{8}\.npz)"
@@ -24,16 +23,16 @@ _PARTIAL = re.compile(
 def claimed(
     path: Path, identity: dict[str, Any], *, fresh: bool = False
 ) -> Iterator[None]:
-    """Make a folder the job's own, or see that it is, and keep other writers out.
+    """Make a folder for a job, or check that it is the job's, and lock it.
 
     Files that a killed writer left half written are removed.
 
     Parameters
     ----------
     path : Path
-        The folder, made if need be.
+        The folder; it is made if it does not exist.
     identity : dict
-        Of the job, in plain values.
+        The job in plain values.
     fresh : bool
         Whether to remove the blocks of an earlier job, this one or another.
 
@@ -45,17 +44,17 @@ def claimed(
     OSError
         If it cannot be written.
     """
-    with _told(path):
+    with _naming(path):
         path.mkdir(parents=True, exist_ok=True)
-    with sole_writer(path, path / _WRITER):
-        if any(not _is_rest(entry) for entry in path.iterdir()):
+    with locked_folder(path):
+        if any(not _is_leftover(entry) for entry in path.iterdir()):
             found = identity_in(path)
             if not fresh:
                 refuse_other(path, found, identity)
-        with _told(path):
-            for rest in (*path.iterdir(), *(path / BLOCKS).glob(".*")):
-                if _PARTIAL.fullmatch(rest.name):
-                    rest.unlink()
+        with _naming(path):
+            for leftover in (*path.iterdir(), *(path / BLOCKS).glob(".*")):
+                if _PARTIAL.fullmatch(leftover.name):
+                    leftover.unlink()
             for old in (*blocks_in(path), path / RESULTS) if fresh else ():
                 old.unlink(missing_ok=True)
             with replace_when_written(path / JOB) as partial:
@@ -71,18 +70,18 @@ def blocks_in(path: Path) -> list[Path]:
 
 
 def digest_of(identity: dict[str, Any]) -> str:
-    """Identify a job in its blocks."""
+    """Return the digest that identifies a job in its blocks."""
     text = json.dumps(identity, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def identity_in(path: Path) -> dict[str, Any]:
-    """Read which job a folder is of.
+    """Read the job of a folder.
 
     Raises
     ------
     ValueError
-        If it is of none.
+        If there is none.
     """
     file = path / JOB
     if not file.exists():
@@ -97,29 +96,30 @@ def identity_in(path: Path) -> dict[str, Any]:
 
 
 def refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> None:
-    """Say in what a folder's job is not the one asked for.
+    """Refuse a folder of another job.
 
     Raises
     ------
     ValueError
-        If it is another.
+        With the first difference.
     """
     for key, value in asked.items():
         if found.get(key) != value:
             raise ValueError(
-                f"{path} holds results of {_said(key, found.get(key))}, not of "
-                f"{_said(key, value)}: choose another folder, or ask for fresh results"
+                f"{path} holds results of {_described(key, found.get(key))}, "
+                f"not of {_described(key, value)}: "
+                "choose another folder, or ask for fresh results"
             )
 
 
-def _is_rest(entry: Path) -> bool:
-    """Whether it may lie in a folder of which a writer was killed before all else."""
-    return entry.name == _WRITER or _PARTIAL.fullmatch(entry.name) is not None
+def _is_leftover(entry: Path) -> bool:
+    """Whether a writer that was killed at once may have left this file."""
+    return entry.name == WRITER or _PARTIAL.fullmatch(entry.name) is not None
 
 
 @contextlib.contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """Name the folder where it cannot be written."""
+def _naming(path: Path) -> Iterator[None]:
+    """Name the folder in errors of the file system."""
     try:
         yield
     except OSError as error:
@@ -127,8 +127,8 @@ def _told(path: Path) -> Iterator[None]:
         raise OSError(f"the folder {path} cannot be written: {reason}") from error
 
 
-def _said(key: str, value: Any) -> str:
-    """Name a part of a job in a few words."""
+def _described(key: str, value: Any) -> str:
+    """Describe a part of a job in a few words."""
     if key in ("scenario", "assumed"):
         lines = str(value).splitlines()
         digest = hashlib.sha256(str(value).encode()).hexdigest()[:8]

@@ -1,4 +1,4 @@
-"""Averages over what is known, as plain numbers; None where nothing is."""
+"""Statistics over the finite entries of arrays; None where there is none."""
 
 import math
 from typing import Any
@@ -45,7 +45,7 @@ def quotient(values: NDArray[Any], freedom: NDArray[Any]) -> float | None:
 
 
 def standard_error(values: NDArray[Any]) -> float | None:
-    """Say how far the mean of independent numbers is off, s / √M; None below two.
+    """Return the standard error of the mean, s / √M; None for fewer than two.
 
     Examples
     --------

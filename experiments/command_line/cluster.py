@@ -1,0 +1,59 @@
+"""The clusters that a Monte Carlo may use: Dask and Ray."""
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+from .errors import BadInputError
+
+
+@contextlib.contextmanager
+def connected(
+    backend: str | None, scheduler: str | None, jobs: int | None
+) -> Iterator[None]:
+    """Connect to a cluster, or start one on this machine, for the block.
+
+    Parameters
+    ----------
+    backend : str or None
+        "dask" or "ray"; no other needs a cluster.
+    scheduler : str or None
+        Address of the cluster; None starts one for Dask, while Ray does so by itself.
+    jobs : int or None
+        Workers of a cluster that is started.
+
+    Raises
+    ------
+    BadInputError
+        If the backend is not installed, or none that has a scheduler.
+    """
+    if backend == "dask":
+        with _dask_client(scheduler, jobs):
+            yield
+        return
+    if scheduler is not None:
+        _join_ray(backend, scheduler)
+    yield
+
+
+def _dask_client(scheduler: str | None, jobs: int | None) -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise BadInputError(
+            "--backend dask needs dask.distributed: pip install 'slamgym[dask]'"
+        ) from None
+    client: Any = distributed.Client
+    if scheduler is not None:
+        return client(scheduler)
+    return client(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
+
+
+def _join_ray(backend: str | None, scheduler: str) -> None:
+    if backend != "ray":
+        raise BadInputError("--scheduler is for --backend dask or ray")
+    try:
+        import ray
+    except ImportError:
+        raise BadInputError("--backend ray needs ray: pip install ray") from None
+    ray.init(address=scheduler)

@@ -1,0 +1,128 @@
+"""``slamgym render``: film an episode."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from . import options
+from .option_values import assignments
+from .program import command
+
+if TYPE_CHECKING:
+    from ...envs.controllers import Controller
+    from ...envs.landmark_world import LandmarkWorldEnv, Observation
+    from ...estimator.interface import SlamEstimator
+    from ...sim_configs import Scenario
+    from ..runs.filter_settings import FilterSettings
+    from .reporter import Tick
+
+_DURATION = 12.0  # [s] of a film by default
+_SLOWEST, _FASTEST = 4.0, 30.0  # [frames/s]
+
+
+@command(
+    "Film an episode as .gif or .mp4.",
+    "Film a drive through a scenario: the robot, its readings, the walls, and the "
+    "belief of a filter with its 3σ ellipses.",
+    "slamgym render loop --out loop.gif",
+    "slamgym render corridor --out corridor.mp4 --fps 20 --controller waypoints",
+)
+def render(
+    scenario: options.ScenarioName,
+    *,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="The .gif or .mp4 file to write.")
+    ],
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            "--estimator",
+            "-e",
+            metavar="NAME",
+            help='The filter whose belief is drawn, or "none".',
+            show_default="ekf where readings carry identities",
+        ),
+    ] = None,
+    option: options.EstimatorOptions = None,
+    seed: options.Seed = 0,
+    steps: options.Steps = None,
+    controller: options.ControllerName = "open_loop",
+    set_: options.ScenarioChanges = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            metavar="N",
+            help="Frames, that is steps, per second.",
+            show_default="so that it lasts 12 s",
+        ),
+    ] = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Drive an episode, and write one frame per step."""
+    from ...envs.rendering.renderer import write_video
+    from ..runs.filter_settings import settings_for_scenario
+    from .reporter import Reporter
+    from .scenario_options import chosen_controller, chosen_scenario
+    from .warm_up import warm_up
+
+    world = chosen_scenario(scenario, steps, set_)
+    shown = estimator or ("ekf" if world.sensor.identities else "none")
+    chosen = assignments("--option", option)
+    settings = None
+    if shown != "none":
+        settings = settings_for_scenario(world, estimator=shown, options=chosen)
+    reporter = Reporter(as_json=as_json)
+    driver = chosen_controller(controller, world, seed)
+    speed = fps or min(max(world.steps / _DURATION, _SLOWEST), _FASTEST)
+    if settings is not None:
+        warm_up(settings, reporter)
+    with reporter.progress("filming") as tick:
+        write_video(_frames(world, settings, driver, seed, tick), out, fps=speed)
+    frames = world.steps + 1
+    reporter.show(f"Wrote {out}: {frames} frames, {speed:.3g} per second")
+    reporter.finish({"out": str(out), "frames": frames, "fps": speed})
+
+
+def _frames(
+    scenario: "Scenario",
+    settings: "FilterSettings | None",
+    driver: "Controller",
+    seed: int,
+    tick: "Tick",
+) -> Iterator[Any]:
+    """Yield the frames of an episode, arrays (height, width, 3) of uint8."""
+    import gymnasium
+
+    env: Any = gymnasium.make(
+        "slamgym/LandmarkWorld-v0",
+        scenario=scenario,
+        render_mode="rgb_array",
+        disable_env_checker=True,
+    )
+    world: LandmarkWorldEnv = env.unwrapped
+    observation, info = env.reset(seed=seed)
+    estimator = None if settings is None else settings.make(world.start_estimate)
+    yield _frame(world, observation, estimator)
+    for step in range(scenario.steps):
+        observation, _, _, _, info = env.step(driver.act(info["pose"], step))
+        if estimator is not None:
+            estimator.predict(observation["odometry"])
+        yield _frame(world, observation, estimator)
+        tick(step + 1, scenario.steps)
+    env.close()
+
+
+def _frame(
+    world: "LandmarkWorldEnv",
+    observation: "Observation",
+    estimator: "SlamEstimator | None",
+) -> Any:
+    """Update the estimator with the scan, and draw world and belief."""
+    if estimator is not None:
+        seen = observation["mask"]
+        ids = seen.nonzero()[0].tolist() if world.scenario.sensor.identities else None
+        estimator.update(observation["landmarks"][seen], ids)
+        world.show_belief(estimator.belief())
+    return world.render()

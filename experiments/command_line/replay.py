@@ -1,0 +1,107 @@
+"""``slamgym replay``: filter a log, compare with the truth, draw."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from . import options
+from .option_values import assignments, standard_deviations
+from .program import command
+
+
+@command(
+    "Filter a log, compare with the truth, draw.",
+    "Filter a log, and compare with the truth as far as it is known: prints every "
+    "landmark with its Euclidean and Mahalanobis distance to its true place.",
+    "slamgym replay data.txt",
+    "slamgym replay data.txt --landmark-init independent --out homework",
+    "slamgym replay sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1",
+    "slamgym replay results/loop-ekf/log.csv --estimator invariant",
+)
+def replay(
+    log: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LOG",
+            help="A slamlog CSV, a course data.txt, a Freiburg sensor.dat, iSAM or g2o "
+            "text, or a UTIAS MR.CLAM folder; the content decides.",
+        ),
+    ],
+    *,
+    estimator: options.EstimatorName = "ekf",
+    motion_std: options.MotionStd = None,
+    measurement_std: options.MeasurementStd = None,
+    initial_pose_std: options.InitialPoseStd = None,
+    landmark_init: Annotated[
+        str | None,
+        typer.Option(
+            metavar="full|independent",
+            help="How a landmark enters the map: full correlates it with the pose it "
+            "was seen from; independent, as in the homework, does not.",
+            show_default="full",
+        ),
+    ] = None,
+    gate_probability: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P",
+            help="Reject readings outside this probability region of their innovation.",
+            show_default="none rejected",
+        ),
+    ] = None,
+    range_std_per_metre: Annotated[
+        float | None,
+        typer.Option(
+            metavar="K",
+            help="Part of σr that grows with the range: σr + K r.",
+            show_default="from the log, else 0",
+        ),
+    ] = None,
+    noise_at_rest: Annotated[
+        bool | None,
+        typer.Option(
+            "--noise-at-rest/--no-noise-at-rest",
+            help="Whether the pose becomes uncertain while the odometry reports no "
+            "motion.",
+            show_default="from the log, else not",
+        ),
+    ] = None,
+    option: options.EstimatorOptions = None,
+    robot: Annotated[
+        int | None,
+        typer.Option(
+            metavar="K",
+            help="Which robot of a UTIAS folder.",
+            show_default="the lowest number",
+        ),
+    ] = None,
+    out: options.OutFolder = None,
+    every_step: options.EveryStep = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Filter a log, and write everything to a folder."""
+    from ..runs.filter_settings import settings_for
+    from .output_folder import default_folder, output_folder
+    from .reporter import Reporter
+    from .run_files import filter_and_write, read_any_log, show_run
+
+    named = {
+        "landmark_init": landmark_init,
+        "gate_probability": gate_probability,
+        "range_std_per_metre": range_std_per_metre,
+        "noise_at_rest": noise_at_rest,
+    }
+    given = {name: value for name, value in named.items() if value is not None}
+    drive = read_any_log(log, robot)
+    settings = settings_for(
+        drive,
+        estimator=estimator,
+        **standard_deviations(motion_std, measurement_std, initial_pose_std),
+        options=given | assignments("--option", option),
+    )
+    reporter = Reporter(as_json=as_json)
+    place = out or default_folder(drive.name, estimator)
+    with output_folder(place) as folder:
+        summary = filter_and_write(drive, settings, folder, every_step, reporter)
+    show_run(summary, place, reporter)

@@ -1,0 +1,50 @@
+"""``slamgym run``: drive through a scenario, filter what the robot reads, draw."""
+
+from . import options
+from .option_values import assignments
+from .program import command
+
+
+@command(
+    "Drive through a scenario, filter, draw.",
+    "Drive a robot through a scenario and follow it with a filter, which knows the "
+    "scenario's noise. Writes pictures of map, errors and covariance, the log, the "
+    "scenario and the numbers.",
+    "slamgym run six_landmarks",
+    "slamgym run loop --seed 3 --out loop_3",
+    "slamgym run dense --set sensor.max_range=4 --steps 100 --json",
+    "slamgym run mine.toml --controller random --estimator mine:MyFilter",
+)
+def run(
+    scenario: options.ScenarioName,
+    *,
+    estimator: options.EstimatorName = "ekf",
+    option: options.EstimatorOptions = None,
+    seed: options.Seed = 0,
+    steps: options.Steps = None,
+    controller: options.ControllerName = "open_loop",
+    set_: options.ScenarioChanges = None,
+    out: options.OutFolder = None,
+    every_step: options.EveryStep = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Drive, filter, and write everything to a folder."""
+    from ...sim_configs import save_scenario
+    from ..runs.filter_settings import settings_for_scenario
+    from .output_folder import default_folder, output_folder
+    from .reporter import Reporter
+    from .run_files import filter_and_write, show_run
+    from .scenario_options import chosen_scenario, recorded
+
+    world = chosen_scenario(scenario, steps, set_)
+    settings = settings_for_scenario(
+        world, estimator=estimator, options=assignments("--option", option)
+    )
+    reporter = Reporter(as_json=as_json)
+    place = out or default_folder(world.name, estimator)
+    with output_folder(place) as folder:
+        with reporter.progress("driving") as tick:
+            log = recorded(world, controller, seed, tick)
+        save_scenario(world, folder / "scenario.toml")
+        summary = filter_and_write(log, settings, folder, every_step, reporter)
+    show_run(summary, place, reporter)

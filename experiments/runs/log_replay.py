@@ -1,0 +1,172 @@
+"""Feed a log to an estimator, and keep what it believes at every step."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...estimator.interface import Belief, SlamEstimator, SupportsJoin, SupportsTruth
+from ...estimator.map_management.managed_slam import ManagedSlam
+from ...estimator.map_management.map_view import marginal_without_joining
+from ..logs.events import Scan
+from ..logs.ground_truth import true_poses_of
+from ..logs.slamlog import SlamLog
+from ..logs.steps import Step, predictions, steps_of
+from .blas_threads import one_blas_thread
+from .map_history import MapHistory
+from .memory_check import refuse_large_map
+from .run_recorder import MapChanges, ReadingCounts, RunRecorder
+from .trace import RunTrace
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], object]
+
+_MOST_MAPS = 500  # kept of a run by default
+_MOST_JOINED = 50  # the same where each must be joined from submaps
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """An estimator's run over a log."""
+
+    log: SlamLog
+    """The log."""
+    trace: RunTrace
+    """The estimator's belief after every step."""
+    belief: Belief
+    """Its belief at the end."""
+    scans: int
+    """Number of scans in the log."""
+    readings: ReadingCounts
+    """Their readings, counted by what became of them."""
+    changes: MapChanges = field(default_factory=MapChanges)
+    """Changes of its map."""
+
+
+def replay(
+    log: SlamLog,
+    estimator: SlamEstimator,
+    *,
+    name: str | None = None,
+    keep_history: bool = False,
+    progress: Progress | None = None,
+) -> Replay:
+    """Feed a log to an estimator: for each step its motion, then its scan.
+
+    For a filter that joins its map on demand (``submaps``), the trace holds the local
+    belief around the robot as of the last closed submap; the map is joined for the
+    pictures and at the end.
+
+    Parameters
+    ----------
+    log : SlamLog
+        The log; a scan without landmark ids is left to the estimator to associate.
+    estimator : SlamEstimator
+        At its start, with an empty map; afterwards it is at the end of the log.
+        One that observes the truth (``ideal``) receives it, if the log holds all of it.
+    name : str, optional
+        Name of the estimator in the trace; its class by default.
+    keep_history : bool, default False
+        Whether the trace keeps the map after every step, for pictures of each, or
+        only of some hundred steps spread over the run.
+    progress : callable, optional
+        Called with (steps done, steps) after every step.
+
+    Returns
+    -------
+    Replay
+        The trace, the final belief, and what became of the readings.
+
+    Raises
+    ------
+    ValueError
+        If the estimator refuses a reading, naming the time in the log; before the
+        first step, if the log names more landmarks than a belief of it may hold.
+    numpy.linalg.LinAlgError
+        If its covariance degenerates, naming the time too.
+    MemoryError
+        If memory does not suffice for the landmarks that the log names.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import make_estimator
+    >>> from slamgym.experiments.logs import OdometryRow, Scan, SlamLog
+    >>> scans = [Scan(t, np.array([[0.0, 5.0 - 2 * t]]), [4]) for t in (0.0, 1.0)]
+    >>> log = SlamLog("drive", events=(scans[0], OdometryRow(1, 2.0, 0.0, 1), scans[1]))
+    >>> slam = make_estimator("ekf", motion_std=(0.1,) * 3, measurement_std=(0.1, 0.1))
+    >>> replay(log, slam).readings
+    ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1, ...
+    """
+    refuse_large_map(log, estimator)
+    steps = list(steps_of(log))
+    times = np.array([step.t for step in steps], dtype=np.float64)
+    show_truth = _truth_source(estimator, log, times)
+    most = _MOST_JOINED if isinstance(estimator, SupportsJoin) else _MOST_MAPS
+    history = MapHistory(None if keep_history else most)
+    recorder = RunRecorder(estimator, len(steps), history)
+    report = progress or (lambda done, total: None)
+    with one_blas_thread():
+        for number, step in enumerate(steps):
+            try:
+                show_truth(number)
+                _take(step, log, estimator, recorder)
+            except ValueError as error:
+                raise _kind(error)(f"{log.name}, t = {step.t:g}: {error}") from error
+            report(number + 1, len(steps))
+    trace = recorder.trace(name or _name_of(estimator), times, log)
+    return Replay(
+        log,
+        trace,
+        recorder.belief,
+        scans=sum(step.scan is not None for step in steps),
+        readings=recorder.counts(),
+        changes=recorder.changes(),
+    )
+
+
+def _name_of(estimator: SlamEstimator) -> str:
+    """Return the name of its class; for a managed filter, that of the filter."""
+    inner = estimator.filter if isinstance(estimator, ManagedSlam) else estimator
+    return type(inner).__name__
+
+
+def _truth_source(
+    estimator: SlamEstimator, log: SlamLog, times: Array
+) -> Callable[[int], None]:
+    """Return the function that passes the truth of a step to an observing estimator.
+
+    It does nothing for other estimators, or if the log lacks a part of the truth.
+    """
+    poses = true_poses_of(log, times)
+    seen = {i for e in log.events if isinstance(e, Scan) for i in _ids(e) or ()}
+    landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
+    if not isinstance(estimator, SupportsTruth):
+        return lambda _: None
+    if poses is None or not seen <= set(landmarks):
+        return lambda _: None
+    if not np.isfinite(poses).all():
+        return lambda _: None
+    return lambda step: estimator.observe_truth(poses[step], landmarks)
+
+
+def _take(
+    step: Step, log: SlamLog, estimator: SlamEstimator, recorder: RunRecorder
+) -> None:
+    for row in step.motions:
+        for odometry, dt in predictions(row, log.motion):
+            estimator.predict(odometry, dt)
+    predicted = marginal_without_joining(estimator, ())
+    report = None
+    if step.scan is not None:
+        report = estimator.update(step.scan.measurements, _ids(step.scan))
+    recorder.add(predicted, report)
+
+
+def _kind(error: ValueError) -> type[ValueError]:
+    is_numerical = isinstance(error, np.linalg.LinAlgError)
+    return np.linalg.LinAlgError if is_numerical else ValueError
+
+
+def _ids(scan: Scan) -> list[int] | None:
+    return None if scan.landmark_ids is None else scan.landmark_ids.tolist()
