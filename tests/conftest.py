@@ -1,11 +1,20 @@
+"""What all tests share: one thread a process, bytecode files, the public logs."""
+
 import os
+import sys
 from pathlib import Path
 
 import pytest
 
-# Before numpy is loaded: BLAS threads that wait for a core which others use make small
-# products fifty times slower.  Subprocesses inherit it.
+# Before numpy and torch are loaded: threads that wait for a core which others use make
+# small products fifty times slower.  Subprocesses inherit it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# Some tests start Python anew.  Without bytecode files each of these processes, and
+# each worker of pytest-xdist, compiles every module again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # Subprocesses of tests import the modules in tests/support, too.
 _SUPPORT = str(Path(__file__).parent / "support")
@@ -21,3 +30,11 @@ def public_logs():
     if not folder or not Path(folder).is_dir():
         pytest.skip("SLAMGYM_DATA names no folder of public logs")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def sb3():
+    """Return Stable-Baselines3, which is slow to load, on one thread."""
+    library = pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
+    pytest.importorskip("torch").set_num_threads(1)
+    return library

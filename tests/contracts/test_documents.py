@@ -157,7 +157,7 @@ def test_ci_types_the_commands_of_the_readme():
     test = README.split("## Test")[1].split("\n## ")[0]
     typed = [*commands(set_up), *commands(test)]
     assert typed == [line for line in ci if line in typed]
-    assert ci[-1] == "pytest"
+    assert ci[-1] == "pytest -n auto"
 
 
 def test_contributing_lists_the_checks_of_ci():
@@ -166,7 +166,7 @@ def test_contributing_lists_the_checks_of_ci():
     assert checks.splitlines() == [
         line
         for line in ci
-        if line in {"ruff check", "ruff format --check", "mypy", "pytest"}
+        if line in {"ruff check", "ruff format --check", "mypy", "pytest -n auto"}
     ]
 
 

@@ -19,6 +19,8 @@ ID = "slamgym/LandmarkWorld-v0"
 SEED = 4
 LOST = {"scenario": "hidden_identities", "steps": 30}
 
+pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning")
+
 
 def native(count=3, mode=AutoresetMode.SAME_STEP, **changes):
     return gym.make_vec(ID, count, autoreset_mode=mode, **changes)
@@ -37,13 +39,12 @@ def test_another_autoreset_mode_is_refused():
         to_stable_baselines(native(mode=AutoresetMode.NEXT_STEP))
 
 
-sb3 = pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
-pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning")
-
-
 def dummy(count=3, **changes):
-    makers = [lambda: gym.make(ID, disable_env_checker=True, **changes)] * count
-    return sb3.common.vec_env.DummyVecEnv(makers)
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    return DummyVecEnv(
+        [lambda: gym.make(ID, disable_env_checker=True, **changes)] * count
+    )
 
 
 def same(value, other):
@@ -60,7 +61,7 @@ def same(value, other):
 
 
 @pytest.mark.parametrize("changes", [{}, LOST], ids=["plain", "lost"])
-def test_it_steps_as_a_dummy_of_single_worlds_does(changes):
+def test_it_steps_as_a_dummy_of_single_worlds_does(changes, sb3):
     """Observations, rewards, dones and every info, across the ends of episodes."""
     vectors = [to_stable_baselines(native(**changes)), dummy(**changes)]
     assert vectors[0].observation_space == vectors[1].observation_space
@@ -83,7 +84,7 @@ def test_it_steps_as_a_dummy_of_single_worlds_does(changes):
     same(*(dict(vector.reset()) for vector in vectors))
 
 
-def test_flat_worlds_have_flat_terminal_observations():
+def test_flat_worlds_have_flat_terminal_observations(sb3):
     vector = to_stable_baselines(FlattenBatch(native(steps=2)))
     vector.reset()
     vector.step(np.zeros((3, 2)))
@@ -95,7 +96,7 @@ def test_flat_worlds_have_flat_terminal_observations():
         assert info["TimeLimit.truncated"] is True
 
 
-def test_an_info_that_some_worlds_lack_is_missing_there():
+def test_an_info_that_some_worlds_lack_is_missing_there(sb3):
     vector = RecordEpisodeStatistics(native(max_episode_steps=5))
     adapted = to_stable_baselines(vector)
     adapted.reset()
@@ -105,7 +106,7 @@ def test_an_info_that_some_worlds_lack_is_missing_there():
     assert infos[1]["episode"]["l"] == 5
 
 
-def test_attributes_and_methods_are_handed_out_world_by_world():
+def test_attributes_and_methods_are_handed_out_world_by_world(sb3):
     worlds = native(3, render_mode="rgb_array")
     vector = to_stable_baselines(worlds)
     vector.reset()
@@ -126,7 +127,7 @@ def test_attributes_and_methods_are_handed_out_world_by_world():
     assert worlds.closed
 
 
-def test_stable_baselines_own_checker_accepts_the_single_world():
+def test_stable_baselines_own_checker_accepts_the_single_world(sb3):
     from stable_baselines3.common.env_checker import check_env
 
     env = gym.make(ID, disable_env_checker=True).unwrapped
@@ -136,7 +137,7 @@ def test_stable_baselines_own_checker_accepts_the_single_world():
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_ppo_learns_on_it(flat):
+def test_ppo_learns_on_it(flat, sb3):
     worlds = native(8, steps=16)
     worlds = to_stable_baselines(FlattenBatch(worlds) if flat else worlds)
     policy = "MlpPolicy" if flat else "MultiInputPolicy"
@@ -160,7 +161,7 @@ def blocks(heading):
     return re.findall(r"^```(\w+)\n(.*?)^```$", section, re.M | re.S)
 
 
-def test_the_document_leads_from_make_vec_to_a_policy():
+def test_the_document_leads_from_make_vec_to_a_policy(sb3):
     """The block that needs Stable-Baselines3 is run here, in the place of readers."""
     scope = {"__name__": "reader"}
     languages = []
@@ -178,7 +179,7 @@ def randomised():
     return [code for language, code in found if language == "python"]
 
 
-def test_a_policy_goes_on_in_worlds_drawn_anew_per_round():
+def test_a_policy_goes_on_in_worlds_drawn_anew_per_round(sb3):
     """The document's lines, also those that stand in comments there."""
     code = randomised()[0].replace("# model.", "model.").replace("64 * 512", "1024")
     easy = gym.make_vec(
@@ -193,7 +194,7 @@ def test_a_policy_goes_on_in_worlds_drawn_anew_per_round():
     assert model.get_env().worlds.env is scope["worlds"]
 
 
-def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed():
+def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed(sb3):
     scope = {"__name__": "reader"}
     exec(compile(randomised()[1], "document", "exec"), scope)
     drives, noises = [], set()
@@ -214,7 +215,7 @@ def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed():
     np.testing.assert_array_equal(*drives)
 
 
-def test_ppo_takes_worlds_that_are_drawn_anew_per_episode():
+def test_ppo_takes_worlds_that_are_drawn_anew_per_episode(sb3):
     scope = {"__name__": "reader"}
     exec(compile(randomised()[1], "document", "exec"), scope)
     worlds = to_stable_baselines(FlattenBatch(scope["worlds"]))
