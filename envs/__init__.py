@@ -1,6 +1,5 @@
-"""Worlds that move and measure; they know nothing of estimators."""
+"""Worlds that move and measure.  They know nothing of estimators."""
 
-from .landmark_world import LandmarkWorldEnv as LandmarkWorldEnv
-from .vector.landmark_world_vector import (
-    LandmarkWorldVectorEnv as LandmarkWorldVectorEnv,
-)
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -1,10 +1,10 @@
 """How good an estimate is: numbers in, verdicts out.
 
-``nees`` and ``trajectory_error`` measure, ``hypothesis_tests`` and
-``time_average_tests`` decide with known error rates, ``consistency_report`` states it.
+``trajectory_error`` and ``nees`` measure.  ``hypothesis_tests`` and
+``time_average_tests`` decide with known error rates.  ``consistency_report`` collects
+the decisions on one filter.
 """
 
-from .consistency_report import ConsistencyReport as ConsistencyReport
-from .consistency_report import assert_consistent as assert_consistent
-from .consistency_report import consistency_report as consistency_report
-from .hypothesis_tests import runs_to_detect as runs_to_detect
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

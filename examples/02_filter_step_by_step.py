@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import SlamEstimator, make_estimator
-from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models import wrap_angle
 from slamgym.sim_configs import action_sequence
 
 Array = NDArray[np.float64]

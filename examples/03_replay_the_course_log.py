@@ -23,12 +23,8 @@ from pathlib import Path
 
 from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.figures import map_figure, save_figure
-from slamgym.experiments.logs.importers import read_log
-from slamgym.experiments.logs.recording import record_episode
-from slamgym.experiments.logs.slamlog import SlamLog, write_slamlog
-from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.log_replay import Replay, replay
-from slamgym.experiments.runs.summary import landmark_table
+from slamgym.experiments.logs import SlamLog, read_log, record_episode, write_slamlog
+from slamgym.experiments.runs import Replay, landmark_table, replay, settings_for
 from slamgym.sim_configs import action_sequence, load_scenario
 
 RESULTS = Path("results")

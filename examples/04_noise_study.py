@@ -18,9 +18,9 @@ from pathlib import Path
 
 from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.figures import noise_study_figure, save_figure
-from slamgym.experiments.logs.recording import record_episode
-from slamgym.experiments.noise_study.one_run import study_log
-from slamgym.experiments.runs.filter_settings import settings_for
+from slamgym.experiments.logs import record_episode
+from slamgym.experiments.noise_study import study_log
+from slamgym.experiments.runs import settings_for
 from slamgym.sim_configs import action_sequence, load_scenario
 
 PICTURE = Path("results/04_noise_study.png")

@@ -30,9 +30,12 @@ from slamgym.estimator import (
     UpdateReport,
     check_estimator,
 )
-from slamgym.estimator.models.angles import wrap_angle
-from slamgym.estimator.models.bearing_range import locate_landmark, predict_measurement
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models import (
+    locate_landmark,
+    predict_measurement,
+    predict_pose,
+    wrap_angle,
+)
 from slamgym.estimator.support import argument_checks
 
 Array = NDArray[np.float64]

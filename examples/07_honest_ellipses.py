@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import Belief, SlamEstimator, make_estimator
-from slamgym.evaluation.trajectory_error import landmark_distances
+from slamgym.evaluation import landmark_distances
 from slamgym.sim_configs import action_sequence
 
 PICTURE = Path("results/07_honest_ellipses.png")

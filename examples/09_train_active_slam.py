@@ -34,9 +34,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
+from slamgym.agents import BASELINES, ActiveSlamEnv, ActiveSlamVectorEnv, make_baseline
 from slamgym.agents.active_slam import Observation
-from slamgym.agents.active_slam_baselines import BASELINES, make_baseline
 from slamgym.agents.active_slam_scores import (
     HELD_OUT,
     Episode,
@@ -47,8 +46,7 @@ from slamgym.agents.active_slam_scores import (
     play_all,
     score_table,
 )
-from slamgym.envs.vector.stable_baselines import to_stable_baselines
-from slamgym.envs.vector.wrappers import FlattenBatch
+from slamgym.envs.vector import FlattenBatch, to_stable_baselines
 
 FOLDER = Path("results/09_train_active_slam")
 INK, PALE, RED = "#222222", "#bbbbbb", "#c0392b"

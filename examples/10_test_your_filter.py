@@ -18,9 +18,11 @@ import argparse
 from numpy.typing import ArrayLike
 
 from slamgym.estimator import EkfSlam
-from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.report.html_report import write_html_report
-from slamgym.experiments.monte_carlo.report.summary import summarise_monte_carlo
+from slamgym.experiments.monte_carlo import (
+    monte_carlo,
+    summarise_monte_carlo,
+    write_html_report,
+)
 
 
 class CautiousEkf(EkfSlam):

@@ -1,6 +1,10 @@
-"""Filters for maps that grow: local maps, sparse information, submaps.
+"""Filters for maps that grow beyond what a dense covariance allows.
 
-``compressed`` and the modules named ``local_map_*`` are the exact local maps;
-``sparse_information``, the matrix, its marginals and its sparsification are the sparse
-filter; ``submaps`` and the modules named ``submap_*`` are local maps in own frames.
+``compressed`` defers the exact update of distant landmarks, ``sparse_information``
+keeps a sparse information matrix, and ``submaps`` builds local maps in frames of their
+own and joins them on demand.
 """
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -1,4 +1,8 @@
-"""Which landmarks a map holds: association, confirmation, removal, merging.
+"""Which landmarks a map holds: confirmation, removal and merging.
 
-``landmark_policy`` says what is wanted and ``managed`` does it around any filter.
+``policy`` states the rules, and ``managed_slam`` applies them around any filter.
 """
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -4,18 +4,6 @@ Every function takes plain arrays and returns a matplotlib Figure, unknown to py
 `save_figure` writes it.
 """
 
-from .accuracy import truth_figure
-from .consistency import errors_figure
-from .covariance import covariance_figure
-from .maps import map_figure, map_sequence, noise_study_figure
-from .style import save_figure
+from lazy_loader import attach_stub
 
-__all__ = [
-    "covariance_figure",
-    "errors_figure",
-    "map_figure",
-    "map_sequence",
-    "noise_study_figure",
-    "save_figure",
-    "truth_figure",
-]
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

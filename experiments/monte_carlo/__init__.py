@@ -4,15 +4,6 @@ scenario → simulated runs → filtered runs → run measures → result blocks
 → scores → summary, table, plots, html report
 """
 
-from .report.summary import consistency_of, summarise_monte_carlo
-from .runner import monte_carlo
-from .store.result_blocks import merge_blocks
-from .store.results import load_results
+from lazy_loader import attach_stub
 
-__all__ = [
-    "consistency_of",
-    "load_results",
-    "merge_blocks",
-    "monte_carlo",
-    "summarise_monte_carlo",
-]
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

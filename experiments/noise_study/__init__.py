@@ -1,1 +1,5 @@
 """The noise study: every noise scaled up and down, one at a time."""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -1,1 +1,5 @@
 """Runs of a filter over a log or a simulated world, and their summaries."""
+
+from lazy_loader import attach_stub
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

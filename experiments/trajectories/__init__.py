@@ -3,14 +3,6 @@
 controllers → driven episodes → trajectory → formats → shard folder, manifest → dataset
 """
 
-from .dataset import load_trajectories
-from .driven_episodes import drive_episodes
-from .generate import generate_trajectories
-from .trajectory import Trajectory
+from lazy_loader import attach_stub
 
-__all__ = [
-    "Trajectory",
-    "drive_episodes",
-    "generate_trajectories",
-    "load_trajectories",
-]
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -1,13 +1,17 @@
 """Landmark-SLAM worlds for Gymnasium, and EKF-SLAM estimators to run in them.
 
-``import slamgym`` registers the environments and loads nothing else; the parts are
-:mod:`slamgym.sim_configs`, :mod:`slamgym.envs`, :mod:`slamgym.estimator`,
+``import slamgym`` registers the environments.  Every other name is loaded at its first
+use; ``__init__.pyi`` lists them.  The parts are :mod:`slamgym.sim_configs`,
+:mod:`slamgym.envs`, :mod:`slamgym.estimator`, :mod:`slamgym.evaluation`,
 :mod:`slamgym.agents` and :mod:`slamgym.experiments`.
 """
 
 import gymnasium
+from lazy_loader import attach_stub
 
 __version__ = "0.1.0"
+
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
 
 gymnasium.register(
     id="slamgym/LandmarkWorld-v0",

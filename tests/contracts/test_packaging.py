@@ -57,10 +57,11 @@ def test_the_wheel_holds_every_module_and_the_data(wheel):
     sources = {
         f"slamgym/{file.relative_to(ROOT)}"
         for part in PARTS
-        for suffix in ("py", "toml", "json")
+        for suffix in ("py", "pyi", "toml", "json")
         for file in (ROOT / part).rglob(f"*.{suffix}")
     }
-    assert sources | {"slamgym/__init__.py", "slamgym/py.typed"} <= inside
+    top = {"slamgym/__init__.py", "slamgym/__init__.pyi", "slamgym/py.typed"}
+    assert sources | top <= inside
     assert "slamgym/sim_configs/presets/six_landmarks.toml" in inside
 
 
@@ -71,7 +72,8 @@ def test_the_wheel_holds_nothing_else(wheel):
         name
         for name in inside
         if not name.startswith(homes)
-        and name not in {"slamgym/__init__.py", "slamgym/py.typed"}
+        and name.removeprefix("slamgym/")
+        not in {"__init__.py", "__init__.pyi", "py.typed"}
         and not name.split("/")[0].endswith(".dist-info")
     ]
     assert strangers == []

@@ -1,0 +1,2 @@
+from .unicycle_body import UnicycleBody as UnicycleBody
+from .vector_bodies import UnicycleBodies as UnicycleBodies

@@ -1,0 +1,1 @@
+from .any_format import read_log as read_log

@@ -1,0 +1,9 @@
+from .filter_settings import FilterSettings as FilterSettings
+from .filter_settings import settings_for as settings_for
+from .log_replay import Replay as Replay
+from .log_replay import replay as replay
+from .simulated_runs import SimulatedRuns as SimulatedRuns
+from .simulated_runs import simulate_runs as simulate_runs
+from .summary import landmark_table as landmark_table
+from .summary import summarise as summarise
+from .trace import RunTrace as RunTrace
