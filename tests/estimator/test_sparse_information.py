@@ -17,25 +17,25 @@ from slamgym.estimator import (
     ObservabilityConstrainedEkfSlam,
     check_estimator,
 )
-from slamgym.estimator.large_maps.sparse_cholesky import nested_dissection
+from slamgym.estimator.large_maps.sparse_cholesky import landmark_dissection
 from slamgym.estimator.large_maps.sparse_cholesky.coordinates import pairs
 from slamgym.estimator.large_maps.sparse_cholesky.information_matrix import (
     InformationMatrix,
-    solver,
 )
 from slamgym.estimator.large_maps.sparse_cholesky.landmark_elimination import (
-    surround_all,
+    RestFactor,
 )
+from slamgym.estimator.large_maps.sparse_cholesky.schur_complement import solver
 from slamgym.estimator.large_maps.sparse_information.conditional_pose import (
+    ConditionalPose,
     LinearScan,
-    PoseGivenMap,
     cut_links,
     relocate,
 )
 from slamgym.estimator.large_maps.sparse_information.local_information import (
-    Map,
-    begin,
-    finish,
+    SparseMap,
+    begin_local_map,
+    write_back,
 )
 from slamgym.estimator.large_maps.sparse_information.sparse_information_slam import (
     SparseInformationSlam,
@@ -226,7 +226,7 @@ def test_a_relocation_uses_no_reading_twice():
 
 
 def test_readings_that_do_not_determine_a_pose_do_not_replace_it():
-    pose = PoseGivenMap(np.zeros(3), np.zeros((3, 4)), np.eye(3), np.zeros(2))
+    pose = ConditionalPose(np.zeros(3), np.zeros((3, 4)), np.eye(3), np.zeros(2))
 
     def scan(points):
         expected = predict_measurement(np.zeros(3), np.array(points))
@@ -286,7 +286,7 @@ def test_marginals_are_blocks_of_the_dense_inverse():
     matrix.load_state_dict(
         {k: state[f"matrix_{k}"] for k in ("counts", "links", "blocks")}
     )
-    matrix.put(state["local_slots"], state["local_information"])
+    matrix.replace(state["local_slots"], state["local_information"])
     slots = np.array(
         [
             dict(zip(state["landmark_ids"], state["slots"], strict=True))[i]
@@ -460,7 +460,7 @@ def test_unknown_options_and_landmarks_are_refused():
 def test_a_matrix_that_is_not_positive_definite_is_named():
     matrix = InformationMatrix()
     matrix.grow(200)
-    matrix.put(np.arange(200), np.zeros((400, 400)))
+    matrix.replace(np.arange(200), np.zeros((400, 400)))
     with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
         solver(matrix, np.arange(200))
 
@@ -520,7 +520,7 @@ def test_pruning_is_the_step_of_the_seif():
     weak = np.array([False, False, True, False])
 
     pruned = cut_links(
-        PoseGivenMap(np.ones(3), gain, covariance, np.ones(2)), on_map, weak
+        ConditionalPose(np.ones(3), gain, covariance, np.ones(2)), on_map, weak
     )
 
     given_passive = np.linalg.inv(joint[:9, :9])
@@ -561,24 +561,24 @@ def test_merging_is_an_exact_reading_that_two_landmarks_are_one():
 def test_a_small_reach_puts_off_corrections_and_loses_none():
     # A chain of 60 landmarks, of which 5 are in hand and 8 around them eliminated.
     rng = np.random.default_rng(0)
-    world, count, local = Map(), 60, np.arange(20, 25)
+    world, count, local = SparseMap(), 60, np.arange(20, 25)
     world.grow(count)
     chain = np.zeros((2 * count, 2 * count))
     for k in range(count - 1):
         rows = rng.standard_normal((4, 4))
         chain[2 * k : 2 * k + 4, 2 * k : 2 * k + 4] += rows @ rows.T
-    world.information.put(np.arange(count), chain)
+    world.information.replace(np.arange(count), chain)
     world.points[: 2 * count] = rng.standard_normal(2 * count)
     exact = world.points[: 2 * count].copy()
-    pose = PoseGivenMap(np.zeros(3), np.zeros((3, 10)), np.eye(3), np.zeros(2))
+    pose = ConditionalPose(np.zeros(3), np.zeros((3, 10)), np.eye(3), np.zeros(2))
     for slots in (local, local + 7, local - 3):
-        taken, _ = begin(world, pose, slots, 8)
-        assert len(taken.outer.slots) == 2
+        taken, _ = begin_local_map(world, pose, slots, 8)
+        assert len(taken.fixed.slots) == 2
         push = np.zeros(2 * count)
         push[2 * slots[0] : 2 * slots[-1] + 2] = rng.standard_normal(10)
         moved, _ = taken.settle(pose, push[2 * slots[0] : 2 * slots[-1] + 2])
-        assert moved.outer.unrest(moved.shift) > 1e-6
-        finish(world, moved)
+        assert moved.fixed.largest_residual(moved.shift) > 1e-6
+        write_back(world, moved)
         exact += np.linalg.solve(chain, push)
     waiting = np.linalg.solve(chain, world.residual[: 2 * count])
     assert np.abs(waiting).max() > 1e-3
@@ -626,7 +626,7 @@ def test_readings_are_blind_to_a_turn_of_the_map_at_its_first_estimates(base, bo
     matrix.load_state_dict(
         {k: state[f"matrix_{k}"] for k in ("counts", "links", "blocks")}
     )
-    matrix.put(state["local_slots"], state["local_information"])
+    matrix.replace(state["local_slots"], state["local_information"])
     slots = state["slots"]
     first = state["first"].reshape(-1, 2)
     first[state["local_slots"]] = state["local_first"].reshape(-1, 2)
@@ -686,9 +686,9 @@ def test_what_is_kept_of_the_elimination_is_that_of_the_whole_map_at_any_time(
     rng = np.random.default_rng(0)
     places = rng.uniform(0, 100, (900, 2))
     places[600:] = places[600 + np.argsort(places[600:, 0])] + (100, 0)
-    monkeypatch.setattr(nested_dissection, "LEAF", 15)
+    monkeypatch.setattr(landmark_dissection, "LEAF", 15)
     dense = town_information(rng, places, 8.0)
-    world, count = Map(), 600
+    world, count = SparseMap(), 600
     world.grow(900)
     known = np.arange(count)
 
@@ -699,7 +699,7 @@ def test_what_is_kept_of_the_elimination_is_that_of_the_whole_map_at_any_time(
         near = np.union1d(slots, world.information.neighbours(slots))
         linked = np.flatnonzero(now[pairs(slots)].any(axis=0)) // 2
         near = np.union1d(near, linked)
-        world.information.put(near, now[np.ix_(pairs(near), pairs(near))])
+        world.information.replace(near, now[np.ix_(pairs(near), pairs(near))])
         world.elimination.revise(world.information, world.first, near)
 
     world.first[: 2 * len(places)] = places.ravel()
@@ -730,7 +730,8 @@ def test_what_is_kept_of_the_elimination_is_that_of_the_whole_map_at_any_time(
 def assert_eliminates(elimination, matrix, dense, known, local):
     """Hold C, T and Λ_HH⁻¹ against the dense matrix of the known landmarks."""
     rng = np.random.default_rng(9)
-    around = surround_all(elimination, matrix, local)
+    factor = RestFactor(elimination, matrix, local)
+    around = factor.complement()
     assert set(around.slots) == set(known) - set(local)
     H, L = pairs(around.slots), pairs(local)
     link = dense[np.ix_(H, L)]
@@ -740,8 +741,18 @@ def assert_eliminates(elimination, matrix, dense, known, local):
     np.testing.assert_allclose(complement, link.T @ T, rtol=1e-8, atol=1e-8)
     shift = rng.standard_normal(len(around.border))
     np.testing.assert_allclose(
-        around.respond(shift), T[:, around.border] @ shift, rtol=1e-8, atol=1e-8
+        factor.respond(shift), T[:, around.border] @ shift, rtol=1e-8, atol=1e-8
     )
     right = rng.standard_normal((len(H), 2))
     expected = np.linalg.solve(dense[np.ix_(H, H)], right)
-    np.testing.assert_allclose(around.solve(right), expected, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(factor.solve(right), expected, rtol=1e-8, atol=1e-8)
+    eliminated = np.random.default_rng(1).choice(around.slots, 9, replace=False)
+    covariance, response = factor.covariance(eliminated)
+    at = np.searchsorted(H, pairs(eliminated))
+    inverse = np.linalg.inv(dense[np.ix_(H, H)])
+    np.testing.assert_allclose(
+        covariance, inverse[np.ix_(at, at)], rtol=1e-8, atol=1e-8
+    )
+    np.testing.assert_allclose(
+        response, T[np.ix_(at, around.border)], rtol=1e-8, atol=1e-8
+    )

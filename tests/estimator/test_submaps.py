@@ -10,11 +10,12 @@ import pytest
 from numeric_jacobian import numeric_jacobian
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
+from scipy.sparse import csc_array
 
 from slamgym.estimator import check_estimator
+from slamgym.estimator.large_maps.sparse_cholesky.submap_dissection import dissect
 from slamgym.estimator.large_maps.sparse_cholesky.submap_elimination import (
-    Elimination,
-    dissect,
+    SubmapElimination,
 )
 from slamgym.estimator.large_maps.submaps.factor import (
     inverse_spread,
@@ -376,11 +377,11 @@ def test_elimination_solves_what_a_dense_solver_solves(count):
         H[np.ix_(mine, mine)] += matrix
         g[mine] += right
     parts = dissect(unknowns, rng.normal(size=(count, 2)))
-    done = Elimination(parts, size, lambda k: matrices[k])
+    done = SubmapElimination(parts, size, lambda k: matrices[k])
     rows = rng.normal(size=(4, size)) * (rng.random((4, size)) < 0.2)
     np.testing.assert_allclose(done.solution(), np.linalg.solve(H, g), atol=1e-8)
     np.testing.assert_allclose(
-        done.covariance(*np.nonzero(rows)[::-1], rows[np.nonzero(rows)], len(rows)),
+        done.covariance(csc_array(rows)),
         rows @ np.linalg.solve(H, rows.T),
         atol=1e-8,
     )

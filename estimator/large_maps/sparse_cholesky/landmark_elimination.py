@@ -1,230 +1,228 @@
-"""Eliminate all of a map but the landmarks around the robot, and keep what still holds.
+"""Elimination of all landmarks except the local map, with reuse between local maps.
 
-A node of the :class:`Dissection` eliminates its own landmarks P, when all below it have
-been, and hands to its parent what that means for the landmarks R they are linked with
-(multifrontal Cholesky; Duff and Reid 1983)::
+Each node of a :class:`LandmarkDissection` eliminates its own landmarks, after those of
+its descendants (:mod:`.multifrontal`).  Landmarks of the local map are not eliminated:
+they remain in the fronts up to the root, where the update is −C, the Schur complement
+without Λ_LL.
 
-    [Λ_PP Λ_PR; · U] = sum of the rows of P and of what the children handed up
-    L Lᵀ = Λ_PP,   X = L⁻¹ Λ_PR,   U ← U − Xᵀ X
-
-Landmarks of the local map are not eliminated: they stay in R up to the root, whose U is
-−C.  When the robot moves on, only the nodes above the old and the new local map are
-worked out again; all others are as they were.
+Nodes that do not depend on the local map are cached.  When the local map changes, only
+the nodes above the old and the new local map are computed again.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack, solve_triangular
+from scipy.sparse import csc_array
 
 from .coordinates import pairs
-from .information_matrix import InformationMatrix, Surroundings
-from .nested_dissection import Dissection, descends
+from .information_matrix import InformationMatrix
+from .landmark_dissection import LandmarkDissection, descends, with_ancestors
+from .multifrontal import (
+    Node,
+    eliminate,
+    marginal_covariance,
+    substitute_back,
+    substitute_forward,
+)
+from .schur_complement import SchurComplement
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-class Eliminated(NamedTuple):
-    """What one node worked out."""
+class _Eliminated(NamedTuple):
+    """A node and its update; of a leaf, whose update is −Xᵀ X, None."""
 
-    own: Int
-    """P, shape (p,)."""
-    rest: Int
-    """R, shape (r,)."""
-    factor: Array
-    """L, shape (2p, 2p)."""
-    response: Array
-    """X, shape (2p, 2r)."""
-    kept: Array | None
-    """U, shape (2r, 2r); of a leaf, where it is −Xᵀ X, None."""
+    node: Node
+    stored_update: Array | None
 
     @property
-    def handed(self) -> Array:
-        """U, shape (2r, 2r)."""
-        return -(self.response.T @ self.response) if self.kept is None else self.kept
+    def update(self) -> Array:
+        """Update of the parent's front, shape (r, r)."""
+        if self.stored_update is None:
+            return -(self.node.response.T @ self.node.response)
+        return self.stored_update
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes [bytes]."""
-        kept = 0 if self.kept is None else self.kept.nbytes
-        return self.factor.nbytes + self.response.nbytes + kept
+        """Memory of factor and update [bytes]."""
+        update = 0 if self.stored_update is None else self.stored_update.nbytes
+        return self.node.lower.nbytes + self.node.response.nbytes + update
 
 
-class Elimination:
-    """The nodes of a map that are worked out, and hold until their landmarks change."""
+class LandmarkElimination:
+    """Elimination order of a map, and the eliminated nodes that are still valid."""
 
     def __init__(self) -> None:
-        self.dissection = Dissection()
-        self._known: dict[int, Eliminated] = {}
+        self.dissection = LandmarkDissection()
+        self._cache: dict[int, _Eliminated] = {}
 
     @property
     def nbytes(self) -> int:
-        """Memory that what is kept takes [bytes]."""
-        return sum(part.nbytes for part in self._known.values())
+        """Memory of the cached nodes [bytes]."""
+        return sum(part.nbytes for part in self._cache.values())
 
     def revise(self, matrix: InformationMatrix, first: Array, changed: Int) -> None:
-        """Take in rows that changed, and forget what they were the ground of."""
-        nodes, parted = self.dissection.revise(matrix, first, changed)
-        gone = ancestry(np.append(nodes, np.array(parted, dtype=np.int64)))
-        for top in parted:
-            gone |= {node for node in self._known if _is_below(node, top)}
-        for node in gone:
-            self._known.pop(node, None)
+        """Update the elimination order after rows changed, and drop invalid nodes."""
+        nodes, dissected = self.dissection.revise(matrix, first, changed)
+        invalid = with_ancestors(np.append(nodes, np.array(dissected, dtype=np.int64)))
+        cached = np.array(list(self._cache), dtype=np.int64)
+        for top in dissected:
+            invalid.update(cached[descends(cached, top)].tolist())
+        for node in invalid:
+            self._cache.pop(node, None)
 
-    def work_out(
+    def eliminate(
         self, matrix: InformationMatrix, local: Int
-    ) -> tuple[list[Eliminated], Int]:
-        """Return all nodes, children first, and the landmarks they eliminate."""
+    ) -> tuple[list[Node], Array, Int]:
+        """Eliminate all landmarks except the local ones.
+
+        Returns
+        -------
+        nodes : list of Node
+            Children first.
+        update : ndarray
+            Of the root, whose ``rest`` are local landmarks.
+        slots : ndarray
+            The eliminated landmarks.
+        """
         self.dissection.grow(len(matrix))
         nodes = self.dissection.nodes
-        inside = np.zeros(len(nodes), dtype=bool)
-        inside[local] = True
-        own = np.flatnonzero((nodes > 0) & ~inside)
-        own = own[np.argsort(nodes[own], kind="stable")]
-        names, starts = np.unique(nodes[own], return_index=True)
-        parts = np.split(own, starts[1:])[: len(names)]
-        members = dict(zip(names.tolist(), parts, strict=True))
-        affected = ancestry(nodes[local])
-        found: dict[int, Eliminated] = {}
-        for node in sorted(ancestry(names) | {1}, reverse=True):
-            known = None if node in affected else self._known.get(node)
-            if known is None:
-                children = [
-                    found[child] for child in (2 * node, 2 * node + 1) if child in found
-                ]
-                mine = members.get(node, np.empty(0, dtype=np.int64))
-                beyond = inside | ~descends(nodes, node)
-                known = eliminate(matrix, mine, beyond, children)
+        is_local = np.zeros(len(nodes), dtype=bool)
+        is_local[local] = True
+        slots = np.flatnonzero((nodes > 0) & ~is_local)
+        members = _by_node(slots, nodes)
+        affected = with_ancestors(nodes[local])
+        done: dict[int, _Eliminated] = {}
+        present = with_ancestors(np.array(list(members), dtype=np.int64))
+        for node in sorted(present | {1}, reverse=True):
+            part = None if node in affected else self._cache.get(node)
+            if part is None:
+                children = [done[k] for k in (2 * node, 2 * node + 1) if k in done]
+                own = members.get(node, np.empty(0, dtype=np.int64))
+                beyond = is_local | ~descends(nodes, node)
+                part = _eliminate(matrix, own, beyond, children)
                 if node not in affected:
-                    self._known[node] = known
-            found[node] = known
-        return list(found.values()), np.sort(own)
+                    self._cache[node] = part
+            done[node] = part
+        return [part.node for part in done.values()], done[1].update, slots
 
 
-def ancestry(nodes: Int) -> set[int]:
-    """Return nodes and all that are above them."""
-    found: set[int] = set()
-    front = set(nodes.tolist()) - {0}
-    while front:
-        found |= front
-        front = {node >> 1 for node in front} - found - {0}
-    return found
+def _by_node(slots: Int, nodes: Int) -> dict[int, Int]:
+    """Group landmarks by their nodes."""
+    order = slots[np.argsort(nodes[slots], kind="stable")]
+    names, starts = np.unique(nodes[order], return_index=True)
+    groups = np.split(order, starts[1:])[: len(names)]
+    return dict(zip(names.tolist(), groups, strict=True))
 
 
-def _is_below(node: int, top: int) -> bool:
-    return node >> max(node.bit_length() - top.bit_length(), 0) == top
-
-
-def eliminate(
+def _eliminate(
     matrix: InformationMatrix,
     own: Int,
     beyond: NDArray[np.bool_],
-    children: list[Eliminated],
-) -> Eliminated:
-    """Eliminate a node's own landmarks; ``beyond`` says which are not below it."""
+    children: list[_Eliminated],
+) -> _Eliminated:
+    """Eliminate a node's own landmarks; ``beyond`` marks those not below the node."""
     counts, links, blocks = matrix.rows(own)
-    outside = links[beyond[links]]
-    rest = np.setdiff1d(np.concatenate([outside, *(c.rest for c in children)]), own)
+    inherited = [child.node.rest[::2] // 2 for child in children]
+    rest = np.setdiff1d(np.concatenate([links[beyond[links]], *inherited]), own)
     place = np.full(len(beyond), -1)
     place[own] = np.arange(len(own))
     place[rest] = np.arange(len(own), len(own) + len(rest))
-    size, p = 2 * (len(own) + len(rest)), 2 * len(own)
-    front = np.zeros((size, size))
+    count, p = len(own) + len(rest), 2 * len(own)
+    front = np.zeros((2 * count, 2 * count))
     here = place[links]
     row = np.repeat(np.arange(len(own)), counts)[here >= 0]
-    by_blocks = front.reshape(size // 2, 2, size // 2, 2)
-    by_blocks[row, :, here[here >= 0], :] = blocks[here >= 0]
-    for child in children:
-        at = pairs(place[child.rest])
-        front[np.ix_(at, at)] += child.handed
-    factor, failed = front[:p, :p], 0
-    if p:
-        factor, failed = lapack.dpotrf(factor, lower=1, clean=1)
-    if failed:
-        raise np.linalg.LinAlgError("the information matrix is not positive definite")
-    response = np.ascontiguousarray(_solve(factor, front[:p, p:]))
-    handed = front[p:, p:] - response.T @ response if children else None
-    return Eliminated(own, rest, np.ascontiguousarray(factor), response, handed)
+    front.reshape(count, 2, count, 2)[row, :, here[here >= 0], :] = blocks[here >= 0]
+    for child, slots in zip(children, inherited, strict=True):
+        at = pairs(place[slots])
+        front[np.ix_(at, at)] += child.update
+    node = eliminate(front, pairs(own), pairs(rest))
+    update = front[p:, p:] - node.response.T @ node.response if children else None
+    return _Eliminated(node, update)
 
 
-def _solve(factor: Array, right: Array, *, transposed: bool = False) -> Array:
-    if not right.size:
-        return right.copy()
-    return np.asarray(
-        solve_triangular(
-            factor, right, lower=True, trans=int(transposed), check_finite=False
-        )
-    )
-
-
-class Factor:
-    """Solves with what :class:`Elimination` worked out, as late as it is asked to."""
+class RestFactor:
+    """Factor of all landmarks except the local ones, made when it is first used."""
 
     def __init__(
-        self, whole: Elimination, matrix: InformationMatrix, local: Int
+        self, elimination: LandmarkElimination, matrix: InformationMatrix, local: Int
     ) -> None:
-        self._ask = (whole, matrix, local)
-        self._nodes: list[Eliminated] | None = None
-        self._slots = local
+        self._elimination, self._matrix, self._local = elimination, matrix, local
+        self._done: tuple[list[Node], Array, Int] | None = None
 
-    def nodes(self) -> list[Eliminated]:
-        """Return all nodes, children first."""
-        if self._nodes is None:
-            self._nodes, self._slots = self._ask[0].work_out(*self._ask[1:])
-        return self._nodes
+    def _eliminated(self) -> tuple[list[Node], Array, Int]:
+        if self._done is None:
+            self._done = self._elimination.eliminate(self._matrix, self._local)
+        return self._done
 
     @property
     def slots(self) -> Int:
-        """The landmarks eliminated, H."""
-        self.nodes()
-        return self._slots
+        """The eliminated landmarks, H."""
+        return self._eliminated()[2]
 
     def solve(self, right: Array) -> Array:
-        """Work out Λ_HH⁻¹ b."""
-        values = np.zeros((2 * len(self._ask[1]), *right.shape[1:]))
-        rows = pairs(self.slots)
+        """Return Λ_HH⁻¹ b."""
+        nodes, _, slots = self._eliminated()
+        rows = pairs(slots)
+        values = np.zeros((2 * len(self._matrix), *right.shape[1:]))
         values[rows] = right
-        for node in self.nodes():
-            own, rest = pairs(node.own), pairs(node.rest)
-            values[own] = _solve(node.factor, values[own])
-            values[rest] -= node.response.T @ values[own]
-        values[pairs(self._ask[2])] = 0.0
-        return self._back(values)[rows]
+        substitute_forward(nodes, values)
+        values[pairs(self._local)] = 0.0
+        substitute_back(nodes, values)
+        return values[rows]
 
-    def respond(self, border: Int, shift: Array) -> Array:
-        """Work out T δ_B, where B are some of the local landmarks' coordinates."""
-        values = np.zeros(2 * len(self._ask[1]))
-        rows = pairs(self.slots)
-        values[pairs(self._ask[2])[border]] = shift
-        return -self._back(values)[rows]
+    def respond(self, shift: Array) -> Array:
+        """Return T δ_B."""
+        nodes, _, slots = self._eliminated()
+        values = np.zeros(2 * len(self._matrix))
+        values[pairs(self._local)[self.border()[0]]] = shift
+        substitute_back(nodes, values)
+        return -values[pairs(slots)]
 
-    def _back(self, values: Array) -> Array:
-        for node in reversed(self.nodes()):
-            own, rest = pairs(node.own), pairs(node.rest)
-            right = values[own] - node.response @ values[rest]
-            values[own] = _solve(node.factor, right, transposed=True)
-        return values
+    def covariance(self, slots: Int) -> tuple[Array, Array]:
+        """Return blocks of Λ_HH⁻¹ and rows of T.
 
+        Parameters
+        ----------
+        slots : ndarray, shape (v,)
+            Eliminated landmarks.
 
-def surround_all(
-    whole: Elimination, matrix: InformationMatrix, local: Int
-) -> Surroundings:
-    """Eliminate all landmarks but the local ones; T is not made, C is."""
-    factor = Factor(whole, matrix, local)
-    root = factor.nodes()[-1]
-    place = np.full(len(matrix), -1)
-    place[local] = np.arange(len(local))
-    order = np.argsort(place[root.rest])
-    border = pairs(place[root.rest][order])
-    columns = pairs(order)
-    complement = -root.handed[np.ix_(columns, columns)]
-    return Surroundings(
-        factor.slots,
-        border,
-        np.empty((0, len(border))),
-        (complement + complement.T) / 2,
-        factor.solve,
-        lambda shift: factor.respond(border, shift),
-    )
+        Returns
+        -------
+        covariance : ndarray, shape (2v, 2v)
+        response : ndarray, shape (2v, c)
+        """
+        nodes, _, _ = self._eliminated()
+        columns = pairs(slots)
+        size = len(columns)
+        where = (np.arange(size), columns)
+        unit = csc_array((np.ones(size), where), (size, 2 * len(self._matrix)))
+        covariance, remainder = marginal_covariance(nodes, unit)
+        border = pairs(self._local)[self.border()[0]].tolist()
+        response = np.zeros((size, len(border)))
+        for column, unknown in enumerate(border):
+            if unknown in remainder:
+                response[:, column] = -remainder[unknown]
+        return covariance, response
+
+    def border(self) -> tuple[Int, Int]:
+        """Return the columns of B in the local map, and in the root's front."""
+        place = np.full(len(self._matrix), -1)
+        place[self._local] = np.arange(len(self._local))
+        rest = place[self._eliminated()[0][-1].rest[::2] // 2]
+        order = np.argsort(rest)
+        return pairs(rest[order]), pairs(order)
+
+    def complement(self) -> SchurComplement:
+        """Return the effect on the local map; T is not computed."""
+        border, columns = self.border()
+        C = -self._eliminated()[1][np.ix_(columns, columns)]
+        return SchurComplement(
+            self.slots, border, np.empty((0, len(border))), (C + C.T) / 2, self
+        )
+
+    def release(self) -> None:
+        """Free the memory of the factor that is not cached."""
+        self._done = None

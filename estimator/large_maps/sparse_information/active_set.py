@@ -1,4 +1,4 @@
-"""Which landmarks a local information map holds, and how many around it count."""
+"""Choice of the local landmarks, and of how many to eliminate around them."""
 
 from math import inf
 
@@ -8,45 +8,51 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-# Landmarks that a local map holds at least when it is chosen, and those eliminated
-# around it at first, where the tolerance allows to leave others.
-LOCAL, AROUND = 50, 100
-# By how many times more of those are taken, should they not do; all, should these not.
-WIDER = 16
-# In a large map the local one is larger: all around it may have to be eliminated, at a
-# cost that grows with the map, while a step costs the third power of the local size.
-SHARE, POWER = 3, 0.4
+SMALLEST_LOCAL_MAP = 50
+"""Smallest number of landmarks in a new local map."""
+FIRST_COUNT = 100
+"""Number of landmarks eliminated at first, if the tolerance allows it."""
+GROWTH = 16
+"""Growth factor of that number when it is too small.  The second step takes all."""
+SCALE, EXPONENT = 3, 0.4
+"""Size of the local map of a large map: 3 n^0.4.
+
+A change of the local map may eliminate the whole map, at a cost that grows with n; a
+step costs the third power of the local size.
+"""
 
 
-def local_size(mapped: int, readings: int, wanted: int) -> int:
-    """Return how many landmarks a local map should hold when it is chosen."""
-    least = max(LOCAL, int(SHARE * mapped**POWER))
-    return max(least, 3 * readings, 3 * wanted // 2)
+def local_map_size(mapped: int, readings: int, required: int) -> int:
+    """Return the number of landmarks of a new local map."""
+    least = max(SMALLEST_LOCAL_MAP, int(SCALE * mapped**EXPONENT))
+    return max(least, 3 * readings, 3 * required // 2)
 
 
 def choose_local(
-    mapped: Int, points: Array, centre: Array, wanted: Int, size: int
+    mapped: Int, points: Array, centre: Array, required: Int, size: int
 ) -> Int:
-    """Return the wanted landmarks and the nearest to a point, ``size`` in all."""
+    """Return the required landmarks and those nearest to a point, ``size`` in all."""
     distances = ((points[mapped] - centre) ** 2).sum(axis=1)
     count = min(size, len(mapped))
     nearest = mapped[np.argpartition(distances, count - 1)[:count]]
-    return union(wanted, np.sort(nearest))[: max(size, len(wanted))]
+    return union(required, np.sort(nearest))[: max(size, len(required))]
 
 
-def first_reach(last: float, *, widened: bool) -> float:
-    """Return how many landmarks to eliminate around a new local map: what was needed.
+def first_elimination_count(last: float, *, enlarged: bool) -> float:
+    """Return the number of landmarks to eliminate around a new local map.
 
-    Where the last reach did at once, less may do.
+    This is the last number if it had to be enlarged, and a smaller one otherwise.
     """
-    return last if widened else max(AROUND, min(last, WIDER**2 * AROUND) / WIDER)
+    if enlarged:
+        return last
+    return max(FIRST_COUNT, min(last, GROWTH**2 * FIRST_COUNT) / GROWTH)
 
 
-def wider(reach: float) -> float:
-    """Return how many to eliminate where ``reach`` did not do: in the end, all."""
-    return WIDER * reach if reach < WIDER * AROUND else inf
+def larger_elimination_count(count: float) -> float:
+    """Return the number to eliminate if ``count`` was too small; finally infinity."""
+    return GROWTH * count if count < GROWTH * FIRST_COUNT else inf
 
 
 def union(first: Int, second: Int) -> Int:
-    """Return the first places, then those of the second that are not among them."""
+    """Return the first slots, then those of the second that are not among them."""
     return np.concatenate([first, second[~np.isin(second, first)]])

@@ -1,4 +1,4 @@
-"""The landmarks around the robot, with all that the rest of the map means for them."""
+"""The landmarks near the robot, conditioned on the rest of a sparse information map."""
 
 from dataclasses import dataclass, replace
 
@@ -7,33 +7,32 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, lapack
 
 from ..sparse_cholesky.coordinates import pairs
-from ..sparse_cholesky.information_matrix import (
-    InformationMatrix,
-    Surroundings,
-    surround,
-)
-from ..sparse_cholesky.landmark_elimination import Elimination, surround_all
-from .conditional_pose import MapReading, PoseGivenMap
+from ..sparse_cholesky.information_matrix import InformationMatrix
+from ..sparse_cholesky.landmark_elimination import LandmarkElimination, RestFactor
+from ..sparse_cholesky.schur_complement import SchurComplement, eliminate_subset
+from .conditional_pose import ConditionalPose, MapMeasurement
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
-class Map:
-    """Means and information of all landmarks, in the order of their slots.
+class SparseMap:
+    """Means and information of all landmarks, by slot.
 
-    The exact mean is m + Λ⁻¹ b: ``residual`` b is what a correction left to do.
+    The exact mean is m + Λ⁻¹ b, where ``residual`` b is the part of the corrections
+    that has not been applied yet.
     """
 
     def __init__(self) -> None:
         self.information = InformationMatrix()
-        self.elimination = Elimination()
+        self.elimination = LandmarkElimination()
         self.points = np.zeros(0)
-        self.first = np.zeros(0)  # where each was found
+        self.first = np.zeros(0)  # first estimates
         self.residual = np.zeros(0)
 
     def grow(self, count: int) -> None:
-        """Make room for so many landmarks."""
+        """Make room for ``count`` landmarks."""
         self.information.grow(count)
         if 2 * count > len(self.points):
             more = np.zeros(4 * count - len(self.points))
@@ -43,23 +42,24 @@ class Map:
 
 
 @dataclass(frozen=True)
-class Outer:
-    """The landmarks beyond the surroundings, held where they are."""
+class FixedLandmarks:
+    """Landmarks O linked with the eliminated ones, held at their means."""
 
     slots: Int
+    """O."""
     response: Array
     """W = Λ_OH T, shape (2o, c): their residual is b + W δ_B."""
     residual: Array
     """b when the local map was chosen, shape (2o,)."""
     scale: Array
-    """Inverse Cholesky factors of their own blocks, shape (o, 2, 2)."""
+    """Inverse Cholesky factors of their diagonal blocks, shape (o, 2, 2)."""
 
     def residual_after(self, shift: Array) -> Array:
-        """Residual after the border moved by δ_B, shape (2o,)."""
+        """Return the residual after the border moved by δ_B, shape (2o,)."""
         return self.residual + self.response @ shift
 
-    def unrest(self, shift: Array) -> float:
-        """Largest residual, as a shift in its own conditional standard deviations."""
+    def largest_residual(self, shift: Array) -> float:
+        """Return the largest residual in conditional standard deviations."""
         left = self.residual_after(shift).reshape(-1, 2)
         white = np.einsum("oij,oj->oi", self.scale, left)
         return float(np.sqrt((white**2).sum(axis=1).max(initial=0.0)))
@@ -67,35 +67,35 @@ class Outer:
 
 @dataclass(frozen=True)
 class LocalInformation:
-    """Mean and information of the landmarks L near the robot; a value.
+    """Mean and information of the local landmarks L; an immutable value.
 
-    While only they are seen, Λ changes nowhere else, so that C (the complement of the
-    :class:`Surroundings`) holds, and all that a full solution would say about L follows
-    from the small dense Λ_LL − C.
+    While the robot measures only local landmarks, no other entry of Λ changes.  The
+    complement C of the eliminated landmarks then stays valid, and the dense matrix
+    Λ_LL − C gives the same solution for L as the whole map.
     """
 
     slots: Int
     points: Array
     """Means, shape (2k,) [m]."""
     first: Array
-    """Their first estimates, shape (2k,) [m]."""
+    """First estimates, shape (2k,) [m]."""
     information: Array
     """Λ_LL, shape (2k, 2k)."""
     start: Array
     """Means of the border when L was chosen, shape (c,)."""
-    surroundings: Surroundings
-    outer: Outer
+    eliminated: SchurComplement
+    fixed: FixedLandmarks
 
     @property
     def shift(self) -> Array:
-        """How far the border has moved, δ_B, shape (c,)."""
-        return self.points[self.surroundings.border] - self.start
+        """Displacement of the border since L was chosen, δ_B, shape (c,)."""
+        return self.points[self.eliminated.border] - self.start
 
     def solver(self) -> tuple[Array, bool]:
-        """Cholesky factor of Λ_LL − C, for :func:`scipy.linalg.cho_solve`."""
-        border = self.surroundings.border
+        """Return the Cholesky factor of Λ_LL − C for :func:`scipy.linalg.cho_solve`."""
+        border = self.eliminated.border
         marginal = self.information.copy()
-        marginal[np.ix_(border, border)] -= self.surroundings.complement
+        marginal[np.ix_(border, border)] -= self.eliminated.complement
         factor, failed = lapack.dpotrf(marginal, lower=1, clean=1)
         if failed:
             raise np.linalg.LinAlgError(
@@ -104,25 +104,17 @@ class LocalInformation:
             )
         return factor, True
 
-    def without_factor(self) -> "LocalInformation":
-        """Let go of the factor around it, which may be large."""
-        return replace(
-            self,
-            surroundings=self.surroundings._replace(solve=np.copy, respond=np.copy),
-        )
-
     def absorb(
-        self, pose: PoseGivenMap, reading: MapReading
-    ) -> tuple["LocalInformation", PoseGivenMap]:
+        self, pose: ConditionalPose, measurement: MapMeasurement
+    ) -> tuple["LocalInformation", ConditionalPose]:
         """Add information, Λ ← Λ + Yᵀ Y, and move map and pose to the new mean."""
-        added = replace(
-            self, information=self.information + reading.rows.T @ reading.rows
-        )
-        return added.settle(pose, reading.rows.T @ reading.innovation)
+        Y = measurement.rows
+        added = replace(self, information=self.information + Y.T @ Y)
+        return added.settle(pose, Y.T @ measurement.innovation)
 
     def settle(
-        self, pose: PoseGivenMap, residual: Array
-    ) -> tuple["LocalInformation", PoseGivenMap]:
+        self, pose: ConditionalPose, residual: Array
+    ) -> tuple["LocalInformation", ConditionalPose]:
         """Move the map by δ = (Λ_LL − C)⁻¹ b, and the pose by K δ."""
         if not residual.any():
             return self, pose
@@ -131,7 +123,7 @@ class LocalInformation:
         return replace(self, points=self.points + delta), moved
 
     def extended(self, slots: Int, points: Array) -> "LocalInformation":
-        """Append landmarks of which nothing is known yet, at these points."""
+        """Append landmarks without information, at these points."""
         return replace(
             self,
             slots=np.concatenate([self.slots, slots]),
@@ -140,73 +132,95 @@ class LocalInformation:
             information=np.pad(self.information, (0, 2 * len(slots))),
         )
 
+    def without(self, gone: Flags, information: Array) -> "LocalInformation":
+        """Drop landmarks, shape (k,); ``information`` is that of the others."""
+        rest = ~np.repeat(gone, 2)
+        place = np.cumsum(rest) - 1
+        return replace(
+            self,
+            slots=self.slots[~gone],
+            points=self.points[rest],
+            first=self.first[rest],
+            information=information,
+            eliminated=self.eliminated._replace(border=place[self.eliminated.border]),
+        )
 
-def begin(
-    world: Map, pose: PoseGivenMap, slots: Int, reach: float
-) -> tuple[LocalInformation, PoseGivenMap]:
-    """Take landmarks in hand, the ``reach`` nearest by links eliminated around them.
 
-    ``pose.gain`` must be that of these landmarks.
+def begin_local_map(
+    map_: SparseMap, pose: ConditionalPose, slots: Int, count: float
+) -> tuple[LocalInformation, ConditionalPose]:
+    """Choose local landmarks, and eliminate landmarks around them.
+
+    Parameters
+    ----------
+    map_ : SparseMap
+        Pending residuals of local and eliminated landmarks are applied to it.
+    pose : ConditionalPose
+        Its gain must be that of the local landmarks.
+    slots : ndarray
+        The local landmarks.
+    count : float
+        Number of landmarks to eliminate, nearest by links first.
     """
-    matrix = world.information
-    around = _eliminated(world, slots, reach)
-    columns = pairs(around.slots)
-    outer = np.setdiff1d(matrix.neighbours(around.slots), slots)
-    waiting = world.residual[columns]
-    if waiting.any():
-        waiting = around.solve(waiting)
-    world.points[columns] += waiting
-    world.residual[columns] = 0.0
-    rest = matrix.part(outer, around.slots)
-    response = np.zeros((0, len(around.border)))
-    if len(outer):
-        response = np.ascontiguousarray(rest @ around.response)
-    outside, inside = pairs(outer), pairs(slots)
-    world.residual[outside] -= rest @ waiting
-    residual = world.residual[inside].copy()
-    residual -= matrix.part(slots, around.slots) @ waiting
-    world.residual[inside] = 0.0
+    matrix = map_.information
+    eliminated = _eliminate(map_, slots, count)
+    columns = pairs(eliminated.slots)
+    fixed = np.setdiff1d(matrix.neighbours(eliminated.slots), slots)
+    pending = map_.residual[columns]
+    if pending.any():
+        pending = eliminated.factor.solve(pending)
+    map_.points[columns] += pending
+    map_.residual[columns] = 0.0
+    link = matrix.submatrix(fixed, eliminated.slots)
+    response = np.zeros((0, len(eliminated.border)))
+    if len(fixed):
+        response = np.ascontiguousarray(link @ eliminated.response)
+    outside, inside = pairs(fixed), pairs(slots)
+    map_.residual[outside] -= link @ pending
+    residual = map_.residual[inside].copy()
+    residual -= matrix.submatrix(slots, eliminated.slots) @ pending
+    map_.residual[inside] = 0.0
     local = LocalInformation(
         slots,
-        world.points[inside],
-        world.first[inside],
+        map_.points[inside],
+        map_.first[inside],
         matrix.dense(slots),
-        world.points[inside][around.border],
-        around,
-        Outer(
-            outer,
+        map_.points[inside][eliminated.border],
+        eliminated,
+        FixedLandmarks(
+            fixed,
             response,
-            world.residual[outside],
-            np.linalg.inv(np.linalg.cholesky(matrix.diagonal(outer))),
+            map_.residual[outside],
+            np.linalg.inv(np.linalg.cholesky(matrix.diagonal(fixed))),
         ),
     )
     return local.settle(pose, residual)
 
 
-def _eliminated(world: Map, slots: Int, reach: float) -> Surroundings:
-    """Eliminate the nearest by links, or all where these are as many as there are."""
-    matrix = world.information
-    if reach >= len(matrix) - len(slots):
-        return surround_all(world.elimination, matrix, slots)
-    return surround(matrix, slots, matrix.around(slots, reach))
+def _eliminate(map_: SparseMap, slots: Int, count: float) -> SchurComplement:
+    """Eliminate the nearest landmarks by links, or the whole rest of the map."""
+    matrix = map_.information
+    if count >= len(matrix) - len(slots):
+        return RestFactor(map_.elimination, matrix, slots).complement()
+    return eliminate_subset(matrix, slots, matrix.nearest_by_links(slots, int(count)))
 
 
-def finish(world: Map, local: LocalInformation) -> None:
-    """Hand everything back to the map."""
-    world.points[pairs(local.slots)] = local.points
-    world.first[pairs(local.slots)] = local.first
-    around, shift = local.surroundings, local.shift
+def write_back(map_: SparseMap, local: LocalInformation) -> None:
+    """Write the local map and its effect on the eliminated landmarks to the map."""
+    map_.points[pairs(local.slots)] = local.points
+    map_.first[pairs(local.slots)] = local.first
+    eliminated, shift = local.eliminated, local.shift
     if shift.any():
-        world.points[pairs(around.slots)] -= around.respond(shift)
-    world.residual[pairs(local.outer.slots)] = local.outer.residual_after(shift)
-    world.information.put(local.slots, local.information)
-    world.elimination.revise(world.information, world.first, local.slots)
+        map_.points[pairs(eliminated.slots)] -= eliminated.factor.respond(shift)
+    map_.residual[pairs(local.fixed.slots)] = local.fixed.residual_after(shift)
+    map_.information.replace(local.slots, local.information)
+    map_.elimination.revise(map_.information, map_.first, local.slots)
 
 
-def link_count(world: Map, local: LocalInformation) -> int:
-    """Count the blocks of Λ that are not zero, those of the local map as they are."""
-    matrix, slots = world.information, local.slots
+def link_count(map_: SparseMap, local: LocalInformation) -> int:
+    """Count the nonzero blocks of Λ, including the current local map."""
+    matrix, slots = map_.information, local.slots
     k = len(slots)
     blocks = local.information.reshape(k, 2, k, 2)
-    now = int(blocks.any(axis=(1, 3)).sum())
-    return matrix.block_count - len(matrix.part(slots, slots).indices) + now
+    current = int(blocks.any(axis=(1, 3)).sum())
+    return matrix.block_count - len(matrix.submatrix(slots, slots).indices) + current

@@ -1,4 +1,4 @@
-"""What a sparse information matrix says about some of its landmarks and the pose."""
+"""Marginals of the pose and some landmarks of a sparse information map."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -8,16 +8,17 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from ..sparse_cholesky.coordinates import pairs
-from ..sparse_cholesky.information_matrix import Surroundings
-from .conditional_pose import PoseGivenMap
-from .local_information import LocalInformation, Map
+from ..sparse_cholesky.landmark_elimination import RestFactor
+from ..sparse_cholesky.schur_complement import SchurComplement
+from .conditional_pose import ConditionalPose
+from .local_information import LocalInformation, SparseMap
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
 class Marginal(NamedTuple):
-    """Of the pose and some landmarks."""
+    """Gaussian of the pose and n landmarks."""
 
     mean: Array
     """Shape (3 + 2n,)."""
@@ -26,53 +27,59 @@ class Marginal(NamedTuple):
 
 
 def marginal(
-    world: Map,
+    map_: SparseMap,
     local: LocalInformation,
-    everything: Surroundings,
-    pose: PoseGivenMap,
+    rest: RestFactor,
+    pose: ConditionalPose,
     slots: Int,
 ) -> Marginal:
-    """Marginal of the pose and of landmarks by their slots.
+    """Return the marginal of the pose and some landmarks.
 
-    With L the local map and ``everything`` all landmarks H beside it::
+    With L the local map and H all other landmarks::
 
         p = K m_L + ω,   m_H = −T m_B + h,   cov ω = Ω,  cov h = Λ_HH⁻¹
         Σ_LL = (Λ_LL − C)⁻¹
 
-    so that with G = [K; E; −T] the answer is G Σ_LL Gᵀ plus Ω and blocks of Λ_HH⁻¹, of
-    which only the columns that were asked for are solved for.
+    With G = [K; E; −T], the covariance is G Σ_LL Gᵀ plus Ω and blocks of Λ_HH⁻¹.  Only
+    the requested rows of T and Λ_HH⁻¹ are computed.
+
+    Parameters
+    ----------
+    map_ : SparseMap
+    local : LocalInformation
+    rest : RestFactor
+        Of all landmarks except the local ones.
+    pose : ConditionalPose
+    slots : ndarray, shape (n,)
+        The landmarks.
     """
-    place = np.full(len(world.points) // 2, -1)
+    place = np.full(len(map_.points) // 2, -1)
     place[local.slots] = np.arange(len(local.slots))
     is_near = place[slots] >= 0
     inside = np.append([True] * 3, np.repeat(is_near, 2))
     outside = np.flatnonzero(~inside)
     here = np.append([0, 1, 2], 3 + pairs(place[slots[is_near]]))
-    columns = pairs(np.searchsorted(everything.slots, slots[~is_near]))
-    near = _near(local, everything, pose)  # the same bits whatever is asked for
-    border = 3 + everything.border
+    whole = rest.complement()
+    near = _near(local, whole, pose)  # its bits do not depend on the slots
     covariance = np.empty((len(inside), len(inside)))
     covariance[np.ix_(inside, inside)] = near[np.ix_(here, here)]
     if len(outside):
-        unit = np.zeros((2 * len(everything.slots), len(columns)))
-        unit[columns, np.arange(len(columns))] = 1.0
-        solved = everything.solve(unit)
-        link = world.information.part(everything.slots, local.slots).tocsc()
-        T = (link[:, everything.border].T @ solved).T
-        own = solved[columns] + T @ near[np.ix_(border, border)] @ T.T
+        own, T = rest.covariance(slots[~is_near])
+        border = 3 + whole.border
+        own += T @ near[np.ix_(border, border)] @ T.T
         covariance[np.ix_(outside, outside)] = (own + own.T) / 2
         cross = -T @ near[np.ix_(border, here)]
         covariance[np.ix_(outside, inside)] = cross
         covariance[np.ix_(inside, outside)] = cross.T
-    mean = np.concatenate([pose.mean, means(world, local)[pairs(slots)]])
+    mean = np.concatenate([pose.mean, means(map_, local)[pairs(slots)]])
     return Marginal(mean, covariance)
 
 
 def _near(
-    local: LocalInformation, everything: Surroundings, pose: PoseGivenMap
+    local: LocalInformation, whole: SchurComplement, pose: ConditionalPose
 ) -> Array:
-    """Covariance of the pose and all local landmarks."""
-    exact = replace(local, surroundings=everything)
+    """Return the covariance of the pose and all local landmarks."""
+    exact = replace(local, eliminated=whole)
     rows = np.vstack([pose.gain, np.eye(len(local.points))])
     root = solve_triangular(exact.solver()[0], rows.T, lower=True, check_finite=False)
     covariance = root.T @ root
@@ -80,12 +87,12 @@ def _near(
     return np.asarray(covariance)
 
 
-def means(world: Map, local: LocalInformation) -> Array:
-    """Positions of all landmarks as they are known now, by slots, flat [m]."""
-    points = world.points.copy()
-    around = local.surroundings
+def means(map_: SparseMap, local: LocalInformation) -> Array:
+    """Return the positions of all landmarks by slot, flat [m]."""
+    points = map_.points.copy()
     shift = local.shift
     if shift.any():
-        points[pairs(around.slots)] -= around.respond(shift)
+        eliminated = local.eliminated
+        points[pairs(eliminated.slots)] -= eliminated.factor.respond(shift)
     points[pairs(local.slots)] = local.points
     return points

@@ -1,113 +1,100 @@
-"""Save a sparse information filter, and check what was saved before taking it."""
+"""Conversion of a sparse belief to arrays, and checks of such arrays."""
 
 from collections.abc import Mapping
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...support import argument_checks
-from ..sparse_cholesky.information_matrix import (
-    InformationMatrix,
-    Solver,
-    Surroundings,
-    solver,
-)
-from ..sparse_cholesky.landmark_elimination import Factor
-from .conditional_pose import PoseGivenMap
-from .local_information import LocalInformation, Map, Outer
+from ..sparse_cholesky.landmark_elimination import RestFactor
+from ..sparse_cholesky.schur_complement import Factor, SchurComplement, SubsetFactor
+from .conditional_pose import ConditionalPose
+from .local_information import FixedLandmarks, LocalInformation, SparseMap
+from .sparse_belief import SparseBelief
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-_MATRIX = ("counts", "links", "blocks")
-_LOCAL = ("slots", "points", "first", "information", "start")
-_AROUND = ("slots", "border", "response", "complement")
-_OUTER = ("slots", "response", "residual", "scale")
-_POSE = ("mean", "gain", "covariance", "reference")
-_WHOLE = {"counts", "links", "border", "slots"}
+_PARTS = {
+    "matrix": ("counts", "links", "blocks"),
+    "local": ("slots", "points", "first", "information", "start"),
+    "around": ("slots", "border", "response", "complement"),
+    "outer": ("slots", "response", "residual", "scale"),
+    "pose": ("mean", "gain", "covariance", "reference"),
+}
+_MAP = ("points", "first", "residual")
+_OTHERS = ("landmark_ids", "slots", "free", "nodes", "parted")
+_LOCAL_MAP = ("origin", "reach", "widened")
+_WHOLE_NUMBERS = {"counts", "links", "border", "slots"}
 
 
-class SavedState(NamedTuple):
-    """All that changes in the filter."""
-
-    slots: dict[int, int]
-    """Place of each landmark, by identity."""
-    free: list[int]
-    """Places of removed landmarks."""
-    world: Map
-    local: LocalInformation
-    pose: PoseGivenMap
-    origin: Array
-    """Where the local map was chosen, shape (2,) [m]."""
-    reach: float
-    """How many landmarks around it were to be eliminated."""
-    widened: bool
-    """Whether that is more than at first."""
-
-
-def as_arrays(saved: SavedState, name: str, base: str) -> dict[str, Any]:
-    """Return copies of everything, as arrays."""
-    world, local = saved.world, saved.local
-    world.elimination.dissection.grow(len(world.information))
-    count = 2 * len(world.information)
+def as_arrays(belief: SparseBelief, name: str, base: str) -> dict[str, Any]:
+    """Return copies of the whole state, as arrays."""
+    map_, local = belief.map_, belief.local
+    dissection = map_.elimination.dissection
+    dissection.grow(len(map_.information))
+    parts = {
+        "local": local,
+        "around": local.eliminated,
+        "outer": local.fixed,
+        "pose": belief.pose,
+    }
     return {
         "estimator": np.array(name),
         "base": np.array(base),
-        "landmark_ids": np.array(list(saved.slots), dtype=np.int64),
-        "slots": np.array(list(saved.slots.values()), dtype=np.int64),
-        "free": np.array(saved.free, dtype=np.int64),
-        "points": world.points[:count].copy(),
-        "first": world.first[:count].copy(),
-        "residual": world.residual[:count].copy(),
-        "nodes": world.elimination.dissection.nodes.copy(),
-        "parted": np.array(world.elimination.dissection.parted),
-        "origin": saved.origin.copy(),
-        "reach": np.array(saved.reach),
-        "widened": np.array(saved.widened),
-        **{f"matrix_{k}": v for k, v in world.information.state_dict().items()},
-        **{f"local_{k}": getattr(local, k).copy() for k in _LOCAL},
-        **{f"around_{k}": getattr(local.surroundings, k).copy() for k in _AROUND},
-        **{f"outer_{k}": getattr(local.outer, k).copy() for k in _OUTER},
-        **{f"pose_{k}": getattr(saved.pose, k).copy() for k in _POSE},
+        "landmark_ids": np.array(list(belief.slots), dtype=np.int64),
+        "slots": np.array(list(belief.slots.values()), dtype=np.int64),
+        "free": np.array(belief.free, dtype=np.int64),
+        "nodes": dissection.nodes.copy(),
+        "parted": np.array(dissection.dissected),
+        "origin": belief.origin.copy(),
+        "reach": np.array(belief.count),
+        "widened": np.array(belief.enlarged),
+        **{k: getattr(map_, k)[: 2 * len(map_.information)].copy() for k in _MAP},
+        **{f"matrix_{k}": v for k, v in map_.information.state_dict().items()},
+        **{
+            f"{prefix}_{key}": getattr(part, key).copy()
+            for prefix, part in parts.items()
+            for key in _PARTS[prefix]
+        },
     }
 
 
-def checked_state(state: Mapping[str, Any], name: str, base: str) -> SavedState:
-    """Read what :func:`as_arrays` returned, or refuse it."""
-    _check_entries(state, name, base)
-    ids, slots, free = (
-        np.asarray(state[key]).ravel().tolist()
-        for key in ("landmark_ids", "slots", "free")
-    )
-    world = Map()
-    world.information.load_state_dict(_part(state, "matrix", _MATRIX))
-    count = len(world.information)
-    if sorted(slots + free) != list(range(count)) or len(set(ids)) != len(slots):
-        raise ValueError(
-            f"state['slots'] and state['free'] must share out the {count} rows of the "
-            f"matrix among {len(ids)} landmarks, got {len(slots)} and {len(free)}"
-        )
-    world.points, world.first, world.residual = (
+def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelief:
+    """Return the belief that :func:`as_arrays` saved.
+
+    Raises
+    ------
+    ValueError
+        If the state is of another estimator, incomplete or inconsistent.
+    """
+    entries = [f"{prefix}_{key}" for prefix, keys in _PARTS.items() for key in keys]
+    entries += [*_OTHERS, *_MAP, *_LOCAL_MAP]
+    argument_checks.refuse_other_state(state, entries, estimator=name, base=base)
+    map_ = SparseMap()
+    map_.information.load_state_dict(_part(state, "matrix"))
+    count = len(map_.information)
+    slots, free = _slots(state, count)
+    map_.points, map_.first, map_.residual = (
         argument_checks.finite_vector(f"state[{key!r}]", state[key], 2 * count).copy()
-        for key in ("points", "first", "residual")
+        for key in _MAP
     )
-    pose = PoseGivenMap(**_part(state, "pose", _POSE))
-    around = _part(state, "around", _AROUND)
-    of_local = _part(state, "local", _LOCAL)
+    pose = ConditionalPose(**_part(state, "pose"))
+    of_local = _part(state, "local")
     local = LocalInformation(
         **of_local,
-        surroundings=_surroundings(world, of_local["slots"], around),
-        outer=Outer(**_part(state, "outer", _OUTER)),
+        eliminated=_eliminated(map_, of_local["slots"], _part(state, "around")),
+        fixed=FixedLandmarks(**_part(state, "outer")),
     )
-    _check_fit(local, pose, count)
-    _take_dissection(state, world, local.slots)
+    _check_shapes(local, pose)
+    _check_slots(local, count)
+    _load_dissection(state, map_, local.slots)
     origin = argument_checks.finite_vector("state['origin']", state["origin"], 2).copy()
-    return SavedState(
-        dict(zip(ids, slots, strict=True)),
+    return SparseBelief(
+        slots,
         free,
-        world,
+        map_,
         local,
         pose,
         origin,
@@ -116,74 +103,64 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SavedState:
     )
 
 
-def _surroundings(world: Map, local: Int, around: dict[str, Any]) -> Surroundings:
-    """Eliminate around the local map as before, when that is asked for."""
+def _slots(state: Mapping[str, Any], count: int) -> tuple[dict[int, int], list[int]]:
+    ids, slots, free = (
+        np.asarray(state[key]).ravel().tolist()
+        for key in ("landmark_ids", "slots", "free")
+    )
+    if sorted(slots + free) != list(range(count)) or len(set(ids)) != len(slots):
+        raise ValueError(
+            f"state['slots'] and state['free'] must share out the {count} rows of the "
+            f"matrix among {len(ids)} landmarks, got {len(slots)} and {len(free)}"
+        )
+    return dict(zip(ids, slots, strict=True)), free
+
+
+def _eliminated(map_: SparseMap, local: Int, around: dict[str, Any]) -> SchurComplement:
+    """Return the saved complement; its factor is made when it is first used."""
     slots, response = around["slots"], around["response"]
+    factor: Factor = SubsetFactor(map_.information, slots, response)
     if len(slots) and not len(response):
-        factor = Factor(world.elimination, world.information, local)
-        respond = partial(factor.respond, around["border"])
-        return Surroundings(**around, solve=factor.solve, respond=respond)
-    solve = _later(world.information, slots)
-    return Surroundings(**around, solve=solve, respond=response.__matmul__)
+        factor = RestFactor(map_.elimination, map_.information, local)
+    return SchurComplement(**around, factor=factor)
 
 
-def _take_dissection(state: Mapping[str, Any], world: Map, local: Int) -> None:
-    """Take the order of elimination, and put those in it that are in none."""
-    matrix, count = world.information, len(world.information)
+def _load_dissection(state: Mapping[str, Any], map_: SparseMap, local: Int) -> None:
+    """Load the elimination order; insert landmarks that it does not contain."""
+    matrix, count = map_.information, len(map_.information)
     nodes = np.asarray(state["nodes"])
     if nodes.shape != (count,) or (nodes < 0).any() or (nodes >= 2**50).any():
         raise ValueError(
             f"state['nodes'] must be {count} whole numbers in [0, 2⁵⁰), got "
             f"shape {nodes.shape}"
         )
-    dissection = world.elimination.dissection
+    dissection = map_.elimination.dissection
     dissection.nodes = nodes.astype(np.int64)
-    dissection.parted = int(state["parted"])
+    dissection.dissected = int(state["parted"])
     others = np.setdiff1d(np.flatnonzero(dissection.nodes == 0), local)
-    others = others[matrix.filled(others)]
+    others = others[matrix.is_filled(others)]
     if len(others):
-        dissection.revise(matrix, world.first, others)
+        dissection.revise(matrix, map_.first, others)
     dissection.check(matrix, local)
 
 
-def _later(matrix: InformationMatrix, slots: Int) -> Solver:
-    """Factorise only when asked."""
-    return lambda right: solver(matrix, slots)(right)  # noqa: PLW0108
-
-
-def _check_entries(state: Mapping[str, Any], name: str, base: str) -> None:
-    entries = ["landmark_ids", "slots", "free", "points", "first", "residual"]
-    for prefix, keys in (
-        ("matrix", _MATRIX),
-        ("local", _LOCAL),
-        ("around", _AROUND),
-        ("outer", _OUTER),
-        ("pose", _POSE),
-    ):
-        entries += [f"{prefix}_{key}" for key in keys]
-    entries += ["nodes", "parted", "origin", "reach", "widened"]
-    argument_checks.refuse_other_state(state, entries, estimator=name, base=base)
-
-
-def _part(
-    state: Mapping[str, Any], prefix: str, keys: tuple[str, ...]
-) -> dict[str, Any]:
-    """Return copies of some entries, checked to be finite numbers."""
+def _part(state: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Return copies of the entries with a prefix, all of them finite numbers."""
     part: dict[str, Any] = {}
-    for key in keys:
+    for key in _PARTS[prefix]:
         name = f"state['{prefix}_{key}']"
         values = argument_checks.as_floats(name, state[f"{prefix}_{key}"])
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite")
-        part[key] = values.astype(np.int64) if key in _WHOLE else values.copy()
+        part[key] = values.astype(np.int64) if key in _WHOLE_NUMBERS else values.copy()
     return part
 
 
-def _check_fit(local: LocalInformation, pose: PoseGivenMap, count: int) -> None:
-    """Refuse arrays whose shapes do not belong together."""
-    around, outer = local.surroundings, local.outer
-    k, c = 2 * len(local.slots), len(around.border)
-    h, o = 2 * len(around.slots), 2 * len(outer.slots)
+def _check_shapes(local: LocalInformation, pose: ConditionalPose) -> None:
+    eliminated, fixed = local.eliminated, local.fixed
+    k, c = 2 * len(local.slots), len(eliminated.border)
+    h = 2 * len(eliminated.slots) if len(eliminated.response) else 0
+    o = 2 * len(fixed.slots)
     for name, array, shape in (
         ("pose_mean", pose.mean, (3,)),
         ("pose_gain", pose.gain, (3, k)),
@@ -193,22 +170,25 @@ def _check_fit(local: LocalInformation, pose: PoseGivenMap, count: int) -> None:
         ("local_first", local.first, (k,)),
         ("local_information", local.information, (k, k)),
         ("local_start", local.start, (c,)),
-        ("around_response", around.response, (h if len(around.response) else 0, c)),
-        ("around_complement", around.complement, (c, c)),
-        ("outer_response", outer.response, (o, c)),
-        ("outer_residual", outer.residual, (o,)),
-        ("outer_scale", outer.scale, (o // 2, 2, 2)),
+        ("around_response", eliminated.response, (h, c)),
+        ("around_complement", eliminated.complement, (c, c)),
+        ("outer_response", fixed.response, (o, c)),
+        ("outer_residual", fixed.residual, (o,)),
+        ("outer_scale", fixed.scale, (o // 2, 2, 2)),
     ):
         if array.shape != shape:
             raise ValueError(f"state[{name!r}] must be {shape}, got {array.shape}")
-    for name, places, end in (
+
+
+def _check_slots(local: LocalInformation, count: int) -> None:
+    for name, slots, end in (
         ("local_slots", local.slots, count),
-        ("around_slots", around.slots, count),
-        ("outer_slots", outer.slots, count),
-        ("around_border", around.border, k),
+        ("around_slots", local.eliminated.slots, count),
+        ("outer_slots", local.fixed.slots, count),
+        ("around_border", local.eliminated.border, 2 * len(local.slots)),
     ):
-        if len(places) and not 0 <= places.min() <= places.max() < end:
+        if len(slots) and not 0 <= slots.min() <= slots.max() < end:
             raise ValueError(
-                f"state[{name!r}] must lie in [0, {end}), got {places.min()} to "
-                f"{places.max()}"
+                f"state[{name!r}] must lie in [0, {end}), got {slots.min()} to "
+                f"{slots.max()}"
             )

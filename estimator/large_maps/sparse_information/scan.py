@@ -1,4 +1,4 @@
-"""One scan against a local information map: which readings to use, and their NIS."""
+"""Selection of the measurements of one scan, with their NIS."""
 
 from math import isfinite
 from typing import Any, NamedTuple
@@ -9,8 +9,8 @@ from scipy.linalg import lapack, solve_triangular
 
 from ...filters.ekf import EkfSlam, not_positive_definite
 from ...support import argument_checks
-from .conditional_pose import LinearScan, PoseGivenMap, seen_from
-from .linearisation import BASES, linear_scan
+from .conditional_pose import ConditionalPose, LinearScan, marginalise_pose
+from .linearisation import BASES, linearise_scan
 from .local_information import LocalInformation
 
 Array = NDArray[np.float64]
@@ -19,23 +19,23 @@ Flags = NDArray[np.bool_]
 
 
 class Screened(NamedTuple):
-    """Readings of mapped landmarks, in their order; n of them, m to be used."""
+    """n measurements of mapped landmarks, m of which are used."""
 
     skipped: Flags
-    """Expected too close, shape (n,)."""
+    """Landmark expected below the minimum range, shape (n,)."""
     gated: Flags
-    """Refused by the gate, shape (n,)."""
+    """Rejected by the gate, shape (n,)."""
     near: Flags
     """Robot within 10 σ of the landmark, shape (n,)."""
     scan: LinearScan
-    """Those to use, linearised at the prior, m readings."""
+    """The m used measurements, linearised at the prior."""
     nis: float
     factor: Array
     """L, shape (2m, 2m), L Lᵀ = S."""
 
 
 class ScanRules:
-    """Noise and acceptance of readings, set up and checked as by :class:`EkfSlam`."""
+    """Noise and acceptance rules of measurements, checked by :class:`EkfSlam`."""
 
     def __init__(
         self,
@@ -60,19 +60,19 @@ class ScanRules:
         self._motion_values = checked.motion_values
         if min(self.rules.bearing_std, self.rules.range_std) <= 0:
             raise ValueError(
-                "measurement_std must be 2 finite numbers > 0: of an exact reading the "
-                f"information is infinite, got {measurement_std!r}"
+                "measurement_std must be 2 finite numbers > 0, because an exact "
+                f"measurement has infinite information, got {measurement_std!r}"
             )
 
     def motion_variance(self, distance: float, turn: float, dt: float) -> Array:
-        """(σx², σy², σα²) of a motion, shape (3,)."""
+        """Return (σx², σy², σα²) of a motion, shape (3,)."""
         if not (isfinite(dt) and dt >= 0):
             raise ValueError(f"dt must be a finite number >= 0, got {dt!r}")
         moves = distance or turn or self._motion_values[3]
         return self._motion_values[:3] * (dt if moves else 0.0)
 
     def variance(self, distance: Array) -> Array:
-        """Diagonal of Q of readings at these ranges, shape (n, 2)."""
+        """Return the diagonal of Q at these ranges, shape (n, 2)."""
         rules = self.rules
         range_std = rules.range_std + rules.range_std_per_metre * distance
         bearing = np.full(len(distance), rules.bearing_std)
@@ -80,16 +80,15 @@ class ScanRules:
 
     def screen(
         self,
-        pose: PoseGivenMap,
+        pose: ConditionalPose,
         local: LocalInformation,
         places: Int,
         readings: Array,
         ids: list[int],
     ) -> Screened:
-        """Linearise readings of local landmarks and decide which to use.
+        """Linearise measurements of local landmarks and select those to use.
 
-        With Σ = (Λ_LL − C)⁻¹, S = H Σ Hᵀ + N, where H and N are the readings as a
-        function of the map (:func:`seen_from`).
+        S = H Σ Hᵀ + N, with Σ = (Λ_LL − C)⁻¹ and H, N from :func:`marginalise_pose`.
         """
         expected = np.hypot(*(local.points.reshape(-1, 2)[places] - pose.mean[:2]).T)
         skipped = expected < self.rules.min_range
@@ -97,18 +96,18 @@ class ScanRules:
         places, readings = places[kept], readings[kept]
         at = readings[:, 1] if self.rules.noise_as_read else expected[kept]
         variance = self.variance(at)
-        scan = linear_scan(self.base, local, pose, places, readings, variance)
+        scan = linearise_scan(self.base, local, pose, places, readings, variance)
         S = _innovation_covariance(pose, local, scan)
         blocks = np.array(
             [S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(places))]
         ).reshape(-1, 2, 2)
-        refused = _squared(scan.innovation, blocks) > self.rules.gate
+        refused = _squared_distances(scan.innovation, blocks) > self.rules.gate
         gated, near = np.zeros_like(skipped), np.zeros_like(skipped)
-        gated[kept], near[kept] = refused, _meets(scan, blocks, expected[kept])
+        gated[kept], near[kept] = refused, _is_too_near(scan, blocks, expected[kept])
         used = np.repeat(~refused, 2)
         used_ids = [i for i, k in zip(ids, kept & ~gated, strict=True) if k]
         factor, nis = np.empty((0, 0)), 0.0
-        scan = scan.only(~refused)
+        scan = scan.subset(~refused)
         if used_ids:
             factor = _factor(S[np.ix_(used, used)], used_ids)
             white = solve_triangular(factor, scan.innovation.ravel(), lower=True)
@@ -117,25 +116,25 @@ class ScanRules:
 
 
 def _innovation_covariance(
-    pose: PoseGivenMap, local: LocalInformation, scan: LinearScan
+    pose: ConditionalPose, local: LocalInformation, scan: LinearScan
 ) -> Array:
     if not len(scan.landmarks):
         return np.empty((0, 0))
-    H, N = seen_from(pose, scan)
+    H, N = marginalise_pose(pose, scan)
     spread = solve_triangular(local.solver()[0], H.T, lower=True, check_finite=False)
     return np.asarray(spread.T @ spread + N)
 
 
-def _squared(innovation: Array, blocks: Array) -> Array:
-    """NIS of each reading by itself, shape (n,)."""
+def _squared_distances(innovation: Array, blocks: Array) -> Array:
+    """Return the NIS of each measurement alone, shape (n,)."""
     solved = np.linalg.solve(blocks, innovation[..., None])[..., 0]
     return np.asarray((innovation * solved).sum(axis=1))
 
 
-def _meets(scan: LinearScan, blocks: Array, distance: Array) -> Flags:
-    """Whether the robot is within 10 σ of each landmark, as :class:`EkfSlam` has it.
+def _is_too_near(scan: LinearScan, blocks: Array, distance: Array) -> Flags:
+    """Return whether the robot is within 10 σ of each landmark, as :class:`EkfSlam`.
 
-    The covariance of a landmark's place in the robot's frame is H_l⁻¹ (S − Q) H_l⁻ᵀ.
+    A landmark's covariance in the robot frame is H_l⁻¹ (S − Q) H_l⁻ᵀ.
     """
     noise = np.einsum("ni,ij->nij", scan.variance, np.eye(2))
     back = np.linalg.inv(scan.jacobian_landmark)

@@ -1,4 +1,4 @@
-"""What one scan does to a sparse information map and the pose."""
+"""Update of a sparse information map and the pose with one scan."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...interface import UpdateReport
-from .conditional_pose import PoseGivenMap
+from .conditional_pose import ConditionalPose
 from .local_information import LocalInformation
 from .scan import ScanRules, Screened
 from .sparsification import (
     State,
-    active,
     add_landmarks,
     correct_all,
     correct_and_relocate,
@@ -24,42 +23,43 @@ Int = NDArray[np.int64]
 
 
 class Sparsity(NamedTuple):
-    """How the links of the pose are kept few."""
+    """Limit of the links of the pose."""
 
     bound: float
-    """Γ, or infinity."""
+    """Γ, the largest number of active landmarks, or infinity."""
     prunes: bool
+    """Whether to cut weak links instead of relocating the pose."""
 
 
-class Outcome(NamedTuple):
+class ScanResult(NamedTuple):
     """Belief and report after a scan."""
 
     local: LocalInformation
-    pose: PoseGivenMap
+    pose: ConditionalPose
     report: UpdateReport
     added_slots: list[int]
 
 
-def consider(
+def process_scan(
     state: State,
     rules: ScanRules,
     sparsity: Sparsity,
     scan: tuple[Array, list[int]],
     slots: Mapping[int, int],
-    vacant: Int,
-) -> Outcome:
-    """Work out what a scan does, and change nothing.
+    free_slots: Int,
+) -> ScanResult:
+    """Return belief and report after a scan, without changing the old belief.
 
     Parameters
     ----------
-    state : LocalInformation, PoseGivenMap
-        The belief, all mapped landmarks of the scan among the local ones.
+    state : LocalInformation, ConditionalPose
+        The belief.  All mapped landmarks of the scan must be local.
     scan : ndarray, shape (m, 2), and list of int
-        Readings and identities.
+        Measurements and identities.
     slots : mapping
-        Places of the mapped landmarks by identity.
-    vacant : ndarray, shape (>= m,)
-        Places to put new landmarks.
+        Slots of the mapped landmarks by identity.
+    free_slots : ndarray, shape (>= m,)
+        Slots for new landmarks.
     """
     (local, pose), (readings, ids) = state, scan
     far = readings[:, 1] >= rules.rules.min_range
@@ -71,12 +71,12 @@ def consider(
     names = [ids[k] for k in mapped]
     screened = rules.screen(pose, local, places, readings[mapped], names)
     used = mapped[~(screened.skipped | screened.gated)]
-    crowded = not sparsity.prunes and _is_crowded(
+    exceeds = not sparsity.prunes and _exceeds_bound(
         pose, screened.scan.landmarks, len(new), sparsity
     )
-    state = _absorb(rules.base, state, screened, readings[used], crowded=crowded)
+    state = _absorb(rules.base, state, screened, readings[used], relocates=exceeds)
     local, pose = state
-    seen, added = screened.scan.landmarks, vacant[: len(new)]
+    seen, added = screened.scan.landmarks, free_slots[: len(new)]
     if len(new):
         variance = rules.variance(readings[new, 1])
         local, pose = add_landmarks(rules.base, state, added, readings[new], variance)
@@ -100,32 +100,34 @@ def consider(
         innovation=screened.scan.innovation,
         factor=screened.factor,
     )
-    return Outcome(local, pose, report, added.tolist())
+    return ScanResult(local, pose, report, added.tolist())
 
 
 def _absorb(
-    base: str, state: State, screened: Screened, readings: Array, *, crowded: bool
+    base: str, state: State, screened: Screened, readings: Array, *, relocates: bool
 ) -> State:
-    """Correct, and relocate the pose where its links would become too many."""
+    """Correct, and relocate the pose if it would have too many links."""
     scan = screened.scan
     if not len(scan.landmarks):
         return state
-    if crowded:
+    if relocates:
         relocated = correct_and_relocate(base, state, scan, readings)
         if relocated is not None:
             return relocated
     return correct_all(*state, scan)
 
 
-def _is_crowded(pose: PoseGivenMap, seen: Int, new: int, sparsity: Sparsity) -> bool:
-    """Whether a scan makes too many landmarks active, and may give a new pose.
+def _exceeds_bound(
+    pose: ConditionalPose, seen: Int, new: int, sparsity: Sparsity
+) -> bool:
+    """Return whether a scan makes too many landmarks active and can give a new pose.
 
-    Two readings only do where the bound is exceeded twice: then none is left to link
-    the pose with the landmarks active so far before it is forgotten.
+    Two measurements suffice only if the scan exceeds the bound twofold, because none is
+    then left to correct the old pose before it is discarded.
     """
     if not pose.covariance.any():
-        return False  # a pose that is certain links nothing
-    linked = active(pose)
+        return False  # a certain pose has no links
+    linked = pose.is_linked
     linked[seen] = True
     count, enough = linked.sum() + new, 3
     if count > 2 * sparsity.bound:

@@ -14,10 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve
+from scipy.sparse import coo_array
 
 from ...error_frames import ErrorFrame
 from ..sparse_cholesky.coordinates import pairs
-from ..sparse_cholesky.submap_elimination import Elimination, Quadratic, dissect
+from ..sparse_cholesky.submap_dissection import dissect
+from ..sparse_cholesky.submap_elimination import Quadratic, SubmapElimination
 from .factor import floor, inverse_spread, points_of, relation, whitened
 from .frame_initialisation import Outline, points_seen
 from .store import Submap
@@ -110,7 +112,7 @@ class JoinedMap:
         self._parts = dissect(
             [self._unknowns(k) for k in range(len(slots))], frames[:-1, :2]
         )
-        self._elimination: Elimination | None = None
+        self._elimination: SubmapElimination | None = None
         self._settle()
 
     @property
@@ -132,9 +134,9 @@ class JoinedMap:
         place = self._place[slots]
         fused = np.flatnonzero(place >= 0)
         rows = np.concatenate([np.arange(3), 3 + pairs(fused)])
-        unknowns = [3 * count - 3 + np.arange(3), 3 * count + pairs(place[fused])]
+        columns = [3 * count - 3 + np.arange(3), 3 * count + pairs(place[fused])]
         mean[rows[3:]] = self._points[place[fused]].ravel()
-        found = [(np.concatenate(unknowns), rows, np.ones(len(rows)))]
+        found = [(np.concatenate(columns), rows, np.ones(len(rows)))]
         others = np.flatnonzero(place < 0)
         owners = self._owner[slots[others]]
         for k in np.unique(owners).tolist():
@@ -144,8 +146,9 @@ class JoinedMap:
             own[where[:, None], where] = alone.covariance
             at = np.broadcast_arrays(self._unknowns(k), where[:, None])
             found.append((at[0].ravel(), at[1].ravel(), alone.jacobian.ravel()))
-        A = [np.concatenate(parts) for parts in zip(*found, strict=True)]
-        own += self._factors.covariance(A[0], A[1], A[2], size)
+        unknowns, rows, values = map(np.concatenate, zip(*found, strict=True))
+        A = coo_array((values, (rows, unknowns)), (size, self.size)).tocsc()
+        own += self._factors.covariance(A)
         return Gaussian(mean, own)
 
     def _settle(self) -> None:
@@ -174,7 +177,7 @@ class JoinedMap:
         return trial
 
     @property
-    def _factors(self) -> Elimination:
+    def _factors(self) -> SubmapElimination:
         assert self._elimination is not None
         return self._elimination
 
@@ -187,7 +190,7 @@ class JoinedMap:
         self.frames = np.vstack([self.frames[:1], values[:cut].reshape(-1, 3)])
         self._points = values[cut:].reshape(-1, 2)
         self._elimination = None  # it may be large: never two of them
-        done = Elimination(self._parts, self.size, self._say)
+        done = SubmapElimination(self._parts, self.size, self._say)
         self._elimination = done
         return Point(values, done.cost, done.decrement(), done.solution())
 

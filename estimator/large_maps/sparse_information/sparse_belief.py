@@ -1,0 +1,190 @@
+"""The belief of the sparse information filter: map, local map and pose."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sparse_cholesky.coordinates import pairs
+from ..sparse_cholesky.landmark_elimination import RestFactor
+from .active_set import (
+    FIRST_COUNT,
+    choose_local,
+    first_elimination_count,
+    larger_elimination_count,
+    local_map_size,
+    union,
+)
+from .conditional_pose import ConditionalPose
+from .local_information import (
+    LocalInformation,
+    SparseMap,
+    begin_local_map,
+    write_back,
+)
+from .marginals import Marginal, marginal, means
+from .sparsification import State, marginalise, merge_landmarks
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass
+class SparseBelief:
+    """All state of the filter; one local map is in use at any time."""
+
+    slots: dict[int, int]
+    """Slot of each landmark, by identity."""
+    free: list[int]
+    """Slots of removed landmarks."""
+    map_: SparseMap
+    local: LocalInformation
+    pose: ConditionalPose
+    origin: Array
+    """Position of the robot when the local map was chosen, shape (2,) [m]."""
+    count: float = FIRST_COUNT
+    """Number of landmarks to eliminate around the local map."""
+    enlarged: bool = False
+    """Whether the first number was too small."""
+    rest: RestFactor | None = field(default=None, repr=False)
+    """Factor of all landmarks except the local ones, if known."""
+
+    @classmethod
+    def empty(cls, pose: Array, std: Array) -> "SparseBelief":
+        """Return the belief of a robot at this pose, shape (3,), without a map."""
+        start = ConditionalPose(
+            pose.copy(), np.zeros((3, 0)), np.diag(std**2), pose[:2].copy()
+        )
+        map_ = SparseMap()
+        nothing = np.empty(0, dtype=np.int64)
+        local, start = begin_local_map(map_, start, nothing, FIRST_COUNT)
+        return cls({}, [], map_, local, start, pose[:2].copy())
+
+    def free_slots(self, count: int) -> Int:
+        """Return slots for new landmarks."""
+        fresh = len(self.slots) + len(self.free)
+        slots = self.free[::-1] + list(range(fresh, fresh + count))
+        return np.array(slots[:count], dtype=np.int64)
+
+    def add(self, ids: Sequence[int], slots: Sequence[int]) -> None:
+        """Assign slots to new landmarks."""
+        self.slots.update(zip(ids, slots, strict=True))
+        self.free = [slot for slot in self.free if slot not in slots]
+        self.map_.grow(len(self.slots) + len(self.free))
+
+    def choose_local_map(self, ids: Sequence[int], *, exact: bool) -> None:
+        """Choose a new local map if a scan needs it or the old one is too large.
+
+        Parameters
+        ----------
+        ids : sequence of int
+            Landmarks of the scan.
+        exact : bool
+            Whether to eliminate the whole rest of the map.
+        """
+        seen = np.array([self.slots[i] for i in ids if i in self.slots], dtype=int)
+        local = self.local.slots
+        required = union(seen, local[self.pose.is_linked])
+        size = local_map_size(len(self.slots), len(ids), len(required))
+        if np.isin(seen, local).all() and 2 * len(local) <= 3 * size:
+            return
+        here = self.pose.mean[:2]
+        ahead = here + (here - self.origin) / 2  # likely direction of motion
+        mapped = np.array(list(self.slots.values()))
+        points = self.map_.points.reshape(-1, 2)
+        chosen = choose_local(mapped, points, ahead, required, size)
+        self._change_local_map(chosen, self._first_count(exact=exact))
+        self.origin, self.enlarged = here.copy(), False
+
+    def enlarge_elimination(self) -> None:
+        """Keep the local map, and eliminate more landmarks around it."""
+        self._change_local_map(self.local.slots, larger_elimination_count(self.count))
+        self.enlarged = True
+
+    def remove(self, ids: Sequence[int], *, exact: bool) -> None:
+        """Marginalise landmarks."""
+        gone = self._include_links(ids, exact=exact)
+        self._drop(ids, gone, marginalise(self.local, self.pose, gone))
+
+    def merge(self, kept: int, gone: int, *, exact: bool) -> None:
+        """Condition on two landmarks being the same, and drop the second."""
+        dropped = self._include_links([gone, kept], exact=exact)
+        place = int(np.flatnonzero(self.local.slots == self.slots[kept])[0])
+        dropped[place] = False
+        merged = merge_landmarks(self.local, self.pose, place, dropped)
+        self._drop([gone], dropped, merged)
+
+    def marginal(self, ids: Sequence[int]) -> Marginal:
+        """Return the marginal of the pose and some landmarks."""
+        if self.rest is None:
+            map_ = self.map_
+            self.rest = RestFactor(map_.elimination, map_.information, self.local.slots)
+        slots = np.array([self.slots[i] for i in ids], dtype=np.int64)
+        return marginal(self.map_, self.local, self.rest, self.pose, slots)
+
+    def landmarks(self) -> Array:
+        """Return the positions of all landmarks, shape (n, 2) [m]."""
+        points = means(self.map_, self.local).reshape(-1, 2)
+        return points[list(self.slots.values())]
+
+    def ids_of(self, slots: Int) -> tuple[int, ...]:
+        """Return the landmarks in these slots, in the order of the belief."""
+        chosen = set(slots.tolist())
+        return tuple(i for i, slot in self.slots.items() if slot in chosen)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the belief [bytes]."""
+        local, map_ = self.local, self.map_
+        arrays = (
+            map_.points,
+            map_.first,
+            map_.residual,
+            local.information,
+            local.eliminated.response,
+            local.fixed.response,
+        )
+        stored = map_.information.nbytes + map_.elimination.nbytes
+        return stored + sum(array.nbytes for array in arrays)
+
+    def _include_links(self, ids: Sequence[int], *, exact: bool) -> Flags:
+        """Add landmarks and all their links to the local map; return their flags."""
+        slots = np.array([self.slots[i] for i in ids])
+        linked = np.append(slots, self.map_.information.neighbours(slots))
+        chosen = union(self.local.slots, linked)
+        self._change_local_map(chosen, self._first_count(exact=exact))
+        return np.isin(self.local.slots, slots)
+
+    def _drop(self, ids: Sequence[int], gone: Flags, rest: State) -> None:
+        """Replace the local map by one without some landmarks; free their slots."""
+        stays = np.repeat(~gone, 2)
+        information = np.where(stays & stays[:, None], self.local.information, 0.0)
+        self.map_.information.replace(self.local.slots, information)
+        self.local, self.pose = rest
+        self.rest = None
+        slots = [self.slots.pop(i) for i in ids]
+        self.map_.elimination.dissection.nodes[slots] = 0
+        self.free += slots
+
+    def _first_count(self, *, exact: bool) -> float:
+        if exact:
+            return inf
+        return first_elimination_count(self.count, enlarged=self.enlarged)
+
+    def _change_local_map(self, slots: Int, count: float) -> None:
+        """Write the local map back, and begin another one."""
+        old, pose = self.local.slots, self.pose
+        write_back(self.map_, self.local)
+        self.rest = None
+        self.local.eliminated.factor.release()  # it may be large
+        gain = np.zeros((3, 2 * len(slots)))
+        _, before, after = np.intersect1d(old, slots, return_indices=True)
+        gain[:, pairs(after)] = pose.gain[:, pairs(before)]
+        pose = pose._replace(gain=gain)
+        self.local, self.pose = begin_local_map(self.map_, pose, slots, count)
+        self.count = count
+        factor = self.local.eliminated.factor
+        self.rest = factor if isinstance(factor, RestFactor) else None
