@@ -11,7 +11,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from ..envs import LandmarkWorldEnv
-from ..envs.rendering.live_view import RENDER_MODES
+from ..envs.rendering import RENDER_MODES
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, Progress, Stakes
 from .belief_arrays import belief_in_rows

@@ -12,14 +12,14 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from ..envs.spaces import action_space
+from ..envs.vector import WorldBatch
 from ..envs.vector.episodes import (
     checked_reset_mask,
     episode_steps,
-    final_moments,
+    final_infos,
     with_masks,
     world_seeds,
 )
-from ..envs.vector.world_batch import WorldBatch
 from ..estimator.support import argument_checks
 from ..sim_configs import Scenario, load_scenario
 from .active_slam import split_settings
@@ -177,7 +177,7 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             self._begin(ended)
             self._ended = np.zeros_like(ended)
             observations, infos = self._answer(np.zeros_like(won))
-            final = final_moments(last, last_infos, ended)
+            final = final_infos(last, last_infos, ended)
             return (
                 observations,
                 rewards,

@@ -32,8 +32,7 @@ from rich.console import Console
 from rich.table import Table
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.vector.stable_baselines import to_stable_baselines
-from slamgym.envs.vector.wrappers import FlattenBatch
+from slamgym.envs.vector import FlattenBatch, to_stable_baselines
 
 Call = Callable[[], object]
 Worlds = VectorEnv[Any, Any, Any]

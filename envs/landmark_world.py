@@ -1,6 +1,5 @@
 """The landmark world: a unicycle robot among landmarks, as a Gymnasium environment."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..sim_configs import Scenario, load_scenario, place_landmarks
 from ..sim_configs.scenario import refuse_ranges
-from .rendering.live_view import RENDER_MODES, LiveView, Moment
-from .rendering.render_state import BeliefLike
+from .actions import clipped_action
+from .rendering.episode_renderer import EpisodeRenderer
+from .rendering.render_state import RENDER_MODES, BeliefLike
 from .robot.unicycle_body import UnicycleBody
 from .sensors.bearing_range import BearingRangeSensor, hide_identities
 from .sensors.noise_streams import (
@@ -29,23 +29,21 @@ Array = NDArray[np.float64]
 Observation = dict[str, Any]
 
 _FPS = 30
-_REAL_NUMBERS = "efd" + np.typecodes["AllInteger"]
 
 
 class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
     """A robot drives among point landmarks and measures its motion and the landmarks.
 
     ## Description
-    The plant of a SLAM problem. A unicycle robot drives among N point landmarks, is
-    stopped by walls, and emits noisy odometry and bearing-range measurements; the
-    truth is told only in `info`. What is simulated is a
-    :class:`~slamgym.sim_configs.Scenario`. One step drives d = v Δt along the heading,
-    then turns by α = ω Δt.
+    The plant of a SLAM problem. A unicycle robot drives among N point landmarks and
+    stops at walls. It returns noisy odometry and bearing-range measurements. Only
+    `info` contains the truth. A :class:`~slamgym.sim_configs.Scenario` describes the
+    world. One step drives d = v Δt along the heading, then turns by α = ω Δt.
 
     ## Action Space
     ``Box(float32, (2,))``: (v, ω), speed [m/s] and turn rate [rad/s], within ± the
-    limits of the robot. Actions beyond are clipped; float64 keeps its precision;
-    what is not two finite numbers is refused with a `ValueError`.
+    limits of the robot. Actions beyond the limits are clipped, and float64 keeps its
+    precision. Anything but two finite numbers raises a `ValueError`.
 
     ## Observation Space
     ``Dict`` of three arrays:
@@ -53,34 +51,34 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
     | key | shape | content |
     |---|---|---|
     | ``landmarks`` | (M, 2) float64 | rows (bearing in [-π, π), range) [rad, m], zeros where unseen |
-    | ``mask`` | (M,) bool | rows that hold a measurement |
-    | ``odometry`` | (2,) float64 | (d, α) as the odometry tells it [m, rad]; zeros at reset |
+    | ``mask`` | (M,) bool | rows with a measurement |
+    | ``odometry`` | (2,) float64 | measured (d, α) [m, rad]; zeros at reset |
 
-    With identities, M = N and row i is landmark i. With identities hidden, M = N +
-    ``max_clutter``, and the measurements stand in front in random order. The
-    observation of `reset` measures from the start pose.
+    With identities, M = N and row i is landmark i. With hidden identities, M = N +
+    ``max_clutter``, and the first rows hold the measurements in random order. The
+    observation of `reset` is measured from the start pose.
 
     `info` has the same keys in `reset` and `step`: ``pose``, the true (x, y, θ) with θ
-    not wrapped; ``collision``, whether a wall held the robot back; and, with identities
-    hidden, ``landmark_ids`` (M,) int64, -1 where a row is clutter or empty.
+    not wrapped; ``collision``, whether a wall stopped the robot; and, with hidden
+    identities, ``landmark_ids`` (M,) int64, -1 where a row is clutter or empty.
 
     ## Rewards
-    Always 0: the world poses no task.
+    Always 0.
 
     ## Starting State
-    ``scenario.start``: either the true start, or the pose a filter starts from
-    (`start_estimate`), is drawn around its pose. A random layout without a seed of its
-    own places new landmarks in every episode.
+    ``scenario.start.pose``. Either the true start or the start pose of a filter
+    (`start_estimate`) is drawn around it. A random layout without its own seed places
+    new landmarks in every episode.
 
     ## Episode End
     Never terminated; truncated after ``scenario.steps`` steps.
 
     ## Arguments
     scenario : Scenario, mapping, str or Path, default "six_landmarks"
-        A preset's name, a ``.toml`` file, a mapping of plain values, or a scenario.
-        What is plain data also survives in an ``EnvSpec`` written as JSON.
+        A preset's name, a ``.toml`` file, a mapping of plain values, or a scenario. An
+        ``EnvSpec`` written as JSON keeps plain data only.
     render_mode : {"human", "rgb_array"}, optional
-        Whether every moment is shown in a window, or `render` returns frames.
+        "human" shows every step in a window; with "rgb_array" `render` returns frames.
     **changes
         Fields of the scenario to replace, as in `Scenario.with_changes`.
 
@@ -115,9 +113,9 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
         self.action_space = action_space(self.scenario)
         self.observation_space = observation_space(self.scenario)
         self.render_mode = render_mode
-        self._view = None
+        self._renderer = None
         if render_mode is not None:
-            self._view = LiveView(self.scenario, render_mode, fps=_FPS)
+            self._renderer = EpisodeRenderer(self.scenario, render_mode, fps=_FPS)
         robot, self._dt = self.scenario.robot, self.scenario.dt
         self._limits = robot.max_speed, robot.max_turn_rate
         self._body = UnicycleBody(robot.radius, self.scenario.walls)
@@ -130,19 +128,19 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode, and measure from the start pose.
+        """Start an episode, and measure from the start pose.
 
         Parameters
         ----------
         seed : int >= 0, optional
-            Fixes everything random in this episode and those that follow.
+            Seed of all randomness in this episode and the following ones.
         options : dict, optional
-            There are none.
+            Must be empty.
 
         Raises
         ------
         ValueError
-            If an option is given.
+            If there is an option.
         """
         if options:
             raise ValueError(f"options must be empty, got {options!r}")
@@ -153,8 +151,8 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
         self._motion_noise = motion_noise_rows(streams, self.scenario)
         self._sensor_noise = sensor_noise_rows(streams, self.scenario)
         self._steps_left = self.scenario.steps
-        if self._view is not None:
-            self._view.begin(self.landmarks)
+        if self._renderer is not None:
+            self._renderer.begin(self.landmarks)
         return self._observe(odometry=np.zeros(2), collision=False)
 
     def step(
@@ -170,10 +168,11 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
         Raises
         ------
         ValueError
-            If the action is not two finite numbers; the world stays as it is.
+            If the action is not two finite numbers. The world does not change.
         """
-        command = self._command(action)
-        slip, error = self._odometer.place_noise(command, next(self._motion_noise))
+        speed, turn_rate = clipped_action(action, self._limits)
+        command = speed * self._dt, turn_rate * self._dt
+        slip, error = self._odometer.split_noise(command, next(self._motion_noise))
         share = self._body.drive(command, slip)
         odometry = self._odometer.read(command, share, error)
         observation, info = self._observe(odometry, collision=share < 1.0)
@@ -181,26 +180,26 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
         return observation, 0.0, False, self._steps_left <= 0, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return a frame in mode "rgb_array", else None: "human" shows every step."""
+        """Return a frame in mode "rgb_array", else None."""
         self._refuse_before_reset()
-        if self._view is None:
+        if self._renderer is None:
             gymnasium.logger.warn("render shows nothing without a render_mode")
             return None
-        return self._view.draw() if self.render_mode == "rgb_array" else None
+        return self._renderer.draw() if self.render_mode == "rgb_array" else None
 
     def show_belief(self, belief: BeliefLike | None) -> None:
-        """Let the frames show what an estimator believes, from now on; None for not."""
-        if self._view is not None:
-            self._view.show_belief(belief)
+        """Show a belief in the following frames; None hides it."""
+        if self._renderer is not None:
+            self._renderer.show_belief(belief)
 
     def close(self) -> None:
-        """Close the window, if there is one; may be repeated."""
-        if self._view is not None:
-            self._view.close()
+        """Close the window, if there is one. Further calls have no effect."""
+        if self._renderer is not None:
+            self._renderer.close()
 
     @property
     def pose(self) -> Array:
-        """True (x, y, θ), shape (3,) [m, m, rad], a fresh array; θ is not wrapped."""
+        """True (x, y, θ), shape (3,) [m, m, rad], a copy; θ is not wrapped."""
         self._refuse_before_reset()
         return self._body.pose
 
@@ -212,7 +211,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
 
     @property
     def start_estimate(self) -> Array:
-        """Pose from which a filter starts, shape (3,) [m, m, rad], a copy.
+        """Start pose for a filter, shape (3,) [m, m, rad], a copy.
 
         Its standard deviations are ``scenario.start.std``.
         """
@@ -238,17 +237,6 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
         self._body.place((drawn if draws_truth else centre).tolist())
         self._start_estimate = centre if draws_truth else drawn
 
-    def _command(self, action: ArrayLike) -> tuple[float, float]:
-        """Turn an action (v, ω) into the command (d, α) of one step [m, rad]."""
-        speed, turn_rate = _two_numbers(action)
-        fastest, quickest = self._limits
-        if not (-fastest <= speed <= fastest and -quickest <= turn_rate <= quickest):
-            if not (math.isfinite(speed) and math.isfinite(turn_rate)):
-                raise _refusal(action)
-            speed = min(max(speed, -fastest), fastest)
-            turn_rate = min(max(turn_rate, -quickest), quickest)
-        return speed * self._dt, turn_rate * self._dt
-
     def _observe(
         self, odometry: Array, collision: bool
     ) -> tuple[Observation, dict[str, Any]]:
@@ -262,27 +250,10 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
                 readings, mask, noise
             )
         measurements = readings.T
-        if self._view is not None:
-            self._view.add(Moment(body.pose, measurements[mask], collision))
+        if self._renderer is not None:
+            self._renderer.add(body.pose, measurements[mask], collision)
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
 
 
 def _refuse_to_step(steps: int) -> list[list[float]]:
     raise ResetNeeded("call reset before step")
-
-
-def _two_numbers(action: ArrayLike) -> list[float]:
-    try:
-        array = np.asarray(action)
-    except ValueError:  # ragged
-        raise _refusal(action) from None
-    if array.shape != (2,) or array.dtype.char not in _REAL_NUMBERS:
-        raise _refusal(action)
-    numbers: list[float] = array.tolist()
-    return numbers
-
-
-def _refusal(action: ArrayLike) -> ValueError:
-    return ValueError(
-        f"action must be 2 finite numbers (v [m/s], ω [rad/s]), got {action!r}"
-    )

@@ -65,7 +65,7 @@ def id_and_connector(config, each):
 def native_vector(config, each):
     from ray.tune.registry import register_env
 
-    from slamgym.envs.vector.wrappers import FlattenBatch
+    from slamgym.envs.vector import FlattenBatch
 
     def make(context):
         count = context["num_envs"]

@@ -1,3 +1,7 @@
+from .blitting import BlittedFigure as BlittedFigure
 from .ellipses import covariance_ellipses as covariance_ellipses
+from .render_state import RENDER_MODES as RENDER_MODES
+from .render_state import BeliefLike as BeliefLike
+from .render_state import RenderState as RenderState
 from .renderer import WorldRenderer as WorldRenderer
 from .video import write_video as write_video

@@ -1,4 +1,4 @@
-"""The artists of the live view, each made once."""
+"""The matplotlib artists of a scene, each created once."""
 
 from typing import NamedTuple
 
@@ -21,11 +21,11 @@ Array = NDArray[np.floating]
 INK, GREY, WALL = "#1b1f24", "#8a9199", "#6b5a4e"
 RAY, ALARM, POSE, MAP = "#e69f00", "#d55e00", "#0072b2", "#009e73"  # Okabe and Ito
 AXES_BOX = (0.105, 0.165, 0.87, 0.775)  # left, bottom, width, height of the figure
-NOWHERE = np.full((1, 2), np.nan)
+NO_POINT = np.full((1, 2), np.nan)
 
 
 class MovingArtists(NamedTuple):
-    """The artists that differ from frame to frame, from back to front."""
+    """The artists that change between frames, from back to front."""
 
     view: Polygon
     rays: LineCollection
@@ -43,7 +43,7 @@ class MovingArtists(NamedTuple):
 
 
 def add_axes(figure: Figure, name: str) -> Axes:
-    """Add axes in metres at a fixed place, with a title at its left."""
+    """Add axes in metres at a fixed place, with a title at the left."""
     axes = figure.add_axes(AXES_BOX)
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     axes.grid(color="#e8eaed", linewidth=0.8)
@@ -56,7 +56,7 @@ def add_axes(figure: Figure, name: str) -> Axes:
 
 
 def add_still(axes: Axes, scenario: Scenario, landmarks: Array) -> list[Artist]:
-    """Draw what never moves, and return what of it the legend names."""
+    """Draw landmarks and walls, and return the artists for the legend."""
     size = 8 if len(landmarks) <= 60 else 5
     (crosses,) = axes.plot(
         *landmarks.T, "+", color=INK, ms=size, mew=size / 6, label="landmark"
@@ -75,10 +75,10 @@ def add_still(axes: Axes, scenario: Scenario, landmarks: Array) -> list[Artist]:
 
 
 def add_moving(axes: Axes, radius: float) -> MovingArtists:
-    """Make what moves, still without data; `radius` [m] is that of the robot's body."""
+    """Create the moving artists without data; `radius` is that of the robot [m]."""
     moving = MovingArtists(
         view=Polygon(
-            NOWHERE,
+            NO_POINT,
             fc=(*to_rgba(RAY)[:3], 0.07),
             ec=RAY,
             lw=0.6,
@@ -92,8 +92,8 @@ def add_moving(axes: Axes, radius: float) -> MovingArtists:
         pose_ellipse=_ellipses(axes, POSE, fill=0.15),
         body=_ellipses(axes, INK, fill=0.12),
         halo=_ellipses(axes, ALARM, fill=0.2),
-        arrow=Polygon(NOWHERE, fc=INK, ec="white", lw=0.7),
-        estimate=Polygon(NOWHERE, fc="none", ec=POSE, lw=1.5),
+        arrow=Polygon(NO_POINT, fc=INK, ec="white", lw=0.7),
+        estimate=Polygon(NO_POINT, fc="none", ec=POSE, lw=1.5),
         alarm=_title(0.64, "right", "collision", ALARM),
         clock=_title(sum(AXES_BOX[::2]), "right", ""),
     )
@@ -139,5 +139,5 @@ def _points(marker: str, colour: str, label: str) -> Line2D:
 
 
 def arrow_key(face: str, edge: str, label: str) -> Line2D:
-    """Stand for an arrow-shaped robot in a legend."""
+    """Return the legend entry of an arrow-shaped robot."""
     return Line2D([], [], ls="", marker=">", mfc=face, mec=edge, ms=7, label=label)

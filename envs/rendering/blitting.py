@@ -1,4 +1,4 @@
-"""Frames of a figure of which only some artists move."""
+"""Fast frames of a figure in which only some artists move."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,10 +16,10 @@ class BlittedFigure:
     Parameters
     ----------
     figure : Figure
-        With an Agg canvas, which may be a window's; on other canvases everything is
-        drawn anew each time.
+        With an Agg canvas, possibly that of a window. On other canvases every frame
+        redraws everything.
     moving : sequence of Artist
-        What changes from frame to frame, drawn in this order above all others.
+        Artists that change between frames, drawn in this order above all others.
     """
 
     def __init__(self, figure: Figure, moving: Sequence[Artist]) -> None:
@@ -34,7 +34,7 @@ class BlittedFigure:
             self._canvas.mpl_connect("draw_event", self._keep_still_part)
 
     def draw(self) -> None:
-        """Draw the present frame, and the still part too when it is outdated."""
+        """Draw the present frame, and the still part too if it is outdated."""
         if self._still is None:
             self._canvas.draw()  # ends in _keep_still_part
         else:
@@ -51,11 +51,11 @@ class BlittedFigure:
         return copy
 
     def outdate(self) -> None:
-        """Have the still part drawn anew next time: a limit or a legend changed."""
+        """Redraw the still part in the next frame: a limit or a legend has changed."""
         self._still = None
 
     def _keep_still_part(self, event: Event) -> None:
-        ours = event.canvas is self._canvas  # and not one that saves the figure
+        ours = event.canvas is self._canvas  # not the canvas of a saved file
         if ours:
             self._still = self._canvas.copy_from_bbox(self._figure.bbox)
             self._draw_moving()

@@ -1,9 +1,9 @@
-"""The n-sigma ellipses of planar Gaussian beliefs, many at a time.
+"""The n-sigma ellipses of planar Gaussian beliefs.
 
 Symbols
 -------
 P = [[a, b], [b, c]]  covariance of a position [m²]
-n                     how many standard deviations the ellipse is wide
+n                     size of the ellipse in standard deviations
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ class Ellipses(NamedTuple):
 
 
 def covariance_ellipses(covariance: ArrayLike, sigmas: float = 3.0) -> Ellipses:
-    """Ellipses { l : (l - mean)ᵀ P⁻¹ (l - mean) = n² } of covariances P.
+    """Compute the ellipses { l : (l - mean)ᵀ P⁻¹ (l - mean) = n² } of covariances P.
 
     ::
 
@@ -37,8 +37,8 @@ def covariance_ellipses(covariance: ArrayLike, sigmas: float = 3.0) -> Ellipses:
     Parameters
     ----------
     covariance : array_like, shape (…, 2, 2)
-        Covariances P [m²], symmetric, finite, without negative eigenvalues;
-        eigenvalues negative by rounding count as zero.
+        Covariances P [m²], symmetric, finite and without negative eigenvalues.
+        Eigenvalues that are negative by rounding count as zero.
     sigmas : float, default 3
         n > 0.
 
@@ -50,7 +50,7 @@ def covariance_ellipses(covariance: ArrayLike, sigmas: float = 3.0) -> Ellipses:
     Raises
     ------
     ValueError
-        When a matrix is no covariance, or sigmas is not positive.
+        If a matrix is not a covariance, or sigmas is not positive.
 
     Examples
     --------

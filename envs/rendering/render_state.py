@@ -1,11 +1,13 @@
-"""What a picture of the world is made from: plain arrays, without matplotlib."""
+"""The input of the renderer: plain arrays, without matplotlib."""
 
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
+RenderMode = Literal["human", "rgb_array"]
+RENDER_MODES: tuple[RenderMode, ...] = ("human", "rgb_array")
 
 
 class BeliefLike(Protocol):
@@ -25,23 +27,23 @@ class BeliefLike(Protocol):
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the whole state, shape (3 + 2n, 3 + 2n)."""
+        """Covariance of the additive error of the state, shape (3 + 2n, 3 + 2n)."""
 
 
-class WorldSnapshot(NamedTuple):
-    """The world at one moment, as the renderer draws it."""
+class RenderState(NamedTuple):
+    """The state of a world that one frame shows."""
 
     pose: Array
     """True (x, y, θ), shape (3,) [m, m, rad]."""
     path: Array
-    """True positions so far, the present one included, shape (k, 2) [m]."""
+    """True positions up to the present one, shape (k, 2) [m]."""
     measurements: Array
     """Readings of this step, rows (bearing, range), shape (m, 2) [rad, m]."""
     collision: bool
     """Whether a wall stopped the robot in this step."""
     belief: BeliefLike | None
-    """What an estimator believes, or None."""
+    """Belief of an estimator, or None."""
     time: float
-    """Since the episode began [s]."""
+    """Since the start of the episode [s]."""
     step: int
-    """Steps since the episode began."""
+    """Steps since the start of the episode."""

@@ -1,9 +1,9 @@
-"""The live view of a landmark world, by matplotlib alone.
+"""Rendering of a landmark world with matplotlib.
 
-Everything is drawn once; from then on a frame costs only what moves (blitting).
+The first frame draws everything, later ones only the moving artists (blitting).
 """
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -12,46 +12,43 @@ from numpy.typing import NDArray
 
 from ...sim_configs import Scenario
 from .blitting import BlittedFigure
-from .render_state import BeliefLike, WorldSnapshot
-from .scene import WorldPicture
-from .video import write_video
+from .render_state import RENDER_MODES, RenderMode, RenderState
+from .scene import Scene
 
 if TYPE_CHECKING:
     from .window import Window
-
-__all__ = ["BeliefLike", "WorldRenderer", "WorldSnapshot", "write_video"]
 
 Array = NDArray[np.floating]
 
 _INCHES = 6.0  # side of the figure; its pixels come from the resolution
 
 
-class _Scene(NamedTuple):
-    """What exists from the first frame until `close`."""
+class _Drawing(NamedTuple):
+    """The objects that exist from the first frame until `close`."""
 
-    picture: WorldPicture
+    scene: Scene
     blitted: BlittedFigure
     window: "Window | None"
 
 
 class WorldRenderer:
-    """Draws snapshots of one world, to arrays or to a window.
+    """Draws the states of one world, to arrays or to a window.
 
-    The figure is made at the first `render` and is never pickled or copied with the
-    renderer, which then makes another.
+    The first `render` creates the figure. Copies and pickles of the renderer do not
+    contain it; they create their own.
 
     Parameters
     ----------
     scenario : Scenario
-        What is drawn: walls, robot, sensor, and the planned path for the limits.
+        Source of walls, robot, sensor, and planned path.
     landmarks : ndarray, shape (N, 2)
         True positions [m].
     mode : {"rgb_array", "human"}
-        Whether `render` returns frames or shows them in matplotlib's own window.
+        Whether `render` returns frames or shows them in a window of matplotlib.
     size_px : int, default 600
-        Side of the square picture [pixels].
+        Side of the square frame [pixels].
     fps : float, default 30
-        At most so many frames per second appear in the window [1/s].
+        Largest number of frames per second in the window [1/s].
 
     Examples
     --------
@@ -59,7 +56,7 @@ class WorldRenderer:
     >>> renderer = WorldRenderer(
     ...     load_scenario("six_landmarks"), np.ones((1, 2)), "rgb_array", size_px=200
     ... )
-    >>> start = WorldSnapshot(
+    >>> start = RenderState(
     ...     np.zeros(3), np.zeros((1, 2)), np.empty((0, 2)), False, None, 0.0, 0
     ... )
     >>> renderer.render(start).shape
@@ -71,12 +68,12 @@ class WorldRenderer:
         self,
         scenario: Scenario,
         landmarks: Array,
-        mode: Literal["rgb_array", "human"],
+        mode: RenderMode,
         size_px: int = 600,
         *,
         fps: float = 30.0,
     ) -> None:
-        if mode not in ("rgb_array", "human"):
+        if mode not in RENDER_MODES:
             raise ValueError(f"mode must be 'rgb_array' or 'human', got {mode!r}")
         if size_px < 100:
             raise ValueError(f"size_px must be >= 100, got {size_px}")
@@ -87,21 +84,21 @@ class WorldRenderer:
         self._mode = mode
         self._size_px = size_px
         self._fps = fps
-        self._scene: _Scene | None = None
+        self._drawing: _Drawing | None = None
 
-    def render(self, snapshot: WorldSnapshot) -> NDArray[np.uint8] | None:
-        """Draw one snapshot.
+    def render(self, state: RenderState) -> NDArray[np.uint8] | None:
+        """Draw one state.
 
         Returns
         -------
         ndarray of uint8, shape (size_px, size_px, 3), or None
-            A fresh copy in mode "rgb_array"; None in mode "human", which waits so
-            long that the window shows at most `fps` frames per second.
+            A new array in mode "rgb_array". None in mode "human", which waits until
+            the next frame is due.
         """
-        if self._scene is None:
-            self._scene = self._make_scene()
-        picture, blitted, window = self._scene
-        if picture.show(snapshot):
+        if self._drawing is None:
+            self._drawing = self._make_drawing()
+        scene, blitted, window = self._drawing
+        if scene.show(state):
             blitted.outdate()
         if window is None:
             return blitted.frame()
@@ -109,15 +106,15 @@ class WorldRenderer:
         return None
 
     def close(self) -> None:
-        """Close the window, if there is one, and free the figure; may be repeated."""
-        if self._scene is not None and self._scene.window is not None:
-            self._scene.window.close()
-        self._scene = None
+        """Close the window and free the figure. Further calls have no effect."""
+        if self._drawing is not None and self._drawing.window is not None:
+            self._drawing.window.close()
+        self._drawing = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_scene": None}
+        return {**self.__dict__, "_drawing": None}
 
-    def _make_scene(self) -> _Scene:
+    def _make_drawing(self) -> _Drawing:
         figure, window = Figure(), None
         if self._mode == "human":
             from .window import Window  # noqa: PLC0415 (pyplot, for windows only)
@@ -126,7 +123,7 @@ class WorldRenderer:
             figure = window.figure
         else:
             FigureCanvasAgg(figure)
-        figure.set_dpi((self._size_px + 0.01) / _INCHES)  # never a pixel less
+        figure.set_dpi((self._size_px + 0.01) / _INCHES)  # never one pixel less
         figure.set_size_inches(_INCHES, _INCHES)
-        picture = WorldPicture(figure, self._scenario, self._landmarks)
-        return _Scene(picture, BlittedFigure(figure, picture.moving), window)
+        scene = Scene(figure, self._scenario, self._landmarks)
+        return _Drawing(scene, BlittedFigure(figure, scene.moving), window)

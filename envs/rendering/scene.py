@@ -1,4 +1,4 @@
-"""What the live view shows: the world, the robot in it, and a belief about both."""
+"""The scene of a frame: the world, the robot, its readings and a belief."""
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -10,7 +10,7 @@ from .artists import (
     ALARM,
     AXES_BOX,
     INK,
-    NOWHERE,
+    NO_POINT,
     POSE,
     add_axes,
     add_moving,
@@ -18,24 +18,24 @@ from .artists import (
     arrow_key,
     set_ellipses,
 )
-from .axes_limits import ViewLimits
-from .render_state import BeliefLike, WorldSnapshot
+from .axes_limits import AxesLimits
+from .render_state import BeliefLike, RenderState
 
 Array = NDArray[np.floating]
 
 _ARROW = np.array([[1.0, 0.0], [-0.75, 0.7], [-0.35, 0.0], [-0.75, -0.7]])
-_ARROW_SHARE = 0.024  # of the view's width: small robots stay visible
+_ARROW_SHARE = 0.024  # of the width of the axes, so that small robots stay visible
 
 
-class WorldPicture:
-    """The artists of one world on one figure, made once and then moved.
+class Scene:
+    """The artists of one world on one figure, created once and then moved.
 
     Parameters
     ----------
     figure : Figure
         Square and empty.
     scenario : Scenario
-        Gives walls, robot, sensor and the length of the episode.
+        Source of walls, robot, sensor and the length of the episode.
     landmarks : ndarray, shape (N, 2)
         True positions [m].
     """
@@ -45,10 +45,10 @@ class WorldPicture:
         self._figure = figure
         self._axes = add_axes(figure, scenario.name)
         width, height = figure.get_size_inches() * AXES_BOX[2:]
-        self._limits = ViewLimits(scenario, landmarks, aspect=width / height)
+        self._limits = AxesLimits(scenario, landmarks, aspect=width / height)
         self._still = add_still(self._axes, scenario, landmarks)
         self._moving = add_moving(self._axes, scenario.robot.radius)
-        self._legend_names_belief = False
+        self._legend_has_belief = False
         self._show_limits()
         self._show_legend()
 
@@ -57,20 +57,20 @@ class WorldPicture:
         """The artists that `show` moves, from back to front."""
         return tuple(self._moving)
 
-    def show(self, snapshot: WorldSnapshot) -> bool:
-        """Move the artists; return whether the still part has changed too."""
-        resized = self._limits.follow(snapshot)
+    def show(self, state: RenderState) -> bool:
+        """Move the artists; return whether the still part has changed."""
+        resized = self._limits.follow(state)
         if resized:
             self._show_limits()
-        renamed = snapshot.belief is not None and not self._legend_names_belief
+        renamed = state.belief is not None and not self._legend_has_belief
         if renamed:
-            self._legend_names_belief = True
+            self._legend_has_belief = True
             self._show_legend()
-        self._show_robot(snapshot.pose, snapshot.collision)
-        self._moving.path.set_data(*np.transpose(snapshot.path))
-        self._show_readings(snapshot.pose, snapshot.measurements)
-        self._show_belief(snapshot.belief)
-        self._show_clock(snapshot)
+        self._show_robot(state.pose, state.collision)
+        self._moving.path.set_data(*np.transpose(state.path))
+        self._show_readings(state.pose, state.measurements)
+        self._show_belief(state.belief)
+        self._show_clock(state)
         return resized or renamed
 
     def _show_robot(self, pose: Array, collision: bool) -> None:
@@ -108,32 +108,32 @@ class WorldPicture:
         landmarks = np.reshape(belief.landmarks, (-1, 2))
         n = len(landmarks)
         blocks = np.reshape(np.asarray(belief.covariance)[3:, 3:], (n, 2, n, 2))
-        spread = np.einsum("iaib->iab", blocks)  # each landmark's own covariance
+        spread = np.einsum("iaib->iab", blocks)  # marginal covariance of each landmark
         moving.map.set_data(*landmarks.T)
         set_ellipses(moving.map_ellipses, landmarks, spread)
         moving.estimate.set_xy(self._arrow_at(belief.pose))
         spread = np.asarray(belief.pose_covariance)[None, :2, :2]
         set_ellipses(moving.pose_ellipse, belief.pose[None, :2], spread)
 
-    def _show_clock(self, snapshot: WorldSnapshot) -> None:
-        """Tell the time; few characters, since every one costs 0.1 ms."""
+    def _show_clock(self, state: RenderState) -> None:
+        """Show step and time; every character costs 0.1 ms per frame."""
         self._moving.clock.set_text(
-            f"step {snapshot.step}/{self._scenario.steps}   {snapshot.time:.1f} s"
+            f"step {state.step}/{self._scenario.steps}   {state.time:.1f} s"
         )
 
     def _show_limits(self) -> None:
         self._axes.set(xlim=self._limits.x, ylim=self._limits.y)
 
     def _show_legend(self) -> None:
-        """Name what can be seen, below the axes, where it covers nothing."""
+        """Draw the legend below the axes."""
         for legend in self._figure.legends[:]:
             legend.remove()
         moving = self._moving
         named: list[Artist] = [arrow_key(INK, INK, "robot"), moving.path, *self._still]
         named.append(moving.readings)
-        if self._sees_only_part():
+        if self._view_is_limited():
             named.append(moving.view)
-        if self._legend_names_belief:
+        if self._legend_has_belief:
             named += [arrow_key("white", POSE, "pose belief, 3σ"), moving.map]
         self._figure.legend(
             handles=named,
@@ -155,14 +155,14 @@ class WorldPicture:
         shape = self._arrow_length() * _ARROW @ np.array([[cos, sin], [-sin, cos]])
         return np.asarray(pose[:2] + shape)
 
-    def _sees_only_part(self) -> bool:
+    def _view_is_limited(self) -> bool:
         sensor = self._scenario.sensor
         return bool(sensor.field_of_view < 2 * np.pi or np.isfinite(sensor.max_range))
 
     def _area_in_view(self, pose: Array) -> Array:
-        """Outline of what the sensor reaches: a wedge, or a disc for all around."""
-        if not self._sees_only_part():
-            return NOWHERE
+        """Return the outline of the field of view: a sector or a disc."""
+        if not self._view_is_limited():
+            return NO_POINT
         sensor = self._scenario.sensor
         (left, right), (low, high) = self._limits.x, self._limits.y
         reach = min(sensor.max_range, np.hypot(right - left, high - low))

@@ -1,4 +1,4 @@
-"""Moving pictures of frames: GIF by Pillow, MP4 by ffmpeg."""
+"""Videos from frames: GIF by Pillow, MP4 by ffmpeg."""
 
 from collections.abc import Iterable, Iterator
 from importlib import import_module
@@ -16,15 +16,15 @@ Frame = NDArray[np.uint8]
 
 
 def write_video(frames: Iterable[Frame], path: str | Path, fps: float = 30.0) -> None:
-    """Write frames as a video, complete or not at all.
+    """Write frames to a video file; an error leaves no partial file.
 
     Parameters
     ----------
     frames : iterable of ndarray of uint8, shape (H, W, 3)
-        The pictures, all of one size; consumed one by one.
+        All of one size; read one by one.
     path : str or Path
-        Ends in .gif (Pillow; times in hundredths of a second) or .mp4 (H.264, needs
-        the extra ``slamgym[video]``; an odd last row or column is repeated).
+        Ends in .gif (Pillow; the resolution in time is 10 ms) or .mp4 (H.264, needs
+        the extra ``slamgym[video]``; odd sizes are padded by one row or column).
     fps : float, default 30
         Frames per second [1/s].
 
@@ -51,7 +51,7 @@ def write_video(frames: Iterable[Frame], path: str | Path, fps: float = 30.0) ->
 
 
 def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Pass the frames on, once each is known to look like the first."""
+    """Yield the frames, checking each against the shape of the first."""
     shape = None
     for k, frame in enumerate(frames):
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
@@ -71,8 +71,7 @@ def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:
 def _write_gif(frames: Iterator[Frame], path: Path, fps: float) -> None:
     first = next(frames)
     palette = _palette(first)
-    # without dithering flat colours stay flat, and with one palette for all frames only
-    # what moves is stored
+    # No dithering keeps flat colours flat; one palette lets Pillow store only changes.
     images = (
         Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
         for frame in chain([first], frames)
@@ -88,10 +87,10 @@ def _write_gif(frames: Iterator[Frame], path: Path, fps: float) -> None:
 
 
 def _palette(frame: Frame) -> Image.Image:
-    """Choose 128 colours of one frame, and 125 from everywhere for those to come."""
+    """Return 128 colours of one frame and a cube of 125 colours for later frames."""
     own = Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE).getpalette()
     colours = np.reshape(own or [], (-1, 3))
-    colours[(colours >= 248).all(axis=1)] = 255  # Pillow would take grey for white
+    colours[(colours >= 248).all(axis=1)] = 255  # else Pillow replaces white by grey
     levels = np.linspace(0, 255, 5).round().astype(int)
     cube = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(-1, 3)
     palette = Image.new("P", (1, 1))

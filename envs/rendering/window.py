@@ -1,4 +1,4 @@
-"""Matplotlib's own window, for watching an episode."""
+"""A window of matplotlib that shows an episode."""
 
 import logging
 import time
@@ -10,10 +10,10 @@ from .blitting import BlittedFigure
 
 
 class Window:
-    """A figure on the screen that shows a limited number of frames per second.
+    """A figure on the screen with a limited number of frames per second.
 
-    Says so in the log when matplotlib has no backend with windows: then nothing can be
-    seen. A window that its user has closed stays closed.
+    If matplotlib's backend has no windows, the log has a warning and nothing is shown.
+    A window that the user has closed stays closed.
     """
 
     def __init__(self, fps: float) -> None:
@@ -30,7 +30,7 @@ class Window:
             )
 
     def refresh(self, blitted: BlittedFigure) -> None:
-        """Show the present frame, then serve the window until the next is due."""
+        """Show the present frame, then run the event loop until the next one is due."""
         if not pyplot.fignum_exists(self.figure.number):
             return
         blitted.draw()
@@ -43,5 +43,5 @@ class Window:
         canvas.start_event_loop(max(self._due - now, 0.001))
 
     def close(self) -> None:
-        """Take the figure off the screen and out of pyplot's memory."""
+        """Close the window and free the figure in pyplot."""
         pyplot.close(self.figure)

@@ -1,14 +1,13 @@
-"""Noise drawn ahead: one random stream per source, handed out step by step.
+"""Noise of one world: one random stream per source, drawn in blocks of steps.
 
-Every stream is drawn in one fixed layout, step after step, so that no setting of one
-source changes the noise of another, and the length of a block changes nothing.
+Every stream is drawn step after step in a fixed layout. So the settings of one source
+do not affect the noise of another, and the length of a block has no effect.
 """
 
 import math
 from collections.abc import Callable, Iterable
 from functools import partial
-from itertools import repeat
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,31 +18,31 @@ Array = NDArray[np.float64]
 Row = TypeVar("Row")
 
 MANY_STD = 10.0
-"""No normal noise exceeds so many standard deviations: the odds are 1e-23."""
+"""Bound of normal noise in standard deviations; the probability beyond is 1e-23."""
 
 _FIRST_BLOCK = 16  # steps; short, so that a reset is quick
 _LONGEST_BLOCK = 128  # steps; later blocks grow to this
 
 SensorNoise = tuple[Array, Array, Array | None, Array | None]
-"""What chance does to the sensor in one step: (error, nearest, clutter, order).
+"""Random effects on the sensor in one step: (error, nearest, clutter, order).
 
-A plain tuple, since a named one would cost 1 % of a step. N landmarks, C rows for
-clutter; worlds simulated side by side add axes where the dots are.
+A plain tuple, because a named one costs 1 % of a step. N landmarks, C rows for clutter.
+Worlds that are simulated together add axes at the dots.
 
 error : shape (2, …, N)
     (εβ, εr) [rad, m]; εr in units of σr(r) where that grows with the range.
 nearest : shape (…, N)
-    A landmark is read above this true range [m]: at least min_range; more where a
-    negative εr would leave no range above zero; inf where the reading drops out.
+    A landmark is read above this true range [m]. It is min_range or more, so that the
+    noisy range is positive; inf where the reading drops out.
 clutter : shape (2, …, C), or None with identities
     False readings (β, r), zeros where there is none [rad, m].
 order : shape (…, N + C), or None with identities
-    Uniform numbers that sort the rows.
+    Uniform random numbers that sort the rows.
 """
 
 
 class Streams(NamedTuple):
-    """The independent generators of one episode, in the order they are spawned."""
+    """The independent generators of one episode, in the order of spawning."""
 
     start: np.random.Generator
     map: np.random.Generator
@@ -55,7 +54,7 @@ class Streams(NamedTuple):
 
 
 def spawn_streams(rng: np.random.Generator) -> Streams:
-    """Spawn the streams of one episode; the state of `rng` stays as it is.
+    """Spawn the streams of one episode; the state of `rng` does not change.
 
     Examples
     --------
@@ -67,12 +66,12 @@ def spawn_streams(rng: np.random.Generator) -> Streams:
 
 
 class NoiseRows(Generic[Row]):
-    """Endless rows of noise, one per step, drawn in blocks that grow.
+    """An endless iterator over rows of noise, one per step, drawn in growing blocks.
 
     Parameters
     ----------
     draw : callable
-        Takes a number of steps and draws the rows of as many steps to come.
+        Takes a number of steps and draws the rows of that many next steps.
 
     Examples
     --------
@@ -94,45 +93,41 @@ class NoiseRows(Generic[Row]):
 
 
 def motion_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[list[float]]:
-    """Rows (εx, εy, εα) [m, m, rad], as the floats that a single robot needs."""
-    return NoiseRows(partial(_motion_floats, streams, scenario))
+    """Return the rows (εx, εy, εα) [m, m, rad] of an episode, as floats."""
+    return NoiseRows(partial(_draw_motion_noise, streams, scenario))
 
 
 def sensor_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[SensorNoise]:
-    """Rows of `SensorNoise`; the first belongs to the start, before any step."""
-    law = SensorNoiseLaw(scenario)
-    return NoiseRows(partial(_sensor_noise_by_step, streams, scenario, law))
+    """Return the rows of `SensorNoise`; the first one is that of the start."""
+    return NoiseRows(partial(_sensor_noise_by_step, streams, scenario))
 
 
-def draw_motion_noise(streams: Streams, scenario: Scenario, steps: int) -> Array:
-    """Draw the motion noise of the steps that come next.
-
-    Returns
-    -------
-    ndarray, shape (steps, 3)
-        Rows (εx, εy, εα) [m, m, rad].
-    """
-    return streams.motion.standard_normal((steps, 3)) * scenario.motion.std
+def _draw_motion_noise(
+    streams: Streams, scenario: Scenario, steps: int
+) -> list[list[float]]:
+    noise = streams.motion.standard_normal((steps, 3)) * scenario.motion.std
+    rows: list[list[float]] = noise.tolist()
+    return rows
 
 
 class UnitDraws(NamedTuple):
-    """What the generators yield for the sensor, before any setting scales it.
+    """Random numbers for the sensor before any scaling, for K steps or K worlds.
 
-    K steps or K worlds. What a scenario has no use for is None, and is not drawn.
+    A field that the scenario does not need is None and is not drawn.
     """
 
     measurement: Array
-    """Normal numbers, shape (2, K, N)."""
+    """Standard normal, shape (2, K, N)."""
     dropout: Array | None
-    """Uniform numbers, shape (K, N)."""
+    """Uniform, shape (K, N)."""
     clutter: Array | None
-    """Uniform numbers, one for how many, two for each row, shape (K, 1 + 2 C)."""
+    """Uniform, one for the count and two for each row, shape (K, 1 + 2 C)."""
     order: Array | None
-    """Uniform numbers, shape (K, N + C)."""
+    """Uniform, shape (K, N + C)."""
 
 
 def unit_widths(scenario: Scenario) -> tuple[int, int, int, int]:
-    """Count the numbers that each field of `UnitDraws` takes per step, 0 for none.
+    """Count the random numbers of each field of `UnitDraws` per step.
 
     Examples
     --------
@@ -150,13 +145,13 @@ def unit_widths(scenario: Scenario) -> tuple[int, int, int, int]:
     )
 
 
-class SensorNoiseLaw:
-    """Turns unit draws into the noise that a scenario's sensor has.
+class SensorNoiseModel:
+    """Scales unit draws to the noise of a scenario's sensor.
 
     Parameters
     ----------
     scenario : Scenario
-        Whose `sensor` is meant.
+        Source of the sensor's settings.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -180,10 +175,10 @@ class SensorNoiseLaw:
         return unit * self._scale, nearest, self._clutter(draws), draws.order
 
     def _clutter(self, draws: UnitDraws) -> Array:
-        """Place false readings, uniform over the bearings and ranges that are seen.
+        """Draw false readings, uniform over the visible bearings and ranges.
 
-        Per step one number chooses how many, then each reserved row draws (β, r).
-        Returns (β, r), shape (2, K, C), zeros where there is none.
+        One number per step determines their count, two more determine (β, r) of each
+        reserved row. Returns (β, r), shape (2, K, C), zeros in empty rows.
         """
         sensor, rows = self._sensor, self._sensor.max_clutter
         if draws.clutter is None:
@@ -192,25 +187,19 @@ class SensorNoiseLaw:
         counts = np.searchsorted(self._counts_below, drawn[..., 0], side="right")
         width = sensor.max_range - sensor.min_range
         bearings = (drawn[..., 1::2] - 0.5) * sensor.field_of_view
-        ranges = sensor.max_range - drawn[..., 2::2] * width  # never min_range, maybe 0
+        ranges = sensor.max_range - drawn[..., 2::2] * width  # above min_range
         present = np.arange(rows) < counts[..., None]
         return np.where(present, np.stack([bearings, ranges]), 0.0)
 
 
 def draw_sensor_noise(streams: Streams, scenario: Scenario, steps: int) -> SensorNoise:
-    """Draw the sensor's noise of the steps that come next.
+    """Draw the sensor noise of the next steps.
 
     Returns
     -------
     SensorNoise
         Its four arrays, with the steps as their first axis.
     """
-    return _draw_and_scale(streams, scenario, SensorNoiseLaw(scenario), steps)
-
-
-def _draw_and_scale(
-    streams: Streams, scenario: Scenario, law: SensorNoiseLaw, steps: int
-) -> SensorNoise:
     normal, *widths = unit_widths(scenario)
     sources = streams.dropout, streams.clutter, streams.order
     unit = streams.measurement.standard_normal((steps, 2, normal // 2))
@@ -219,34 +208,22 @@ def _draw_and_scale(
         for source, width in zip(sources, widths, strict=True)
     ]
     draws = UnitDraws(unit.transpose(1, 0, 2), *uniform)
-    error, nearest, clutter, order = law.apply(draws)
+    error, nearest, clutter, order = SensorNoiseModel(scenario).apply(draws)
     if clutter is not None:
         clutter = clutter.transpose(1, 0, 2)
     return error.transpose(1, 0, 2), nearest, clutter, order
 
 
-def _motion_floats(
-    streams: Streams, scenario: Scenario, steps: int
-) -> list[list[float]]:
-    rows: list[list[float]] = draw_motion_noise(streams, scenario, steps).tolist()
-    return rows
-
-
 def _sensor_noise_by_step(
-    streams: Streams, scenario: Scenario, law: SensorNoiseLaw, steps: int
+    streams: Streams, scenario: Scenario, steps: int
 ) -> Iterable[SensorNoise]:
-    error, nearest, clutter, order = _draw_and_scale(streams, scenario, law, steps)
-    return zip(
-        error,
-        nearest,
-        repeat(None) if clutter is None else clutter,
-        repeat(None) if order is None else order,
-        strict=False,  # repeat has no end
-    )
+    fields = draw_sensor_noise(streams, scenario, steps)
+    rows = ([None] * steps if field is None else field for field in fields)
+    return cast("Iterable[SensorNoise]", zip(*rows, strict=True))
 
 
 def _nearest_readable(unit: Array, std: float, per_metre: float) -> Array:
-    """Find the range r above which r + (σ + k r) ε is positive, with unit noise ε."""
+    """Return the range r above which r + (σ + k r) ε > 0, with unit noise ε."""
     if per_metre == 0.0:
         return -std * unit
     slope = 1.0 + per_metre * unit
@@ -255,7 +232,7 @@ def _nearest_readable(unit: Array, std: float, per_metre: float) -> Array:
 
 
 def _poisson_cdf(mean: float, largest: int) -> Array:
-    """P(at most k false readings) for k < largest, where the law is cut off."""
+    """Return P(at most k false readings) for k < largest, the truncation."""
     if mean == 0.0:
         return np.empty(0)
     logs = [k * math.log(mean) - mean - math.lgamma(k + 1) for k in range(largest)]

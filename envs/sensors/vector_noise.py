@@ -1,7 +1,7 @@
-"""Noise of many worlds, each from its own generators, drawn ahead and stepped together.
+"""Noise of many worlds, each from its own generators, drawn some steps ahead.
 
-A stream is drawn in the layout that a single world uses, so that world i has the noise
-of a single world with its generator, whatever happens to the others.
+The layout of every stream is that of a single world. So world i has the noise of a
+single world with the same generator, independent of the other worlds.
 """
 
 from collections.abc import Iterable, Sequence
@@ -10,23 +10,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...sim_configs import Scenario
-from .noise_streams import SensorNoise, SensorNoiseLaw, Streams, UnitDraws, unit_widths
+from .noise_streams import (
+    SensorNoise,
+    SensorNoiseModel,
+    Streams,
+    UnitDraws,
+    unit_widths,
+)
 
 Array = NDArray[np.float64]
 
-_BLOCK_NUMBERS = 1024  # drawn at once per world: stays in the cache, hides the calls
+_BLOCK_NUMBERS = 1024  # per world and block: fits the cache, amortises the calls
 _FEWEST_STEPS = 8
 _PAIR = np.array([[0], [1]])
-_UNIFORM = Streams._fields.index("dropout")  # this stream and those behind it
+_UNIFORM = Streams._fields.index("dropout")  # this stream and the later ones
 
 
-class NoiseBlocks:
-    """Noise of B worlds, drawn some steps ahead of each.
+class VectorNoise:
+    """Draws and delivers the noise of B worlds.
 
     Parameters
     ----------
     scenario : Scenario
-        Of every world.
+        The scenario of every world.
     count : int
         B.
     """
@@ -35,21 +41,23 @@ class NoiseBlocks:
         widths = (3, *unit_widths(scenario))
         steps = max(_FEWEST_STEPS, _BLOCK_NUMBERS // sum(widths))
         self._steps = min(steps, scenario.steps + 1)
-        self._law = SensorNoiseLaw(scenario)
-        self._motion_std = np.tile(scenario.motion.std, (count, 1))  # one loop
+        self._model = SensorNoiseModel(scenario)
+        self._motion_std = np.tile(
+            scenario.motion.std, (count, 1)
+        )  # tiled: numpy runs one loop
         self._sources = [
             _Source(name, count, self._steps, width)
             for name, width in zip(Streams._fields[2:], widths, strict=True)
         ]
         self._motion, self._measurement, *self._uniform = self._sources
-        self._place = np.arange(count) * self._steps  # of each world's row
+        self._place = np.arange(count) * self._steps  # row of each world
         self._end = self._place + self._steps
         self._at_least_left = self._steps
 
     def begin(self, worlds: Sequence[int], streams: Sequence[Streams]) -> None:
-        """Give these worlds the streams of a new episode, and go to its start.
+        """Set the streams of a new episode in these worlds, and go to its start.
 
-        The start has noise for the sensor; the motion's row is left out there.
+        The start has sensor noise but no motion noise.
         """
         for world, generators in zip(worlds, streams, strict=True):
             for source in self._sources:
@@ -58,7 +66,7 @@ class NoiseBlocks:
         self._at_least_left = int((self._end - self._place).min())
 
     def advance(self, moving: NDArray[np.bool_] | None) -> None:
-        """Go to the next step of the worlds that move (all)."""
+        """Go to the next step in the worlds that move (None: all)."""
         self._place += 1 if moving is None else moving
         self._at_least_left -= 1
         if self._at_least_left == 0:
@@ -70,12 +78,12 @@ class NoiseBlocks:
         return noise
 
     def sensor(self, worlds: NDArray[np.intp] | slice | None) -> SensorNoise:
-        """Return the sensor's noise of this step in some worlds, None for all.
+        """Return the sensor noise of this step in some worlds (None: all).
 
-        Its arrays hold until the next call.
+        Its arrays are valid until the next call.
         """
         place = self._place if worlds is None else self._place[worlds]
-        return self._law.apply(
+        return self._model.apply(
             UnitDraws(
                 self._measurement.pairs(place),
                 *(each.rows(place) if each.width else None for each in self._uniform),
@@ -91,7 +99,7 @@ class NoiseBlocks:
 
 
 class _Source:
-    """One stream of every world: K steps drawn ahead, `width` numbers in each."""
+    """One stream of every world: K steps drawn ahead, `width` numbers per step."""
 
     def __init__(self, name: str, count: int, steps: int, width: int) -> None:
         self.width = width
@@ -118,7 +126,7 @@ class _Source:
         return chosen
 
     def pairs(self, places: NDArray[np.intp]) -> Array:
-        """Take the two halves of the rows apart, shape (2, b, width / 2)."""
+        """Return the two halves of the rows, shape (2, b, width / 2)."""
         halves = self._ahead.reshape(-1, self.width // 2)
         all_worlds = len(places) == len(self._chosen)
         out = self._chosen.reshape(2, -1, self.width // 2) if all_worlds else None
@@ -127,6 +135,6 @@ class _Source:
 
     def _fill(self, world: int, first: int) -> None:
         rng, end = self._rngs[world], (world + 1) * self._steps
-        if rng is not None:  # else the world has not begun
+        if rng is not None:  # None before the first reset
             draw = rng.random if self._stream >= _UNIFORM else rng.standard_normal
             draw(out=self._ahead[end - self._steps + first : end])

@@ -1,4 +1,4 @@
-"""Many worlds side by side, simulated together."""
+"""Many worlds at once: native vector environments, batches and their wrappers."""
 
 from lazy_loader import attach_stub
 

@@ -1,4 +1,4 @@
-"""What Gymnasium asks of vector environments around the episodes of their worlds."""
+"""Gymnasium's rules for the episodes of vector environments: seeds, masks, infos."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +15,7 @@ Infos = dict[str, Any]
 def world_seeds(
     seed: int | Sequence[int | None] | None, count: int
 ) -> list[int | None]:
-    """Spread a seed s over the worlds as Gymnasium does: s, s + 1 and so on.
+    """Return the seeds of the worlds as in Gymnasium: s, s + 1 and so on.
 
     Raises
     ------
@@ -39,13 +39,13 @@ def world_seeds(
 
 
 def checked_reset_mask(options: dict[str, Any] | None, count: int) -> BoolArray | None:
-    """Take the mask of worlds to reset out of the options, None for all.
+    """Return the mask of worlds to reset from the options, None for all.
 
     Raises
     ------
     ValueError, TypeError
-        If there is another option, or the mask is not a bool ndarray of shape (count,)
-        that is True somewhere.
+        If there is another option, or if the mask is not a bool ndarray of shape
+        (count,) with a True element.
     """
     if not options:
         return None
@@ -63,9 +63,9 @@ def checked_reset_mask(options: dict[str, Any] | None, count: int) -> BoolArray 
 
 
 def with_masks(infos: Infos, worlds: BoolArray | None, count: int) -> Infos:
-    """Add to each key the mask ``_key`` of the worlds (all) that it tells of.
+    """Add to each key the mask ``_key`` of the worlds that have the info (None: all).
 
-    Where a world is not told of there are zeros, as from Gymnasium's own vectors.
+    The values of the other worlds are zeros, as in Gymnasium's own vector environments.
 
     Examples
     --------
@@ -77,25 +77,25 @@ def with_masks(infos: Infos, worlds: BoolArray | None, count: int) -> Infos:
         if worlds is None:
             masked[key], masked[f"_{key}"] = value, ~np.zeros(count, np.bool_)
         else:
-            told = np.zeros_like(value)
-            told[worlds] = value[worlds]
-            masked[key], masked[f"_{key}"] = told, worlds.copy()
+            chosen = np.zeros_like(value)
+            chosen[worlds] = value[worlds]
+            masked[key], masked[f"_{key}"] = chosen, worlds.copy()
     return masked
 
 
-def final_moments(observations: Infos, infos: Infos, ended: BoolArray) -> Infos:
-    """Form ``final_obs`` and ``final_info`` of the worlds whose episodes ended.
+def final_infos(observations: Infos, infos: Infos, ended: BoolArray) -> Infos:
+    """Return ``final_obs`` and ``final_info`` of the worlds whose episodes ended.
 
     Parameters
     ----------
     observations, infos : dict of ndarray
-        Of all worlds, the worlds along the first axis.
+        Those of all worlds, with the worlds along the first axis.
     ended : bool ndarray, shape (B,)
 
     Returns
     -------
     dict
-        As the same-step mode of Gymnasium's vectors puts them into its infos.
+        In the form of Gymnasium's same-step mode.
     """
     count = len(ended)
     last = np.full(count, None, dtype=object)
@@ -110,14 +110,14 @@ def final_moments(observations: Infos, infos: Infos, ended: BoolArray) -> Infos:
 
 
 def episode_steps(scenario: Scenario, most: int | None) -> int:
-    """Return how many steps an episode has: the scenario's, or ``max_episode_steps``.
+    """Return the number of steps of an episode, at most ``max_episode_steps``.
 
     Raises
     ------
     ValueError
-        If it is no whole number of steps.
+        If ``max_episode_steps`` is not a whole number >= 1.
     """
-    if most is None or most == -1:  # Gymnasium's word for no limit
+    if most is None or most == -1:  # Gymnasium's value for no limit
         return scenario.steps
     if isinstance(most, bool) or not isinstance(most, int) or most < 1:
         raise ValueError(f"max_episode_steps must be a whole number >= 1, got {most!r}")

@@ -1,4 +1,4 @@
-"""Many landmark worlds side by side, as one native Gymnasium vector environment."""
+"""Many landmark worlds as one native vector environment of Gymnasium."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from ...sim_configs import Scenario, load_scenario
 from ..landmark_world import LandmarkWorldEnv
 from ..rendering.render_state import BeliefLike
-from ..rendering.vector_rendering import WorldViews
 from ..spaces import action_space, observation_space
 from .episodes import (
     checked_reset_mask,
     episode_steps,
-    final_moments,
+    final_infos,
     with_masks,
     world_seeds,
 )
+from .vector_rendering import VectorRenderer
 from .world_batch import WorldBatch
 
 Array = NDArray[np.float64]
@@ -35,11 +35,10 @@ Infos = dict[str, Any]
 class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     """B landmark worlds of one scenario, simulated together in numpy.
 
-    Under ``reset(seed=s)`` world i has the bits of a `LandmarkWorldEnv` under
-    ``reset(seed=s + i)``, in the first episode and in those that follow, whatever the
-    other worlds do. Spaces, observations and infos are those of `LandmarkWorldEnv` with
-    an axis of worlds in front. ``gymnasium.make_vec("slamgym/LandmarkWorld-v0", B)``
-    makes this class.
+    After ``reset(seed=s)`` world i equals, to the bit, a `LandmarkWorldEnv` after
+    ``reset(seed=s + i)``, in the first episode and in the following ones. Spaces,
+    observations and infos are those of `LandmarkWorldEnv` with a leading world axis.
+    ``gymnasium.make_vec("slamgym/LandmarkWorld-v0", B)`` makes this class.
 
     Parameters
     ----------
@@ -48,13 +47,14 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
     scenario : Scenario, mapping, str or Path, default "six_landmarks"
         As for `LandmarkWorldEnv`.
     render_mode : {"human", "rgb_array"}, optional
-        Whether each world has a window, or `render` returns a frame of each.
+        "human" opens a window per world; with "rgb_array" `render` returns a frame of
+        each.
     max_episode_steps : int, optional
-        Truncates episodes before the scenario's own steps are over.
+        Truncates episodes earlier than the scenario's own number of steps.
     autoreset_mode : AutoresetMode or str, default ``AutoresetMode.NEXT_STEP``
-        Whether a world whose episode has ended begins a new one at the next step, in
-        the same step (the last moment is then in ``infos["final_obs"]`` and
-        ``infos["final_info"]``), or not before ``reset(options={"reset_mask": …})``.
+        When a world whose episode has ended starts a new one: at the next step, in the
+        same step (``infos["final_obs"]`` and ``infos["final_info"]`` then hold the end
+        of the last one), or at ``reset(options={"reset_mask": …})``.
     **changes
         Fields of the scenario to replace, as in `Scenario.with_changes`.
 
@@ -67,7 +67,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
     ((3, 28, 2), (3, 3))
     """
 
-    _views: WorldViews | None = None  # here, as close comes even after a refusal
+    _renderer: VectorRenderer | None = None  # for close after a failed constructor
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         self.render_mode = render_mode
         if render_mode is not None:
             fps = float(self.metadata["render_fps"])
-            self._views = WorldViews(self.scenario, render_mode, fps, num_envs)
+            self._renderer = VectorRenderer(self.scenario, render_mode, fps, num_envs)
         self._steps = episode_steps(self.scenario, max_episode_steps)
         self._worlds = WorldBatch(self.scenario, num_envs)
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
@@ -111,23 +111,23 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observations, Infos]:
-        """Begin an episode in every world, or in those of a mask.
+        """Start an episode in every world, or in those of a mask.
 
         Parameters
         ----------
         seed : int >= 0, or list of B of them, optional
-            World i is seeded ``seed + i``, or by its place in the list; None seeds
-            nothing anew.
+            World i has the seed ``seed + i``, or item i of the list. None keeps the
+            generators.
         options : dict, optional
             ``{"reset_mask": mask}``, bool ndarray of shape (B,), chooses worlds. The
-            others stay as they are, and have no info.
+            others do not change and have no info.
 
         Raises
         ------
         ValueError, TypeError
-            If there are other options, or a mask or seeds of another form.
+            For other options, or an invalid mask or seed.
         gymnasium.error.ResetNeeded
-            If a mask leaves out worlds that have never begun.
+            If a mask leaves out worlds that have never been reset.
         """
         mask = checked_reset_mask(options, self.num_envs)
         seeds = world_seeds(seed, self.num_envs)
@@ -147,10 +147,10 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         Raises
         ------
         ValueError
-            If the actions are not B rows of two finite numbers; the worlds stay as they
-            are.
+            If the actions are not B rows of two finite numbers. The worlds do not
+            change.
         gymnasium.error.ResetNeeded
-            Before `reset`, and, without autoreset, for worlds that have ended.
+            Before `reset`. Without autoreset also for worlds that have ended.
         """
         resetting, moving = self._ended, None
         if np.count_nonzero(resetting):
@@ -158,8 +158,8 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
             moving = ~resetting
         self._worlds.step(actions, moving)
         self._steps_left -= 1
-        if self._views is not None:
-            self._views.add(self._worlds, ~resetting)
+        if self._renderer is not None:
+            self._renderer.add(self._worlds, ~resetting)
         if moving is not None:
             self._begin(resetting)
         truncated = self._steps_left <= 0
@@ -167,7 +167,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
             self._ended = truncated
         elif np.count_nonzero(truncated):
-            final = final_moments(self._observations(), self._infos(), truncated)
+            final = final_infos(self._observations(), self._infos(), truncated)
             self._begin(truncated)
         infos = {**final, **with_masks(self._infos(), None, self.num_envs)}
         rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
@@ -176,20 +176,20 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a frame of each world in mode "rgb_array", else None."""
         self._refuse_before_reset()
-        if self._views is None:
+        if self._renderer is None:
             logger.warn("render shows nothing without a render_mode")
             return None
-        return self._views.draw() if self.render_mode == "rgb_array" else None
+        return self._renderer.draw() if self.render_mode == "rgb_array" else None
 
     def show_beliefs(self, beliefs: Sequence[BeliefLike | None]) -> None:
-        """Let the frames of world i show belief i, from now on; None for none."""
-        if self._views is not None:
-            self._views.show_beliefs(beliefs)
+        """Show belief i in the following frames of world i; None hides it."""
+        if self._renderer is not None:
+            self._renderer.show_beliefs(beliefs)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the windows, if there are any."""
-        if self._views is not None:
-            self._views.close()
+        if self._renderer is not None:
+            self._renderer.close()
 
     @property
     def poses(self) -> Array:
@@ -205,7 +205,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
 
     @property
     def start_estimates(self) -> Array:
-        """Poses from which filters start, shape (B, 3) [m, m, rad], a copy."""
+        """Start poses for filters, shape (B, 3) [m, m, rad], a copy."""
         self._refuse_before_reset()
         return self._worlds.start_estimates
 
@@ -223,7 +223,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         return tuple(self._seeds)
 
     def _generators(self) -> list[np.random.Generator]:
-        """Seed what has no generator yet by the entropy of the machine."""
+        """Return the generators; the machine's entropy seeds missing ones."""
         made = []
         for world, rng in enumerate(self._rngs):
             if rng is None:
@@ -243,8 +243,8 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         self._worlds.reset(self._generators(), worlds)
         self._steps_left[worlds] = self._steps
         self._ended = self._ended & ~worlds
-        if self._views is not None:
-            self._views.begin(self._worlds, worlds)
+        if self._renderer is not None:
+            self._renderer.begin(self._worlds, worlds)
 
     def _observations(self) -> Observations:
         worlds = self._worlds
@@ -255,7 +255,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         }
         if self.autoreset_mode != AutoresetMode.DISABLED:
             return observations
-        # there a later reset repeats them, whatever was written into these
+        # a partial reset repeats them: the caller must not write into the originals
         return {key: value.copy() for key, value in observations.items()}
 
     def _infos(self) -> Infos:

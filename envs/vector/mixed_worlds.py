@@ -1,4 +1,4 @@
-"""Worlds of different scenarios behind the interface of a `WorldBatch`."""
+"""Worlds of different scenarios with the interface of `WorldBatch`."""
 
 from collections.abc import Sequence
 
@@ -12,15 +12,14 @@ Array = NDArray[np.float64]
 
 
 class MixedWorlds:
-    """B single worlds, stepped one after the other.
+    """B single worlds of different scenarios, stepped one after the other.
 
-    For worlds whose scenarios differ. All have equally many landmarks, and either all
-    hide identities or none.
+    All have equally many landmarks. Either all hide identities or none.
 
     Parameters
     ----------
     scenarios : sequence of Scenario, length B
-        What each world is.
+        The scenario of each world.
 
     Attributes
     ----------
@@ -48,28 +47,28 @@ class MixedWorlds:
 
     @property
     def start_estimates(self) -> Array:
-        """Poses from which filters start, shape (B, 3) [m, m, rad], a copy."""
+        """Start poses for filters, shape (B, 3) [m, m, rad], a copy."""
         return np.array([world.start_estimate for world in self._worlds])
 
     def reset(self, generators: Sequence[np.random.Generator]) -> None:
-        """Begin an episode in every world; see `WorldBatch.reset`."""
-        moments = []
+        """Start an episode in every world; see `WorldBatch.reset`."""
+        outputs = []
         for world, generator in zip(self._worlds, generators, strict=True):
             world.np_random = generator
-            moments.append(world.reset())
-        self._take(moments)
+            outputs.append(world.reset())
+        self._stack(outputs)
 
     def step(self, actions: Array) -> None:
         """Drive and turn for one step; see `WorldBatch.step`."""
-        moments = []
+        outputs = []
         for world, action in zip(self._worlds, actions, strict=True):
             observation, *_, info = world.step(action)
-            moments.append((observation, info))
-        self._take(moments)
+            outputs.append((observation, info))
+        self._stack(outputs)
 
-    def _take(self, moments: list[tuple[Observation, dict[str, object]]]) -> None:
-        """Stack what the worlds said."""
-        seen, infos = zip(*moments, strict=True)
+    def _stack(self, outputs: list[tuple[Observation, dict[str, object]]]) -> None:
+        """Stack the observations and infos of the worlds."""
+        seen, infos = zip(*outputs, strict=True)
         self.measurements = np.array([each["landmarks"] for each in seen])
         self.mask = np.array([each["mask"] for each in seen])
         self.odometry = np.array([each["odometry"] for each in seen])

@@ -1,4 +1,4 @@
-"""Many worlds of one scenario side by side, simulated together in numpy."""
+"""Many worlds of one scenario, simulated together in numpy."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,12 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...sim_configs import Scenario, place_landmarks
 from ...sim_configs.scenario import refuse_ranges
+from ..actions import clipped_actions
 from ..robot.vector_bodies import UnicycleBodies
 from ..sensors.bearing_range import BearingRangeSensor, hide_identities
 from ..sensors.noise_streams import Streams, spawn_streams
-from ..sensors.vector_noise import NoiseBlocks
+from ..sensors.odometry import VectorOdometrySensor
+from ..sensors.vector_noise import VectorNoise
 from ..spaces import count_rows
-from .actions import checked_actions
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -22,19 +23,18 @@ Places = NDArray[np.intp]
 Scan = tuple[Array, BoolArray, NDArray[np.int64] | None]
 
 _READINGS_AT_ONCE = 8192
-_NO_ERROR = np.array(0.0)
 
 
 class WorldBatch:
-    """B worlds of one scenario, which share nothing but their code.
+    """B independent worlds of one scenario.
 
-    World i has the bits of a single `LandmarkWorldEnv` whose ``np_random`` is the
-    generator i, whatever the other worlds do.
+    World i equals, to the bit, a single `LandmarkWorldEnv` whose ``np_random`` is the
+    generator i.
 
     Parameters
     ----------
     scenario : Scenario
-        What every world is; a random layout without a seed differs from world to world.
+        The scenario of every world. A random layout without a seed differs per world.
     count : int
         B, the number of worlds.
 
@@ -43,23 +43,23 @@ class WorldBatch:
     measurements : ndarray, shape (B, M, 2)
         Rows (β in [-π, π), r), zeros where unseen [rad, m].
     mask : bool ndarray, shape (B, M)
-        Rows that hold a measurement.
+        Rows with a measurement.
     odometry : ndarray, shape (B, 2)
-        (d, α) as the odometry tells it [m, rad].
+        Measured (d, α) [m, rad].
     poses : ndarray, shape (B, 3)
         True (x, y, θ) [m, m, rad], θ not wrapped.
     collisions : bool ndarray, shape (B,)
-        Where a wall held the robot back.
+        Whether a wall stopped the robot.
     landmark_ids : int64 ndarray, shape (B, M), or None with identities
         The true landmark of each row, -1 for clutter and empty rows.
     begun : bool
-        Whether there has been a `reset`.
+        Whether `reset` has been called.
 
     Notes
     -----
-    `reset` and `step` assign new arrays and never write into those handed out before.
-    Nor does writing into them move a robot; but a world that takes no part in a `reset`
-    has its rows repeated from the last arrays.
+    `reset` and `step` assign new arrays and never write into earlier ones. Writing into
+    an array does not move a robot. A world that takes no part in a `reset` keeps its
+    rows of the last arrays.
 
     Examples
     --------
@@ -78,17 +78,14 @@ class WorldBatch:
         refuse_ranges(scenario)
         self.scenario = scenario
         self.count = count
-        self._noise = NoiseBlocks(scenario, count)
+        self._noise = VectorNoise(scenario, count)
         self._sensor = BearingRangeSensor(scenario)
-        robot, motion = scenario.robot, scenario.motion
+        self._odometer = VectorOdometrySensor(scenario, count)
+        robot = scenario.robot
         self._bodies = UnicycleBodies(count, robot.radius, scenario.walls)
         limits = robot.max_speed, robot.max_turn_rate
-        self._fastest = np.tile(limits, (count, 1))  # so that numpy runs one loop
-        self._slowest = -self._fastest
-        self._slips = motion.noise_in == "motion"
-        self._noise_at_rest = motion.noise_at_rest
+        self._limits = np.tile(limits, (count, 1))  # tiled: numpy runs one loop
         self._hides_identities = not scenario.sensor.identities
-        self._no_slip = np.zeros((count, 3))
         self.begun = False
         self._clear()
 
@@ -113,7 +110,7 @@ class WorldBatch:
 
     @property
     def start_estimates(self) -> Array:
-        """Poses from which filters start, shape (B, 3) [m, m, rad], a copy."""
+        """Start poses for filters, shape (B, 3) [m, m, rad], a copy."""
         return self._start_estimates.copy()
 
     def reset(
@@ -121,22 +118,22 @@ class WorldBatch:
         generators: Sequence[np.random.Generator],
         worlds: BoolArray | None = None,
     ) -> None:
-        """Begin an episode in some worlds (all), and measure from its start.
+        """Start an episode in some worlds, and measure from its start.
 
         Parameters
         ----------
         generators : sequence of numpy.random.Generator, length B
-            Generator i is what ``np_random`` is to a single world; of the chosen worlds
-            alone they spawn.
+            Generator i corresponds to ``np_random`` of a single world. Only those of
+            the chosen worlds spawn.
         worlds : bool ndarray, shape (B,), optional
-            Which worlds; at first all.
+            Worlds to reset (None: all). The first call must reset all.
 
         Raises
         ------
         ValueError
-            If there are not B generators, or the choice is not B truth values.
+            If there are not B generators, or `worlds` is not a mask of B worlds.
         gymnasium.error.ResetNeeded
-            If some worlds have never begun and are not chosen.
+            If a world that has never been reset is not chosen.
         """
         chosen = self._chosen(worlds)
         if len(generators) != self.count:
@@ -161,15 +158,15 @@ class WorldBatch:
         Parameters
         ----------
         actions : array_like, shape (B, 2)
-            (v, ω) [m/s, rad/s]; what lies beyond the robot's limits is clipped.
+            (v, ω) [m/s, rad/s], clipped to the limits of the robot.
         moving : bool ndarray, shape (B,), optional
-            Which worlds take the step (all); the others stay as they are, and their
-            actions are not looked at.
+            Worlds that take the step (None: all). The others do not change, and their
+            actions are ignored.
 
         Raises
         ------
         ValueError
-            If the actions of moving worlds are not finite numbers; no world moves then.
+            If an action of a moving world is not finite. Then no world moves.
         gymnasium.error.ResetNeeded
             Before `reset`.
         """
@@ -179,9 +176,9 @@ class WorldBatch:
             moving = self._truth_values(moving, "moving")
             if np.count_nonzero(moving) == self.count:
                 moving = None
-        checked = checked_actions(actions, self.count, moving)
+        clipped = clipped_actions(actions, self._limits, moving)
         self._noise.advance(moving)
-        self._drive(checked, moving)
+        self._drive(clipped * self.scenario.dt, moving)
         self.measurements, self.mask, self.landmark_ids = self._scan_all()
 
     def _truth_values(self, value: BoolArray, name: str) -> BoolArray:
@@ -218,30 +215,18 @@ class WorldBatch:
             placed_once = np.ascontiguousarray(place_landmarks(layout, streams[0].map))
             self._landmarks[:] = placed_once.view(np.complex128)[:, 0]
 
-    def _drive(self, actions: Array, moving: BoolArray | None) -> None:
-        clipped = np.minimum(np.maximum(actions, self._slowest), self._fastest)
-        commands = clipped * self.scenario.dt
-        slip, error = self._place_noise(commands)
+    def _drive(self, commands: Array, moving: BoolArray | None) -> None:
+        slip, error = self._odometer.split_noise(commands, self._noise.motion())
         share = self._bodies.drive(commands, slip, moving)
+        odometry = self._odometer.read(commands, share, error)
         collisions = np.zeros(self.count, dtype=np.bool_)
         if share is not None:
-            commands[:, 0] *= share
             np.less(share, 1.0, out=collisions)
-        odometry = commands + error
         if moving is not None:
             odometry = np.where(moving[:, None], odometry, self.odometry)
             collisions = np.where(moving, collisions, self.collisions)
         self.odometry, self.collisions = odometry, collisions
         self.poses = self._bodies.poses()
-
-    def _place_noise(self, commands: Array) -> tuple[Array, Array]:
-        """Split the noise into slip, (B, 3), and odometry error, (B, 2) or ()."""
-        noise = self._noise.motion()
-        if not self._noise_at_rest:
-            noise[~commands.any(axis=1)] = 0.0
-        if self._slips:
-            return noise, _NO_ERROR
-        return self._no_slip, noise[:, ::2]
 
     def _measure_some(self, worlds: Places) -> None:
         measurements, mask, ids = self._scan(worlds)
@@ -251,9 +236,9 @@ class WorldBatch:
             self.landmark_ids = _replaced(self.landmark_ids, worlds, ids)
 
     def _scan_all(self) -> Scan:
-        """Scan part after part, so small that its arrays stay in the cache.
+        """Scan in blocks of worlds whose arrays fit the cache.
 
-        Worlds that did not move find the noise of their last scan, and so its readings.
+        Worlds that did not move have the noise of their last scan, and so its readings.
         """
         size = max(1, _READINGS_AT_ONCE // self.mask.shape[1])
         if self.count <= size:

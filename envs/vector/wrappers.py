@@ -1,4 +1,4 @@
-"""Wrappers of vector environments that work on the whole batch at once."""
+"""Wrappers of vector environments that process the whole batch at once."""
 
 from typing import Any
 
@@ -14,22 +14,22 @@ Infos = dict[str, Any]
 
 
 class FlattenBatch(VectorWrapper):  # with type parameters since Gymnasium 1.4 only
-    """Lays the arrays of every world's observation side by side: (B, D) numbers.
+    """Concatenates the arrays of every world's observation to (B, D) numbers.
 
-    World by world it gives what `gymnasium.wrappers.FlattenObservation` does, keys in
-    the order of the space, but copies each key once for all worlds, where
+    The rows equal those of `gymnasium.wrappers.FlattenObservation`, keys in the order
+    of the space. It copies each key once for all worlds, whereas
     `gymnasium.wrappers.vector.FlattenObservation` loops over the worlds in Python. It
-    goes with every autoreset mode; `final_obs` is flattened too.
+    supports every autoreset mode and flattens `final_obs` too.
 
     Parameters
     ----------
     env : gymnasium.vector.VectorEnv
-        With a one-level ``Dict`` of ``Box`` and ``MultiBinary`` as its observation.
+        Its observation is a flat ``Dict`` of ``Box`` and ``MultiBinary``.
 
     Raises
     ------
     ValueError
-        If the observation is something else.
+        For any other observation.
 
     Examples
     --------
@@ -49,7 +49,7 @@ class FlattenBatch(VectorWrapper):  # with type parameters since Gymnasium 1.4 o
         self._dtype = flat.dtype
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Array, Infos]:
-        """Begin episodes as the wrapped environment does."""
+        """Start episodes in the wrapped environment."""
         observations, infos = self.env.reset(seed=seed, options=options)
         return self._flatten(observations), infos
 

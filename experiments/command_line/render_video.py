@@ -61,7 +61,7 @@ def render(
     as_json: options.AsJson = False,
 ) -> None:
     """Drive an episode, and write one frame per step."""
-    from ...envs.rendering.renderer import write_video
+    from ...envs.rendering import write_video
     from ..runs.filter_settings import settings_for_scenario
     from .reporter import Reporter
     from .scenario_options import chosen_controller, chosen_scenario

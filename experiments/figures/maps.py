@@ -11,7 +11,7 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 from PIL import Image
 
-from ...envs.rendering.blitting import BlittedFigure
+from ...envs.rendering import BlittedFigure
 from ...sim_configs.atomic_file import replace_when_written
 from ..runs.trace import RunTrace
 from .map_picture import MapPicture, map_limits, pose_stride

@@ -15,7 +15,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 from numpy.typing import NDArray
 
-from ...envs.rendering.ellipses import covariance_ellipses
+from ...envs.rendering import covariance_ellipses
 from ...sim_configs.atomic_file import replace_when_written
 
 Array = NDArray[np.floating]

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from ...envs.vector.world_batch import WorldBatch
+from ...envs.vector import WorldBatch
 from ...estimator.support.memory_limit import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
 

@@ -6,8 +6,7 @@ import numpy as np
 from gymnasium.utils import seeding
 
 from ...envs.controllers import make_vector_controller
-from ...envs.vector.mixed_worlds import MixedWorlds
-from ...envs.vector.world_batch import WorldBatch
+from ...envs.vector import MixedWorlds, WorldBatch
 from ...sim_configs import Scenario, drawn_scenario
 from .trajectory import Trajectory
 

@@ -716,7 +716,7 @@ def test_a_table_names_means_with_their_intervals():
 
 
 def test_a_loop_in_the_manner_of_cleanrl_runs():
-    from slamgym.envs.vector.wrappers import FlattenBatch
+    from slamgym.envs.vector import FlattenBatch
 
     vector = FlattenBatch(gym.make_vec(ID, 4, scenario="active_easy"))
     size = int(np.prod(vector.single_observation_space.shape))

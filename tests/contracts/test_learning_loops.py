@@ -14,8 +14,7 @@ from gymnasium.wrappers import (
 from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordStatisticsOfMany
 
 import slamgym  # noqa: F401 (registers the environments)
-from slamgym.envs.vector.stable_baselines import to_stable_baselines
-from slamgym.envs.vector.wrappers import FlattenBatch
+from slamgym.envs.vector import FlattenBatch, to_stable_baselines
 
 IDS = sorted(each for each in gym.registry if each.startswith("slamgym/"))
 STEPS = 12

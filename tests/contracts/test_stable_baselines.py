@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import slamgym  # noqa: F401 (registers the environments)
-from slamgym.envs.vector.stable_baselines import to_stable_baselines
-from slamgym.envs.vector.wrappers import FlattenBatch
+from slamgym.envs.vector import FlattenBatch, to_stable_baselines
 
 ID = "slamgym/LandmarkWorld-v0"
 SEED = 4

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slamgym.envs.rendering.ellipses import covariance_ellipses
+from slamgym.envs.rendering import covariance_ellipses
 
 finite = st.floats(-5, 5)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
 
-from slamgym.envs.rendering.axes_limits import ViewLimits
-from slamgym.envs.rendering.renderer import WorldRenderer, WorldSnapshot
+from slamgym.envs.rendering import RenderState, WorldRenderer
+from slamgym.envs.rendering.axes_limits import AxesLimits
 from slamgym.sim_configs import action_sequence, load_scenario
 
 LANDMARKS = np.array([[3.0, 6.0], [3.0, 12.0], [7.0, 8.0], [7.0, 14.0], [11.0, 6.0]])
@@ -33,7 +33,7 @@ def snapshot(pose=(2.0, 1.0, 0.5), **changes):
         [np.arctan2(*offset.T[::-1]) - pose[2], np.linalg.norm(offset, axis=1)], axis=1
     )
     path = np.array([[0.0, 0.0], pose[:2]])
-    return WorldSnapshot(pose, path, readings, False, None, 3.0, 1)._replace(**changes)
+    return RenderState(pose, path, readings, False, None, 3.0, 1)._replace(**changes)
 
 
 @pytest.fixture
@@ -43,8 +43,8 @@ def renderer():
     renderer.close()
 
 
-def picture_of(renderer):
-    return renderer._scene.picture
+def scene_of(renderer):
+    return renderer._drawing.scene
 
 
 def share_of_different_pixels(one, other):
@@ -92,9 +92,9 @@ def test_blitted_frame_is_nearly_that_of_a_full_draw(renderer):
     moment = snapshot(belief=FixedBelief(), collision=True)
     renderer.render(snapshot((6.0, 3.0, 2.0), belief=FixedBelief()))
     blitted = renderer.render(moment)
-    for artist in picture_of(renderer).moving:
+    for artist in scene_of(renderer).moving:
         artist.set_animated(False)
-    canvas = picture_of(renderer)._figure.canvas
+    canvas = scene_of(renderer)._figure.canvas
     with canvas.callbacks.blocked(signal="draw_event"):  # draws no moving part twice
         canvas.draw()
     full = np.asarray(canvas.buffer_rgba())[..., :3]
@@ -114,19 +114,19 @@ def test_blitting_is_several_times_faster_than_drawing_everything(renderer):
             times.append(time.thread_time() - start)
         return min(times)
 
-    assert fastest(renderer._scene.blitted.outdate) > 2.5 * fastest(lambda: None)
+    assert fastest(renderer._drawing.blitted.outdate) > 2.5 * fastest(lambda: None)
 
 
 def test_rays_of_exact_readings_end_at_the_landmarks(renderer):
     renderer.render(snapshot())
-    segments = np.array(picture_of(renderer)._moving.rays.get_segments())
+    segments = np.array(scene_of(renderer)._moving.rays.get_segments())
     np.testing.assert_allclose(segments[:, 1], LANDMARKS, atol=1e-12)
     np.testing.assert_allclose(segments[:, 0], np.tile([2.0, 1.0], (5, 1)))
 
 
 def test_belief_is_drawn_as_ellipses_of_three_sigma(renderer):
     renderer.render(snapshot(belief=FixedBelief()))
-    moving = picture_of(renderer)._moving
+    moving = scene_of(renderer)._moving
     for shown, means, blocks in (
         (moving.pose_ellipse, [FixedBelief.pose[:2]], [np.diag([0.2, 0.1])]),
         (
@@ -144,7 +144,7 @@ def test_belief_is_drawn_as_ellipses_of_three_sigma(renderer):
 def test_belief_disappears_when_it_is_withdrawn(renderer):
     renderer.render(snapshot(belief=FixedBelief()))
     renderer.render(snapshot())
-    moving = picture_of(renderer)._moving
+    moving = scene_of(renderer)._moving
     assert not moving.map_ellipses.get_visible()
     assert not moving.estimate.get_visible()
 
@@ -155,12 +155,12 @@ def test_belief_without_landmarks_is_drawn(renderer):
         covariance = FixedBelief.pose_covariance
 
     renderer.render(snapshot(belief=Lost()))
-    assert len(picture_of(renderer)._moving.map_ellipses.get_widths()) == 0
+    assert len(scene_of(renderer)._moving.map_ellipses.get_widths()) == 0
 
 
 def test_arrow_points_along_the_heading(renderer):
     renderer.render(snapshot((2.0, 1.0, 2.1)))
-    tip = picture_of(renderer)._moving.arrow.get_xy()[0] - [2.0, 1.0]
+    tip = scene_of(renderer)._moving.arrow.get_xy()[0] - [2.0, 1.0]
     assert np.arctan2(tip[1], tip[0]) == pytest.approx(2.1)
 
 
@@ -168,15 +168,15 @@ def test_collision_is_shown(renderer):
     calm = renderer.render(snapshot())
     hit = renderer.render(snapshot(collision=True))
     assert share_of_different_pixels(calm, hit) > 0.001
-    assert picture_of(renderer)._moving.alarm.get_text() == "collision"
-    assert picture_of(renderer)._moving.alarm.get_visible()
+    assert scene_of(renderer)._moving.alarm.get_text() == "collision"
+    assert scene_of(renderer)._moving.alarm.get_visible()
 
 
 def test_field_of_view_is_a_wedge_about_the_heading():
     narrow = SIX.with_changes(sensor={"field_of_view": 1.0, "max_range": 4.0})
     renderer = WorldRenderer(narrow, LANDMARKS, "rgb_array", size_px=200)
     renderer.render(snapshot((2.0, 1.0, 0.5)))
-    outline = picture_of(renderer)._moving.view.get_xy() - [2.0, 1.0]
+    outline = scene_of(renderer)._moving.view.get_xy() - [2.0, 1.0]
     distance = np.linalg.norm(outline, axis=1)
     bearing = np.arctan2(*outline[distance > 1].T[::-1]) - 0.5
     assert distance.max() == pytest.approx(4.0)
@@ -186,12 +186,12 @@ def test_field_of_view_is_a_wedge_about_the_heading():
 
 def test_unlimited_view_is_not_drawn(renderer):
     renderer.render(snapshot())
-    assert np.isnan(picture_of(renderer)._moving.view.get_xy()).all()
+    assert np.isnan(scene_of(renderer)._moving.view.get_xy()).all()
 
 
 def test_clock_tells_step_and_time(renderer):
     renderer.render(snapshot(step=7, time=21.0))
-    assert picture_of(renderer)._moving.clock.get_text() == "step 7/29   21.0 s"
+    assert scene_of(renderer)._moving.clock.get_text() == "step 7/29   21.0 s"
 
 
 @pytest.mark.parametrize("sensor", [{}, {"max_range": 5.0}])
@@ -200,7 +200,7 @@ def test_texts_stay_inside_the_figure_and_apart(sensor, walls):
     scenario = SIX.with_changes(sensor=sensor, walls=walls)
     renderer = WorldRenderer(scenario, LANDMARKS, "rgb_array")
     renderer.render(snapshot(belief=FixedBelief(), collision=True))
-    figure = picture_of(renderer)._figure
+    figure = scene_of(renderer)._figure
     legend = figure.legends[0].get_window_extent()
     assert figure.bbox.x0 <= legend.x0
     assert legend.x1 <= figure.bbox.x1
@@ -215,7 +215,7 @@ def test_texts_stay_inside_the_figure_and_apart(sensor, walls):
 
 def test_axes_are_in_metres_of_equal_length(renderer):
     renderer.render(snapshot())
-    axes = picture_of(renderer)._axes
+    axes = scene_of(renderer)._axes
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
     scale = axes.transData.transform([[0, 0], [1, 1]])
     assert np.ptp(scale, axis=0)[0] == pytest.approx(np.ptp(scale, axis=0)[1])
@@ -230,7 +230,7 @@ def inside(limits, points):
 
 def test_view_holds_landmarks_walls_start_and_planned_path():
     scenario = SIX.with_changes(walls=((-40.0, 3.0, -30.0, 3.0),))
-    limits = ViewLimits(scenario, LANDMARKS, aspect=1.0)
+    limits = AxesLimits(scenario, LANDMARKS, aspect=1.0)
     pose, path = np.array(scenario.start.pose), []
     for speed, rate in action_sequence(scenario):
         path.append(pose[:2].copy())
@@ -240,7 +240,7 @@ def test_view_holds_landmarks_walls_start_and_planned_path():
 
 
 def test_view_follows_a_robot_that_leaves_it_and_returns_with_the_episode():
-    limits = ViewLimits(SIX, LANDMARKS, aspect=1.2)
+    limits = AxesLimits(SIX, LANDMARKS, aspect=1.2)
     first = limits.x, limits.y
     assert not limits.follow(snapshot())
     assert limits.follow(snapshot((90.0, -20.0, 0.0)))
@@ -254,7 +254,7 @@ def test_view_follows_a_robot_that_leaves_it_and_returns_with_the_episode():
 def test_frame_after_leaving_the_view_shows_the_robot(renderer):
     renderer.render(snapshot())
     renderer.render(snapshot((90.0, -20.0, 0.0)))
-    picture = picture_of(renderer)
+    picture = scene_of(renderer)
     pixel = picture._axes.transData.transform([90.0, -20.0])
     assert picture._axes.bbox.contains(*pixel)
 
@@ -263,7 +263,7 @@ def test_world_of_one_point_has_a_view():
     scenario = SIX.with_changes(
         controls={"sequence": "commands", "commands": [(0.0, 0.0, 1)]}
     )
-    limits = ViewLimits(scenario, np.zeros((1, 2)), aspect=1.0)
+    limits = AxesLimits(scenario, np.zeros((1, 2)), aspect=1.0)
     assert np.ptp(limits.x) > 0
 
 
@@ -381,5 +381,5 @@ def test_arrays_are_rendered_without_pyplot():
 
 def test_ellipses_are_in_data_coordinates(renderer):
     renderer.render(snapshot())
-    shown = [a for a in picture_of(renderer).moving if isinstance(a, EllipseCollection)]
+    shown = [a for a in scene_of(renderer).moving if isinstance(a, EllipseCollection)]
     assert {artist._units for artist in shown} == {"xy"}

@@ -11,8 +11,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import FlattenObservation, RecordEpisodeStatistics
 
 import slamgym  # noqa: F401 (registers the environments)
+from slamgym.envs.vector import FlattenBatch
 from slamgym.envs.vector.landmark_world_vector import LandmarkWorldVectorEnv
-from slamgym.envs.vector.wrappers import FlattenBatch
 from slamgym.sim_configs import list_presets, load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from slamgym.envs.rendering.renderer import write_video
+from slamgym.envs.rendering import write_video
 
 
 def moving_square(count=5, size=(40, 60)):

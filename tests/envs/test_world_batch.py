@@ -10,7 +10,7 @@ from gymnasium.utils import seeding
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.robot.wall_contacts import WallContacts
-from slamgym.envs.vector.world_batch import WorldBatch
+from slamgym.envs.vector import WorldBatch
 from slamgym.sim_configs import list_presets, load_scenario
 
 WORLDS, STEPS, SEED = 5, 400, 11

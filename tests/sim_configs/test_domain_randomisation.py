@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.vector.world_batch import WorldBatch
+from slamgym.envs.vector import WorldBatch
 from slamgym.sim_configs import (
     ScenarioError,
     drawn_scenario,
