@@ -21,7 +21,7 @@ import xarray as xr
 from rich.console import Console
 from rich.table import Table
 
-from slamgym.evaluation.nees import average_band
+from slamgym.evaluation.chi_square import average_band
 from slamgym.experiments.monte_carlo import monte_carlo
 
 SCENARIOS = (

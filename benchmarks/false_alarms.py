@@ -12,16 +12,16 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from slamgym.evaluation.chi_square import average_band
 from slamgym.evaluation.hypothesis_tests import (
-    family_decision,
-    final_step_decision,
-    nis_decision,
-    whiteness_decision,
+    family_test,
+    final_step_test,
+    nis_test,
+    whiteness_test,
 )
-from slamgym.evaluation.nees import average_band
 from slamgym.evaluation.time_average_tests import (
-    bootstrap_decision,
-    time_average_decision,
+    bootstrap_test,
+    time_average_test,
 )
 
 Array = NDArray[np.float64]
@@ -59,20 +59,18 @@ def inside(nees: Array) -> float:
 
 def bootstrap(nees: Array, _: Array) -> bool:
     averages, rng = nees.mean(axis=1), np.random.default_rng(0)
-    return bootstrap_decision(averages, DOF, rng=rng, resamples=399).accepted
+    return bootstrap_test(averages, DOF, rng=rng, resamples=399).accepted
 
 
 DECISIONS: dict[str, Accepts] = {
-    "final step, χ²": lambda x, _: final_step_decision(x[:, -1], DOF).accepted,
-    "time averages, t": lambda x, _: (
-        time_average_decision(x.mean(axis=1), DOF).accepted
-    ),
+    "final step, χ²": lambda x, _: final_step_test(x[:, -1], DOF).accepted,
+    "time averages, t": lambda x, _: time_average_test(x.mean(axis=1), DOF).accepted,
     "time averages, bootstrap": bootstrap,
-    "grid of 10 steps, Holm": lambda x, _: family_decision(x[:, GRID], DOF).accepted,
-    "NIS pooled, χ²": lambda _, y: nis_decision(y, ONES).accepted,
-    "NIS whiteness, Ljung-Box": lambda _, y: whiteness_decision(y, ONES).accepted,
+    "grid of 10 steps, Holm": lambda x, _: family_test(x[:, GRID], DOF).accepted,
+    "NIS pooled, χ²": lambda _, y: nis_test(y, ONES).accepted,
+    "NIS whiteness, Ljung-Box": lambda _, y: whiteness_test(y, ONES).accepted,
     "not offered: NEES pooled over time": lambda x, _: (
-        final_step_decision(x.ravel(), DOF).accepted
+        final_step_test(x.ravel(), DOF).accepted
     ),
     "not offered: 95 % of steps inside the band": lambda x, _: inside(x) >= 0.95,
     "not offered: all steps inside the band": lambda x, _: inside(x) == 1.0,

@@ -24,7 +24,8 @@ from slamgym.estimator import (
     SparseInformationSlam,
     SubmapSlam,
 )
-from slamgym.evaluation.nees import average_band, pose_nees
+from slamgym.evaluation.chi_square import average_band
+from slamgym.evaluation.nees import pose_nees
 from slamgym.experiments.figures.style import (
     GREY,
     PALE,

@@ -1,9 +1,11 @@
-"""Is a filter consistent?  The decisions on many runs, in words and with error rates.
+"""The tests on many runs of one filter, collected in a report.
 
-NEES pooled over time is not offered: the errors of successive steps are correlated, so
-their sum is not chi-square, and a consistent filter is refused far more often than
-stated.  Here only independent numbers are added: one per run, or innovations.
+No test pools NEES over time: the errors of successive steps are correlated, so their
+sum is not chi-square, and such a test rejects a consistent filter far more often than
+stated.  Every sum here is over independent numbers: one per run, or innovations.
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
@@ -14,27 +16,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..estimator.error_frames import ErrorFrame
 from ..estimator.support import argument_checks
+from .chi_square import Array
 from .hypothesis_tests import (
-    Decision,
-    FamilyDecision,
-    family_decision,
-    final_step_decision,
-    nis_decision,
+    FamilyTest,
+    HypothesisTest,
+    family_test,
+    final_step_test,
+    nis_test,
     runs_to_detect,
-    whiteness_decision,
+    whiteness_test,
 )
-from .nees import Array
 from .time_average_tests import (
     EQUIVALENCE_MARGIN,
-    Equivalence,
-    bootstrap_decision,
-    equivalence_decision,
-    time_average_decision,
+    EquivalenceTest,
+    bootstrap_test,
+    equivalence_test,
+    time_average_test,
 )
 
 FEW_RUNS = 20
+"""Number of runs below which the report warns that little can be shown."""
 FEW_AVERAGES = 10
-"""Runs below which the t-test refuses too often to share the 5 %, and has no say."""
+"""Number of runs below which the t-test rejects too often to count in the verdict."""
 FACTORS = (1.1, 1.2, 1.5)
 _GRID = 10
 _LAGS = 10
@@ -42,63 +45,77 @@ _ERROR_RATE = 0.05
 _MOST_NAMES = 10
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ConsistencyReport:
-    """What many runs say about a filter; made by :func:`consistency_report`.
+    """Results of all tests on many runs of a filter; see :func:`evaluate_consistency`.
 
-    Ratios are NEES divided by its degrees of freedom, 1 for a consistent filter.
+    A ratio is NEES divided by its degrees of freedom, 1 for a consistent filter.
+    ``str(report)`` gives one sentence per test.
     """
 
     frame: str
     """Error coordinates of the NEES."""
     degrees_of_freedom: int
     runs: int
-    """All of them, failed ones included."""
+    """Number of runs, failed ones included."""
     failed_runs: tuple[int, ...]
-    """Rows that hold nan where NEES or NIS should be; no decision counts them."""
+    """Rows with nan in place of a NEES or NIS; no test counts them."""
     undefined_steps: int
     """Leading steps at which no run has a NEES, as at a start known for certain."""
-    final_step: Decision
-    time_average: Decision
-    bootstrap: Decision
-    family: FamilyDecision
+    final_step: HypothesisTest
+    time_average: HypothesisTest
+    bootstrap: HypothesisTest
+    family: FamilyTest
     family_steps: NDArray[np.int64]
     """Steps of the grid of ``family``."""
-    nis: Decision
-    whiteness: Decision
-    equivalence: Equivalence
+    nis: HypothesisTest
+    whiteness: HypothesisTest
+    equivalence: EquivalenceTest
     mean_ratio: float
-    """Of the runs' time averages."""
+    """Mean of the runs' time averages."""
     median_ratio: float
+    """Median of the runs' time averages."""
     share_above_3: float
     """Share of the runs whose time average is above 3."""
     runs_needed: tuple[tuple[float, int], ...]
-    """(factor, runs with which the final step finds it in 90 % of cases)."""
+    """(factor, number of runs with which the final step finds it in 90 % of cases)."""
+
+    def __repr__(self) -> str:
+        return (
+            f"<ConsistencyReport: {_outcome(self.accepted)}, {self.runs} runs, "
+            f"{self.frame} frame, mean NEES ratio {self.mean_ratio:.3f}>"
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences())
 
     @property
     def accepted(self) -> bool:
-        """Whether no run failed and no NEES decision refuses, wrongly 5 % at most.
+        """Whether no run failed and no NEES test rejects.
 
-        Final step, time averages and grid share the 5 %, after Bonferroni; below 10
-        runs, the time averages, whose test is not exact, have no say.  NIS is left out:
-        pooled over 10⁵ scans it refuses departures of a few thousandths, which say
-        nothing about the errors; so is the bootstrap, which repeats the t-test.
+        A consistent filter is rejected in at most 5 % of cases.
+
+        The final step, the time averages and the grid share the 5 % (Bonferroni).
+        Below 10 runs the time averages do not count, because their test is not exact.
+        NIS does not count: pooled over 10⁵ scans it rejects deviations of a few
+        thousandths, which say nothing about the errors.  The bootstrap does not count,
+        because it repeats the t-test.
         """
         p = (self.final_step.p_value, self.average_p_value, self.family.p_value)
         return not self.failed_runs and min(p) * len(p) >= _ERROR_RATE
 
     @property
     def used_runs(self) -> int:
-        """Runs that did not fail."""
+        """Number of runs that did not fail."""
         return self.runs - len(self.failed_runs)
 
     @property
     def average_p_value(self) -> float:
-        """The time averages' p as `accepted` counts it: 1 below 10 runs."""
+        """p-value of the time averages that `accepted` uses: 1 below 10 runs."""
         return 1.0 if self.used_runs < FEW_AVERAGES else self.time_average.p_value
 
     def warnings(self) -> tuple[str, ...]:
-        """Say what weakens the report: failed runs, few runs."""
+        """Return what weakens the report: failed runs, few runs."""
         found = []
         if self.failed_runs:
             count = len(self.failed_runs)
@@ -115,36 +132,32 @@ class ConsistencyReport:
         return tuple(found)
 
     def sentences(self) -> tuple[str, ...]:
-        """Say each decision in a sentence with its error rate, warnings first."""
-        grid, verdict = self.family, self.equivalence
+        """Return the warnings, then one sentence per test with its error rate."""
+        frame, grid, near = f"{self.frame} frame", self.family, self.equivalence
         low, high = EQUIVALENCE_MARGIN
         needed = ", ".join(f"{factor:g}: {runs}" for factor, runs in self.runs_needed)
         return (
             *self.warnings(),
-            _sentence(f"Final step, {self.frame} frame, χ²", "ratio", self.final_step),
-            _sentence(
-                f"Time averages, {self.frame} frame, t", "ratio", self.time_average
-            ),
-            _sentence(
-                f"Time averages, {self.frame} frame, bootstrap", "ratio", self.bootstrap
-            ),
-            f"Grid of {len(grid.statistic)} steps, {self.frame} frame, Holm: "
-            f"{grid.rejected.sum()} refused; band [{grid.interval.low:.3f}, "
-            f"{grid.interval.high:.3f}]: {_word(grid.accepted)} "
-            f"(refuses a consistent filter in at most {grid.error_rate:.0%}).",
+            _sentence(f"Final step, {frame}, χ²", "ratio", self.final_step),
+            _sentence(f"Time averages, {frame}, t", "ratio", self.time_average),
+            _sentence(f"Time averages, {frame}, bootstrap", "ratio", self.bootstrap),
+            f"Grid of {len(grid.statistic)} steps, {frame}, Holm: "
+            f"{grid.rejected.sum()} rejected; band [{grid.interval.low:.3f}, "
+            f"{grid.interval.high:.3f}]: {_outcome(grid.accepted)} "
+            f"(rejects a consistent filter in at most {grid.error_rate:.0%}).",
             _sentence("NIS over all scans, χ²", "ratio", self.nis),
             _sentence("NIS whiteness, Ljung-Box", "Q", self.whiteness),
-            f"Equivalence, {self.frame} frame: the 90 % interval of the ratio is "
-            f"[{verdict.interval.low:.3f}, {verdict.interval.high:.3f}]; inside "
-            f"[{low:g}, {high:g}]: {verdict.verdict} (claims consistency wrongly in at "
-            f"most {verdict.error_rate:.0%}).",
-            f"Per-run ratios, {self.frame} frame: mean {self.mean_ratio:.3f}, median "
+            f"Equivalence, {frame}: the 90 % interval of the ratio is "
+            f"[{near.interval.low:.3f}, {near.interval.high:.3f}]; inside "
+            f"[{low:g}, {high:g}]: {near.verdict} (claims consistency wrongly in at "
+            f"most {near.error_rate:.0%}).",
+            f"Per-run ratios, {frame}: mean {self.mean_ratio:.3f}, median "
             f"{self.median_ratio:.3f}, {self.share_above_3:.1%} of the runs above 3.",
             f"Runs that find covariances too small by a factor in 90 %: {needed}.",
         )
 
 
-def consistency_report(
+def evaluate_consistency(
     nees: ArrayLike,
     nis: ArrayLike,
     nis_dof: ArrayLike,
@@ -153,26 +166,26 @@ def consistency_report(
     frame: ErrorFrame,
     rng: np.random.Generator,
 ) -> ConsistencyReport:
-    """Decide on many independent runs of a filter.
+    """Test on many independent runs whether a filter is consistent.
 
     Parameters
     ----------
     nees : array_like, shape (runs, steps)
-        Not divided by ``dof``; nan where a run failed, and at leading steps at which no
-        run has one.
+        Not divided by ``dof``; nan from the step at which a run failed, and at leading
+        steps at which no run has a NEES.
     nis, nis_dof : array_like, shape (runs, steps)
-        NIS of each scan and its degrees of freedom, 0 where nothing was corrected.
+        NIS of each scan and its degrees of freedom, 0 if the scan corrected nothing.
     dof : int
         Degrees of freedom of one NEES.
     frame : {"additive", "invariant"}
-        Error coordinates in which the NEES was taken.
+        Error coordinates of the NEES.
     rng : numpy.random.Generator
         Draws the bootstrap.
 
     Raises
     ------
     ValueError
-        Where shapes do not fit, or fewer than 2 runs did not fail.
+        If shapes do not fit, or if fewer than 2 runs did not fail.
     """
     argument_checks.one_of("frame", frame, ("additive", "invariant"))
     scores, scans, freedom = _same_shape(nees, nis, nis_dof)
@@ -187,16 +200,14 @@ def consistency_report(
         runs=len(failed),
         failed_runs=tuple(np.flatnonzero(failed).tolist()),
         undefined_steps=first,
-        final_step=final_step_decision(scores[:, -1], dof),
-        time_average=time_average_decision(averages, dof),
-        bootstrap=bootstrap_decision(averages, dof, rng=rng),
-        family=family_decision(scores[:, grid], dof),
+        final_step=final_step_test(scores[:, -1], dof),
+        time_average=time_average_test(averages, dof),
+        bootstrap=bootstrap_test(averages, dof, rng=rng),
+        family=family_test(scores[:, grid], dof),
         family_steps=grid + first,
-        nis=nis_decision(scans, freedom),
-        whiteness=whiteness_decision(
-            scans, freedom, lags=min(_LAGS, scans.shape[1] - 1)
-        ),
-        equivalence=equivalence_decision(averages, dof),
+        nis=nis_test(scans, freedom),
+        whiteness=whiteness_test(scans, freedom, lags=min(_LAGS, scans.shape[1] - 1)),
+        equivalence=equivalence_test(averages, dof),
         mean_ratio=float(averages.mean() / dof),
         median_ratio=float(np.median(averages) / dof),
         share_above_3=float(np.mean(averages > 3 * dof)),
@@ -205,13 +216,13 @@ def consistency_report(
 
 
 def assert_consistent(report: ConsistencyReport) -> None:
-    """Raise AssertionError, with the report's sentences, unless it is accepted.
+    """Raise AssertionError with the report's sentences unless the report accepts.
 
-    A consistent filter is refused in at most 5 % of cases; with a fixed seed the
+    The call rejects a consistent filter in at most 5 % of cases.  With a fixed seed the
     outcome is always the same.
     """
     if not report.accepted:
-        raise AssertionError("not consistent\n" + "\n".join(report.sentences()))
+        raise AssertionError(f"not consistent\n{report}")
 
 
 @cache
@@ -254,20 +265,17 @@ def _gaps(
     return first, failed
 
 
-def _sentence(title: str, name: str, decision: Decision) -> str:
-    low, high = decision.interval
-    if np.isnan(decision.p_value):
-        return (
-            f"{title}: {name} {decision.statistic:.3f}, nothing decided: too few runs, "
-            "or all equal."
-        )
+def _sentence(title: str, name: str, test: HypothesisTest) -> str:
+    found = f"{title}: {name} {test.statistic:.3f}"
+    if np.isnan(test.p_value):
+        return f"{found}, nothing decided: too few runs, or all equal."
+    low, high = test.interval
     return (
-        f"{title}: {name} {decision.statistic:.3f}, accepted within "
-        f"[{low:.3f}, {high:.3f}], p = {decision.p_value:.2g}: "
-        f"{_word(decision.accepted)} "
-        f"(refuses a consistent filter in {decision.error_rate:.0%})."
+        f"{found}, accepted within [{low:.3f}, {high:.3f}], p = {test.p_value:.2g}: "
+        f"{_outcome(test.accepted)} "
+        f"(rejects a consistent filter in {test.error_rate:.0%})."
     )
 
 
-def _word(accepted: bool) -> str:
-    return "accepted" if accepted else "refused"
+def _outcome(accepted: bool) -> str:
+    return "accepted" if accepted else "rejected"

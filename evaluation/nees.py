@@ -1,18 +1,17 @@
-"""Is a filter as good as it says?  NEES of poses, headings and maps; NIS; their bands.
+"""NEES of poses, headings, landmarks and maps.
 
-NEES = eᵀ P⁻¹ e of an error e with claimed covariance P: chi-square with as many degrees
-of freedom as e has entries, if the claim is true.  Averages over runs (ANEES) are not
-divided by the dimension unless the name says so.  The frame of an error, additive or
-invariant (:mod:`.error_frames`), is always named: where the heading is uncertain the
-additive NEES rejects even the right filter.
+NEES = eᵀ P⁻¹ e of an error e with claimed covariance P.  If the claim is true, NEES is
+chi-square with as many degrees of freedom as e has entries.  Averages over runs (ANEES)
+are not divided by the dimension unless the name says so.  Every function names the
+frame of its error, additive or invariant (:mod:`slamgym.estimator.error_frames`),
+because the additive NEES rejects even the right filter if the heading is uncertain.
 """
 
-from typing import NamedTuple
+from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dtrtrs
-from scipy.stats import chi2
 
 from ..estimator.error_frames import (
     ErrorFrame,
@@ -24,23 +23,9 @@ from ..estimator.error_frames import (
 Array = NDArray[np.float64]
 
 SINGULAR = 1e-10
-"""A variance, given the entries before it, that counts as zero beside its own."""
+"""Conditional variance, as a share of the variance, below which it counts as zero."""
 
-_FEW = 4  # so small covariances are factored side by side
-
-
-class LjungBox(NamedTuple):
-    """Test of whiteness."""
-
-    statistic: float
-    p_value: float
-
-
-class Band(NamedTuple):
-    """Interval in which an average lies with the stated probability."""
-
-    low: float
-    high: float
+_FEW = 4  # up to this size, all covariances are factored together
 
 
 def normalised_squared_error(errors: Array, covariances: Array) -> Array:
@@ -160,13 +145,13 @@ def landmark_nees(
 
 
 def relative_map_nees(true_states: Array, means: Array, covariances: Array) -> Array:
-    """Return the NEES of the map as the robot sees it, 2n degrees of freedom.
+    """Return the NEES of the map in the robot's frame, 2n degrees of freedom.
 
     ::
 
         m = R(θ)ᵀ (l − p),   ∂m/∂θ = −J m,   J = [0 −1; 1 0]
 
-    The frame is the robot's own, which no turn or shift of the whole world changes.
+    A rotation or translation of the whole world does not change this NEES.
 
     Parameters
     ----------
@@ -177,8 +162,8 @@ def relative_map_nees(true_states: Array, means: Array, covariances: Array) -> A
     -------
     ndarray, shape (...)
     """
-    seen = _seen_from_robot(means)
-    errors = _seen_from_robot(true_states) - seen
+    local = _landmarks_from_robot(means)
+    errors = _landmarks_from_robot(true_states) - local
     n = errors.shape[-1] // 2
     cos, sin = np.cos(means[..., 2]), np.sin(means[..., 2])
     turn = np.stack([cos, sin, -sin, cos], axis=-1).reshape(*cos.shape, 2, 2)
@@ -186,99 +171,17 @@ def relative_map_nees(true_states: Array, means: Array, covariances: Array) -> A
     for row in range(0, 2 * n, 2):
         jacobian[..., row : row + 2, :2] = -turn
         jacobian[..., row : row + 2, 3 + row : 5 + row] = turn
-    jacobian[..., 0::2, 2] = seen[..., 1::2]
-    jacobian[..., 1::2, 2] = -seen[..., 0::2]
+    jacobian[..., 0::2, 2] = local[..., 1::2]
+    jacobian[..., 1::2, 2] = -local[..., 0::2]
     claimed = jacobian @ covariances @ np.swapaxes(jacobian, -1, -2)
     return normalised_squared_error(errors, claimed)
-
-
-def autocorrelation(series: Array, *, lags: int) -> tuple[Array, Array]:
-    """Return the autocorrelations of several runs together, and their pairs.
-
-    Parameters
-    ----------
-    series : ndarray, shape (runs, steps)
-        One standardised number per step, nan where there is none.
-    lags : int
-        Largest lag, < steps.
-
-    Returns
-    -------
-    correlations, pairs : ndarray, shape (lags,)
-        At lags 1 … ``lags``, and the number of pairs each is made of.
-    """
-    known = np.isfinite(series)
-    centred = np.where(known, series - np.mean(series[known]), 0.0)
-    power = (centred**2).sum() / known.sum()
-    pairs = np.array(
-        [(known[:, k:] & known[:, :-k]).sum() for k in range(1, lags + 1)], dtype=float
-    )
-    sums = np.array(
-        [(centred[:, k:] * centred[:, :-k]).sum() for k in range(1, lags + 1)]
-    )
-    return sums / np.maximum(pairs, 1) / power, pairs
-
-
-def ljung_box(series: Array, *, lags: int = 10) -> LjungBox:
-    """Test whether several runs of a standardised series are white.
-
-    ::
-
-        Q = Σₖ Nₖ rₖ²,   rₖ the autocorrelation at lag k of Nₖ pairs:  χ²(lags)
-
-    Parameters
-    ----------
-    series : ndarray, shape (runs, steps)
-        One standardised number per step, nan where there is none.
-    lags : int
-        Largest lag, in [1, steps).
-
-    Returns
-    -------
-    LjungBox
-
-    Raises
-    ------
-    ValueError
-        Where there are fewer steps than lags.
-    """
-    if not 1 <= lags < series.shape[-1]:
-        raise ValueError(f"lags must be in [1, {series.shape[-1]}), got {lags}")
-    correlations, pairs = autocorrelation(series, lags=lags)
-    statistic = float((pairs * correlations**2).sum())
-    return LjungBox(statistic, float(chi2.sf(statistic, lags)))
-
-
-def average_band(
-    runs: int, degrees_of_freedom: int, *, probability: float = 0.95
-) -> Band:
-    """Return the interval of the average of ``runs`` chi-squares, two-sided.
-
-    Parameters
-    ----------
-    runs, degrees_of_freedom : int
-        M and n: M times the average is chi-square with M n degrees of freedom.
-    probability : float
-        Of lying inside.
-
-    Examples
-    --------
-    Bailey's 50 runs of a pose:
-
-    >>> average_band(50, 3)
-    Band(low=2.359..., high=3.716...)
-    """
-    tail = (1 - probability) / 2
-    freedom = runs * degrees_of_freedom
-    low, high = chi2.ppf([tail, 1 - tail], freedom) / runs
-    return Band(float(low), float(high))
 
 
 def _whiten_few(errors: Array, correlations: Array) -> Array:
     """Solve L w = e, C = L Lᵀ, entry by entry over all leading axes at once.
 
-    Each entry costs a few operations on whole arrays, which have the same bits whatever
-    stands beside it.
+    Each entry costs a few operations on whole arrays.  The result for one covariance
+    does not depend on the others, to the bit.
     """
     n = errors.shape[-1]
     white = np.empty(errors.shape)
@@ -300,7 +203,7 @@ def _whiten_few(errors: Array, correlations: Array) -> Array:
 
 
 def _whiten_each(errors: Array, correlations: Array) -> Array:
-    """Solve L w = e, C = L Lᵀ, one after the other; nan where C is singular."""
+    """Solve L w = e, C = L Lᵀ, one by one; nan where C is singular."""
     n = errors.shape[-1]
     white = np.full((errors[..., 0].size, n), np.nan)
     pairs = zip(errors.reshape(-1, n), correlations.reshape(-1, n, n), strict=True)
@@ -315,15 +218,15 @@ def _whiten_each(errors: Array, correlations: Array) -> Array:
 def _in_frame(
     true_states: Array, means: Array, covariances: Array, frame: ErrorFrame
 ) -> tuple[Array, Array]:
-    """Errors and their claimed covariances in a named frame."""
+    """Return errors and their claimed covariances in a named frame."""
     if frame == "invariant":
         errors = invariant_error(true_states, means)
         return errors, invariant_covariance(means, covariances)
     return additive_error(true_states, means), covariances
 
 
-def _seen_from_robot(states: Array) -> Array:
-    """Landmarks in the robot's frame, shape (..., 2n)."""
+def _landmarks_from_robot(states: Array) -> Array:
+    """Return the landmarks in the robot's frame, shape (..., 2n)."""
     dx, dy = states[..., 3::2] - states[..., :1], states[..., 4::2] - states[..., 1:2]
     cos, sin = np.cos(states[..., 2:3]), np.sin(states[..., 2:3])
     pairs = np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)

@@ -1,46 +1,53 @@
-"""Decisions on the time average of each run's NEES, one independent number per run.
+"""Tests of the time average of each run's NEES: one independent number per run.
 
-The averages are skewed where NEES is correlated over time, so the t-test and the
-interval are corrected for skewness, by the monotone cubic of [1]_.
+If NEES is correlated over time, the averages are skewed.  The t-test and its interval
+are therefore corrected for skewness by the monotone cubic of [1]_.
 
 References
 ----------
 .. [1] P. Hall, On the removal of skewness by transformation, JRSS B 54(1), 1992.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import t as student
 
-from .hypothesis_tests import Decision, one_per_run, to_band
-from .nees import Array, Band
+from .chi_square import Array, Band, to_band
+from .hypothesis_tests import HypothesisTest, one_per_run
 
 EQUIVALENCE_MARGIN = Band(0.8, 1.25)
 FEWEST_RESAMPLED = 5
-"""Runs below which there are too few different resamples for a bootstrap."""
+"""Smallest number of runs with enough different resamples for a bootstrap."""
 
 
-class Equivalence(NamedTuple):
-    """Whether the ratio is shown to be near 1."""
+class EquivalenceTest(NamedTuple):
+    """Result of a test that shows a ratio to be near 1."""
 
     statistic: float
     interval: Band
     """90 % confidence interval of the ratio."""
     verdict: str
     """"consistent", "not consistent" or "not shown"."""
-    accepted: bool
     error_rate: float
     """Probability of "consistent" for a filter at or beyond the margin."""
 
+    @property
+    def accepted(self) -> bool:
+        """Whether the ratio is shown to be near 1."""
+        return self.verdict == "consistent"
 
-def time_average_decision(
+
+def time_average_test(
     averages: Array, degrees_of_freedom: int, *, error_rate: float = 0.05
-) -> Decision:
-    """Decide on the per-run time averages of NEES by a t-test of their mean.
+) -> HypothesisTest:
+    """Test the mean of the per-run time averages of NEES by a t-test.
 
-    Where NEES hardly changes over time the plain t-test refuses 8 % at 10 runs and
-    7.5 % at 20 instead of 5 %; corrected for skewness it refuses 5 to 6 %.
+    If NEES hardly changes over time, the plain t-test rejects 8 % of consistent filters
+    at 10 runs and 7.5 % at 20 runs instead of 5 %.  With the correction for skewness it
+    rejects 5 to 6 %.
 
     Parameters
     ----------
@@ -49,7 +56,7 @@ def time_average_decision(
     degrees_of_freedom : int
         n of one NEES.
     error_rate : float
-        Probability of refusing a consistent filter.
+        Probability of rejecting a consistent filter.
     """
     ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
     mean, error = _mean_and_error(ratios)
@@ -58,37 +65,38 @@ def time_average_decision(
     limit = student.ppf(1 - error_rate / 2, runs - 1)
     ends = 1 + error * _skew(np.array([-limit, limit]), skewness, runs)
     p_value = float(2 * student.sf(abs(score), runs - 1))
-    return Decision(mean, to_band(ends), p_value, p_value >= error_rate, error_rate)
+    return HypothesisTest(mean, to_band(ends), p_value, error_rate)
 
 
-def bootstrap_decision(
+def bootstrap_test(
     averages: Array,
     degrees_of_freedom: int,
     *,
     rng: np.random.Generator,
     resamples: int = 1999,
     error_rate: float = 0.05,
-) -> Decision:
-    """Decide on the per-run time averages by the studentised bootstrap.
+) -> HypothesisTest:
+    """Test the mean of the per-run time averages by the studentised bootstrap.
 
-    The percentile bootstrap would refuse 9 to 11 % of 50 to 20 runs where NEES hardly
-    changes over time.  Resamples of one run only, which have no spread to divide by,
-    are left out.  Below 5 runs, or where all averages are equal, nothing is decided:
-    the p-value is nan, and any mean is accepted.
+    If NEES hardly changes over time, the percentile bootstrap would reject 9 % of
+    consistent filters at 50 runs and 11 % at 20.  Resamples that repeat a single run
+    have no spread to divide by and are left out.  With fewer than 5 runs, or if all
+    averages are equal, the test cannot decide: its p-value is nan, and it accepts any
+    mean.
 
     Parameters
     ----------
     averages, degrees_of_freedom, error_rate
-        As in :func:`time_average_decision`.
+        As in :func:`time_average_test`.
     rng : numpy.random.Generator
         Draws the resamples.
     resamples : int
-        How many.
+        Number of resamples.
     """
     ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
     mean, error = _mean_and_error(ratios)
     if len(ratios) < FEWEST_RESAMPLED or np.ptp(ratios) == 0:
-        return Decision(mean, Band(-np.inf, np.inf), np.nan, True, error_rate)
+        return HypothesisTest(mean, Band(-np.inf, np.inf), np.nan, error_rate)
     drawn = ratios[rng.integers(0, len(ratios), (resamples, len(ratios)))]
     drawn = drawn[np.ptp(drawn, axis=1) > 0]
     errors = drawn.std(axis=1, ddof=1) / np.sqrt(len(ratios))
@@ -98,20 +106,21 @@ def bootstrap_decision(
     above = len(scores) - np.searchsorted(scores, score, "left")
     p_value = min(1.0, 2 * (1 + min(below, above)) / (len(scores) + 1))
     ends = 1 + error * np.quantile(scores, [error_rate / 2, 1 - error_rate / 2])
-    return Decision(mean, to_band(ends), p_value, p_value >= error_rate, error_rate)
+    return HypothesisTest(mean, to_band(ends), p_value, error_rate)
 
 
-def equivalence_decision(
+def equivalence_test(
     averages: Array, degrees_of_freedom: int, *, error_rate: float = 0.05
-) -> Equivalence:
-    """Decide whether the mean ratio is shown to lie inside [.8, 1.25].
+) -> EquivalenceTest:
+    """Test whether the mean ratio is shown to lie inside [.8, 1.25].
 
     Parameters
     ----------
     averages, degrees_of_freedom
-        As in :func:`time_average_decision`, whose interval this uses.
+        As in :func:`time_average_test`, whose interval this uses.
     error_rate : float
-        Of claiming consistency at the margin; the interval has twice as much outside.
+        Probability of claiming consistency at the margin.  The interval leaves out
+        twice this probability.
     """
     ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
     mean, error = _mean_and_error(ratios)
@@ -124,7 +133,7 @@ def equivalence_decision(
         verdict = "consistent"
     elif interval.high < low or interval.low > high:
         verdict = "not consistent"
-    return Equivalence(mean, interval, verdict, verdict == "consistent", error_rate)
+    return EquivalenceTest(mean, interval, verdict, error_rate)
 
 
 def _mean_and_error(values: Array) -> tuple[float, float]:
@@ -144,7 +153,7 @@ def _unskew(score: float, skewness: float, runs: int) -> float:
 
 
 def _skew(scores: Array, skewness: float, runs: int) -> Array:
-    """Undo :func:`_unskew`."""
+    """Return the inverse of :func:`_unskew`."""
     c = skewness / np.sqrt(runs)
     if abs(c) < 1e-9:
         return scores

@@ -9,12 +9,8 @@ from slamgym.estimator.error_frames import (
     invariant_covariance,
     invariant_error,
 )
-from slamgym.evaluation.nees import (
-    average_band,
-    heading_nees,
-    normalised_squared_error,
-    pose_nees,
-)
+from slamgym.evaluation.chi_square import average_band
+from slamgym.evaluation.nees import heading_nees, normalised_squared_error, pose_nees
 
 MEAN = np.array([1.0, -2.0, 0.7, 3.0, 4.0, -5.0, 2.0])
 TRUTH = np.array([1.3, -1.5, 1.2, 2.0, 4.5, -5.5, 1.0])

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from linear_filter import kalman_scores
 
-from slamgym.evaluation.consistency_report import assert_consistent, consistency_report
+from slamgym.evaluation.consistency_report import (
+    assert_consistent,
+    evaluate_consistency,
+)
 
 RUNS, STEPS = 100, 40
 
@@ -17,7 +20,7 @@ def scores():
 
 def report(nees, nis, nis_dof, frame="invariant"):
     rng = np.random.default_rng(0)
-    return consistency_report(nees, nis, nis_dof, frame=frame, rng=rng)
+    return evaluate_consistency(nees, nis, nis_dof, frame=frame, rng=rng)
 
 
 def test_a_consistent_filter_passes(scores):
@@ -105,6 +108,12 @@ def test_every_nees_sentence_names_the_frame(scores):
     lines = report(*scores, frame="additive").sentences()
     assert sum("additive frame" in line for line in lines) == 6
     assert lines[-1].endswith("1.1: 767, 1.2: 209, 1.5: 42.")
+
+
+def test_the_report_is_short_in_repr_and_whole_as_text(scores):
+    found = report(*scores)
+    assert repr(found).startswith("<ConsistencyReport: accepted, 100 runs, invariant")
+    assert str(found).splitlines() == list(found.sentences())
 
 
 def test_mean_median_and_share_are_those_of_the_runs(scores):

@@ -12,8 +12,8 @@ from monte_carlo_dataset import FILTERS, typical, with_failures
 from rich.console import Console
 from scipy.stats import chi2
 
-from slamgym.evaluation.consistency_report import consistency_report
-from slamgym.evaluation.hypothesis_tests import family_band
+from slamgym.evaluation.chi_square import family_band
+from slamgym.evaluation.consistency_report import evaluate_consistency
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES
 from slamgym.experiments.monte_carlo.report.estimator_lines import look_of, thinned
@@ -59,7 +59,7 @@ def white_report(factor, runs, steps=20, outliers=0):
     nees[:outliers] *= 50
     dof = np.full((runs, steps), 2)
     nis = rng.chisquare(2, (runs, steps))
-    return consistency_report(nees, nis, dof, frame="invariant", rng=rng)
+    return evaluate_consistency(nees, nis, dof, frame="invariant", rng=rng)
 
 
 def test_the_fixture_has_the_runners_schema():
@@ -181,7 +181,7 @@ def test_few_runs_of_a_consistent_filter_are_called_wrong_in_5_percent(runs):
     for _ in range(repetitions):
         nees = np.repeat(rng.chisquare(3, (runs, 1)), 4, axis=1)
         nis = rng.chisquare(2, (runs, 4))
-        report = consistency_report(nees, nis, dof, frame="invariant", rng=rng)
+        report = evaluate_consistency(nees, nis, dof, frame="invariant", rng=rng)
         found = judge(report, 0, runs).word == "not consistent"
         assert not (found and report.accepted)
         wrong += found

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from ....evaluation.consistency_report import ConsistencyReport
-from ....evaluation.hypothesis_tests import Decision
+from ....evaluation.hypothesis_tests import HypothesisTest
 from ....evaluation.time_average_tests import EQUIVALENCE_MARGIN
 from ...runs.nan_statistics import finite
 
@@ -50,7 +50,7 @@ def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
     }
 
 
-def _decision(decision: Decision) -> dict[str, Any]:
+def _decision(decision: HypothesisTest) -> dict[str, Any]:
     decided = not math.isnan(decision.p_value)
     return {
         "statistic": finite(decision.statistic),

@@ -8,8 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ....estimator.error_frames import ErrorFrame
-from ....evaluation.hypothesis_tests import family_band
-from ....evaluation.nees import average_band
+from ....evaluation.chi_square import average_band, family_band
 from ...figures.style import GREY, INK, dress, new_figure
 from .estimator_lines import (
     EstimatorLook,

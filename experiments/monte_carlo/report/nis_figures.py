@@ -6,8 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.stats import chi2
 
-from ....evaluation.hypothesis_tests import normal_scores
-from ....evaluation.nees import autocorrelation
+from ....evaluation.whiteness import autocorrelation, normal_scores
 from ...figures.style import GREY, dress, new_figure
 from .estimator_lines import EstimatorLook, legend_above, plain
 from .scores import Array, EstimatorScores

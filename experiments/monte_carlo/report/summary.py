@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 
 from ....estimator.error_frames import ErrorFrame
-from ....evaluation.consistency_report import ConsistencyReport, consistency_report
-from ....evaluation.nees import average_band
+from ....evaluation.chi_square import average_band
+from ....evaluation.consistency_report import ConsistencyReport, evaluate_consistency
 from ...runs.nan_statistics import finite, mean, quotient, root_mean_square
 from .decision_entries import decisions_table
 from .scores import (
@@ -205,7 +205,7 @@ def _decide(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport | N
 def _report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
     nees = scores.results[f"pose_nees_{frame}"].values[:, 1:].copy()
     nees[~scores.good] = np.nan
-    return consistency_report(
+    return evaluate_consistency(
         nees,
         scores.results["nis"].values[:, 1:],
         scores.results["nis_dof"].values[:, 1:],

@@ -5,21 +5,20 @@ import pytest
 from linear_filter import kalman_scores
 from scipy.stats import chi2, norm
 
+from slamgym.evaluation.chi_square import average_band, family_band
 from slamgym.evaluation.hypothesis_tests import (
-    family_band,
-    family_decision,
-    final_step_decision,
-    nis_decision,
-    normal_scores,
+    family_test,
+    final_step_test,
+    nis_test,
     runs_to_detect,
-    whiteness_decision,
+    whiteness_test,
 )
-from slamgym.evaluation.nees import average_band, ljung_box
 from slamgym.evaluation.time_average_tests import (
-    bootstrap_decision,
-    equivalence_decision,
-    time_average_decision,
+    bootstrap_test,
+    equivalence_test,
+    time_average_test,
 )
+from slamgym.evaluation.whiteness import ljung_box, normal_scores
 
 REPETITIONS, RUNS, STEPS, DOF = 2000, 50, 60, 3
 GRID = np.arange(STEPS // 10, STEPS + 1, STEPS // 10) - 1
@@ -35,17 +34,17 @@ def repetitions():
 
 def bootstrap(nees):
     rng = np.random.default_rng(2)
-    return bootstrap_decision(nees.mean(axis=1), DOF, rng=rng, resamples=399)
+    return bootstrap_test(nees.mean(axis=1), DOF, rng=rng, resamples=399)
 
 
 ONES = np.ones((RUNS, STEPS), dtype=np.int64)
 DECISIONS = {
-    "final step": lambda nees, _: final_step_decision(nees[:, -1], DOF),
-    "time average": lambda nees, _: time_average_decision(nees.mean(axis=1), DOF),
+    "final step": lambda nees, _: final_step_test(nees[:, -1], DOF),
+    "time average": lambda nees, _: time_average_test(nees.mean(axis=1), DOF),
     "bootstrap": lambda nees, _: bootstrap(nees),
-    "family": lambda nees, _: family_decision(nees[:, GRID], DOF),
-    "nis": lambda _, nis: nis_decision(nis, ONES),
-    "whiteness": lambda _, nis: whiteness_decision(nis, ONES),
+    "family": lambda nees, _: family_test(nees[:, GRID], DOF),
+    "nis": lambda _, nis: nis_test(nis, ONES),
+    "whiteness": lambda _, nis: whiteness_test(nis, ONES),
 }
 
 
@@ -61,7 +60,7 @@ def test_averages_of_a_filter_that_never_forgets_are_refused_as_often(runs):
     """One χ²(3) per run, the most skewed case; the plain t-test refuses 8 %."""
     rng = np.random.default_rng(3)
     averages = rng.chisquare(DOF, (REPETITIONS, runs))
-    refused = [not time_average_decision(row, DOF).accepted for row in averages]
+    refused = [not time_average_test(row, DOF).accepted for row in averages]
     assert 0.035 <= np.mean(refused) <= 0.07
 
 
@@ -69,7 +68,7 @@ def test_the_interval_of_the_time_averages_ends_where_they_are_refused():
     """Between them lies the correction for skewness and its inverse."""
     rng = np.random.default_rng(8)
     for averages in rng.chisquare(DOF, (2000, 8)):
-        decision = time_average_decision(averages, DOF)
+        decision = time_average_test(averages, DOF)
         low, high = decision.interval
         assert (low <= decision.statistic <= high) == decision.accepted
 
@@ -78,7 +77,7 @@ def test_the_interval_of_the_time_averages_ends_where_they_are_refused():
 def test_equivalence_is_claimed_at_the_margin_as_often_as_stated(ratio):
     rng = np.random.default_rng(4)
     averages = ratio * rng.chisquare(DOF, (REPETITIONS, 400))
-    claimed = [equivalence_decision(row, DOF).accepted for row in averages]
+    claimed = [equivalence_test(row, DOF).accepted for row in averages]
     assert 0.035 <= np.mean(claimed) <= 0.07
 
 
@@ -86,7 +85,7 @@ def test_covariances_too_small_by_a_fifth_are_found_with_the_stated_power():
     rng = np.random.default_rng(5)
     nees, _ = kalman_scores(rng, REPETITIONS * 209, 8, claimed=1.2)
     rows = nees[:, -1].reshape(REPETITIONS, 209)
-    refused = np.mean([not final_step_decision(row, DOF).accepted for row in rows])
+    refused = np.mean([not final_step_test(row, DOF).accepted for row in rows])
     assert 0.85 <= refused <= 0.95
 
 
@@ -105,15 +104,15 @@ def test_pooled_nis_is_two_sided(factor, repetitions):
 
 def test_repeated_innovations_are_not_white(repetitions):
     _, nis = repetitions[0]
-    assert not whiteness_decision(np.repeat(nis, 2, axis=1)[:, :STEPS], ONES).accepted
+    assert not whiteness_test(np.repeat(nis, 2, axis=1)[:, :STEPS], ONES).accepted
 
 
 def test_steps_without_a_scan_are_left_out(repetitions):
     _, nis = repetitions[0]
     freedom, holes = ONES.copy(), nis.copy()
     freedom[:, ::2], holes[:, ::2] = 0, np.nan
-    assert nis_decision(holes, freedom) == nis_decision(nis[:, 1::2], ONES[:, 1::2])
-    assert np.isfinite(whiteness_decision(holes, freedom).statistic)
+    assert nis_test(holes, freedom) == nis_test(nis[:, 1::2], ONES[:, 1::2])
+    assert np.isfinite(whiteness_test(holes, freedom).statistic)
 
 
 @pytest.mark.parametrize("name", ["final step", "time average", "bootstrap", "nis"])
@@ -127,7 +126,7 @@ def test_accepted_says_the_same_as_the_interval(name, repetitions):
 
 def test_the_family_band_holds_what_the_family_decision_accepts(repetitions):
     for nees, _ in repetitions[:200]:
-        family = family_decision(nees[:, GRID], DOF)
+        family = family_test(nees[:, GRID], DOF)
         low, high = family.interval
         outside = (family.statistic < low) | (family.statistic > high)
         assert outside.any() == (not family.accepted)
@@ -150,7 +149,7 @@ def test_runs_to_detect_a_factor(factor, runs):
 def test_the_bootstrap_of_few_runs_is_finite_or_decides_nothing(runs):
     rng = np.random.default_rng(9)
     for averages in rng.chisquare(DOF, (30, runs)):
-        decision = bootstrap_decision(averages, DOF, rng=rng)
+        decision = bootstrap_test(averages, DOF, rng=rng)
         assert decision.statistic == pytest.approx(averages.mean() / DOF)
         if runs < 5:
             assert np.isnan(decision.p_value)
@@ -162,7 +161,7 @@ def test_the_bootstrap_of_few_runs_is_finite_or_decides_nothing(runs):
 
 def test_the_bootstrap_of_runs_that_are_all_equal_decides_nothing():
     averages = np.full(7, 0.1)  # whose mean is not 0.1 to the last bit
-    decision = bootstrap_decision(averages, DOF, rng=np.random.default_rng(9))
+    decision = bootstrap_test(averages, DOF, rng=np.random.default_rng(9))
     assert np.isnan(decision.p_value)
 
 
@@ -177,9 +176,9 @@ def test_normal_scores_have_the_quantiles_of_a_normal():
 def test_equivalence_has_three_verdicts():
     rng = np.random.default_rng(6)
     averages = rng.chisquare(DOF, 400)
-    assert equivalence_decision(averages, DOF).verdict == "consistent"
-    assert equivalence_decision(2 * averages, DOF).verdict == "not consistent"
-    assert equivalence_decision(averages[:10], DOF).verdict == "not shown"
+    assert equivalence_test(averages, DOF).verdict == "consistent"
+    assert equivalence_test(2 * averages, DOF).verdict == "not consistent"
+    assert equivalence_test(averages[:10], DOF).verdict == "not shown"
 
 
 def test_ljung_box_finds_correlated_innovations():
@@ -190,7 +189,7 @@ def test_ljung_box_finds_correlated_innovations():
 
 def test_what_is_not_one_number_per_run_is_refused():
     with pytest.raises(ValueError, match="nees must be at least 1 finite"):
-        final_step_decision(np.array([1.0, np.nan]), DOF)
+        final_step_test(np.array([1.0, np.nan]), DOF)
     with pytest.raises(ValueError, match="factor must differ from 1"):
         runs_to_detect(1.0, DOF)
     with pytest.raises(ValueError, match="lags must be in"):

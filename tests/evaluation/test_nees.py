@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from slamgym.evaluation.nees import (
-    autocorrelation,
     landmark_nees,
     pose_nees,
     position_nees,
     relative_map_nees,
     state_nees,
 )
+from slamgym.evaluation.whiteness import autocorrelation
 
 RUNS = 20_000
 MEAN = np.array([3.0, -2.0, 0.7, 5.0, 1.0, -4.0, 6.0])
