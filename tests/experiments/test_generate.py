@@ -6,13 +6,14 @@ import json
 import os
 import random
 import re
-import signal
 import subprocess
 import sys
 import time
 import tracemalloc
 
+import forked
 import gymnasium
+import jobs_to_kill
 import numpy as np
 import pytest
 
@@ -176,17 +177,6 @@ def test_the_same_job_gives_the_same_bytes(name, tmp_path):
 
 # killed and damaged
 
-JOB = """
-import sys
-from slamgym.experiments.trajectories.generate import generate_trajectories
-from slamgym.sim_configs import load_scenario
-scenario = load_scenario("loop").with_changes(steps=200)
-generate_trajectories(
-    scenario, sys.argv[1], episodes=120, episodes_per_shard=5, controller="waypoints",
-    format=sys.argv[2],
-)
-"""
-
 
 def whole_shards(out):
     try:
@@ -198,13 +188,13 @@ def whole_shards(out):
 def run_until_killed(out, name, delay):
     """Kill the job with SIGKILL a while after some progress."""
     before = whole_shards(out)
-    job = subprocess.Popen([sys.executable, "-c", JOB, str(out), name])
-    while job.poll() is None and whole_shards(out) == before:
+    job = forked.start(jobs_to_kill.episodes, out, name)
+    while job.is_alive() and whole_shards(out) == before:
         time.sleep(0.001)
     time.sleep(delay)
-    job.send_signal(signal.SIGKILL)
-    job.wait()
-    return job.returncode
+    job.kill()
+    job.join()
+    return job.exitcode
 
 
 @pytest.mark.parametrize(
@@ -217,10 +207,9 @@ def test_a_job_killed_at_random_ends_with_the_bytes_of_one_that_was_not(
 ):
     delays = [random.uniform(0.0, latest) for _ in range(kills)]
     ends = [run_until_killed(tmp_path / "killed", name, delay) for delay in delays]
-    assert ends.count(-signal.SIGKILL) >= kills - 1
+    assert ends.count(forked.KILLED) >= kills - 1
     for folder in ("killed", "whole"):
-        arguments = [sys.executable, "-c", JOB, str(tmp_path / folder), name]
-        subprocess.run(arguments, check=True)
+        jobs_to_kill.episodes(tmp_path / folder, name)
     assert read_manifest(tmp_path / "whole").is_complete
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
 

@@ -11,6 +11,8 @@ import time
 import tracemalloc
 import zipfile
 
+import forked
+import jobs_to_kill
 import netCDF4
 import numpy as np
 import pytest
@@ -315,27 +317,18 @@ def test_a_disk_that_fills_under_the_results_says_so(tmp_path, monkeypatch):
     assert list((tmp_path / "blocks").glob("runs-*.npz"))
 
 
-KILLED = textwrap.dedent(
-    """
-    import sys
-    from slamgym.experiments.monte_carlo import monte_carlo
-    monte_carlo("six_landmarks", "ekf,invariant", 20, block_size=1, out=sys.argv[1])
-    """
-)
-
-
 def test_a_job_killed_ten_times_ends_with_the_same_bits(whole, tmp_path):
     rng = np.random.default_rng(0)
     blocks = tmp_path / "blocks"
     stood = []
     for _ in range(10):
         before = len(list(blocks.glob("runs-*.npz")))
-        with subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path)]) as child:
-            while child.poll() is None:
-                if len(list(blocks.glob("runs-*.npz"))) > before:
-                    time.sleep(float(rng.uniform(0, 0.004)))  # some time in the next
-                    child.send_signal(signal.SIGKILL)
-                    break
+        job = forked.start(jobs_to_kill.two_filters, tmp_path)
+        while job.is_alive() and len(list(blocks.glob("runs-*.npz"))) == before:
+            time.sleep(0.001)
+        time.sleep(float(rng.uniform(0, 0.004)))  # some time in the next
+        job.kill()
+        job.join()
         stood.append(len(list(blocks.glob("runs-*.npz"))))
     assert len({count for count in stood if 0 < count < RUNS}) >= 5  # in the middle
     with monte_carlo(

@@ -4,11 +4,12 @@ import ast
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import textwrap
 
+import forked
+import jobs_to_kill
 import pytest
 import xarray as xr
 from typer.testing import CliRunner
@@ -23,50 +24,6 @@ RUNS = 12
 JOB = {"scenario": "six_landmarks", "estimators": "ekf", "block_size": 4}
 BLOCKS = [f"runs-{a:07d}-{b:07d}.npz" for a, b in ((0, 4), (4, 8), (8, 12))]
 
-DIES = """
-    import os, signal, sys, time
-    import numpy as np
-    from slamgym.experiments.monte_carlo import monte_carlo, runner
-    from slamgym.experiments.monte_carlo.store import job_folder
-
-    def die(file):
-        file.write_bytes(b"half a file")
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    def dies_at_the_second_block(file, write=np.savez, **arrays):
-        die(file) if "runs-0000004" in file.name else write(file, **arrays)
-
-    def dies_at_the_job(path, lend=job_folder.replace_when_written):
-        with lend(path) as file:
-            die(file)
-
-    def dies_at_the_results(path, *_):
-        die(path.with_name(".results.0123abcd.nc"))
-
-    def stays_after_a_block(done, runs):
-        if done:
-            print("one", flush=True)
-            time.sleep(600)
-
-    def dies_after_a_block(done, runs):
-        if done:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    job = {"scenario": "six_landmarks", "estimators": "ekf", "block_size": 4}
-    job |= {"runs": 12, "out": sys.argv[1]}
-    if sys.argv[2] == "block":
-        np.savez = dies_at_the_second_block
-    if sys.argv[2] == "job":
-        job_folder.replace_when_written = dies_at_the_job
-    if sys.argv[2] == "results":
-        runner.write_results = dies_at_the_results
-    if sys.argv[2] == "never":
-        job["progress"] = stays_after_a_block
-    if sys.argv[2] == "workers":
-        job |= {"progress": dies_after_a_block, "jobs": 2, "backend": "loky"}
-    monte_carlo(**job)
-"""
-
 pytestmark = pytest.mark.skipif(
     os.name == "nt", reason="folders are not locked on Windows"
 )
@@ -77,32 +34,25 @@ def whole():
     return monte_carlo(**JOB, runs=RUNS)
 
 
-def writer(folder, dies_at):
-    """Begin a writer in a process of its own."""
-    code = textwrap.dedent(DIES)
-    return subprocess.Popen(
-        [sys.executable, "-c", code, str(folder), dies_at],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-
 def killed(folder, dies_at):
     """Let a writer die at some place, with rests left behind."""
-    with writer(folder, dies_at) as child:
-        assert child.wait() == -signal.SIGKILL
+    job = forked.start(jobs_to_kill.three_blocks, folder, dies_at)
+    job.join()
+    assert job.exitcode == forked.KILLED
 
 
 @pytest.fixture(scope="module")
 def at_work(tmp_path_factory):
     """Lend a folder that another process writes to, and that process."""
     folder = tmp_path_factory.mktemp("at work") / "out"
-    with writer(folder, "never") as child:
-        try:
-            assert child.stdout.readline() == "one\n"
-            yield folder, child
-        finally:
-            child.kill()
+    began = forked.event()
+    job = forked.start(jobs_to_kill.three_blocks, folder, "never", began)
+    try:
+        assert began.wait(timeout=120)
+        yield folder, job
+    finally:
+        job.kill()
+        job.join()
 
 
 def tree(folder):

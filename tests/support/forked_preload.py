@@ -1,0 +1,6 @@
+"""What the server of `forked` loads before it forks: modules, and compiled kernels."""
+
+import slamgym.experiments.trajectories.generate  # noqa: F401
+from slamgym.experiments.monte_carlo import monte_carlo
+
+monte_carlo("six_landmarks", "ekf,invariant", 1)
