@@ -1,7 +1,7 @@
-"""The truth of a log, at the moments and in the order of a run.
+"""The ground truth of a log at the times and in the order of a run.
 
-A log's ground truth may be the path of an antenna at a place (a, b) on the robot,
-header ``groundtruth_offset: a,b`` in metres, forward and to the left::
+The ground truth may be the path of an antenna at (a, b) on the robot, forward and to
+the left, which the header gives in metres as ``groundtruth_offset: a,b``::
 
     antenna = position + C(θ) (a, b),    C(θ) = [cos θ, -sin θ; sin θ, cos θ]
 """
@@ -25,15 +25,15 @@ def true_poses_of(log: SlamLog, times: Array) -> Array | None:
     Parameters
     ----------
     log : SlamLog
-        A log, perhaps with ground truth.
+        A log, with or without ground truth.
     times : ndarray, shape (k,)
-        When to know the pose [s].
+        Times of the poses [s].
 
     Returns
     -------
     ndarray, shape (k, 3), or None
-        (x, y, θ) [m, m, rad], nan where unknown; None where the log knows none. Of an
-        antenna beside the robot's centre the heading must be known as well.
+        (x, y, θ) [m, m, rad], nan where unknown; None if all are unknown. If the
+        antenna is not at the robot's centre, the heading must be known too.
     """
     poses = poses_at(times, log.ground_truth)
     offset = antenna_offset(log)
@@ -47,25 +47,24 @@ def true_landmarks_of(
 ) -> Array | None:
     """Look up the true positions of some landmarks, in their order.
 
-    Where the log does not tell what its readings are of, the ids are the filter's own;
-    a landmark then is the true one that is nearest, if it is the nearest to that, too.
+    If the log does not identify its readings, the ids are the filter's own. A landmark
+    is then paired with the nearest true one, if each is the nearest of the other.
 
     Parameters
     ----------
     log : SlamLog
-        A log, perhaps with true landmarks.
+        A log, with or without true landmarks.
     ids : sequence of int
-        The landmarks.
+        Ids of the landmarks.
     landmarks : ndarray, shape (n, 2)
-        Where they are estimated to be [m].
+        Their estimated positions [m].
 
     Returns
     -------
     ndarray, shape (n, 2), or None
-        Positions [m], nan where unknown; None where the log knows none of them.
+        Positions [m], nan where unknown; None if all are unknown.
     """
-    scans = [event for event in log.events if isinstance(event, Scan)]
-    if len(ids) and len(log.landmarks) and any(s.landmark_ids is None for s in scans):
+    if len(ids) and len(log.landmarks) and not _identifies_readings(log):
         return _nearest(log.landmarks, landmarks)
     known = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
     if not any(i in known for i in ids):
@@ -73,8 +72,13 @@ def true_landmarks_of(
     return np.array([known.get(i, np.full(2, np.nan)) for i in ids])
 
 
+def _identifies_readings(log: SlamLog) -> bool:
+    scans = (event for event in log.events if isinstance(event, Scan))
+    return all(scan.landmark_ids is not None for scan in scans)
+
+
 def _nearest(truth: Array, landmarks: Array) -> Array:
-    """Pair each landmark (n, 2) with its true one (n, 2); nan where there is none."""
+    """Return the true position of each landmark, (n, 2); nan where there is none."""
     gaps = np.linalg.norm(landmarks[:, None] - truth, axis=2)
     nearest = gaps.argmin(axis=1)
     is_mutual = gaps.argmin(axis=0)[nearest] == np.arange(len(landmarks))
@@ -84,13 +88,13 @@ def _nearest(truth: Array, landmarks: Array) -> Array:
 def path_accuracy(log: SlamLog, times: Array, poses: Array) -> PositionAccuracy | None:
     """Compare an estimated path with the ground truth, at the times of the truth.
 
-    Between its steps the estimate is interpolated; so the error weighs time evenly,
-    however the steps are spread. The positions compared are those of the antenna.
+    The estimate is interpolated between its steps, so the error weighs time evenly,
+    whatever the distribution of the steps. The positions are those of the antenna.
 
     Parameters
     ----------
     log : SlamLog
-        A log, perhaps with ground truth.
+        A log, with or without ground truth.
     times : ndarray, shape (k,)
         Times of the steps [s].
     poses : ndarray, shape (k, 3)
@@ -99,7 +103,7 @@ def path_accuracy(log: SlamLog, times: Array, poses: Array) -> PositionAccuracy 
     Returns
     -------
     PositionAccuracy or None
-        None where no ground truth lies within the time of the steps.
+        None if no ground truth lies within the time of the steps.
     """
     estimate = poses_at(log.ground_truth[:, 0], np.column_stack([times, poses]))
     inside = np.isfinite(estimate).all(axis=1)
@@ -111,7 +115,7 @@ def path_accuracy(log: SlamLog, times: Array, poses: Array) -> PositionAccuracy 
 
 
 def antenna_offset(log: SlamLog) -> Array:
-    """Return (a, b), where on the robot the ground truth was measured [m].
+    """Return the place (a, b) on the robot where the truth was measured [m].
 
     Raises
     ------
@@ -129,7 +133,7 @@ def antenna_offset(log: SlamLog) -> Array:
 
 
 def _turned(offset: Array, headings: Array) -> Array:
-    """Turn an offset on the robot into the world, for each heading: (k, 2) [m]."""
+    """Rotate an offset on the robot by each heading: (k, 2) [m]."""
     cos, sin = np.cos(headings), np.sin(headings)
     return np.stack(
         [cos * offset[0] - sin * offset[1], sin * offset[0] + cos * offset[1]], axis=1

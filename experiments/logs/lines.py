@@ -1,19 +1,19 @@
-"""Lines of a text log that know where they stand, for errors that say so."""
+"""Lines of a text log with their places in the file, which errors name."""
 
-import contextlib
 import math
 import os
-import secrets
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
+
+from ...sim_configs.atomic_file import replace_when_written
 
 MAX_ID_DIGITS = 18  # every such number fits int64
 MAX_SHOWN = 60  # characters of a wrong text that an error repeats
 
 
 class LogError(ValueError):
-    """A log cannot be read or written; the message is one line with file and reason."""
+    """A log cannot be read or written; the message names file and reason in a line."""
 
 
 class LogLine(NamedTuple):
@@ -44,7 +44,7 @@ number, got 'east'
     text: str
 
     def error(self, expected: str, got: str) -> LogError:
-        """Make the error that names this line, what was expected and what came."""
+        """Return an error with this line, what was expected, and what was found."""
         return LogError(
             f"{self.file}, line {self.number}: expected {expected}, got {got}"
         )
@@ -86,7 +86,7 @@ def shown(text: str) -> str:
 
 
 def to_lines(text: str, file: str) -> list[LogLine]:
-    r"""Split a text into its lines that are not blank.
+    r"""Split a text into lines, without blank ones.
 
     Raises
     ------
@@ -126,10 +126,7 @@ def read_lines(path: str | PathLike[str]) -> list[LogLine]:
 
 
 def write_whole(path: str | PathLike[str], text: str) -> None:
-    """Write a UTF-8 text file that appears complete or not at all.
-
-    The text goes to a new file in the same folder, which then takes the name; whoever
-    reads meanwhile sees the old file or the new one.
+    """Write a UTF-8 text file, which appears complete or not at all.
 
     Raises
     ------
@@ -139,15 +136,14 @@ def write_whole(path: str | PathLike[str], text: str) -> None:
     target = Path(path).resolve()
     if target.exists() and not target.is_file():
         raise LogError(f"{path}: cannot be written: not a regular file")
-    partial = target.with_name(f".{secrets.token_hex(8)}.part")
     try:
-        with partial.open("x", encoding="utf-8", newline="\n") as stream:
+        with (
+            replace_when_written(target) as partial,
+            partial.open("x", encoding="utf-8", newline="\n") as stream,
+        ):
             stream.write(text)
             stream.flush()
             os.fsync(stream.fileno())
-        partial.replace(target)
     except OSError as error:
-        raise LogError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()
+        reason = error.strerror or error
+        raise LogError(f"{path}: cannot be written: {reason}") from error

@@ -1,4 +1,4 @@
-"""The call of Python that makes the same results again."""
+"""Write the Python call that reproduces the results of a Monte Carlo."""
 
 import tomllib
 from typing import Any
@@ -9,15 +9,15 @@ ASSUMED_FILE = "assumed.toml"
 
 
 def python_call(summary: dict[str, Any]) -> str:
-    """Write the call of ``monte_carlo`` that a summary comes from.
+    """Write the call of ``monte_carlo`` that made a summary.
 
-    A scenario that is no preset, or a changed one, is called by a file, which a comment
-    tells to save first; so is the scenario whose noise was assumed.
+    The call reads a scenario that is no preset, or a changed one, from a file, and a
+    comment asks to save it first; likewise the scenario whose noise was assumed.
 
     Parameters
     ----------
     summary : dict
-        Of ``summarise_monte_carlo``.
+        Result of ``summarise_monte_carlo``.
     """
     preset = _is_preset(summary)
     name = summary["scenario"]
@@ -44,7 +44,7 @@ def python_call(summary: dict[str, Any]) -> str:
 
 
 def _is_preset(summary: dict[str, Any]) -> bool:
-    """Whether the preset of that name is the scenario itself, and not a namesake."""
+    """Whether the scenario equals the preset of its name."""
     try:
         world = load_scenario(tomllib.loads(summary["scenario_toml"]))
         return bool(world == load_scenario(summary["scenario"]))
@@ -53,7 +53,7 @@ def _is_preset(summary: dict[str, Any]) -> bool:
 
 
 def _estimators(entries: dict[str, Any]) -> str:
-    """Write names alone where they say all, else labels with (name, options)."""
+    """Write names alone where they suffice, else labels with (name, options)."""
     named = {
         label: (entry.get("name", label), entry.get("options") or {})
         for label, entry in entries.items()

@@ -1,6 +1,7 @@
 """Feed a log to an estimator, and keep what it believes at every step."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -105,15 +106,13 @@ def replay(
     most = _MOST_JOINED if isinstance(estimator, SupportsJoin) else _MOST_MAPS
     history = MapHistory(None if keep_history else most)
     recorder = RunRecorder(estimator, len(steps), history)
-    report = progress or (lambda done, total: None)
     with one_blas_thread():
         for number, step in enumerate(steps):
-            try:
+            with _naming_time(log, step):
                 show_truth(number)
                 _take(step, log, estimator, recorder)
-            except ValueError as error:
-                raise _kind(error)(f"{log.name}, t = {step.t:g}: {error}") from error
-            report(number + 1, len(steps))
+            if progress is not None:
+                progress(number + 1, len(steps))
     trace = recorder.trace(name or _name_of(estimator), times, log)
     return Replay(
         log,
@@ -163,9 +162,15 @@ def _take(
     recorder.add(predicted, report)
 
 
-def _kind(error: ValueError) -> type[ValueError]:
-    is_numerical = isinstance(error, np.linalg.LinAlgError)
-    return np.linalg.LinAlgError if is_numerical else ValueError
+@contextlib.contextmanager
+def _naming_time(log: SlamLog, step: Step) -> Iterator[None]:
+    """Name the time of a step in the estimator's errors."""
+    try:
+        yield
+    except ValueError as error:
+        is_numerical = isinstance(error, np.linalg.LinAlgError)
+        kind = np.linalg.LinAlgError if is_numerical else ValueError
+        raise kind(f"{log.name}, t = {step.t:g}: {error}") from error
 
 
 def _ids(scan: Scan) -> list[int] | None:

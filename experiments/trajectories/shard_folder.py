@@ -30,16 +30,16 @@ def claimed(folder: Path) -> Iterator[None]:
         raise ValueError(f"out must be a folder, got the file {folder}")
     folder.mkdir(parents=True, exist_ok=True)
     with locked_folder(folder):
-        entries = [entry for entry in folder.iterdir() if entry.name != WRITER]
-        leftovers = [entry for entry in entries if _LEFTOVERS.fullmatch(entry.name)]
-        foreign = sorted(entry.name for entry in set(entries) - set(leftovers))
+        names = {entry.name for entry in folder.iterdir()} - {WRITER}
+        leftovers = set(filter(_LEFTOVERS.fullmatch, names))
+        foreign = sorted(names - leftovers)
         if foreign and MANIFEST not in foreign:
             raise ValueError(
                 f"out must be a new or empty folder, or hold a {MANIFEST}: "
                 f"{folder} holds {foreign[0]}"
             )
-        for entry in leftovers:
-            _remove(entry)
+        for name in leftovers:
+            _remove(folder / name)
         yield
 
 

@@ -24,11 +24,13 @@ from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
-from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES
+from slamgym.experiments.monte_carlo.measure.filtered_runs import filter_runs
+from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES, measure_runs
 from slamgym.experiments.monte_carlo.store.result_blocks import merge_blocks
 from slamgym.experiments.monte_carlo.store.results import load_results
-from slamgym.experiments.runs.filter_settings import settings_for
+from slamgym.experiments.runs.filter_settings import settings_for, settings_for_scenario
 from slamgym.experiments.runs.log_replay import replay
+from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
 RUNS = 20
@@ -115,6 +117,19 @@ def test_figures_are_those_of_a_replay_of_the_same_drive(whole):
     error = np.linalg.norm(trace.landmarks - trace.true_landmarks, axis=1)
     by_id = error[np.argsort(trace.landmark_ids)]
     np.testing.assert_allclose(row.landmark_error, by_id, rtol=1e-12)
+
+
+def test_deviations_and_areas_are_those_of_the_claimed_covariances():
+    """Every variance differs, so that none can stand in for another."""
+    runs = simulate_runs(WORLD, 2, seed=0)
+    filtered = filter_runs(settings_for_scenario(WORLD), runs)
+    variances = np.array([4.0, 9.0, 25.0]) * np.array([1.0, 100.0])[:, None]
+    filtered.trace.pose_covariances[:] = variances[:, None, :, None] * np.eye(3)
+    block = measure_runs(runs, filtered)
+    for run, scale in enumerate((1.0, 10.0)):
+        np.testing.assert_allclose(block["position_std"][run], scale * np.sqrt(13.0))
+        np.testing.assert_allclose(block["heading_std"][run], scale * 5.0)
+        np.testing.assert_allclose(block["pose_area"][run], scale**2 * 54 * np.pi)
 
 
 def test_the_ideal_filter_is_told_the_truth():
@@ -374,7 +389,7 @@ def test_a_disk_that_is_full_leaves_the_blocks_before(whole, tmp_path):
     monte_carlo("six_landmarks", runs=8, **job).close()
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
     try:
-        with pytest.raises(OSError, match="1 whole blocks stay there"):
+        with pytest.raises(OSError, match="1 complete blocks stay there"):
             monte_carlo("six_landmarks", runs=RUNS, **job)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -251,7 +251,9 @@ def test_failure_while_writing_leaves_the_old_file_and_no_other(tmp_path, monkey
 
 
 def test_writing_into_a_missing_folder_is_a_one_line_error(tmp_path):
-    with pytest.raises(LogError, match="cannot be written: No such file or directory"):
+    with pytest.raises(
+        LogError, match=r"new\.csv: cannot be written: the folder of .* does not exist"
+    ):
         write_slamlog(SlamLog("new"), tmp_path / "missing" / "new.csv")
 
 

@@ -1,4 +1,4 @@
-"""Read a log whatever its format is."""
+"""Read a log of any known format."""
 
 from dataclasses import replace
 from os import PathLike
@@ -33,7 +33,7 @@ def read_log(
     landmarks: ArrayLike | None = None,
     robot: int | None = None,
 ) -> SlamLog:
-    """Read a log of any known format; the content tells which it is.
+    """Read a log of any known format, which is detected from the content.
 
     Parameters
     ----------
@@ -42,8 +42,8 @@ def read_log(
         ``sensor.dat`` (with ``world.dat`` beside it), an iSAM or g2o text, or the
         folder of a UTIAS MR.CLAM data set.
     landmarks : array_like, shape (n, 2), optional
-        True positions of the landmarks 0, 1, …, n - 1 [m], in place of those the log
-        brings along.
+        True positions of the landmarks 0, 1, …, n - 1 [m], in place of those in the
+        log.
     robot : int, optional
         Which robot of a UTIAS folder; the lowest by default.
 
@@ -55,11 +55,11 @@ def read_log(
     Raises
     ------
     LogError
-        If the content is no log of a known format, or breaks its rules.
+        If the content is no log of a known format, or malformed.
     OSError
         If a file cannot be opened.
     ValueError
-        If ``robot`` is given for a format that knows one robot only.
+        If ``robot`` is given for a format of one robot.
     """
     source = Path(path)
     if source.is_dir():
@@ -80,16 +80,16 @@ def read_log(
 
 
 def _format_of(line: LogLine) -> str:
-    """Tell the format from the first line of a file."""
-    fields = line.text.split()
+    """Detect the format from the first line of a file."""
+    tag, *fields = line.text.split()
     if line.text.startswith("#") or "," in line.text:
         return "slamlog"
-    if fields[0] == "SENSOR" or (fields[0] == "ODOMETRY" and len(fields) == 4):
+    if (tag, len(fields)) == ("ODOMETRY", 3) or tag == "SENSOR":
         return "freiburg"
-    if fields[0] in ISAM_TAGS:
+    if tag in ISAM_TAGS:
         return "isam"
     try:
-        [float(field) for field in fields]
+        np.array([tag, *fields], dtype=np.float64)
     except ValueError:
         raise line.error(EXPECTED, shown(line.text)) from None
     return "course"

@@ -1,1 +1,1 @@
-"""Filter the simulated runs and measure errors and consistency."""
+"""Filter simulated runs, and measure their errors and consistency."""

@@ -1,4 +1,4 @@
-"""Which estimators a Monte Carlo compares, as code or the command line names them."""
+"""Parse which estimators a Monte Carlo compares."""
 
 import hashlib
 import inspect
@@ -19,16 +19,16 @@ _SPEC = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>[^\]]*)\])?")
 
 
 class EstimatorChoice(NamedTuple):
-    """An estimator under the label that results show."""
+    """An estimator and its label in the results."""
 
     label: str
     name: str
     """Registered name or "module:Class"."""
     options: Mapping[str, Any] = {}
-    """What its constructor takes besides the noise of the world."""
+    """Arguments of its constructor other than the noise."""
 
     def code(self) -> str:
-        """Identify the source of an estimator of one's own; nothing of slamgym's."""
+        """Return a digest of the user's own source; empty for slamgym's estimators."""
         try:
             source = inspect.getsourcefile(find_estimator(self.name))
         except TypeError:
@@ -38,7 +38,7 @@ class EstimatorChoice(NamedTuple):
         return hashlib.sha256(Path(source).read_bytes()).hexdigest()[:12]
 
     def settings(self, scenario: Scenario) -> FilterSettings:
-        """Set it up with the noise of a world."""
+        """Return its settings for the noise of a world."""
         return settings_for_scenario(
             scenario, estimator=self.name, options=self.options
         )
@@ -47,18 +47,18 @@ class EstimatorChoice(NamedTuple):
 def estimator_choices(
     estimators: str | Iterable[str] | Mapping[str, Any],
 ) -> tuple[EstimatorChoice, ...]:
-    """Read which estimators are meant.
+    """Parse estimators from names, classes or labels.
 
     Parameters
     ----------
     estimators : str, iterable of str, or mapping
-        Names with commas between, each perhaps with options in brackets; or several
-        such; or labels with a name, a class, or a pair (name, options) each.
+        Names separated by commas, with optional options in brackets; or several such
+        texts; or a mapping from labels to a name, a class, or a pair (name, options).
 
     Raises
     ------
     ValueError
-        If there is none, one is unknown or unreadable, or a label stands twice.
+        If there is none, one is unknown or malformed, or a label occurs twice.
 
     Examples
     --------
@@ -73,21 +73,24 @@ options={'iterations': 3})
     if isinstance(estimators, Mapping):
         choices = [_labelled(label, what) for label, what in estimators.items()]
     else:
-        texts = [estimators] if isinstance(estimators, str) else list(estimators)
+        texts = [estimators] if isinstance(estimators, str) else estimators
         choices = [_read(spec) for text in texts for spec in _split(text)]
     if not choices:
         raise ValueError("estimators must name at least one, got none")
-    labels = [choice.label for choice in choices]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise ValueError(f"estimators must differ, got '{label}' twice")
+    _refuse_repeated([choice.label for choice in choices])
     for choice in choices:
         find_estimator(choice.name)
     return tuple(choices)
 
 
+def _refuse_repeated(labels: list[str]) -> None:
+    for label in labels:
+        if labels.count(label) > 1:
+            raise ValueError(f"estimators must differ, got '{label}' twice")
+
+
 def _split(text: str) -> list[str]:
-    """Split at the commas that stand outside of brackets."""
+    """Split at the commas outside brackets."""
     parts = re.split(r",(?![^\[]*\])", text)
     return [part.strip() for part in parts if part.strip()]
 
@@ -118,7 +121,7 @@ def _labelled(label: str, what: Any) -> EstimatorChoice:
 
 
 def _name_of(label: str, what: str | Callable[..., Any]) -> str:
-    """Name a class by its import path, or register what cannot be imported."""
+    """Return the import path of a class, or register what cannot be imported."""
     if isinstance(what, str):
         return what
     module, name = getattr(what, "__module__", ""), getattr(what, "__qualname__", "")

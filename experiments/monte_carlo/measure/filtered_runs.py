@@ -1,4 +1,4 @@
-"""One filter over many simulated runs: in a batch where it can, else one by one."""
+"""Run one filter over many simulated runs: in a batch if possible, else one by one."""
 
 from collections.abc import Mapping
 from typing import NamedTuple, cast
@@ -21,22 +21,22 @@ _MAP_NOT_FINITE = "the belief about the map is not finite"
 
 
 class Failure(NamedTuple):
-    """How a run ended before its time."""
+    """Where and why a run failed."""
 
     step: int
-    """At which step of the run."""
+    """Step of the run."""
     message: str
 
 
 class FilteredRuns(NamedTuple):
-    """What a filter believed in B runs."""
+    """The beliefs of a filter in B runs."""
 
     trace: BatchTrace
-    """After every step; nan from the step on at which a run failed."""
+    """The belief after every step; nan from the step on at which a run failed."""
     beliefs: list[Belief | None]
-    """At the end; None of a run that failed."""
+    """Final beliefs; None for a run that failed."""
     failures: Mapping[int, Failure]
-    """By the row of the run."""
+    """By the index of the run."""
 
 
 def filter_runs(
@@ -44,17 +44,17 @@ def filter_runs(
 ) -> FilteredRuns:
     """Feed every run to a filter of its own.
 
-    A filter made of the shared kernels runs in a batch, any other step by step; the
-    results are the same to the last bit.  An error in one run ends that run alone.
+    A filter made of the shared kernels runs in a batch, any other one step by step; the
+    results are the same to the last bit. An error in one run ends that run alone.
 
     Parameters
     ----------
     settings : FilterSettings
         Makes the filters.
     runs : SimulatedRuns
-        What they are fed.
+        Their input.
     threads : int, optional
-        Over which a batch is shared out; all cores where not given.
+        Threads of a batch; all cores by default.
     """
     first = settings.make(runs.initial_poses[0])
     refuse_large_maps(runs, first, at_once=can_batch(first))
@@ -103,7 +103,7 @@ def _in_a_batch(
 
 
 def _why(settings: FilterSettings, runs: SimulatedRuns, run: int, step: int) -> Failure:
-    """Repeat a run that failed in a batch, for what the single filter says of it."""
+    """Repeat a run that failed in a batch, for the message of the single filter."""
     trace = _empty_trace(*runs.visible.shape[:2])
     failure = _one_by_one(settings, runs, run, trace, [])
     return failure or Failure(step, _NOT_FINITE)
@@ -116,7 +116,7 @@ def _one_by_one(
     trace: BatchTrace,
     beliefs: list[Belief | None],
 ) -> Failure | None:
-    """Take one run through all steps, into its row of the trace; append its belief."""
+    """Filter one run into its row of the trace, and append its final belief."""
     step = 0
     try:
         slam = settings.make(runs.initial_poses[run])
@@ -179,7 +179,7 @@ def _empty_trace(runs: int, steps: int) -> BatchTrace:
 
 
 def _erase(trace: BatchTrace, run: int, step: int) -> None:
-    """Forget a run from the step on at which it failed."""
+    """Set a run to nan from the step on at which it failed."""
     for array in (trace.poses, trace.pose_covariances, trace.nis):
         array[run, step:] = np.nan
     trace.degrees_of_freedom[run, step:] = 0

@@ -1,8 +1,9 @@
-"""What is measured of every run of a Monte Carlo: how wrong, and how honest.
+"""Measure the errors and the consistency of every run of a Monte Carlo.
 
-Each run is measured by itself, so its figures do not depend on what runs beside it.
+Each run is measured by itself, so its figures do not depend on the other runs.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +29,9 @@ class Variable(NamedTuple):
     """One variable of the results."""
 
     dims: tuple[str, ...]
-    """Beside ``estimator``."""
+    """Dimensions other than ``estimator``."""
     kind: str
-    """Of numpy: f8, i8, ?, or U for text."""
+    """numpy kind: f8, i8, ?, or U for text."""
     meaning: str
 
 
@@ -43,7 +44,7 @@ VARIABLES: dict[str, Variable] = {
     "nis": Variable(STEP, "f8", "NIS of the scan"),
     "nis_dof": Variable(STEP, "i8", "its degrees of freedom"),
     "position_error": Variable(STEP, "f8", "distance to the true position [m]"),
-    "heading_error": Variable(STEP, "f8", "true less estimated heading [rad]"),
+    "heading_error": Variable(STEP, "f8", "true minus estimated heading [rad]"),
     "heading_std": Variable(STEP, "f8", "claimed deviation of the heading [rad]"),
     "position_std": Variable(STEP, "f8", "root of the trace of the covariance [m]"),
     "ate": Variable(RUN, "f8", "RMS distance of the path, not aligned [m]"),
@@ -75,37 +76,54 @@ def measure_runs(runs: SimulatedRuns, filtered: FilteredRuns) -> Block:
     runs : SimulatedRuns
         B runs of T steps among L landmarks.
     filtered : FilteredRuns
-        What the filter made of them.
+        The beliefs of a filter in these runs.
 
     Returns
     -------
     dict
-        The `VARIABLES`, shape (B,), (B, T) or (B, L) each; nan where there is none.
+        The `VARIABLES`, shape (B,), (B, T) or (B, L) each; nan where undefined.
     """
-    count, steps, landmarks = runs.visible.shape
-    sizes = {"run": count, "step": steps, "landmark": landmarks}
-    block = {name: _empty(variable, sizes) for name, variable in VARIABLES.items()}
+    block = _empty_block(runs)
     failures = dict(filtered.failures)
-    for run, belief in enumerate(filtered.beliefs):
-        truth = runs.true_poses[run]
-        with np.errstate(all="ignore"):  # a diverged run may leave all numbers
-            measured = _measure_path(truth, filtered, run)
-            try:
-                if belief is not None:
-                    measured |= _measure_map(truth[-1], runs.landmarks[run], belief)
-            except Exception as error:  # of somebody's estimator, only at the end
-                said = f"the final belief is no map of this world: {error}"
-                failures[run] = Failure(steps - 1, said)
+    for run in range(len(runs.visible)):
+        with np.errstate(all="ignore"):  # a diverged run may overflow
+            measured = _measure_path(runs.true_poses[run], filtered, run)
+            map_measures = _try_to_measure_map(runs, run, filtered.beliefs[run])
+        if isinstance(map_measures, Failure):
+            failures[run] = map_measures
+        else:
+            measured |= map_measures
         for name, value in measured.items():
             block[name][run] = value
+    _write_failures(block, failures)
+    return block
+
+
+def _try_to_measure_map(
+    runs: SimulatedRuns, run: int, belief: Belief | None
+) -> dict[str, Value] | Failure:
+    """Measure the final map; a malformed belief of a user's estimator is a failure."""
+    if belief is None:
+        return {}
+    try:
+        return _measure_map(runs.true_poses[run, -1], runs.landmarks[run], belief)
+    except Exception as error:
+        message = f"the final belief is no map of this world: {error}"
+        return Failure(runs.visible.shape[1] - 1, message)
+
+
+def _write_failures(block: Block, failures: Mapping[int, Failure]) -> None:
+    messages = [""] * len(block["failed"])
     for run, failure in failures.items():
         block["failed"][run] = True
         block["failed_at"][run] = failure.step
-    messages = [
-        failures[run].message if run in failures else "" for run in range(count)
-    ]
+        messages[run] = failure.message
     block["message"] = np.array(messages)
-    return block
+
+
+def _empty_block(runs: SimulatedRuns) -> Block:
+    sizes = dict(zip(("run", "step", "landmark"), runs.visible.shape, strict=True))
+    return {name: _empty(variable, sizes) for name, variable in VARIABLES.items()}
 
 
 def _empty(variable: Variable, sizes: dict[str, int]) -> NDArray[np.generic]:
@@ -181,7 +199,7 @@ def _measure_map(
 
 
 def _by_id(values: Array, ids: list[int], count: int) -> Array:
-    """Put the values of mapped landmarks into rows of all, nan where not mapped."""
+    """Return values for all landmarks, nan for those that are not in the map."""
     rows = np.full(count, np.nan)
     rows[ids] = values
     return rows

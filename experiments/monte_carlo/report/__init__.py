@@ -1,1 +1,1 @@
-"""What the results say: scores, verdicts, tables, figures, and the HTML report."""
+"""Report the results: scores, verdicts, tables, figures, and the HTML report."""

@@ -1,4 +1,4 @@
-"""The decisions on an estimator, as plain JSON types."""
+"""The test decisions on an estimator as plain JSON types."""
 
 import math
 from typing import Any
@@ -10,7 +10,7 @@ from ...runs.nan_statistics import finite
 
 
 def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
-    """Write a report's decisions as plain JSON types.
+    """Return the decisions of a report as plain JSON types.
 
     Returns
     -------

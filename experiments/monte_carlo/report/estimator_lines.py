@@ -1,4 +1,4 @@
-"""How several estimators are told apart in one figure, and lines kept short."""
+"""Colours, dashes and markers of several estimators in one figure, and thin lines."""
 
 import math
 from typing import Any, NamedTuple
@@ -25,26 +25,26 @@ _DASHES: tuple[Any, ...] = (
 )
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _MOST_POINTS = 400
-_LETTERS = 52  # that a row of a legend holds
-_KEY = 6  # letters' room that a key takes
+_LETTERS = 52  # in a row of a legend
+_KEY = 6  # width of a key in letters
 _ROW = 0.19  # height of a row of a legend [inch]
 
 
 class EstimatorLook(NamedTuple):
-    """Colour, dashes and marker: never told apart by colour alone."""
+    """Colour, dashes and marker, distinct even without colour."""
 
     colour: str
     dashes: Any
     marker: str
 
     def line(self, label: str | None = None) -> dict[str, Any]:
-        """Return the arguments of a line of matplotlib's."""
+        """Return the arguments of a matplotlib line."""
         return {"color": self.colour, "ls": self.dashes, "lw": 1.5, "label": label}
 
 
 def look_of(place: int) -> EstimatorLook:
-    """Return the look of the estimator at a place of the results, from 0."""
-    dashes = (place + place // len(_COLOURS)) % len(_DASHES)  # shifts once a round
+    """Return the look of the estimator with an index in the results, from 0."""
+    dashes = (place + place // len(_COLOURS)) % len(_DASHES)  # shifts per cycle
     return EstimatorLook(
         _COLOURS[place % len(_COLOURS)],
         _DASHES[dashes],
@@ -55,7 +55,7 @@ def look_of(place: int) -> EstimatorLook:
 def thinned(
     x: NDArray[Any], y: Array, *, most: int = _MOST_POINTS
 ) -> tuple[NDArray[Any], Array]:
-    """Leave out points of a line that nobody would see, but no peak.
+    """Leave out points of a line that would not be visible, but no peak.
 
     The line is cut into pieces; each keeps its lowest and its highest point.
 
@@ -64,7 +64,7 @@ def thinned(
     x, y : ndarray, shape (n,)
         The line.
     most : int
-        Points that are left, about.
+        Approximate number of points that remain.
 
     Examples
     --------
@@ -93,7 +93,7 @@ _EXTREMES = (_argmin, _last_argmax)
 
 
 def plain(label: str) -> str:
-    r"""Keep matplotlib from reading a label as mathematics, or from hiding it.
+    r"""Protect a label from being parsed as mathematics or hidden by matplotlib.
 
     Examples
     --------
@@ -105,7 +105,7 @@ def plain(label: str) -> str:
 
 
 def log_ticks(axes: Axes, which: str) -> None:
-    """Make an axis logarithmic with plain numbers: 0.5, 1, 2, 5, 10."""
+    """Make an axis logarithmic, with ticks such as 0.5, 1, 2, 5, 10."""
     getattr(axes, f"set_{which}scale")("log")
     axis = getattr(axes, f"{which}axis")
     low, high = axis.get_view_interval()
@@ -116,7 +116,7 @@ def log_ticks(axes: Axes, which: str) -> None:
 
 
 def legend_above(figure: Figure, axes: Axes) -> None:
-    """Put an axes' legend above, in as many columns as have room; the figure grows."""
+    """Put the legend above the axes in as many columns as fit; the figure grows."""
     handles, labels = axes.get_legend_handles_labels()
     longest = max((len(label) for label in labels), default=0) + _KEY
     columns = max(1, min(len(labels), _LETTERS // longest))

@@ -1,4 +1,4 @@
-"""Figures as SVG that stands inside a web page, in its fonts and colours."""
+"""Figures as SVG inside a web page, in its fonts and colours."""
 
 import io
 import re
@@ -29,17 +29,17 @@ COLOUR_VARIABLES = {
 def inline_svg(figure: Figure, name: str, description: str) -> str:
     """Return a figure as an ``<svg>`` element without size, font or colour of its own.
 
-    It fills the width it is given; text stays text; the same figure gives the same
+    It fills the available width and keeps text as text; the same figure gives the same
     bytes.
 
     Parameters
     ----------
     figure : Figure
-        Any figure of matplotlib, in the house's colours.
+        A figure in the colours of `COLOUR_VARIABLES`.
     name : str
-        Unique on the page; begins all ids.
+        Prefix of all ids, unique on the page.
     description : str
-        What screen readers say.
+        Text for screen readers.
     """
     buffer = io.StringIO()
     figure.draw_without_rendering()
@@ -59,7 +59,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
 
 
 def _own_ids(svg: str, name: str) -> str:
-    """Keep only ids that something refers to, and begin them by the figure's name."""
+    """Keep only ids that are referenced, and prefix them with the figure's name."""
     used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', svg))
 
     def renamed(match: re.Match[str]) -> str:
@@ -71,7 +71,7 @@ def _own_ids(svg: str, name: str) -> str:
 
 
 def _short_numbers(svg: str) -> str:
-    """Write coordinates to a hundredth of a point."""
+    """Round coordinates to a hundredth of a point."""
 
     def shortened(match: re.Match[str]) -> str:
         return re.sub(r"(\.\d\d)\d+", r"\1", match[0])
@@ -81,7 +81,7 @@ def _short_numbers(svg: str) -> str:
 
 
 def _use_page_style(svg: str) -> str:
-    """Leave fonts to the page, and take colours from its variables."""
+    """Remove fonts, and take colours from the page's variables."""
     svg = re.sub(r"\bfont: ([\d.]+px) [^;\"]*", r"font-size: \1", svg)
     svg = re.sub(r"font-family: [^;\"]*;?", "", svg)
     for colour, variable in COLOUR_VARIABLES.items():

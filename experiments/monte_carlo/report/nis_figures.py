@@ -1,4 +1,4 @@
-"""Whether innovations are as large as promised, and white, over many runs."""
+"""Figures of innovations over many runs: their size and whiteness."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,19 +14,19 @@ from .scores import Array, EstimatorScores
 _MOST_BLOCKS = 60
 _LAGS = 10
 _TAIL = 0.025
-_LEAST = 0.02  # correlation that the axis shows at least
+_LEAST = 0.02  # smallest range of correlations on the axis
 
 
 def nis_figure(shown: list[tuple[EstimatorScores, EstimatorLook]]) -> Figure:
     """Draw NIS by its degrees of freedom over time, and its autocorrelation.
 
     Innovations are white, so the NIS of neighbouring steps may be pooled: each point
-    is of a block of steps and all runs, with its 95 % band of χ².
+    covers a block of steps and all runs, with its 95 % band of χ².
 
     Parameters
     ----------
     shown : list of (EstimatorScores, EstimatorLook)
-        Estimators with runs that did not fail.
+        Estimators with successful runs.
     """
     figure = new_figure(4.8, 4.0)
     above, below = figure.subplots(2, 1, height_ratios=(3, 2))
@@ -49,8 +49,8 @@ def pooled_nis(scores: EstimatorScores) -> tuple[Array, Array, Array]:
     Returns
     -------
     steps, ratios, degrees_of_freedom : ndarray, shape (k,)
-        Middle of each block, NIS by degrees of freedom there, and these; blocks
-        without a correction are left out.
+        Middle of each block, its NIS by degrees of freedom, and its degrees of freedom;
+        blocks without a correction are left out.
     """
     freedom = scores.over_time("nis_dof")
     nis = np.where(freedom > 0, scores.over_time("nis"), 0.0)
@@ -65,14 +65,14 @@ def pooled_nis(scores: EstimatorScores) -> tuple[Array, Array, Array]:
 
 
 def nis_autocorrelation(scores: EstimatorScores) -> tuple[Array, Array]:
-    """Correlate the NIS with itself some scans later.
+    """Compute the autocorrelation of the NIS.
 
-    Each NIS is made about normal first, as the decision on whiteness does.
+    Each NIS is first transformed to be nearly normal, as in the test of whiteness.
 
     Returns
     -------
     correlations, pairs : ndarray, shape (lags,)
-        At lags 1 to 10, and of how many pairs.
+        Correlations at lags 1 to 10, and their numbers of pairs.
     """
     normal = normal_scores(scores.over_time("nis"), scores.over_time("nis_dof"))
     return autocorrelation(normal, lags=min(_LAGS, normal.shape[1] - 1))

@@ -1,7 +1,7 @@
-"""What of a Monte Carlo's results counts: runs that did not fail, after the start.
+"""Select the results of a Monte Carlo that count: successful runs, after the start.
 
-The first step is a scan before any motion.  A start known for certain leaves further
-leading steps without a NEES; they are left out as well.
+The first step is a scan before any motion. If the start is certain, further leading
+steps have no NEES; they are left out as well.
 """
 
 import json
@@ -19,12 +19,12 @@ Array = NDArray[np.float64]
 
 POSE_FREEDOM, POINT_FREEDOM = 3, 2
 _FIRST = 1
-_LARGEST = 1e100  # squares of larger numbers would leave all numbers
+_LARGEST = 1e100  # squares of larger numbers would overflow
 _NO_MESSAGE = "its NEES or NIS is not finite, or above 1e100"
 
 
 class FailedRun(NamedTuple):
-    """A run that no figure counts, and why."""
+    """A run that is left out of all figures, and the reason."""
 
     run: int
     step: int
@@ -33,13 +33,13 @@ class FailedRun(NamedTuple):
 
 
 class EstimatorScores(NamedTuple):
-    """One estimator's results: M runs that did not fail, K steps after the start."""
+    """One estimator's results: M successful runs, K steps after the start."""
 
     label: str
     first: int
     """First step that has a NEES, >= 1."""
     good: NDArray[np.bool_]
-    """Which of all runs did not fail, shape (runs,)."""
+    """Which of all runs succeeded, shape (runs,)."""
     failures: tuple[FailedRun, ...]
     results: xr.Dataset
     """Of all runs and steps."""
@@ -64,20 +64,20 @@ class EstimatorScores(NamedTuple):
 
     @property
     def nis_per_degree(self) -> float | None:
-        """All NIS by all their degrees of freedom; None where nothing was read."""
+        """Sum of NIS by the sum of degrees of freedom; None without readings."""
         freedom = self.over_time("nis_dof")
         return quotient(np.where(freedom > 0, self.over_time("nis"), 0.0), freedom)
 
 
 def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorScores:
-    """Take one estimator's results, and find its failed runs.
+    """Select one estimator's results, and find its failed runs.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         Results of ``monte_carlo``.
     label : str
-        Of the estimator.
+        Label of the estimator.
     frame : {"additive", "invariant"}
         Error coordinates whose NEES must be finite, and below 1e100.
     """
@@ -104,7 +104,7 @@ def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorSc
 
 
 def labels_of(dataset: xr.Dataset) -> tuple[str, ...]:
-    """Name the estimators, in their order."""
+    """Return the labels of the estimators in their order."""
     return tuple(str(label) for label in dataset["estimator"].values)
 
 
@@ -114,10 +114,10 @@ def estimators_of(dataset: xr.Dataset) -> dict[str, Any]:
 
 
 def start_heading_std(dataset: xr.Dataset) -> float:
-    """Return how well the heading is known at the start [rad].
+    """Return the standard deviation of the heading at the start [rad].
 
-    Readings are relative to the robot and no landmark is known beforehand, so they tell
-    nothing of the direction of the whole: later headings cannot be known better.
+    Readings are relative to the robot and no landmark is known beforehand, so they hold
+    no information about the orientation of the map: no later heading is known better.
     """
     table = tomllib.loads(dataset.attrs["scenario"])
     return float(table.get("start", {}).get("std", (0.0, 0.0, 0.0))[2])

@@ -1,4 +1,4 @@
-"""The numbers of a Monte Carlo, as one dictionary of plain JSON types."""
+"""Summarise a Monte Carlo as one dictionary of plain JSON types."""
 
 import json
 from typing import Any
@@ -21,19 +21,20 @@ from .scores import (
     start_heading_std,
 )
 from .verdict import heading_sentence, judge, verdict_sentence
-from .warnings import failure_groups, notes_of
+from .warnings import failure_groups, run_warnings
 
-_BOOTSTRAP_SEED = 0  # the same for each estimator: its figures do not hang on others
+_BOOTSTRAP_SEED = 0  # the same for each estimator, independent of the others
+_FRAMES: tuple[ErrorFrame, ...] = ("invariant", "additive")
 
 
 def summarise_monte_carlo(
     dataset: xr.Dataset, *, frame: ErrorFrame = "invariant"
 ) -> dict[str, Any]:
-    """Gather what one wants to know of many runs.
+    """Summarise the results of many runs.
 
-    Every number is finite; what is unknown is None.  The same results give the same
-    summary.  Failed runs are counted and named, and left out of all else, as is step 0,
-    a scan before any motion.
+    Every number is finite; unknown values are None. The same results give the same
+    summary. Failed runs are counted and named, and excluded from everything else, as is
+    step 0, a scan before any motion.
 
     Parameters
     ----------
@@ -45,13 +46,13 @@ def summarise_monte_carlo(
     Returns
     -------
     dict
-        ``scenario`` (its name), ``scenario_toml``, ``assumed_toml`` (whose noise the
-        estimators were told, None where the same), ``seed``, ``runs``, ``first_run``
-        (number of the first of them), ``steps``, ``block_size`` (None where unknown),
-        ``versions``, ``command``; ``frame``; ``knowable_heading_std`` [rad], the
-        deviation of the heading at the start, below which it cannot fall;
-        ``estimators`` by label, see :func:`summarise_estimator`; and ``notes``,
-        sentences that nobody should miss, see :func:`.notes.notes_of`.
+        ``scenario`` (its name), ``scenario_toml``, ``assumed_toml`` (the scenario whose
+        noise the estimators assume, None where the same), ``seed``, ``runs``,
+        ``first_run`` (number of the first of them), ``steps``, ``block_size`` (None
+        where unknown), ``versions``, ``command``; ``frame``; ``knowable_heading_std``
+        [rad], the deviation of the heading at the start, below which it cannot fall;
+        ``estimators`` by label, see :func:`summarise_estimator`; and ``notes``, the
+        warnings of :func:`.warnings.run_warnings`.
     """
     attrs = dataset.attrs
     assumed = attrs.get("assumed", attrs["scenario"])
@@ -77,23 +78,23 @@ def summarise_monte_carlo(
         "frame": frame,
         "knowable_heading_std": knowable,
         "estimators": entries,
-        "notes": notes_of(entries, dataset.sizes["run"]),
+        "notes": run_warnings(entries, dataset.sizes["run"]),
     }
 
 
 def summarise_estimator(
     scores: EstimatorScores, frame: ErrorFrame, knowable: float
 ) -> dict[str, Any]:
-    """Sum up one estimator's runs.
+    """Summarise the runs of one estimator.
 
-    Averages and root mean squares (``rmse``, deviations) are over runs and steps unless
-    they say ``end``.  NEES and NIS are divided by their degrees of freedom: 1
-    is right.
+    Averages and root mean squares (``rmse``, deviations) are over runs and steps, or
+    over runs for keys with ``end``. NEES and NIS are divided by their degrees of
+    freedom: 1 is expected.
 
     Parameters
     ----------
     scores : EstimatorScores
-        Its results.
+        Results of the estimator.
     frame : {"invariant", "additive"}
         Error coordinates of the decisions.
     knowable : float
@@ -103,9 +104,9 @@ def summarise_estimator(
     -------
     dict
         ``verdict`` with ``reason``, ``sentence`` and ``heading_sentence``; ``accepted``
-        and ``decisions`` (None where fewer than 2 runs did not fail), ``sentences``,
+        and ``decisions`` (None if fewer than 2 runs succeeded), ``sentences``,
         ``warnings``; ``good_runs``, ``failed_runs``, ``failure_groups`` (see
-        :func:`.notes.failure_groups`); by frame ``pose_nees`` and its
+        :func:`.warnings.failure_groups`); by frame ``pose_nees`` and its
         share of steps inside the 95 % band, and ``position_nees``;
         ``heading_nees``; ``median_run`` and ``share_above_3`` of the runs' averages;
         NEES at the end of ``state``, ``landmarks`` and ``relative_map``; ``nis``;
@@ -114,27 +115,17 @@ def summarise_estimator(
         ``landmark_mahalanobis``, root mean square; ``area`` of the 3σ ellipses at the
         end [m²].
     """
-    report = _decide(scores, frame)
-    failed = len(scores.failures)
-    verdict = judge(report, failed, len(scores.good))
     heading = _heading_std_end(scores)
     per_run = scores.ratios(frame).mean(axis=1)
     return {
-        "verdict": verdict.word,
-        "reason": verdict.reason,
-        "sentence": verdict_sentence(scores.label, verdict),
-        "heading_sentence": heading_sentence(heading["claimed"], knowable),
-        "accepted": None if report is None else report.accepted,
-        "decisions": None if report is None else decisions_table(report),
-        "sentences": [] if report is None else list(report.sentences()),
-        "warnings": [] if report is None else list(report.warnings()),
+        **_verdict(scores, _decide(scores, frame), heading["claimed"], knowable),
         "good_runs": int(scores.good.sum()),
         "failed_runs": [failure._asdict() for failure in scores.failures],
         "failure_groups": failure_groups(scores.failures),
-        "pose_nees": {name: _nees(scores, name) for name in ("invariant", "additive")},
+        "pose_nees": {name: _nees(scores, name) for name in _FRAMES},
         "position_nees": {
             name: mean(scores.over_time(f"position_nees_{name}") / POINT_FREEDOM)
-            for name in ("invariant", "additive")
+            for name in _FRAMES
         },
         "median_run": finite(np.median(per_run) if len(per_run) else np.nan),
         "share_above_3": mean(per_run > POSE_FREEDOM),
@@ -162,10 +153,40 @@ def summarise_estimator(
     }
 
 
+def _verdict(
+    scores: EstimatorScores,
+    report: ConsistencyReport | None,
+    heading_std: float | None,
+    knowable: float,
+) -> dict[str, Any]:
+    """Write the verdict on an estimator, and the decisions behind it."""
+    verdict = judge(report, len(scores.failures), len(scores.good))
+    entries = {
+        "verdict": verdict.word,
+        "reason": verdict.reason,
+        "sentence": verdict_sentence(scores.label, verdict),
+        "heading_sentence": heading_sentence(heading_std, knowable),
+    }
+    if report is None:
+        nothing: dict[str, Any] = {
+            "accepted": None,
+            "decisions": None,
+            "sentences": [],
+            "warnings": [],
+        }
+        return entries | nothing
+    return entries | {
+        "accepted": report.accepted,
+        "decisions": decisions_table(report),
+        "sentences": list(report.sentences()),
+        "warnings": list(report.warnings()),
+    }
+
+
 def consistency_of(
     results: xr.Dataset, estimator: str, *, frame: ErrorFrame = "invariant"
 ) -> ConsistencyReport:
-    """Decide whether an estimator's covariances tell the truth about its errors.
+    """Decide whether an estimator's covariances agree with its errors.
 
     Parameters
     ----------
@@ -179,7 +200,7 @@ def consistency_of(
     Raises
     ------
     ValueError
-        If there is no such label, or fewer than 2 runs did not fail.
+        If there is no such label, or fewer than 2 runs succeeded.
 
     Examples
     --------
@@ -195,7 +216,7 @@ def consistency_of(
 
 
 def _decide(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport | None:
-    """Decide on the runs that did not fail, where these are enough."""
+    """Test the successful runs, if there are enough."""
     freedom = scores.results["nis_dof"].values[:, 1:]
     if scores.good.sum() < 2 or not freedom[scores.good].any():
         return None
@@ -231,7 +252,7 @@ def _nees(scores: EstimatorScores, frame: ErrorFrame) -> dict[str, float | None]
 def _nees_at_the_end(
     scores: EstimatorScores, frame: ErrorFrame
 ) -> dict[str, float | None]:
-    """Divide NEES of maps by their degrees of freedom, which hang on what was seen."""
+    """Divide NEES of maps by their degrees of freedom, which depend on the map."""
     state = scores.per_run(f"state_nees_{frame}")
     relative = scores.per_run("relative_map_nees")
     each = scores.per_run(f"landmark_nees_{frame}")

@@ -1,4 +1,4 @@
-"""The table of a Monte Carlo: a row per measure, a column per estimator."""
+"""The table of a Monte Carlo: one row per measure, one column per estimator."""
 
 import math
 from collections.abc import Callable
@@ -12,17 +12,17 @@ from .verdict import KINDS, in_degrees
 Entry = dict[str, Any]
 _NOTHING = "–"
 _STYLES = {"good": "green", "bad": "red", "open": "yellow"}
-_LEAST_BOUND = math.radians(0.1)  # on a heading, worth a word
+_LEAST_BOUND = math.radians(0.1)  # of a heading that is shown
 
 
 class Measure(NamedTuple):
-    """A row."""
+    """One row of the table."""
 
     name: str
     right: str
-    """What it is for a consistent filter, or where it cannot be better; else empty."""
+    """Value of a consistent filter, or lower bound; else empty."""
     of: Callable[[Entry], str]
-    """Writes the cell of one estimator of the summary."""
+    """Writes the cell of one estimator from its entry in the summary."""
 
 
 def measures(summary: dict[str, Any]) -> list[Measure]:
@@ -31,7 +31,7 @@ def measures(summary: dict[str, Any]) -> list[Measure]:
     Parameters
     ----------
     summary : dict
-        Of ``summarise_monte_carlo``.
+        Result of ``summarise_monte_carlo``.
     """
     frame, runs = summary["frame"], summary["runs"]
     other = "additive" if frame == "invariant" else "invariant"
@@ -78,12 +78,12 @@ def measures(summary: dict[str, Any]) -> list[Measure]:
 
 
 def monte_carlo_table(summary: dict[str, Any]) -> Table:
-    """Lay a summary out for a terminal of 80 columns or more.
+    """Lay out a summary for a terminal of 80 columns or more.
 
     Parameters
     ----------
     summary : dict
-        Of ``summarise_monte_carlo``.
+        Result of ``summarise_monte_carlo``.
     """
     entries = summary["estimators"]
     table = Table(
@@ -110,7 +110,7 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
 
 
 def number(value: float) -> str:
-    """Write three digits, and no more noise than that.
+    """Write a number with three digits.
 
     Examples
     --------
@@ -124,7 +124,7 @@ def number(value: float) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a share.
+    """Write a share as a percentage.
 
     Examples
     --------

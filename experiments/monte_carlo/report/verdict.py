@@ -1,4 +1,4 @@
-"""What a consistency report comes to, in one word and one sentence."""
+"""Reduce a consistency report to one word and one sentence."""
 
 import math
 from typing import NamedTuple
@@ -13,7 +13,7 @@ NEARLY = "nearly consistent"
 NOT_CONSISTENT = "not consistent"
 NOT_SHOWN = "not shown"
 KINDS = {CONSISTENT: "good", NEARLY: "good", NOT_CONSISTENT: "bad", NOT_SHOWN: "open"}
-"""What each word means for the filter; colours follow it."""
+"""Rating of each word, which chooses its colour."""
 
 _ERROR_RATE = 0.05
 _DECIDING = 3  # final step, time averages and grid share the error rate
@@ -24,32 +24,32 @@ _NOT_REFUSED = "its errors agree with its covariances (5 %)"
 
 
 class Verdict(NamedTuple):
-    """One word, and why."""
+    """One word and its reason."""
 
     word: str
-    """"consistent": no decision refuses, and the ratio is shown to be near 1;
-    "nearly consistent": refused, but shown to be near 1; "not consistent": refused,
-    which befalls a consistent filter in 5 % of cases at most; "not shown": neither, or
-    some runs failed."""
+    """"consistent": no test rejects, and the ratio is shown to be near 1;
+    "nearly consistent": rejected, but shown to be near 1; "not consistent": rejected,
+    which happens to a consistent filter in at most 5 % of cases; "not shown": neither,
+    or some runs failed."""
     reason: str
-    """Goes on after the word; without a full stop."""
+    """Continues after the word, without a full stop."""
 
 
 def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
-    """Sum a report up.
+    """Reduce a report to a verdict.
 
     Parameters
     ----------
     report : ConsistencyReport or None
-        None where fewer than 2 runs did not fail, or nothing could be decided.
+        None if fewer than 2 runs succeeded, or no test could be done.
     failed, runs : int
-        Failed runs, and all.
+        Numbers of failed runs and of all runs.
     """
     if report is None:
         used = runs - failed
         what = "run that did not fail" if used == 1 else "runs that did not fail"
         return Verdict(NOT_SHOWN, f"{used} {what} of {runs} decide nothing")
-    verdict = _judge_good_runs(report)
+    verdict = _verdict_on_successes(report)
     if not failed:
         return verdict
     word = verdict.word if verdict.word == NOT_CONSISTENT else NOT_SHOWN
@@ -58,7 +58,7 @@ def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
 
 
 def verdict_sentence(label: str, verdict: Verdict) -> str:
-    """Say a verdict in a plain sentence.
+    """Write a verdict as a sentence.
 
     Examples
     --------
@@ -69,19 +69,19 @@ def verdict_sentence(label: str, verdict: Verdict) -> str:
 
 
 def heading_sentence(claimed: float | None, knowable: float) -> str:
-    """Say if a filter claims to know its heading better than anybody can.
+    """Write whether a filter claims to know its heading better than is possible.
 
     Parameters
     ----------
     claimed : float or None
-        Standard deviation of the heading at the end that the filter claims [rad].
+        Standard deviation of the final heading according to the filter [rad].
     knowable : float
-        That of the start, the least there can be [rad].
+        That of the start, which is the lower bound [rad].
 
     Returns
     -------
     str
-        Empty where it does not.
+        Empty if it does not.
 
     Examples
     --------
@@ -99,7 +99,7 @@ def heading_sentence(claimed: float | None, knowable: float) -> str:
 
 
 def in_degrees(angle: float) -> str:
-    """Write the size of an angle [rad] for people.
+    """Write the size of an angle [rad] in degrees.
 
     Examples
     --------
@@ -112,7 +112,7 @@ def in_degrees(angle: float) -> str:
 
 
 def p_text(p_value: float) -> str:
-    """Write a p-value for people.
+    """Write a p-value with two digits.
 
     Examples
     --------
@@ -123,8 +123,8 @@ def p_text(p_value: float) -> str:
     return f"p < {_SMALLEST_P:g}" if small else f"p = {p_value:.2g}"
 
 
-def _judge_good_runs(report: ConsistencyReport) -> Verdict:
-    """Judge as if no run had failed."""
+def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
+    """Return the verdict on the successful runs."""
     verdict = report.equivalence
     interval = f"the 90 % interval of the ratio, {_interval(verdict.interval)}"
     refusal = _refusal(report)
@@ -145,7 +145,7 @@ def _judge_good_runs(report: ConsistencyReport) -> Verdict:
 
 
 def _refusal(report: ConsistencyReport) -> str:
-    """Say by how much the filter is wrong, if final step, averages or grid refuse."""
+    """Write how wrong the filter is, if final step, averages or grid reject it."""
     final, average, grid = report.final_step, report.time_average, report.family
     p_value = min(final.p_value, report.average_p_value)
     ratios = [final.statistic, average.statistic]
@@ -171,7 +171,7 @@ def _is_near_everywhere(report: ConsistencyReport) -> bool:
 
 
 def _outliers(report: ConsistencyReport) -> str:
-    """Point out that a few runs rule the average."""
+    """Point out that a few runs dominate the average."""
     most = EQUIVALENCE_MARGIN.high
     if not report.median_ratio <= most < report.mean_ratio:
         return ""

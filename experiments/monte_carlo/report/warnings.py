@@ -1,4 +1,4 @@
-"""What nobody should miss: too few runs, and runs that failed, in a few sentences."""
+"""Warnings about the results of a Monte Carlo: too few runs, and failed runs."""
 
 import textwrap
 from collections.abc import Iterable, Mapping
@@ -12,13 +12,13 @@ _LETTERS = 160  # of a message
 
 
 def failure_groups(failures: Iterable[FailedRun]) -> list[dict[str, Any]]:
-    """Count the failures by what they say.
+    """Group failures by their message.
 
     Returns
     -------
     list of dict
-        ``{count, message, run, step}`` with the first run of each message and the step
-        at which it failed, -1 where unknown; the most frequent first.
+        ``{count, message, run, step}``, the most frequent first, with the first run of
+        each message and the step at which it failed, -1 where unknown.
 
     Examples
     --------
@@ -32,27 +32,28 @@ def failure_groups(failures: Iterable[FailedRun]) -> list[dict[str, Any]]:
     return sorted(groups.values(), key=lambda group: -int(group["count"]))
 
 
-def notes_of(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[str]:
-    """Say how far the numbers of a Monte Carlo can be trusted.
+def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[str]:
+    """List why the numbers of a Monte Carlo should be used with caution.
 
     Parameters
     ----------
     entries : mapping
         By label, each with ``good_runs`` and ``failure_groups``.
     runs : int
-        All runs.
+        Number of all runs.
 
     Returns
     -------
     list of str
-        Sentences, each one line, without markup of their own; up to 3 different
-        failures of an estimator are told.
+        Sentences of one line without markup; they name up to 3 different failures per
+        estimator.
 
     Examples
     --------
     >>> groups = [{"count": 2, "message": "boom", "run": 0, "step": 3}]
-    >>> for note in notes_of({"ekf": {"good_runs": 3, "failure_groups": groups}}, 5):
-    ...     print(note)
+    >>> entry = {"good_runs": 3, "failure_groups": groups}
+    >>> for line in run_warnings({"ekf": entry}, 5):
+    ...     print(line)
     ekf: 2 of 5 runs failed: 2 × boom (first: run 0, step 3).
     Only 5 runs: below 20 little can be shown.
     """
@@ -74,12 +75,12 @@ def _failed(label: str, entry: Mapping[str, Any], runs: int) -> str:
     groups = entry["failure_groups"]
     if not groups:
         return ""
-    told = [_group(group) for group in groups[:_MOST_GROUPS]]
+    named = [_group(group) for group in groups[:_MOST_GROUPS]]
     if len(groups) > _MOST_GROUPS:
         others = sum(group["count"] for group in groups[_MOST_GROUPS:])
-        told.append(f"{others} × other messages")
+        named.append(f"{others} × other messages")
     return f"{label}: {runs - entry['good_runs']} of {runs} runs failed: " + (
-        "; ".join(told) + "."
+        "; ".join(named) + "."
     )
 
 

@@ -1,8 +1,9 @@
-"""The results of a Monte Carlo as they come: blocks of runs, in memory or in a folder.
+"""Keep the results of a Monte Carlo as blocks of runs, in memory or in a folder.
 
-A folder holds ``job.json``, what is computed, and ``blocks/runs-*.npz``, each written
-whole or not at all, so that a job may be killed at any time and goes on after its last
-whole block.  Blocks of one job made on several machines may be put into one folder.
+A folder holds ``job.json``, the description of the job, and ``blocks/runs-*.npz``. Each
+block appears complete or not at all, so that a job may be killed at any time and then
+continues after its last complete block. Blocks of one job from several machines may be
+put into one folder.
 """
 
 import contextlib
@@ -39,22 +40,22 @@ class Span(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many."""
+        """Number of runs."""
         return self.stop - self.first
 
 
 class Job(NamedTuple):
-    """What is computed, but for the number of runs."""
+    """What is computed, except for the number of runs."""
 
     scenario: Scenario
     assumed: Scenario
-    """Whose noise the estimators are told."""
+    """The scenario whose noise the estimators assume."""
     estimators: tuple[EstimatorChoice, ...]
     seed: int
     block_size: int
 
     def identity(self) -> dict[str, Any]:
-        """Describe the job in plain values; equal jobs have equal ones."""
+        """Describe the job in plain values, equal for equal jobs."""
         return {
             "format": FORMAT,
             "scenario": scenario_text(self.scenario),
@@ -74,14 +75,14 @@ class Job(NamedTuple):
         }
 
     def spans(self, runs: Span) -> list[Span]:
-        """Divide runs into blocks, the last one perhaps shorter."""
+        """Divide runs into blocks; the last one may be shorter."""
         size = self.block_size
         starts = range(runs.first, runs.stop, size)
         return [Span(first, min(first + size, runs.stop)) for first in starts]
 
 
 class BlockFolder:
-    """The blocks of one job; within ``with``, no other process writes to its folder.
+    """The blocks of one job; its folder is locked within ``with``.
 
     Parameters
     ----------
@@ -90,13 +91,13 @@ class BlockFolder:
     path : Path, optional
         The folder; without one, blocks are kept in memory.
     fresh : bool
-        Whether to remove what an earlier job, this one or another, left there.
+        Whether to remove the results of an earlier job, this one or another.
 
     Raises
     ------
     ValueError
-        If the folder is a file.  On entry: if it holds another job, or what slamgym did
-        not write, or another process writes to it.
+        If the folder is a file. On entry: if it holds another job, or files that
+        slamgym did not write, or another process writes to it.
     OSError
         On entry, if it cannot be written.
     """
@@ -113,22 +114,22 @@ class BlockFolder:
         self._claim = contextlib.ExitStack()
 
     def __enter__(self) -> "BlockFolder":
-        """Claim the folder."""
+        """Lock the folder."""
         if self._path is not None:
             claim = claimed(self._path, self._identity, fresh=self._fresh)
             self._claim.enter_context(claim)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let other writers in."""
+        """Unlock the folder."""
         self._claim.close()
 
     def missing(self, runs: Span) -> list[Span]:
-        """List the blocks that are still to be computed; warn of a broken one."""
+        """List the blocks that are still to be computed; warn of a damaged one."""
         return [span for span in self._job.spans(runs) if not self._has(span)]
 
     def add(self, span: Span, blocks: list[Block]) -> None:
-        """Keep a block, one part for each estimator."""
+        """Keep a block, one part per estimator."""
         if self._path is None:
             self._kept[span.first] = blocks
             return
@@ -145,14 +146,14 @@ class BlockFolder:
             whole = len(list(file.parent.glob("runs-*.npz")))
             raise OSError(
                 f"{file} cannot be written: {error.strerror or error}; "
-                f"{whole} whole blocks stay there, to go on from"
+                f"{whole} complete blocks stay there, to continue from"
             ) from error
         for shorter in self._files_from(span.first):
             if shorter != file:
                 shorter.unlink()
 
     def blocks(self, runs: Span) -> Iterator[tuple[Span, list[Block]]]:
-        """Give back all blocks in order, one at a time."""
+        """Yield all blocks in order, one at a time."""
         for span in self._job.spans(runs):
             if self._path is None:
                 yield span, self._kept.pop(span.first)
@@ -167,9 +168,9 @@ class BlockFolder:
             if problem:
                 aside = file.replace(file.with_suffix(".broken"))
                 warnings.warn(
-                    f"{file} {problem}; it is put aside as {aside.name}, and its "
-                    "runs are done again",
-                    stacklevel=4,
+                    f"{file} {problem}; it is moved to {aside.name}, and its "
+                    "runs are repeated",
+                    stacklevel=5,
                 )
             elif _stop_of(file) >= span.stop:
                 return True
@@ -195,41 +196,46 @@ class BlockFolder:
 def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
     """Copy the blocks of one job from several folders into one.
 
-    ``monte_carlo`` with ``out=target`` then has only the rest to compute.
+    ``monte_carlo`` with ``out=target`` then computes only the missing blocks.
 
     Parameters
     ----------
     sources : sequence of str or Path
-        Folders that ``monte_carlo`` has written, at least one.
+        Folders written by ``monte_carlo``, at least one.
     target : str or Path
         A new folder, or one of the same job.
 
     Raises
     ------
     ValueError
-        If a folder holds another job than the first, or a damaged block, or another
+        If a folder holds a different job from the first, or a damaged block, or another
         process writes to the target.
     """
     folders = [Path(source) for source in sources]
     if not folders:
         raise ValueError("sources must be at least one folder, got none")
     place, identity = Path(target), identity_in(folders[0])
-    for source in folders:
-        refuse_other(source, identity_in(source), identity)
+    for folder in folders:
+        refuse_other(folder, identity_in(folder), identity)
     with claimed(place, identity):
         digest = digest_of(identity)
-        for file in (f for source in folders for f in blocks_in(source)):
-            problem = _problem(file, digest)
-            if problem:
-                raise ValueError(f"{file} {problem}")
-            copy = place / BLOCKS / file.name
-            if not copy.exists():
-                with replace_when_written(copy) as partial:
-                    partial.write_bytes(file.read_bytes())
+        for folder in folders:
+            for file in blocks_in(folder):
+                _copy_block(file, place / BLOCKS / file.name, digest)
+
+
+def _copy_block(file: Path, copy: Path, digest: str) -> None:
+    """Copy a block of a job, if the copy does not exist."""
+    problem = _problem(file, digest)
+    if problem:
+        raise ValueError(f"{file} {problem}")
+    if not copy.exists():
+        with replace_when_written(copy) as partial:
+            partial.write_bytes(file.read_bytes())
 
 
 def _problem(file: Path, digest: str) -> str:
-    """Say what is wrong with a block, nothing if it is whole."""
+    """Return what is wrong with a block; empty if it is complete."""
     try:
         with zipfile.ZipFile(file) as archive:
             if archive.testzip() is not None:

@@ -24,18 +24,18 @@ _FROM_TRUTH = "of a consistent filter NEES and NIS are χ² with the degrees tol
 
 
 def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Dataset:
-    """Put the blocks of a job together in memory.
+    """Combine the blocks of a job into a dataset in memory.
 
     Parameters
     ----------
     job : Job
         The job.
     blocks : iterator
-        All of its blocks, in order.
+        All its blocks, in order.
     runs : Span
-        The runs that they hold.
+        Their runs.
     command : str
-        How to do it again.
+        Command that reproduces the results.
     """
     sizes = _sizes(job, runs)
     arrays: dict[str, Any] = {
@@ -59,12 +59,12 @@ def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Da
 def write_results(
     path: Path, job: Job, blocks: Blocks, runs: Span, command: str = ""
 ) -> None:
-    """Write the blocks of a job as one netCDF file, with one block in memory at a time.
+    """Write the blocks of a job as one netCDF file, one block in memory at a time.
 
     Parameters
     ----------
     path : Path
-        The file, complete or as it was.
+        The file; after an error it stays as it was.
     job, blocks, runs, command
         As in :func:`dataset_of`.
     """
@@ -73,12 +73,12 @@ def write_results(
             _write(partial, job, blocks, runs, command)
     except (OSError, RuntimeError) as error:  # netCDF raises the second on a full disk
         raise OSError(
-            f"{path} cannot be written: {error}; its blocks stay, to go on from"
+            f"{path} cannot be written: {error}; its blocks stay, to continue from"
         ) from error
 
 
 def load_results(path: str | Path) -> xr.Dataset:
-    """Open the results of a Monte Carlo; arrays are read when they are used.
+    """Open the results of a Monte Carlo; arrays are read on demand.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def load_results(path: str | Path) -> xr.Dataset:
     Raises
     ------
     ValueError
-        If the file is not one, or not whole.
+        If the file is not one, or not complete.
     """
     file = Path(path)
     file = file / RESULTS if file.is_dir() else file
@@ -98,8 +98,8 @@ def load_results(path: str | Path) -> xr.Dataset:
         results = xr.open_dataset(file, engine="netcdf4")
     except (OSError, KeyError, ValueError) as error:
         raise ValueError(
-            f"{file} is truncated or no results: {error}; where blocks/ stands beside "
-            "it, the command that made it makes it anew from them"
+            f"{file} is truncated, or holds no results: {error}; if there is blocks/ "
+            "beside it, the same command makes the file again from them"
         ) from error
     lacking = sorted(set(VARIABLES) - set(results.variables))
     if lacking:
@@ -124,7 +124,7 @@ def _write(path: Path, job: Job, blocks: Blocks, runs: Span, command: str) -> No
 
 
 def attributes(job: Job, runs: Span, command: str) -> dict[str, Any]:
-    """Say where results come from: all that is needed to do it again."""
+    """Return the origin of results: all that is needed to reproduce them."""
     identity = job.identity()
     return {
         "title": f"Monte Carlo of {job.scenario.name}, {runs.size} runs",
@@ -159,7 +159,7 @@ def _fill(
 
 
 def _stored(kind: str) -> Any:
-    """Type in a netCDF file, which knows no truth values."""
+    """Return the type in a netCDF file, which has no booleans."""
     return {"?": "i1", "i": "i8", "U": str}.get(kind, kind)
 
 

@@ -1,0 +1,86 @@
+"""Engage the workers of a Monte Carlo: processes, threads, or a cluster."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, effective_n_jobs, parallel_config
+
+from ...sim_configs.scenario_errors import closest
+
+Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed
+Workers = Callable[[Iterable[Call]], Iterable[Any]]
+
+BACKENDS = ("loky", "threading", "dask", "ray")
+_LARGEST = 2**63  # of the integers in a file of results
+
+
+def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
+    """Return workers that compute calls in any order; None if this process does it all.
+
+    Parameters
+    ----------
+    jobs : int or None
+        Number of workers; -1 for one on each core.
+    backend : str or None
+        One of `BACKENDS`; None for what joblib is configured to use.
+
+    Raises
+    ------
+    ValueError
+        If an argument does not fit, or Ray is not installed.
+    """
+    if backend is not None and backend not in BACKENDS:
+        hint = closest(backend, BACKENDS)
+        raise ValueError(
+            f"backend must be one of {', '.join(BACKENDS)}, got '{backend}'{hint}"
+        )
+    if jobs is not None and jobs != -1:
+        integer("jobs", jobs, 1)
+    if backend == "ray":
+        return _ray_workers(None if jobs == -1 else jobs)
+    if backend is None and effective_n_jobs(jobs) == 1:
+        return None
+    return _joblib_workers(jobs, backend)
+
+
+def integer(name: str, value: int, least: int) -> int:
+    """Check an integer, and return it as int."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not (whole and least <= value < _LARGEST):
+        raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
+    return int(value)
+
+
+def _joblib_workers(jobs: int | None, backend: str | None) -> Workers:
+    chosen: dict[str, Any] = {} if backend is None else {"backend": backend}
+    if jobs is not None or backend is not None:
+        chosen["n_jobs"] = jobs or -1
+    with parallel_config(**chosen):
+        workers: Workers = Parallel(
+            return_as="generator_unordered", pre_dispatch="2*n_jobs"
+        )
+        return workers
+
+
+def _ray_workers(jobs: int | None) -> Workers:
+    """Engage a cluster's workers by Ray's own pool.
+
+    Ray's backend for joblib returns results only when the last one is complete, so that
+    no block could be written before.
+    """
+    try:
+        from ray.util.multiprocessing import Pool  # noqa: PLC0415 (an extra)
+    except ImportError:
+        raise ValueError("backend 'ray' needs ray: pip install ray") from None
+
+    def compute(calls: Iterable[Call]) -> Iterator[Any]:
+        with Pool(jobs) as pool:
+            yield from pool.imap_unordered(_call, calls)
+
+    return compute
+
+
+def _call(call: Call) -> Any:
+    function, arguments, options = call
+    return function(*arguments, **options)
