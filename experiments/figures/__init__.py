@@ -1,7 +1,7 @@
 """The figures of a run: map, accuracy, covariance, consistency, noise study.
 
-Every function takes plain arrays and returns a matplotlib Figure, unknown to pyplot;
-`save_figure` writes it.
+Every function takes the trace of a run and returns a matplotlib Figure that pyplot does
+not manage; `save_figure` writes it.
 """
 
 from lazy_loader import attach_stub

@@ -1,4 +1,4 @@
-"""Many runs of a scenario, and whether the filters told the truth.
+"""Run filters many times over a scenario, and test their consistency.
 
 scenario → simulated runs → filtered runs → run measures → result blocks → results
 → scores → summary, table, plots, html report

@@ -1,4 +1,4 @@
-"""The noise study: every noise scaled up and down, one at a time."""
+"""Noise studies: scale each noise up and down, one at a time."""
 
 from lazy_loader import attach_stub
 

@@ -5,3 +5,4 @@ from .one_run import NoiseRow as NoiseRow
 from .one_run import NoiseRun as NoiseRun
 from .one_run import study_log as study_log
 from .one_run import study_scenario as study_scenario
+from .variations import scaled_scenario as scaled_scenario

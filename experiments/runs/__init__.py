@@ -1,4 +1,4 @@
-"""Runs of a filter over a log or a simulated world, and their summaries."""
+"""Run filters over a log or over simulated worlds, and summarise the runs."""
 
 from lazy_loader import attach_stub
 

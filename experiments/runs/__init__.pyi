@@ -1,5 +1,6 @@
 from .filter_settings import FilterSettings as FilterSettings
 from .filter_settings import settings_for as settings_for
+from .filter_settings import settings_for_scenario as settings_for_scenario
 from .log_replay import Replay as Replay
 from .log_replay import replay as replay
 from .simulated_runs import SimulatedRuns as SimulatedRuns

@@ -1,4 +1,4 @@
-"""Trajectories by the million: driven, written in shards, read back.
+"""Generate data sets of trajectories, written in shards, and read them.
 
 controllers → driven episodes → trajectory → formats → shard folder, manifest → dataset
 """

@@ -1,3 +1,4 @@
+from .dataset import TrajectoryDataset as TrajectoryDataset
 from .dataset import load_trajectories as load_trajectories
 from .driven_episodes import drive_episodes as drive_episodes
 from .formats.slamlog_files import to_slamlog as to_slamlog
