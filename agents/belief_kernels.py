@@ -8,8 +8,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimator.models.angles import wrap_angle
-from ..estimator.support.jit import compiled, part
+from ..estimator.models.bearing_range import wrap_angle_jit
+from ..estimator.support.jit import jit, njit_internal
 
 Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]
@@ -70,11 +70,12 @@ def turned(
     )
 
 
-_clip, _root, _on_log_scale = part(clip), part(root), part(on_log_scale)
-_correlation, _turned, _wrap = part(correlation), part(turned), part(wrap_angle)
+_clip, _root = njit_internal(clip), njit_internal(root)
+_on_log_scale = njit_internal(on_log_scale)
+_correlation, _turned = njit_internal(correlation), njit_internal(turned)
 
 
-@part
+@njit_internal
 def show_pose(
     mean: Array,
     covariance: Array,
@@ -85,7 +86,7 @@ def show_pose(
 ) -> None:
     """Write the features of one pose."""
     left, bottom, right, top = bounds
-    heading = _wrap(mean[2])
+    heading = wrap_angle_jit(mean[2])
     cos, sin = math.cos(heading), math.sin(heading)
     pose[0] = _clip((2 * mean[0] - left - right) / (right - left), -1.0, 1.0)
     pose[1] = _clip((2 * mean[1] - bottom - top) / (top - bottom), -1.0, 1.0)
@@ -100,7 +101,7 @@ def show_pose(
     correlations[2] = _correlation(cos * y_h - sin * x_h, aside * turn)
 
 
-@part
+@njit_internal
 def relative_spread(
     covariance: Array, x: int, dx: float, dy: float
 ) -> tuple[float, float, float]:
@@ -119,7 +120,7 @@ def relative_spread(
     )
 
 
-@compiled
+@jit
 def show_beliefs(  # noqa: PLR0917 (the outputs one by one, in order of their keys)
     means: Array,
     covariances: Array,

@@ -26,8 +26,9 @@ from second_core import two_processes
 
 from slamgym.estimator import EkfSlam, make_batch, make_estimator
 from slamgym.estimator.filters.ekf import workspace_for
+from slamgym.estimator.kernels.belief_arrays import BeliefArrays, aligned_zeros
 from slamgym.estimator.kernels.predict import predict
-from slamgym.estimator.kernels.scan_rows import aligned_zeros
+from slamgym.estimator.kernels.scan_rows import SLOT, new_ledger
 from slamgym.estimator.kernels.scan_update import update_belief
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.05, 0.02, 0.02]), np.array([0.02, 0.08])
@@ -77,22 +78,13 @@ def kernel_step(slam: EkfSlam, readings: NDArray[np.float64]) -> Callable[[], ob
     where = slam.rules.linearisation
     count = len(readings)
     work = workspace_for(slam.rules, count, capacity)
-    ledger = np.zeros((3, count), dtype=np.int64)
-    ledger[0] = np.arange(count)
+    ledger = new_ledger(count)
+    ledger[SLOT] = np.arange(count)
+    belief = BeliefArrays(mean, covariance, reference)
 
     def step() -> None:
-        predict(mean, covariance, size, 0.0, 0.0, variance, where, reference)
-        update_belief(
-            mean,
-            covariance,
-            size,
-            readings,
-            count,
-            reference,
-            rules,
-            *work,
-            ledger,
-        )
+        predict(*belief, size, 0.0, 0.0, variance, where)
+        update_belief(*belief, size, readings, count, ledger, *work, rules)
 
     return step
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.angles import wrap_angle
-from ..support.jit import compiled, part
+from ..models.bearing_range import wrap_angle_jit
+from ..support.jit import jit
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -16,8 +16,6 @@ Noise = tuple[float, float, float]
 
 # What a reading is of, where it is not a slot of the map.
 NEW, AMBIGUOUS = -1, -2
-
-_wrap = part(wrap_angle)
 
 
 class Distances(NamedTuple):
@@ -79,7 +77,7 @@ def innovation_distances(
     return fit
 
 
-@compiled
+@jit
 def _compare(
     mean: Array,
     covariance: Array,
@@ -116,7 +114,7 @@ def _compare(
                 s_bb = ax * ax * xx + 2 * ax * ay * xy + ay * ay * yy
                 s_bb += P[2, 2] - 2 * (ax * gx + ay * gy)
                 bearing = np.arctan2(dy, dx) - heading
-            nu_b = _wrap(readings[k, 0] - bearing)
+            nu_b = wrap_angle_jit(readings[k, 0] - bearing)
             rr = s_rr + range_std * range_std
             bb = s_bb + settings[0] * settings[0]
             determinant = rr * bb - s_br * s_br

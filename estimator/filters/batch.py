@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..interface import Belief
-from ..kernels.batch import NEVER, drive_runs
-from ..kernels.scan_rows import Workspace, aligned_zeros
+from ..kernels.batch import NEVER, RunArrays, StepData, drive_runs
+from ..kernels.belief_arrays import aligned_zeros
+from ..kernels.scan_rows import Workspace
 from ..models.angles import wrap_angle
 from ..support import argument_checks
 from ..support.threads import share_out, usable_cores
@@ -153,7 +155,7 @@ class BatchSlam:
         )
         chosen = self._chosen(runs)
         failed_at = np.where(chosen, self.failed_at, 0)  # the kernel passes these over
-        data = u, z, seen
+        data = StepData(u, z, seen)
         drive = partial(self._drive, data, durations, trace, failed_at)
         share_out(drive, self.runs, self._threads)
         self.failed_at = np.where(chosen, failed_at, self.failed_at)
@@ -264,31 +266,24 @@ class BatchSlam:
 
     def _drive(
         self,
-        data: tuple[Array, Array, NDArray[np.bool_]],
+        data: StepData,
         dt: Array,
         trace: BatchTrace,
         failed_at: NDArray[np.int64],
         part: slice,
     ) -> None:
-        u, z, seen = data
+        runs = RunArrays(
+            self._means, self._covariances, self._references, self._slots, self._mapped
+        )
         drive_runs(
-            self._means[part],
-            self._covariances[part],
-            self._references[part],
-            self._slots[part],
-            self._mapped[part],
-            self._rule_values,
-            self._motion_values,
-            u[part],
-            z[part],
-            seen[part],
+            _of(part, runs),
+            _of(part, data),
             dt,
-            trace.poses[part],
-            trace.pose_covariances[part],
-            trace.nis[part],
-            trace.degrees_of_freedom[part],
+            _of(part, trace),
             failed_at[part],
-            *self._room(),
+            self._motion_values,
+            self._rule_values,
+            _of(slice(None), self._room()),
         )
 
     def _room(self) -> Workspace:
@@ -311,3 +306,8 @@ def can_batch(estimator: object) -> bool:
         and type(estimator).update is EkfSlam.update
         and type(estimator).belief is EkfSlam.belief
     )
+
+
+def _of(part: slice, arrays: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return views on some of the runs; a plain tuple, as kernels take it."""
+    return tuple(array[part] for array in arrays)

@@ -11,23 +11,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..error_frames import ErrorFrame
 from ..interface import Belief, UpdateReport
+from ..kernels.belief_arrays import aligned_zeros
 from ..kernels.covariance_update import BLOCK
-from ..kernels.predict import ADDITIVE, AT_ESTIMATE, INVARIANT, predict
-from ..kernels.scan_rows import INNOVATION, Workspace, aligned_zeros, new_workspace
-from ..kernels.scan_update import (
+from ..kernels.predict import predict
+from ..kernels.rules import ADDITIVE, AT_ESTIMATE, INVARIANT, Rules
+from ..kernels.scan_record import record
+from ..kernels.scan_rows import (
     ADDED,
-    DONE,
-    FATE,
     GATED,
-    NOT_USABLE,
+    OUTCOME,
     SKIPPED,
     SLOT,
     USED,
-    Rules,
-    joint_factor,
-    record,
-    update_belief,
+    Workspace,
+    new_ledger,
+    new_workspace,
 )
+from ..kernels.scan_update import DONE, NOT_USABLE, update_belief
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.memory_limit import covariance_bytes, landmarks_that_fit
@@ -183,12 +183,12 @@ class EkfSlam:
         predict(
             self._mean,
             self._covariance,
+            self._reference,
             self._size,
             distance,
             turn,
             variance,
             self._rules.linearisation,
-            self._reference,
         )
 
     def _motion_variance_of(self, distance: float, turn: float, dt: float) -> Array:
@@ -232,19 +232,19 @@ class EkfSlam:
         self._make_room(count)
         slots = self._slots
         self._ledger[SLOT, :count] = [slots.get(i, -1) for i in ids]
-        outcome, used, nis = update_belief(
+        status, used, nis = update_belief(
             self._mean,
             self._covariance,
+            self._reference,
             self._size,
             readings,
             count,
-            self._reference,
-            self._rule_values,
-            *self._workspace,
             self._ledger,
+            *self._workspace,
+            self._rule_values,
         )
-        if outcome != DONE:
-            self._refuse(outcome, readings, ids)
+        if status != DONE:
+            self._refuse(status, readings, ids)
         return self._report(ids, used, nis)
 
     def belief(self) -> Belief:
@@ -345,41 +345,42 @@ class EkfSlam:
         if readings >= self._scan_room:
             room = 8 + 2 * readings
             self._workspace = workspace_for(self._rules, room, len(self._mean))
-            self._ledger = np.zeros((3, room), dtype=np.int64)
+            self._ledger = new_ledger(room)
             self._scan_room = room
 
     def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
         return argument_checks.given_identities(landmark_ids, count, self)
 
-    def _refuse(self, outcome: int, readings: Array, ids: list[int]) -> None:
+    def _refuse(self, status: int, readings: Array, ids: list[int]) -> None:
         """Raise the error of an update that did not go through."""
-        if outcome == NOT_USABLE:
+        if status == NOT_USABLE:
             argument_checks.refuse_unusable(readings, ids)
-        row = np.flatnonzero(self._ledger[FATE, : len(ids)] == USED)[outcome]
+        outcomes = self._ledger[OUTCOME, : len(ids)]
+        row = np.flatnonzero(outcomes == USED)[status]
         raise not_positive_definite(ids[row])
 
     def _report(self, ids: list[int], used: int, nis: float) -> UpdateReport:
-        _, fates, near = self._ledger[:, : len(ids)].tolist()
-        found = record(self._workspace.rows, used, self._rules)
-        by_fate: dict[int, tuple[int, ...]] = {USED: tuple(ids)}
+        _, outcomes, near, _ = self._ledger[:, : len(ids)].tolist()
+        found = record(self._workspace.rows, self._ledger, used, self._rules)
+        having: dict[int, tuple[int, ...]] = {USED: tuple(ids)}
         if used < len(ids):
-            by_fate = {
-                fate: tuple(i for i, f in zip(ids, fates, strict=True) if f == fate)
-                for fate in (USED, ADDED, GATED, SKIPPED)
+            having = {
+                chosen: tuple(compress(ids, [one == chosen for one in outcomes]))
+                for chosen in (USED, ADDED, GATED, SKIPPED)
             }
-            for i in by_fate[ADDED]:
+            for i in having[ADDED]:
                 self._slots[i] = len(self._slots)
             self._size = 3 + 2 * len(self._slots)
         return UpdateReport(
             nis,
             2 * used,
-            by_fate[USED],
-            by_fate.get(ADDED, ()),
-            by_fate.get(GATED, ()),
-            by_fate.get(SKIPPED, ()),
+            having[USED],
+            having.get(ADDED, ()),
+            having.get(GATED, ()),
+            having.get(SKIPPED, ()),
             tuple(compress(ids, near)) if any(near) else (),
-            found[:, INNOVATION].reshape(-1, 2),
-            partial(joint_factor, found, self._rules.sequential),
+            found.innovation,
+            partial(found.joint_factor, sequential=self._rules.sequential),
         )
 
 

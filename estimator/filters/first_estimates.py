@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from ..kernels.predict import AT_REFERENCE
+from ..kernels.rules import AT_REFERENCE
 from .ekf import EkfSlam
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..interface import UpdateReport
-from ..kernels.predict import AT_ESTIMATE, AT_TRUTH
+from ..kernels.rules import AT_ESTIMATE, AT_TRUTH
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .ekf import EkfSlam

@@ -4,7 +4,7 @@ from typing import Any, ClassVar
 
 from numpy.typing import ArrayLike
 
-from ..kernels.predict import INVARIANT
+from ..kernels.rules import INVARIANT
 from ..support import argument_checks
 from .ekf import EkfSlam
 

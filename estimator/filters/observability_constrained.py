@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from ..kernels.predict import PROJECTED
+from ..kernels.rules import PROJECTED
 from .ekf import EkfSlam
 
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..interface import Belief, UpdateReport
 from ..support.argument_checks import LandmarkIds
-from ..support.jit import compiled, part
+from ..support.jit import jit, njit_internal
 from .ekf import EkfSlam
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ class RobocentricEkfSlam(EkfSlam):
         return Belief(mean, (moved + moved.T) / 2, ids)
 
 
-@compiled
+@jit
 def move_frame(mean: Array, covariance: Array, size: int) -> None:
     """Express all in the robot's present frame: x ← f(x), P ← T P Tᵀ, in O(size²).
 
@@ -111,14 +111,14 @@ def move_frame(mean: Array, covariance: Array, size: int) -> None:
             covariance[i, j] = covariance[j, i] = 0.0
 
 
-@part
+@njit_internal
 def _transpose(covariance: Array, size: int) -> None:
     for i in range(size):
         for j in range(i):
             covariance[i, j], covariance[j, i] = covariance[j, i], covariance[i, j]
 
 
-@part
+@njit_internal
 def _turn_rows(mean: Array, covariance: Array, size: int, c: float, s: float) -> None:
     """P ← T P, but for the rows of the way, which come to nothing."""
     for i in range(ORIGIN, size, 2):

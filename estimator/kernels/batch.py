@@ -1,57 +1,97 @@
 """The loop over runs and steps, compiled; the arithmetic is that of one filter."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ..support.jit import compiled, part
-from .predict import Array, Int, predict
-from .scan_update import ADDED, DONE, FATE, SLOT, as_rules, update_belief, usable
+from ..support.jit import jit, njit_internal
+from .belief_arrays import Array, BeliefArrays, Int
+from .predict import move
+from .rules import as_rules
+from .scan_rows import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT, Workspace
+from .scan_update import DONE, update_by_scan
+from .screen import usable
 
 NEVER = -1
 
+Bool = NDArray[np.bool_]
 
-@compiled
-def drive_runs(  # every array of a batch once, with a leading run axis
-    means: Array,
-    covariances: Array,
-    references: Array,
-    slots: Int,
-    mapped: Int,
-    rule_values: Array,
-    motion_values: Array,
-    odometry: Array,
-    measurements: Array,
-    visible: NDArray[np.bool_],
+
+class RunArrays(NamedTuple):
+    """The beliefs of B runs, each array with a leading run axis."""
+
+    means: Array  # (B, capacity)
+    covariances: Array  # (B, capacity, capacity)
+    references: Array  # (B, capacity)
+    slots: Int  # (B, L) place of each landmark in the map, -1 where not mapped
+    mapped: Int  # (B,) how many landmarks are
+
+
+class StepData(NamedTuple):
+    """The data of T steps of B runs."""
+
+    odometry: Array  # (B, T, 2)
+    measurements: Array  # (B, T, L, 2)
+    visible: Bool  # (B, T, L)
+
+
+@jit
+def drive_runs(
+    run_arrays: tuple[Array, Array, Array, Int, Int],
+    step_data: tuple[Array, Array, Bool],
     dt: Array,
-    poses: Array,
-    pose_covariances: Array,
-    nis: Array,
-    freedom: Int,
+    trace: tuple[Array, Array, Array, Int],
     failed_at: Int,
-    rows: Array,
-    before: Array,
-    prior: Array,
+    motion_values: Array,
+    rule_values: Array,
+    workspace_arrays: tuple[Array, Array, Array],
 ) -> None:
     """Take each run through all its steps, in place.
 
-    ``motion_values`` holds the variances (σx², σy², σα²) and 1 where a robot at rest
-    has motion noise too; ``rows``, ``before`` and ``prior`` are a workspace.
+    The arrays come as plain tuples, the entries of :class:`RunArrays`,
+    :class:`StepData` and :class:`.scan_rows.Workspace`: numba takes microseconds to
+    recognise a NamedTuple.
+
+    Parameters
+    ----------
+    dt : ndarray, shape (T,)
+        Duration of each step.
+    trace
+        On return: poses (B, T, 3), their covariances (B, T, 3, 3), NIS (B, T) and its
+        degrees of freedom (B, T).
+    failed_at : ndarray, shape (B,)
+        On entry NEVER for the runs that take part.  On return the step at which a run
+        stopped, NEVER where it did not.
+    motion_values : ndarray, shape (4,)
+        The variances (σx², σy², σα²), and 1 where a robot at rest has motion noise too.
+    rule_values
+        As :func:`.rules.as_rules` reads them.
     """
+    runs, data = RunArrays(*run_arrays), StepData(*step_data)
+    poses, pose_covariances, nis, degrees_of_freedom = trace
+    workspace = Workspace(*workspace_arrays)
     rules = as_rules(rule_values)
-    landmarks = slots.shape[1]
-    ledger = np.zeros((3, landmarks), np.int64)
+    landmarks = runs.slots.shape[1]
+    ledger = np.zeros((LEDGER_HEIGHT, landmarks), np.int64)
     readings = np.empty((landmarks, 2))
     ids = np.empty(landmarks, np.int64)
     variance = np.empty(3)
-    for b in range(len(means)):
+    for b in range(len(failed_at)):
         if failed_at[b] != NEVER:
             failed_at[b] = 0
             continue
-        mean, covariance = means[b], covariances[b]
+        belief = BeliefArrays(runs.means[b], runs.covariances[b], runs.references[b])
+        slots = runs.slots[b]
         for t in range(len(dt)):
-            d, turn = odometry[b, t, 0], odometry[b, t, 1]
+            d, turn = data.odometry[b, t, 0], data.odometry[b, t, 1]
             m = gather(
-                measurements[b, t], visible[b, t], slots[b], readings, ids, ledger
+                data.measurements[b, t],
+                data.visible[b, t],
+                slots,
+                readings,
+                ids,
+                ledger,
             )
             if not (usable(d) and usable(turn) and m >= 0):
                 failed_at[b] = t
@@ -59,54 +99,35 @@ def drive_runs(  # every array of a batch once, with a leading run axis
             share = dt[t] if motion_values[3] > 0 or d != 0 or turn != 0 else 0.0
             for i in range(3):
                 variance[i] = motion_values[i] * share
-            size = 3 + 2 * mapped[b]
-            predict(
-                mean,
-                covariance,
-                size,
-                d,
-                turn,
-                variance,
-                rules.linearisation,
-                references[b],
+            size = 3 + 2 * runs.mapped[b]
+            move(belief, size, d, turn, variance, rules.linearisation)
+            status, used, nis[b, t] = update_by_scan(
+                belief, size, readings, m, ledger, rules, workspace
             )
-            outcome, used, nis[b, t] = update_belief(
-                mean,
-                covariance,
-                size,
-                readings,
-                m,
-                references[b],
-                rule_values,
-                rows,
-                before,
-                prior,
-                ledger,
-            )
-            if outcome != DONE:
+            if status != DONE:
                 nis[b, t] = np.nan
                 failed_at[b] = t
                 break
-            freedom[b, t] = 2 * used
-            mapped[b] += note_new(m, ids, ledger, slots[b], mapped[b])
+            degrees_of_freedom[b, t] = 2 * used
+            runs.mapped[b] += note_new(m, ids, ledger, slots, runs.mapped[b])
             for i in range(3):
-                poses[b, t, i] = mean[i]
+                poses[b, t, i] = belief.mean[i]
                 for j in range(3):
-                    pose_covariances[b, t, i, j] = covariance[i, j]
+                    pose_covariances[b, t, i, j] = belief.covariance[i, j]
 
 
-@part
+@njit_internal
 def gather(
     measurements: Array,
-    visible: NDArray[np.bool_],
+    visible: Bool,
     slots: Int,
     readings: Array,
     ids: Int,
     ledger: Int,
 ) -> int:
-    """Collect the readings that there are, and their places in the map.
+    """Collect the readings of one step, and their landmarks' places in the map.
 
-    Returns how many, or -1 where one is not usable.
+    Returns how many there are, or -1 where one is not usable.
     """
     m = 0
     for i in range(len(visible)):
@@ -120,12 +141,12 @@ def gather(
     return m
 
 
-@part
+@njit_internal
 def note_new(m: int, ids: Int, ledger: Int, slots: Int, mapped: int) -> int:
-    """Give the added landmarks their places in the map; return how many."""
+    """Give the added landmarks their places in the map; return how many there are."""
     added = 0
     for k in range(m):
-        if ledger[FATE, k] == ADDED:
+        if ledger[OUTCOME, k] == ADDED:
             slots[ids[k]] = mapped + added
             added += 1
     return added

@@ -31,7 +31,7 @@ from ..interface import (
     SupportsMerging,
     SupportsRemoval,
 )
-from ..kernels.predict import AT_ESTIMATE
+from ..kernels.rules import AT_ESTIMATE
 from .map_view import keeps_own_arrays, view_map
 
 Array = NDArray[np.float64]

@@ -1,5 +1,9 @@
 """Bearing-range measurement model of a point landmark, forward and inverse.
 
+:func:`predict_measurement` and :func:`locate_landmark` serve filters in numpy, for many
+landmarks at once.  The functions with a twin ``…_jit`` serve the kernels: the same
+equations for one landmark, entry by entry.
+
 Symbols
 -------
 p = (x, y, θ)  robot pose in the world frame [m, m, rad]
@@ -12,9 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..support.jit import njit_inlined, njit_internal
 from .angles import wrap_angle
 
 Array = NDArray[np.float64]
+
+wrap_angle_jit = njit_internal(wrap_angle)
 
 
 class MeasurementPrediction(NamedTuple):
@@ -34,7 +41,7 @@ class LandmarkLocation(NamedTuple):
 
 
 def predict_measurement(pose: Array, landmarks: Array) -> MeasurementPrediction:
-    """Bearing and range at which the robot should see each landmark.
+    """Predict bearing and range of each landmark, with both Jacobians.
 
     ::
 
@@ -79,7 +86,7 @@ def predict_measurement(pose: Array, landmarks: Array) -> MeasurementPrediction:
 
 
 def locate_landmark(pose: Array, measurement: Array) -> LandmarkLocation:
-    """Where in the world each measured landmark lies: the inverse of h.
+    """Locate each measured landmark in the world, with both Jacobians: h⁻¹.
 
     ::
 
@@ -119,3 +126,60 @@ def locate_landmark(pose: Array, measurement: Array) -> LandmarkLocation:
         jacobian_pose=jacobian_pose,
         jacobian_measurement=np.stack([turned, along], axis=2),
     )
+
+
+def expected_reading(dx: float, dy: float, heading: float) -> tuple[float, float]:
+    """Return the bearing, not wrapped, and the range of one landmark: h(p, l).
+
+    Parameters
+    ----------
+    dx, dy : float
+        l − (x, y) [m].
+    heading : float
+        θ [rad].
+    """
+    return np.arctan2(dy, dx) - heading, np.sqrt(dx * dx + dy * dy)
+
+
+def reading_slopes(dx: float, dy: float) -> tuple[float, float, float, float]:
+    """Return the Jacobian of one reading by its landmark, (βx, βy, rx, ry).
+
+    ::
+
+        Hl = [βx βy; rx ry] = [−dy/r², dx/r²; dx/r, dy/r],    Hp = [−Hl, (−1; 0)]
+
+    Parameters
+    ----------
+    dx, dy : float
+        l − (x, y), not both 0 [m].
+    """
+    per_range = 1 / np.sqrt(dx * dx + dy * dy)
+    along_x, along_y = dx * per_range, dy * per_range
+    return -along_y * per_range, along_x * per_range, along_x, along_y
+
+
+def located(
+    x: float, y: float, heading: float, bearing: float, distance: float
+) -> tuple[float, float, float, float]:
+    """Return where one measured landmark lies, and the direction (cos, sin) to it.
+
+    ::
+
+        l = (x + r cos, y + r sin)  of  θ + β
+        ∂l/∂p = [1 0 −r sin; 0 1 r cos],    ∂l/∂z = [−r sin, cos; r cos, sin]
+
+    Parameters
+    ----------
+    x, y, heading : float
+        p [m, m, rad].
+    bearing, distance : float
+        z = (β, r) [rad, m].
+    """
+    direction = heading + bearing
+    cos, sin = np.cos(direction), np.sin(direction)
+    return x + distance * cos, y + distance * sin, cos, sin
+
+
+expected_reading_jit = njit_inlined(expected_reading)
+reading_slopes_jit = njit_inlined(reading_slopes)
+located_jit = njit_inlined(located)

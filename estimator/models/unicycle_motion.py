@@ -1,4 +1,7 @@
-"""Unicycle motion model: how one odometry reading moves the robot pose.
+"""Unicycle motion model: the pose after one odometry reading, with its Jacobians.
+
+:func:`drive` is the equation.  Filters in numpy use it through :func:`predict_pose`,
+kernels through its compiled twin ``drive_jit``.
 
 Symbols
 -------
@@ -7,12 +10,54 @@ u = (d, α)       odometry: distance driven, then heading turned [m, rad]
 ε = (εx, εy, εα) motion noise in the robot's own frame [m, m, rad], ε ~ N(0, R)
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..support.jit import njit_inlined
+
 Array = NDArray[np.float64]
+
+Real = TypeVar("Real", float, NDArray[np.float64])
+
+
+def drive(
+    x: Real, y: Real, heading: Real, distance: Real, turn: Real
+) -> tuple[Real, Real, Real, Real, Real]:
+    """Drive a distance along the heading, then turn: g(p, u, 0) and what G, F need.
+
+    ::
+
+        x' = x + d cos θ,    y' = y + d sin θ,    θ' = θ + α
+
+        G = [1 0 −d sin θ; 0 1 d cos θ; 0 0 1]
+        F = [cos θ  −sin θ  0; sin θ  cos θ  0; 0 0 1]
+
+    Parameters
+    ----------
+    x, y, heading : float or ndarray, any one shape
+        p = (x, y, θ) [m, m, rad].
+    distance, turn : float or ndarray
+        u = (d, α) [m, rad].
+
+    Returns
+    -------
+    x, y, heading
+        The pose after the step, θ not wrapped.
+    cos, sin
+        Of the old heading: the entries of G and F that vary.
+
+    Examples
+    --------
+    >>> [float(value) for value in drive(1.0, 0.0, 0.0, 2.0, 0.5)]
+    [3.0, 0.0, 0.5, 1.0, 0.0]
+    """
+    cos, sin = np.cos(heading), np.sin(heading)
+    return x + distance * cos, y + distance * sin, heading + turn, cos, sin
+
+
+drive_jit = njit_inlined(drive)
 
 
 class MotionPrediction(NamedTuple):
@@ -24,16 +69,16 @@ class MotionPrediction(NamedTuple):
 
 
 def predict_pose(pose: Array, odometry: Array) -> MotionPrediction:
-    """Drive d along the old heading, then turn by α.
+    """Move a pose by one odometry reading, with both Jacobians.
 
-    ::
+    The robot drives d along the old heading, then turns by α::
 
         g(p, u, ε) = p + (d + εx) (cos θ,  sin θ, 0)
                        +      εy  (-sin θ, cos θ, 0)
                        + (α + εα) (0, 0, 1)
 
-    evaluated with its derivatives at ε = 0.  θ is returned unwrapped, so that the
-    pose stays differentiable; wrap differences of angles, never the state.
+    All are evaluated at ε = 0.  θ is not wrapped, so that the pose stays
+    differentiable: wrap differences of angles, never the state.
 
     Parameters
     ----------
@@ -63,9 +108,9 @@ def predict_pose(pose: Array, odometry: Array) -> MotionPrediction:
     array([2. , 0. , 0.5])
     """
     distance, turn = odometry
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x, y, heading, cos, sin = drive(pose[0], pose[1], pose[2], distance, turn)
     return MotionPrediction(
-        pose=pose + np.array([distance * cos, distance * sin, turn]),
+        pose=np.array([x, y, heading]),
         jacobian_pose=np.array(
             [[1, 0, -distance * sin], [0, 1, distance * cos], [0, 0, 1]]
         ),

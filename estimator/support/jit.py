@@ -1,41 +1,47 @@
-"""Compile numerical kernels with numba, and never run a stale one."""
+"""Compile numerical kernels with numba, and never run stale code.
+
+Each decorator leaves a function of plain scalars and arrays that also runs as plain
+Python: ``NUMBA_DISABLE_JIT=1`` turns compilation off, for a debugger.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
+from inspect import getfile
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from numba import njit
+from numba import config, njit, types
+from numba.extending import intrinsic
 
 SOURCES = Path(__file__).parents[1]
+"""The folder `estimator`: kernels call functions from any file in it."""
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
 
-def compiled(function: Kernel) -> Kernel:
+def jit(function: Kernel) -> Kernel:
     """Compile a kernel at its first call and keep it in numba's cache on disk.
 
-    It takes none of the liberties of ``fastmath``: one function gives the same bits
-    alone, called by another kernel, in a thread, or loaded from the cache; where
-    multiply-adds are to be fused, :mod:`.fused` says so.  ``NUMBA_DISABLE_JIT=1`` runs
-    the plain Python functions instead, for a debugger.
+    ``fastmath`` stays off: a kernel gives the same bits when called from Python, from
+    another kernel, in a thread, or when loaded from the cache.  Where a multiply-add is
+    to be rounded once, the code calls :func:`fma`.
     """
     return _compile(function, callable_from_python=True)
 
 
-def part(function: Kernel) -> Kernel:
+def njit_internal(function: Kernel) -> Kernel:
     """Compile a function that only kernels call, in about half the time.
 
-    Its ``py_func`` can be called from Python.
+    Python can call its ``py_func``.
     """
     return _compile(function, callable_from_python=False)
 
 
-def inlined(function: Kernel) -> Kernel:
-    """Make a function part of the kernel that calls it, so that it compiles but once.
+def njit_inlined(function: Kernel) -> Kernel:
+    """Copy the body of a function into its caller, which compiles it only once.
 
-    For what conducts other kernels and is itself called from one place.
+    For a function that calls other kernels and has one caller.
     """
     return cast("Kernel", njit(inline="always", error_model="numpy")(function))
 
@@ -49,9 +55,13 @@ def _compile(function: Kernel, *, callable_from_python: bool) -> Kernel:
         "no_cpython_wrapper": not callable_from_python,
     }
     kernel = njit(**options)(function)
-    stats = getattr(kernel, "stats", None)  # None without JIT
+    stats = getattr(kernel, "stats", None)  # None where compilation is turned off
     if stats is not None:
-        discard_stale_cache(SOURCES, Path(stats.cache_path))
+        own_folder = Path(getfile(function)).parent
+        cached = Path(stats.cache_path)
+        discard_stale_cache(SOURCES, cached)
+        if not own_folder.is_relative_to(SOURCES):
+            discard_stale_cache(own_folder, cached)
     return cast("Kernel", kernel)
 
 
@@ -59,16 +69,37 @@ def _compile(function: Kernel, *, callable_from_python: bool) -> Kernel:
 def discard_stale_cache(sources: Path, cached: Path) -> None:
     """Delete cached kernels that are older than any source file; once per folder.
 
-    Numba looks at the file of the kernel itself only, not at the files of the kernels
-    it calls: after an edit of one of those it would run yesterday's code.
+    Numba compares a cached kernel with its own file only.  After an edit in the file of
+    a function that the kernel calls, numba would run the old code.
 
     Parameters
     ----------
     sources, cached : Path
-        Folder of the sources, and the folder in which numba keeps what it compiled.
+        Folder of the sources, and the folder of numba's cache.
     """
     newest = max((f.stat().st_mtime for f in sources.rglob("*.py")), default=0.0)
     for file in cached.glob("*.nb[ic]"):
-        with suppress(OSError):  # somebody else's cache
+        with suppress(OSError):  # a cache that belongs to another user
             if file.stat().st_mtime < newest:
                 file.unlink()
+
+
+def _multiply_add(a: float, b: float, c: float) -> float:
+    """Return a b + c in plain Python, rounded twice."""
+    return a * b + c
+
+
+def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.fma(*arguments)
+
+    return types.float64(types.float64, types.float64, types.float64), generate
+
+
+# A compiler that is free to fuse (``fastmath``) does so depending on what is inlined
+# where.  One kernel would then give different bits alone and inside another kernel.
+fma = cast(
+    "Callable[[float, float, float], float]",
+    _multiply_add if getattr(config, "DISABLE_JIT", 0) else intrinsic(_emitted_fma),
+)
+"""a b + c, rounded once."""

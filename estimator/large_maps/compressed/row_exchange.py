@@ -3,13 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ...support.jit import compiled
+from ...support.jit import jit
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-@compiled
+@jit
 def read_columns(block: Array, first: int, columns: Int, rows: Array) -> None:
     """Copy some columns of a block into rows (c, width), from column ``first`` on.
 
@@ -20,7 +20,7 @@ def read_columns(block: Array, first: int, columns: Int, rows: Array) -> None:
             rows[j, first + i] = block[i, columns[j]]
 
 
-@compiled
+@jit
 def write_columns(
     block: Array, first: int, columns: Int, rows: Array, places: Int
 ) -> None:
@@ -30,7 +30,7 @@ def write_columns(
             block[i, columns[j]] = rows[places[j], first + i]
 
 
-@compiled
+@jit
 def fill_extended(
     covariance: Array, before: int, pose: Array, rows: Array, virtual: int, step: int
 ) -> None:
@@ -62,7 +62,7 @@ def fill_extended(
             covariance[k, m] = covariance[m, k] = 1.0
 
 
-@compiled
+@jit
 def unpivot(factor: Array, places: Int, rows: Array) -> None:
     """Move an upper triangular factor's columns to their places, its first rows."""
     for i in range(len(rows)):
