@@ -1,65 +1,182 @@
-"""The layers of the repository, enforced: who may import whom."""
+"""The floors of the repository, enforced: imports go down, never up or in a circle."""
 
 import ast
 import sys
-from pathlib import Path
+from graphlib import TopologicalSorter
 
 import pytest
+from import_graph import FILES, GRAPH, ROOT
 
-ROOT = Path(__file__).parents[2]
-LAYERS = ("estimator", "sim_configs", "envs", "agents", "experiments")
-MAY_IMPORT = {
-    "estimator": {"numpy", "scipy", "numba", "psutil", "estimator"},
-    "sim_configs": {"numpy", "pydantic", "pydantic_core", "sim_configs"},
-    "envs": {"numpy", "gymnasium", "pymunk", "sim_configs", "envs"},
-    "agents": {"numpy", "gymnasium", "sim_configs", "envs", "estimator", "agents"},
+FLOORS = {  # from the ground up; rooms of one line do not import each other
+    "": """
+        sim_configs estimator
+        envs evaluation
+        agents
+        experiments
+    """,
+    "envs": """
+        angles actions
+        robot
+        sensors controllers
+        spaces rendering
+        landmark_world
+        vector
+    """,
+    "estimator": """
+        support
+        models
+        error_frames
+        belief update_report
+        interface
+        kernels
+        association
+        filters
+        map_management
+        large_maps
+        registry contract
+        check_estimator
+    """,
+    "estimator.large_maps": """
+        sparse_cholesky
+        compressed sparse_information submaps
+    """,
+    "evaluation": """
+        chi_square nees trajectory_error
+        whiteness
+        hypothesis_tests
+        time_average_tests
+        consistency_report
+    """,
+    "experiments": """
+        logs
+        runs
+        figures
+        monte_carlo
+        noise_study
+        trajectories
+        command_line
+    """,
+    "experiments.monte_carlo": """
+        reproduction measure workers
+        store report
+        runner
+    """,
 }
-DRAWING = {  # the only files that may import matplotlib and what it writes with
-    "envs": {
-        "renderer",
-        "artists",
-        "scene",
-        "blitting",
-        "window",
-        "video",
-    },
-    "estimator": {"plotting"},
-    "sim_configs": set(),
-    "agents": set(),
+STRANGERS = {
+    ("envs", "estimator"),
+    ("envs", "evaluation"),
+    ("estimator", "sim_configs"),
 }
-FILES = [file for layer in MAY_IMPORT for file in sorted((ROOT / layer).rglob("*.py"))]
+EVALUATION_KNOWS = {"models", "support", "error_frames", "interface", "belief"}
+MAY_IMPORT = {  # besides the standard library and lazy_loader
+    "sim_configs": {"numpy", "pydantic", "pydantic_core"},
+    "envs": {"numpy", "gymnasium", "pymunk"},
+    "estimator": {"numpy", "scipy", "numba", "psutil"},
+    "evaluation": {"numpy", "scipy"},
+    "agents": {"numpy", "gymnasium"},
+}
+DRAWING = {"artists", "scene", "blitting", "renderer", "video", "window"}
+DRAWING_LIBRARIES = {"matplotlib", "PIL", "imageio_ffmpeg"}
+TOO_LONG = {  # modules that still have more than 300 lines
+    "estimator.filters.batch",
+    "estimator.filters.ekf",
+    "estimator.kernels.scan_update",
+    "estimator.large_maps.compressed.compressed_slam",
+    "estimator.large_maps.submaps.joining",
+    "estimator.large_maps.submaps.submap_slam",
+    "estimator.map_management.managed_slam",
+}
 
 
-def imported_packages(file):
-    """Top-level packages a file imports; relative ones by the layer they reach."""
-    inside = file.relative_to(ROOT).parent.parts
-    for node in ast.walk(ast.parse(file.read_text())):
+def room_in(house, module):
+    """Return the room of a house that a module stands in, "" for none or the house."""
+    inside = module.removeprefix(house).removeprefix(".") if house else module
+    belongs = not house or module.startswith(f"{house}.")
+    return inside.split(".")[0] if belongs else ""
+
+
+def floor_of(house):
+    return {
+        room: floor
+        for floor, line in enumerate(FLOORS[house].strip().splitlines())
+        for room in line.split()
+    }
+
+
+def imports_between_rooms(house):
+    """Yield (module, imported module, room, imported room) inside a house."""
+    for module, targets in GRAPH.items():
+        for target in targets:
+            room, other = room_in(house, module), room_in(house, target)
+            if room and other and room != other:
+                yield module, target, room, other
+
+
+@pytest.mark.parametrize("house", FLOORS, ids=lambda house: house or "slamgym")
+def test_imports_only_go_down(house):
+    floor = floor_of(house)
+    climbing = [
+        f"{module} imports {target}"
+        for module, target, room, other in imports_between_rooms(house)
+        if floor[room] <= floor[other]
+    ]
+    assert climbing == []
+
+
+@pytest.mark.parametrize("house", FLOORS, ids=lambda house: house or "slamgym")
+def test_every_room_stands_on_a_floor(house):
+    rooms = {room_in(house, module) for module in FILES} - {""}
+    assert rooms == set(floor_of(house))
+
+
+def test_worlds_and_estimators_do_not_know_each_other():
+    met = {(room, other) for _, _, room, other in imports_between_rooms("")}
+    assert not met & (STRANGERS | {(b, a) for a, b in STRANGERS})
+
+
+def test_evaluation_knows_little_of_the_estimators():
+    known = {
+        room_in("estimator", target)
+        for module, targets in GRAPH.items()
+        if room_in("", module) == "evaluation"
+        for target in targets
+    }
+    assert known - {""} <= EVALUATION_KNOWS
+
+
+def test_no_module_imports_itself_through_others():
+    assert list(TopologicalSorter(GRAPH).static_order())
+
+
+def libraries(module):
+    """Yield the packages outside the repository that a module imports."""
+    for node in ast.walk(ast.parse(FILES[module].read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name.split(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            if node.level == 0:
-                yield node.module.split(".")[0]
-            elif node.level <= len(inside):
-                yield inside[0]
-            else:
-                names = [node.module] if node.module else [a.name for a in node.names]
-                yield from (name.split(".")[0] for name in names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield node.module.split(".")[0]
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
-def test_a_file_imports_only_what_its_layer_may(file):
-    layer = file.relative_to(ROOT).parts[0]
-    allowed = MAY_IMPORT[layer] | set(sys.stdlib_module_names) | {"lazy_loader"}
-    if file.stem in DRAWING[layer]:
-        allowed = allowed | {"matplotlib", "PIL", "imageio_ffmpeg"}
-    assert set(imported_packages(file)) <= allowed
+@pytest.mark.parametrize("module", [m for m in FILES if room_in("", m) in MAY_IMPORT])
+def test_a_module_imports_only_the_libraries_of_its_layer(module):
+    allowed = MAY_IMPORT[room_in("", module)] | {"lazy_loader"}
+    if module.removeprefix("envs.rendering.") in DRAWING:
+        allowed |= DRAWING_LIBRARIES
+    assert set(libraries(module)) <= allowed | set(sys.stdlib_module_names)
 
 
-def test_modules_are_imported_relatively_inside_the_package():
-    for file in (f for layer in LAYERS for f in (ROOT / layer).rglob("*.py")):
-        imports = [
-            line
-            for line in file.read_text().splitlines()
-            if line.startswith(("import ", "from ")) and " slamgym" in f" {line}"
-        ]
-        assert not [line for line in imports if line.split()[1].startswith("slamgym")]
+@pytest.mark.parametrize("module", FILES)
+def test_modules_are_imported_relatively_inside_the_package(module):
+    assert "slamgym" not in set(libraries(module))
+
+
+def test_modules_have_at_most_300_lines():
+    long = {m for m, file in FILES.items() if len(file.read_text().splitlines()) > 300}
+    assert long <= TOO_LONG
+
+
+def test_the_links_of_the_package_reach_every_folder():
+    links = {
+        link.name for link in (ROOT / "src" / "slamgym").iterdir() if link.is_dir()
+    }
+    assert links - {"__pycache__"} == set(floor_of(""))

@@ -1,0 +1,83 @@
+"""The imports between the modules of the repository, read from their source."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = (
+    "sim_configs",
+    "envs",
+    "estimator",
+    "evaluation",
+    "agents",
+    "experiments",
+)
+
+
+def module_name(file):
+    """Return the dotted name below slamgym: ``estimator.filters.ekf``."""
+    return ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(
+        ".__init__"
+    )
+
+
+FILES = {
+    module_name(file): file
+    for package in PACKAGES
+    for file in sorted((ROOT / package).rglob("*.py"))
+}
+
+
+def absolute(module, node):
+    """Return the name below slamgym that a relative import names, or None."""
+    if not node.level:
+        return None
+    parts = module.split(".")
+    if FILES[module].name != "__init__.py":
+        parts = parts[:-1]
+    inside = parts[: len(parts) - node.level + 1]
+    return ".".join([*inside, *filter(None, [node.module])])
+
+
+def stub_targets():
+    """Return what each lazy name of each package stands for: module → name → module."""
+    targets = {}
+    for module, file in FILES.items():
+        stub = file.with_suffix(".pyi")
+        if stub.exists():
+            imports = (
+                node
+                for node in ast.parse(stub.read_text()).body
+                if isinstance(node, ast.ImportFrom)
+            )
+            targets[module] = {
+                alias.name: absolute(module, node)
+                for node in imports
+                for alias in node.names
+            }
+    return targets
+
+
+STUBS = stub_targets()
+
+
+def defining_module(module, name):
+    """Return the module that ``from module import name`` takes the name from."""
+    if f"{module}.{name}" in FILES and name not in STUBS.get(module, {}):
+        return f"{module}.{name}"
+    while name in STUBS.get(module, {}) and STUBS[module][name] != module:
+        module = STUBS[module][name]
+    return module
+
+
+def imports_of(module):
+    """Return the modules of the repository that a module imports, also in functions."""
+    found = set()
+    for node in ast.walk(ast.parse(FILES[module].read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            target = absolute(module, node)
+            found |= {defining_module(target, alias.name) for alias in node.names}
+    return found - {module}
+
+
+GRAPH = {module: imports_of(module) for module in FILES}
