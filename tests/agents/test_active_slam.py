@@ -728,6 +728,7 @@ def test_a_loop_in_the_manner_of_cleanrl_runs():
     assert np.isfinite(rewards).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
 def test_stable_baselines_learns_from_single_worlds(algorithm):
     library = pytest.importorskip("stable_baselines3", reason="needs SB3")
@@ -742,6 +743,7 @@ def test_stable_baselines_learns_from_single_worlds(algorithm):
     assert action in env.action_space
 
 
+@pytest.mark.slow
 def test_the_example_trains_saves_reads_back_and_draws(tmp_path, monkeypatch, capsys):
     pytest.importorskip("stable_baselines3", reason="needs Stable-Baselines3")
     example = next(Path(__file__).parents[2].glob("examples/*train_active_slam.py"))

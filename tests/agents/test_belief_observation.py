@@ -200,6 +200,7 @@ def test_gymnasiums_checker_finds_nothing_to_warn_of(preset):
     assert len(warned) == 1  # of being a wrapper, and nothing else
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["six_landmarks", "loop", "slippery", "standing"])
 def test_every_observation_of_an_episode_lies_in_its_space(preset):
     env = BeliefObservation(world(preset), "ekf")

@@ -69,6 +69,7 @@ def reader(first_run, tmp_path, monkeypatch):
     return {"__name__": "reader", "estimator": make_estimator("ekf", **noise)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("code", "output"), PYTHON)
 def test_python_in_a_document_runs_and_prints_what_it_shows(
     code, output, reader, capsys
@@ -88,6 +89,7 @@ def test_the_three_uses_fit_into_fifteen_lines_each():
     assert max(lengths) <= 15
 
 
+@pytest.mark.slow
 def test_the_main_job_writes_what_the_readme_promises(first_run):
     section = README.split("## Drive, filter, look")[1].split("\n## ")[0]
     table = [line for line in section.splitlines() if line.startswith("| `")]

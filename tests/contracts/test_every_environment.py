@@ -84,6 +84,7 @@ def test_a_spec_of_many_worlds_written_as_json_makes_the_same_worlds(each, keywo
 # --- other processes ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("each", IDS)
 def test_workers_that_know_nothing_but_the_id_make_the_same_worlds(each):
     """Spawned, not forked: the package named in the id is all that registers it."""
@@ -111,6 +112,7 @@ def decoded(path):
     return np.frombuffer(done.stdout, np.uint8), done.stderr.decode()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("each", IDS)
 def test_gymnasium_records_a_video_that_shows_the_episode(each, tmp_path):
     pytest.importorskip("moviepy", reason="RecordVideo needs gymnasium[other]")
@@ -141,6 +143,7 @@ def test_gymnasium_records_a_video_that_shows_the_episode(each, tmp_path):
         assert errors[k] < 4
 
 
+@pytest.mark.slow
 def test_gymnasium_records_a_video_of_many_worlds(tmp_path):
     vector = pytest.importorskip("gymnasium.wrappers.vector")
     if not hasattr(vector, "RecordVideo"):

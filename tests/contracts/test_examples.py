@@ -78,6 +78,7 @@ def test_03_refuses_what_is_no_log_in_one_line(run, tmp_path):
         run("03_replay_the_course_log", "noise.txt")
 
 
+@pytest.mark.slow
 def test_04_shows_modesty_and_pride(run):
     rows = run("04_noise_study").splitlines()
     nis = {row[:6].strip(): float(row.split()[-2]) for row in rows[1:-1]}
@@ -92,6 +93,7 @@ def test_05_keeps_the_contract_and_shows_a_breach(run):
     assert "TurnsFirst breaks the contract:\n  predict((d, α)) must drive d" in printed
 
 
+@pytest.mark.slow
 def test_06_says_that_it_needs_a_screen(tmp_path):
     done = subprocess.run(
         [sys.executable, EXAMPLES / "06_keyboard.py"],

@@ -30,6 +30,7 @@ def test_gymnasiums_checker_finds_nothing_to_warn_of(preset):
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", list_presets())
 def test_every_observation_of_an_episode_lies_in_its_space(preset):
     env = LandmarkWorldEnv(preset)

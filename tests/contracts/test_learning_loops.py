@@ -80,6 +80,7 @@ def episodes_one_by_one(each, seed, transitions):
     return episodes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 @pytest.mark.parametrize("each", IDS)
 def test_a_replay_buffer_holds_what_the_actions_led_to(each, mode):
@@ -183,6 +184,7 @@ def learn(torch, agent, optimizer, rollout, advantages):
     return loss.item()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make_worlds", [native_worlds, wrapped_worlds])
 @pytest.mark.parametrize("each", IDS)
 def test_a_loop_as_cleanrl_writes_it_runs(torch, each, make_worlds):
@@ -233,6 +235,7 @@ OPTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side_by_side", [False, True], ids=["single", "vector"])
 @pytest.mark.parametrize("algorithm", OPTIONS)
 @pytest.mark.parametrize("each", IDS)

@@ -52,6 +52,7 @@ def machine(wheel, tmp_path_factory):
     return programs
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_module_and_the_data(wheel):
     inside = set(zipfile.ZipFile(wheel).namelist())
     sources = {
@@ -65,6 +66,7 @@ def test_the_wheel_holds_every_module_and_the_data(wheel):
     assert "slamgym/sim_configs/presets/six_landmarks.toml" in inside
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_nothing_else(wheel):
     inside = zipfile.ZipFile(wheel).namelist()
     homes = tuple(f"slamgym/{part}/" for part in PARTS)
@@ -80,6 +82,7 @@ def test_the_wheel_holds_nothing_else(wheel):
     assert not [name for name in inside if "__pycache__" in name]
 
 
+@pytest.mark.slow
 def test_the_installed_wheel_runs_a_world_and_a_filter(machine, tmp_path):
     program = (
         "import gymnasium, numpy, slamgym; from slamgym.estimator import EkfSlam; "
@@ -95,6 +98,7 @@ def test_the_installed_wheel_runs_a_world_and_a_filter(machine, tmp_path):
     assert Path(place).is_relative_to(machine.parent)
 
 
+@pytest.mark.slow
 def test_the_installed_command_answers(machine, tmp_path):
     assert "slamgym run six_landmarks" in call(
         machine / "slamgym", "--help", cwd=tmp_path

@@ -59,6 +59,7 @@ def same(value, other):
         assert np.asarray(value).dtype == np.asarray(other).dtype
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, LOST], ids=["plain", "lost"])
 def test_it_steps_as_a_dummy_of_single_worlds_does(changes, sb3):
     """Observations, rewards, dones and every info, across the ends of episodes."""
@@ -83,6 +84,7 @@ def test_it_steps_as_a_dummy_of_single_worlds_does(changes, sb3):
     same(*(dict(vector.reset()) for vector in vectors))
 
 
+@pytest.mark.slow
 def test_flat_worlds_have_flat_terminal_observations(sb3):
     vector = to_stable_baselines(FlattenBatch(native(steps=2)))
     vector.reset()
@@ -95,6 +97,7 @@ def test_flat_worlds_have_flat_terminal_observations(sb3):
         assert info["TimeLimit.truncated"] is True
 
 
+@pytest.mark.slow
 def test_an_info_that_some_worlds_lack_is_missing_there(sb3):
     vector = RecordEpisodeStatistics(native(max_episode_steps=5))
     adapted = to_stable_baselines(vector)
@@ -105,6 +108,7 @@ def test_an_info_that_some_worlds_lack_is_missing_there(sb3):
     assert infos[1]["episode"]["l"] == 5
 
 
+@pytest.mark.slow
 def test_attributes_and_methods_are_handed_out_world_by_world(sb3):
     worlds = native(3, render_mode="rgb_array")
     vector = to_stable_baselines(worlds)
@@ -126,6 +130,7 @@ def test_attributes_and_methods_are_handed_out_world_by_world(sb3):
     assert worlds.closed
 
 
+@pytest.mark.slow
 def test_stable_baselines_own_checker_accepts_the_single_world(sb3):
     from stable_baselines3.common.env_checker import check_env
 
@@ -135,6 +140,7 @@ def test_stable_baselines_own_checker_accepts_the_single_world(sb3):
     check_env(gym.wrappers.FlattenObservation(env))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [False, True])
 def test_ppo_learns_on_it(flat, sb3):
     worlds = native(8, steps=16)
@@ -160,6 +166,7 @@ def blocks(heading):
     return re.findall(r"^```(\w+)\n(.*?)^```$", section, re.M | re.S)
 
 
+@pytest.mark.slow
 def test_the_document_leads_from_make_vec_to_a_policy(sb3):
     """The block that needs Stable-Baselines3 is run here, in the place of readers."""
     scope = {"__name__": "reader"}
@@ -178,6 +185,7 @@ def randomised():
     return [code for language, code in found if language == "python"]
 
 
+@pytest.mark.slow
 def test_a_policy_goes_on_in_worlds_drawn_anew_per_round(sb3):
     """The document's lines, also those that stand in comments there."""
     code = randomised()[0].replace("# model.", "model.").replace("64 * 512", "1024")
@@ -193,6 +201,7 @@ def test_a_policy_goes_on_in_worlds_drawn_anew_per_round(sb3):
     assert model.get_env().worlds.env is scope["worlds"]
 
 
+@pytest.mark.slow
 def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed(sb3):
     scope = {"__name__": "reader"}
     exec(compile(randomised()[1], "document", "exec"), scope)
@@ -214,6 +223,7 @@ def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed(sb3):
     np.testing.assert_array_equal(*drives)
 
 
+@pytest.mark.slow
 def test_ppo_takes_worlds_that_are_drawn_anew_per_episode(sb3):
     scope = {"__name__": "reader"}
     exec(compile(randomised()[1], "document", "exec"), scope)

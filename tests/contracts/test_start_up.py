@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator import make_estimator
@@ -48,6 +49,7 @@ def test_importing_the_estimators_loads_no_statistics_and_no_pictures():
     assert not {"scipy.special", "scipy.stats", "matplotlib", "pymunk"} & set(loaded)
 
 
+@pytest.mark.slow
 def test_a_state_saved_here_continues_bit_for_bit_in_another_process(tmp_path):
     slam = make_estimator("invariant", **NOISE)
     for odometry, readings, _ in drive(0, 20):
@@ -58,6 +60,7 @@ def test_a_state_saved_here_continues_bit_for_bit_in_another_process(tmp_path):
     code = """
 import pickle, sys
 import numpy as np
+import pytest
 from slamgym.estimator import make_estimator
 
 folder, std, sensor = sys.argv[1], eval(sys.argv[2]), eval(sys.argv[3])
@@ -84,6 +87,7 @@ for load in (np.load, lambda path: pickle.loads(open(path, "rb").read())):
         np.testing.assert_array_equal(covariance, slam.belief().covariance)
 
 
+@pytest.mark.slow
 def test_kernels_run_as_plain_python_for_a_debugger():
     code = """
 from slamgym.estimator import make_estimator
@@ -116,10 +120,12 @@ def test_an_edited_kernel_is_compiled_again(tmp_path):
     assert sorted(f.name for f in cache.iterdir()) == ["module.pyc", "new.nbi"]
 
 
+@pytest.mark.slow
 def test_kernels_compiled_and_kernels_loaded_give_the_same_bits(tmp_path):
     code = """
 import sys
 import numpy as np
+import pytest
 from slamgym.estimator import make_batch, make_estimator
 
 noise = {"motion_std": (0.1, 0.05, 0.03), "measurement_std": (0.02, 0.1)}

@@ -208,6 +208,7 @@ def test_wandering_has_the_documented_means_and_spreads(dt):
     assert actions[:, 1].std() == pytest.approx(0.8 / 3, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.1, 1.0])
 def test_wandering_forgets_within_the_correlation_time(dt):
     turns = wander(steps=int(8000 / dt), dt=dt, correlation_time=5.0)[:, 1]

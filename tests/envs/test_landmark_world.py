@@ -327,6 +327,7 @@ def test_a_map_drawn_anew_does_not_change_path_or_noise():
     assert_same(moments, episode(make(landmarks=points, sensor={"std": [0.0, 0.0]})))
 
 
+@pytest.mark.slow
 def test_episodes_are_the_same_in_every_process():
     code = (
         "import hashlib, numpy as np\n"

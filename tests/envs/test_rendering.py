@@ -267,6 +267,7 @@ def test_world_of_one_point_has_a_view():
     assert np.ptp(limits.x) > 0
 
 
+@pytest.mark.slow
 def test_renderer_is_copied_and_pickled_without_its_figure(renderer):
     frame = renderer.render(snapshot())
     for twin in (pickle.loads(pickle.dumps(renderer)), copy.deepcopy(renderer)):
@@ -373,6 +374,7 @@ def test_environments_are_imported_without_matplotlib():
     assert "matplotlib" not in modules
 
 
+@pytest.mark.slow
 def test_arrays_are_rendered_without_pyplot():
     modules = loaded_modules("import slamgym.envs.rendering.renderer")
     assert "matplotlib" in modules

@@ -78,6 +78,7 @@ def reset_some(vectors, mask):
 # --- parity ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES, ids=str)
 @pytest.mark.parametrize("name", WORLDS_TO_TEST)
 def test_it_gives_what_gymnasiums_vector_of_single_worlds_gives(name, mode):

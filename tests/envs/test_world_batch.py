@@ -107,6 +107,7 @@ def assert_equal_worlds(batch, singles):
             assert bits(value) == bits(of_this[name]), (name, world)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_each_world_is_the_single_world_of_its_generator(name):
     """Through resets of some worlds, and steps that some worlds do not take."""

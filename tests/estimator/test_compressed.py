@@ -125,12 +125,14 @@ def test_it_equals_the_full_filter_while_300_landmarks_come_and_go(base):
     assert phases > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_it_equals_the_full_filter_while_1000_landmarks_come_and_go(base):
     _, phases = follow_both(base, 1000, 1000, mapped=True, every=100)
     assert phases > 3
 
 
+@pytest.mark.slow
 def test_it_equals_the_full_filter_over_1000_steps_among_1000_landmarks():
     """With a twin in numpy and BLAS for the full filter, not its own kernels."""
     slam = map_all(CompressedEkfSlam(*NOISE), 1000)
@@ -167,6 +169,7 @@ def test_it_equals_the_full_filter_at_a_local_size_of_the_users_choice(base):
     assert len(slam.local_ids) <= 18 + 10
 
 
+@pytest.mark.slow
 def test_over_20000_steps_it_stays_symmetric_and_positive_definite():
     slam = run(CompressedEkfSlam(*NOISE), wander(120, 20_000, seen=4))
     belief = slam.belief()
@@ -265,6 +268,7 @@ def through_npz(state):
     return dict(np.load(file))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 @pytest.mark.parametrize("jumping", [False, True])
 def test_a_run_stopped_at_any_step_continues_bit_for_bit(base, jumping):

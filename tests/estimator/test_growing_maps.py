@@ -52,6 +52,7 @@ def results():
     return results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("label", "full"), EXACT.items())
 def test_compressed_has_every_nees_of_its_base(results, label, full):
     one, other = results.sel(estimator=label), results.sel(estimator=full)
@@ -61,6 +62,7 @@ def test_compressed_has_every_nees_of_its_base(results, label, full):
     np.testing.assert_array_equal(one.nis_dof, other.nis_dof)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("label", "full"), EXACT.items())
 def test_compressed_is_accepted_where_its_base_is(results, label, full):
     one, other = consistency_of(results, label), consistency_of(results, full)
@@ -75,6 +77,7 @@ def in_band(total, dof):
     return low < total < high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", [*EXACT.values(), *OTHERS])
 def test_in_a_city_the_final_belief_is_honest(results, label):
     one = results.sel(estimator=label)
@@ -236,6 +239,7 @@ def both_processes(tmp_path_factory):
     return here, json.loads(done.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_stopped_after_any_call_it_goes_on_in_another_process(both_processes, way):
     here, there = both_processes
@@ -325,6 +329,7 @@ def tidied(slam, runs, run, called):
     return float(nees), len(error), merged
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", MANAGED)
 def test_merging_true_duplicates_keeps_a_growing_map_honest(way):
     name, options = MANAGED[way]
@@ -339,6 +344,7 @@ def test_merging_true_duplicates_keeps_a_growing_map_honest(way):
     assert in_band(total, freedom)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", MANAGED)
 def test_two_neighbours_in_a_growing_map_are_not_merged(way):
     """0.3 m apart, never seen in one scan, so that only their distance tells."""

@@ -207,6 +207,7 @@ class WithoutAWindow:
         return getattr(self._slam, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -387,6 +388,7 @@ def merged_runs(name, start_std, runs=150, steps=40):
     return np.array(errors), merges / runs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "start_std"), [("ekf", (0, 0, 0)), ("invariant", (0.1, 0.1, 0.1))]
 )
@@ -396,6 +398,7 @@ def test_merging_true_duplicates_keeps_the_filter_consistent(name, start_std):
     assert in_band(nees, 15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ekf", "invariant"])
 def test_two_neighbours_are_not_merged(name):
     """0.3 m apart, never seen in one scan, so that only their distance tells."""
@@ -759,6 +762,7 @@ def test_landmarks_begun_in_a_new_submap_count_as_seen():
     assert sightings.tolist() == [20] * 5 + [7]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", [False, True])
 def test_a_saved_run_in_submaps_goes_on_bit_for_bit(tmp_path, folder):
     options = {**SMALL, **({"folder": tmp_path / "run"} if folder else {})}
@@ -781,6 +785,7 @@ def test_a_saved_run_in_submaps_goes_on_bit_for_bit(tmp_path, folder):
         assert all(np.array_equal(v, final[k]) for k, v in whole.state_dict().items())
 
 
+@pytest.mark.slow
 def test_merging_true_duplicates_keeps_submaps_consistent():
     """Landmark 0 gets another name halfway, after submaps were closed."""
     errors, merges, runs, steps = [], 0, 30, 40

@@ -84,6 +84,7 @@ def test_it_keeps_the_contract(options):
     check_estimator(lambda **noise: SparseInformationSlam(**noise, **options))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start_std", [(0, 0, 0), (0.2, 0.1, 0.05)], ids=str)
 def test_without_a_bound_it_is_the_textbook_filter(start_std):
     # A robot that cannot slip sideways, from a pose that may be certain: the joint
@@ -170,6 +171,7 @@ def relative_eigenvalues(slam, full):
     return np.linalg.eigvalsh(np.linalg.solve(L, np.linalg.solve(L, P).T))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bound", [4, 8])
 def test_at_the_same_linearisation_it_is_never_more_certain_than_the_ekf(bound):
     # Without noise all means stay at the truth, and with them all Jacobians.
@@ -248,6 +250,7 @@ def test_the_order_of_a_scan_does_not_matter():
     np.testing.assert_allclose(A.covariance, B.covariance, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_with_a_bound_links_stay_few_and_without_they_do_not():
     drives = [wander(2000, steps, seed=5) for steps in (300, 900)]
     small, large = (
@@ -300,6 +303,7 @@ def test_marginals_are_blocks_of_the_dense_inverse():
     np.testing.assert_array_equal(whole.landmarks, slam.landmarks)
 
 
+@pytest.mark.slow
 def test_what_waits_far_from_the_robot_is_within_the_tolerance():
     def deviation(tolerance):
         exact, slam = (
@@ -372,6 +376,7 @@ np.savez({result!r}, mean=belief.mean, covariance=belief.covariance)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [137, 301])
 def test_another_process_continues_with_the_same_bits(tmp_path, steps):
     drive = list(wander(1000, 400))
@@ -465,6 +470,7 @@ def test_a_matrix_that_is_not_positive_definite_is_named():
         solver(matrix, np.arange(200))
 
 
+@pytest.mark.slow
 def test_in_the_loop_it_errs_like_the_ekf_and_pruning_far_beyond():
     # A handful of landmarks in view and four that may be linked.  All three share the
     # EKF's linearisation, which is overconfident here by itself (benchmarks/
@@ -585,6 +591,7 @@ def test_a_small_reach_puts_off_corrections_and_loses_none():
     np.testing.assert_allclose(world.points[: 2 * count] + waiting, exact, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("base", "full"),
     [
@@ -637,6 +644,7 @@ def test_readings_are_blind_to_a_turn_of_the_map_at_its_first_estimates(base, bo
     assert turn @ information @ turn < 1e-6 * np.linalg.eigvalsh(information)[4]
 
 
+@pytest.mark.slow
 def test_in_the_loop_constrained_jacobians_make_relocating_honest():
     # Seven times overconfident as ekf, with four landmarks that may be linked.
     world, runs = load_scenario("loop"), 3
@@ -678,6 +686,7 @@ def town_information(rng, places, reach):
     return dense
 
 
+@pytest.mark.slow
 def test_what_is_kept_of_the_elimination_is_that_of_the_whole_map_at_any_time(
     monkeypatch,
 ):

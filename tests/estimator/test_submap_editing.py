@@ -205,6 +205,7 @@ WAYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("way", WAYS)
 def test_merging_is_having_known_it_from_the_start(base, way):
@@ -256,6 +257,7 @@ def test_merging_is_a_reading_of_distance_zero(base, way):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", BASES)
 def test_merging_keeps_the_belief_honest(base):
     nees = []
@@ -616,6 +618,7 @@ def states_agree(one, other):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("on_disk", [False, True])
 @pytest.mark.parametrize("cut", [16, 45, 60])

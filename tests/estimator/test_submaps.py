@@ -299,6 +299,7 @@ def test_without_a_closed_submap_it_is_the_base_filter():
 # --- honesty --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_landmarks_and_the_pose_are_where_the_covariance_says():
     nees = []
     for seed in range(25):
@@ -311,6 +312,7 @@ def test_the_landmarks_and_the_pose_are_where_the_covariance_says():
     assert abs(np.sum(nees) - dof) < 4 * np.sqrt(2 * dof)
 
 
+@pytest.mark.slow
 def test_in_the_loop_it_is_honest_where_the_ekf_is_not():
     choices = {
         "ekf": ("ekf", {}),

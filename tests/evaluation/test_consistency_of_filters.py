@@ -50,6 +50,7 @@ def share_inside(nees):
     return ((average > low) & (average < high)).mean()
 
 
+@pytest.mark.slow
 def test_in_the_loop_the_invariant_filter_is_consistent_and_the_ekf_is_not():
     # NEES is strongly correlated in time, so the share of steps inside the band varies
     # from one 200 runs to the next (.73 to .98): the average of three is looked at.
@@ -74,6 +75,7 @@ def test_with_the_frame_anchored_every_filter_is_consistent(name):
     assert 0.9 < study("anchored", name)[0].mean() < 1.1
 
 
+@pytest.mark.slow
 def test_with_a_coarse_sensor_the_iterated_invariant_filter_stays_sound():
     nees, _ = study("coarse_loop", "invariant", iterations=3)
     per_run = nees.mean(axis=1)

@@ -48,6 +48,7 @@ DECISIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DECISIONS)
 def test_a_consistent_filter_is_refused_as_often_as_stated(name, repetitions):
     decide = DECISIONS[name]
@@ -55,6 +56,7 @@ def test_a_consistent_filter_is_refused_as_often_as_stated(name, repetitions):
     assert 0.035 <= refused <= 0.07
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [10, 20, 50])
 def test_averages_of_a_filter_that_never_forgets_are_refused_as_often(runs):
     """One χ²(3) per run, the most skewed case; the plain t-test refuses 8 %."""
@@ -81,6 +83,7 @@ def test_equivalence_is_claimed_at_the_margin_as_often_as_stated(ratio):
     assert 0.035 <= np.mean(claimed) <= 0.07
 
 
+@pytest.mark.slow
 def test_covariances_too_small_by_a_fifth_are_found_with_the_stated_power():
     rng = np.random.default_rng(5)
     nees, _ = kalman_scores(rng, REPETITIONS * 209, 8, claimed=1.2)

@@ -55,6 +55,7 @@ def test_a_filter_that_errs_by_a_tenth_about_the_noise_is_refused(drives, doubt)
     assert not low < final_nees(drives, doubt).sum() < high
 
 
+@pytest.mark.slow
 def test_the_nis_of_all_scans_is_chi_square_too(drives):
     """The innovations of a filter are white, so those of one run add up too."""
     total, dof = 0.0, 0

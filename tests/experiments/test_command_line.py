@@ -182,6 +182,7 @@ def test_options_reach_the_filter(log, without_pictures):
     }
 
 
+@pytest.mark.slow
 def test_the_pictures_of_single_steps_can_be_left_out(log):
     files = answered("replay", log, "--no-every-step")["files"]
     assert not [name for name in files if name.startswith("map_steps")]
@@ -348,6 +349,7 @@ def test_several_mistakes_of_a_scenario_stand_in_one_line(here):
     assert "; mine.toml: steps must be" in message
 
 
+@pytest.mark.slow
 def test_a_noise_study_draws_one_figure_and_tables_eleven_runs(log):
     summary = answered("noise-study", log, "--out", "study")
     assert summary["files"] == ["noise_study.csv", "noise_study.png", "summary.json"]
@@ -438,6 +440,7 @@ def test_help_and_scenarios_load_neither_numba_nor_matplotlib():
     subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
 
 
+@pytest.mark.slow
 def test_the_installed_program_answers_an_error_with_one_line():
     program = [
         sys.executable,

@@ -197,6 +197,7 @@ def run_until_killed(out, name, delay):
     return job.exitcode
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kills", "latest"),
     [("npz", 5, 0.06), ("slamlog", 3, 0.2)],  # [s]: about two shards
@@ -415,6 +416,7 @@ def test_a_folder_without_a_right_manifest_is_named(tmp_path):
 # memory, progress, command
 
 
+@pytest.mark.slow
 def test_memory_stays_flat(tmp_path):
     def peak(shards):
         tracemalloc.start()

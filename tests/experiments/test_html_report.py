@@ -151,6 +151,7 @@ def test_the_page_asks_for_nothing_and_runs_nothing(report):
     assert policy.startswith("default-src 'none'")
 
 
+@pytest.mark.slow
 def test_whatever_names_and_messages_hold_is_shown_as_text():
     page = page_of(hostile_results())
     outline = Outline(page)
@@ -163,6 +164,7 @@ def test_whatever_names_and_messages_hold_is_shown_as_text():
     assert HOSTILE in map(html.unescape, drawn)
 
 
+@pytest.mark.slow
 def test_the_scenario_can_be_taken_from_the_page():
     page = page_of(typical())
     (text,) = re.findall(r"toml</summary>\n<pre[^>]*><code>(.*?)</code>", page, re.S)
@@ -194,6 +196,7 @@ def call_on(page, folder):
     return eval(ast.get_source_segment(code, last), names), code
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"steps": 5}, {"name": "my_own"}])
 @pytest.mark.parametrize("assumed", [False, True])
 @pytest.mark.parametrize(
@@ -228,10 +231,12 @@ def test_many_estimators_are_counted_in_the_headline():
     assert said == "loop: 4 of 4 estimators consistent"
 
 
+@pytest.mark.slow
 def test_the_same_results_give_the_same_bytes():
     assert page_of(typical()) == page_of(typical().copy(deep=True))
 
 
+@pytest.mark.slow
 def test_a_failure_leaves_the_old_report(report, tmp_path, monkeypatch):
     path = tmp_path / "report.html"
     path.write_text("old")
@@ -247,6 +252,7 @@ def broken_disk(path):
     raise OSError("disk full")
 
 
+@pytest.mark.slow
 def test_long_runs_of_several_estimators_stay_below_2_megabytes():
     short = typical()
     rows = np.arange(1005) % 29 + 1

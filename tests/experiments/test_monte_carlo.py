@@ -79,6 +79,7 @@ def test_a_run_depends_on_its_seed_alone(whole):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["loky", "threading"])
 def test_workers_change_no_bit(whole, backend):
     shared = monte_carlo(
@@ -332,6 +333,7 @@ def test_a_disk_that_fills_under_the_results_says_so(tmp_path, monkeypatch):
     assert list((tmp_path / "blocks").glob("runs-*.npz"))
 
 
+@pytest.mark.slow
 def test_a_job_killed_ten_times_ends_with_the_same_bits(whole, tmp_path):
     rng = np.random.default_rng(0)
     blocks = tmp_path / "blocks"
@@ -398,6 +400,7 @@ def test_a_disk_that_is_full_leaves_the_blocks_before(whole, tmp_path):
         xr.testing.assert_equal(later.load(), whole)
 
 
+@pytest.mark.slow
 def test_memory_grows_with_the_block_and_not_with_the_runs(tmp_path):
     def peak(runs):
         tracemalloc.start()
@@ -467,6 +470,7 @@ def test_options_may_be_words():
     assert make_estimator("ekf", motion_std=(0, 0, 0), measurement_std=(0.1, 0.1))
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(whole, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
     script = textwrap.dedent(

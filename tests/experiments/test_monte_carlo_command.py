@@ -65,6 +65,7 @@ def test_results_summary_and_report_are_written_and_told(here):
     assert "<svg" in page
 
 
+@pytest.mark.slow
 def test_a_filter_of_ones_own_is_found_and_its_crash_told(here):
     (here / "fragile.py").write_text(FRAGILE)
     script = shutil.which("slamgym", path=Path(sys.executable).parent)
@@ -88,6 +89,7 @@ def test_a_filter_of_ones_own_is_found_and_its_crash_told(here):
     assert "&lt;b&gt;a wheel" in page
 
 
+@pytest.mark.slow
 def test_filters_may_be_told_another_noise():
     result = slamgym(
         *("monte-carlo", "six_landmarks", "-e", "invariant", "--runs", 30, "--json"),
@@ -115,6 +117,7 @@ def test_what_cannot_be_done_is_said_in_one_line(here, arguments, message):
     assert not (here / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_of_another_scenario_is_refused(here):
     assert (
         slamgym("monte-carlo", "anchored", "--runs", 2, "--out", "out").exit_code == 0
@@ -125,6 +128,7 @@ def test_a_folder_of_another_scenario_is_refused(here):
     assert (here / "out" / "results.nc").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_an_interrupted_job_says_that_it_goes_on(here):
     command = [
         sys.executable,
@@ -161,6 +165,7 @@ def test_a_noise_study_over_many_runs_writes_figure_and_table(here):
     )
 
 
+@pytest.mark.slow
 def test_dask_is_asked_for_by_name(here):
     pytest.importorskip("distributed", reason="needs dask.distributed")
     script = shutil.which("slamgym", path=Path(sys.executable).parent)

@@ -194,6 +194,7 @@ def test_what_a_killed_writer_left_is_gone_after_the_next_run(
     assert names(tmp_path) == finished()
 
 
+@pytest.mark.slow
 def test_workers_that_outlive_a_killed_writer_do_not_keep_the_folder(tmp_path, whole):
     killed(tmp_path, "workers")
     done = []
@@ -235,6 +236,7 @@ def test_a_folder_with_something_else_stays_as_it_is(tmp_path):
         monte_carlo(**JOB, runs=RUNS, out=tmp_path / "thesis.tex")
 
 
+@pytest.mark.slow
 def test_parts_of_two_machines_are_merged_without_their_rests(tmp_path, whole):
     one, two, both = (tmp_path / name for name in ("one", "two", "both"))
     killed(one, "block")
@@ -302,6 +304,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_runs_use_one_blas_thread_and_leave_the_others_as_they_were():
     """Else the last bits would depend on how many workers share the cores."""
     done = subprocess.run(

@@ -171,6 +171,7 @@ def test_verdicts_on_white_nees(factor, runs, word, said):
     assert said in verdict.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [2, 3, 5, 10, 20])
 def test_few_runs_of_a_consistent_filter_are_called_wrong_in_5_percent(runs):
     """NEES that never changes over time is the hardest case: as skewed as can be."""
@@ -193,6 +194,7 @@ def test_few_runs_of_a_filter_that_is_far_off_are_found(runs):
     assert judge(white_report(8.0, runs), 0, runs).word == "not consistent"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", range(2, 7))
 def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs):
     world = load_scenario("six_landmarks").with_changes(steps=12)
@@ -283,6 +285,7 @@ def test_gaps_that_nobody_flagged_are_found_with_their_step():
     assert "not finite" in failure["message"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("good", [0, 1])
 def test_fewer_than_two_good_runs_decide_nothing_and_break_nothing(good):
     failures = [("ekf", run, 5, "boom") for run in range(good, 40)]
@@ -374,6 +377,7 @@ def test_a_bound_of_the_heading_too_small_to_matter_is_left_out(std, bound):
     assert row.right == bound
 
 
+@pytest.mark.slow
 def test_a_word_has_one_colour_on_terminal_and_page():
     summary = summarise_monte_carlo(typical())
     styles = {"good": "green", "bad": "red", "open": "yellow"}
@@ -426,6 +430,7 @@ def test_the_heading_panels_show_claim_truth_and_what_is_knowable():
     assert line_of(axes, "at the start").get_ydata()[0] == pytest.approx(5.7296, 1e-4)
 
 
+@pytest.mark.slow
 def test_every_run_is_a_dot_of_its_own():
     axes = figure_of(typical(), "runs").axes[0]
     dots = [line for line in axes.lines if line.get_marker() == "o"]

@@ -147,6 +147,7 @@ def test_without_truth_the_errors_are_unknown(log):
     assert row.landmark_area > 0
 
 
+@pytest.mark.slow
 def test_a_study_of_one_run_loads_nothing_of_the_monte_carlo():
     program = (
         "import sys\n"

@@ -78,6 +78,7 @@ def drawn_texts(figure, monkeypatch):
     return [(text.get_text(), text.get_window_extent()) for text in drawn]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("figure_of", FIGURES)
 @pytest.mark.parametrize(("steps", "count"), [(12, 6), (200, 20), (60, 200)])
 def test_texts_neither_overlap_nor_leave_the_figure(
@@ -111,6 +112,7 @@ def test_errors_and_time_have_units():
     assert counted.get_xlabel() == "time [steps]"
 
 
+@pytest.mark.slow
 def test_figures_are_made_without_pyplot():
     code = "import slamgym.experiments.figures, sys; print(*sys.modules)"
     result = subprocess.run(
@@ -237,6 +239,7 @@ def test_map_before_any_landmark_is_drawn():
     assert len(ellipses_of(figure, FIRST).get_widths()) == 0
 
 
+@pytest.mark.slow
 def test_sequence_saves_the_map_of_every_step(tmp_path):
     trace = make_trace(steps=4)
     files = map_sequence(trace, tmp_path / "maps", dpi=100)
@@ -345,6 +348,7 @@ def test_rows_of_large_maps_are_named_thinly():
     assert 5 < len(labels) < 20
 
 
+@pytest.mark.slow
 def test_certain_rows_are_grey_not_white():
     certain = make_trace().first_covariance.copy()
     certain[:3], certain[:, :3] = 0, 0

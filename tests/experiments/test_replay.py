@@ -435,6 +435,7 @@ def test_utias_agrees_with_an_independent_filter(public_logs):
     assert errors == pytest.approx((0.276, 0.282, 0.158, 0.209), rel=0.05)
 
 
+@pytest.mark.slow
 def test_utias_is_no_worse_with_the_noise_at_the_expected_range(public_logs):
     as_read = errors_on_utias(public_logs, range_noise_at="reading")
     expected = errors_on_utias(public_logs)

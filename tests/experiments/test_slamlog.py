@@ -295,6 +295,7 @@ def test_a_log_of_wrong_shapes_is_refused(change):
         SlamLog("odd", **change)
 
 
+@pytest.mark.slow
 def test_public_logs_survive_the_round_trip(public_logs, tmp_path):
     for name in ("cmu16833", "freiburg9", "mrpt_kfslam_demo", "utias_d6_r3"):
         log = read_slamlog(public_logs / f"{name}.csv")

@@ -49,6 +49,7 @@ def summary(request, log):
     return filtered(log, POLICY, request.param)
 
 
+@pytest.mark.slow
 def test_management_keeps_the_map_small_and_the_path_true(summary):
     assert 350 <= len(summary["landmarks"]) <= 420
     assert summary["map_changes"]["most"] <= 420
@@ -56,6 +57,7 @@ def test_management_keeps_the_map_small_and_the_path_true(summary):
     assert summary["ate"]["aligned"] < 2.6  # against GPS
 
 
+@pytest.mark.slow
 def test_every_reading_is_accounted_for(log, summary):
     counts = summary["readings"]
     scans = [event for event in log.events if isinstance(event, Scan)]
@@ -65,6 +67,7 @@ def test_every_reading_is_accounted_for(log, summary):
     )
 
 
+@pytest.mark.slow
 def test_without_confirmation_and_removal_the_map_grows_far_larger(log):
     beginning = replace(log, events=tuple(e for e in log.events if e.t < 300))
     managed = filtered(beginning, POLICY)

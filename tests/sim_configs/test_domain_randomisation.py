@@ -60,6 +60,7 @@ def test_factors_are_uniform_in_their_logarithm(name):
     assert abs((exponents**2).mean() - 1 / 3) < 4 * 0.3 / math.sqrt(400)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VALUES)
 def test_values_are_uniform_between_their_ends(name):
     drawn = draws({name: [0.4, 0.9]})

@@ -297,6 +297,7 @@ def test_a_saved_layout_loads_back_equal(layout, tmp_path):
     assert load_scenario(tmp_path / "copy.toml") == scenario
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     name=st.text(min_size=1),
