@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """The same EKF-SLAM step by other means: stacked dense numpy, filterpy, Stone Soup.
 
 Each peer is given what it needs to be fast: one vectorised h and one vectorised full H.

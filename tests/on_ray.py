@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """What runs on Ray: PPO of RLlib on every environment, and a Monte Carlo.
 
 Not part of the suite, as Ray asks for an older Gymnasium and for two gigabytes; in an

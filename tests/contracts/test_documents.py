@@ -147,6 +147,35 @@ def test_relative_links_resolve(document):
         assert not anchor or anchor in anchors(target), link
 
 
+NAMED_FILE = re.compile(r"`((?:[\w.]+/)+[\w.-]+\.\w+)`|python ((?:[\w]+/)+\w+\.py)")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
+def test_files_named_in_a_document_exist(document):
+    text = document.read_text()
+    for name in filter(
+        None, (name for pair in NAMED_FILE.findall(text) for name in pair)
+    ):
+        inside = name.split("/")[0] in {entry.name for entry in ROOT.iterdir()}
+        assert (ROOT / name).exists() or not inside, name
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
+def test_a_link_that_names_a_module_leads_to_it(document):
+    linked = re.findall(r"\[([\w/]+\.py)\]\(([^)#\s]+)\)", document.read_text())
+    assert not [(name, path) for name, path in linked if not path.endswith(name)]
+
+
+def test_the_flow_of_a_step_names_rooms_and_modules_that_exist():
+    flow = README.split("## Where things are")[1].split("```text\n")[1].split("```")[0]
+    for line in flow.splitlines():
+        _, rooms, modules = re.split(r"  +", line.strip().removeprefix("→ "))
+        house, *names = re.split(r"[/,] *", rooms)
+        folders = [ROOT / house / name for name in names] or [ROOT / house]
+        for module in modules.split(", "):
+            assert any((f / f"{module}.py").exists() for f in folders), line
+
+
 def test_pictures_in_documents_are_small():
     pictures = list((ROOT / "docs" / "images").iterdir())
     assert pictures
