@@ -1,5 +1,7 @@
 """Active SLAM: explore an unknown map of landmarks, and come to know it."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Active SLAM in many worlds side by side, in numpy and on the batched filters."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """Estimators for agents: chosen by name or made by hand, and held to their promises."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from functools import partial

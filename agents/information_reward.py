@@ -14,6 +14,8 @@ uncorrelated with all else: so P has one size from the first step to the last, a
 decreases of a criterion over an episode add up to its first value minus its last.
 """
 
+from __future__ import annotations
+
 import math
 from typing import Any, SupportsFloat
 

@@ -1,5 +1,7 @@
 """Checks and clipping of actions, for one world or for many."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 

@@ -1,5 +1,7 @@
 """The landmark world: a unicycle robot among landmarks, as a Gymnasium environment."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

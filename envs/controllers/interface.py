@@ -1,5 +1,7 @@
 """The interface of controllers, for one robot and for many, and its argument checks."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from typing import Protocol

@@ -1,5 +1,7 @@
 """Open-loop control: a sequence of actions, whatever the pose."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Self
 

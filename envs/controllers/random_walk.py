@@ -1,5 +1,7 @@
 """A correlated random walk: speed and turn rate change slowly and at random."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from typing import Self

@@ -1,5 +1,7 @@
 """Waypoint control: turn towards the next point, then drive to it."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from typing import Self

@@ -6,6 +6,8 @@ P = [[a, b], [b, c]]  covariance of a position [m²]
 n                     size of the ellipse in standard deviations
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Many landmark worlds as one native vector environment of Gymnasium."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """Many worlds of one scenario, simulated together in numpy."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -53,7 +53,7 @@ def _join_ray(backend: str | None, scheduler: str) -> None:
     if backend != "ray":
         raise BadInputError("--scheduler is for --backend dask or ray")
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise BadInputError("--backend ray needs ray: pip install ray") from None
     ray.init(address=scheduler)

@@ -1,5 +1,7 @@
 """What a log is made of: odometry rows, and scans of simultaneous readings."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

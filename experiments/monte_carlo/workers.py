@@ -70,7 +70,7 @@ def _ray_workers(jobs: int | None) -> Workers:
     no block could be written before.
     """
     try:
-        from ray.util.multiprocessing import Pool  # noqa: PLC0415 (an extra)
+        from ray.util.multiprocessing import Pool  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ValueError("backend 'ray' needs ray: pip install ray") from None
 

@@ -1,5 +1,7 @@
 """How an estimator is set up for a log: what the log tells, and what the user says."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -74,7 +76,7 @@ class FilterSettings:
                 f"estimator '{self.estimator}' refuses its options: {error}"
             ) from error
 
-    def scaled(self, sigma: str, factor: float) -> "FilterSettings":
+    def scaled(self, sigma: str, factor: float) -> FilterSettings:
         """Multiply one of `SIGMAS` by a factor, and keep all else."""
         scaled = [
             std * factor if name == sigma else std

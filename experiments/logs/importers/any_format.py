@@ -1,5 +1,7 @@
 """Read a log of any known format."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
