@@ -1,11 +1,11 @@
-"""Active SLAM: explore an unknown map of landmarks, and come to know it."""
+"""Active SLAM: explore an unknown map until every landmark is known accurately."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -15,13 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
 from ..sim_configs import Scenario
-from .active_slam_task import ActiveSlamTask, Progress, Stakes
-from .belief_arrays import belief_in_rows
-from .coverage_grid import FloorPlan
+from .active_slam_task import ActiveSlamTask, Progress, RewardWeights
+from .agent_knowledge import AgentKnowledge
+from .belief_arrays import belief_arrays
 from .estimator_choice import (
-    BeliefOfMap,
     EstimatorChoice,
-    FollowingEstimator,
     checked_belief,
     choose_estimator,
 )
@@ -30,35 +28,15 @@ Array = NDArray[np.float64]
 Observation = dict[str, Any]
 
 
-class Situation(NamedTuple):
-    """All that an agent may know at one moment; nothing of the truth."""
-
-    scenario: Scenario
-    plan: FloorPlan
-    estimator: FollowingEstimator
-    """To ask what would be; whoever changes its state restores it."""
-    belief: BeliefOfMap
-    explored: NDArray[np.bool_]
-    """Cells of the plan seen so far, as believed, shape (C,)."""
-    known: NDArray[np.bool_]
-    """Landmarks known to the accuracy, shape (N,)."""
-    accuracy: float
-    """That a landmark has to be known to [m]."""
-    prior_std: tuple[float, float]
-    """Of the coordinates of a landmark not yet mapped [m]."""
-    step: int
-    """Steps done so far."""
-
-
 class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
-    """A robot explores a walled floor until it knows where every landmark is.
+    """A robot explores a walled floor until it knows every landmark.
 
     ## Description
-    The floor's plan is known, its landmarks are not: they stand elsewhere in every
-    episode. An estimator follows the robot, and the agent observes what it believes.
-    Its pose decays while it drives into the unknown, and with it every landmark it
-    maps from there; seeing landmarks again that are known well makes up for it. So the
-    agent has to explore, to look again, and not to touch a wall, in few steps.
+    The walls of the floor are known. The landmarks are not, and every episode places
+    new ones. An estimator runs in the loop, and the agent observes its belief. The pose
+    becomes uncertain while the robot explores, and so do the landmarks that it maps
+    there. Revisiting well-known landmarks reduces the uncertainty. The agent has to
+    explore, to revisit, and to avoid the walls, in few steps.
 
     ## Action Space
     ``Box(float32, (2,))``: (v, ω), speed [m/s] and turn rate [rad/s], as in
@@ -66,10 +44,10 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
 
     ## Observation Space
     ``Dict`` of float64 arrays within [-1, 1] and a bool mask; see
-    `ActiveSlamTask.observe` and `belief_features`. All of it comes from the belief and
-    the plan. N is the number of landmarks, row i is landmark i. Where landmarks are
-    believed is told in the robot's frame, ahead along the heading and aside to the
-    left, in diagonals of the floor; zeros where they are not mapped.
+    `ActiveSlamTask.observe` and `belief_features`. All values derive from the belief
+    and the walls. N is the number of landmarks, row i is landmark i. Positions of
+    landmarks are in the robot's frame, ahead along the heading and aside to the left,
+    in diagonals of the floor; zeros where not mapped.
 
     | key | shape | content |
     |---|---|---|
@@ -81,26 +59,26 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
     | ``belief_landmark_correlation`` | (N,) | of the two |
     | ``belief_landmark_map_std`` | (N,) | worst σ in the map's frame, log scale |
     | ``belief_mask`` | (N,) bool | which landmarks are mapped |
-    | ``goals`` | (9,) | ways to the nearest unseen, nearest unknown, best known |
+    | ``goals`` | (9,) | directions to the nearest unseen, nearest unknown, best known |
     | ``progress`` | (4,) | shares: explored, mapped, known, time left |
-    | ``uncertain`` | (16,) | pull of mapped landmarks not yet known, by direction |
-    | ``unexplored`` | (16,) | pull of the floor not yet seen, by direction |
-    | ``walls`` | (8,) | way to the wall, by direction |
+    | ``uncertain`` | (16,) | density of mapped, not yet known landmarks, by direction |
+    | ``unexplored`` | (16,) | density of unseen cells, by direction |
+    | ``walls`` | (8,) | distance to the wall, by direction |
 
     `info` has the same keys in `reset` and `step`: the truth, ``pose`` (x, y, θ) and
     ``collision``; the counts ``mapped`` and ``known``; and ``success``.
 
     ## Rewards
     Per step, with U = ½ log det Σ / N the uncertainty of the map in nats per landmark,
-    where a landmark not yet mapped may be anywhere on the floor (σ = side / √12)::
+    where an unmapped landmark is uniform on the floor (σ = side / √12)::
 
         U_before - U_after
         - step_cost - effort_cost effort(v, ω)
         - crash_cost                            if a wall is touched
         + success_reward (1 + time left)        if every landmark is known
 
-    The information terms add up to U at the first scan minus U at the end, some 8 to
-    12 at most; all rewards of an episode lie within about [-13, 20]. ``criterion`` "A"
+    The information terms add up to U at the first scan minus U at the end, at most
+    about 8 to 12. The return of an episode is within about [-13, 20]. ``criterion`` "A"
     or "E" measures U by the mean squared or the worst error instead [m²].
 
     | mean return (success) | active_easy | active_medium | active_hard |
@@ -112,25 +90,26 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
     | PPO, 2 million steps | | 14.7 (0.90) | |
 
     ## Starting State
-    The robot stands at the scenario's start, which the estimator knows to
-    ``scenario.start.std``; it has taken one scan.
+    The robot is at the scenario's start, known to the estimator with
+    ``scenario.start.std``, and has taken one scan.
 
     ## Episode End
-    Terminated when every landmark is known: its worst standard deviation is at most
-    ``accuracy``. Terminated on touching a wall. Truncated after ``scenario.steps``.
+    Terminated when every landmark is known, that is, its worst standard deviation is
+    at most ``accuracy``, or when the robot touches a wall. Truncated after
+    ``scenario.steps``.
 
     ## Arguments
     scenario : Scenario, mapping, str or Path, default "active_medium"
         "active_easy", "active_medium", "active_hard", or any with walls and identities.
     estimator : str, callable or object, default "invariant"
-        Which filter: see `choose_estimator`. The reward is its own opinion, so an
-        overconfident filter is paid for what it does not know.
+        The filter, see `choose_estimator`. The reward depends on its covariance, so an
+        overconfident filter collects reward for information that it does not have.
     estimator_options : mapping, optional
         Further options of the filter.
     criterion, accuracy, success_reward, crash_cost, effort_cost, step_cost
-        See `Stakes`.
+        See `RewardWeights`.
     render_mode : {"human", "rgb_array"}, optional
-        As in `LandmarkWorldEnv`; the frames show the belief too.
+        As in `LandmarkWorldEnv`; the frames also show the belief.
     **changes
         Fields of the scenario to replace, as in `Scenario.with_changes`.
 
@@ -157,11 +136,11 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        stakes, changes = split_settings(settings)
+        weights, changes = split_settings(settings)
         self._world = LandmarkWorldEnv(scenario, render_mode=render_mode, **changes)
         self.scenario = self._world.scenario
         self.render_mode = render_mode
-        self.task = ActiveSlamTask(self.scenario, stakes)
+        self.task = ActiveSlamTask(self.scenario, weights)
         self.action_space = self._world.action_space
         self.observation_space = self.task.observation_space
         self._estimator = choose_estimator(estimator, self.scenario, estimator_options)
@@ -170,36 +149,36 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode with a new map, and take the first scan."""
+        """Start an episode with a new map, and take the first scan."""
         super().reset(seed=seed)
         self._world.np_random = self.np_random
         observation, info = self._world.reset(options=options)
         self._estimator.reset(self._world.start_estimate, self.scenario.start.std)
-        self._progress = self.task.begin(self._take_in(observation, step=0))
-        return self._answer(info, success=False)
+        self._progress = self.task.begin(self._update(observation, step=0))
+        return self._output(info, success=False)
 
     def step(
         self, action: ArrayLike
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Drive one step, look, and be rewarded for what that told.
+        """Drive one step, take a scan, and compute the reward.
 
         Raises
         ------
         ValueError
-            If the action is not two finite numbers; the world stays as it is.
+            If the action is not two finite numbers. The world does not change.
         """
         before = self._reached()
         observation, _, _, _, info = self._world.step(action)
         self._estimator.predict(observation["odometry"])
         step = int(before.steps[0]) + 1
-        after = self.task.proceed(before, self._take_in(observation, step=step))
+        after = self.task.proceed(before, self._update(observation, step=step))
         self._progress = after
         collision = np.array([info["collision"]])
         actions = np.asarray(action, dtype=np.float64)[None]
-        verdict = self.task.judge(before, after, actions, collision)
-        seen, info = self._answer(info, success=bool(verdict.success[0]))
-        ends = bool(verdict.terminated[0]), bool(verdict.truncated[0])
-        return seen, float(verdict.rewards[0]), *ends, info
+        outcome = self.task.reward(before, after, actions, collision)
+        seen, info = self._output(info, success=bool(outcome.success[0]))
+        ends = bool(outcome.terminated[0]), bool(outcome.truncated[0])
+        return seen, float(outcome.rewards[0]), *ends, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a frame in mode "rgb_array", else None."""
@@ -210,24 +189,24 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
         self._world.close()
 
     @property
-    def situation(self) -> Situation:
-        """What an agent may know now, for those that plan instead of learn."""
+    def knowledge(self) -> AgentKnowledge:
+        """The knowledge of an agent at this step, for policies that plan."""
         progress = self._reached()
-        return Situation(
+        return AgentKnowledge(
             self.scenario,
-            self.task.plan,
+            self.task.grid,
             self._estimator,
             self._belief,
             progress.explored[0],
             progress.known[0],
-            self.task.stakes.accuracy,
+            self.task.weights.accuracy,
             self.task.prior_std,
             int(progress.steps[0]),
         )
 
     @property
     def landmarks(self) -> Array:
-        """True positions of this episode's landmarks, (N, 2) [m], for pictures."""
+        """True positions of this episode's landmarks, (N, 2) [m], for figures."""
         return self._world.landmarks
 
     def _reached(self) -> Progress:
@@ -235,16 +214,16 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
             raise ResetNeeded("call reset first: there is no episode yet")
         return self._progress
 
-    def _take_in(self, observation: Observation, *, step: int) -> Any:
-        """Let the estimator see one scan; return its belief in rows."""
+    def _update(self, observation: Observation, *, step: int) -> Any:
+        """Update the estimator with one scan; return its belief."""
         seen = np.flatnonzero(observation["mask"])
         self._estimator.update(observation["landmarks"][seen], seen.tolist())
         self._belief = checked_belief(self._estimator, step)
         if self.render_mode is not None:
             self._world.show_belief(self._belief)
-        return belief_in_rows(self._belief, self.scenario.landmarks.count, by_id=True)
+        return belief_arrays(self._belief, self.scenario.landmarks.count, by_id=True)
 
-    def _answer(
+    def _output(
         self, info: dict[str, Any], *, success: bool
     ) -> tuple[Observation, dict[str, Any]]:
         progress = self._reached()
@@ -257,8 +236,8 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
         return {key: row[0] for key, row in rows.items()}, {**info, **counts}
 
 
-def split_settings(settings: Mapping[str, Any]) -> tuple[Stakes, dict[str, Any]]:
-    """Tell the stakes from changes of the scenario."""
-    own = {field.name for field in fields(Stakes)}
-    stakes = Stakes(**{key: settings[key] for key in settings if key in own})
-    return stakes, {key: settings[key] for key in settings if key not in own}
+def split_settings(settings: Mapping[str, Any]) -> tuple[RewardWeights, dict[str, Any]]:
+    """Split settings into reward weights and changes of the scenario."""
+    own = {field.name for field in fields(RewardWeights)}
+    weights = RewardWeights(**{key: settings[key] for key in settings if key in own})
+    return weights, {key: settings[key] for key in settings if key not in own}

@@ -1,14 +1,14 @@
-"""Drivers for active SLAM that plan instead of learn, to compare agents with.
+"""Baselines for active SLAM: policies that plan instead of learn.
 
 =============  =====================================================================
 ``random``     actions uniform within the robot's limits
-``coverage``   up and down the floor in lanes, then across, whatever is seen
-``greedy``     of a few motions, the one after which the estimator expects to know most
-``revisit``    explore what is nearest; back to the best known landmark when unsure
+``coverage``   lanes up and down the floor, then across, independent of the belief
+``greedy``     the motion with the largest expected information, out of a few
+``revisit``    the nearest goal; when uncertain, the best known landmark
 =============  =====================================================================
 
-None of them sees the truth: they read a `Situation`. They drive straight at what they
-want, so they need a floor without inner walls.
+They use `AgentKnowledge` only, not the truth. They drive straight to their goals, so
+they need a floor without inner walls.
 """
 
 import math
@@ -17,10 +17,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..envs.angles import wrap_angle
 from ..envs.controllers import Waypoints
 from ..sim_configs import Robot, Scenario
 from ..sim_configs.scenario_errors import closest
-from .active_slam import Situation
+from .agent_knowledge import AgentKnowledge, as_points
 from .belief_features import largest_variances, world_bounds
 from .greedy_information import GreedyInformation
 
@@ -28,50 +29,50 @@ Array = NDArray[np.float64]
 
 BASELINES = ("random", "coverage", "greedy", "revisit")
 
-_ROOM = 1.0  # kept from the walls [m]
+_CLEARANCE = 1.0  # distance kept from the walls [m]
 _ALIGNED = 0.4  # heading error below which a robot drives while it turns [rad]
 
 
-class Driver(Protocol):
-    """What chooses actions from what an agent may know."""
+class Baseline(Protocol):
+    """Chooses actions from the knowledge of an agent."""
 
-    def act(self, situation: Situation) -> Array:
-        """Choose (v, ω) [m/s, rad/s]; step 0 of an episode starts a driver anew."""
+    def act(self, knowledge: AgentKnowledge) -> Array:
+        """Choose (v, ω) [m/s, rad/s]; step 0 restarts the baseline."""
         ...
 
 
 class RandomActions:
-    """Draw every action uniformly within the limits.
+    """Draws every action uniformly within the limits.
 
     Parameters
     ----------
     rng : numpy.random.Generator
-        Where they come from.
+        Source of the random numbers.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
 
-    def act(self, situation: Situation) -> Array:
-        """Draw an action; see `Driver.act`."""
-        robot = situation.scenario.robot
+    def act(self, knowledge: AgentKnowledge) -> Array:
+        """Draw an action; see `Baseline.act`."""
+        robot = knowledge.scenario.robot
         limits = np.array([robot.max_speed, robot.max_turn_rate])
         return self._rng.uniform(-limits, limits)
 
 
 class Coverage:
-    """Drive in lanes over the whole floor, up and down, then across, then again.
+    """Drives in lanes over the whole floor, up and down, then across, repeatedly.
 
-    The lanes are so far apart that their views just overlap.
+    The fields of view of adjacent lanes just overlap.
 
     Parameters
     ----------
     scenario : Scenario
-        Whose floor, sensor and robot are meant.
+        Source of floor, sensor and robot.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        lanes = lanes_of(scenario)
+        lanes = coverage_lanes(scenario)
         self._waypoints = Waypoints(
             lanes,
             scenario.robot,
@@ -80,68 +81,66 @@ class Coverage:
             loop=True,
         )
 
-    def act(self, situation: Situation) -> Array:
-        """Drive on along the lanes; see `Driver.act`."""
-        return self._waypoints.act(situation.belief.pose, situation.step)
+    def act(self, knowledge: AgentKnowledge) -> Array:
+        """Drive on along the lanes; see `Baseline.act`."""
+        return self._waypoints.act(knowledge.belief.pose, knowledge.step)
 
 
 class Revisit:
-    """Explore while sure of the pose, else return to what is known best.
+    """Explores while the pose is certain, else returns to the best known landmark.
 
-    Unsure is a position whose worst standard deviation exceeds half the accuracy asked
-    for; the robot then drives to the landmark known best until it is sure again, or
-    until it has looked at it in vain. Sure, it drives to the nearest landmark that is
-    mapped but not known, or cell not yet seen.
+    The return starts when the worst standard deviation of the position exceeds 0.8 of
+    the required accuracy. It ends below half of it, or after 25 steps; then the robot
+    explores for 25 steps in any case. Exploration drives to the nearest goal.
     """
 
     def __init__(self) -> None:
         self._returning = 0
 
-    def act(self, situation: Situation) -> Array:
-        """Drive to the next goal; see `Driver.act`."""
-        if situation.step == 0:
+    def act(self, knowledge: AgentKnowledge) -> Array:
+        """Drive to the next goal; see `Baseline.act`."""
+        if knowledge.step == 0:
             self._returning = 0
-        goal = self._anchor(situation) if self._is_unsure(situation) else None
+        goal = self._anchor(knowledge) if self._is_uncertain(knowledge) else None
         if goal is None:
-            goal = nearest_goal(situation)
-        scenario = situation.scenario
+            goal = nearest_goal(knowledge)
+        scenario = knowledge.scenario
         return steer(
-            situation.belief.pose,
+            knowledge.belief.pose,
             _kept_inside(goal, scenario),
             scenario.robot,
             scenario.dt,
         )
 
-    def _is_unsure(self, situation: Situation) -> bool:
-        (xx, xy), (_, yy) = situation.belief.pose_covariance[:2, :2]
-        std = math.sqrt(largest_variances(xx, xy, yy))
-        if std < 0.5 * situation.accuracy or self._returning > _PATIENCE:
-            self._returning = 0 if std < 0.5 * situation.accuracy else -_PATIENCE
-        elif std > 0.8 * situation.accuracy or self._returning != 0:
+    def _is_uncertain(self, knowledge: AgentKnowledge) -> bool:
+        std = math.sqrt(largest_variances(knowledge.belief.pose_covariance[:2, :2]))
+        if std < 0.5 * knowledge.accuracy or self._returning > _PATIENCE:
+            self._returning = 0 if std < 0.5 * knowledge.accuracy else -_PATIENCE
+        elif std > 0.8 * knowledge.accuracy or self._returning != 0:
             self._returning += 1
         return self._returning > 0
 
     @staticmethod
-    def _anchor(situation: Situation) -> Array | None:
-        belief = situation.belief
+    def _anchor(knowledge: AgentKnowledge) -> Array | None:
+        belief = knowledge.belief
         if not len(belief.landmark_ids):
             return None
-        best = int(np.argmin(_landmark_variances(situation)))
+        best = int(np.argmin(_landmark_variances(knowledge)))
         return np.asarray(belief.landmarks[best])
 
 
-_PATIENCE = 25  # steps on the way back, and then of exploring whatever the pose
+_PATIENCE = 25  # largest number of steps of a return, then steps of exploration
 
 
-def make_baseline(name: str, scenario: Scenario, rng: np.random.Generator) -> Driver:
-    """Make a baseline by name.
+def make_baseline(name: str, scenario: Scenario, rng: np.random.Generator) -> Baseline:
+    """Make the baseline of a name.
 
     Parameters
     ----------
     name : {"random", "coverage", "greedy", "revisit"}
-        See the module.
+        See the module's docstring.
     scenario : Scenario
-        The task's.
+        The scenario of the task.
     rng : numpy.random.Generator
         Used by ``"random"`` only.
 
@@ -167,65 +166,59 @@ def make_baseline(name: str, scenario: Scenario, rng: np.random.Generator) -> Dr
     )
 
 
-def lanes_of(scenario: Scenario) -> Array:
-    """Plan lanes up and down over the floor, then across; corners (K, 2) [m].
+def coverage_lanes(scenario: Scenario) -> Array:
+    """Return the corners of lanes up and down the floor, then across, (K, 2) [m].
 
     Examples
     --------
     >>> from slamgym.sim_configs import load_scenario
-    >>> lanes_of(load_scenario("active_easy"))[:3].round(2).tolist()
+    >>> coverage_lanes(load_scenario("active_easy"))[:3].round(2).tolist()
     [[-3.48, -3.48], [-3.48, 3.48], [0.0, 3.48]]
     """
     sensor = scenario.sensor
     aside = math.sin(min(sensor.field_of_view / 2, math.pi / 2))
     left, bottom, right, top = world_bounds(scenario)
     reach = min(sensor.max_range, math.hypot(right - left, top - bottom)) * aside
-    margin = max(_ROOM, 0.72 * reach)
+    margin = max(_CLEARANCE, 0.72 * reach)
     x = _spaced(left + margin, right - margin, 1.4 * reach)
     y = _spaced(bottom + margin, top - margin, 1.4 * reach)
     up = _zigzag(x, (y[0], y[-1]))
     return np.concatenate([up, _zigzag(y, (x[0], x[-1]))[:, ::-1]])
 
 
-def nearest_goal(situation: Situation) -> Array:
-    """Find the nearest cell not yet seen or landmark not yet known [m], (2,).
+def nearest_goal(knowledge: AgentKnowledge) -> Array:
+    """Return the nearest of `AgentKnowledge.goals`, (2,) [m].
 
-    What is left to find is not looked for once all landmarks are mapped.
+    Without goals, while landmarks are missing, every cell is a goal.
     """
-    belief, plan = situation.belief, situation.plan
-    known = situation.known[list(belief.landmark_ids)]
-    goals = [belief.landmarks[~known]]
-    if len(belief.landmark_ids) < len(situation.known):
-        cells = plan.cells[~situation.explored]
-        goals.append(np.column_stack([cells.real, cells.imag]))
-    points = np.concatenate(goals)
-    if not len(points):  # all seen, yet some not found: look everywhere again
-        points = np.column_stack([plan.cells.real, plan.cells.imag])
-    away = np.hypot(*(points - belief.pose[:2]).T)
+    points = knowledge.goals()
+    if not len(points):
+        points = as_points(knowledge.grid.cells)
+    away = np.hypot(*(points - knowledge.belief.pose[:2]).T)
     return np.asarray(points[np.argmin(away)])
 
 
 def steer(pose: Array, goal: Array, robot: Robot, dt: float) -> Array:
-    """Turn towards a goal, and drive when it is ahead; (v, ω)."""
-    ahead, aside = goal - pose[:2]
-    error = (math.atan2(aside, ahead) - pose[2] + math.pi) % (2 * math.pi) - math.pi
+    """Return the action (v, ω) that turns to a goal and drives when it is ahead."""
+    dx, dy = goal - pose[:2]
+    error = wrap_angle(math.atan2(dy, dx) - pose[2])
     turn = min(max(error / dt, -robot.max_turn_rate), robot.max_turn_rate)
-    speed = math.hypot(ahead, aside) / dt if abs(error) < _ALIGNED else 0.0
+    speed = math.hypot(dx, dy) / dt if abs(error) < _ALIGNED else 0.0
     return np.array([min(speed, robot.max_speed), turn])
 
 
-def _landmark_variances(situation: Situation) -> Array:
-    """Worst variance of each mapped landmark, (n,) [m²]."""
-    belief = situation.belief
-    x = 3 + 2 * np.arange(len(belief.landmark_ids))
-    cov = np.asarray(belief.covariance)
-    return largest_variances(cov[x, x], cov[x, x + 1], cov[x + 1, x + 1])
+def _landmark_variances(knowledge: AgentKnowledge) -> Array:
+    """Return the worst variance of each mapped landmark, (n,) [m²]."""
+    belief = knowledge.belief
+    first = 3 + 2 * np.arange(len(belief.landmark_ids))
+    rows = first[:, None] + (0, 1)
+    return largest_variances(belief.covariance[rows[:, :, None], rows[:, None]])
 
 
 def _kept_inside(goal: Array, scenario: Scenario) -> Array:
     left, bottom, right, top = world_bounds(scenario)
-    low = np.array([left, bottom]) + _ROOM
-    return np.clip(goal, low, np.array([right, top]) - _ROOM)
+    low = np.array([left, bottom]) + _CLEARANCE
+    return np.clip(goal, low, np.array([right, top]) - _CLEARANCE)
 
 
 def _spaced(first: float, last: float, gap: float) -> Array:

@@ -1,4 +1,4 @@
-"""How well drivers do active SLAM: episodes on maps of given seeds, and their means."""
+"""Scores of policies in active SLAM: episodes on maps of given seeds, and means."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -7,24 +7,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .active_slam import ActiveSlamEnv, Observation
-from .active_slam_baselines import Driver
+from .active_slam_baselines import Baseline
 
 Array = NDArray[np.float64]
 Policy = Callable[[Observation, ActiveSlamEnv], Array]
-"""Chooses an action from an observation; planners read ``env.situation`` too."""
+"""Chooses an action from an observation; baselines read ``env.knowledge``."""
 
 VALIDATION = 1_000_000
-"""Maps to choose by, while observations, rewards and constants are still open: seeds
-from here to `HELD_OUT`.  Who trains stays below."""
+"""First seed of the validation maps, up to `HELD_OUT`. Training uses smaller seeds."""
 
 HELD_OUT = 2_000_000
-"""Maps to judge by, once: seeds from here on.  No choice may rest on them."""
+"""First seed of the maps for the final evaluation. No choice may depend on them."""
 
 MEASURES = ("total", "success", "known", "steps", "crashed")
 
 
 class Episode(NamedTuple):
-    """What came of one episode."""
+    """The result of one episode."""
 
     total: float
     """Sum of the rewards."""
@@ -33,15 +32,15 @@ class Episode(NamedTuple):
     known: float
     """Share of the landmarks known at the end."""
     steps: int
-    """Until the episode ended."""
+    """Length of the episode."""
     crashed: bool
-    """Whether it ended at a wall."""
+    """Whether the robot touched a wall."""
     path: Array
     """True positions, shape (steps + 1, 2) [m]."""
 
 
 class Mean(NamedTuple):
-    """A mean with half the width of its 95 % interval."""
+    """A mean with the half width of its 95 % interval."""
 
     value: float
     half_width: float
@@ -50,8 +49,8 @@ class Mean(NamedTuple):
         return f"{self.value:.2f} ± {self.half_width:.2f}"
 
 
-def play(env: ActiveSlamEnv, policy: Policy, seed: int) -> Episode:
-    """Let a policy play the episode of a seed to its end."""
+def run_episode(env: ActiveSlamEnv, policy: Policy, seed: int) -> Episode:
+    """Run a policy for the episode of a seed."""
     observation, info = env.reset(seed=seed)
     path, total, ended = [info["pose"][:2]], 0.0, False
     while not ended:
@@ -66,18 +65,20 @@ def play(env: ActiveSlamEnv, policy: Policy, seed: int) -> Episode:
     )
 
 
-def play_all(env: ActiveSlamEnv, policy: Policy, seeds: Iterable[int]) -> list[Episode]:
-    """Let a policy play the episodes of several seeds."""
-    return [play(env, policy, seed) for seed in seeds]
+def run_episodes(
+    env: ActiveSlamEnv, policy: Policy, seeds: Iterable[int]
+) -> list[Episode]:
+    """Run a policy for the episodes of several seeds."""
+    return [run_episode(env, policy, seed) for seed in seeds]
 
 
-def driven_by(driver: Driver) -> Policy:
-    """Make a policy of a driver, which reads the situation alone."""
-    return lambda _, env: driver.act(env.situation)
+def baseline_policy(baseline: Baseline) -> Policy:
+    """Return the policy of a baseline."""
+    return lambda _, env: baseline.act(env.knowledge)
 
 
 def score_table(played: Mapping[str, Sequence[Episode]]) -> str:
-    """Write a table of means with 95 % intervals, one line per player."""
+    """Format a table of means with 95 % intervals, one line per policy."""
     head = ("return", "success", "landmarks known", "steps", "crashed")
     lines = [f"{'':10}" + "".join(f"{title:>18}" for title in head)]
     for name, episodes in played.items():
@@ -87,7 +88,7 @@ def score_table(played: Mapping[str, Sequence[Episode]]) -> str:
 
 
 def difference_lines(played: Mapping[str, Sequence[Episode]], name: str) -> str:
-    """Write how one player does on the same maps as every other, one line each.
+    """Format the differences of one policy from all others on the same maps.
 
     Examples
     --------
@@ -111,7 +112,7 @@ def difference_lines(played: Mapping[str, Sequence[Episode]], name: str) -> str:
 
 
 def mean_of(episodes: Sequence[Episode], measure: str) -> Mean:
-    """Average one of `MEASURES` over episodes, with its 95 % interval.
+    """Return the mean of one of `MEASURES` over episodes, with its 95 % interval.
 
     The interval is the normal one, 1.96 s / √n.
 
@@ -127,7 +128,7 @@ def mean_of(episodes: Sequence[Episode], measure: str) -> Mean:
 def mean_difference(
     episodes: Sequence[Episode], others: Sequence[Episode], measure: str
 ) -> Mean:
-    """Average how much more `episodes` have than `others` on the same maps, in order.
+    """Return the mean difference of a measure between episodes on the same maps.
 
     Examples
     --------

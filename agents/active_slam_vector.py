@@ -1,4 +1,4 @@
-"""Active SLAM in many worlds side by side, in numpy and on the batched filters."""
+"""Active SLAM in many worlds, simulated together and with batched filters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ..estimator.support import argument_checks
 from ..sim_configs import Scenario, load_scenario
 from .active_slam import split_settings
 from .active_slam_task import ActiveSlamTask, Progress
-from .belief_arrays import BeliefArrays, beliefs_of_batch, take_scans
+from .belief_arrays import BeliefArrays, beliefs_of_batch, update_filters
 from .estimator_choice import choose_batch
 
 Array = NDArray[np.float64]
@@ -35,9 +35,9 @@ Observation = dict[str, NDArray[Any]]
 
 
 class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
-    """Many worlds of `ActiveSlamEnv`, which see its docstring.
+    """Many worlds of `ActiveSlamEnv`, whose docstring describes the task.
 
-    World i under ``reset(seed=s)`` is the single one under ``reset(seed=s + i)``.
+    World i after ``reset(seed=s)`` equals a single one after ``reset(seed=s + i)``.
 
     Parameters
     ----------
@@ -48,12 +48,11 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     estimator : str, default "invariant"
         The registered name of a filter that runs in batches.
     max_episode_steps : int, optional
-        What Gymnasium hands over; episodes are cut there if it comes before the
-        scenario's own end.
+        Truncates episodes earlier than the scenario's own number of steps.
     autoreset_mode : AutoresetMode or str, default "NextStep"
-        Any of Gymnasium's three; "Disabled" takes ``options={"reset_mask": …}``.
+        Any of Gymnasium's three. "Disabled" needs ``options={"reset_mask": …}``.
     render_mode : None
-        Worlds side by side are not drawn.
+        Vector environments of active SLAM are not rendered.
 
     Examples
     --------
@@ -80,20 +79,20 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
                 f"render_mode must be None for worlds side by side, got {render_mode!r}"
             )
         num_envs = argument_checks.whole("num_envs", num_envs, 1)
-        stakes, changes = split_settings(settings)
+        weights, changes = split_settings(settings)
         self.scenario = load_scenario(scenario)
         if changes:
             self.scenario = self.scenario.with_changes(**changes)
         self.num_envs = num_envs
         self.render_mode = None
-        self.task = ActiveSlamTask(self.scenario, stakes)
+        self.task = ActiveSlamTask(self.scenario, weights)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_action_space = action_space(self.scenario)
         self.single_observation_space = self.task.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._most_steps = episode_steps(self.scenario, max_episode_steps)
+        self._max_steps = episode_steps(self.scenario, max_episode_steps)
         self._worlds = WorldBatch(self.scenario, num_envs)
         self._filters = choose_batch(
             estimator,
@@ -112,7 +111,7 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin episodes in all worlds, or in those of ``options["reset_mask"]``."""
+        """Start episodes in all worlds, or in those of ``options["reset_mask"]``."""
         mask = checked_reset_mask(options, self.num_envs)
         chosen = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask.copy()
         for world, each in enumerate(world_seeds(seed, self.num_envs)):
@@ -120,7 +119,7 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
                 self._generators[world] = seeding.np_random(each)[0]
         self._begin(chosen)
         self._ended &= ~chosen
-        observations, infos = self._answer(np.zeros_like(chosen))
+        observations, infos = self._output(np.zeros_like(chosen))
         return observations, with_masks(infos, mask, self.num_envs)
 
     def step(
@@ -144,25 +143,25 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._worlds.step(actions, moving)
         self._filter(moving, moved=True)
         after = self.task.proceed(before, self._beliefs())
-        verdict = self.task.judge(
+        outcome = self.task.reward(
             before,
             after,
             np.where(moving[:, None], actions, 0.0),
             self._worlds.collisions,
         )
-        truncated = verdict.truncated | (
-            ~verdict.terminated & (after.steps >= self._most_steps)
+        truncated = outcome.truncated | (
+            ~outcome.terminated & (after.steps >= self._max_steps)
         )
         self._progress = after
-        self._ended = (verdict.terminated | truncated) & moving
+        self._ended = (outcome.terminated | truncated) & moving
         if fresh.any():
             self._begin(fresh)
-        rewards = np.where(moving, verdict.rewards, 0.0)
-        ends = verdict.terminated & moving, truncated & moving
-        return self._finish(rewards, *ends, verdict.success & moving)
+        rewards = np.where(moving, outcome.rewards, 0.0)
+        ends = outcome.terminated & moving, truncated & moving
+        return self._finish(rewards, *ends, outcome.success & moving)
 
     def beliefs(self) -> BeliefArrays:
-        """Return what all filters believe now."""
+        """Return the present beliefs of all filters."""
         return self._reached().beliefs
 
     def _finish(
@@ -172,23 +171,16 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         truncated: BoolArray,
         won: BoolArray,
     ) -> tuple[Observation, Array, BoolArray, BoolArray, dict[str, Any]]:
-        observations, infos = self._answer(won)
-        ended = self._ended
+        observations, infos = self._output(won)
+        ended, final = self._ended, {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             last, last_infos = observations, infos
             self._begin(ended)
             self._ended = np.zeros_like(ended)
-            observations, infos = self._answer(np.zeros_like(won))
+            observations, infos = self._output(np.zeros_like(won))
             final = final_infos(last, last_infos, ended)
-            return (
-                observations,
-                rewards,
-                terminated,
-                truncated,
-                {**with_masks(infos, None, self.num_envs), **final},
-            )
-        masked = with_masks(infos, None, self.num_envs)
-        return observations, rewards, terminated, truncated, masked
+        infos = {**with_masks(infos, None, self.num_envs), **final}
+        return observations, rewards, terminated, truncated, infos
 
     def _reached(self) -> Progress:
         if self._progress is None:
@@ -196,7 +188,7 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return self._progress
 
     def _begin(self, chosen: BoolArray) -> None:
-        """Begin episodes in the chosen worlds, each with its first scan."""
+        """Start episodes in the chosen worlds, each with its first scan."""
         self._worlds.reset(self._generators, chosen)
         self._filters.reset(
             self._worlds.start_estimates, self.scenario.start.std, runs=chosen
@@ -222,12 +214,12 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             "mask": self._worlds.mask,
             "odometry": self._worlds.odometry,
         }
-        take_scans(self._filters, observations, worlds, moved=moved)
+        update_filters(self._filters, observations, worlds, moved=moved)
 
     def _beliefs(self) -> BeliefArrays:
         return beliefs_of_batch(self._filters)
 
-    def _answer(self, success: BoolArray) -> tuple[Observation, dict[str, Any]]:
+    def _output(self, success: BoolArray) -> tuple[Observation, dict[str, Any]]:
         progress = self._reached()
         infos: dict[str, Any] = {
             "pose": self._worlds.poses.copy(),

@@ -1,4 +1,4 @@
-"""Beliefs as arrays of one fixed size, so that many stand side by side."""
+"""Beliefs as arrays of a fixed size, for one world or many."""
 
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 class BeliefArrays(NamedTuple):
-    """Beliefs of B worlds over a pose and N landmarks, row i of them for landmark i.
+    """Beliefs of B worlds over a pose and N landmarks; row i is landmark i.
 
     The state is (x, y, θ, l0x, l0y, l1x, …).
     """
@@ -23,7 +23,7 @@ class BeliefArrays(NamedTuple):
     covariances: Array
     """Of the additive error, shape (B, 3 + 2N, 3 + 2N), zeros where not mapped."""
     mapped: NDArray[np.bool_]
-    """Which landmarks are in the map, shape (B, N)."""
+    """Landmarks in the map, shape (B, N)."""
 
     @property
     def poses(self) -> Array:
@@ -44,8 +44,8 @@ class BeliefArrays(NamedTuple):
         return np.moveaxis(blocks[:, each, :, each, :], 0, 1)
 
 
-def stored(beliefs: BeliefArrays) -> BatchStorage:
-    """Lay beliefs out as a batch of filters keeps its own."""
+def as_storage(beliefs: BeliefArrays) -> BatchStorage:
+    """Convert beliefs to the storage format of a batch of filters."""
     rows = np.arange(beliefs.mapped.shape[1])
     return BatchStorage.of(
         np.ascontiguousarray(beliefs.means),
@@ -55,22 +55,22 @@ def stored(beliefs: BeliefArrays) -> BatchStorage:
 
 
 def beliefs_of_batch(batch: BatchSlam) -> BeliefArrays:
-    """Take the beliefs of a batch of filters."""
+    """Return the beliefs of a batch of filters."""
     return BeliefArrays(*batch.beliefs())
 
 
-def belief_in_rows(belief: BeliefOfMap, size: int, *, by_id: bool) -> BeliefArrays:
-    """Give the belief of one world a fixed size; B = 1.
+def belief_arrays(belief: BeliefOfMap, size: int, *, by_id: bool) -> BeliefArrays:
+    """Convert the belief of one world to arrays of a fixed size; B = 1.
 
     Parameters
     ----------
     belief : Belief
         Of any estimator.
     size : int
-        N, the rows for landmarks.
+        N, the number of landmark rows.
     by_id : bool
-        Whether row i is for the landmark of identity i. Else the rows are in the
-        order of the map, for estimators that give identities of their own.
+        If True, row i is the landmark with identity i. Else the rows are in the order
+        of the map, for estimators that assign their own identities.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def belief_in_rows(belief: BeliefOfMap, size: int, *, by_id: bool) -> BeliefArra
     >>> from slamgym.estimator import EkfSlam
     >>> slam = EkfSlam((0.1, 0.1, 0.1), (0.1, 0.1))
     >>> _ = slam.update([(0.0, 2.0)], landmark_ids=[1])
-    >>> rows = belief_in_rows(slam.belief(), size=3, by_id=True)
+    >>> rows = belief_arrays(slam.belief(), size=3, by_id=True)
     >>> rows.mapped.tolist(), rows.landmarks[0, 1].tolist()
     ([[False, True, False]], [2.0, 0.0])
     """
@@ -105,30 +105,30 @@ def belief_in_rows(belief: BeliefOfMap, size: int, *, by_id: bool) -> BeliefArra
     return BeliefArrays(means, covariances, mapped)
 
 
-def take_scans(
+def update_filters(
     filters: BatchSlam,
     observations: dict[str, NDArray[Any]],
     worlds: NDArray[np.bool_],
     *,
     moved: bool,
 ) -> None:
-    """Let the filters of some worlds take in one observation each.
+    """Update the filters of some worlds with one observation each.
 
     Parameters
     ----------
     filters : BatchSlam
-        One for each of B worlds.
+        One filter for each of B worlds.
     observations : dict
         The batched observation of a landmark world, each key with a leading axis B.
     worlds : bool ndarray, shape (B,)
-        Whose observations are taken in.
+        Worlds whose filters are updated.
     moved : bool
-        Whether a step lies behind them. If not, it is the scan from the start.
+        Whether the worlds have moved. False for the scan from the start.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If a filter fails, naming its world.
+        If a filter fails; the message names its world.
     """
     filters.run(
         observations["odometry"][:, None],

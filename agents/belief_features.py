@@ -1,37 +1,37 @@
-"""Beliefs as an agent observes them: egocentric, of fixed size, within finite bounds.
+"""Beliefs as observations of an agent: egocentric, of fixed size, bounded.
 
 Symbols
 -------
-p = (x, y, θ)   mean of the pose; R = R(θ) turns the robot's frame into the world's
-l               mean of a landmark; ρ = Rᵀ (l - p) the same in the robot's frame [m]
+p = (x, y, θ)   mean of the pose; R = R(θ) rotates from the robot's to the world frame
+l               mean of a landmark; ρ = Rᵀ (l - p) in the robot's frame [m]
 P               covariance of the additive error of the state
 
-The errors of ρ are, to first order::
+The error of ρ is, to first order::
 
     e_ρ = Rᵀ (e_l - e_p - e_θ J (l - p)),    J = [0 -1; 1 0]
 
-so that a landmark is better known relative to the robot than in the map, wherever the
-errors of pose and landmark are correlated.
+If the errors of pose and landmark are correlated, the landmark is better known relative
+to the robot than in the map.
 """
 
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..envs.controllers import planned_path
 from ..estimator.filters.batch_results import BatchStorage
 from ..sim_configs import Scenario
 from ..sim_configs.layouts import possible_positions
-from .belief_kernels import show_beliefs
+from .belief_kernels import write_features
 
 Array = NDArray[np.float64]
 Bounds = tuple[float, float, float, float]
 
 
 def belief_space(rows: int) -> spaces.Dict:
-    """Bound the features of a belief with N rows; the keys of `belief_features`.
+    """Return the space of `belief_features` with N landmark rows.
 
     Examples
     --------
@@ -57,14 +57,14 @@ def belief_space(rows: int) -> spaces.Dict:
 
 
 def world_bounds(scenario: Scenario) -> Bounds:
-    """Find the rectangle of a world: around its walls, if it has any.
+    """Return the rectangle around the walls of a world.
 
-    Without walls, around the start, the planned path and where landmarks may stand.
+    Without walls it contains the planned path and all possible landmark positions.
 
     Returns
     -------
     (xmin, ymin, xmax, ymax)
-        Of sides > 0 [m].
+        Both sides are positive [m].
 
     Examples
     --------
@@ -88,18 +88,18 @@ def world_bounds(scenario: Scenario) -> Bounds:
 def belief_features(
     beliefs: BatchStorage, bounds: Bounds
 ) -> dict[str, NDArray[np.generic]]:
-    """Turn beliefs into observations.
+    """Convert beliefs to observations.
 
-    The bits are the same for one world alone and among many, and in whichever order
-    its landmarks are stored.
+    The result for a world does not depend on the other worlds or on the order in which
+    the landmarks are stored, to the bit.
 
     Parameters
     ----------
     beliefs : BatchStorage
         Of B worlds.
     bounds : (xmin, ymin, xmax, ymax)
-        Rectangle that the coordinates are scaled by [m]: its middle is 0, the middle
-        of its sides ±1. What is outside is clipped.
+        Rectangle that scales the coordinates [m]: its centre maps to 0, the centres of
+        its sides to ±1. Values outside are clipped.
 
     Returns
     -------
@@ -116,7 +116,7 @@ def belief_features(
         ``belief_mask``                 (B, N)    which landmarks are mapped
         =============================== ========= ===================================
 
-        Standard deviations are `on_log_scale`; what is not mapped is 0.
+        Standard deviations are `on_log_scale`; rows that are not mapped are 0.
     """
     worlds, rows = beliefs.slots.shape
     features: dict[str, NDArray[Any]] = {
@@ -129,16 +129,18 @@ def belief_features(
         "belief_pose_correlation": np.empty((worlds, 3)),
         "belief_pose_std": np.empty((worlds, 3)),
     }
-    show_beliefs(*beliefs, bounds, *features.values())
+    write_features(*beliefs, bounds, *features.values())
     return features
 
 
-def largest_variances(xx: Array, xy: Array, yy: Array) -> Array:
-    """Compute the larger eigenvalues of [xx xy; xy yy]: variances in worst directions.
+def largest_variances(covariances: ArrayLike) -> Array:
+    """Compute the larger eigenvalues of covariances, (…, 2, 2) to (…).
 
     Examples
     --------
-    >>> float(largest_variances(np.array(2.0), np.array(1.0), np.array(2.0)))
+    >>> float(largest_variances([[2.0, 1.0], [1.0, 2.0]]))
     3.0
     """
+    P = np.asarray(covariances)
+    xx, xy, yy = P[..., 0, 0], P[..., 0, 1], P[..., 1, 1]
     return np.asarray(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))

@@ -1,4 +1,4 @@
-"""The arithmetic of the features of a belief, compiled: one pass over all worlds.
+"""Compiled kernels of `belief_features`: one pass over all worlds.
 
 Symbols are those of `belief_features`.
 """
@@ -21,17 +21,17 @@ _DECADES = math.log10(LARGEST_STD / SMALLEST_STD)
 
 
 def clip(value: float, low: float, high: float) -> float:
-    """Bring a number into an interval."""
+    """Clip a number to an interval."""
     return min(max(value, low), high)
 
 
 def root(variance: float) -> float:
-    """Compute a standard deviation; 0 where rounding has made a variance negative."""
+    """Compute a standard deviation; 0 for a variance negative by rounding."""
     return math.sqrt(max(variance, 0.0))
 
 
 def on_log_scale(std: float) -> float:
-    """Map a standard deviation to [0, 1], four decades evenly.
+    """Map a standard deviation to [0, 1] on a logarithmic scale of four decades.
 
     ::
 
@@ -43,12 +43,12 @@ def on_log_scale(std: float) -> float:
     [0.0, 0.25, 0.5, 1.0]
     """
     bounded = min(max(std, SMALLEST_STD), LARGEST_STD)
-    # the ends by hand: a rounded logarithm could leave the interval
+    # clipped: a rounded logarithm can leave the interval
     return min(max(math.log10(bounded / SMALLEST_STD) / _DECADES, 0.0), 1.0)
 
 
 def correlation(covariance: float, product: float) -> float:
-    """Divide by a product of standard deviations; 0 where there is nothing to."""
+    """Divide a covariance by a product of standard deviations; 0 if that is 0."""
     return min(max(covariance / product, -1.0), 1.0) if product > 0.0 else 0.0
 
 
@@ -76,7 +76,7 @@ _correlation, _turned = njit_internal(correlation), njit_internal(turned)
 
 
 @njit_internal
-def show_pose(
+def write_pose_features(
     mean: Array,
     covariance: Array,
     bounds: Rectangle,
@@ -121,7 +121,7 @@ def relative_spread(
 
 
 @jit
-def show_beliefs(  # noqa: PLR0917 (the outputs one by one, in order of their keys)
+def write_features(  # noqa: PLR0917 (the outputs one by one, in order of their keys)
     means: Array,
     covariances: Array,
     slots: NDArray[np.int64],
@@ -135,12 +135,14 @@ def show_beliefs(  # noqa: PLR0917 (the outputs one by one, in order of their ke
     pose_correlation: Array,
     pose_std: Array,
 ) -> None:
-    """Write the features of all beliefs; see `belief_features` for what they are."""
+    """Write the features of all beliefs, see `belief_features`."""
     left, bottom, right, top = bounds
     diagonal = math.hypot(right - left, top - bottom)
     for b in range(len(means)):
         mean, covariance = means[b], covariances[b]
-        show_pose(mean, covariance, bounds, pose[b], pose_correlation[b], pose_std[b])
+        write_pose_features(
+            mean, covariance, bounds, pose[b], pose_correlation[b], pose_std[b]
+        )
         cos, sin = pose[b, 2], pose[b, 3]
         for i in range(slots.shape[1]):
             mask[b, i] = slots[b, i] >= 0

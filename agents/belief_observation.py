@@ -1,4 +1,4 @@
-"""An estimator inside the loop: what it believes becomes part of the observation."""
+"""An estimator in the loop: its belief becomes part of the observation."""
 
 from collections.abc import Mapping
 from typing import Any, SupportsFloat
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..envs import LandmarkWorldEnv
 from ..estimator.support import argument_checks
 from ..sim_configs import Scenario
-from .belief_arrays import BeliefArrays, belief_in_rows, stored
+from .belief_arrays import BeliefArrays, as_storage, belief_arrays
 from .belief_features import belief_features, belief_space, world_bounds
 from .estimator_choice import (
     BeliefOfMap,
@@ -28,32 +28,32 @@ class BeliefObservation(
     gymnasium.Wrapper[Observation, NDArray[Any], Observation, NDArray[Any]],
     RecordConstructorArgs,
 ):
-    """Runs an estimator on what a landmark world emits, and shows its belief.
+    """Runs an estimator on the observations of a landmark world, and adds its belief.
 
-    The belief comes from the observations, the start's estimate and the scenario's
-    noise alone; the truth stays in `info`. To the keys of the observation are added
-    those of `belief_features`, every value within [-1, 1]; row i is landmark i, or,
-    where identities are hidden, the i-th landmark of the estimator's map.
+    The estimator uses the observations, the start estimate and the scenario's noise
+    settings; the truth stays in `info`. The observation has the additional keys of
+    `belief_features`, with values within [-1, 1]. Row i is landmark i. With hidden
+    identities it is landmark i of the estimator's map.
 
     Parameters
     ----------
     env : Env
         A `LandmarkWorldEnv`, wrapped or not, whose observation is still its Dict.
     estimator : str, callable or object
-        Which filter: see `choose_estimator`. Only a name survives in an ``EnvSpec``
-        written as JSON.
+        The filter, see `choose_estimator`. An ``EnvSpec`` written as JSON keeps only a
+        name.
     estimator_options : mapping, optional
         Further options of the filter.
     max_landmarks : int, optional
-        N, the rows for landmarks; as many as the world has where not given.
+        N, the number of landmark rows. The default is that of the world.
 
     Raises
     ------
     TypeError
-        If the estimator lacks a method, or its belief a part, which is named.
+        If the estimator lacks a method, or its belief a part.
     ValueError
-        If the world has, or the map comes to hold, more landmarks than there are rows,
-        or a belief is not finite or has a negative variance; then the step is named.
+        If the world or the map has more landmarks than there are rows, or a belief is
+        not finite or has a negative variance.
 
     Examples
     --------
@@ -94,14 +94,14 @@ class BeliefObservation(
 
     @property
     def belief(self) -> BeliefOfMap:
-        """What the estimator believes now."""
+        """The present belief of the estimator."""
         if self._belief is None:
             raise gymnasium.error.ResetNeeded("call reset first: there is no belief")
         return self._belief
 
     @property
     def beliefs(self) -> BeliefArrays:
-        """The same in rows of fixed size, with B = 1."""
+        """The present belief as arrays of a fixed size, with B = 1."""
         if self._beliefs is None:
             raise gymnasium.error.ResetNeeded("call reset first: there is no belief")
         return self._beliefs
@@ -109,37 +109,39 @@ class BeliefObservation(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode: the estimator starts from the start's estimate."""
+        """Start an episode; the estimator starts from the start estimate."""
         observation, info = self.env.reset(seed=seed, options=options)
         world = self.env.get_wrapper_attr("start_estimate")
         self._estimator.reset(world, self.scenario.start.std)
         self._steps = 0
-        return self._take_in(observation), info
+        return self._update(observation), info
 
     def step(
         self, action: Any
     ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Step the world, then let the estimator predict and update."""
+        """Step the world, then predict and update."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._estimator.predict(observation["odometry"])
         self._steps += 1
-        return self._take_in(observation), reward, terminated, truncated, info
+        return self._update(observation), reward, terminated, truncated, info
 
-    def _take_in(self, observation: Observation) -> Observation:
+    def _update(self, observation: Observation) -> Observation:
         seen = np.flatnonzero(observation["mask"])
         ids = seen.tolist() if self._by_id else None
         self._estimator.update(observation["landmarks"][seen], ids)
         belief = checked_belief(self._estimator, self._steps)
         self._belief = belief
-        self._beliefs = belief_in_rows(belief, self._rows, by_id=self._by_id)
+        self._beliefs = belief_arrays(belief, self._rows, by_id=self._by_id)
         if self.env.render_mode is not None:
             self.env.get_wrapper_attr("show_belief")(belief)
-        features = belief_features(stored(self._beliefs), self._bounds)
-        return joined(observation, {key: row[0] for key, row in features.items()})
+        features = belief_features(as_storage(self._beliefs), self._bounds)
+        return with_features(
+            observation, {key: row[0] for key, row in features.items()}
+        )
 
 
 def scenario_of(env: Any) -> Scenario:
-    """Read the scenario of a landmark world, or refuse another environment."""
+    """Return the scenario of a landmark world; raise for another environment."""
     scenario = getattr(env.unwrapped, "scenario", None)
     if not isinstance(scenario, Scenario):
         raise ValueError(
@@ -150,7 +152,7 @@ def scenario_of(env: Any) -> Scenario:
 
 
 def count_landmark_rows(scenario: Scenario, max_landmarks: int | None) -> int:
-    """Choose the fixed size: what is asked for, else what the world has."""
+    """Return the number of landmark rows: `max_landmarks`, or that of the world."""
     count = scenario.landmarks.count
     if max_landmarks is None:
         return count
@@ -163,7 +165,7 @@ def count_landmark_rows(scenario: Scenario, max_landmarks: int | None) -> int:
 
 
 def with_belief(space: spaces.Space[Any], rows: int) -> spaces.Dict:
-    """Add the features of a belief to the observation space of a world."""
+    """Add the space of belief features to the observation space of a world."""
     if not isinstance(space, spaces.Dict) or "odometry" not in space.spaces:
         raise ValueError(
             f"env must still observe landmarks, mask and odometry, got {space}"
@@ -171,7 +173,7 @@ def with_belief(space: spaces.Space[Any], rows: int) -> spaces.Dict:
     return spaces.Dict({**space.spaces, **belief_space(rows).spaces})
 
 
-def joined(observation: Observation, features: Mapping[str, Any]) -> Observation:
-    """Add features to an observation; keys in alphabetical order, as in its space."""
+def with_features(observation: Observation, features: Mapping[str, Any]) -> Observation:
+    """Add features to an observation, with the keys in alphabetical order."""
     both = {**observation, **features}
     return {key: both[key] for key in sorted(both)}

@@ -1,4 +1,4 @@
-"""Estimators inside the loop of many worlds: beliefs become part of observations."""
+"""Filters in the loop of many worlds: beliefs become part of the observations."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,9 +9,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from .belief_arrays import BeliefArrays, beliefs_of_batch, take_scans
+from .belief_arrays import BeliefArrays, beliefs_of_batch, update_filters
 from .belief_features import belief_features, world_bounds
-from .belief_observation import count_landmark_rows, joined, scenario_of, with_belief
+from .belief_observation import (
+    count_landmark_rows,
+    scenario_of,
+    with_belief,
+    with_features,
+)
 from .estimator_choice import choose_batch
 
 Array = NDArray[np.float64]
@@ -21,10 +26,10 @@ Infos = dict[str, Any]
 
 
 class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
-    """Runs a filter per world on what a vector of worlds emits, and shows the beliefs.
+    """Runs one filter per world on the observations, and adds the beliefs.
 
-    Row i of every array has the bits that `BeliefObservation` gives in world i. It goes
-    with every autoreset mode; ``infos["final_obs"]`` holds the last beliefs too.
+    Row i of every array equals that of `BeliefObservation` in world i, to the bit. The
+    wrapper supports every autoreset mode; ``infos["final_obs"]`` has the last beliefs.
 
     Parameters
     ----------
@@ -35,13 +40,13 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
     estimator_options : mapping, optional
         Further options of the filter.
     max_landmarks : int, optional
-        N, the rows for landmarks; as many as the world has where not given.
+        N, the number of landmark rows. The default is that of the world.
 
     Raises
     ------
     ValueError
-        If the filter cannot run in batches, the worlds hide identities, or have more
-        landmarks than there are rows.
+        If the filter cannot run in batches, or if the worlds hide identities or have
+        more landmarks than there are rows.
 
     Examples
     --------
@@ -88,7 +93,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
 
     @property
     def beliefs(self) -> BeliefArrays:
-        """What the filters believe now."""
+        """The present beliefs of the filters."""
         if not self._begun:
             raise ResetNeeded("call reset first: there are no beliefs")
         return beliefs_of_batch(self._filters)
@@ -96,43 +101,43 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Infos]:
-        """Begin episodes as the worlds do, with a new map in each filter."""
+        """Start episodes in the worlds, with a new map in each filter."""
         mask = (options or {}).get("reset_mask")
         worlds = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask.copy()
         observations, infos = self.env.reset(seed=seed, options=options)
         self._begin(observations, worlds)
         self._begun = True
         self._ended = self._ended & ~worlds
-        return self._shown(observations), infos
+        return self._with_beliefs(observations), infos
 
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], Infos]:
-        """Step the worlds, then let the filters predict and update."""
+        """Step the worlds, then predict and update."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP:
             self._finish(observations, ended, infos)
         else:
             begun = self._ended & (self._mode == AutoresetMode.NEXT_STEP)
-            self._take_in(observations, ~begun, moved=True)
+            self._update(observations, ~begun, moved=True)
             if begun.any():
                 self._begin(observations, begun)
             self._ended = ended
-        return self._shown(observations), rewards, terminated, truncated, infos
+        return self._with_beliefs(observations), rewards, terminated, truncated, infos
 
     def _finish(
         self, observations: Observation, ended: BoolArray, infos: Infos
     ) -> None:
-        """Take in the last moment of episodes that end, then the first of the next."""
+        """Update with the last scan of ended episodes, then with the first new one."""
         last = {key: rows.copy() for key, rows in observations.items()}
         for world in np.flatnonzero(ended).tolist():
             for key, rows in last.items():
                 rows[world] = infos["final_obs"][world][key]
-        self._take_in(last, np.ones(self.num_envs, dtype=np.bool_), moved=True)
+        self._update(last, np.ones(self.num_envs, dtype=np.bool_), moved=True)
         if not ended.any():
             return
-        shown = self._shown(last)
+        shown = self._with_beliefs(last)
         for world in np.flatnonzero(ended).tolist():
             infos["final_obs"][world] = {
                 key: rows[world].copy() for key, rows in shown.items()
@@ -143,25 +148,25 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         worlds_of: Any = self.env.unwrapped
         estimates = worlds_of.start_estimates
         self._filters.reset(estimates, self.scenario.start.std, runs=worlds)
-        self._take_in(observations, worlds, moved=False)
+        self._update(observations, worlds, moved=False)
 
-    def _take_in(
+    def _update(
         self, observations: Observation, worlds: BoolArray, *, moved: bool
     ) -> None:
         if self._missing_rows:
             longer = {
-                key: _lengthened(observations[key], self._missing_rows)
+                key: _padded(observations[key], self._missing_rows)
                 for key in ("landmarks", "mask")
             }
             observations = {**observations, **longer}
-        take_scans(self._filters, observations, worlds, moved=moved)
+        update_filters(self._filters, observations, worlds, moved=moved)
 
-    def _shown(self, observations: Observation) -> Observation:
+    def _with_beliefs(self, observations: Observation) -> Observation:
         features = belief_features(self._filters.storage(), self._bounds)
-        return joined(observations, features)
+        return with_features(observations, features)
 
 
-def _lengthened(rows: NDArray[Any], more: int) -> NDArray[Any]:
-    """Add empty rows to the second axis."""
+def _padded(rows: NDArray[Any], more: int) -> NDArray[Any]:
+    """Append empty rows to the second axis."""
     padding = [(0, 0), (0, more), *((0, 0) for _ in rows.shape[2:])]
     return np.pad(rows, padding)

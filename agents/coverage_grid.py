@@ -1,7 +1,6 @@
-"""The floor of a bounded world: its cells, its walls, and what of it has been seen.
+"""The floor of a bounded world: its cells and walls, and what the sensor sees of it.
 
-All of this is known to an agent: the plan is given, the landmarks are not; and where
-the robot stands is what an estimator believes.
+An agent knows the walls but not the landmarks. Poses are estimates.
 
 Symbols
 -------
@@ -14,6 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..envs.robot.wall_contacts import wall_distances
 from ..envs.sensors.bearing_range import BearingRangeSensor
 from ..sim_configs import Scenario
 from .belief_features import Bounds, world_bounds
@@ -23,29 +23,29 @@ BoolArray = NDArray[np.bool_]
 ComplexArray = NDArray[np.complex128]
 
 SECTORS = 8
-"""Directions that features around the robot are summed in, the first straight ahead."""
+"""Number of directions around the robot, the first straight ahead."""
 
 _CELLS_PER_SIDE = 24  # at most
 _SMALLEST_CELL = 0.75  # [m]
 _DIRECTIONS = np.exp(2j * np.pi * np.arange(SECTORS) / SECTORS)
 
 
-class FloorPlan:
+class CoverageGrid:
     """Cells and walls of a scenario's world.
 
     Parameters
     ----------
     scenario : Scenario
-        With walls around all that the robot can reach.
+        With walls around the floor.
 
     Attributes
     ----------
     bounds : (xmin, ymin, xmax, ymax)
         Rectangle around the walls [m].
     cells : complex ndarray, shape (C,)
-        Centres of square cells, row by row from the lower left [m].
+        Centres of the cells, row by row from the lower left [m].
     cell_size : float
-        Side of a cell [m]; about.
+        Approximate side of a cell [m].
 
     Raises
     ------
@@ -55,8 +55,8 @@ class FloorPlan:
     Examples
     --------
     >>> from slamgym.sim_configs import load_scenario
-    >>> plan = FloorPlan(load_scenario("corridor"))
-    >>> plan.cells[0].round(2), len(plan.cells)
+    >>> grid = CoverageGrid(load_scenario("corridor"))
+    >>> grid.cells[0].round(2), len(grid.cells)
     (np.complex128(-0.82-0.82j), 361)
     """
 
@@ -78,12 +78,11 @@ class FloorPlan:
         self._sensor = BearingRangeSensor(scenario)
         ends = np.reshape(scenario.walls, (-1, 2, 2))
         self._ends: ComplexArray = ends[..., 0] + 1j * ends[..., 1]
-        self._min_range = np.nextafter(scenario.sensor.min_range, -1.0)
 
-    def seen_from(self, poses: Array) -> BoolArray:
-        """Tell which cells the sensor reads from poses, (B, 3) to (B, C).
+    def visible_from(self, poses: Array) -> BoolArray:
+        """Return which cells are in view from poses, (B, 3) to (B, C).
 
-        What is nearer than the sensor's least range counts as seen.
+        Cells nearer than the sensor's smallest range count as seen.
         """
         position, inverse_heading = _complex_poses(poses)
         shape = (len(poses), len(self.cells))
@@ -92,9 +91,9 @@ class FloorPlan:
         return mask
 
     def wall_distances(self, poses: Array) -> Array:
-        """Measure the way to the next wall in `SECTORS` directions, to (B, 8) [m].
+        """Return the distance to the wall in `SECTORS` directions, to (B, 8) [m].
 
-        At most the diagonal of the floor.
+        It is at most the diagonal of the floor.
         """
         position, inverse_heading = _complex_poses(poses)
         ray = np.conj(inverse_heading) * _DIRECTIONS  # (B, 8)
@@ -105,21 +104,21 @@ class FloorPlan:
         safe = np.where(parallel, 1.0, across)
         distance = _cross(start, along)[:, None] / safe
         share = _cross(start[:, None], ray[:, :, None]) / safe
-        margin = 1e-9  # rays through a corner meet one of its walls
+        margin = 1e-9  # a ray through a corner hits one of its walls
         hits = ~parallel & (distance >= 0) & (share >= -margin) & (share <= 1 + margin)
         nearest = np.where(hits, distance, self.diagonal).min(axis=2)
         return np.asarray(np.minimum(nearest, self.diagonal))
 
     def clearance(self, points: Array) -> Array:
-        """Measure how far points (…, 2) are from the nearest wall, to (…) [m]."""
-        p = (points[..., 0] + 1j * points[..., 1])[..., None]
-        a, along = self._ends[:, 0], self._ends[:, 1] - self._ends[:, 0]
-        length2 = along.real**2 + along.imag**2
-        share = np.clip(((p - a) * np.conj(along)).real / length2, 0.0, 1.0)
-        return np.asarray(np.abs(p - a - share * along).min(axis=-1))
+        """Return the distance of points (…, 2) from the nearest wall, to (…) [m]."""
+        start, along = self._ends[:, 0], self._ends[:, 1] - self._ends[:, 0]
+        away = wall_distances(points[..., 0] + 1j * points[..., 1], start, along)
+        return np.asarray(away.min(axis=-1))
 
-    def way_to_least(self, poses: Array, points: ComplexArray, costs: Array) -> Array:
-        """Point from the robot to the cheapest of some points, (B, 3).
+    def direction_to_cheapest(
+        self, poses: Array, points: ComplexArray, costs: Array
+    ) -> Array:
+        """Return the direction from the robot to the point of least cost, (B, 3).
 
         Parameters
         ----------
@@ -128,13 +127,13 @@ class FloorPlan:
         points : complex ndarray, shape (C,) or (B, C)
             As x + iy [m].
         costs : ndarray, shape (B, C)
-            Where all are inf there is no point to go to.
+            inf excludes a point.
 
         Returns
         -------
         ndarray
             Cosine and sine of the bearing, and the distance in diagonals of the floor
-            (at most 1); zeros where there is no point.
+            (at most 1); zeros if all points are excluded.
         """
         position, inverse_heading = _complex_poses(poses)
         world = np.arange(len(poses))
@@ -145,10 +144,10 @@ class FloorPlan:
         unit = relative / np.maximum(distance, 1e-9)
         far = np.minimum(distance / self.diagonal, 1.0)
         there = np.isfinite(costs[world, cheapest])
-        way = np.stack([unit.real, unit.imag, far], axis=1)
-        return np.asarray(np.clip(way * there[:, None], -1.0, 1.0))
+        direction = np.stack([unit.real, unit.imag, far], axis=1)
+        return np.asarray(np.clip(direction * there[:, None], -1.0, 1.0))
 
-    def pull(
+    def sector_sums(
         self, poses: Array, points: ComplexArray, weights: Array, reach: float
     ) -> Array:
         """Sum weights of points in `SECTORS` directions around the robot, to (B, 8).
@@ -157,8 +156,8 @@ class FloorPlan:
 
             Σ_c  w_c  e^{-|δ_c| / reach}  max(0, cos(arg δ_c - φ_k))²  / 2
 
-        in direction φ_k: the lobes of all directions sum up to one. A point right at
-        the robot pulls nowhere.
+        in direction φ_k. The lobes of all directions add up to one. A point at the
+        position of the robot has no direction and no weight.
 
         Parameters
         ----------
@@ -169,7 +168,7 @@ class FloorPlan:
         weights : ndarray, shape (B, C)
             w >= 0.
         reach : float
-            Distance over which the pull falls to 1 / e [m].
+            Distance over which a weight decays to 1 / e [m].
         """
         position, inverse_heading = _complex_poses(poses)
         relative = (points - position) * inverse_heading
@@ -189,7 +188,7 @@ def _lobe(unit: ComplexArray, direction: complex) -> Array:
 
 
 def _complex_poses(poses: Array) -> tuple[ComplexArray, ComplexArray]:
-    """Give x + iy and cos θ - i sin θ, each of shape (B, 1)."""
+    """Return x + iy and cos θ - i sin θ, each of shape (B, 1)."""
     heading = poses[:, 2:3]
     return poses[:, 0:1] + 1j * poses[:, 1:2], np.cos(heading) - 1j * np.sin(heading)
 

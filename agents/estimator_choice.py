@@ -1,4 +1,4 @@
-"""Estimators for agents: chosen by name or made by hand, and held to their promises."""
+"""Estimators in the loop of an agent: construction, and checks of their beliefs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..envs.rendering import BeliefLike
 from ..estimator.filters.batch import BatchSlam
 from ..estimator.registry import (
     accepted_options,
@@ -22,41 +23,25 @@ from ..sim_configs import Scenario
 Array = NDArray[np.float64]
 
 
-class BeliefOfMap(Protocol):
-    """What an agent reads of a belief; `slamgym.estimator.Belief` is one."""
-
-    @property
-    def pose(self) -> Array:
-        """Mean of the pose, shape (3,) [m, m, rad]."""
-
-    @property
-    def pose_covariance(self) -> Array:
-        """Covariance of the pose, shape (3, 3)."""
+class BeliefOfMap(BeliefLike, Protocol):
+    """The parts of a belief that agents use; `slamgym.estimator.Belief` has them."""
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """Identities of the n mapped landmarks, in the order of the state."""
 
-    @property
-    def landmarks(self) -> Array:
-        """Means of the n mapped landmarks, shape (n, 2) [m]."""
-
-    @property
-    def covariance(self) -> Array:
-        """Of the additive error of the state, shape (3 + 2n, 3 + 2n)."""
-
 
 class FollowingEstimator(Protocol):
-    """What an agent's loop asks of an estimator: four of `SlamEstimator`'s methods."""
+    """The four methods of `SlamEstimator` that an agent's loop needs."""
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run, the map empty."""
+        """Start a new run with an empty map."""
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad]."""
+        """Predict with odometry (d, α) [m, rad]."""
 
     def update(self, measurements: ArrayLike, landmark_ids: Any = None) -> Any:
-        """Take in one scan, rows (bearing, range) [rad, m]."""
+        """Update with one scan, rows (bearing, range) [rad, m]."""
 
     def belief(self) -> Any:
         """Return the present belief."""
@@ -67,7 +52,7 @@ EstimatorChoice = str | FollowingEstimator | Callable[..., FollowingEstimator]
 _METHODS = ("reset", "predict", "update", "belief")
 _OF_BELIEF = ("pose", "pose_covariance", "landmark_ids", "landmarks", "covariance")
 _ARRAYS = ("pose", "pose_covariance", "landmarks", "covariance")
-_ROUNDING = 1e-9  # that a variance may be below 0, as in `check_estimator`
+_ROUNDING = 1e-9  # tolerance of a negative variance, as in `check_estimator`
 
 
 def choose_estimator(
@@ -75,24 +60,24 @@ def choose_estimator(
     scenario: Scenario,
     options: Mapping[str, Any] | None = None,
 ) -> FollowingEstimator:
-    """Make an estimator that knows the noise of a world.
+    """Make an estimator with the noise settings of a world.
 
     Parameters
     ----------
     estimator : str, callable or object
         A registered name or "module:Class", a factory with the keywords of
-        `make_estimator`, or an estimator already made, which keeps its settings.
+        `make_estimator`, or an existing estimator, which keeps its settings.
     scenario : Scenario
-        Its noise is told to the estimator.
+        Source of the noise settings.
     options : mapping, optional
         Further options of the estimator's constructor.
 
     Raises
     ------
     ValueError
-        If the name is unknown, or options are given for an estimator already made.
+        If the name is unknown, or there are options for an existing estimator.
     TypeError
-        If the estimator lacks a method, which is named.
+        If the estimator lacks a method.
 
     Examples
     --------
@@ -104,8 +89,8 @@ def choose_estimator(
         return checked_estimator(_named(estimator, scenario, options or {}))
     if isinstance(estimator, type) or not _has_a_method(estimator):
         factory = cast("Callable[..., FollowingEstimator]", estimator)
-        told = told_options(factory, scenario)
-        estimator = _made_by(factory, scenario, {**told, **(options or {})})
+        settings = noise_options(factory, scenario)
+        estimator = _made_by(factory, scenario, {**settings, **(options or {})})
     elif options:
         raise ValueError(
             "estimator_options must be empty with an estimator already made, "
@@ -121,9 +106,9 @@ def choose_batch(
     landmarks: int,
     options: Mapping[str, Any] | None = None,
 ) -> BatchSlam:
-    """Make a batch of a registered estimator that knows the noise of a world.
+    """Make a batch of a registered estimator with the noise settings of a world.
 
-    One thread: what one step costs is less than handing it to another.
+    It has one thread: a step takes less time than starting another thread.
 
     Raises
     ------
@@ -135,7 +120,7 @@ def choose_batch(
             f"estimator must be a registered name where worlds run side by side, "
             f"got {estimator!r}"
         )
-    known = told_options(find_estimator(estimator), scenario)
+    known = noise_options(find_estimator(estimator), scenario)
     return make_batch(
         estimator,
         runs=runs,
@@ -147,17 +132,17 @@ def choose_batch(
     )
 
 
-def told_options(factory: Callable[..., Any], scenario: Scenario) -> dict[str, Any]:
-    """Collect what a world tells of its noise, as far as the factory takes it."""
-    told = {
+def noise_options(factory: Callable[..., Any], scenario: Scenario) -> dict[str, Any]:
+    """Return the noise settings of a world that a factory accepts."""
+    settings = {
         "range_std_per_metre": scenario.sensor.range_std_per_metre,
         "noise_at_rest": scenario.motion.noise_at_rest,
     }
-    return accepted_options(factory, told)
+    return accepted_options(factory, settings)
 
 
 def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:
-    """Return the estimator, or name the method of the Protocol that it lacks."""
+    """Return the estimator, or raise a `TypeError` if it lacks a method."""
     for method in _METHODS:
         if not callable(getattr(estimator, method, None)):
             raise TypeError(
@@ -168,17 +153,17 @@ def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:
 
 
 def checked_belief(estimator: FollowingEstimator, step: int) -> BeliefOfMap:
-    """Ask for the belief, and name what is wrong with it.
+    """Return the belief of an estimator after checking its shapes and numbers.
 
-    Shapes, finite numbers and variances are looked at in every step. Whether the whole
-    covariance is positive semidefinite costs more; `check_estimator` tells that.
+    `check_estimator` has the more expensive check that the whole covariance is positive
+    semidefinite.
 
     Parameters
     ----------
     estimator : FollowingEstimator
-        Whose belief is asked for.
+        Source of the belief.
     step : int
-        For the message; 0 is the first scan, before any motion.
+        For the error message; 0 is the first scan, before any motion.
 
     Raises
     ------
@@ -188,38 +173,45 @@ def checked_belief(estimator: FollowingEstimator, step: int) -> BeliefOfMap:
         If a number is not finite or a variance is negative.
     """
     belief = estimator.belief()
-    name = type(estimator).__name__
+    name = f"{type(estimator).__name__}.belief()"
     parts = {part: getattr(belief, part, None) for part in _OF_BELIEF}
-    for part, value in parts.items():
-        if value is None:
-            raise TypeError(
-                f"{name}.belief() must return a belief with {', '.join(_OF_BELIEF)}, "
-                f"got {type(belief).__name__} without {part}"
-            )
-    count = len(belief.landmark_ids)
+    missing = [part for part, value in parts.items() if value is None]
+    if missing:
+        raise TypeError(
+            f"{name} must return a belief with {', '.join(_OF_BELIEF)}, "
+            f"got {type(belief).__name__} without {missing[0]}"
+        )
     arrays = {part: np.asarray(parts[part]) for part in _ARRAYS}
-    for (part, array), shape in zip(arrays.items(), _shapes(count), strict=True):
-        if array.shape != shape and not 0 == array.size == math.prod(shape):
-            what = part if part == "landmarks" else f"a {part}"
-            raise TypeError(
-                f"{name}.belief() must have {what} of shape {shape} with {count} "
-                f"landmarks, got {array.shape} at step {step}"
-            )
+    for part, array in arrays.items():
+        problem = _wrong_shape(part, array, len(belief.landmark_ids))
+        if problem:
+            raise TypeError(f"{name} must {problem} at step {step}")
     for part, array in arrays.items():
         problem = _wrong_number(part, array)
         if problem:
-            raise ValueError(f"{name}.belief() must {problem} at step {step}")
+            raise ValueError(f"{name} must {problem} at step {step}")
     checked: BeliefOfMap = belief
     return checked
 
 
-def _shapes(landmarks: int) -> tuple[tuple[int, ...], ...]:
-    size = 3 + 2 * landmarks
-    return (3,), (3, 3), (landmarks, 2), (size, size)
+def _wrong_shape(part: str, values: NDArray[Any], count: int) -> str | None:
+    """Return the message for a wrong shape of a part of a belief, or None."""
+    size = 3 + 2 * count
+    shapes = {
+        "pose": (3,),
+        "pose_covariance": (3, 3),
+        "landmarks": (count, 2),
+        "covariance": (size, size),
+    }
+    shape = shapes[part]
+    if values.shape == shape or 0 == values.size == math.prod(shape):
+        return None
+    what = part if part == "landmarks" else f"a {part}"
+    return f"have {what} of shape {shape} with {count} landmarks, got {values.shape}"
 
 
 def _wrong_number(part: str, values: NDArray[Any]) -> str | None:
-    """Tell which rule a part of a belief breaks, and by which number."""
+    """Return the message for a wrong number in a part of a belief, or None."""
     finite = np.isfinite(values)
     if not finite.all():
         return f"be finite, got {_first(part, values, ~finite)}"
@@ -230,7 +222,7 @@ def _wrong_number(part: str, values: NDArray[Any]) -> str | None:
 
 
 def _first(part: str, values: NDArray[Any], wrong: NDArray[np.bool_]) -> str:
-    """Write the first wrong entry, as in "covariance[1, 1] = -0.5"."""
+    """Format the first wrong entry, as in "covariance[1, 1] = -0.5"."""
     place = np.argwhere(wrong)[0].tolist()
     return f"{part}{place} = {values[tuple(place)]}"
 
@@ -244,8 +236,8 @@ def _has_a_method(estimator: Any) -> bool:
 def _named(
     name: str, scenario: Scenario, options: Mapping[str, Any]
 ) -> FollowingEstimator:
-    """Make a registered estimator; it associates where the world hides identities."""
-    known: dict[str, Any] = told_options(find_estimator(name), scenario)
+    """Make a registered estimator, with data association if identities are hidden."""
+    known: dict[str, Any] = noise_options(find_estimator(name), scenario)
     if not scenario.sensor.identities:
         known["management"] = True
     return _made_by(partial(make_estimator, name), scenario, {**known, **options})

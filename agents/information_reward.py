@@ -1,17 +1,17 @@
-"""What knowledge is worth: optimality criteria of a belief, and a reward from them.
+"""Optimality criteria of a belief, and a reward for the gain of information.
 
-How small is a covariance P?  The design of experiments answers by one number:
+The theory of experimental design measures a covariance P by one number:
 
 =====  ==============================  =========================================
-D      ½ log det P [nats]              entropy, but for a constant
+D      ½ log det P [nats]              entropy up to a constant
 A      trace P [m²]                    mean squared error
 E      largest eigenvalue of P [m²]    error in the worst direction
 =====  ==============================  =========================================
 
-A map grows, so beliefs of different sizes must be compared. Every landmark that is not
-yet mapped counts with a prior, a covariance of ``prior_std``² on its two coordinates,
-uncorrelated with all else: so P has one size from the first step to the last, and the
-decreases of a criterion over an episode add up to its first value minus its last.
+A map grows, so beliefs of different sizes have to be compared. Every unmapped landmark
+has a prior, a variance of ``prior_std``² for each coordinate, uncorrelated with all
+other states. So P has a fixed size, and the decreases of a criterion over an episode
+add up to its first value minus its last.
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ from .belief_features import world_bounds
 from .belief_observation import BeliefObservation
 
 Array = NDArray[np.float64]
-
-CRITERIA = ("D", "A", "E")
 
 
 def d_optimality(covariance: ArrayLike) -> Array:
@@ -70,18 +68,26 @@ def e_optimality(covariance: ArrayLike) -> Array:
     return np.asarray(np.linalg.eigvalsh(matrices)[..., -1])
 
 
-_BY_NAME = {"D": d_optimality, "A": a_optimality, "E": e_optimality}
+CRITERIA = {"D": d_optimality, "A": a_optimality, "E": e_optimality}
+
+
+def check_criterion(criterion: str) -> None:
+    """Raise a `ValueError` if there is no such criterion."""
+    if criterion not in CRITERIA:
+        raise ValueError(
+            f"criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}"
+        )
 
 
 def map_covariances(beliefs: BeliefArrays, prior_std: ArrayLike) -> Array:
-    """Take the joint covariance of all landmarks, mapped or not.
+    """Return the joint covariance of all landmarks, mapped or not.
 
     Parameters
     ----------
     beliefs : BeliefArrays
         Of B worlds with N landmarks.
     prior_std : float or array_like, shape (2,)
-        Of the coordinates of a landmark that is not mapped [m].
+        Of the coordinates of an unmapped landmark [m].
 
     Returns
     -------
@@ -96,37 +102,34 @@ def map_covariances(beliefs: BeliefArrays, prior_std: ArrayLike) -> Array:
 
 
 def uncertainty(beliefs: BeliefArrays, criterion: str, prior_std: ArrayLike) -> Array:
-    """Measure how uncertain maps are.
+    """Compute the uncertainty of maps.
 
     Parameters
     ----------
     beliefs : BeliefArrays
         Of B worlds with N landmarks.
     criterion : {"D", "A", "E"}
-        What is measured. D and A are divided by N, so that they are per landmark.
+        D and A are divided by N, the number of landmarks.
     prior_std : float or array_like, shape (2,)
-        Of the coordinates of a landmark that is not mapped [m].
+        Of the coordinates of an unmapped landmark [m].
 
     Returns
     -------
     ndarray, shape (B,)
-        The decrease from one belief to the next is the information gained.
+        Its decrease from one belief to the next is the information gain.
 
     Raises
     ------
     ValueError
         If the criterion is unknown.
     """
-    if criterion not in CRITERIA:
-        raise ValueError(
-            f"criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}"
-        )
-    measured = _BY_NAME[criterion](map_covariances(beliefs, prior_std))
+    check_criterion(criterion)
+    measured = CRITERIA[criterion](map_covariances(beliefs, prior_std))
     return measured if criterion == "E" else measured / beliefs.mapped.shape[1]
 
 
 def effort(actions: ArrayLike, limits: ArrayLike) -> Array:
-    """Measure what actions cost the robot, (…, 2) to (…): 0 at rest, 1 at both limits.
+    """Compute the effort of actions, (…, 2) to (…): 0 at rest, 1 at both limits.
 
     ::
 
@@ -144,7 +147,7 @@ def effort(actions: ArrayLike, limits: ArrayLike) -> Array:
 
 
 def landmark_prior_std(scenario: Scenario) -> tuple[float, float]:
-    """Give the σ of a landmark that may be anywhere in the world: side / √12 [m].
+    """Return the σ of a landmark uniform in the world: side / √12 [m].
 
     Examples
     --------
@@ -157,14 +160,14 @@ def landmark_prior_std(scenario: Scenario) -> tuple[float, float]:
 
 
 class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Rewards what the belief gains, and charges for collisions and effort.
+    """Rewards information gain, with costs of collisions and effort.
 
     ::
 
         reward += gain - collision_cost [collision] - effort_cost effort(action)
 
     where the gain is the decrease of `uncertainty` in this step. The first scan, in
-    `reset`, is not rewarded.
+    `reset`, has no reward.
 
     Parameters
     ----------
@@ -173,12 +176,12 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
     criterion : {"D", "A", "E"}
         See `uncertainty`.
     prior_std : float, optional
-        Of the coordinates of a landmark that is not mapped [m]; where not given, of one
-        that may be anywhere in the world.
+        Of the coordinates of an unmapped landmark [m]. The default is that of a
+        landmark uniform in the world.
     gain : float
         Factor of the gain.
     collision_cost, effort_cost : float
-        What a collision, and an `effort` of 1, cost.
+        Cost of a collision, and of an `effort` of 1.
 
     Examples
     --------
@@ -211,10 +214,7 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
             effort_cost=effort_cost,
         )
         super().__init__(env)
-        if criterion not in CRITERIA:
-            raise ValueError(
-                f"criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}"
-            )
+        check_criterion(criterion)
         if not _observes_beliefs(env):
             raise ValueError(
                 "env must have a BeliefObservation among its wrappers, got "
@@ -241,7 +241,7 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode, and measure the uncertainty of its first belief."""
+        """Start an episode, and compute the uncertainty of its first belief."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._uncertainty = self._measure()
         return observation, info
@@ -249,7 +249,7 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
     def step(
         self, action: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Step, and add what the belief has gained to the reward."""
+        """Take a step, and add the information gain to the reward."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         before, self._uncertainty = self._uncertainty, self._measure()
         gain, collision_cost, effort_cost = self._factors

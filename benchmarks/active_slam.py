@@ -25,9 +25,9 @@ from slamgym.agents.active_slam_scores import (
     VALIDATION,
     Episode,
     Policy,
+    baseline_policy,
     difference_lines,
-    driven_by,
-    play_all,
+    run_episodes,
     score_table,
 )
 
@@ -40,12 +40,12 @@ def score(scenario: str, seeds: range, policy: str | None) -> dict[str, list[Epi
     env = ActiveSlamEnv(scenario)
     players: dict[str, Policy] = {}
     for name in BASELINES:
-        driver = make_baseline(name, env.scenario, np.random.default_rng(0))
-        players[name] = driven_by(driver)
+        baseline = make_baseline(name, env.scenario, np.random.default_rng(0))
+        players[name] = baseline_policy(baseline)
     if policy is not None:
         load_policy = runpy.run_path(str(TRAINING))["load_policy"]
         players["ppo"] = load_policy(Path(policy))
-    return {name: play_all(env, player, seeds) for name, player in players.items()}
+    return {name: run_episodes(env, player, seeds) for name, player in players.items()}
 
 
 def main() -> None:

@@ -40,10 +40,10 @@ from slamgym.agents.active_slam_scores import (
     HELD_OUT,
     Episode,
     Policy,
+    baseline_policy,
     difference_lines,
-    driven_by,
     mean_of,
-    play_all,
+    run_episodes,
     score_table,
 )
 from slamgym.envs.vector import FlattenBatch, to_stable_baselines
@@ -121,9 +121,9 @@ def play_everyone(
     seeds = range(HELD_OUT, HELD_OUT + maps)
     players = {"ppo": policy}
     for name in BASELINES:
-        driver = make_baseline(name, env.scenario, np.random.default_rng(0))
-        players[name] = driven_by(driver)
-    return {name: play_all(env, each, seeds) for name, each in players.items()}
+        baseline = make_baseline(name, env.scenario, np.random.default_rng(0))
+        players[name] = baseline_policy(baseline)
+    return {name: run_episodes(env, each, seeds) for name, each in players.items()}
 
 
 def draw_curve(

@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating]
+Array = NDArray[np.float64]
 RenderMode = Literal["human", "rgb_array"]
 RENDER_MODES: tuple[RenderMode, ...] = ("human", "rgb_array")
 

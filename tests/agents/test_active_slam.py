@@ -19,17 +19,21 @@ from slamgym.agents import (
     BeliefObservation,
     BeliefObservationVector,
 )
-from slamgym.agents.active_slam_baselines import BASELINES, lanes_of, make_baseline
+from slamgym.agents.active_slam_baselines import (
+    BASELINES,
+    coverage_lanes,
+    make_baseline,
+)
 from slamgym.agents.active_slam_scores import (
     VALIDATION,
     Episode,
-    driven_by,
+    baseline_policy,
     mean_of,
-    play,
-    play_all,
+    run_episode,
+    run_episodes,
     score_table,
 )
-from slamgym.agents.coverage_grid import SECTORS, FloorPlan
+from slamgym.agents.coverage_grid import SECTORS, CoverageGrid
 from slamgym.agents.information_reward import effort, map_covariances
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import EkfSlam, list_estimators
@@ -130,10 +134,10 @@ def test_rewards_are_what_the_docstring_says(criterion):
 
 
 def beliefs(env):
-    from slamgym.agents.belief_arrays import belief_in_rows
+    from slamgym.agents.belief_arrays import belief_arrays
 
     count = env.scenario.landmarks.count
-    return belief_in_rows(env.situation.belief, count, by_id=True)
+    return belief_arrays(env.knowledge.belief, count, by_id=True)
 
 
 def test_touching_a_wall_ends_the_episode():
@@ -155,7 +159,7 @@ def test_knowing_every_landmark_ends_the_episode_with_a_reward():
         assert env._progress.known.sum() < 5
         _, reward, terminated, truncated, info = env.step([0.0, 0.0])
         steps += 1
-    spreads = env.situation.belief.landmark_covariances
+    spreads = env.knowledge.belief.landmark_covariances
     assert np.sqrt(np.linalg.eigvalsh(spreads)[:, -1]).max() <= 0.08
     assert info["success"]
     assert not truncated
@@ -195,10 +199,10 @@ def test_the_agent_does_not_see_the_truth(monkeypatch):
 def test_settings_survive_a_spec_written_as_json():
     env = gym.make(ID, scenario="active_easy", accuracy=0.5, estimator="ekf", steps=9)
     rebuilt = gym.make(EnvSpec.from_json(env.spec.to_json()))
-    assert rebuilt.unwrapped.task.stakes == env.unwrapped.task.stakes
+    assert rebuilt.unwrapped.task.weights == env.unwrapped.task.weights
     assert rebuilt.unwrapped.scenario == env.unwrapped.scenario
     rebuilt.reset(seed=0)
-    assert type(rebuilt.unwrapped.situation.estimator) is EkfSlam
+    assert type(rebuilt.unwrapped.knowledge.estimator) is EkfSlam
 
 
 @pytest.mark.parametrize(
@@ -235,7 +239,7 @@ def test_to_step_or_to_look_before_reset_is_refused():
     with pytest.raises(gym.error.ResetNeeded):
         ActiveSlamEnv().step([0.0, 0.0])
     with pytest.raises(gym.error.ResetNeeded):
-        _ = ActiveSlamEnv().situation
+        _ = ActiveSlamEnv().knowledge
     with pytest.raises(gym.error.ResetNeeded):
         ActiveSlamVectorEnv(2).step(np.zeros((2, 2)))
 
@@ -363,7 +367,7 @@ def test_rows_may_be_any_integer(rows):
 def test_landmarks_are_told_ahead_and_aside_one_after_the_other_in_diagonals():
     env = ActiveSlamEnv("active_medium")
     for observation, *_ in wander(env, 40, seed=3):
-        belief, told = env.situation.belief, observation["belief_landmarks"]
+        belief, told = env.knowledge.belief, observation["belief_landmarks"]
         count = env.scenario.landmarks.count
         assert told.shape == (2 * count,)
         x, y, heading = belief.pose
@@ -512,17 +516,17 @@ def test_many_worlds_are_not_drawn():
 
 
 @pytest.fixture(scope="module")
-def plan():
-    return FloorPlan(load_scenario("active_medium"))
+def grid():
+    return CoverageGrid(load_scenario("active_medium"))
 
 
 POSES = np.array([[0.1, 0.0, 0.3], [-6.0, 7.0, -2.0], [3.0, -7.5, 40.0]])
 
 
-def test_cells_seen_are_those_in_range_and_in_view(plan):
-    seen = plan.seen_from(POSES)
+def test_cells_seen_are_those_in_range_and_in_view(grid):
+    seen = grid.visible_from(POSES)
     for row, (x, y, heading) in enumerate(POSES):
-        for cell, mark in zip(plan.cells, seen[row], strict=True):
+        for cell, mark in zip(grid.cells, seen[row], strict=True):
             away = math.hypot(cell.real - x, cell.imag - y)
             bearing = math.atan2(cell.imag - y, cell.real - x) - heading
             in_view = math.cos(bearing) >= 0  # half of the surroundings
@@ -531,15 +535,15 @@ def test_cells_seen_are_those_in_range_and_in_view(plan):
 
 def test_walls_hide_cells_where_they_hide_landmarks():
     scenario = load_scenario("corridor")
-    seen = FloorPlan(scenario).seen_from(np.zeros((1, 3)))[0]
-    cells = FloorPlan(scenario).cells
+    seen = CoverageGrid(scenario).visible_from(np.zeros((1, 3)))[0]
+    cells = CoverageGrid(scenario).cells
     behind = (cells.real > 1.5) & (cells.imag > 3.0) & (cells.imag < 9.0)
     assert not seen[behind].any()
     assert seen[(np.abs(cells.imag) < 1.0) & (cells.real < 7.5)].all()
 
 
-def test_the_way_to_a_wall_is_found_in_every_direction(plan):
-    ways = plan.wall_distances(POSES)
+def test_the_way_to_a_wall_is_found_in_every_direction(grid):
+    ways = grid.wall_distances(POSES)
     for row, (x, y, heading) in enumerate(POSES):
         for k in range(SECTORS):
             dx, dy = (
@@ -551,29 +555,31 @@ def test_the_way_to_a_wall_is_found_in_every_direction(plan):
 
 
 def test_inner_walls_stop_the_rays_too():
-    ways = FloorPlan(load_scenario("corridor")).wall_distances(np.zeros((1, 3)))[0]
+    ways = CoverageGrid(load_scenario("corridor")).wall_distances(np.zeros((1, 3)))[0]
     expected = [13.2, 1.2 * 2**0.5, 13.2, 1.2 * 2**0.5, 1.2, 1.2 * 2**0.5, 1.2]
     assert ways[:3][[0, 2]] == pytest.approx([13.2, 13.2])
     assert ways[[3, 4, 5, 6, 7]] == pytest.approx([*expected[3:], 1.2 * 2**0.5])
 
 
-def test_clearance_is_the_distance_to_the_nearest_wall(plan):
+def test_clearance_is_the_distance_to_the_nearest_wall(grid):
     points = np.random.default_rng(0).uniform(-8, 8, (50, 2))
-    np.testing.assert_allclose(plan.clearance(points), 8 - np.abs(points).max(axis=1))
+    np.testing.assert_allclose(grid.clearance(points), 8 - np.abs(points).max(axis=1))
 
 
-def test_pulls_of_all_directions_sum_up_to_the_weights(plan):
-    weights = np.random.default_rng(0).random((3, len(plan.cells)))
-    pulls = plan.pull(POSES, plan.cells, weights, reach=3.0)
-    away = np.abs(plan.cells - (POSES[:, :1] + 1j * POSES[:, 1:2]))
+def test_sector_sums_add_up_to_the_weights(grid):
+    weights = np.random.default_rng(0).random((3, len(grid.cells)))
+    sums = grid.sector_sums(POSES, grid.cells, weights, reach=3.0)
+    away = np.abs(grid.cells - (POSES[:, :1] + 1j * POSES[:, 1:2]))
     np.testing.assert_allclose(
-        pulls.sum(axis=1), (weights * np.exp(-away / 3.0)).sum(axis=1)
+        sums.sum(axis=1), (weights * np.exp(-away / 3.0)).sum(axis=1)
     )
 
 
-def test_a_landmark_on_the_left_pulls_to_the_left(plan):
+def test_a_landmark_on_the_left_counts_on_the_left(grid):
     pose = np.array([[1.0, 1.0, np.pi / 2]])
-    pull = plan.pull(pose, np.array([-3.0 + 1.0j]), np.ones((1, 1)), reach=4.0)[0]
+    pull = grid.sector_sums(pose, np.array([-3.0 + 1.0j]), np.ones((1, 1)), reach=4.0)[
+        0
+    ]
     assert pull.argmax() == 2
     assert pull[2] == pytest.approx(0.5 / math.e)
     assert pull[[0, 4, 5, 6, 7]] == pytest.approx(np.zeros(5))
@@ -582,12 +588,12 @@ def test_a_landmark_on_the_left_pulls_to_the_left(plan):
 def test_goals_are_the_ways_to_what_is_nearest_and_to_what_is_known_best():
     env = ActiveSlamEnv("active_medium", accuracy=0.06)
     for observation, *_ in wander(env, 60, seed=3):
-        now = env.situation
+        now = env.knowledge
         ids = list(now.belief.landmark_ids)
         x, y, heading = now.belief.pose
         spots = now.belief.landmarks @ [1, 1j]
         std = np.linalg.eigvalsh(now.belief.landmark_covariances)[:, -1]
-        candidates = [now.plan.cells[~now.explored], spots[~now.known[ids]]]
+        candidates = [now.grid.cells[~now.explored], spots[~now.known[ids]]]
         candidates += [spots[[std.argmin()]] if ids else spots]
         for k, places in enumerate(candidates):
             goal = observation["goals"][3 * k : 3 * k + 3]
@@ -609,9 +615,9 @@ def scores():
     env = ActiveSlamEnv("active_easy")
     played = {}
     for name in BASELINES:
-        driver = make_baseline(name, env.scenario, np.random.default_rng(0))
-        played[name] = play_all(
-            env, driven_by(driver), range(VALIDATION, VALIDATION + 8)
+        baseline = make_baseline(name, env.scenario, np.random.default_rng(0))
+        played[name] = run_episodes(
+            env, baseline_policy(baseline), range(VALIDATION, VALIDATION + 8)
         )
     return played
 
@@ -632,32 +638,32 @@ def test_those_who_plan_do_not_touch_a_wall(scores):
 @pytest.mark.parametrize("name", BASELINES)
 def test_a_baseline_does_the_same_again(name, scores):
     env = ActiveSlamEnv("active_easy")
-    driver = make_baseline(name, env.scenario, np.random.default_rng(0))
-    again = play(env, driven_by(driver), VALIDATION)
+    baseline = make_baseline(name, env.scenario, np.random.default_rng(0))
+    again = run_episode(env, baseline_policy(baseline), VALIDATION)
     np.testing.assert_array_equal(again.path, scores[name][0].path)
 
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_lanes_show_the_whole_floor(level):
     scenario = load_scenario(level)
-    plan, lanes = FloorPlan(scenario), lanes_of(scenario)
-    seen = np.zeros(len(plan.cells), dtype=bool)
+    grid, lanes = CoverageGrid(scenario), coverage_lanes(scenario)
+    seen = np.zeros(len(grid.cells), dtype=bool)
     for start, end in pairwise(lanes):
         heading = math.atan2(*(end - start)[::-1])
         points = start + np.linspace(0, 1, 60)[:, None] * (end - start)
         poses = np.column_stack([points, np.full(60, heading)])
-        seen |= plan.seen_from(poses).any(axis=0)
+        seen |= grid.visible_from(poses).any(axis=0)
     assert seen.mean() > 0.97
 
 
 def test_thinking_ahead_leaves_the_estimator_as_it_was():
     env = ActiveSlamEnv("active_medium")
-    driver = make_baseline("greedy", env.scenario, np.random.default_rng(0))
+    baseline = make_baseline("greedy", env.scenario, np.random.default_rng(0))
     env.reset(seed=0)
     for _ in range(10):
-        before = env.situation.estimator.state_dict()
-        action = driver.act(env.situation)
-        after = env.situation.estimator.state_dict()
+        before = env.knowledge.estimator.state_dict()
+        action = baseline.act(env.knowledge)
+        after = env.knowledge.estimator.state_dict()
         for key in before:
             np.testing.assert_array_equal(before[key], after[key])
         env.step(action)
@@ -671,12 +677,12 @@ def test_greedy_turns_to_the_side_where_something_can_be_learnt():
         sensor={"field_of_view": 1.0, "max_range": 6.0},
         start={"pose": [0.0, 0.0, np.pi / 2], "std": [0.01, 0.01, 0.01]},
     )
-    driver = make_baseline("greedy", env.scenario, np.random.default_rng(0))
+    baseline = make_baseline("greedy", env.scenario, np.random.default_rng(0))
     env.reset(seed=0)
     env.step([0.0, 1.0])
-    everything = np.ones(len(env.task.plan.cells), dtype=bool)
-    now = env.situation._replace(explored=everything)
-    assert driver.act(now)[1] < 0
+    everything = np.ones(len(env.task.grid.cells), dtype=bool)
+    now = env.knowledge._replace(explored=everything)
+    assert baseline.act(now)[1] < 0
 
 
 def test_revisiting_goes_back_to_the_best_landmark_when_unsure():
@@ -686,12 +692,12 @@ def test_revisiting_goes_back_to_the_best_landmark_when_unsure():
         motion={"std": [0.1, 0.1, 0.05]},
         sensor={"field_of_view": 2 * np.pi},
     )
-    driver = make_baseline("revisit", env.scenario, np.random.default_rng(0))
+    baseline = make_baseline("revisit", env.scenario, np.random.default_rng(0))
     env.reset(seed=0)
     for _ in range(6):
         env.step([1.0, 0.0])
-    driver.act(env.situation._replace(step=0))
-    action = driver.act(env.situation)
+    baseline.act(env.knowledge._replace(step=0))
+    action = baseline.act(env.knowledge)
     assert action[0] == 0  # turns round on the spot
     assert abs(action[1]) == 1
 

@@ -1,0 +1,49 @@
+"""The knowledge of an agent in active SLAM: belief, floor and progress, no truth."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sim_configs import Scenario
+from .coverage_grid import CoverageGrid
+from .estimator_choice import BeliefOfMap, FollowingEstimator
+
+Array = NDArray[np.float64]
+
+
+class AgentKnowledge(NamedTuple):
+    """What an agent may know at one step, for policies that plan."""
+
+    scenario: Scenario
+    grid: CoverageGrid
+    estimator: FollowingEstimator
+    """For predictions. A policy that changes its state must restore it."""
+    belief: BeliefOfMap
+    explored: NDArray[np.bool_]
+    """Cells of the grid seen so far, as believed, shape (C,)."""
+    known: NDArray[np.bool_]
+    """Landmarks known to the required accuracy, shape (N,)."""
+    accuracy: float
+    """Required standard deviation of a landmark [m]."""
+    prior_std: tuple[float, float]
+    """Standard deviations of the coordinates of an unmapped landmark [m]."""
+    step: int
+    """Steps so far."""
+
+    def goals(self) -> Array:
+        """Return the positions worth a visit, shape (K, 2) [m].
+
+        These are the mapped landmarks that are not yet known and, while a landmark is
+        not yet mapped, the unexplored cells.
+        """
+        ids = list(self.belief.landmark_ids)
+        landmarks: Array = self.belief.landmarks[~self.known[ids]]
+        if len(ids) == len(self.known):
+            return landmarks
+        return np.concatenate([landmarks, as_points(self.grid.cells[~self.explored])])
+
+
+def as_points(numbers: NDArray[np.complex128]) -> Array:
+    """Return complex numbers x + iy, (K,), as points (K, 2)."""
+    return np.column_stack([numbers.real, numbers.imag])
