@@ -1,5 +1,7 @@
 """The ideal EKF-SLAM: Jacobians at the ground truth, for study only."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -1,5 +1,7 @@
 """The right-invariant EKF-SLAM: the filter that knows what it cannot know."""
 
+from __future__ import annotations
+
 from typing import Any, ClassVar
 
 from numpy.typing import ArrayLike

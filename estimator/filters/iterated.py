@@ -1,5 +1,7 @@
 """The iterated EKF-SLAM: Gauss-Newton inside the update."""
 
+from __future__ import annotations
+
 from typing import Any
 
 from numpy.typing import ArrayLike

@@ -1,5 +1,7 @@
 """The robocentric EKF-SLAM: the map lives in the robot's own frame."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,5 +1,7 @@
 """The unscented EKF-SLAM: cubature points instead of Jacobians."""
 
+from __future__ import annotations
+
 from itertools import compress
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Any filter, its landmarks managed by a policy."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -80,7 +80,6 @@ DRAWING_LIBRARIES = {"matplotlib", "PIL", "imageio_ffmpeg"}
 TOO_LONG = {  # modules that still have more than 300 lines
     "estimator.filters.batch",
     "estimator.filters.ekf",
-    "estimator.kernels.scan_update",
     "estimator.large_maps.compressed.compressed_slam",
     "estimator.large_maps.submaps.joining",
     "estimator.large_maps.submaps.submap_slam",

@@ -1,5 +1,7 @@
 """The compressed filter: a large map at the cost of the landmarks around the robot."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Selection of the measurements of one scan, with their NIS."""
 
+from __future__ import annotations
+
 from math import isfinite
 from typing import Any, NamedTuple
 

@@ -1,5 +1,7 @@
 """The exactly sparse extended information filter: a large map with few links."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from math import inf
 from typing import Any

@@ -6,6 +6,8 @@ would take far too long.  So whenever a submap is closed, the map is joined and 
 around the robot is copied into an invariant filter, which then takes the steps too.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
@@ -57,7 +59,7 @@ class Extent(NamedTuple):
         away = float(np.hypot(*(position - self.centre)))
         return away + within + self.slack <= self.radius
 
-    def chosen(self, points: Array) -> tuple[Int, "Extent"]:
+    def chosen(self, points: Array) -> tuple[Int, Extent]:
         """Return which of some landmarks (n, 2) lie within, the nearest if many.
 
         Of many, also the extent that those have.
@@ -188,7 +190,7 @@ class Vicinity:
         limits = np.array([*numbers, extent.farthest, *self._reaches])
         return self._slam.state_dict() | {"extent": limits}
 
-    def restored(self, state: Mapping[str, Any]) -> "Vicinity":
+    def restored(self, state: Mapping[str, Any]) -> Vicinity:
         """Make another from what :meth:`state_dict` returned."""
         other = Vicinity(self._make, self._survey)
         if state:

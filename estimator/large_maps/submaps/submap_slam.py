@@ -1,5 +1,7 @@
 """Submaps: a map of any size as many small ones, joined when they are asked for."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Mapping
 from contextlib import suppress
