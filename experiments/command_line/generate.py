@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from . import options
 from .errors import InterruptedRunError
 from .program import command
@@ -27,39 +25,36 @@ def generate(
     *,
     episodes: Annotated[
         int,
-        typer.Option(
-            min=1, metavar="N", help="How many to drive; episode i has seed SEED + i."
-        ),
+        options.option("N", "How many to drive; episode i has seed SEED + i.", min=1),
     ],
     controller: options.ControllerName = "waypoints",
     seed: options.Seed = 0,
     format_: Annotated[
         str,
-        typer.Option(
-            "--format",
-            metavar="NAME",
-            help="npz, parquet and minari hold everything; slamlog, g2o and tum hold "
-            "what their readers know.",
+        options.option(
+            "--format NAME",
+            "npz, parquet and minari hold everything; slamlog, g2o and tum hold what "
+            "their readers know.",
         ),
     ] = "npz",
     shard: Annotated[
         int | None,
-        typer.Option(
+        options.option(
+            "N",
+            "Episodes in each file or folder of the data set.",
+            "100, fewer if they are large",
             min=1,
-            metavar="N",
-            help="Episodes in each file or folder of the data set.",
-            show_default="100, fewer if they are large",
         ),
     ] = None,
     steps: options.Steps = None,
     set_: options.ScenarioChanges = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="The folder to write: new, empty, or begun by the same command, which "
-            "then continues.",
-            show_default="results/<name>-<controller>-<format>",
+        options.option(
+            "DIR",
+            "The folder to write: new, empty, or begun by the same command, which then "
+            "continues.",
+            "results/<name>-<controller>-<format>",
         ),
     ] = None,
     as_json: options.AsJson = False,

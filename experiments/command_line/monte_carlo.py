@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from . import options
 from .errors import FAILURE, InterruptedRunError
 from .option_values import changes
@@ -36,20 +34,18 @@ def monte_carlo(
     *,
     estimators: Annotated[
         str,
-        typer.Option(
-            "--estimators",
-            "-e",
-            metavar="NAMES",
-            help="Filters with commas between, such as "
-            '"ekf,invariant[iterations=3]" or "module:Class" of your own; options '
-            "stand in brackets.",
+        options.option(
+            "--estimators -e NAMES",
+            'Filters with commas between, such as "ekf,invariant[iterations=3]" or '
+            '"module:Class" of your own; options stand in brackets.',
         ),
     ] = "ekf,invariant",
     runs: Annotated[
         int,
-        typer.Option(
-            help="How many; run i is the world of seed SEED + i, so that seeds closer "
-            "than this share worlds."
+        options.option(
+            "",
+            "How many; run i is the world of seed SEED + i, so that seeds closer than "
+            "this share worlds.",
         ),
     ] = 200,
     seed: options.Seed = 0,
@@ -57,60 +53,52 @@ def monte_carlo(
     set_: options.ScenarioChanges = None,
     assume: Annotated[
         list[str] | None,
-        typer.Option(
-            "--assume",
-            metavar="KEY=VALUE",
-            help="A change of the scenario that only the filters assume, such as "
+        options.option(
+            "KEY=VALUE",
+            "A change of the scenario that only the filters assume, such as "
             f"motion.std=[0.1,0.1,0.1]. {options.REPEATED}",
         ),
     ] = None,
     jobs: options.Jobs = None,
     backend: Annotated[
         str | None,
-        typer.Option(
-            metavar="loky|dask|ray",
-            help="Where the workers are: loky, on this machine; dask or ray, on a "
-            "cluster.",
+        options.option(
+            "loky|dask|ray",
+            "Where the workers are: loky, on this machine; dask or ray, on a cluster.",
         ),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Of the Dask or Ray cluster.",
-            show_default="a cluster of this machine",
+        options.option(
+            "ADDRESS", "Of the Dask or Ray cluster.", "a cluster of this machine"
         ),
     ] = None,
     block_size: Annotated[
-        int, typer.Option(metavar="N", help="Runs done and written at a time.")
+        int, options.option("N", "Runs done and written at a time.")
     ] = 64,
     first_run: Annotated[
         int,
-        typer.Option(
-            metavar="N",
-            help="Leave the runs below N, a multiple of the block size, to others.",
+        options.option(
+            "N", "Leave the runs below N, a multiple of the block size, to others."
         ),
     ] = 0,
     merge: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--merge",
-            metavar="DIR",
-            help=f"Take over what another machine has done of this job. "
-            f"{options.REPEATED}",
+        options.option(
+            "DIR",
+            "Take over what another machine has done of this job. " + options.REPEATED,
         ),
     ] = None,
     fresh: Annotated[
-        bool,
-        typer.Option("--fresh", help="Remove earlier results in the folder first."),
+        bool, options.option("--fresh", "Remove earlier results in the folder first.")
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="The folder to write. A job that was stopped there continues, and "
-            "more runs build on those there are.",
-            show_default="results/monte-carlo-<scenario>",
+        options.option(
+            "DIR",
+            "The folder to write. A job that was stopped there continues, and more "
+            "runs build on those there are.",
+            "results/monte-carlo-<scenario>",
         ),
     ] = None,
     as_json: options.AsJson = False,

@@ -53,15 +53,15 @@ def noise_study(
     set_: options.ScenarioChanges = None,
     runs: Annotated[
         int,
-        typer.Option(
-            help="For a scenario: more than one runs a Monte Carlo for each change."
+        options.option(
+            "", "For a scenario: more than one runs a Monte Carlo for each change."
         ),
     ] = 1,
     change: Annotated[
         str,
-        typer.Option(
-            metavar="both|world|filter|all",
-            help="With --runs: whether noises change in world and filter, in the world "
+        options.option(
+            "both|world|filter|all",
+            "With --runs: whether noises change in world and filter, in the world "
             "alone, or in what the filter assumes.",
         ),
     ] = "all",

@@ -1,11 +1,36 @@
 """The arguments and options that several commands share, each with its help."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 REPEATED = "May be repeated."
+
+
+def option(form: str, text: str, default: str | bool = True, **limits: int) -> Any:
+    """Describe an option of a command.
+
+    Parameters
+    ----------
+    form : str
+        Its names, then what its help shows for the value, as in "--jobs -j N".  The
+        name of the parameter names the option where the form has no name.
+    text : str
+        The help.
+    default : str or bool
+        What the help shows as the default; True for the value itself.
+    **limits : int
+        ``min`` or ``max``.
+    """
+    words = form.split()
+    names = [word for word in words if word.startswith("-")]
+    value = [word for word in words if word not in names]
+    metavar = value[0] if value else None
+    return typer.Option(
+        *names, metavar=metavar, help=text, show_default=default, **limits
+    )
+
 
 ScenarioName = Annotated[
     str,
@@ -15,94 +40,76 @@ ScenarioName = Annotated[
 ]
 EstimatorName = Annotated[
     str,
-    typer.Option(
-        "--estimator",
-        "-e",
-        metavar="NAME",
-        help='A filter (see: slamgym estimators), or "module:Class" of your own.',
+    option(
+        "--estimator -e NAME",
+        'A filter (see: slamgym estimators), or "module:Class" of your own.',
     ),
 ]
 EstimatorOptions = Annotated[
     list[str] | None,
-    typer.Option(
-        "--option",
-        metavar="KEY=VALUE",
-        help=f"An option of the filter, such as gate_probability=0.999. {REPEATED}",
+    option(
+        "--option KEY=VALUE",
+        f"An option of the filter, such as gate_probability=0.999. {REPEATED}",
     ),
 ]
 ScenarioChanges = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help=f"A change of the scenario, such as sensor.max_range=4. {REPEATED}",
+    option(
+        "--set KEY=VALUE",
+        f"A change of the scenario, such as sensor.max_range=4. {REPEATED}",
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Fixes everything random.")]
-Steps = Annotated[
-    int | None,
-    typer.Option(help="Steps to drive.", show_default="those of the scenario"),
-]
+Seed = Annotated[int, option("", "Fixes everything random.", min=0)]
+Steps = Annotated[int | None, option("", "Steps to drive.", "those of the scenario")]
 ControllerName = Annotated[
     str,
-    typer.Option(
-        "--controller",
-        metavar="NAME",
-        help="open_loop follows the scenario's controls blindly, waypoints steers "
-        "along the path they mean, random wanders.",
+    option(
+        "NAME",
+        "open_loop follows the scenario's controls blindly, waypoints steers along the "
+        "path they mean, random wanders.",
     ),
 ]
 OutFolder = Annotated[
     Path | None,
-    typer.Option(
-        metavar="DIR",
-        help="The folder to write. What slamgym wrote there before is replaced.",
-        show_default="results/<name>-<estimator>",
+    option(
+        "DIR",
+        "The folder to write. What slamgym wrote there before is replaced.",
+        "results/<name>-<estimator>",
     ),
 ]
 EveryStep = Annotated[
     bool | None,
-    typer.Option(
+    option(
         "--every-step/--no-every-step",
-        help="Draw the map after every step, into map_steps/.",
-        show_default="if there are 60 steps or fewer",
+        "Draw the map after every step, into map_steps/.",
+        "if there are 60 steps or fewer",
     ),
 ]
-AsJson = Annotated[
-    bool, typer.Option("--json", help="Print one JSON object and nothing else.")
-]
+AsJson = Annotated[bool, option("--json", "Print one JSON object and nothing else.")]
 MotionStd = Annotated[
     str | None,
-    typer.Option(
-        metavar="A,B,C",
-        help="σx,σy,σα of the motion noise in the robot's frame [m, m, rad], per unit "
-        "of the log's time: a step or a second.",
-        show_default="from the log",
+    option(
+        "A,B,C",
+        "σx,σy,σα of the motion noise in the robot's frame [m, m, rad], per unit of "
+        "the log's time: a step or a second.",
+        "from the log",
     ),
 ]
 MeasurementStd = Annotated[
     str | None,
-    typer.Option(
-        metavar="A,B",
-        help="σβ,σr of bearing and range [rad, m].",
-        show_default="from the log",
-    ),
+    option("A,B", "σβ,σr of bearing and range [rad, m].", "from the log"),
 ]
 InitialPoseStd = Annotated[
     str | None,
-    typer.Option(
-        metavar="A,B,C",
-        help="σx,σy,σθ of the first pose [m, m, rad].",
-        show_default="from the log, else 0,0,0",
+    option(
+        "A,B,C", "σx,σy,σθ of the first pose [m, m, rad].", "from the log, else 0,0,0"
     ),
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option(
-        "--jobs",
-        "-j",
-        metavar="N",
-        help="Worker processes, -1 for one on each core.",
-        show_default="this process, its filters on all cores",
+    option(
+        "--jobs -j N",
+        "Worker processes, -1 for one on each core.",
+        "this process, its filters on all cores",
     ),
 ]

@@ -4,8 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from . import options
 from .option_values import assignments
 from .program import command
@@ -32,17 +30,13 @@ _SLOWEST, _FASTEST = 4.0, 30.0  # [frames/s]
 def render(
     scenario: options.ScenarioName,
     *,
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="The .gif or .mp4 file to write.")
-    ],
+    out: Annotated[Path, options.option("FILE", "The .gif or .mp4 file to write.")],
     estimator: Annotated[
         str | None,
-        typer.Option(
-            "--estimator",
-            "-e",
-            metavar="NAME",
-            help='The filter whose belief is drawn, or "none".',
-            show_default="ekf where readings carry identities",
+        options.option(
+            "--estimator -e NAME",
+            'The filter whose belief is drawn, or "none".',
+            "ekf where readings carry identities",
         ),
     ] = None,
     option: options.EstimatorOptions = None,
@@ -52,10 +46,8 @@ def render(
     set_: options.ScenarioChanges = None,
     fps: Annotated[
         float | None,
-        typer.Option(
-            metavar="N",
-            help="Frames, that is steps, per second.",
-            show_default="so that it lasts 12 s",
+        options.option(
+            "N", "Frames, that is steps, per second.", "so that it lasts 12 s"
         ),
     ] = None,
     as_json: options.AsJson = False,

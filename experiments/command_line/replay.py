@@ -35,46 +35,41 @@ def replay(
     initial_pose_std: options.InitialPoseStd = None,
     landmark_init: Annotated[
         str | None,
-        typer.Option(
-            metavar="full|independent",
-            help="How a landmark enters the map: full correlates it with the pose it "
-            "was seen from; independent, as in the homework, does not.",
-            show_default="full",
+        options.option(
+            "full|independent",
+            "How a landmark enters the map: full correlates it with the pose it was "
+            "seen from; independent, as in the homework, does not.",
+            "full",
         ),
     ] = None,
     gate_probability: Annotated[
         float | None,
-        typer.Option(
-            metavar="P",
-            help="Reject readings outside this probability region of their innovation.",
-            show_default="none rejected",
+        options.option(
+            "P",
+            "Reject readings outside this probability region of their innovation.",
+            "none rejected",
         ),
     ] = None,
     range_std_per_metre: Annotated[
         float | None,
-        typer.Option(
-            metavar="K",
-            help="Part of σr that grows with the range: σr + K r.",
-            show_default="from the log, else 0",
+        options.option(
+            "K",
+            "Part of σr that grows with the range: σr + K r.",
+            "from the log, else 0",
         ),
     ] = None,
     noise_at_rest: Annotated[
         bool | None,
-        typer.Option(
+        options.option(
             "--noise-at-rest/--no-noise-at-rest",
-            help="Whether the pose becomes uncertain while the odometry reports no "
-            "motion.",
-            show_default="from the log, else not",
+            "Whether the pose becomes uncertain while the odometry reports no motion.",
+            "from the log, else not",
         ),
     ] = None,
     option: options.EstimatorOptions = None,
     robot: Annotated[
         int | None,
-        typer.Option(
-            metavar="K",
-            help="Which robot of a UTIAS folder.",
-            show_default="the lowest number",
-        ),
+        options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
     ] = None,
     out: options.OutFolder = None,
     every_step: options.EveryStep = None,

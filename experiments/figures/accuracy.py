@@ -1,4 +1,4 @@
-"""How far a run's path and map are from ground truth."""
+"""Figure of the distances of a run's path and map from ground truth."""
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -31,7 +31,7 @@ Mask = NDArray[np.bool_]
 
 _LANDMARK = EllipseKind("estimated landmark, 3σ", TEAL, fill=0.15)
 _MOST_ERRORS = 80  # error lines along the path
-_MOST_NAMES = 40  # landmarks that are all named
+_MOST_NAMES = 40  # landmarks; larger maps name only some
 
 
 def truth_figure(trace: RunTrace) -> Figure:
@@ -43,12 +43,12 @@ def truth_figure(trace: RunTrace) -> Figure:
     Parameters
     ----------
     trace : RunTrace
-        With true poses, true landmarks, or both; what is nan is not compared.
+        With true poses, true landmarks, or both; nan entries are not compared.
 
     Raises
     ------
     ValueError
-        When the run has no ground truth at all.
+        If the run has no ground truth at all.
     """
     poses, landmarks = _known(trace.true_poses), _known(trace.true_landmarks)
     if not (poses.any() or landmarks.any()):
@@ -59,7 +59,7 @@ def truth_figure(trace: RunTrace) -> Figure:
     if distances is None:
         figure = new_figure(7.2, 6.2 * height / width + 1.5)
         area = figure.add_subplot()
-    else:  # so low that the map is as high as the bars beside it
+    else:  # its height makes the map as high as the bars beside it
         figure = new_figure(10.8, 5.6 * height / width + 1.5)
         area, *beside = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
         names = [f"l{i}" for i in trace.landmark_ids[landmarks]]
@@ -81,7 +81,7 @@ def truth_figure(trace: RunTrace) -> Figure:
 
 
 def _known(truth: Array | None) -> Mask:
-    """Mark the rows of a truth that hold a position."""
+    """Return which rows of a truth hold a position."""
     if truth is None:
         return np.zeros(0, dtype=bool)
     return np.asarray(np.isfinite(truth[:, :2]).all(axis=1))

@@ -1,4 +1,4 @@
-"""Whether a run's errors and innovations are as large as its covariances promise."""
+"""Figure of a run's errors and innovations against its covariances."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,7 +19,7 @@ _LOG_FROM = 8.0  # times the band's upper bound: larger NIS needs a logarithmic 
 def errors_figure(trace: RunTrace) -> Figure:
     """Draw pose errors with their ±3σ bands, and the NIS with its 95% band, over time.
 
-    Without true poses only the NIS is drawn, which needs no truth.
+    Without true poses, the figure shows the NIS alone, which needs no truth.
 
     Parameters
     ----------
@@ -74,14 +74,14 @@ def pose_errors(poses: Array, true_poses: Array) -> Array:
 def nis_band(
     dof: NDArray[np.integer], probability: float = 0.95
 ) -> tuple[Array, Array]:
-    """Bounds between which a consistent filter's NIS lies with some probability.
+    """Return the bounds of a consistent filter's NIS for a probability.
 
     Parameters
     ----------
     dof : ndarray of int, shape (k,)
         Degrees of freedom.
     probability : float, default 0.95
-        Half of the rest lies below the lower, half above the upper bound.
+        Probability between the bounds; half of the rest lies below, half above.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def _error_title(name: str, error: Array, std: Array) -> str:
 
 
 def _draw_nis(axes: Axes, trace: RunTrace) -> None:
-    """Draw the NIS of the steps that corrected something, outliers in another look."""
+    """Draw the NIS of the steps with a correction; outliers have another marker."""
     dress(axes)
     lower, upper = nis_band(trace.nis_dof)
     used = trace.nis_dof > 0

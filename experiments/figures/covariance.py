@@ -1,4 +1,4 @@
-"""The covariance of the whole state before and after a run, as correlations."""
+"""Figure of the covariance of the whole state at the begin and end of a run."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,8 +18,8 @@ _UNDEFINED = "#c9ced4"
 def covariance_figure(trace: RunTrace) -> Figure:
     """Show the first and the final covariance as heat maps of correlations.
 
-    Beside each row stands its standard deviation, so that nothing of the covariance is
-    lost. Rows without any uncertainty have no correlations and are grey.
+    Each row is labelled with its standard deviation, so that the figure shows the whole
+    covariance. Rows without uncertainty have no correlations and are grey.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def covariance_figure(trace: RunTrace) -> Figure:
     bar.set_label("correlation", fontsize=10, color=INK)
     bar.ax.tick_params(labelsize=9, color=GREY)
     bar.outline.set_visible(False)
-    figure.draw_without_rendering()  # its layout comes to rest in the second pass
+    figure.draw_without_rendering()  # the layout needs a second pass
     return figure
 
 
@@ -95,12 +95,12 @@ def _draw_correlations(
 
 
 def row_labels(ids: NDArray[np.integer]) -> tuple[list[float], list[str]]:
-    """Name the rows x, y, θ, l0x, l0y, …: all, or of large maps some landmarks.
+    """Label the rows x, y, θ, l0x, l0y, …; for large maps only some landmarks.
 
     Returns
     -------
     positions, labels : list of float, list of str
-        Where the labels stand, counted in rows, and what they say.
+        Positions in rows, and texts.
     """
     rows, labels = [0.0, 1.0, 2.0], ["x", "y", "θ"]
     if 3 + 2 * len(ids) <= _MOST_LABELS:
@@ -132,7 +132,7 @@ def _write_deviations(axes: Axes, std: Array) -> None:
 
 
 def _summary(covariance: Array, step: int) -> str:
-    """Say when, how large, and how strongly landmarks are correlated."""
+    """Write the step, the number of landmarks, and their mean correlation."""
     landmarks = correlations(covariance)[3:, 3:]
     n = len(landmarks) // 2
     between = ~np.kron(np.eye(n, dtype=bool), np.ones((2, 2), dtype=bool))

@@ -1,7 +1,8 @@
-"""The map picture of the EKF-SLAM homework: how poses and landmarks get certain.
+"""The map picture of the EKF-SLAM homework: poses and landmarks with their ellipses.
 
-Magenta predicted and blue updated poses, red first and green later landmarks, each as
-its 3σ ellipse; the kinds also differ by line style, for eyes that miss the colours.
+Predicted poses are magenta and updated ones blue, first landmarks red and later ones
+green, each with its 3σ ellipse. The kinds also differ by line style, for colour-blind
+readers.
 """
 
 from typing import NamedTuple
@@ -26,13 +27,13 @@ LATER = EllipseKind("landmark later, 3σ", "#128a3a", fill=0.16, width=1.5)
 _FORMER = EllipseKind("landmark in between", LATER.colour, width=0.6, alpha=0.35)
 
 _MOST_POSES = 60  # ellipses along the path; longer runs show every second, third, …
-_MOST_FORMER = 300  # green ellipses of steps gone by
+_MOST_FORMER = 300  # green ellipses of earlier steps
 _SHORTEST_SIDE = 0.55  # of a map, as a share of its longest
 _ARROW = np.array([[1.0, 0.0], [-0.75, 0.7], [-0.35, 0.0], [-0.75, -0.7]])
 
 
 class _Artists(NamedTuple):
-    """What differs from step to step, from back to front."""
+    """The artists that change with the step, from back to front."""
 
     former: EllipseCollection
     later: EllipseCollection
@@ -50,11 +51,11 @@ class MapPicture:
     Parameters
     ----------
     axes : Axes
-        To draw on.
+        The axes.
     trace : RunTrace
         The run.
     scale : float, default 1
-        Of lines and markers; less for small panels.
+        Scale of lines and markers, smaller for small panels.
     """
 
     def __init__(self, axes: Axes, trace: RunTrace, *, scale: float = 1.0) -> None:
@@ -88,7 +89,7 @@ class MapPicture:
         self._show_landmarks(step)
 
     def legend_keys(self) -> list[Artist]:
-        """List what a legend should name; to be drawn with `ELLIPSE_HANDLER`."""
+        """Return the keys of a legend, to be drawn with `ELLIPSE_HANDLER`."""
         kinds = [PREDICTED, UPDATED, FIRST, LATER]
         keys: list[Artist] = [kind.legend_key() for kind in kinds]
         truth = [] if self._trace.true_landmarks is None else [self._truth]
@@ -113,7 +114,7 @@ class MapPicture:
         )
 
     def _former_steps(self, step: int) -> range:
-        """Choose steps gone by whose landmarks are shown too: few in large maps."""
+        """Return the earlier steps whose landmarks are shown too: few in large maps."""
         stride = -(-self._trace.last_step * len(self._first_steps) // _MOST_FORMER)
         return range(0, step, max(1, stride))
 
@@ -162,12 +163,12 @@ class MapPicture:
 
 
 def pose_stride(trace: RunTrace) -> int:
-    """Every how many steps the ellipses of the pose are drawn."""
+    """Return the number of steps between two drawn ellipses of the pose."""
     return -(-len(trace.t) // _MOST_POSES)
 
 
 def map_limits(trace: RunTrace) -> Array:
-    """Box that holds a run's poses, landmarks and, within reason, their 3σ ellipses.
+    """Return a box around a run's poses, landmarks and 3σ ellipses; see `box_around`.
 
     Returns
     -------
@@ -192,17 +193,17 @@ def map_limits(trace: RunTrace) -> Array:
 
 
 def box_around(points: Array, means: Array, covariances: Array) -> Array:
-    """Box that holds points and 3σ ellipses, as long as these are not much larger.
+    """Return a box around points and 3σ ellipses, unless these are much larger.
 
-    Ellipses widen the box of the points by at most a third of its span: one landmark
-    of great uncertainty must not make all others tiny.
+    Ellipses widen the box of the points by at most a third of its span, so that one
+    uncertain landmark does not make all others tiny.
 
     Parameters
     ----------
     points : ndarray, shape (m, 2)
-        Positions [m]; nan rows are left out.
+        Positions [m]; rows of nan are ignored.
     means, covariances : ndarray, shapes (k, 2) and (k, 2, 2)
-        Of the ellipses [m, m²].
+        Means and covariances of the ellipses [m, m²].
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Figures that show maps: after a step, after every step, and for other noise."""
+"""Figures of maps: after one step, after every step, and for different noise."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,21 +23,21 @@ Array = NDArray[np.floating]
 def map_figure(trace: RunTrace, step: int | None = None) -> Figure:
     """Draw poses and landmarks up to a step, with their 3σ ellipses.
 
-    Magenta predicted and blue updated poses, red first and green later landmarks, as
-    in section 2 of the CMU 16-833 EKF-SLAM homework. Long runs show every second,
-    third, … pose. The view is that of the whole run at any step.
+    Predicted poses are magenta and updated ones blue, first landmarks red and later
+    ones green, as in section 2 of the CMU 16-833 EKF-SLAM homework. Long runs show
+    every second, third, … pose. All steps share the limits of the whole run.
 
     Parameters
     ----------
     trace : RunTrace
         The run.
     step : int, optional
-        In 0 … K; the last one by default.
+        Step in 0 … K; the last one by default.
 
     Raises
     ------
     ValueError
-        When the run has no such step.
+        If the run has no such step.
     """
     last = trace.last_step
     step = last if step is None else step
@@ -51,17 +51,16 @@ def map_figure(trace: RunTrace, step: int | None = None) -> Figure:
 def map_sequence(
     trace: RunTrace, folder: str | Path, *, dpi: float = 100
 ) -> list[Path]:
-    """Save one map picture after every step.
+    """Save one map picture after every step, step_000.png, step_001.png, ….
 
-    The files are called step_000.png, step_001.png, … and only what differs between
-    the steps is drawn anew.
+    Only the artists that differ between the steps are drawn again.
 
     Parameters
     ----------
     trace : RunTrace
         The run.
     folder : str or Path
-        Is made when it does not exist.
+        The folder; it is made if it does not exist.
     dpi : float, default 100
         Pixels per inch.
 
@@ -102,7 +101,7 @@ def noise_study_figure(runs: Sequence[tuple[str, RunTrace]]) -> Figure:
     Raises
     ------
     ValueError
-        When there is no variation to compare.
+        If there is no variation to compare.
     """
     if len(runs) < 2:
         raise ValueError(f"runs must hold a reference and a variation, got {len(runs)}")
@@ -134,7 +133,7 @@ def noise_study_figure(runs: Sequence[tuple[str, RunTrace]]) -> Figure:
 
 
 class _MapParts(NamedTuple):
-    """A map figure whose step can still be chosen."""
+    """A map figure that can show any step."""
 
     figure: Figure
     picture: MapPicture
@@ -164,12 +163,12 @@ def _map_parts(trace: RunTrace) -> _MapParts:
         fontsize=9,
     )
     titles = write_title(axes, *_title(trace, 0))
-    figure.draw_without_rendering()  # one layout is not enough where axes are equal
+    figure.draw_without_rendering()  # equal axes need a second layout
     return _MapParts(figure, picture, titles, trace)
 
 
 def _title(trace: RunTrace, step: int) -> tuple[str, str]:
-    """Say what the map shows, and how certain it has become."""
+    """Return title and subtitle: the step, and the size of the landmarks' ellipses."""
     now = trace.map_at(step)
     stride = pose_stride(trace)
     thinned = f"  ·  1 pose in {stride} drawn" if stride > 1 else ""
@@ -184,7 +183,7 @@ def _title(trace: RunTrace, step: int) -> tuple[str, str]:
 
 
 def _outcome(trace: RunTrace) -> str:
-    """Say how large the final map's ellipses and its errors are."""
+    """Write the size of the final map's ellipses and errors."""
     largest = np.linalg.eigvalsh(trace.landmark_covariances)[:, -1]
     size = (
         f"landmarks: 3σ within {3 * np.sqrt(largest.max()):.2g} m"
@@ -213,7 +212,7 @@ def _draw_panel(axes: Axes, title: str, trace: RunTrace, limits: Array) -> MapPi
 
 
 def _shared_limits(traces: Sequence[RunTrace]) -> Array:
-    """Box of all maps, but at most half the reference's span more on each side."""
+    """Return a box around all maps, but at most twice as wide as the reference."""
     low, high = map_limits(traces[0])
     room = 0.5 * float((high - low).max())
     boxes = np.array([map_limits(trace) for trace in traces])
@@ -226,7 +225,7 @@ def _shared_limits(traces: Sequence[RunTrace]) -> Array:
 
 
 def _label_outer_axes(grid: NDArray[np.object_], panels: int) -> None:
-    """Label x below the lowest panel of each column, y at the left, others not."""
+    """Label x below the lowest panel of each column, and y at the left."""
     shown = [[True, False], *([True, True] for _ in range(len(grid) - 1))]
     if panels % 2 == 0:
         shown[-1][1] = False

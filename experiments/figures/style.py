@@ -1,4 +1,4 @@
-"""The common look of all figures, and how they come to disk."""
+"""The common style of all figures, and their files."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -27,7 +27,7 @@ _METADATA = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Make an empty figure [inches] that lays out itself, unknown to pyplot."""
+    """Return an empty figure [inches] with constrained layout, outside pyplot."""
     figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     layout = figure.get_layout_engine()
@@ -37,21 +37,23 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: float = 200) -> None:
-    """Write a figure to a file, complete or not at all, the same bytes each time.
+    """Write a figure to a file, which appears complete or not at all.
+
+    The same figure gives the same bytes.
 
     Parameters
     ----------
     figure : Figure
-        Any figure of matplotlib.
+        Any matplotlib figure.
     path : str or Path
-        Its suffix chooses the format: .png, .pdf, .svg, …
+        The file; its suffix selects the format: .png, .pdf, .svg, …
     dpi : float, default 200
-        Pixels per inch, for formats made of pixels.
+        Pixels per inch of raster formats.
 
     Raises
     ------
     ValueError
-        When the suffix names no format.
+        If the suffix names no format.
     """
     target = Path(path)
     formats = figure.canvas.get_supported_filetypes()
@@ -60,15 +62,15 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 200) -> None:
             f"path must end in one of {', '.join(f'.{f}' for f in sorted(formats))}, "
             f"got {str(path)!r}"
         )
-    figure.draw_without_rendering()  # one layout is not enough where axes are equal
+    figure.draw_without_rendering()  # equal axes need a second layout
     with replace_when_written(target) as partial:
         metadata = _METADATA.get(target.suffix.lower())
-        with rc_context({"svg.hashsalt": "slamgym"}):  # else its ids are random
+        with rc_context({"svg.hashsalt": "slamgym"}):  # makes its ids reproducible
             figure.savefig(partial, dpi=dpi, metadata=metadata)
 
 
 def dress(axes: Axes, *, size: float = 10.0) -> None:
-    """Give axes the common look: two spines, a pale grid, small grey ticks."""
+    """Apply the common style to axes: two spines, a pale grid, small grey ticks."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(GREY)
     axes.set_axisbelow(True)
@@ -81,7 +83,7 @@ def dress(axes: Axes, *, size: float = 10.0) -> None:
 def write_title(
     axes: Axes, title: str, subtitle: str = "", *, size: float = 11.0
 ) -> tuple[Text, Text]:
-    """Write what one sees above the axes: a bold line, and a grey one below it."""
+    """Write a bold title and a grey subtitle above the axes."""
     small = size - 1.5
     lift = 1.6 * small + 5 if subtitle else 5  # [points]
     above = axes.set_title(
@@ -100,7 +102,7 @@ def write_title(
 
 
 class EllipseKind(NamedTuple):
-    """How ellipses of one meaning look, in the picture and in the legend."""
+    """The style of one kind of ellipses in the picture and in the legend."""
 
     label: str
     colour: str
@@ -110,7 +112,7 @@ class EllipseKind(NamedTuple):
     alpha: float = 1.0
 
     def add_to(self, axes: Axes, scale: float = 1.0) -> EllipseCollection:
-        """Add a collection without ellipses, in data coordinates."""
+        """Add an empty collection in data coordinates."""
         shown = EllipseCollection(
             [],
             [],
@@ -128,7 +130,7 @@ class EllipseKind(NamedTuple):
         return shown
 
     def legend_key(self) -> Ellipse:
-        """Stand for the ellipses in a legend drawn with `ELLIPSE_HANDLER`."""
+        """Return the key for a legend drawn with `ELLIPSE_HANDLER`."""
         return Ellipse(
             (0, 0),
             1,
@@ -142,7 +144,7 @@ class EllipseKind(NamedTuple):
 
 
 def set_ellipses(shown: EllipseCollection, means: Array, covariances: Array) -> None:
-    """Show the 3σ ellipses of n positions: means (n, 2) [m], covariances (n, 2, 2)."""
+    """Set the 3σ ellipses of n positions: means (n, 2) [m], covariances (n, 2, 2)."""
     outline = covariance_ellipses(np.reshape(covariances, (-1, 2, 2)))
     shown.set(
         offsets=np.reshape(means, (-1, 2)),

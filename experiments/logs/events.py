@@ -1,4 +1,4 @@
-"""What a log is made of: odometry rows, and scans of simultaneous readings."""
+"""The events of a log: odometry rows, and scans of simultaneous readings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .lines import LogLine
 
 @dataclass(frozen=True)
 class OdometryRow:
-    """One odometry reading u = (d, α) and the time it ends at.
+    """One odometry reading u = (d, α) and the time at its end.
 
     Attributes
     ----------
@@ -24,8 +24,8 @@ class OdometryRow:
     d, alpha : float
         Distance driven [m] and heading turned, counter-clockwise [rad].
     dt : float
-        Share of the motion noise that the row carries: noise variances grow with dt,
-        and a row of dt = 0 has none.
+        Duration for the motion noise: noise variances grow with dt, and a row with
+        dt = 0 has none.
     """
 
     t: float
@@ -45,14 +45,14 @@ class Scan:
     measurements : ndarray, shape (m, 2)
         Rows (β, r): bearing from the heading, and range [rad, m].
     landmark_ids : ndarray of int64, shape (m,), or None
-        Identity behind each row, without repetition; None when unknown.
+        Landmark of each row, without repetition; None if unknown.
     sizes : ndarray, shape (m,), or None
-        Diameter of what was seen [m], when the sensor tells.
+        Diameters of the seen objects [m], if the sensor measures them.
 
     Raises
     ------
     ValueError
-        If the shapes do not fit; a moment without any reading is no scan.
+        If the shapes do not match, or there is no reading.
     """
 
     t: float
@@ -79,7 +79,7 @@ class Scan:
 
 
 def float_array(name: str, value: ArrayLike, *, columns: int) -> NDArray[np.float64]:
-    """Bring a table of numbers into the shape (n, columns), or name what is wrong.
+    """Return a table of numbers as an array of shape (n, columns), or raise ValueError.
 
     Examples
     --------
@@ -103,7 +103,7 @@ class Reading(NamedTuple):
 
 
 def wrap_bearing(angle: float) -> float:
-    """Bring an angle into [-π, π); one that is there already keeps its last bit.
+    """Wrap an angle into [-π, π); an angle inside keeps its bits.
 
     Examples
     --------
@@ -116,7 +116,7 @@ def wrap_bearing(angle: float) -> float:
 class EventRecorder:
     """Collect rows in their order; consecutive readings of equal time form one scan.
 
-    Each row comes with the line it was read from, which errors then name.
+    Each row comes with its line in the file, which errors name.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Drive a robot through a simulated world, and keep what it read as a log."""
+"""Drive a robot through a simulated world, and record its readings as a log."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -24,17 +24,17 @@ def record_episode(
     *,
     progress: Callable[[int, int], object] | None = None,
 ) -> SlamLog:
-    """Drive one episode and write down its readings and the truth.
+    """Drive one episode, and record its readings and the truth.
 
     The controller sees the true pose. Time counts steps: the first scan is at t = 0,
-    every odometry row has dt = 1, so that it carries the noise of one step.
+    every odometry row has dt = 1, the noise of one step.
 
     Parameters
     ----------
     scenario : Scenario, mapping, str or Path
         The world, as in :func:`slamgym.sim_configs.load_scenario`.
     controller : Controller
-        What drives, see :mod:`slamgym.envs.controllers`.
+        Drives the robot, see :mod:`slamgym.envs.controllers`.
     seed : int
         Fixes everything random in the world.
     progress : callable, optional
@@ -43,10 +43,10 @@ def record_episode(
     Returns
     -------
     SlamLog
-        Starting at the pose that a filter starts from. The header holds the noise,
-        ``motion_std``, ``measurement_std`` and ``start_sigma``, under the names by
-        which :func:`~slamgym.experiments.runs.filter_settings.settings_for` finds it.
-        Scans carry no ids when the scenario hides identities.
+        The log; it starts at the initial pose of filters. The header holds the noise as
+        ``motion_std``, ``measurement_std`` and ``start_sigma``, where
+        :func:`~slamgym.experiments.runs.settings_for` finds it. Scans have no ids if the
+        scenario hides identities.
 
     Examples
     --------
@@ -81,7 +81,7 @@ def record_episode(
 
 
 def _scan(t: float, observation: Observation, scenario: Scenario) -> list[Scan]:
-    """Make the scan of one moment, if anything was seen."""
+    """Return the scan of one step, if anything was seen."""
     seen = observation["mask"]
     if not seen.any():
         return []

@@ -1,15 +1,16 @@
 """Logs of odometry and measurements in the text format ``slamlog 1``.
 
-A CSV file: a header of ``# key: value`` lines, of which the first must be
-``# format: slamlog 1``, and rows of four kinds, told apart by their first field::
+A CSV file with a header of ``# key: value`` lines, the first one
+``# format: slamlog 1``, and rows of four kinds, named by their first field::
 
     landmark,id,x,y                             true position
     odometry,t,d,alpha,dt                       drive and turn until t
     measurement,t,id,bearing,range[,size]       id empty when unknown
     groundtruth,t,x,y,theta                     theta empty when unknown
 
-Metres, radians, seconds (or steps). Odometry and measurement rows stand in the order in
-which a filter consumes them; consecutive measurement rows of equal t are one scan.
+Units are metres, radians, and seconds or steps. Odometry and measurement rows have the
+order in which a filter consumes them; consecutive measurement rows of equal t are one
+scan.
 """
 
 import math
@@ -46,32 +47,32 @@ ROW_FORMS = {
 
 @dataclass(frozen=True, eq=False)
 class SlamLog:
-    """One drive: what the robot read, and the truth as far as it is known.
+    """One drive: the readings of the robot, and the truth as far as it is known.
 
     Attributes
     ----------
     name : str
-        What the log is called.
+        Name of the log.
     header : dict of str to str
         Further notes on the log, such as ``source`` or ``groundtruth_offset``.
     motion : "turn-last" or "midpoint"
-        What an odometry row means: drive d, then turn α; or an arc, of which d is
-        driven along the heading θ + α/2.
+        Meaning of an odometry row: drive d, then turn α; or an arc, driven by d along
+        the heading θ + α/2.
     start : ndarray, shape (3,)
         Pose (x, y, θ) before the first event [m, m, rad].
     landmark_ids : ndarray of int64, shape (n,)
-        Landmarks of which the true position is known.
+        Landmarks with a known true position.
     landmarks : ndarray, shape (n, 2)
         These true positions [m].
     events : tuple of OdometryRow and Scan
-        What a filter consumes, in this order; their times never run backwards.
+        Input of a filter in order; times do not decrease.
     ground_truth : ndarray, shape (k, 4)
         Rows (t, x, y, θ) of the true path [s, m, m, rad]; θ is nan where unknown.
 
     Raises
     ------
     ValueError
-        If the shapes do not fit.
+        If the shapes do not match.
     """
 
     name: str
@@ -107,8 +108,8 @@ class SlamLog:
 def read_slamlog(path: str | PathLike[str]) -> SlamLog:
     """Read a log in the format ``slamlog 1``.
 
-    A header without ``name``, ``motion`` or ``start`` means the name of the file,
-    turn-last, and the origin.
+    The defaults of ``name``, ``motion`` and ``start`` in the header are the name of the
+    file, turn-last, and the origin.
 
     Parameters
     ----------
@@ -123,7 +124,8 @@ def read_slamlog(path: str | PathLike[str]) -> SlamLog:
     Raises
     ------
     LogError
-        If the file is no such log; names file, line, what was expected and what came.
+        If the file is no such log, with file, line, what was expected and what was
+        found.
     OSError
         If the file cannot be opened.
     """
@@ -131,7 +133,7 @@ def read_slamlog(path: str | PathLike[str]) -> SlamLog:
 
 
 def write_slamlog(log: SlamLog, path: str | PathLike[str]) -> None:
-    """Write a log so that :func:`read_slamlog` gives back the same numbers, bit by bit.
+    """Write a log so that :func:`read_slamlog` returns the same numbers, bit by bit.
 
     The file appears complete or not at all, and replaces one that is there already.
 
@@ -145,7 +147,7 @@ def write_slamlog(log: SlamLog, path: str | PathLike[str]) -> None:
     Raises
     ------
     LogError
-        If the log would not read back as it is, such as one with a number that is not
+        If the log would not read back unchanged, for example because a number is not
         finite, or if the file cannot be written.
     """
     text = "\n".join(_rendered(log)) + "\n"
@@ -158,7 +160,7 @@ def write_slamlog(log: SlamLog, path: str | PathLike[str]) -> None:
 
 
 class _SlamlogParser:
-    """Take in the lines of a log one after the other."""
+    """Parse the lines of a log one after the other."""
 
     def __init__(self) -> None:
         self.header: dict[str, LogLine] = {}

@@ -1,4 +1,4 @@
-"""A log as the steps a filter takes: a motion, then the scan at its end.
+"""Split a log into the steps of a filter: a motion, then the scan at its end.
 
 Symbols
 -------
@@ -13,14 +13,14 @@ from .slamlog import Motion, SlamLog
 
 
 class Step(NamedTuple):
-    """What happens between two moments of a log, and at the second."""
+    """The motion between two times of a log, and the scan at the second one."""
 
     t: float
-    """The moment at which it ends [s, or steps]."""
+    """Time of the end [s, or steps]."""
     motions: tuple[OdometryRow, ...]
-    """The way there; none before the first scan, or between scans at rest."""
+    """The motion; empty before the first scan, or between scans at rest."""
     scan: Scan | None
-    """What is seen there."""
+    """The scan at the end."""
 
 
 class Prediction(NamedTuple):
@@ -29,15 +29,15 @@ class Prediction(NamedTuple):
     odometry: tuple[float, float]
     """(d, α) [m, rad]."""
     dt: float
-    """Share of the motion noise."""
+    """Duration for the motion noise."""
 
 
 def steps_of(log: SlamLog) -> Iterator[Step]:
-    """Cut a log into steps; step 0 is the start, before any motion.
+    """Split a log into steps; step 0 is the start, before any motion.
 
     Odometry rows that end at the same time, such as a turn and a drive, are one
-    motion. A scan belongs to the motion that ends at its time; one taken at another
-    time is a step without motion.
+    motion. A scan belongs to the motion that ends at its time; a scan at another time
+    is a step without motion.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def steps_of(log: SlamLog) -> Iterator[Step]:
 
 
 def predictions(row: OdometryRow, motion: Motion) -> tuple[Prediction, ...]:
-    """Say an odometry row in the words of the motion model: drive d, then turn α.
+    """Convert an odometry row to the motion model: drive d, then turn α.
 
     A midpoint row, an arc driven along the heading θ + α/2, is exactly two of them.
 
@@ -82,7 +82,7 @@ def predictions(row: OdometryRow, motion: Motion) -> tuple[Prediction, ...]:
     row : OdometryRow
         The row.
     motion : "turn-last" or "midpoint"
-        What the log means by it.
+        Motion model of the log.
 
     Examples
     --------
@@ -98,7 +98,7 @@ def predictions(row: OdometryRow, motion: Motion) -> tuple[Prediction, ...]:
 
 
 def _start_time(log: SlamLog) -> float:
-    """When the log begins: at its first scan, or before its first motion."""
+    """Return the start time: of the first scan, or before the first motion."""
     if not log.events:
         return 0.0
     first = log.events[0]

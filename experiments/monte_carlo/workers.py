@@ -30,13 +30,13 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
     ValueError
         If an argument does not fit, or Ray is not installed.
     """
-    if backend is not None and backend not in BACKENDS:
-        hint = closest(backend, BACKENDS)
+    if backend not in (None, *BACKENDS):
+        hint = closest(str(backend), BACKENDS)
         raise ValueError(
             f"backend must be one of {', '.join(BACKENDS)}, got '{backend}'{hint}"
         )
-    if jobs is not None and jobs != -1:
-        integer("jobs", jobs, 1)
+    if jobs not in (None, -1):
+        integer("jobs", jobs or 0, 1)
     if backend == "ray":
         return _ray_workers(None if jobs == -1 else jobs)
     if backend is None and effective_n_jobs(jobs) == 1:

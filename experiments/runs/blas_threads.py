@@ -1,4 +1,4 @@
-"""One BLAS thread: several wait for each other over the small products of filters."""
+"""Limit BLAS to one thread, which is fastest for the small products of filters."""
 
 from contextlib import AbstractContextManager
 from typing import Any
@@ -7,10 +7,10 @@ from threadpoolctl import threadpool_limits
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:
-    """Let linear algebra run on one thread, as long as the context lasts.
+    """Run linear algebra on one thread within the context.
 
-    Several are many times slower where the cores are shared, and the last bits of a
-    product depend on how many there are.
+    Several threads are many times slower on shared cores, and the last bits of a
+    product depend on their number.
 
     Examples
     --------
@@ -20,7 +20,7 @@ def one_blas_thread() -> AbstractContextManager[Any]:
     >>> {pool["num_threads"] for pool in pools}
     {1}
     """
-    import scipy.linalg  # noqa: F401, PLC0415 (its BLAS must be there to be limited)
+    import scipy.linalg  # noqa: F401, PLC0415 (loads the BLAS to be limited)
 
     limits: AbstractContextManager[Any] = threadpool_limits(1, user_api="blas")
     return limits

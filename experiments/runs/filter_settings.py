@@ -1,4 +1,4 @@
-"""How an estimator is set up for a log: what the log tells, and what the user says."""
+"""Set up an estimator for a log, from the header of the log and the user's choices."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..logs.recording import log_header
 from ..logs.slamlog import SlamLog
 
 SIGMAS = ("σx", "σy", "σα", "σβ", "σr")
-"""The five noises of a run: of the motion in the robot's frame, of the sensor."""
+"""The five noises: three of the motion in the robot's frame, two of the sensor."""
 
 _COURSE_SOURCE = "course data.txt"
 _COURSE_NOISE = {  # as the homework publishes it
@@ -52,10 +52,10 @@ class FilterSettings:
     initial_pose_std: tuple[float, ...] = (0.0, 0.0, 0.0)
     """(σx, σy, σθ) of the first pose [m, m, rad]."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """What the estimator's constructor takes besides."""
+    """Further arguments of the estimator's constructor."""
 
     def make(self, initial_pose: ArrayLike) -> SlamEstimator:
-        """Make the estimator at a first pose (3,) [m, m, rad].
+        """Make the estimator at an initial pose (3,) [m, m, rad].
 
         Raises
         ------
@@ -77,7 +77,7 @@ class FilterSettings:
             ) from error
 
     def scaled(self, sigma: str, factor: float) -> FilterSettings:
-        """Multiply one of `SIGMAS` by a factor, and keep all else."""
+        """Return settings with one of `SIGMAS` multiplied by a factor."""
         scaled = [
             std * factor if name == sigma else std
             for name, std in zip(
@@ -98,12 +98,12 @@ def settings_for(
     initial_pose_std: Sequence[float] | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> FilterSettings:
-    """Set up an estimator for a log: by what is given, else by what the log tells.
+    """Set up an estimator for a log: by the arguments, else by the log's header.
 
     A log's header may hold ``motion_std``, ``measurement_std``, ``start_sigma``,
     ``range_std_per_metre`` and ``noise_at_rest``; logs of the simulator do, and for the
-    course log its published values stand in. A log that says nothing of it starts
-    at a known pose, and its robot has no noise where it reports to rest.
+    course log the published values are used. By default, a log starts at a known pose,
+    and its robot has no noise while it reports to be at rest.
 
     Parameters
     ----------
@@ -116,14 +116,15 @@ def settings_for(
     measurement_std : sequence of 2 floats, optional
         See :class:`FilterSettings`.
     options : mapping, optional
-        Further options of the estimator; they go before those of the header.
+        Further options of the estimator, which override those of the header.
 
     Raises
     ------
     ValueError
-        If neither the caller nor the log tells a noise, or the estimator is unknown.
+        If neither the caller nor the log specifies a noise, or the estimator is
+        unknown.
     LogError
-        If the header holds something else than numbers, or true and false.
+        If a value in the header is malformed.
     """
     factory = find_estimator(estimator)
     header = dict(log.header)
@@ -137,7 +138,7 @@ def settings_for(
             log.name, {"start_sigma": "0,0,0"} | header, "start_sigma", initial_pose_std
         ),
         options={
-            **_told_options(log.name, header, factory),
+            **_header_options(log.name, header, factory),
             **_needed_options(log, header),
             **(options or {}),
         },
@@ -163,8 +164,8 @@ def settings_for_scenario(
     >>> settings_for_scenario(load_scenario("six_landmarks")).motion_std
     (0.25, 0.1, 0.1)
     """
-    told = SlamLog(scenario.name, log_header(scenario, seed=0))
-    return settings_for(told, estimator=estimator, options=options)
+    log = SlamLog(scenario.name, log_header(scenario, seed=0))
+    return settings_for(log, estimator=estimator, options=options)
 
 
 def _std(
@@ -176,29 +177,29 @@ def _std(
         return tuple(_number(name, key, part) for part in header[key].split(","))
     example = "0.1,0.1,0.05" if key == "motion_std" else "0.02,0.1"
     raise ValueError(
-        f"{name} does not tell its {key}: give it, "
+        f"{name} does not specify its {key}: give it, "
         f"for example --{key.replace('_', '-')} {example}"
     )
 
 
-def _told_options(
+def _header_options(
     name: str, header: Mapping[str, str], factory: EstimatorFactory
 ) -> dict[str, Any]:
-    """Read the options that the log tells, as far as the estimator knows them."""
-    told: dict[str, Any] = {}
+    """Return the options in the header that the estimator accepts."""
+    options: dict[str, Any] = {}
     if not _flag(name, "noise_at_rest", header.get("noise_at_rest", "false")):
-        told["noise_at_rest"] = False
+        options["noise_at_rest"] = False
     if "range_std_per_metre" in header:
         key = "range_std_per_metre"
-        told[key] = _number(name, key, header[key])
-    return accepted_options(factory, told)
+        options[key] = _number(name, key, header[key])
+    return accepted_options(factory, options)
 
 
 def _needed_options(log: SlamLog, header: Mapping[str, str]) -> dict[str, Any]:
-    """Let readings be associated where the log does not say what they are of."""
-    told = _flag(log.name, "identities", header.get("identities", "true"))
+    """Turn management on if the log does not identify all readings."""
+    identified = _flag(log.name, "identities", header.get("identities", "true"))
     scans = (event for event in log.events if isinstance(event, Scan))
-    if told and all(scan.landmark_ids is not None for scan in scans):
+    if identified and all(scan.landmark_ids is not None for scan in scans):
         return {}
     return {"management": True}
 

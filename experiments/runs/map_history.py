@@ -1,4 +1,4 @@
-"""The map after every step of a run, or after so many of them as memory allows."""
+"""The maps of a run after every step, or after a limited number of steps."""
 
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -11,13 +11,13 @@ from .trace import MapEstimate
 
 
 class MapHistory(Sequence[MapEstimate]):
-    """Maps of a run, one for each step; steps left out answer with the one before.
+    """The maps of a run, one per step; a step without one has the map before it.
 
     Parameters
     ----------
     most : int, optional
-        How many maps to keep, evenly spaced over the run; all of them by default. The
-        first one with a landmark and the latest one are kept besides.
+        Number of maps to keep, evenly spaced over the run; all by default. The first
+        map with a landmark and the latest one are kept in addition.
 
     Examples
     --------
@@ -36,7 +36,7 @@ class MapHistory(Sequence[MapEstimate]):
         self._length = 0
 
     def append(self, belief: Belief | MapView) -> None:
-        """Take in the belief after the next step."""
+        """Append the belief after the next step."""
         step = self._length
         ids = belief.ids if isinstance(belief, MapView) else belief.landmark_ids
         self._latest = MapEstimate(
@@ -53,7 +53,7 @@ class MapHistory(Sequence[MapEstimate]):
         self._length += 1
 
     def leave_out(self) -> None:
-        """Pass over the next step, which is not due, and not the last one either."""
+        """Skip the next step, which must be neither due nor the last."""
         self._length += 1
 
     def is_due(self, step: int, ids: Sequence[int]) -> bool:
@@ -66,7 +66,7 @@ class MapHistory(Sequence[MapEstimate]):
     @overload
     def __getitem__(self, index: slice) -> Sequence[MapEstimate]: ...
     def __getitem__(self, index: int | slice) -> MapEstimate | Sequence[MapEstimate]:
-        """Return the map after a step, or the latest that was kept before it."""
+        """Return the map after a step, or the latest kept one before it."""
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(self._length))]
         step = range(self._length)[index]
@@ -76,14 +76,14 @@ class MapHistory(Sequence[MapEstimate]):
         return self._kept[kept[bisect_right(kept, step) - 1]]
 
     def __len__(self) -> int:
-        """Count the steps, kept or not."""
+        """Return the number of steps, kept or not."""
         return self._length
 
     def _is_due(self, step: int) -> bool:
         return step % self._stride == 0 or step == self._first_map
 
     def _thin(self) -> None:
-        """Drop every second map when there are too many."""
+        """Drop every second map if there are too many."""
         if self._most is None or len(self._kept) <= self._most + 1:
             return
         self._stride *= 2

@@ -1,4 +1,4 @@
-"""Whether the maps of a job fit into memory: told before the filters run."""
+"""Check whether the maps of a job fit into memory, before the filters run."""
 
 from typing import TYPE_CHECKING
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 
 def refuse_large_map(log: SlamLog, estimator: SlamEstimator) -> None:
-    """Refuse a log whose landmarks are more than memory holds for this filter.
+    """Refuse a log with more landmarks than memory holds for this filter.
 
-    What is counted is the least that a run takes, the filter's map and the belief at
-    its end, of the landmarks that the log names; where it names none, or the filter
-    does not say what it takes (``memory_for``), nothing is refused here.
+    The check counts the least memory of a run: the filter's map and the final belief of
+    the landmarks that the log names. It accepts a log without names, and a filter that
+    does not estimate its memory (``memory_for``).
 
     Raises
     ------
     ValueError
-        Where they are more than the filter's ``belief_limit``.
+        If they exceed the filter's ``belief_limit``.
     MemoryError
-        With what it takes, and what is available.
+        With the required and the available memory.
     """
     scans = [event.landmark_ids for event in log.events if isinstance(event, Scan)]
     named = [ids for ids in scans if ids is not None]
@@ -50,23 +50,23 @@ def refuse_large_map(log: SlamLog, estimator: SlamEstimator) -> None:
 def refuse_large_maps(
     runs: "SimulatedRuns", estimator: SlamEstimator, *, at_once: bool
 ) -> None:
-    """Refuse runs whose landmarks are more than memory holds for this filter.
+    """Refuse runs with more landmarks than memory holds for this filter.
 
     Parameters
     ----------
     runs : SimulatedRuns
-        What the filters will be fed.
+        Input of the filters.
     estimator : SlamEstimator
         One of them.
     at_once : bool
-        Whether all are in memory together; the beliefs at their ends are in any case.
+        Whether all filters are in memory together; the final beliefs always are.
 
     Raises
     ------
     ValueError
-        Where they are more than the filter's ``belief_limit``.
+        If they exceed the filter's ``belief_limit``.
     MemoryError
-        With what it takes, and what is available.
+        With the required and the available memory.
     """
     read = runs.visible.any(axis=1).sum(axis=1).tolist()  # by each run
     _refuse_beyond_limit(max(read), estimator)
@@ -82,6 +82,6 @@ def refuse_large_maps(
 
 
 def _refuse_beyond_limit(landmarks: int, estimator: SlamEstimator) -> None:
-    """Refuse a run at whose end the belief would be one that the filter refuses."""
+    """Refuse a run with more landmarks than the filter's belief may hold."""
     if isinstance(estimator, SupportsBeliefLimit):
         refuse_large_belief(landmarks, estimator.belief_limit, "take fewer steps")

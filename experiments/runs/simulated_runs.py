@@ -1,4 +1,4 @@
-"""Many runs of one scenario as arrays: what a batch of filters is fed."""
+"""Simulate many runs of one scenario as arrays, the input of a batch of filters."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,24 +16,24 @@ Array = NDArray[np.float64]
 
 
 class SimulatedRuns(NamedTuple):
-    """B runs of T = steps + 1 scans, the first before any motion; L landmarks."""
+    """B runs of T = steps + 1 scans, the first before any motion, and L landmarks."""
 
     odometry: Array
     """(d, α) before each scan, shape (B, T, 2) [m, rad]; zeros before the first."""
     measurements: Array
     """Rows (β, r), shape (B, T, L, 2) [rad, m]."""
     visible: NDArray[np.bool_]
-    """Which readings there are, shape (B, T, L)."""
+    """Whether a landmark is read, shape (B, T, L)."""
     true_poses: Array
     """(x, y, θ), shape (B, T, 3) [m, m, rad]."""
     landmarks: Array
     """True positions, shape (B, L, 2) [m]."""
     initial_poses: Array
-    """Poses that filters start from, shape (B, 3)."""
+    """Initial poses of the filters, shape (B, 3)."""
 
     @property
     def dt(self) -> Array:
-        """Duration that the motion noise of each step counts, shape (T,)."""
+        """Duration of the motion noise of each step, shape (T,)."""
         durations = np.ones(self.odometry.shape[1])
         durations[0] = 0.0
         return durations
@@ -42,19 +42,19 @@ class SimulatedRuns(NamedTuple):
 def simulate_runs(
     scenario: Scenario | Mapping[str, object] | str | Path, runs: int, seed: int
 ) -> SimulatedRuns:
-    """Drive the scenario's own controls in ``runs`` worlds, run i seeded seed + i.
+    """Drive the scenario's controls in ``runs`` worlds; run i has seed ``seed + i``.
 
     Parameters
     ----------
     scenario : Scenario, mapping, str or Path
-        The world, its identities known.
+        The world, with known identities.
     runs, seed : int
         Number of runs, and the seed of the first; run i depends on seed + i alone.
 
     Raises
     ------
     ValueError
-        Where ``runs`` is below 1 or the scenario hides identities.
+        If ``runs`` is below 1, or the scenario hides identities.
     """
     world = load_scenario(scenario)
     if runs < 1:

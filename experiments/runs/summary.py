@@ -1,4 +1,4 @@
-"""The numbers of a run, as one dictionary of plain JSON types."""
+"""Summarise a run as one dictionary of plain JSON types."""
 
 import json
 import math
@@ -19,20 +19,20 @@ from .trace import RunTrace
 
 Array = NDArray[np.floating]
 
-_SHARE = 0.95  # of a consistent filter's NIS within its interval
+_SHARE = 0.95  # probability of the interval of the NIS
 
 
 def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[str, Any]:
-    """Gather what one wants to know of a run.
+    """Summarise a run.
 
-    Every number is finite; what is unknown, for want of ground truth, is None.
+    Every number is finite; values that need missing ground truth are None.
 
     Parameters
     ----------
     replay : Replay
         The run.
     settings : FilterSettings, optional
-        How its estimator was set up, to be written down too.
+        Settings of its estimator, to be included.
 
     Returns
     -------
@@ -76,8 +76,8 @@ def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
     -------
     list of dict
         ``{id, x, y, euclidean, mahalanobis}`` [m, m, m, -] in the order of the state;
-        the distances are None where the truth is unknown, the last one also where the
-        covariance is singular.
+        the distances are None where the truth is unknown, and the last one also where
+        the covariance is singular.
     """
     truth = trace.true_landmarks
     errors = trace.landmarks - (np.nan if truth is None else truth)
@@ -107,7 +107,7 @@ def nis_summary(trace: RunTrace) -> dict[str, Any] | None:
         ``mean`` over the ``scans`` that corrected something; ``total`` and its
         ``degrees_of_freedom``, and their quotient ``per_degree``, near 1 for a
         consistent filter; ``inside_95``, the share of scans within the two-sided 95 %
-        interval of χ². None where no scan corrected anything.
+        interval of χ². None if no scan corrected anything.
     """
     used = trace.nis_dof > 0
     if not used.any():
@@ -133,8 +133,8 @@ def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
     dict or None
         ``mean`` over the ``steps`` where it is defined, ``final`` at the last step
         (None where undefined), ``degrees_of_freedom`` 3, ``per_degree``, the mean by 3,
-        near 1 for a consistent filter, and the ``frame`` of the error, the filter's
-        own. None where it is defined nowhere.
+        near 1 for a consistent filter, and the ``frame`` of the error, which is the
+        filter's own. None if it is defined nowhere.
     """
     values = pose_nees(trace)
     known = np.isfinite(values)
@@ -151,13 +151,12 @@ def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
 
 
 def pose_nees(trace: RunTrace) -> Array:
-    """NEES of the pose at every step, in the error frame of the filter.
+    """Return the NEES of the pose at every step, in the error frame of the filter.
 
     Returns
     -------
     ndarray, shape (K + 1,)
-        nan where the true pose is unknown or P is singular, as it is at a start known
-        for certain.
+        nan where the true pose is unknown or P is singular, as at a certain start.
     """
     if trace.true_poses is None:
         return np.full(len(trace.t), np.nan)
@@ -170,7 +169,7 @@ def pose_nees(trace: RunTrace) -> Array:
 
 
 def map_accuracy(trace: RunTrace) -> PositionAccuracy | None:
-    """Compare the final map with the truth; None where no landmark's is known."""
+    """Compare the final map with the truth; None if it is unknown."""
     if trace.true_landmarks is None:
         return None
     known = np.isfinite(trace.true_landmarks).all(axis=1)
@@ -188,7 +187,7 @@ def settings_table(settings: FilterSettings) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Keep what JSON can say; write down the rest as text."""
+    """Return a value as it is if JSON can represent it, else as text."""
     try:
         json.dumps(value, allow_nan=False)
     except (TypeError, ValueError):

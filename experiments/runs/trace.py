@@ -1,4 +1,4 @@
-"""What one estimator believed at every step of one run, as plain arrays."""
+"""The beliefs of one estimator at every step of one run, as plain arrays."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,17 +29,17 @@ class MapEstimate(NamedTuple):
 class RunTrace:
     """One estimator's run over one log, for steps k = 0 … K.
 
-    Step 0 is the start and its scan, before any motion; "predicted" is before the
+    Step 0 is the start and its scan, before any motion. "Predicted" means before the
     scan of a step, "updated" after it.
 
     Raises
     ------
     ValueError
-        When the shapes do not fit together.
+        If the shapes do not match.
     """
 
     estimator: str
-    """Its name, for titles."""
+    """Name for titles."""
     t: Array
     """Times, shape (K + 1,) [`time_unit`]."""
     predicted_poses: Array
@@ -57,7 +57,7 @@ class RunTrace:
     nis_dof: Integers
     """Its degrees of freedom, 0 where nothing was corrected, shape (K + 1,)."""
     landmark_ids: Integers
-    """Of the final map, in the order of the state, shape (n,)."""
+    """Ids of the final map in the order of the state, shape (n,)."""
     landmarks: Array
     """Final means, shape (n, 2) [m]."""
     first_landmarks: Array
@@ -69,13 +69,13 @@ class RunTrace:
     true_landmarks: Array | None
     """Shape (n, 2), nan where unknown; None without ground truth."""
     first_covariance: Array
-    """Of the whole state, right after the first scan that added landmarks."""
+    """Covariance of the state right after the first scan that added landmarks."""
     final_covariance: Array
-    """Of the whole state at the end, shape (3 + 2n, 3 + 2n)."""
+    """Covariance of the state at the end, shape (3 + 2n, 3 + 2n)."""
     time_unit: str = "s"
-    """Of `t`, for labels; simulated logs count "steps"."""
+    """Unit of `t` for labels; simulated logs count "steps"."""
     frame: ErrorFrame = "additive"
-    """Coordinates in which the estimator takes its error to be Gaussian."""
+    """Coordinates of the estimator's Gaussian error."""
 
     def __post_init__(self) -> None:
         steps, n = len(self.t), len(self.landmark_ids)
@@ -104,11 +104,11 @@ class RunTrace:
         return landmark_covariances(self.final_covariance)
 
     def map_at(self, step: int) -> MapEstimate:
-        """Give the map as it was after a step."""
+        """Return the map after a step."""
         return MapEstimate(*self.landmark_history[step])
 
     def first_steps(self) -> Integers:
-        """Find the step at which each landmark of the final map first appears."""
+        """Return the step at which each landmark of the final map first appears."""
         first = dict.fromkeys(self.landmark_ids.tolist(), self.last_step)
         for step in range(self.last_step, -1, -1):
             ids = self.map_at(step).ids.tolist()

@@ -275,7 +275,7 @@ def test_a_log_of_unknown_noise_asks_for_it(log):
     log.write_text(LOG.replace("# motion_std", "# other_std"))
     message = refused("replay", log)
     assert message == (
-        "little does not tell its motion_std: give it, "
+        "little does not specify its motion_std: give it, "
         "for example --motion-std 0.1,0.1,0.05"
     )
 

@@ -345,7 +345,7 @@ class Simple(EkfSlam):
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        ({}, "log does not tell its motion_std"),
+        ({}, "log does not specify its motion_std"),
         ({"motion_std": "1,x,1"}, "motion_std must be numbers, got 'x'"),
         ({"noise_at_rest": "maybe"}, "noise_at_rest must be true or false"),
     ],

@@ -1,7 +1,7 @@
 """The log of the EKF-SLAM homework of CMU 16-833 (``data.txt``).
 
 Lines alternate: readings ``β r β r …`` of all landmarks, in the same order each time,
-and odometry ``d α``; numbers stand between white space.
+and odometry ``d α``, separated by white space.
 """
 
 from os import PathLike
@@ -24,9 +24,10 @@ MATCH_DISTANCE = 1.0  # [m]
 def read_course(path: str | PathLike[str]) -> SlamLog:
     """Read a course log; readings carry the landmark ids 0, 1, … in their order.
 
-    The format holds no truth. It comes from a ``world.dat`` in the same folder; without
-    one it is the published ground truth, but only if the first scan, taken from the
-    origin, puts each of six landmarks within 1 m of it. The header says which.
+    The format holds no truth. The truth comes from a ``world.dat`` in the same folder.
+    Without one it is the published ground truth, but only if the first scan, taken from
+    the origin, places each of six landmarks within 1 m of it. The header names the
+    source.
 
     Parameters
     ----------
@@ -41,7 +42,7 @@ def read_course(path: str | PathLike[str]) -> SlamLog:
     Raises
     ------
     LogError
-        If the lines do not alternate as they should.
+        If the lines do not alternate.
     OSError
         If the file cannot be opened.
     """
@@ -69,7 +70,7 @@ def read_course(path: str | PathLike[str]) -> SlamLog:
 def _truth(
     path: str | PathLike[str], first_scan: Scan
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], str]:
-    """Find true positions, and say where they come from."""
+    """Return the ids, the true positions, and their source."""
     ids = np.arange(len(first_scan.measurements))
     world = world_beside(path)
     if world is not None:
@@ -87,7 +88,7 @@ def _truth(
 
 
 def _is_published_world(scan: Scan) -> bool:
-    """Whether a scan from the origin shows each published landmark in its place."""
+    """Whether a scan from the origin shows each published landmark at its position."""
     if len(scan.measurements) != len(PUBLISHED_LANDMARKS):
         return False
     bearing, distance = scan.measurements.T

@@ -17,7 +17,7 @@ ROW_FORMS = {"ODOMETRY": "ODOMETRY r1 t r2", "SENSOR": "SENSOR id range bearing"
 
 
 def read_freiburg(path: str | PathLike[str]) -> SlamLog:
-    """Read a Freiburg log, and its landmarks if ``world.dat`` lies beside it.
+    """Read a Freiburg log, and its landmarks if ``world.dat`` is in the same folder.
 
     Each step becomes two turn-last rows, (0, r1) with dt = 0 and (t, r2) with dt = 1,
     which is the same motion. Bearings are wrapped into [-π, π).
@@ -35,7 +35,7 @@ def read_freiburg(path: str | PathLike[str]) -> SlamLog:
     Raises
     ------
     LogError
-        If a line is none of the two.
+        If a line is of another kind.
     OSError
         If the file cannot be opened.
     """

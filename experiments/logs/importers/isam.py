@@ -1,9 +1,9 @@
-"""Pose-landmark graphs as text: iSAM, and the same in the words of g2o.
+"""Read pose-landmark graphs as text, in the formats of iSAM and g2o.
 
 Lines ``ODOMETRY i j dx dy dθ …`` (pose j in the frame of pose i) and
 ``LANDMARK i j x y …`` (landmark j in the frame of pose i), or ``EDGE_SE2`` and
-``EDGE_SE2_XY``. The information matrices at the ends of the lines are not read;
-``VERTEX`` and ``FIX`` lines hold estimates and are passed over.
+``EDGE_SE2_XY``. The information matrices at the ends of the lines, and the estimates in
+``VERTEX`` and ``FIX`` lines, are ignored.
 """
 
 import math
@@ -24,9 +24,9 @@ def read_isam(path: str | PathLike[str]) -> SlamLog:
     """Read a graph whose odometry lines form one chain of poses.
 
     Poses and landmarks share one sequence of ids in the file: landmarks keep theirs,
-    while poses are counted anew, so that pose k has t = k. An increment (dx, dy, dθ)
+    while poses are renumbered, so that pose k has t = k. An increment (dx, dy, dθ)
     becomes two turn-last rows, (0, φ) with dt = 0 and (d, dθ - φ) with dt = 1, where
-    d (cos φ, sin φ) = (dx, dy) and φ in [-π/2, π/2]: d < 0 when the robot backs.
+    d (cos φ, sin φ) = (dx, dy) and φ in [-π/2, π/2]: d < 0 if the robot drives backwards.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def read_isam(path: str | PathLike[str]) -> SlamLog:
 def _walk(
     odometry: list[LogLine], seen_from: dict[int, list[LogLine]]
 ) -> tuple[OdometryRow | Scan, ...]:
-    """Follow the chain of poses, and take the readings of each pose on the way."""
+    """Follow the chain of poses, and record the readings of each pose."""
     recorder = EventRecorder()
     pose = _id(odometry[0], 1)
     visited = {pose}

@@ -1,4 +1,4 @@
-"""The UTIAS multi-robot data sets (MR.CLAM): one folder of ``.dat`` files per drive.
+"""Read the UTIAS multi-robot data sets (MR.CLAM): one folder of .dat files per drive.
 
 ``Robot<k>_Odometry.dat`` (t, v, ω), ``Robot<k>_Measurement.dat`` (t, barcode, range,
 bearing), ``Robot<k>_Groundtruth.dat`` (t, x, y, θ; optional), ``Barcodes.dat``
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 ODOMETRY_STEP = 0.1  # [s]
 TRUTH_STEP = 0.2  # [s]
 LAST_ROBOT = 5
-TIME_DIGITS = 6  # stamps near 1.25e9 s are good to 2.4e-7 s in float64
+TIME_DIGITS = 6  # float64 resolves stamps near 1.25e9 s to 2.4e-7 s
 ODOMETRY_NAME = re.compile(r"Robot(\d+)_Odometry\.dat")
 MERGED = LogLine("merged odometry", 0, "")
 
@@ -37,11 +37,11 @@ TimedReadings = list[tuple[LogLine, Reading]]
 def read_utias(folder: Path, *, robot: int | None = None) -> SlamLog:
     """Read the drive of one robot.
 
-    Velocities are held between their stamps and integrated onto a grid of 10 Hz, which
-    is cut at each scan. Barcodes become subject numbers; readings of other robots, of
-    unknown barcodes, and from outside the time of the odometry are left out and counted
-    in the header (``left_out``). Time starts at the first odometry (``epoch`` in the
-    header), the ground truth is interpolated every 0.2 s.
+    Velocities are constant between their stamps and integrated onto a grid of 10 Hz,
+    which is split at each scan. Barcodes become subject numbers. Readings of other
+    robots, of unknown barcodes, and outside the time of the odometry are left out and
+    counted in the header (``left_out``). Time starts at the first odometry (``epoch`` in
+    the header), and the ground truth is interpolated every 0.2 s.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def read_utias(folder: Path, *, robot: int | None = None) -> SlamLog:
     -------
     SlamLog
         Motion midpoint, in seconds; the start is the true pose at the first odometry,
-        or the origin when that is not known (``start_from`` in the header).
+        or the origin if that is unknown (``start_from`` in the header).
 
     Raises
     ------
@@ -104,7 +104,7 @@ def _choose_robot(folder: Path, robot: int | None) -> int:
 def _read_measurements(
     folder: Path, robot: int, *, epoch: float, end: float
 ) -> tuple[TimedReadings, str]:
-    """Read what the robot saw of landmarks, and count what is left out."""
+    """Read the robot's readings of landmarks, and count those left out."""
     subjects = _read_barcodes(folder)
     readings: TimedReadings = []
     robots = unknown = outside = 0
@@ -131,7 +131,7 @@ def _read_measurements(
 
 
 def _read_barcodes(folder: Path) -> dict[int, int]:
-    """Read which subject wears which barcode."""
+    """Read the subject of each barcode."""
     lines = _lines(folder / "Barcodes.dat", "subject barcode")
     pairs = ((line, line.text.split()) for line in lines)
     return {line.to_id(code): line.to_id(subject) for line, (subject, code) in pairs}
@@ -158,7 +158,7 @@ def _read_truth(path: Path, epoch: float) -> Array:
 
 
 def _merge(odometry: Array, readings: TimedReadings) -> tuple[OdometryRow | Scan, ...]:
-    """Integrate the held velocities between the times of grid and readings."""
+    """Integrate the velocities between the times of grid and readings."""
     stamps, end = odometry[:, 0], odometry[-1, 0]
     moved = odometry[:-1, 1:] * np.diff(stamps)[:, None]
     travelled = np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
@@ -181,7 +181,7 @@ def _merge(odometry: Array, readings: TimedReadings) -> tuple[OdometryRow | Scan
 
 
 def _resample(truth: Array, end: float) -> Array:
-    """Interpolate the true path on a grid, as far as it and the odometry reach."""
+    """Interpolate the true path on a grid within the time of the odometry."""
     times = np.round(np.arange(0, end + TRUTH_STEP / 2, TRUTH_STEP), TIME_DIGITS)
     poses = poses_at(times, truth)
     is_known = np.isfinite(poses).all(axis=1)
@@ -195,7 +195,7 @@ def _timed_table(path: Path, form: str) -> Array:
 
 
 def _timed_lines(path: Path, form: str) -> list[LogLine]:
-    """Read lines of which the first field is a time that never runs backwards."""
+    """Read lines whose first field is a time that does not decrease."""
     lines, before = _lines(path, form), -np.inf
     for line in lines:
         stamp = line.to_real(line.text.split()[0])
@@ -206,7 +206,7 @@ def _timed_lines(path: Path, form: str) -> list[LogLine]:
 
 
 def _lines(path: Path, form: str) -> list[LogLine]:
-    """Read the lines that are no comments, each with as many fields as the form."""
+    """Read the lines without comments; each has as many fields as the form."""
     if not path.is_file():
         raise LogError(f"{path.parent}: expected {path.name}, got no such file")
     lines = [line for line in read_lines(path) if not line.text.startswith("#")]

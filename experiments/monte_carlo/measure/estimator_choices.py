@@ -70,17 +70,22 @@ options={'iterations': 3})
     """
     if not isinstance(estimators, Iterable):
         raise ValueError(f"estimators must be names or labels, got {estimators!r}")
-    if isinstance(estimators, Mapping):
-        choices = [_labelled(label, what) for label, what in estimators.items()]
-    else:
-        texts = [estimators] if isinstance(estimators, str) else estimators
-        choices = [_read(spec) for text in texts for spec in _split(text)]
+    choices = _choices(estimators)
     if not choices:
         raise ValueError("estimators must name at least one, got none")
     _refuse_repeated([choice.label for choice in choices])
     for choice in choices:
         find_estimator(choice.name)
     return tuple(choices)
+
+
+def _choices(
+    estimators: str | Iterable[str] | Mapping[str, Any],
+) -> list[EstimatorChoice]:
+    if isinstance(estimators, Mapping):
+        return [_labelled(label, what) for label, what in estimators.items()]
+    texts = [estimators] if isinstance(estimators, str) else estimators
+    return [_read(spec) for text in texts for spec in _split(text)]
 
 
 def _refuse_repeated(labels: list[str]) -> None:
