@@ -45,8 +45,8 @@ def record_episode(
     SlamLog
         The log; it starts at the initial pose of filters. The header holds the noise as
         ``motion_std``, ``measurement_std`` and ``start_sigma``, where
-        :func:`~slamgym.experiments.runs.settings_for` finds it. Scans have no ids if the
-        scenario hides identities.
+        :func:`~slamgym.experiments.runs.settings_for` finds it. Scans have no ids if
+        the scenario hides identities.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Generated trajectories, read back one after the other."""
+"""Read generated trajectories one after the other."""
 
 import warnings
 from collections.abc import Iterator
@@ -15,25 +15,25 @@ _DAMAGED = ("raise", "skip")
 
 
 class DamagedShardError(ValueError):
-    """A shard does not have the bytes that its manifest promises, or is gone."""
+    """A shard is missing, or its bytes differ from the manifest."""
 
 
 class TrajectoryDataset:
-    """The trajectories in a folder; iterating reads shard after shard.
+    """The trajectories in a folder; iteration reads shard after shard.
 
     Parameters
     ----------
     folder : Path
-        Where a manifest lies.
+        Folder with a manifest.
     damaged : {"raise", "skip"}
-        What to do about damaged shards, see `load_trajectories`.
+        Treatment of damaged shards, see `load_trajectories`.
 
     Attributes
     ----------
     folder : Path
-        Where the shards lie.
+        Folder of the shards.
     manifest : Manifest
-        What they are; ``manifest.is_complete`` tells whether any are still to come.
+        Their description; ``manifest.is_complete`` reports whether all are written.
     """
 
     def __init__(self, folder: Path, damaged: Literal["raise", "skip"]) -> None:
@@ -62,19 +62,19 @@ class TrajectoryDataset:
         Parameters
         ----------
         number : int
-            From 0, its place in ``manifest.shards``.
+            Index in ``manifest.shards``.
 
         Raises
         ------
         DamagedShardError
-            If the shard is damaged; whatever was told to `load_trajectories`.
+            If the shard is damaged, even where iteration skips such shards.
         """
         shard = self.manifest.shards[number]
         self._check(shard)
         yield from self._format.read(self.folder / shard.name)
 
     def damaged_shards(self) -> list[str]:
-        """Name the shards that do not match their checksums, or are gone."""
+        """Return the names of the shards that are missing or damaged."""
         return [
             shard.name
             for shard in self.manifest.shards
@@ -93,21 +93,21 @@ class TrajectoryDataset:
 def load_trajectories(
     path: str | PathLike[str], *, damaged: Literal["raise", "skip"] = "raise"
 ) -> TrajectoryDataset:
-    """Open a folder of generated trajectories, of whatever format.
+    """Open a folder of generated trajectories in any format.
 
     Parameters
     ----------
     path : path
-        The folder; one that is not finished gives what it has, and warns.
+        The folder; an unfinished one gives its written shards, and warns.
     damaged : {"raise", "skip"}, optional
-        What happens at a shard that does not match its checksum: iterating raises a
-        `DamagedShardError`, or warns and goes on with the next.
+        Treatment of a shard that does not match its checksum: iteration raises a
+        `DamagedShardError`, or warns and continues with the next one.
 
     Returns
     -------
     TrajectoryDataset
-        Iterable over `Trajectory` in the order of episodes, as often as one likes; at
-        any time one shard is in memory.
+        Iterable over `Trajectory` in the order of episodes, any number of times; one
+        shard at a time is in memory.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def load_trajectories(
     Warns
     -----
     UserWarning
-        If episodes are still to come: how many there are, and what goes on with them.
+        If episodes are missing, with their number and the way to generate them.
     """
     if damaged not in _DAMAGED:
         hint = closest(str(damaged), _DAMAGED)
@@ -131,7 +131,7 @@ def load_trajectories(
 
 
 def _unfinished(dataset: TrajectoryDataset) -> str:
-    """Tell how much is there, and the job that makes the rest."""
+    """Write how many episodes are there, and the job that generates the rest."""
     job = dataset.manifest.job
     return (
         f"{dataset.folder} is not finished: {len(dataset)} of {job.episodes} episodes "
@@ -143,7 +143,7 @@ def _unfinished(dataset: TrajectoryDataset) -> str:
 
 
 def is_whole(folder: Path, shard: ShardEntry) -> bool:
-    """Tell whether a shard has the bytes that its manifest promises."""
+    """Whether a shard has the checksum in the manifest."""
     try:
         return checksum(folder / shard.name) == shard.sha256
     except OSError:

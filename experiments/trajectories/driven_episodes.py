@@ -1,4 +1,4 @@
-"""Drive many worlds side by side, and keep what happened as trajectories."""
+"""Drive many worlds side by side, and record them as trajectories."""
 
 from collections.abc import Callable, Sequence
 
@@ -23,15 +23,15 @@ def drive_episodes(
     """Drive one episode per seed; the controller sees the true poses.
 
     Every episode depends on its own seed alone: world and controller are, bit for bit,
-    those of ``slamgym run`` with this seed. Where the scenario has ranges, its world is
-    drawn from them first, and worlds are stepped one by one, some six times slower.
+    those of ``slamgym run`` with this seed. If the scenario has ranges, the world is
+    drawn from them first, and worlds are stepped one by one, about six times slower.
 
     Parameters
     ----------
     scenario : Scenario
         The world, with or without ranges.
     controller : str
-        See `make_controller`.
+        Name of the controller, see `make_controller`.
     seeds : sequence of int
         One per episode, at least one.
     progress : callable, optional
@@ -86,7 +86,7 @@ def _worlds(
 
 
 class _Record:
-    """What happened to B worlds, as arrays that are filled step by step."""
+    """Record B worlds as arrays that are filled step by step."""
 
     def __init__(self, worlds: WorldBatch | MixedWorlds, steps: int) -> None:
         self._worlds = worlds
@@ -105,7 +105,7 @@ class _Record:
         self._take_moment(0)
 
     def take(self, step: int, actions: np.ndarray) -> None:
-        """Note an action and what came of it."""
+        """Record an action and the state after it."""
         self._actions[:, step] = actions
         self._odometry[:, step] = self._worlds.odometry
         self._collisions[:, step] = self._worlds.collisions

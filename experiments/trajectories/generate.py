@@ -1,4 +1,4 @@
-"""Generate trajectories, shard by shard; what was killed goes on where it stood."""
+"""Generate trajectories shard by shard, and continue after an interruption."""
 
 from collections.abc import Callable, Mapping
 from os import PathLike
@@ -41,11 +41,11 @@ def generate_trajectories(
     episodes_per_shard: int | None = None,
     progress: Progress | None = None,
 ) -> Manifest:
-    """Drive episodes and write them to a folder, or write those that it still lacks.
+    """Drive episodes and write them to a folder, or write those that it lacks.
 
     Every shard and the manifest appear complete or not at all. The same call on the
-    same folder goes on after what is whole already, makes damaged shards again, and
-    ends, whatever happened before, with the same bytes.
+    same folder keeps complete shards, replaces damaged ones, and ends with the same
+    bytes, whatever happened before.
 
     Parameters
     ----------
@@ -54,29 +54,29 @@ def generate_trajectories(
     out : path
         The folder: new, empty, or begun by the same job.
     episodes : int
-        How many, each of ``scenario.steps`` steps.
+        Number of episodes, each of ``scenario.steps`` steps.
     controller : str, optional
-        What drives, see `make_controller`.
+        Name of the controller, see `make_controller`.
     seed : int, optional
-        Episode i has the world of seed + i, as everywhere.
+        Seed of episode 0; episode i has the world of seed + i.
     format : str, optional
-        Of the files, see `trajectory_formats`.
+        Format of the files, see :mod:`.formats`.
     episodes_per_shard : int, optional
-        The default is 100, fewer where they would take more than 256 MB of memory.
+        The default is 100, or fewer if they would take more than 256 MB of memory.
     progress : callable, optional
-        Called with (steps done, steps of all episodes), also those done earlier,
-        whenever some more are done.
+        Called with (steps done, steps of all episodes), which includes steps of
+        earlier calls.
 
     Returns
     -------
     Manifest
-        Of the complete data set.
+        The manifest of the complete data set.
 
     Raises
     ------
     ValueError
-        If an argument does not fit, or the folder holds another job or something else;
-        nothing is written then.
+        If an argument does not fit, or the folder holds another job or something else.
+        Nothing is written then.
     ImportError
         If the package of the format is not installed.
     OSError
@@ -98,7 +98,7 @@ def generate_trajectories(
 
 
 def default_episodes_per_shard(scenario: Scenario) -> int:
-    """Choose how many episodes of a scenario a shard holds.
+    """Return how many episodes of a scenario a shard holds by default.
 
     Examples
     --------
@@ -133,9 +133,9 @@ def _continue(
 
 
 def _begun(job: Job, out: Path, versions: dict[str, str]) -> Manifest:
-    """Read the manifest of a job that was begun, or begin it."""
+    """Return the manifest of a job that was begun, or begin it."""
     manifest = read_manifest(out) if (out / MANIFEST).exists() else None
-    if manifest is None or not manifest.shards:  # begun, but nothing would be lost
+    if manifest is None or not manifest.shards:  # begun without a shard
         manifest = Manifest(job, versions)
         write_manifest(manifest, out)
         return manifest
@@ -165,7 +165,7 @@ def _make_shard(
     promised: ShardEntry | None,
     bar: "_Bar",
 ) -> ShardEntry:
-    """Drive the episodes of a shard, and write them."""
+    """Drive and write the episodes of a shard."""
     episodes = job.episodes_of(number)
     name = f"shard_{number:05d}{layout.ENDING}"
     seeds = [job.seed + episode for episode in episodes]
@@ -177,14 +177,14 @@ def _make_shard(
         entry = ShardEntry(name, episodes.start, len(episodes), checksum(partial))
         if promised is not None and promised != entry:
             raise OSError(
-                f"{out / name} was damaged, and made again it differs from what "
-                f"{MANIFEST} promises: this machine does not make the same bits"
+                f"{out / name} was damaged, and generated again it differs from "
+                f"{MANIFEST}: this machine does not make the same bits"
             )
     return entry
 
 
 class _Bar:
-    """Counts the steps that are done."""
+    """Count the steps that are done, and report them."""
 
     def __init__(self, job: Job, progress: Progress | None) -> None:
         self._steps = job.scenario.steps
@@ -193,11 +193,11 @@ class _Bar:
         self._done = 0
 
     def advance(self, steps: int) -> None:
-        """Count steps driven."""
+        """Count steps that were driven."""
         self._done += steps
         if self._progress is not None:
             self._progress(self._done, self._total)
 
     def skip(self, episodes: int) -> None:
-        """Count episodes that were there already."""
+        """Count episodes of earlier calls."""
         self._done += episodes * self._steps

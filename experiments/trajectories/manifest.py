@@ -1,14 +1,14 @@
-"""What a data set of trajectories is made of: enough to check it and to make it again.
+"""The manifest of a data set of trajectories, for checks and for reproduction.
 
-A data set is a folder of shards with ``manifest.json`` beside them, which names the job
-(scenario, controller, seed, numbers, format), the versions that fix its bits, and every
-shard with its SHA-256. It holds no date and no path: the same job gives the same bytes.
+A data set is a folder of shards with ``manifest.json``. The manifest names the job
+(scenario, controller, seed, numbers, format), the versions that determine its bits, and
+every shard with its SHA-256. It holds no date and no path: the same job gives the same
+bytes.
 """
 
 import hashlib
 import json
 import platform
-import tomllib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from ... import __version__
-from ...sim_configs import Scenario, load_scenario
+from ...sim_configs import Scenario
 from ...sim_configs.atomic_file import replace_when_written
 from ...sim_configs.scenario_files import scenario_text
+from .trajectory import scenario_from_text
 
 MANIFEST = "manifest.json"
 _KIND = "slamgym trajectories 1"
@@ -27,20 +28,20 @@ _CHUNK = 1 << 20  # [bytes]
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be generated.
+    """The description of a data set.
 
     Attributes
     ----------
     scenario : Scenario
-        With its ranges, if it has any.
+        The world, with its ranges if it has any.
     controller : str
         Name of a controller, see `make_controller`.
     seed : int
-        Of episode 0; episode i has seed + i.
+        Seed of episode 0; episode i has seed + i.
     episodes : int
-        How many.
+        Number of episodes.
     episodes_per_shard : int
-        How many there are in each shard but, perhaps, the last.
+        Number of episodes in each shard; the last one may have fewer.
     format : str
         Name of a format, see `trajectory_format`.
     """
@@ -62,6 +63,7 @@ class Job:
 
         Examples
         --------
+        >>> from slamgym.sim_configs import load_scenario
         >>> scenario = load_scenario("loop")
         >>> Job(scenario, "random", 0, 120, 50, "npz").episodes_of(2)
         range(100, 120)
@@ -72,14 +74,14 @@ class Job:
 
 @dataclass(frozen=True)
 class ShardEntry:
-    """A shard that was written.
+    """A written shard.
 
     Attributes
     ----------
     name : str
-        Of its file or folder, beside the manifest.
+        Name of its file or folder, beside the manifest.
     first_episode, episodes : int
-        Which it holds.
+        First episode, and number of episodes.
     sha256 : str
         Its `checksum`.
     """
@@ -92,16 +94,16 @@ class ShardEntry:
 
 @dataclass(frozen=True)
 class Manifest:
-    """A job, what it is made with, and the shards there are so far.
+    """A job, the versions that generate it, and the shards written so far.
 
     Attributes
     ----------
     job : Job
-        What is generated.
+        The job.
     versions : dict of str to str
-        Of all that can change a bit: packages, Python, and the kind of processor.
+        Versions of all that can change a bit: packages, Python, processor type.
     shards : tuple of ShardEntry
-        In the order of their episodes, without gaps.
+        The shards in the order of their episodes, without gaps.
     """
 
     job: Job
@@ -110,7 +112,7 @@ class Manifest:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all shards are there."""
+        """Whether all shards are written."""
         return len(self.shards) == self.job.shards
 
     def with_shards(self, shards: Iterable[ShardEntry]) -> "Manifest":
@@ -119,7 +121,7 @@ class Manifest:
 
 
 def versions_now(libraries: Iterable[str] = ()) -> dict[str, str]:
-    """Name the versions of what makes the bits here.
+    """Return the versions that determine the bits on this machine.
 
     Parameters
     ----------
@@ -154,7 +156,7 @@ def read_manifest(folder: Path) -> Manifest:
     Raises
     ------
     ValueError
-        If there is none, or the file is something else.
+        If there is none, or the file is malformed.
     """
     path = folder / MANIFEST
     if not path.is_file():
@@ -170,7 +172,7 @@ def read_manifest(folder: Path) -> Manifest:
 def _manifest(table: dict[str, Any]) -> Manifest:
     if table["kind"] != _KIND:
         raise ValueError(f"kind is {table['kind']!r}")
-    scenario = load_scenario(tomllib.loads(table["job"]["scenario"]))
+    scenario = scenario_from_text(table["job"]["scenario"])
     return Manifest(
         job=Job(**{**table["job"], "scenario": scenario}),
         versions=table["versions"],
@@ -181,8 +183,8 @@ def _manifest(table: dict[str, Any]) -> Manifest:
 def checksum(path: Path) -> str:
     """Compute the SHA-256 of a shard.
 
-    Of a folder it is the SHA-256 of what ``sha256sum`` prints of its files, named by
-    their paths below it, in alphabetical order.
+    For a folder it is the SHA-256 of the output of ``sha256sum`` for its files, named
+    by their relative paths in alphabetical order.
 
     Raises
     ------

@@ -1,5 +1,6 @@
-"""One drive as arrays: what the robot was told, what it read, and the truth."""
+"""One drive as arrays: actions, readings, and the truth."""
 
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...sim_configs import Scenario
+from ...sim_configs import Scenario, load_scenario
 
 Array = NDArray[np.float64]
 
@@ -16,19 +17,19 @@ Array = NDArray[np.float64]
 class Trajectory:
     """One episode of T steps: T + 1 scans, the first before any motion.
 
-    N landmarks, M rows of readings (N, or more where identities are hidden). What is
-    None, the file that the trajectory was read from does not hold.
+    There are N landmarks and M rows of readings: N, or more if identities are hidden.
+    An array is None if the file of the trajectory does not hold it.
 
     Attributes
     ----------
     scenario : Scenario
-        The world as it was, all ranges drawn.
+        The world, with all ranges drawn.
     controller : str
-        Name of the controller that drove.
+        Name of the controller.
     seed : int
-        Of the world.
+        Seed of the world.
     start_estimate : ndarray, shape (3,)
-        Pose that a filter starts from [m, m, rad].
+        Initial pose of filters [m, m, rad].
     odometry : ndarray, shape (T, 2)
         (d, α) read after each step [m, rad].
     poses : ndarray, shape (T + 1, 3)
@@ -36,16 +37,16 @@ class Trajectory:
     landmarks : ndarray, shape (N, 2), or None
         True positions [m].
     actions : ndarray, shape (T, 2), or None
-        (v, ω) commanded in each step [m/s, rad/s].
+        Command (v, ω) of each step [m/s, rad/s].
     measurements : ndarray, shape (T + 1, M, 2), or None
         Rows (β, r), zeros where unseen [rad, m].
     mask : bool ndarray, shape (T + 1, M), or None
         Rows that hold a measurement.
     collisions : bool ndarray, shape (T,), or None
-        Whether a wall held the robot back in each step.
+        Whether a wall stopped the robot in each step.
     landmark_ids : int64 ndarray, shape (T + 1, M), or None
-        With hidden identities: the true landmark of each row, -1 for clutter and empty
-        rows. With known ones always None: row i is landmark i.
+        For hidden identities, the true landmark of each row, -1 for clutter and empty
+        rows. For known identities None: row i is landmark i.
     """
 
     scenario: Scenario
@@ -81,13 +82,18 @@ ARRAYS = (
 """The names of all arrays of a trajectory."""
 
 
+def scenario_from_text(text: str) -> Scenario:
+    """Parse a scenario from the TOML in a file of trajectories."""
+    return load_scenario(tomllib.loads(text))
+
+
 def array_of(trajectory: Trajectory, name: str) -> NDArray[Any]:
-    """Return an array that a trajectory must have to be written.
+    """Return an array of a trajectory that its format requires.
 
     Raises
     ------
     ValueError
-        If it has none.
+        If the trajectory lacks it.
     """
     value = getattr(trajectory, name)
     if value is None:
@@ -100,6 +106,6 @@ def array_of(trajectory: Trajectory, name: str) -> NDArray[Any]:
 
 
 def arrays_to_write(trajectories: Sequence[Trajectory]) -> tuple[str, ...]:
-    """Name the arrays of trajectories: all, but landmark_ids with hidden ids only."""
+    """Return the names of the arrays; landmark_ids only if identities are hidden."""
     hidden = not trajectories[0].scenario.sensor.identities
     return ARRAYS if hidden else ARRAYS[:-1]

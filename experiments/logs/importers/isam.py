@@ -26,7 +26,7 @@ def read_isam(path: str | PathLike[str]) -> SlamLog:
     Poses and landmarks share one sequence of ids in the file: landmarks keep theirs,
     while poses are renumbered, so that pose k has t = k. An increment (dx, dy, dθ)
     becomes two turn-last rows, (0, φ) with dt = 0 and (d, dθ - φ) with dt = 1, where
-    d (cos φ, sin φ) = (dx, dy) and φ in [-π/2, π/2]: d < 0 if the robot drives backwards.
+    d (cos φ, sin φ) = (dx, dy) and φ in [-π/2, π/2]; d < 0 means driving backwards.
 
     Parameters
     ----------

@@ -40,8 +40,8 @@ def read_utias(folder: Path, *, robot: int | None = None) -> SlamLog:
     Velocities are constant between their stamps and integrated onto a grid of 10 Hz,
     which is split at each scan. Barcodes become subject numbers. Readings of other
     robots, of unknown barcodes, and outside the time of the odometry are left out and
-    counted in the header (``left_out``). Time starts at the first odometry (``epoch`` in
-    the header), and the ground truth is interpolated every 0.2 s.
+    counted in the header (``left_out``). Time starts at the first odometry (``epoch``
+    in the header), and the ground truth is interpolated every 0.2 s.
 
     Parameters
     ----------

@@ -1,11 +1,11 @@
-"""File formats of trajectories, one module each, loaded when used.
+"""File formats of trajectories, one module each, loaded on demand.
 
-A shard, some episodes, is one file or one folder. Every module has
+A shard of some episodes is one file or one folder. Every module has
 
 ``ENDING``
-    What the names of its shards end with.
+    The ending of the names of its shards.
 ``LIBRARIES``
-    The packages besides numpy that write it: their versions fix the bytes.
+    The packages besides numpy that write it; their versions determine the bytes.
 ``check(scenario)``
     Raises a ValueError for a scenario that the format cannot hold.
 ``write(trajectories, path)``
@@ -31,11 +31,11 @@ FORMATS = {
     "tum": "tum",
     "g2o": "g2o",
 }
-"""Names of the formats, and their modules."""
+"""Names of the formats and of their modules."""
 
 
 class TrajectoryFormat(Protocol):
-    """What a module of this package offers."""
+    """The interface of a module of this package."""
 
     ENDING: str
     LIBRARIES: tuple[str, ...]
@@ -59,7 +59,7 @@ def trajectory_format(name: str) -> TrajectoryFormat:
     ValueError
         If there is no such format.
     ImportError
-        If the package that writes it is not installed; the message says how to.
+        If its package is not installed; the message shows how to install it.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The path that odometry alone tells."""
+"""Compute the path from odometry alone."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from ..trajectory import Array
 
 
 def dead_reckoning(start: Array, odometry: Array) -> Array:
-    """Add odometry up.
+    """Integrate odometry.
 
     ::
 

@@ -1,39 +1,38 @@
-"""Shards as folders of text files, with the notes that the texts have no place for.
+"""Shards as folders of text files, with metadata that the text formats lack.
 
-Beside the files of its episodes a shard has ``episodes.jsonl``: one line per episode
-with its name, seed, controller and scenario, the latter as TOML.
+In addition to the files of its episodes, a shard has ``episodes.jsonl`` with one line
+per episode: its name, seed, controller, and scenario as TOML.
 """
 
 import json
-import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from ....sim_configs import Scenario, load_scenario
+from ....sim_configs import Scenario
 from ....sim_configs.scenario_files import scenario_text
-from ..trajectory import Trajectory
+from ..trajectory import Trajectory, scenario_from_text
 
-NOTES = "episodes.jsonl"
+METADATA = "episodes.jsonl"
 
 
-class EpisodeNotes(NamedTuple):
-    """What a text file does not tell."""
+class EpisodeMetadata(NamedTuple):
+    """The data of an episode that its text files do not hold."""
 
     name: str
-    """First part of the names of the episode's files."""
+    """Prefix of the names of the episode's files."""
     seed: int
     controller: str
     scenario: Scenario
 
 
-def write_notes(trajectories: Sequence[Trajectory], folder: Path) -> list[str]:
-    """Write the notes of a shard, and choose the names of its episodes.
+def write_metadata(trajectories: Sequence[Trajectory], folder: Path) -> list[str]:
+    """Write the metadata of a shard, and return the names of its episodes.
 
     Returns
     -------
     list of str
-        Such as ``"seed_00000007"``.
+        Names such as ``"seed_00000007"``.
     """
     names = [f"seed_{each.seed:08d}" for each in trajectories]
     lines = [
@@ -48,16 +47,18 @@ def write_notes(trajectories: Sequence[Trajectory], folder: Path) -> list[str]:
         for name, each in zip(names, trajectories, strict=True)
     ]
     text = "\n".join([*lines, ""])
-    (folder / NOTES).write_text(text, encoding="utf-8", newline="\n")
+    (folder / METADATA).write_text(text, encoding="utf-8", newline="\n")
     return names
 
 
-def read_notes(folder: Path) -> Iterator[EpisodeNotes]:
-    """Yield the notes of each episode of a shard."""
-    for line in (folder / NOTES).read_text(encoding="utf-8").splitlines():
+def read_metadata(folder: Path) -> Iterator[EpisodeMetadata]:
+    """Yield the metadata of each episode of a shard."""
+    for line in (folder / METADATA).read_text(encoding="utf-8").splitlines():
         table = json.loads(line)
-        scenario = load_scenario(tomllib.loads(table["scenario"]))
-        yield EpisodeNotes(table["name"], table["seed"], table["controller"], scenario)
+        scenario = scenario_from_text(table["scenario"])
+        yield EpisodeMetadata(
+            table["name"], table["seed"], table["controller"], scenario
+        )
 
 
 def write_lines(path: Path, lines: Sequence[str]) -> None:
@@ -66,7 +67,7 @@ def write_lines(path: Path, lines: Sequence[str]) -> None:
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Write numbers with blanks between, so that reading gives the same bits.
+    """Write numbers separated by blanks, so that reading gives the same bits.
 
     Examples
     --------

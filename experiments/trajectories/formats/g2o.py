@@ -1,19 +1,20 @@
-"""Shards as folders of pose-landmark graphs in g2o text, for optimisers of graphs.
+"""Shards as folders of pose-landmark graphs in g2o text, for graph optimisers.
 
 Vertices 0 … N - 1 are the landmarks, N + k is the pose of step k. Three files per
 episode:
 
 ``NAME.g2o``
-    ``EDGE_SE2`` odometry (d, 0, α) and ``EDGE_SE2_XY`` readings as g2o knows them; the
-    vertices stand where odometry alone puts them, the first pose is fixed.
+    ``EDGE_SE2`` odometry (d, 0, α) and ``EDGE_SE2_XY`` readings in the form of g2o. The
+    vertices are initialised from odometry alone, and the first pose is fixed.
 ``NAME_gtsam.g2o``
-    The same with readings as ``BR`` lines, bearing and range, which GTSAM understands
-    where it passes over ``EDGE_SE2_XY``; and without ``FIX``, which stops it.
+    The same with readings as ``BR`` lines, bearing and range, because GTSAM ignores
+    ``EDGE_SE2_XY``, and without ``FIX``, which GTSAM rejects.
 ``NAME_truth.g2o``
     Vertices alone: the true poses and landmarks.
 
-They hold start, odometry, readings and truth, every number exact, and the information
-of the noise; but no actions and no collisions. Hidden identities are refused.
+The files hold start, odometry, readings and truth with exact numbers, and the
+information of the noise, but no actions and no collisions. Hidden identities are
+refused.
 """
 
 import math
@@ -25,17 +26,23 @@ import numpy as np
 from ....sim_configs import Scenario
 from ..trajectory import Array, Trajectory, array_of
 from .dead_reckoning import dead_reckoning
-from .episode_files import EpisodeNotes, numbers, read_notes, write_lines, write_notes
+from .episode_files import (
+    EpisodeMetadata,
+    numbers,
+    read_metadata,
+    write_lines,
+    write_metadata,
+)
 
 ENDING = ""
 LIBRARIES: tuple[str, ...] = ()
 
 _LEAST_STD = 1e-6
-"""Stands for noise of zero, whose information would be infinite [m, rad]."""
+"""Replaces zero noise, whose information would be infinite [m, rad]."""
 
 
 def check(scenario: Scenario) -> None:
-    """Refuse scenarios that hide identities: a graph must know them."""
+    """Refuse scenarios that hide identities, which a graph needs."""
     if not scenario.sensor.identities:
         raise ValueError(
             f"format 'g2o' needs sensor.identities = true, scenario '{scenario.name}' "
@@ -44,11 +51,11 @@ def check(scenario: Scenario) -> None:
 
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:
-    """Write a shard; see `trajectory_formats`."""
+    """Write a shard; see `TrajectoryFormat`."""
     for each in trajectories:
         check(each.scenario)
     path.mkdir()
-    names = write_notes(trajectories, path)
+    names = write_metadata(trajectories, path)
     for name, each in zip(names, trajectories, strict=True):
         landmarks = dict(enumerate(array_of(each, "landmarks")))
         reckoned = dead_reckoning(each.start_estimate, each.odometry)
@@ -65,9 +72,9 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
 
 
 def read(path: Path) -> Iterator[Trajectory]:
-    """Yield the trajectories of a shard; see `trajectory_formats`."""
-    for notes in read_notes(path):
-        yield _trajectory(path, notes)
+    """Yield the trajectories of a shard; see `TrajectoryFormat`."""
+    for about in read_metadata(path):
+        yield _trajectory(path, about)
 
 
 def _vertices(
@@ -80,7 +87,7 @@ def _vertices(
 
 
 def _first_seen(trajectory: Trajectory, poses: Array) -> dict[int, Array]:
-    """Place every landmark that is seen by its first reading, by number."""
+    """Return the position of every seen landmark from its first reading."""
     mask = array_of(trajectory, "mask")
     measurements = array_of(trajectory, "measurements")
     placed = {}
@@ -95,10 +102,10 @@ def _first_seen(trajectory: Trajectory, poses: Array) -> dict[int, Array]:
 
 
 def _odometry_edges(trajectory: Trajectory, first_pose: int) -> Iterator[str]:
-    """Give odometry with the information of its noise.
+    """Yield odometry with the information of its noise.
 
-    The noise (εx, εy) is that of the old heading, while the error of an edge is seen
-    from the new one, turned by α::
+    The noise (εx, εy) refers to the old heading, while the error of an edge refers to
+    the new one, rotated by α::
 
         Ω = diag(R(-α) diag(σx⁻², σy⁻²) R(α), σα⁻²)
     """
@@ -124,14 +131,14 @@ def _readings(trajectory: Trajectory) -> Iterator[tuple[int, int, float, float]]
 
 
 def _stds(scenario: Scenario, distance: float) -> tuple[float, float]:
-    """Compute (σβ, σr(r)) of a reading, never zero."""
+    """Return (σβ, σr(r)) of a reading, never zero."""
     bearing_std, range_std = scenario.sensor.std
     range_std += scenario.sensor.range_std_per_metre * distance
     return max(bearing_std, _LEAST_STD), max(range_std, _LEAST_STD)
 
 
 def _xy_edges(trajectory: Trajectory) -> Iterator[str]:
-    """Give readings as positions in the frame of the robot, Ω to first order."""
+    """Yield readings as positions in the frame of the robot, Ω to first order."""
     for pose, landmark, bearing, distance in _readings(trajectory):
         bearing_std, range_std = _stds(trajectory.scenario, distance)
         information = _turned(range_std**-2, (distance * bearing_std) ** -2, bearing)
@@ -155,9 +162,9 @@ def _turned(along: float, aside: float, angle: float) -> tuple[float, float, flo
     )
 
 
-def _trajectory(folder: Path, notes: EpisodeNotes) -> Trajectory:
-    graph = list(_fields(folder / f"{notes.name}_gtsam.g2o"))
-    truth = list(_fields(folder / f"{notes.name}_truth.g2o"))
+def _trajectory(folder: Path, about: EpisodeMetadata) -> Trajectory:
+    graph = list(_fields(folder / f"{about.name}_gtsam.g2o"))
+    truth = list(_fields(folder / f"{about.name}_truth.g2o"))
     odometry = _table(graph, "EDGE_SE2", (3, 5))
     landmarks = _table(truth, "VERTEX_XY", (2, 3))
     shape = (len(odometry) + 1, len(landmarks))
@@ -168,9 +175,9 @@ def _trajectory(folder: Path, notes: EpisodeNotes) -> Trajectory:
             measurements[place] = float(fields[2]), float(fields[3])
             mask[place] = True
     return Trajectory(
-        scenario=notes.scenario,
-        controller=notes.controller,
-        seed=notes.seed,
+        scenario=about.scenario,
+        controller=about.controller,
+        seed=about.seed,
         start_estimate=_table(graph, "VERTEX_SE2", (2, 3, 4))[0],
         odometry=odometry,
         poses=_table(truth, "VERTEX_SE2", (2, 3, 4)),
@@ -186,6 +193,6 @@ def _fields(path: Path) -> Iterator[list[str]]:
 
 
 def _table(lines: Iterable[list[str]], tag: str, columns: tuple[int, ...]) -> Array:
-    """Collect some columns of all lines with a tag; column 0 is the tag."""
+    """Return columns of all lines with a tag; column 0 is the tag."""
     rows = [[float(line[k]) for k in columns] for line in lines if line[0] == tag]
     return np.array(rows)

@@ -1,10 +1,10 @@
-"""Shards as data sets of Minari (in its Arrow format), for offline learning; exact.
+"""Shards as data sets of Minari in its Arrow format, for offline learning; exact.
 
-Observations, actions and truncations as the environment's; the true pose, the collision
-(one column: Minari itself cannot combine infos without) and the hidden landmark ids are
-infos; the landmarks and the start estimate are in the options of each episode, with
-its scenario as TOML. Actions are float64, wider than the environment's action space, so
-that they keep every bit.
+Observations, actions and truncations are those of the environment. The true pose, the
+collision and the hidden landmark ids are infos; the collision has one column because
+Minari cannot combine infos without columns. The options of each episode hold the
+landmarks, the start estimate, and the scenario as TOML. Actions are float64, wider than
+the environment's action space, so that they keep every bit.
 """
 
 import json
@@ -18,15 +18,15 @@ from typing import Any, cast
 
 import minari
 import numpy as np
-import pyarrow as pa  # noqa: F401 (Minari's Arrow format needs it: missed at once)
+import pyarrow as pa  # noqa: F401 (required by Minari's Arrow format)
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 
 from ....envs.spaces import action_space, observation_space
-from ....sim_configs import Scenario, load_scenario
+from ....sim_configs import Scenario
 from ....sim_configs.scenario_files import scenario_text
-from ..trajectory import Trajectory, array_of
+from ..trajectory import Trajectory, array_of, scenario_from_text
 
 ENDING = "-v0"
 LIBRARIES = ("minari", "pyarrow")
@@ -42,7 +42,7 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
     """Write a shard; its folder's name is the id of the data set."""
     scenario = trajectories[0].scenario
     with _datasets_in(path.parent), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of fields that a generated set need not have
+        warnings.simplefilter("ignore")  # about optional fields
         minari.create_dataset_from_buffers(
             dataset_id=path.name,
             buffer=[_buffer(each) for each in trajectories],
@@ -57,7 +57,7 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
 
 
 def read(path: Path) -> Iterator[Trajectory]:
-    """Yield the trajectories of a shard; see `trajectory_formats`."""
+    """Yield the trajectories of a shard; see `TrajectoryFormat`."""
     data = minari.MinariDataset(path / "data")
     storage = data.storage
     for episode, about in zip(
@@ -70,9 +70,9 @@ def read(path: Path) -> Iterator[Trajectory]:
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Let Minari keep its data sets in a folder meanwhile."""
+    """Make Minari keep its data sets in a folder during the block."""
     before = os.environ.get(_ROOT)
-    os.environ[_ROOT] = str(folder.resolve())  # it is joined to itself else
+    os.environ[_ROOT] = str(folder.resolve())  # Minari joins a relative path to itself
     try:
         yield
     finally:
@@ -92,7 +92,7 @@ def _spec(scenario: Scenario) -> EnvSpec:
 
 
 def _common_space(scenarios: Sequence[Scenario]) -> spaces.Dict:
-    """Find bounds that hold in all scenarios."""
+    """Return the space whose bounds hold in all scenarios."""
     each = [observation_space(scenario) for scenario in set(scenarios)]
 
     def box(name: str) -> spaces.Box:
@@ -148,7 +148,7 @@ def _buffer(trajectory: Trajectory) -> EpisodeBuffer:
 def _trajectory(episode: Any, about: dict[str, Any]) -> Trajectory:
     options, seen = about["options"], episode.observations
     return Trajectory(
-        scenario=load_scenario(tomllib.loads(options["scenario"])),
+        scenario=scenario_from_text(options["scenario"]),
         controller=options["controller"],
         seed=about["seed"],
         start_estimate=np.array(options["start_estimate"]),

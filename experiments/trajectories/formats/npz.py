@@ -1,24 +1,29 @@
 """Shards as npz files of numpy: every array of E episodes stacked, exact.
 
-Arrays as in `Trajectory`, each with one axis more, E, in front: ``start_estimate`` has
-the shape (E, 3). Besides ``seed``, ``controller``, ``scenario`` (as TOML), (E,) each.
+The arrays are those of `Trajectory` with an additional first axis E: ``start_estimate``
+has the shape (E, 3). ``seed``, ``controller`` and ``scenario`` (as TOML) are (E,).
 """
 
-import tomllib
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from ....sim_configs import Scenario, load_scenario
+from ....sim_configs import Scenario
 from ....sim_configs.scenario_files import scenario_text
-from ..trajectory import ARRAYS, Trajectory, array_of, arrays_to_write
+from ..trajectory import (
+    ARRAYS,
+    Trajectory,
+    array_of,
+    arrays_to_write,
+    scenario_from_text,
+)
 
 ENDING = ".npz"
 LIBRARIES: tuple[str, ...] = ()
 
-_NO_DATE = (1980, 1, 1, 0, 0, 0)  # so that equal arrays give equal bytes
+_NO_DATE = (1980, 1, 1, 0, 0, 0)  # a constant: equal arrays give equal bytes
 
 
 def check(scenario: Scenario) -> None:
@@ -26,7 +31,7 @@ def check(scenario: Scenario) -> None:
 
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:
-    """Write a shard, uncompressed; see `trajectory_formats`."""
+    """Write a shard, uncompressed; see `TrajectoryFormat`."""
     columns = {
         "scenario": np.array([scenario_text(each.scenario) for each in trajectories]),
         "controller": np.array([each.controller for each in trajectories]),
@@ -41,13 +46,13 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
 
 
 def read(path: Path) -> Iterator[Trajectory]:
-    """Yield the trajectories of a shard; see `trajectory_formats`."""
+    """Yield the trajectories of a shard; see `TrajectoryFormat`."""
     with np.load(path, allow_pickle=False) as archive:
         columns = {name: archive[name] for name in archive.files}
     arrays = [name for name in ARRAYS if name in columns]
     for k in range(len(columns["seed"])):
         yield Trajectory(
-            scenario=load_scenario(tomllib.loads(str(columns["scenario"][k]))),
+            scenario=scenario_from_text(str(columns["scenario"][k])),
             controller=str(columns["controller"][k]),
             seed=int(columns["seed"][k]),
             **{name: columns[name][k] for name in arrays},

@@ -1,12 +1,11 @@
 """Shards as two Parquet tables, for pandas, polars and DuckDB; every number exact.
 
-``steps.parquet`` has one row per moment, T + 1 per episode: seed, step, the action and
-the odometry that led there and whether a wall held the robot back (null at step 0), the
-true pose, and the readings as lists of M. ``episodes.parquet`` has one row per episode:
+``steps.parquet`` has one row per step and one for the start, T + 1 per episode: seed,
+step, the action, the odometry and the collision before it (null at step 0), the true
+pose, and the readings as lists of M. ``episodes.parquet`` has one row per episode:
 seed, controller, scenario (as TOML), start_estimate, and the landmarks as (x, y, x, …).
 """
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from ....sim_configs import Scenario, load_scenario
+from ....sim_configs import Scenario
 from ....sim_configs.scenario_files import scenario_text
-from ..trajectory import Array, Trajectory, array_of
+from ..trajectory import Array, Trajectory, array_of, scenario_from_text
 
 ENDING = ""
 LIBRARIES = ("pyarrow",)
@@ -31,7 +30,7 @@ def check(scenario: Scenario) -> None:
 
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:
-    """Write a shard; see `trajectory_formats`."""
+    """Write a shard; see `TrajectoryFormat`."""
     path.mkdir()
     _write_table(_episode_table(trajectories), path / _EPISODES, len(trajectories))
     steps = pa.concat_tables([_step_table(each) for each in trajectories])
@@ -39,7 +38,7 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
 
 
 def read(path: Path) -> Iterator[Trajectory]:
-    """Yield the trajectories of a shard; see `trajectory_formats`."""
+    """Yield the trajectories of a shard; see `TrajectoryFormat`."""
     steps = pq.ParquetFile(path / _STEPS)
     for group, episode in enumerate(pq.read_table(path / _EPISODES).to_pylist()):
         yield _trajectory(episode, steps.read_row_group(group))
@@ -93,12 +92,12 @@ def _step_table(trajectory: Trajectory) -> Any:
 
 
 def _later(values: NDArray[Any]) -> Any:
-    """Put null, for the moment before any step, in front of a column."""
+    """Prepend null, for the start, to a column."""
     return pa.array([None, *values.tolist()], type=pa.from_numpy_dtype(values.dtype))
 
 
 def _lists(rows: NDArray[Any]) -> Any:
-    """Make one list of fixed length per row."""
+    """Return one list of fixed length per row."""
     flat = pa.array(np.ascontiguousarray(rows).ravel())
     return pa.FixedSizeListArray.from_arrays(flat, rows.shape[1])
 
@@ -118,7 +117,7 @@ def _trajectory(episode: dict[str, Any], steps: Any) -> Trajectory:
 
     hidden = "landmark_ids" in steps.column_names
     return Trajectory(
-        scenario=load_scenario(tomllib.loads(episode["scenario"])),
+        scenario=scenario_from_text(episode["scenario"]),
         controller=episode["controller"],
         seed=episode["seed"],
         start_estimate=np.array(episode["start_estimate"]),

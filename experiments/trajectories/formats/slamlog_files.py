@@ -1,8 +1,8 @@
-"""Shards as folders of slamlog CSVs, one per episode: what a filter consumes, exact.
+"""Shards as folders of slamlog CSVs, one per episode: the input of a filter, exact.
 
-A log holds the start, odometry, measurements, true poses and landmarks, every number
-so that reading gives the same bits. It does not hold the actions, the collisions, and
-the true ids of hidden identities.
+A log holds the start, odometry, measurements, true poses and landmarks; reading gives
+the same bits. It does not hold the actions, the collisions, and the true ids of hidden
+identities.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ from ...logs.events import OdometryRow, Scan
 from ...logs.recording import log_header
 from ...logs.slamlog import SlamLog, read_slamlog, write_slamlog
 from ..trajectory import Trajectory, array_of
-from .episode_files import EpisodeNotes, read_notes, write_notes
+from .episode_files import EpisodeMetadata, read_metadata, write_metadata
 
 ENDING = ""
 LIBRARIES: tuple[str, ...] = ()
@@ -27,21 +27,21 @@ def check(scenario: Scenario) -> None:
 
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:
-    """Write a shard; see `trajectory_formats`."""
+    """Write a shard; see `TrajectoryFormat`."""
     path.mkdir()
-    names = write_notes(trajectories, path)
+    names = write_metadata(trajectories, path)
     for name, trajectory in zip(names, trajectories, strict=True):
         write_slamlog(to_slamlog(trajectory), path / f"{name}.csv")
 
 
 def read(path: Path) -> Iterator[Trajectory]:
-    """Yield the trajectories of a shard; see `trajectory_formats`."""
-    for notes in read_notes(path):
-        yield _trajectory(read_slamlog(path / f"{notes.name}.csv"), notes)
+    """Yield the trajectories of a shard; see `TrajectoryFormat`."""
+    for about in read_metadata(path):
+        yield _trajectory(read_slamlog(path / f"{about.name}.csv"), about)
 
 
 def to_slamlog(trajectory: Trajectory) -> SlamLog:
-    """Make the log of a trajectory, for filters that replay logs.
+    """Return the log of a trajectory, for replay.
 
     Time counts steps, as in :func:`~slamgym.experiments.logs.recording.record_episode`,
     whose log of the same seed is equal.
@@ -75,9 +75,9 @@ def to_slamlog(trajectory: Trajectory) -> SlamLog:
     )
 
 
-def _trajectory(log: SlamLog, notes: EpisodeNotes) -> Trajectory:
+def _trajectory(log: SlamLog, about: EpisodeMetadata) -> Trajectory:
     moves = [event for event in log.events if isinstance(event, OdometryRow)]
-    rows = count_rows(notes.scenario)
+    rows = count_rows(about.scenario)
     measurements = np.zeros((len(moves) + 1, rows, 2))
     mask = np.zeros((len(moves) + 1, rows), dtype=np.bool_)
     for event in log.events:
@@ -88,9 +88,9 @@ def _trajectory(log: SlamLog, notes: EpisodeNotes) -> Trajectory:
             measurements[int(event.t), places] = event.measurements
             mask[int(event.t), places] = True
     return Trajectory(
-        scenario=notes.scenario,
-        controller=notes.controller,
-        seed=notes.seed,
+        scenario=about.scenario,
+        controller=about.controller,
+        seed=about.seed,
         start_estimate=log.start,
         odometry=np.array([(move.d, move.alpha) for move in moves]),
         poses=log.ground_truth[:, 1:],

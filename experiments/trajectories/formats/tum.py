@@ -1,12 +1,12 @@
 """Shards as folders of TUM files: the true path and the path by odometry alone.
 
-Lines ``t x y z qx qy qz qw``, t in seconds, z = 0, which evo and its kin read. Two
-files per episode, ``NAME_truth.tum`` and ``NAME_odometry.tum``; the latter adds the
-odometry up from the pose that a filter starts from.
+The lines are ``t x y z qx qy qz qw`` with t in seconds and z = 0, as evo reads them.
+There are two files per episode, ``NAME_truth.tum`` and ``NAME_odometry.tum``; the
+latter integrates odometry from the initial pose of filters.
 
-They hold the paths alone: no readings, landmarks, actions or collisions. Positions are
-exact; headings read back in [-π, π] within 1e-15, and odometry within 1e-15 times the
-size of the coordinates.
+The files hold the paths alone: no readings, landmarks, actions or collisions. Positions
+are exact; headings read back in [-π, π] within 1e-15, and odometry within 1e-15 times
+the size of the coordinates.
 """
 
 import math
@@ -20,7 +20,7 @@ from ....estimator.models.angles import wrap_angle
 from ....sim_configs import Scenario
 from ..trajectory import Array, Trajectory
 from .dead_reckoning import dead_reckoning
-from .episode_files import numbers, read_notes, write_lines, write_notes
+from .episode_files import numbers, read_metadata, write_lines, write_metadata
 
 ENDING = ""
 LIBRARIES: tuple[str, ...] = ()
@@ -31,9 +31,9 @@ def check(scenario: Scenario) -> None:
 
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:
-    """Write a shard; see `trajectory_formats`."""
+    """Write a shard; see `TrajectoryFormat`."""
     path.mkdir()
-    names = write_notes(trajectories, path)
+    names = write_metadata(trajectories, path)
     for name, each in zip(names, trajectories, strict=True):
         dt = each.scenario.dt
         write_lines(path / f"{name}_truth.tum", _lines(each.poses, dt))
@@ -42,16 +42,16 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
 
 
 def read(path: Path) -> Iterator[Trajectory]:
-    """Yield the trajectories of a shard; see `trajectory_formats`."""
-    for notes in read_notes(path):
-        reckoned = _poses(path / f"{notes.name}_odometry.tum")
+    """Yield the trajectories of a shard; see `TrajectoryFormat`."""
+    for about in read_metadata(path):
+        reckoned = _poses(path / f"{about.name}_odometry.tum")
         yield Trajectory(
-            scenario=notes.scenario,
-            controller=notes.controller,
-            seed=notes.seed,
+            scenario=about.scenario,
+            controller=about.controller,
+            seed=about.seed,
             start_estimate=reckoned[0],
             odometry=_increments(reckoned),
-            poses=_poses(path / f"{notes.name}_truth.tum"),
+            poses=_poses(path / f"{about.name}_truth.tum"),
         )
 
 
@@ -70,7 +70,7 @@ def _poses(path: Path) -> Array:
 
 
 def _increments(poses: Array) -> Array:
-    """Undo dead reckoning: the distances along the old headings, and the turns."""
+    """Return the odometry of a dead-reckoned path: distances and turns."""
     dx, dy = np.diff(poses[:, :2], axis=0).T
     heading = poses[:-1, 2]
     turns = [wrap_angle(turn) for turn in np.diff(poses[:, 2]).tolist()]
