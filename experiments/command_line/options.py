@@ -8,27 +8,29 @@ import typer
 REPEATED = "May be repeated."
 
 
-def option(form: str, text: str, default: str | bool = True, **limits: int) -> Any:
+def option(
+    form: str, text: str, default: str | bool = True, *, min: int | None = None
+) -> Any:
     """Describe an option of a command.
 
     Parameters
     ----------
     form : str
-        Its names, then what its help shows for the value, as in "--jobs -j N".  The
-        name of the parameter names the option where the form has no name.
+        Its names, then the placeholder of its value, as in "--jobs -j N". Without a
+        name, the option is named after the parameter.
     text : str
         The help.
     default : str or bool
-        What the help shows as the default; True for the value itself.
-    **limits : int
-        ``min`` or ``max``.
+        What the help shows as the default; True for the default itself.
+    min : int, optional
+        The least value.
     """
     words = form.split()
     names = [word for word in words if word.startswith("-")]
     value = [word for word in words if word not in names]
     metavar = value[0] if value else None
     return typer.Option(
-        *names, metavar=metavar, help=text, show_default=default, **limits
+        *names, metavar=metavar, help=text, show_default=default, min=min
     )
 
 
