@@ -23,6 +23,7 @@ from slamgym.estimator.filters.marginalise_and_merge import (
     coincide,
     without_landmarks,
 )
+from slamgym.estimator.large_maps.submaps import gauss_newton
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.angles import wrap_angle
 from slamgym.estimator.models.bearing_range import predict_measurement
@@ -53,11 +54,11 @@ def part_of(belief, ids):
 
 def holders(slam):
     """Which submaps hold each landmark, the present one being the last."""
-    slots = [set(o.slots.tolist()) for o in slam._run.closed.outlines]
-    slots.append(set(slam._run.slots.of(slam._present.names).tolist()))
+    slots = [set(o.slots.tolist()) for o in slam._graph.closed.summaries]
+    slots.append(set(slam._graph.index.slots_of(slam._active.names).tolist()))
     return {
         i: [k for k, held in enumerate(slots) if slot in held]
-        for i, slot in slam._run.slots.items()
+        for i, slot in slam._graph.index.items()
     }
 
 
@@ -116,10 +117,10 @@ def test_a_removed_landmark_goes_on_to_tie_submaps_together(base):
 def test_what_only_the_present_submap_holds_makes_room():
     slam = run(made(submap_size=20), laps(12))
     alone = list(slam.landmark_ids[:3])
-    before = len(slam._present)
+    before = len(slam._active)
     slam.remove(alone)
     assert alone
-    assert len(slam._present) == before - len(alone)
+    assert len(slam._active) == before - len(alone)
 
 
 def test_a_removed_landmark_that_is_seen_again_is_a_new_one():
@@ -422,13 +423,13 @@ def assert_as_joined(slam, tolerance):
 
 def surveys_of(slam):
     """Return a list that grows with every look at the joined map, by its reach."""
-    survey, reaches = slam._vicinity._survey, []
+    survey, reaches = slam._neighbourhood._survey, []
 
     def counted(reach):
         reaches.append(reach)
         return survey(reach)
 
-    slam._vicinity._survey = counted
+    slam._neighbourhood._survey = counted
     return reaches
 
 
@@ -502,7 +503,7 @@ def test_where_there_are_too_many_it_claims_no_more_than_it_holds(monkeypatch):
     for odometry, readings, ids, _ in wide_laps(120):
         slam.predict(odometry)
         slam.update(readings, ids)
-        held, extent = set(slam.local_view(25.0).ids), slam._vicinity._extent
+        held, extent = set(slam.local_view(25.0).ids), slam._neighbourhood._region
         whole = slam.belief()
         away = np.hypot(*(whole.landmarks - whole.pose[:2]).T)
         cut += len(held) < len(whole.landmark_ids)
@@ -525,7 +526,7 @@ def test_it_looks_farther_by_how_far_the_map_may_have_drifted():
         slam.update(readings, ids)
         if slam.closed_count > closed:  # the robot is where the present frame begins
             drift = 3 * np.sqrt(np.trace(slam.belief([]).covariance[:2, :2]))
-            _, extent = slam._run.survey(5.0)
+            _, extent = slam._graph.joined_region(5.0)
             assert extent.slack == pytest.approx(drift, rel=1e-6)
             assert extent.slack > 0.1
             least = extent.radius - extent.slack
@@ -565,7 +566,7 @@ def test_it_goes_on_where_the_file_of_a_submap_is_lost(tmp_path):
     few = [(u, z[:5], ids[:5], pose) for u, z, ids, pose in drive]
     run(slam, few[:60])
     slam.local_view(8.0)
-    slam._run.closed.store._at_hand.clear()
+    slam._graph.closed.store._cache.clear()
     (tmp_path / "run" / "submap_000001.npy").unlink()
     closed = slam.closed_count
     run(slam, few[60:])
@@ -582,7 +583,7 @@ def test_it_goes_on_where_the_map_cannot_be_joined(monkeypatch):
         slam.predict(odometry)
         slam.update(readings, ids)
         slam.local_view(8.0)
-    monkeypatch.setattr("slamgym.estimator.large_maps.submaps.joining.ITERATIONS", 0)
+    monkeypatch.setattr(gauss_newton, "ITERATIONS", 0)
     run(slam, drive[20:])
     gap = slam.local_view(0.0).mean[:2] - drive[-1][3][:2]
     assert np.hypot(*gap) < 0.3
@@ -631,13 +632,13 @@ def test_an_edited_run_continues_bit_for_bit(tmp_path, base, on_disk, cut):
     other = made(**options, submap_size=9)
     with np.load(tmp_path / "state.npz") as state:
         other.load_state_dict(state)
-    assert other._vicinity._reaches == slam._vicinity._reaches
-    assert max(other._vicinity._reaches) > 0
+    assert other._neighbourhood._reaches == slam._neighbourhood._reaches
+    assert max(other._neighbourhood._reaches) > 0
     assert_same_bits(slam.belief(), other.belief())
     edited_run(slam, drive, start=cut)
     edited_run(other, drive, start=cut)
     assert slam.closed_count == other.closed_count > 4
-    assert slam._run.closed.renamed
+    assert slam._graph.closed.renamed
     assert states_agree(slam, other)
     assert_same_bits(slam.belief(), other.belief())
     assert_same_bits(

@@ -17,14 +17,15 @@ from slamgym.estimator.large_maps.sparse_cholesky.submap_dissection import disse
 from slamgym.estimator.large_maps.sparse_cholesky.submap_elimination import (
     SubmapElimination,
 )
+from slamgym.estimator.large_maps.submaps import gauss_newton
 from slamgym.estimator.large_maps.submaps.factor import (
+    factor_error,
     inverse_spread,
-    relation,
     retract,
 )
 from slamgym.estimator.large_maps.submaps.fusion import fuse
-from slamgym.estimator.large_maps.submaps.joining import Gaussian
-from slamgym.estimator.large_maps.submaps.store import AT_HAND, MARK
+from slamgym.estimator.large_maps.submaps.gaussian import Gaussian
+from slamgym.estimator.large_maps.submaps.store import CACHE_SIZE, MARKER
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.angles import wrap_angle
 from slamgym.estimator.models.bearing_range import predict_measurement
@@ -121,7 +122,7 @@ def dense_join(slam):
 
     For a base filter whose error is additive; every submap is closed.
     """
-    submaps = [slam._run.closed.store.load(k) for k in range(slam.closed_count)]
+    submaps = [slam._graph.closed.store.load(k) for k in range(slam.closed_count)]
     count, known = len(submaps), len(slam.landmark_ids)
     roots = [np.linalg.cholesky(np.linalg.inv(s.covariance)).T for s in submaps]
 
@@ -138,7 +139,7 @@ def dense_join(slam):
     belief = slam.belief()
     guess = np.concatenate([np.zeros(3 * count), belief.landmarks.ravel()])
     guess[: 3 * count] = (
-        slam._run.closed.join(slam._run.chain.joined).frames[1:].ravel()
+        slam._graph.closed.join(slam._graph.chain.joined).frames[1:].ravel()
     )
     guess += 1e-3 * np.random.default_rng(0).standard_normal(len(guess))
     x = least_squares(errors, guess, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
@@ -152,13 +153,13 @@ def test_the_joined_map_is_the_dense_least_squares_solution():
     drive = list(laps(60))
     run(slam, drive)
     if slam.local_ids:
-        slam._run.close()  # all of them are closed
+        slam._graph.close()  # all of them are closed
     mean, covariance = dense_join(slam)
     belief = slam.belief()
     mean[2] = wrap_angle(mean[2])
     std = np.sqrt(np.diag(covariance))
     assert slam.closed_count > 8
-    assert any(np.diff([len(o.slots) for o in slam._run.closed.outlines]))
+    assert any(np.diff([len(o.slots) for o in slam._graph.closed.summaries]))
     np.testing.assert_allclose((belief.mean - mean) / std, 0, atol=1e-4)
     scaled = (belief.covariance - covariance) / np.outer(std, std)
     np.testing.assert_allclose(scaled, 0, atol=1e-4)
@@ -201,7 +202,7 @@ def test_a_part_of_the_belief_is_that_part_of_the_whole(driven):
 def test_the_frame_of_the_present_submap_is_the_chain_of_the_others():
     std = np.array([0.1, 0.2, 0.05])
     slam = run(made(base="ekf", initial_pose_std=std), laps(50))
-    submaps = [slam._run.closed.store.load(k) for k in range(slam.closed_count)]
+    submaps = [slam._graph.closed.store.load(k) for k in range(slam.closed_count)]
 
     def end(parts):
         pose = parts[:3]
@@ -211,7 +212,7 @@ def test_the_frame_of_the_present_submap_is_the_chain_of_the_others():
             pose = pose + turn @ step
         return pose
 
-    present = slam._present.filter.belief()
+    present = slam._active.filter.belief()
     parts = [START, *(submap.mean[:3] for submap in submaps), present.pose]
     noise = [np.diag(std**2), *(submap.covariance[:3, :3] for submap in submaps)]
     G = numeric_jacobian(end, np.concatenate(parts))
@@ -229,7 +230,7 @@ def test_a_landmark_is_added_once_however_many_submaps_hold_it():
         slam.predict(odometry)
         added += slam.update(readings, ids).added_ids
     assert tuple(added) == slam.landmark_ids
-    assert sum(len(o.slots) for o in slam._run.closed.outlines) > 3 * len(added)
+    assert sum(len(o.slots) for o in slam._graph.closed.summaries) > 3 * len(added)
 
 
 def test_asking_for_the_belief_leaves_no_trace():
@@ -273,12 +274,14 @@ def test_a_submap_uses_nothing_of_what_came_before_it():
     assert one.closed_count == other.closed_count > 3
     for k in range(1, one.closed_count):
         for part, same in zip(
-            one._run.closed.store.load(k), other._run.closed.store.load(k), strict=True
+            one._graph.closed.store.load(k),
+            other._graph.closed.store.load(k),
+            strict=True,
         ):
             if part.dtype != np.int64:
                 np.testing.assert_array_equal(part, same)
     assert not np.array_equal(
-        one._run.closed.store.load(0).mean, other._run.closed.store.load(0).mean
+        one._graph.closed.store.load(0).mean, other._graph.closed.store.load(0).mean
     )
 
 
@@ -337,10 +340,10 @@ def test_the_derivative_of_a_relation_is_that_of_differences(frame, turn):
     state[2] = start[2] + mean[2] + turn
 
     def error(x):
-        return relation(x[:3], x[3:], mean, frame).error
+        return factor_error(x[:3], x[3:], mean, frame).error
 
     expected = numeric_jacobian(error, np.concatenate([start, state]))
-    found = relation(start, state, mean, frame).jacobian
+    found = factor_error(start, state, mean, frame).jacobian
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
@@ -349,7 +352,7 @@ def test_retraction_makes_the_error_it_is_given(frame):
     rng = np.random.default_rng(4)
     mean, error = rng.normal(size=9), 0.5 * rng.normal(size=9)
     state = retract(mean, error, frame)
-    found = relation(np.zeros(3), state, mean, frame).error
+    found = factor_error(np.zeros(3), state, mean, frame).error
     np.testing.assert_allclose(found, error, rtol=0, atol=1e-12)
 
 
@@ -443,12 +446,12 @@ def test_another_process_continues_from_the_folder(tmp_path):
     assert_same_bits(run(made(), drive).belief(), found)
 
 
-def test_submaps_on_disk_are_those_in_memory_and_few_are_at_hand(tmp_path):
+def test_submaps_on_disk_are_those_in_memory_and_few_are_cache(tmp_path):
     drive = list(laps())
     slam = run(made(folder=tmp_path / "run", submap_size=5), fewer(drive))
     other = run(made(submap_size=5), fewer(drive))
-    assert slam.closed_count > AT_HAND + 3
-    assert len(slam._run.closed.store._at_hand) == AT_HAND
+    assert slam.closed_count > CACHE_SIZE + 3
+    assert len(slam._graph.closed.store._cache) == CACHE_SIZE
     assert_same_bits(slam.belief(), other.belief())
     assert slam.nbytes < other.nbytes
     assert len(list((tmp_path / "run").glob("submap_*.npy"))) == slam.closed_count
@@ -551,7 +554,7 @@ def test_a_folder_that_is_none_is_refused(tmp_path):
         made(folder=file)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letters.txt").write_text("x")
-    with pytest.raises(ValueError, match=f"other files and no {MARK}"):
+    with pytest.raises(ValueError, match=f"other files and no {MARKER}"):
         made(folder=tmp_path / "other")
     assert [p.name for p in (tmp_path / "other").iterdir()] == ["letters.txt"]
 
@@ -703,7 +706,7 @@ def test_a_belief_beyond_the_limit_names_the_memory_it_would_take():
 
 
 def test_submaps_that_cannot_be_joined_are_told(driven, monkeypatch):
-    monkeypatch.setattr("slamgym.estimator.large_maps.submaps.joining.ITERATIONS", 1)
+    monkeypatch.setattr(gauss_newton, "ITERATIONS", 1)
     other = made()
     other.load_state_dict(driven.state_dict())
     with pytest.raises(np.linalg.LinAlgError, match="did not converge in 1 iterations"):

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from ...filters.ekf import FRAMES, EkfSlam
 from ...map_management.map_editor import edit_map
-from .joining import Gaussian
-from .landmark_index import Slots, link_name
+from .gaussian import Gaussian
+from .landmark_index import LandmarkIndex, link_name
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -16,7 +16,7 @@ Int = NDArray[np.int64]
 ORIGIN = (0.0, 0.0, 0.0)
 
 
-class PresentSubmap:
+class ActiveSubmap:
     """The present submap, whose landmarks may be removed and merged.
 
     Parameters
@@ -65,14 +65,16 @@ class PresentSubmap:
         mean: Array = self.filter.state_dict()["mean"]
         return Gaussian(mean, self.filter.belief().error_covariance())
 
-    def remove(self, ids: Collection[int], slots: Slots, tied: Collection[int]) -> None:
+    def remove(
+        self, ids: Collection[int], slots: LandmarkIndex, tied: Collection[int]
+    ) -> None:
         """Marginalise landmarks, but for those that stay as links.
 
         Parameters
         ----------
         ids : collection of int
             Mapped landmarks, whether it holds them or not.
-        slots : Slots
+        slots : LandmarkIndex
             Of these.
         tied : collection of int
             Slots that other submaps hold too.

@@ -1,4 +1,4 @@
-"""Where the present submap begins, from the submaps before it, one after the other."""
+"""Frame of the active submap, by composition of the submaps before it."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,37 +9,37 @@ Array = NDArray[np.float64]
 
 
 class Chain:
-    """The frame of the present submap in the world, at no cost.
+    """The frame of the active submap in the world, without a join.
 
-    The composition of what the submaps say of their last poses, from where the run
-    began or from the last join on: with an honest covariance, which knows of no loop
-    closed since.
+    The frame is the composition of the last poses of all submaps since the start of the
+    run or the last join.  Its covariance is consistent, but does not account for loops
+    closed since then.
 
     Parameters
     ----------
     pose, covariance : ndarray, shapes (3,) and (3, 3)
-        Where the run began, in the world.
+        Start of the run in the world.
     """
 
     def __init__(self, pose: Array, covariance: Array) -> None:
         self.start = (pose.copy(), covariance.copy())
         self.pose, self.covariance = self.start
         self.joined = pose[None].copy()
-        """Frames as of the last join, shape (J + 1, 3)."""
+        """Frames of the last join, shape (J + 1, 3)."""
 
     def extend(self, pose: Array, covariance: Array) -> None:
-        """Append a submap: its last pose (3,), and the covariance of its error."""
+        """Append a submap by its last pose, shape (3,), and that pose's covariance."""
         self.pose, by_start, by_pose = compose(self.pose, pose)
         moved = by_start @ self.covariance @ by_start.T
         self.covariance = moved + by_pose @ covariance @ by_pose.T
 
     def rebase(self, joined: Array, pose: Array, covariance: Array) -> None:
-        """Take over frames, and the last of them with its covariance."""
+        """Replace the frames, and the last of them with its covariance."""
         self.joined = joined.copy()
         self.pose, self.covariance = pose.copy(), covariance.copy()
 
     def state_dict(self) -> dict[str, Array]:
-        """Return copies of everything, as arrays."""
+        """Return copies of the whole state, as arrays."""
         return {
             "start": np.vstack(self.start),
             "present": np.vstack([self.pose, self.covariance]),
@@ -48,7 +48,7 @@ class Chain:
 
     @classmethod
     def restored(cls, state: dict[str, Array]) -> "Chain":
-        """Make a chain from what :meth:`state_dict` returned."""
+        """Return the chain that :meth:`state_dict` saved."""
         chain = cls(state["start"][0], state["start"][1:])
         chain.rebase(state["joined"], state["present"][0], state["present"][1:])
         return chain

@@ -1,4 +1,4 @@
-"""The closed submaps of a run: kept as they were closed, joined when somebody asks."""
+"""The closed submaps of a run, joined when a belief asks for them."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,31 +6,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...error_frames import ErrorFrame
-from .frame_initialisation import Outline, Placing, outline_of, points_seen
-from .joining import Gaussian, JoinedMap
+from .frame_initialisation import (
+    FrameInitialisation,
+    SubmapSummary,
+    points_seen,
+    summarise,
+)
+from .gaussian import Gaussian
+from .joining import JoinedMap
 from .merging import merged
-from .neighbourhood import Extent
+from .neighbourhood import Region
 from .store import Submap, SubmapStore
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-ROUGHLY = 0.1
+ROUGHLY_CONVERGED = 0.1
+"""Decrement at which to stop while computing initial frames."""
 
 
 class ClosedSubmaps:
-    """All closed submaps, and the map that they make together.
+    """All closed submaps, and the map joined from them.
 
     Parameters
     ----------
     store : SubmapStore
-        Where they are.
     frame : {"additive", "invariant"}
-        Coordinates of their errors.
+        Coordinates of the submaps' errors.
     renamed : mapping, optional
-        Slots of landmarks found to be others, and the slots of these.
-    outlines : sequence of Outline, optional
-        Of the submaps that the store holds already.
+        Slots of merged landmarks, and the slots that replace them.
+    summaries : sequence of SubmapSummary, optional
+        Of the submaps in the store.
     """
 
     def __init__(
@@ -38,120 +44,125 @@ class ClosedSubmaps:
         store: SubmapStore,
         frame: ErrorFrame,
         renamed: Mapping[int, int] | None = None,
-        outlines: Sequence[Outline] = (),
+        summaries: Sequence[SubmapSummary] = (),
     ) -> None:
         self.store, self._frame = store, frame
         self.renamed = dict(renamed or {})
-        self.outlines = list(outlines)
-        self.slots: set[int] = set().union(*(o.slots.tolist() for o in outlines))
-        """Of the landmarks that they hold, links included."""
-        self._placing = Placing()
+        self.summaries = list(summaries)
+        self.slots: set[int] = set().union(*(s.slots.tolist() for s in summaries))
+        """Slots of the landmarks in the submaps, including links."""
+        self._initialisation = FrameInitialisation()
         self._joined: JoinedMap | None = None
         self._whole: tuple[Int, Gaussian] | None = None
 
     def __len__(self) -> int:
-        return len(self.outlines)
+        return len(self.summaries)
 
     @property
     def nbytes(self) -> int:
-        """Memory that submaps and what joins them take [bytes]."""
-        outlines = sum(outline.nbytes for outline in self.outlines)
+        """Memory of the submaps and the joined map [bytes]."""
+        summaries = sum(summary.nbytes for summary in self.summaries)
         joined = 0 if self._joined is None else self._joined.nbytes
         whole = 0 if self._whole is None else self._whole[1].covariance.nbytes
-        return self.store.nbytes + outlines + joined + whole
+        return self.store.nbytes + summaries + joined + whole
 
     def load(self, index: int) -> Submap:
-        """Return a submap; its arrays are not to be written to."""
+        """Return a submap; its arrays must not be modified."""
         submap = self.store.load(index)
         return merged(submap, self.renamed, self._frame) if self.renamed else submap
 
     def append(self, submap: Submap) -> None:
-        """Keep one more."""
+        """Append a submap."""
         self.store.append(submap)
-        self.outlines.append(outline_of(submap))
+        self.summaries.append(summarise(submap))
         self.slots.update(submap.slots.tolist())
-        self._forget_joined()
+        self._joined = self._whole = None
 
     def with_merged(self, kept: int, gone: int) -> "ClosedSubmaps":
-        """Return the same submaps, one slot standing for another from now on.
+        """Return the same submaps with one slot replaced by another.
 
         Raises
         ------
         numpy.linalg.LinAlgError
-            Where a submap can say nothing of their distance.
+            If the covariance of the landmarks' distance is singular in a submap.
         """
         if gone not in self.slots:
             return self
         earlier = {old: kept for old, new in self.renamed.items() if new == gone}
         renamed = self.renamed | earlier | {gone: kept}
-        outlines = [
-            outline_of(merged(self.store.load(k), renamed, self._frame))
-            if gone in outline.slots
-            else outline
-            for k, outline in enumerate(self.outlines)
+        summaries = [
+            summarise(merged(self.store.load(k), renamed, self._frame))
+            if gone in summary.slots
+            else summary
+            for k, summary in enumerate(self.summaries)
         ]
-        return ClosedSubmaps(self.store, self._frame, renamed, outlines)
+        return ClosedSubmaps(self.store, self._frame, renamed, summaries)
 
     def join(self, known: Array) -> JoinedMap:
-        """Join them, given the first frames; what is joined holds until one is added.
+        """Return the joined map; it is cached until a submap is appended.
 
         Parameters
         ----------
         known : ndarray, shape (J + 1, 3)
-            At least that of the start, where Gauss-Newton begins.
+            The first frames, at least the start: initial values of Gauss-Newton.
         """
         if self._joined is None:
-            frames = self._placing.frames(self.outlines, known, self._settle)
-            self._joined = JoinedMap(self.load, self.outlines, self._frame, frames)
+            frames = self._initialisation.frames(self.summaries, known, self._refined)
+            self._joined = JoinedMap(self.load, self.summaries, self._frame, frames)
         return self._joined
 
-    def marginal(self, slots: Int, known: Array) -> Gaussian:
-        """Return the last frame and some of their landmarks, given the first frame."""
-        if not self.outlines:
+    def marginal(self, slots: Int, known: Array, *, remember: bool = False) -> Gaussian:
+        """Return the last frame and some landmarks, given the first frame.
+
+        Parameters
+        ----------
+        slots : ndarray, shape (n,)
+            Of the landmarks.
+        known : ndarray, shape (J + 1, 3)
+            As for :meth:`join`.
+        remember : bool
+            Whether to cache the result until a submap is appended.
+        """
+        if not self.summaries:
             return Gaussian(known[0], np.zeros((3, 3)))
-        return self.join(known).marginal(slots)
+        if not remember:
+            return self.join(known).marginal(slots)
+        if self._whole is None or not np.array_equal(self._whole[0], slots):
+            self._whole = slots, self.join(known).marginal(slots)
+        return self._whole[1]
 
     def near(
-        self, slots: Int, count: int, extent: Extent, known: Array
-    ) -> tuple[Int, Extent]:
-        """Return which of some landmarks lie within an extent, and what it is then.
+        self, slots: Int, count: int, region: Region, known: Array
+    ) -> tuple[Int, Region]:
+        """Return which of some landmarks lie within a region, and the actual region.
 
         Parameters
         ----------
         slots : ndarray, shape (n,)
             Of these landmarks.
         count : int
-            Of all slots.
-        extent : Extent
+            Number of all slots.
+        region : Region
         known : ndarray, shape (J + 1, 3)
             As for :meth:`join`.
         """
         if not len(slots):
-            return slots, extent
-        points = points_seen(self.outlines, self.join(known).frames, count)[slots]
-        chosen, extent = extent.chosen(points)
-        return slots[chosen], extent
+            return slots, region
+        points = points_seen(self.summaries, self.join(known).frames, count)[slots]
+        chosen, region = region.chosen(points)
+        return slots[chosen], region
 
-    def everything(self, slots: Int, known: Array) -> Gaussian:
-        """Return the same of so many landmarks that it is worth to be remembered."""
-        if self._whole is None or not np.array_equal(self._whole[0], slots):
-            self._whole = slots, self.marginal(slots, known)
-        return self._whole[1]
-
-    def forget_frames(self) -> None:
-        """Begin with placing the frames from the start."""
-        self._placing = Placing()
-        self._forget_joined()
-
-    def _forget_joined(self) -> None:
+    def discard_frames(self) -> None:
+        """Discard the cached frames and the joined map."""
+        self._initialisation = FrameInitialisation()
         self._joined = self._whole = None
 
-    def _settle(self, first: int, last: int, frames: Array) -> Array:
-        """Join some submaps by themselves, roughly; return their frames."""
+    def _refined(self, first: int, last: int, frames: Array) -> Array:
+        """Return the frames of some submaps, joined with a coarse tolerance."""
         return JoinedMap(
             lambda index: self.load(first + index),
-            self.outlines[first:last],
+            self.summaries[first:last],
             self._frame,
             frames,
-            ROUGHLY,
+            ROUGHLY_CONVERGED,
         ).frames

@@ -1,15 +1,15 @@
-"""What a submap says of the frames and landmarks of the world.
+"""The factor of a submap: its error against frames and landmarks in the world.
 
 Symbols
 -------
 F_k = (p_k, θ_k)  frame of submap k in the world [m, m, rad]
 m̂, P              its mean, (last pose, landmarks) in F_k, and the covariance of its
                   error, additive or invariant (:mod:`.error_frames`)
-Y                 the same quantities as the world has them: F_{k+1} and landmarks l
-                  seen from F_k,  Y_q = R(θ_k)ᵀ (q − p_k),  Y_θ = θ_{k+1} − θ_k
+Y                 the same quantities in the world: F_{k+1} and landmarks l relative
+                  to F_k,  Y_q = R(θ_k)ᵀ (q − p_k),  Y_θ = θ_{k+1} − θ_k
 
-Points are complex numbers here, so that R(θ) is e^{iθ} and J is i.  The submap says
-that the error e of m̂ against Y is Gaussian: N(0, P).
+Points are complex numbers here (:mod:`.gaussian`).  The error e of m̂ against Y is
+Gaussian, N(0, P).
 """
 
 from typing import NamedTuple
@@ -20,27 +20,27 @@ from scipy.linalg import solve_triangular
 
 from ...error_frames import ErrorFrame
 from ...models.angles import wrap_angle
+from .gaussian import Complex, points_of, state_of
 
 Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
-SMALLEST = 1e-5
-"""Deviations below this share of a submap's largest count as that much."""
+SMALLEST_RATIO = 1e-5
+"""Lower bound of a standard deviation, relative to the largest of the submap."""
 
 
-class Relation(NamedTuple):
-    """Error of a submap against the world, and its derivative."""
+class FactorError(NamedTuple):
+    """Error of a submap against the world, and its Jacobian."""
 
     error: Array
     """e, shape (3 + 2n,)."""
     jacobian: Array
-    """By F_k, F_{k+1} and the landmarks, shape (3 + 2n, 6 + 2n)."""
+    """∂e/∂(F_k, F_{k+1}, landmarks), shape (3 + 2n, 6 + 2n)."""
 
 
-def relation(
+def factor_error(
     start: Array, state: Array, mean: Array, frame: ErrorFrame = "additive"
-) -> Relation:
-    """Compare a submap with the world.
+) -> FactorError:
+    """Return the error of a submap against the world.
 
     ::
 
@@ -60,10 +60,10 @@ def relation(
 
     Examples
     --------
-    A submap saw a landmark 2 m ahead; the world has it at 3 m from where it began:
+    The submap has the landmark 2 m ahead, the world 3 m from the start:
 
     >>> world = np.array([1.0, 0.0, 0.0, 3.0, 0.0])
-    >>> relation(np.zeros(3), world, np.array([1.0, 0.0, 0.0, 2.0, 0.0])).error
+    >>> factor_error(np.zeros(3), world, np.array([1.0, 0.0, 0.0, 2.0, 0.0])).error
     array([0., 0., 0., 1., 0.])
     """
     turned = np.exp(-1j * start[2])
@@ -81,13 +81,13 @@ def relation(
         jacobian[row, 4 + where] = part(1j * by_point)
         jacobian[row, 2] = part(-1j * scale * seen - slope)
         jacobian[row, 5] = part(slope)
-    return Relation(state_of(error, turn), jacobian)
+    return FactorError(state_of(error, turn), jacobian)
 
 
 def _error(
     seen: Complex, mean: Complex, turn: float, frame: ErrorFrame
 ) -> tuple[Complex, complex, Complex]:
-    """Return e of points, and its derivatives by the points seen and by the turn."""
+    """Return e of points, and its derivatives by the seen points and the turn."""
     if frame == "additive":
         return seen - mean, 1.0 + 0.0j, np.zeros_like(seen)
     scale, slope = inverse_spread(turn)
@@ -111,7 +111,7 @@ def inverse_spread(turn: float) -> tuple[complex, complex]:
 
 
 def retract(mean: Array, error: Array, frame: ErrorFrame) -> Array:
-    """Return the state that has this error against the mean, shape (3 + 2n,)."""
+    """Return the state with this error against the mean, shape (3 + 2n,)."""
     if frame == "additive":
         return mean + error
     turn = float(error[2])
@@ -130,26 +130,15 @@ def compose(start: Array, pose: Array) -> tuple[Array, Array, Array]:
     return start + moved, by_start, by_pose
 
 
-def floor(covariance: Array) -> Array:
-    """Return what to add to a covariance so that it can be solved with."""
+def regularised(covariance: Array) -> Array:
+    """Return a covariance with an increased diagonal, so that it can be solved with."""
     largest = float(np.max(np.diagonal(covariance)))
-    return np.eye(len(covariance)) * max(SMALLEST**2 * largest, 1e-18)
-
-
-def whitened(covariance: Array, columns: Array) -> Array:
-    """Return L⁻¹ times columns, with L Lᵀ the covariance."""
-    lower = np.linalg.cholesky(covariance + floor(covariance))
-    return np.asarray(solve_triangular(lower, columns, lower=True, check_finite=False))
-
-
-def points_of(state: Array) -> Complex:
-    """Position of the pose, then of the landmarks, shape (1 + n,)."""
-    return np.concatenate([state[:1], state[3::2]]) + 1j * np.concatenate(
-        [state[1:2], state[4::2]]
+    return covariance + np.eye(len(covariance)) * max(
+        SMALLEST_RATIO**2 * largest, 1e-18
     )
 
 
-def state_of(points: Complex, heading: float) -> Array:
-    """Return (x, y, θ, l1x, l1y, …), shape (3 + 2n,)."""
-    flat = np.ascontiguousarray(points).view(np.float64)
-    return np.concatenate([flat[:2], [heading], flat[2:]])
+def whitened(covariance: Array, columns: Array) -> Array:
+    """Return L⁻¹ times columns, where L Lᵀ is the covariance."""
+    lower = np.linalg.cholesky(regularised(covariance))
+    return np.asarray(solve_triangular(lower, columns, lower=True, check_finite=False))

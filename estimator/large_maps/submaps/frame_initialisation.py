@@ -1,11 +1,11 @@
-"""Where the frames of submaps are, roughly: a first guess, by divide and conquer.
+"""Initial values of the frames of submaps, by divide and conquer.
 
-Gauss-Newton needs a start from which it finds the right minimum, and composing the
-frames one by one drifts too far from it.  So blocks of submaps are joined first, and
-blocks of blocks, each in its own frame; a block then moves as a rigid body to where the
-landmarks that it shares with the blocks before it want it.  Blocks are aligned like the
-digits of a binary number, so that most of them are there already when the map has grown
-by one.
+Gauss-Newton needs initial values near the right minimum, and composing the frames one
+by one drifts too far from it.  Blocks of submaps are therefore joined first, then
+blocks of blocks, each in its own frame.  A block is then aligned as a rigid body with
+the landmarks that it shares with the blocks before it.  Block boundaries follow the
+binary digits of the number of submaps, so that most blocks can be reused when the map
+grows by one submap.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,152 +14,151 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .factor import compose, floor
+from .factor import compose, regularised
 from .store import Submap
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
-Settle = Callable[[int, int, Array], Array]
+Refine = Callable[[int, int, Array], Array]
 
-FEW = 4
-"""Submaps whose frames may simply be composed."""
+LARGEST_COMPOSED = 4
+"""Up to this many submaps, composing their frames is accurate enough."""
 
 
-class Outline(NamedTuple):
-    """What is kept at hand of a closed submap."""
+class SubmapSummary(NamedTuple):
+    """The part of a closed submap that stays in memory."""
 
     slots: Int
     """Its landmarks, shape (n,)."""
     mean: Array
     """As in the submap, shape (3 + 2n,)."""
-    spread: Array
+    pose_covariance: Array
     """Covariance of its last pose, shape (3, 3)."""
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes [bytes]."""
+        """Memory of the arrays [bytes]."""
         return sum(part.nbytes for part in self)
 
 
-def outline_of(submap: Submap) -> Outline:
-    """Return what is kept at hand of a submap."""
-    return Outline(submap.slots, submap.mean, submap.covariance[:3, :3].copy())
+def summarise(submap: Submap) -> SubmapSummary:
+    """Return the part of a submap that stays in memory."""
+    return SubmapSummary(submap.slots, submap.mean, submap.covariance[:3, :3].copy())
 
 
-class Placing:
-    """Guesses frames, and remembers the blocks that it joined.
+class FrameInitialisation:
+    """Initial frames, with a cache of joined blocks.
 
-    What it answers depends on its arguments alone, not on what it remembers.
+    The result depends only on the arguments, not on the cache.
     """
 
     def __init__(self) -> None:
         self._blocks: dict[tuple[int, int], Array] = {}
 
     def frames(
-        self, outlines: Sequence[Outline], known: Array, settle: Settle
+        self, summaries: Sequence[SubmapSummary], known: Array, refine: Refine
     ) -> Array:
-        """Return a guess of all frames in the world, shape (K + 1, 3).
+        """Return initial values of all frames in the world, shape (K + 1, 3).
 
         Parameters
         ----------
-        outlines : sequence of Outline
+        summaries : sequence of SubmapSummary
             The K closed submaps.
         known : ndarray, shape (J + 1, 3)
-            The first frames, which have been joined before; at least that of the start.
-        settle : callable
-            Improves the frames a to b of some submaps, given (a, b, frames).
+            Frames of an earlier join; at least the start.
+        refine : callable
+            Returns improved frames a to b, given (a, b, frames).
         """
         first = len(known) - 1
         frames, size = known, 1
-        while 2 * size <= len(outlines) - first:
+        while 2 * size <= len(summaries) - first:
             size *= 2
         begin = first
-        while begin < len(outlines):
-            while begin + size > len(outlines):
+        while begin < len(summaries):
+            while begin + size > len(summaries):
                 size //= 2
-            block = self._block(outlines, begin, begin + size, settle)
-            frames = _merged(outlines, begin - len(frames) + 1, frames, block)
+            block = self._block(summaries, begin, begin + size, refine)
+            frames = _merged(summaries, begin - len(frames) + 1, frames, block)
             begin += size
         return frames
 
     def _block(
-        self, outlines: Sequence[Outline], a: int, b: int, settle: Settle
+        self, summaries: Sequence[SubmapSummary], a: int, b: int, refine: Refine
     ) -> Array:
-        """Return the frames a to b as frame a sees them."""
+        """Return the frames a to b relative to frame a."""
         if (a, b) not in self._blocks:
-            if b - a <= FEW:
+            if b - a <= LARGEST_COMPOSED:
                 frames = [np.zeros(3)]
-                for outline in outlines[a:b]:
-                    frames.append(compose(frames[-1], outline.mean[:3])[0])
+                for summary in summaries[a:b]:
+                    frames.append(compose(frames[-1], summary.mean[:3])[0])
                 rough = np.array(frames)
             else:
                 middle = (a + b) // 2
-                left = self._block(outlines, a, middle, settle)
-                right = self._block(outlines, middle, b, settle)
-                rough = _merged(outlines, a, left, right)
+                left = self._block(summaries, a, middle, refine)
+                right = self._block(summaries, middle, b, refine)
+                rough = _merged(summaries, a, left, right)
                 del self._blocks[a, middle], self._blocks[middle, b]
-            self._blocks[a, b] = settle(a, b, rough)
+            self._blocks[a, b] = refine(a, b, rough)
         return self._blocks[a, b]
 
 
-def points_seen(outlines: Sequence[Outline], frames: Array, count: int) -> Array:
-    """Return the landmarks where the first submap that holds each has them.
+def points_seen(summaries: Sequence[SubmapSummary], frames: Array, count: int) -> Array:
+    """Return the landmarks at the positions of the first submap that holds each.
 
     Parameters
     ----------
-    outlines : sequence of Outline
+    summaries : sequence of SubmapSummary
     frames : ndarray, shape (K, 3) or more
         Of these submaps.
     count : int
-        Of slots.
+        Number of slots.
 
     Returns
     -------
     ndarray, shape (count, 2)
-        NaN where none holds it [m].
+        NaN for landmarks that no submap holds [m].
     """
     points = np.full((count, 2), np.nan)
-    for outline, frame in zip(reversed(outlines), frames[len(outlines) - 1 :: -1]):  # noqa: B905
-        mean = outline.mean
+    for summary, frame in zip(reversed(summaries), frames[len(summaries) - 1 :: -1]):  # noqa: B905
+        mean = summary.mean
         seen = complex(*frame[:2]) + np.exp(1j * frame[2]) * (
             mean[3::2] + 1j * mean[4::2]
         )
-        points[outline.slots] = seen.view(np.float64).reshape(-1, 2)
+        points[summary.slots] = seen.view(np.float64).reshape(-1, 2)
     return points
 
 
 def _merged(
-    outlines: Sequence[Outline], first: int, left: Array, right: Array
+    summaries: Sequence[SubmapSummary], first: int, left: Array, right: Array
 ) -> Array:
-    """Let the frames on the right follow those on the left, from submap ``first``."""
+    """Align the right frames with the left ones, which begin at submap ``first``."""
     middle = first + len(left) - 1
     start = left[-1]
     if middle > first:
-        before = outlines[first:middle]
-        after = outlines[middle : middle + len(right) - 1]
+        before = summaries[first:middle]
+        after = summaries[middle : middle + len(right) - 1]
         count = 1 + max(int(o.slots.max(initial=0)) for o in [*before, *after])
         goal = points_seen(before, left, count)
         seen = points_seen(after, right, count)
         common = np.flatnonzero(~np.isnan(goal[:, 0] + seen[:, 0]))
-        start = place(start, before[-1].spread, seen[common], goal[common])
+        start = align(start, before[-1].pose_covariance, seen[common], goal[common])
     moved = np.array([compose(start, frame)[0] for frame in right])
     return np.concatenate([left[:-1], moved])
 
 
-def place(start: Array, covariance: Array, seen: Array, landmarks: Array) -> Array:
-    """Place a block among landmarks by least squares.
+def align(start: Array, covariance: Array, seen: Array, landmarks: Array) -> Array:
+    """Align a frame with landmarks by least squares.
 
-    The frame is expected at ``start``, and sees the landmarks, each of which counts as
-    much as the position of the frame does.
+    Each landmark has the same weight as the expected position of the frame.
 
     Parameters
     ----------
     start, covariance : ndarray, shapes (3,) and (3, 3)
-        Where the frame is expected.
+        Expected frame.
     seen : ndarray, shape (n, 2)
-        Landmarks as the frame sees them [m].
+        Landmarks in the frame [m].
     landmarks : ndarray, shape (n, 2)
-        The same where they are [m].
+        The same landmarks in the world [m].
 
     Returns
     -------
@@ -168,10 +167,10 @@ def place(start: Array, covariance: Array, seen: Array, landmarks: Array) -> Arr
     Examples
     --------
     >>> seen = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 1.0]])
-    >>> place(np.zeros(3), np.diag([1.0, 1.0, 1e-9]), seen, seen + [0.0, 1.0]).round(2)
+    >>> align(np.zeros(3), np.diag([1.0, 1.0, 1e-9]), seen, seen + [0.0, 1.0]).round(2)
     array([0.  , 0.75, 0.  ])
     """
-    prior = np.linalg.inv(covariance + floor(covariance))
+    prior = np.linalg.inv(regularised(covariance))
     weight = 2 / max(covariance[0, 0] + covariance[1, 1], 1e-18)
     q, goal = seen[:, 0] + 1j * seen[:, 1], landmarks[:, 0] + 1j * landmarks[:, 1]
     pose = start.copy()

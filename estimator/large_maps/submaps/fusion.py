@@ -1,13 +1,14 @@
-"""Joining the present submap to the map of the closed ones, by zero differences.
+"""Fusion of the active submap with the joined map of the closed ones.
 
-A landmark known to both is at one place: its difference is measured to be zero,
-exactly.  With the frame F = (p, θ) of the present submap and a landmark l in the world,
-and c the same landmark in the submap::
+A landmark in both has one position, which is an exact measurement of zero difference.
+With the frame F = (p, θ) of the active submap and a landmark l in the world, and c the
+same landmark in the submap::
 
     0 = R(θ)ᵀ (l − p) − c
 
-In the coordinates ξ of :mod:`.error_frames` its derivative is R(θ)ᵀ (ξ_l − ξ_p) − δc:
-free of the heading, so that nothing is learnt about how the map as a whole is turned.
+In the coordinates ξ of :mod:`.error_frames` its derivative is R(θ)ᵀ (ξ_l − ξ_p) − δc.
+It does not depend on the heading, so the measurement gains no information about the
+orientation of the whole map.
 """
 
 import numpy as np
@@ -17,8 +18,8 @@ from scipy.linalg import block_diag, solve_triangular
 from ...error_frames import ErrorFrame, invariant_covariance
 from ...interface import Belief
 from ..sparse_cholesky.coordinates import pairs
-from .factor import compose, points_of, retract, state_of
-from .joining import Gaussian, times
+from .factor import compose, retract
+from .gaussian import Gaussian, points_of, state_of, times
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -27,25 +28,25 @@ Int = NDArray[np.int64]
 def fuse(
     world: Gaussian, local: Gaussian, frame: ErrorFrame, common: tuple[Int, Int]
 ) -> Gaussian:
-    """Join the present submap to the map.
+    """Fuse the active submap with the map.
 
     Parameters
     ----------
     world : Gaussian
-        The submap's frame, and the map's landmarks, in the world.
+        The submap's frame and the map's landmarks, in the world.
     local : Gaussian
-        The robot's pose and landmarks in the submap; its covariance is of the error in
-        ``frame``, unlike that of ``world``, which is of the additive one.
+        The robot's pose and landmarks in the submap.  Its covariance belongs to the
+        error in ``frame``, that of ``world`` to the additive error.
     frame : {"additive", "invariant"}
         Coordinates of the local error.
     common : tuple of two ndarrays
-        Places of the common landmarks in both.
+        Positions of the common landmarks in both.
 
     Returns
     -------
     Gaussian
-        The robot's pose in the world, the map's landmarks, then those landmarks of the
-        submap that the map did not hold.
+        The robot's pose in the world, the map's landmarks, then the landmarks that only
+        the submap holds.
     """
     mean, own = world.mean, local.mean
     prior = block_diag(invariant_covariance(mean, world.covariance), local.covariance)
@@ -69,15 +70,15 @@ def _root(S: Array) -> Array:
         return np.linalg.cholesky(S).astype(np.float64, copy=False)
     except np.linalg.LinAlgError:
         raise np.linalg.LinAlgError(
-            "the present submap cannot be joined to the map, the covariance of their "
-            "differences not being positive definite: measurement_std is degenerate"
+            "the active submap cannot be joined to the map, because the covariance of "
+            "their differences is not positive definite: measurement_std is degenerate"
         ) from None
 
 
 def _difference(
     mean: Array, own: Array, frame: ErrorFrame, common: tuple[Int, Int]
 ) -> tuple[Array, Array]:
-    """Differentiate the differences by (ξ, local error); minus their value."""
+    """Return the Jacobian by (ξ, local error), and the innovation."""
     count = len(common[0])
     out = np.exp(-1j * mean[2])
     inside = 3 + pairs(common[0])
@@ -98,7 +99,7 @@ def _difference(
 def _composed(
     mean: Array, own: Array, covariance: Array, frame: ErrorFrame, known: Int
 ) -> Gaussian:
-    """Return robot, map and new landmarks in the world, of the additive error."""
+    """Return robot, map and new landmarks in the world, with additive error."""
     fresh = np.setdiff1d(np.arange((len(own) - 3) // 2), known)
     pose, by_start, by_pose = compose(mean[:3], own[:3])
     seen = np.exp(1j * mean[2]) * points_of(own)[1 + fresh]
@@ -129,13 +130,13 @@ def part_of(map_: Gaussian, order: Int, wanted: Int, ids: tuple[int, ...]) -> Be
     Parameters
     ----------
     map_ : Gaussian
-        Of landmarks in n slots.
+        Of n landmarks.
     order : ndarray, shape (n,)
-        These slots.
+        Slots of these landmarks.
     wanted : ndarray, shape (v,)
-        Those of the landmarks wanted.
+        Slots of the wanted landmarks.
     ids : tuple of int
-        Of the same.
+        Identities of the wanted landmarks.
     """
     sorter = np.argsort(order)
     places = sorter[np.searchsorted(order, wanted, sorter=sorter)]

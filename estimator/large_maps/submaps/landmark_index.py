@@ -1,8 +1,8 @@
-"""Where each landmark stands in the whole map, and what becomes of one removed.
+"""Slot of each landmark in the whole map, and names of removed landmarks.
 
-A landmark that several submaps hold ties them together.  When it is removed that tie
-stays, as a *link*: it keeps its slot, and in the present submap a name that no landmark
-has; but no belief tells of it, and the same landmark seen again is a new one.
+A landmark that several submaps hold connects them.  If it is removed, it remains as a
+*link*: it keeps its slot and, in the active submap, has a name that no landmark can
+have.  No belief contains it, and the same landmark seen again is a new one.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,24 +15,24 @@ from ...support.argument_checks import LOWEST_ID, LandmarkIds, refuse_reserved
 Int = NDArray[np.int64]
 
 
-class Slots(Mapping[int, int]):
-    """The slot of each mapped landmark, in the order of the map; none is used twice.
+class LandmarkIndex(Mapping[int, int]):
+    """Slot of each mapped landmark, in the order of the map; slots are not reused.
 
     Parameters
     ----------
     slots : mapping
-        By landmark, in ascending order.
+        Slot by landmark, in ascending order.
     count : int
-        Of the slots that have been given so far.
+        Number of slots assigned so far.
 
     Examples
     --------
-    >>> slots = Slots()
-    >>> slots.add([7, 9])
-    >>> slots.remove(7)
+    >>> index = LandmarkIndex()
+    >>> index.add([7, 9])
+    >>> index.remove(7)
     0
-    >>> slots.add([7])
-    >>> dict(slots)
+    >>> index.add([7])
+    >>> dict(index)
     {9: 1, 7: 2}
     """
 
@@ -52,17 +52,17 @@ class Slots(Mapping[int, int]):
         return landmark_id in self._slots  # faster than that of Mapping
 
     def add(self, landmark_ids: Iterable[int]) -> None:
-        """Give new landmarks a slot each."""
+        """Assign a slot to each new landmark."""
         for i in landmark_ids:
             self._slots[i] = self.count
             self.count += 1
 
     def remove(self, landmark_id: int) -> int:
-        """Forget a landmark; return its slot, which stays taken."""
+        """Remove a landmark; return its slot, which is not used again."""
         return self._slots.pop(landmark_id)
 
-    def of(self, names: Sequence[int]) -> Int:
-        """Return the slots of landmarks, and of links by their names, shape (n,)."""
+    def slots_of(self, names: Sequence[int]) -> Int:
+        """Return the slots of landmarks and links by their names, shape (n,)."""
         slots = (self._slots.get(name) for name in names)
         known = [
             slot_of_link(name) if slot is None else slot
@@ -71,12 +71,12 @@ class Slots(Mapping[int, int]):
         return np.array(known, dtype=np.int64)
 
     def links(self, names: Iterable[int]) -> set[int]:
-        """Return those names in a submap that are of no landmark."""
+        """Return the names in a submap that are not landmarks."""
         return {name for name in names if name not in self._slots}
 
 
 def link_name(slot: int) -> int:
-    """Return the name of a removed landmark within the present submap.
+    """Return the name of a removed landmark in the active submap.
 
     Examples
     --------
@@ -87,12 +87,12 @@ def link_name(slot: int) -> int:
 
 
 def slot_of_link(name: int) -> int:
-    """Return the slot of a link by its name."""
+    """Return the slot of a link."""
     return name - LOWEST_ID
 
 
 def refuse_link_names(landmark_ids: LandmarkIds | None) -> None:
-    """Refuse identities as low as the names of links are."""
+    """Raise a ValueError for identities in the range of link names."""
     ids = np.asarray(() if landmark_ids is None else landmark_ids)
     if ids.dtype.kind == "i":
         refuse_reserved(ids.ravel().tolist())

@@ -1,8 +1,7 @@
-"""Two landmarks that are one, within a submap: a reading of distance zero.
+"""Merging of landmarks within a submap: a measurement of zero distance.
 
-A closed submap is never written again.  That two of its landmarks are one is worked
-into it whenever it is read, so that it depends on nothing but the submap and on which
-landmarks are one.
+A closed submap is never rewritten.  Landmarks are merged whenever the submap is read,
+so that the result depends only on the submap and on the list of merged landmarks.
 """
 
 from collections.abc import Mapping
@@ -19,28 +18,28 @@ Array = NDArray[np.float64]
 
 
 def merged(submap: Submap, renamed: Mapping[int, int], frame: ErrorFrame) -> Submap:
-    """Return a submap in which landmarks that are one stand in one slot.
+    """Return a submap with merged landmarks in one slot.
 
-    Where it holds both, it is conditioned on l_i = l_j.  In the coordinates of its
-    error that is linear, and H = [… I … −I …] whatever the frame::
+    If the submap holds both landmarks, it is conditioned on l_i = l_j.  This is linear
+    in the coordinates of its error, with H = [… I … −I …] in either frame::
 
         0 = l_i − l_j = R(t) (l̂_i − l̂_j) + V(t) (ξ_i − ξ_j)
 
-    with t the error of the heading, which the reading must not tell.
+    where t is the error of the heading, about which the measurement has no information.
 
     Parameters
     ----------
     submap : Submap
-        As it was closed.
+        As stored.
     renamed : mapping
-        Slots that are of no more use, and those which stand for them.
+        Slots of merged landmarks, and the slots that replace them.
     frame : {"additive", "invariant"}
         Coordinates of the submap's error.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where nothing can be said of the distance of two landmarks.
+        If the covariance of the distance of two landmarks is singular.
 
     Examples
     --------

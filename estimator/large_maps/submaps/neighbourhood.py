@@ -34,7 +34,7 @@ RECENT = 10
 """Scans that tell how far is looked when it is taken anew."""
 
 
-class Extent(NamedTuple):
+class Region(NamedTuple):
     """How far a vicinity reaches."""
 
     centre: Array
@@ -59,7 +59,7 @@ class Extent(NamedTuple):
         away = float(np.hypot(*(position - self.centre)))
         return away + within + self.slack <= self.radius
 
-    def chosen(self, points: Array) -> tuple[Int, Extent]:
+    def chosen(self, points: Array) -> tuple[Int, Region]:
         """Return which of some landmarks (n, 2) lie within, the nearest if many.
 
         Of many, also the extent that those have.
@@ -73,10 +73,10 @@ class Extent(NamedTuple):
         return np.sort(nearest), self._replace(farthest=farthest)
 
 
-Survey = Callable[[float], tuple[Belief, Extent]]
+Survey = Callable[[float], tuple[Belief, Region]]
 
 
-class Vicinity:
+class Neighbourhood:
     """A part of the joined map, which an ordinary filter carries on once it is asked.
 
     Before that, and after :meth:`forget`, it does nothing.
@@ -96,7 +96,7 @@ class Vicinity:
     def forget(self) -> None:
         """Start a new run."""
         self._slam: InvariantEkfSlam | None = None
-        self._extent = Extent(np.zeros(2), 0.0, 0.0)
+        self._region = Region(np.zeros(2), 0.0, 0.0)
         # The farthest that was asked for or read with each of the last scans, and
         # since then [m].
         self._reaches = RECENT * [0.0]
@@ -115,7 +115,7 @@ class Vicinity:
             How far from the robot to look at least [m].
         """
         slam = self._slam
-        if slam is None or not self._extent.covers(slam._mean[:2], within):
+        if slam is None or not self._region.covers(slam._mean[:2], within):
             slam = self._take(*self._survey(max(within, *self._reaches)))
         self._reaches[-1] = max(within, self._reaches[-1])
         return view_map(slam)
@@ -185,14 +185,14 @@ class Vicinity:
         """Return copies of everything, as arrays; nothing where nobody has looked."""
         if self._slam is None:
             return {}
-        extent = self._extent
+        extent = self._region
         numbers = [*extent.centre, extent.reach, extent.slack, extent.is_all]
         limits = np.array([*numbers, extent.farthest, *self._reaches])
         return self._slam.state_dict() | {"extent": limits}
 
-    def restored(self, state: Mapping[str, Any]) -> Vicinity:
+    def restored(self, state: Mapping[str, Any]) -> Neighbourhood:
         """Make another from what :meth:`state_dict` returned."""
-        other = Vicinity(self._make, self._survey)
+        other = Neighbourhood(self._make, self._survey)
         if state:
             argument_checks.refuse_other_state(state, ["extent"])
             limits = argument_checks.as_floats("state['extent']", state["extent"])
@@ -202,14 +202,14 @@ class Vicinity:
                 )
             x, y, reach, slack, is_all, farthest, *other._reaches = limits.tolist()
             centre = np.array([x, y])
-            other._extent = Extent(centre, reach, slack, bool(is_all), farthest)
+            other._region = Region(centre, reach, slack, bool(is_all), farthest)
             other._slam = self._make()
             other._slam.load_state_dict(
                 {k: v for k, v in state.items() if k != "extent"}
             )
         return other
 
-    def _take(self, belief: Belief, extent: Extent) -> InvariantEkfSlam:
+    def _take(self, belief: Belief, region: Region) -> InvariantEkfSlam:
         slam, P = self._make(), belief.covariance
         state = {
             "estimator": np.array(type(slam).__name__),
@@ -219,5 +219,5 @@ class Vicinity:
             "landmark_ids": np.array(belief.landmark_ids, dtype=np.int64),
         }
         slam.load_state_dict(state)
-        self._slam, self._extent = slam, extent
+        self._slam, self._region = slam, region
         return slam

@@ -1,4 +1,4 @@
-"""A run in submaps as arrays, to save and to continue from."""
+"""Conversion of a run in submaps to arrays, and checks of such arrays."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...support import argument_checks
-from .active_submap import PresentSubmap
+from .active_submap import ActiveSubmap
 from .chain import Chain
 from .closed_submaps import ClosedSubmaps
-from .frame_initialisation import outline_of
-from .graph import SubmapRun
-from .landmark_index import Slots, refuse_link_names, slot_of_link
+from .frame_initialisation import summarise
+from .graph import SubmapGraph
+from .landmark_index import LandmarkIndex, refuse_link_names, slot_of_link
 from .merging import merged
 from .store import FolderStore, MemoryStore, Submap, SubmapStore
 
@@ -27,34 +27,36 @@ SHAPES = {
 
 
 class SavedRun(NamedTuple):
-    """What a saved state holds."""
+    """Contents of a saved state."""
 
     local: dict[str, Any]
-    vicinity: dict[str, Any]
-    """Empty where nobody has looked around."""
-    slots: Slots
+    neighbourhood: dict[str, Any]
+    """Empty if ``local_view`` was never called."""
+    landmarks: LandmarkIndex
     chain: Chain
     closed: ClosedSubmaps
 
 
-def as_arrays(name: str, run: SubmapRun, vicinity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return copies of everything; submaps in a folder by their checksums."""
-    slots, closed, store = run.slots, run.closed, run.closed.store
-    local = run.present.filter.state_dict()
+def as_arrays(
+    name: str, graph: SubmapGraph, neighbourhood: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return copies of the whole state; submaps in a folder by their checksums."""
+    index, closed, store = graph.index, graph.closed, graph.closed.store
+    local = graph.active.filter.state_dict()
     renamed = np.array(list(closed.renamed.items()), dtype=np.int64)
     state: dict[str, Any] = {
         "estimator": np.array(name),
         "base": np.array(str(local["estimator"])),
-        "landmark_ids": np.array(list(slots), dtype=np.int64),
-        "slots": np.array(list(slots.values()), dtype=np.int64),
-        "slot_count": np.array(slots.count),
+        "landmark_ids": np.array(list(index), dtype=np.int64),
+        "slots": np.array(list(index.values()), dtype=np.int64),
+        "slot_count": np.array(index.count),
         "renamed": renamed.reshape(-1, 2),
         "submap_count": np.array(len(store)),
         "run": np.array(""),
     }
     state |= {f"local_{key}": value for key, value in local.items()}
-    state |= {f"vicinity_{key}": value for key, value in vicinity.items()}
-    state |= {f"chain_{key}": value for key, value in run.chain.state_dict().items()}
+    state |= {f"vicinity_{key}": value for key, value in neighbourhood.items()}
+    state |= {f"chain_{key}": value for key, value in graph.chain.state_dict().items()}
     if isinstance(store, FolderStore):
         digests = np.array(store.digests, dtype=np.int64)
         return state | {"run": np.array(store.run), "digests": digests}
@@ -67,46 +69,46 @@ def as_arrays(name: str, run: SubmapRun, vicinity: Mapping[str, Any]) -> dict[st
 def checked_state(
     state: Mapping[str, Any],
     name: str,
-    present: PresentSubmap,
+    active: ActiveSubmap,
     folder: FolderStore | None,
 ) -> SavedRun:
-    """Return what the state holds, or refuse it.
+    """Return the contents of a state that :func:`as_arrays` saved.
 
     Parameters
     ----------
     state : mapping
         From :func:`as_arrays`.
     name : str
-        Class of the estimator that is to continue.
-    present : PresentSubmap
-        Of that estimator, which is left as it is.
+        Class of the estimator that loads the state.
+    active : ActiveSubmap
+        Of that estimator; it is not changed.
     folder : FolderStore or None
-        Likewise its folder.
+        Of that estimator; it is not changed.
 
     Raises
     ------
     ValueError
-        Where something is missing or does not fit together.
+        If the state is incomplete or inconsistent.
     """
     entries = ["landmark_ids", "slots", "slot_count", "renamed", "submap_count", "run"]
     entries += ["local_estimator", *(f"chain_{key}" for key in SHAPES)]
-    base = type(present.filter).__name__
+    base = type(active.filter).__name__
     argument_checks.refuse_other_state(state, entries, estimator=name, base=base)
-    slots = _slots(state)
+    index = _index(state)
     count = int(state["submap_count"])
     chain = _chain(state, count)
     store = _store(state, count, folder)
-    pairs = _numbers(state, "renamed", slots.count).reshape(-1, 2)
+    pairs = _numbers(state, "renamed", index.count).reshape(-1, 2)
     renamed = dict(zip(*pairs.T.tolist(), strict=True))
-    outlines = []
+    summaries = []
     for k in range(count):
         submap = store.load(k)
-        _check(submap, k, slots.count)
-        outlines.append(outline_of(merged(submap, renamed, present.frame)))
-    closed = ClosedSubmaps(store, present.frame, renamed, outlines)
+        _check(submap, k, index.count)
+        summaries.append(summarise(merged(submap, renamed, active.frame)))
+    closed = ClosedSubmaps(store, active.frame, renamed, summaries)
     local = _part(state, "local_")
-    _check_names(local, slots, closed)
-    return SavedRun(local, _part(state, "vicinity_"), slots, chain, closed)
+    _check_names(local, index, closed)
+    return SavedRun(local, _part(state, "vicinity_"), index, chain, closed)
 
 
 def _part(state: Mapping[str, Any], start: str) -> dict[str, Any]:
@@ -120,8 +122,8 @@ def _numbers(state: Mapping[str, Any], key: str, limit: int) -> Int:
     return numbers
 
 
-def _slots(state: Mapping[str, Any]) -> Slots:
-    """Return who stands where in the map, in its order."""
+def _index(state: Mapping[str, Any]) -> LandmarkIndex:
+    """Return the landmarks of the map with their slots."""
     saved = np.asarray(state["landmark_ids"])
     ids = argument_checks.identities(saved, saved.size)
     refuse_link_names(ids)
@@ -132,13 +134,15 @@ def _slots(state: Mapping[str, Any]) -> Slots:
             f"state['slots'] must be {len(ids)} ascending numbers, one for each of "
             f"landmark_ids, got {slots.tolist()}"
         )
-    return Slots(dict(zip(ids, slots.tolist(), strict=True)), count)
+    return LandmarkIndex(dict(zip(ids, slots.tolist(), strict=True)), count)
 
 
-def _check_names(local: Mapping[str, Any], slots: Slots, closed: ClosedSubmaps) -> None:
-    """Refuse a present submap of landmarks that are not in the map."""
+def _check_names(
+    local: Mapping[str, Any], index: LandmarkIndex, closed: ClosedSubmaps
+) -> None:
+    """Raise a ValueError if the active submap holds landmarks not in the map."""
     names = np.asarray(local.get("landmark_ids", ())).ravel().tolist()
-    links = slots.links(names)
+    links = index.links(names)
     if unknown := {i for i in links if slot_of_link(i) not in closed.slots}:
         raise ValueError(
             f"state['local_landmark_ids'] must be in the map, got {min(unknown)}"
@@ -169,23 +173,34 @@ def _store(
 ) -> SubmapStore:
     run = str(state["run"])
     if run:
-        if folder is None:
-            raise ValueError(
-                f"state was saved with a folder of submaps (run {run}): make the "
-                "estimator with that folder"
-            )
-        digests = np.asarray(state.get("digests", ())).tolist()
-        if len(digests) != count:
-            raise ValueError(
-                f"state['digests'] must have {count} entries, got {len(digests)}"
-            )
-        return folder.continued(run, digests)
-    if folder is not None:
-        if count:
-            raise ValueError(
-                "state holds its submaps itself: make the estimator without folder"
-            )
-        return folder.continued("", [])
+        return _continued_folder(state, count, folder)
+    if folder is None:
+        return _memory_store(state, count)
+    if count:
+        raise ValueError(
+            "state holds its submaps itself: make the estimator without folder"
+        )
+    return folder.continued("", [])
+
+
+def _continued_folder(
+    state: Mapping[str, Any], count: int, folder: FolderStore | None
+) -> FolderStore:
+    run = str(state["run"])
+    if folder is None:
+        raise ValueError(
+            f"state was saved with a folder of submaps (run {run}): make the "
+            "estimator with that folder"
+        )
+    digests = np.asarray(state.get("digests", ())).tolist()
+    if len(digests) != count:
+        raise ValueError(
+            f"state['digests'] must have {count} entries, got {len(digests)}"
+        )
+    return folder.continued(run, digests)
+
+
+def _memory_store(state: Mapping[str, Any], count: int) -> MemoryStore:
     store = MemoryStore()
     for k in range(count):
         keys = [f"submap_{k}_{key}" for key in Submap._fields]

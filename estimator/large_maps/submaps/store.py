@@ -1,4 +1,4 @@
-"""Closed submaps: kept in memory, or in a folder with a few of them at hand."""
+"""Storage of closed submaps: in memory, or in a folder with a small cache."""
 
 import os
 import zlib
@@ -14,43 +14,43 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-AT_HAND = 8
-"""Submaps of a folder that are kept in memory."""
-MARK = "submaps.txt"
+CACHE_SIZE = 8
+"""Number of submaps of a folder that are kept in memory."""
+MARKER = "submaps.txt"
 FORMAT = "slamgym submaps 1"
 SUFFIX, PART = ".npy", ".part"
 
 
 class LostSubmapError(ValueError):
-    """A closed submap cannot be read any more."""
+    """A closed submap cannot be read."""
 
 
 class Submap(NamedTuple):
-    """What one closed submap says, in its own frame."""
+    """A closed submap in its own frame."""
 
     slots: Int
-    """Places of its landmarks in the whole map, shape (n,)."""
+    """Slots of its landmarks in the whole map, shape (n,)."""
     mean: Array
-    """Its last pose, where the next one begins, and its landmarks, shape (3 + 2n,)."""
+    """Last pose, where the next submap begins, and landmarks, shape (3 + 2n,)."""
     covariance: Array
-    """Of its error, in the coordinates of its filter, shape (3 + 2n, 3 + 2n)."""
+    """Covariance of the error in its filter's frame, shape (3 + 2n, 3 + 2n)."""
 
 
 class SubmapStore(Protocol):
-    """Where closed submaps are."""
+    """Storage of closed submaps."""
 
     def __len__(self) -> int: ...
 
     def append(self, submap: Submap) -> None:
-        """Keep one more."""
+        """Append a submap."""
 
     def load(self, index: int) -> Submap:
-        """Return one of them; its arrays are not to be written to."""
+        """Return a submap; its arrays must not be modified."""
         ...
 
     @property
     def nbytes(self) -> int:
-        """Memory that they take [bytes]."""
+        """Memory of the submaps [bytes]."""
         ...
 
 
@@ -64,34 +64,34 @@ class MemoryStore:
         return len(self._submaps)
 
     def append(self, submap: Submap) -> None:
-        """Keep one more."""
+        """Append a submap."""
         self._submaps.append(submap)
 
     def load(self, index: int) -> Submap:
-        """Return one of them."""
+        """Return a submap."""
         return self._submaps[index]
 
     @property
     def nbytes(self) -> int:
-        """Memory that they take [bytes]."""
+        """Memory of the submaps [bytes]."""
         return sum(part.nbytes for submap in self._submaps for part in submap)
 
 
 class FolderStore:
-    """Closed submaps of one run in a folder, a few of them at hand in memory.
+    """Closed submaps of one run in a folder, with a small cache in memory.
 
-    The file ``submaps.txt`` marks the folder and names the run; every submap is a file
-    of its own, of which the checksum is remembered.
+    The file ``submaps.txt`` marks the folder and names the run.  Each submap is one
+    file, whose checksum is stored in memory.
 
     Parameters
     ----------
     folder : str or path
-        A folder that is empty or does not exist yet, or that of an earlier run.
+        A folder that is empty, does not exist yet, or holds an earlier run.
 
     Raises
     ------
     ValueError
-        Where it is something else; nothing is written to it then.
+        If it is anything else; nothing is then written.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -100,7 +100,7 @@ class FolderStore:
         self.folder = Path(folder)
         self.run = ""
         self.digests: list[int] = []
-        self._at_hand: OrderedDict[int, Submap] = OrderedDict()
+        self._cache: OrderedDict[int, Submap] = OrderedDict()
         self._found_run()
 
     def __len__(self) -> int:
@@ -108,38 +108,40 @@ class FolderStore:
 
     @property
     def nbytes(self) -> int:
-        """Memory that those at hand take [bytes]."""
-        return sum(part.nbytes for submap in self._at_hand.values() for part in submap)
+        """Memory of the cached submaps [bytes]."""
+        return sum(part.nbytes for submap in self._cache.values() for part in submap)
 
     def claim(self) -> None:
-        """Mark the folder as that of a new run, or refuse where it holds another.
+        """Mark the folder as that of a new run.
 
         Raises
         ------
         ValueError
-            Where the folder holds submaps of another run.
+            If the folder holds submaps of another run.
         """
         if self.run:
             return
         self._refuse(self._found_run())
         self.folder.mkdir(parents=True, exist_ok=True)
         self.run = uuid4().hex
-        (self.folder / MARK).write_text(f"{FORMAT}\nrun {self.run}\n", encoding="utf-8")
+        (self.folder / MARKER).write_text(
+            f"{FORMAT}\nrun {self.run}\n", encoding="utf-8"
+        )
 
     def continued(self, run: str, digests: list[int]) -> "FolderStore":
-        """Return this folder as the one of a run to be continued.
+        """Return a store that continues a saved run in this folder.
 
         Parameters
         ----------
         run : str
-            The run that was saved; "" where that was before its first step.
+            The saved run; "" if it was saved before its first step.
         digests : list of int
-            Checksums of its submaps.
+            Checksums of the submaps.
 
         Raises
         ------
         ValueError
-            Where the folder is of another run, or lacks a submap.
+            If the folder holds another run.
         """
         store = FolderStore(self.folder)
         found = store._found_run()
@@ -156,36 +158,39 @@ class FolderStore:
         return store
 
     def clear(self) -> None:
-        """Forget the run, and delete its files."""
+        """Delete the files of the run."""
         if self.run and self._found_run() == self.run:
             for path in self.folder.glob("submap_[0-9]*"):
-                if path.suffix in (SUFFIX, PART):  # also later ones than are known
+                if path.suffix in (
+                    SUFFIX,
+                    PART,
+                ):  # including files newer than a loaded state
                     path.unlink()
-            (self.folder / MARK).unlink()
+            (self.folder / MARKER).unlink()
         self.run, self.digests = "", []
-        self._at_hand = OrderedDict()
+        self._cache = OrderedDict()
 
     def append(self, submap: Submap) -> None:
-        """Write one more submap."""
+        """Write a submap."""
         content = _written(submap)
         path = self._path(len(self))
         part = path.with_suffix(PART)
         part.write_bytes(content)
         part.replace(path)
-        self._keep(len(self), submap)
+        self._cache_submap(len(self), submap)
         self.digests.append(zlib.crc32(content))
 
     def load(self, index: int) -> Submap:
-        """Return a submap, read from its file where it is not at hand.
+        """Return a submap, from the cache or its file.
 
         Raises
         ------
         LostSubmapError
-            Where its file is missing, or is not the one written.
+            If its file is missing or does not match the checksum.
         """
-        if index in self._at_hand:
-            self._at_hand.move_to_end(index)
-            return self._at_hand[index]
+        if index in self._cache:
+            self._cache.move_to_end(index)
+            return self._cache[index]
         path = self._path(index)
         try:
             content = path.read_bytes()
@@ -196,13 +201,13 @@ class FolderStore:
                 f"{path} is damaged, or not the submap that was written"
             )
         submap = _read(content)
-        self._keep(index, submap)
+        self._cache_submap(index, submap)
         return submap
 
-    def _keep(self, index: int, submap: Submap) -> None:
-        self._at_hand[index] = submap
-        if len(self._at_hand) > AT_HAND:
-            self._at_hand.popitem(last=False)
+    def _cache_submap(self, index: int, submap: Submap) -> None:
+        self._cache[index] = submap
+        if len(self._cache) > CACHE_SIZE:
+            self._cache.popitem(last=False)
 
     def _path(self, index: int) -> Path:
         return self.folder / f"submap_{index:06}{SUFFIX}"
@@ -215,19 +220,19 @@ class FolderStore:
             )
 
     def _found_run(self) -> str:
-        """Return the run that the folder is of, "" where it is free."""
+        """Return the run of the folder; "" if the folder is free."""
         if not self.folder.exists():
             return ""
         if not self.folder.is_dir():
             raise ValueError(f"folder must be a folder, got the file {self.folder}")
         if not any(self.folder.iterdir()):
             return ""
-        mark = self.folder / MARK
+        mark = self.folder / MARKER
         lines = mark.read_text(encoding="utf-8").split("\n") if mark.is_file() else []
         if len(lines) < 2 or lines[0] != FORMAT or not lines[1].startswith("run "):
             raise ValueError(
                 f"folder must be empty or hold submaps, but {self.folder} holds other "
-                f"files and no {MARK} of {FORMAT!r}"
+                f"files and no {MARKER} of {FORMAT!r}"
             )
         return lines[1].removeprefix("run ")
 
