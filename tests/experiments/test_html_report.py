@@ -164,7 +164,7 @@ def test_whatever_names_and_messages_hold_is_shown_as_text():
     assert HOSTILE in map(html.unescape, drawn)
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_the_scenario_can_be_taken_from_the_page():
     page = page_of(typical())
     (text,) = re.findall(r"toml</summary>\n<pre[^>]*><code>(.*?)</code>", page, re.S)
@@ -196,7 +196,7 @@ def call_on(page, folder):
     return eval(ast.get_source_segment(code, last), names), code
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("_no_figures_in_reports")
 @pytest.mark.parametrize("changes", [{}, {"steps": 5}, {"name": "my_own"}])
 @pytest.mark.parametrize("assumed", [False, True])
 @pytest.mark.parametrize(
@@ -219,6 +219,7 @@ def test_the_call_on_the_page_makes_the_same_results(
     assert ("toml" in code) == (bool(changes) or assumed)
 
 
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_the_call_of_a_later_part_of_the_runs_makes_that_part(tmp_path):
     done = monte_carlo("six_landmarks", "ekf", 5, 4, block_size=2, first_run=2)
     again, _ = call_on(page_of(done), tmp_path)
