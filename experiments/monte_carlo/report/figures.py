@@ -1,4 +1,4 @@
-"""What many runs look like: NEES, headings, NIS and errors over time, per estimator."""
+"""Figures of many runs: NEES, heading, NIS and errors over time, per estimator."""
 
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ _MOST_DOTS, _FEW_DOTS = 300, 100
 
 
 class ReportFigure(NamedTuple):
-    """A figure and what to say of it."""
+    """A figure and its caption."""
 
     name: str
     title: str
@@ -46,12 +46,12 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> list[ReportF
     dataset : xarray.Dataset
         Results of ``monte_carlo``.
     summary : dict
-        Theirs, of ``summarise_monte_carlo``.
+        Their summary, of ``summarise_monte_carlo``.
 
     Returns
     -------
     list of ReportFigure
-        Without the estimators none of whose runs went well; empty if no run did.
+        Figures of the estimators with successful runs; empty if there is none.
     """
     frame: ErrorFrame = summary["frame"]
     each = [scores_of(dataset, label, frame) for label in labels_of(dataset)]
@@ -64,7 +64,7 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> list[ReportF
     return [
         ReportFigure(
             "nees",
-            "Do the covariances tell the truth?",
+            "Do the covariances agree with the errors?",
             f"NEES of the pose / 3, {frame} frame, averaged over {runs} runs: a "
             "consistent filter stays near 1, in the grey band at most steps (95 % on "
             f"average){_between(times)}.",
@@ -80,23 +80,23 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> list[ReportF
         ),
         ReportFigure(
             "heading",
-            "Does it know how well it knows its heading?",
+            "Does it know the uncertainty of its heading?",
             "The claimed deviation should follow the true error (root mean squares "
-            "over the runs). No reading tells the direction of the whole, so the "
+            "over the runs). No reading reveals the orientation of the map, so the "
             "heading cannot become better known than at the start: the dotted line.",
             heading_figure(shown, knowable),
         ),
         ReportFigure(
             "nis",
-            "Are the innovations as large as promised, and white?",
+            "Are the innovations as large as claimed, and white?",
             "NIS by its degrees of freedom, pooled over runs and neighbouring steps, "
-            "should stay near 1 and be uncorrelated. That is necessary, not enough: an "
-            "overconfident filter can pass.",
+            "should stay near 1 and be uncorrelated. This is necessary, but not "
+            "sufficient: an overconfident filter can pass.",
             nis_figure(shown),
         ),
         ReportFigure(
             "rmse",
-            "How far off is the position?",
+            "How large is the position error?",
             "Root mean square error of the position over the runs, raw: in the frame "
             "of the start, not aligned with the truth.",
             rmse_figure(shown),
@@ -210,7 +210,7 @@ def rmse_figure(shown: Shown) -> Figure:
 
 
 def grid_steps(summary: dict[str, Any]) -> int:
-    """Return how many steps are tested together, 0 where nothing was decided."""
+    """Return how many steps are tested together; 0 without tests."""
     decisions = [entry["decisions"] for entry in summary["estimators"].values()]
     return max((len(found["grid"]["steps"]) for found in decisions if found), default=0)
 
@@ -219,7 +219,7 @@ def _between(times: int) -> str:
     if not times:
         return ""
     marked = "the marked step" if times == 1 else f"all {times} marked steps"
-    return f" and between the thin lines at {marked} (filled: refused)"
+    return f" and between the thin lines at {marked} (filled: rejected)"
 
 
 def _steps(times: int) -> str:
@@ -229,7 +229,7 @@ def _steps(times: int) -> str:
 def _mark_grid(
     axes: Axes, decisions: dict[str, Any] | None, look: EstimatorLook
 ) -> None:
-    """Mark the steps that are tested, filled where refused."""
+    """Mark the tested steps, filled where rejected."""
     if decisions is None:
         return
     grid = decisions["grid"]
@@ -254,14 +254,14 @@ def _rms_over_runs(scores: EstimatorScores, name: str) -> Array:
 
 
 def _root_mean_square(values: Array) -> Array:
-    """Over runs; nan, which leaves a gap in a line, where it is beyond all numbers."""
+    """Return the RMS over runs; nan, a gap in a line, where it overflows."""
     with np.errstate(over="ignore"):
         square = (values**2).mean(axis=0)
     return np.sqrt(np.where(np.isfinite(square), square, np.nan))
 
 
 def _dots(values: Array) -> Array:
-    """Keep few runs as they are, and show many by their quantiles."""
+    """Return the values of few runs, or quantiles of many."""
     if len(values) <= _MOST_DOTS:
         return values
     return np.asarray(np.quantile(values, (np.arange(_MOST_DOTS) + 0.5) / _MOST_DOTS))
@@ -272,7 +272,7 @@ def _quantiles(runs: int) -> str:
 
 
 def _swarm(values: Array, edges: Array) -> tuple[Array, Array]:
-    """Stack dots of the same bin around the middle of their row."""
+    """Return x and height of dots, stacked per bin around the middle of their row."""
     bins = np.clip(np.searchsorted(edges, values, "right") - 1, 0, _BINS - 1)
     order = np.argsort(values, kind="stable")
     lift = np.zeros(len(values))

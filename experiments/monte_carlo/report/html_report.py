@@ -1,4 +1,4 @@
-"""The report of a Monte Carlo: one web page, no other file, no network."""
+"""Write the report of a Monte Carlo as one web page without other files or network."""
 
 import html
 import re
@@ -23,8 +23,8 @@ _OPEN_SIGN = "?"
 _NOTHING = "–"
 _OUTCOMES = {True: "accepted", False: "refused", None: _NOTHING}
 _INSIDE = {CONSISTENT: "yes", NOT_CONSISTENT: "no, outside"}
-_LARGE = 1e5  # three decimals would say nothing
-_FEW = 3  # estimators that a headline names one by one
+_LARGE = 1e5  # written without three decimals
+_FEW = 3  # estimators; a headline counts more of them
 _DECISIONS = {
     "final_step": "Final step, χ²",
     "time_average": "Time averages, t",
@@ -38,21 +38,23 @@ _DECISIONS = {
 def write_html_report(
     dataset: xr.Dataset, summary: dict[str, Any], path: str | Path
 ) -> None:
-    """Write the report, complete or not at all; the same results give the same bytes.
+    """Write the report, which appears complete or not at all.
+
+    The same results give the same bytes.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         Results of ``monte_carlo``.
     summary : dict
-        Theirs, of ``summarise_monte_carlo``.
+        Their summary, of ``summarise_monte_carlo``.
     path : str or Path
         The .html file; its folder must exist.
 
     Raises
     ------
     FileNotFoundError
-        When the folder does not exist.
+        If the folder does not exist.
     """
     page = html_report(dataset, summary)
     with replace_when_written(path) as partial:
@@ -69,7 +71,7 @@ def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         facts=escape(
             f"{summary['runs']} runs of {summary['steps']} steps, seed "
             f"{summary['seed']}; the same worlds and readings for all estimators; "
-            f"decisions in the {summary['frame']} error frame.{_told(summary)}"
+            f"decisions in the {summary['frame']} error frame.{_assumption(summary)}"
         ),
         verdicts="\n".join(_verdict(*item) for item in entries.items()),
         numbers=_numbers(summary),
@@ -81,7 +83,7 @@ def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
 
 
 def headline(summary: dict[str, Any]) -> str:
-    """Say in one line what came out.
+    """Write the verdicts in one line.
 
     Examples
     --------
@@ -100,7 +102,7 @@ def headline(summary: dict[str, Any]) -> str:
     return f"{summary['scenario']}: {said}"
 
 
-def _told(summary: dict[str, Any]) -> str:
+def _assumption(summary: dict[str, Any]) -> str:
     if summary["assumed_toml"] is None:
         return ""
     return " The estimators assume other noise than the world has."
@@ -150,7 +152,7 @@ def _numbers(summary: dict[str, Any]) -> str:
 
 
 def _breakable(label: str) -> str:
-    """Let a long name go on in the next line where it has joints."""
+    """Allow line breaks in a long name after its punctuation."""
     return re.sub(r"([_,:=])|(?=\[)", r"\1<wbr>", escape(label))
 
 
@@ -197,7 +199,7 @@ def _decision(title: str, decision: dict[str, Any]) -> str:
 
 
 def _interval(ends: Iterable[float | None]) -> str:
-    """Write an interval of numbers that cannot be below 0; a dash where unknown."""
+    """Write an interval of numbers >= 0; a dash where unknown."""
     known = [max(end, 0.0) for end in ends if end is not None]
     if len(known) < 2:
         return _NOTHING
@@ -277,7 +279,7 @@ def _described(label: str, entry: dict[str, Any]) -> str:
 
 
 def escape(text: str) -> str:
-    """Write a text as HTML that breaks no line before a % or inside an interval.
+    """Write a text as HTML without line breaks before a % or inside an interval.
 
     Examples
     --------
