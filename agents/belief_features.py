@@ -38,22 +38,27 @@ def belief_space(rows: int) -> spaces.Dict:
     >>> list(belief_space(6))[:3]
     ['belief_landmark_correlation', 'belief_landmark_map_std', 'belief_landmark_std']
     """
-    shapes = {
+    boxes: dict[str, spaces.Space[NDArray[np.float64]]] = {
+        key: spaces.Box(low, 1.0, shape, dtype=np.float64)
+        for key, (low, shape) in _ranges_and_shapes(rows).items()
+    }
+    yes_or_no: Any = np.bool_
+    boxes["belief_mask"] = spaces.Box(0, 1, (rows,), dtype=yes_or_no)
+    return spaces.Dict(boxes)
+
+
+def _ranges_and_shapes(rows: int) -> dict[str, tuple[float, tuple[int, ...]]]:
+    """Return the lower bound and the shape of every feature, in alphabetical order."""
+    return {
         "belief_landmark_correlation": (-1.0, (rows,)),
         "belief_landmark_map_std": (0.0, (rows,)),
         "belief_landmark_std": (0.0, (rows, 2)),
         "belief_landmarks": (-1.0, (rows, 2)),
+        "belief_mask": (0.0, (rows,)),
         "belief_pose": (-1.0, (4,)),
         "belief_pose_correlation": (-1.0, (3,)),
         "belief_pose_std": (0.0, (3,)),
     }
-    boxes: dict[str, spaces.Space[NDArray[np.float64]]] = {
-        key: spaces.Box(low, 1.0, shape, dtype=np.float64)
-        for key, (low, shape) in shapes.items()
-    }
-    yes_or_no: Any = np.bool_
-    mask = spaces.Box(0, 1, (rows,), dtype=yes_or_no)
-    return spaces.Dict({**boxes, "belief_mask": mask})
 
 
 def world_bounds(scenario: Scenario) -> Bounds:
@@ -120,14 +125,8 @@ def belief_features(
     """
     worlds, rows = beliefs.slots.shape
     features: dict[str, NDArray[Any]] = {
-        "belief_landmark_correlation": np.empty((worlds, rows)),
-        "belief_landmark_map_std": np.empty((worlds, rows)),
-        "belief_landmark_std": np.empty((worlds, rows, 2)),
-        "belief_landmarks": np.empty((worlds, rows, 2)),
-        "belief_mask": np.empty((worlds, rows), dtype=np.bool_),
-        "belief_pose": np.empty((worlds, 4)),
-        "belief_pose_correlation": np.empty((worlds, 3)),
-        "belief_pose_std": np.empty((worlds, 3)),
+        key: np.empty((worlds, *shape), np.bool_ if key == "belief_mask" else float)
+        for key, (_, shape) in _ranges_and_shapes(rows).items()
     }
     write_features(*beliefs, bounds, *features.values())
     return features

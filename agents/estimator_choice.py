@@ -182,14 +182,12 @@ def checked_belief(estimator: FollowingEstimator, step: int) -> BeliefOfMap:
             f"got {type(belief).__name__} without {missing[0]}"
         )
     arrays = {part: np.asarray(parts[part]) for part in _ARRAYS}
-    for part, array in arrays.items():
-        problem = _wrong_shape(part, array, len(belief.landmark_ids))
-        if problem:
-            raise TypeError(f"{name} must {problem} at step {step}")
-    for part, array in arrays.items():
-        problem = _wrong_number(part, array)
-        if problem:
-            raise ValueError(f"{name} must {problem} at step {step}")
+    shapes = partial(_wrong_shape, count=len(belief.landmark_ids))
+    for problem_of, error in ((shapes, TypeError), (_wrong_number, ValueError)):
+        for part, array in arrays.items():
+            problem = problem_of(part, array)
+            if problem:
+                raise error(f"{name} must {problem} at step {step}")
     checked: BeliefOfMap = belief
     return checked
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +28,8 @@ def clipped_action(action: ArrayLike, limits: Sequence[float]) -> tuple[float, f
     >>> clipped_action([3, -0.5], limits=(1.0, 1.0))
     (1.0, -0.5)
     """
-    speed, turn_rate = _two_numbers(action)
+    numbers = _real_numbers(action, (2,), partial(_refusal, action))
+    speed, turn_rate = numbers.tolist()
     fastest, quickest = limits
     if not (-fastest <= speed <= fastest and -quickest <= turn_rate <= quickest):
         if not (math.isfinite(speed) and math.isfinite(turn_rate)):
@@ -63,7 +66,8 @@ def clipped_actions(
         ...
     ValueError: every action must be 2 finite numbers (v [m/s], ω [rad/s]), got [2.0, nan] for world 1
     """  # noqa: E501 (an error of one line)
-    array = _checked_rows(actions, len(limits))
+    refusal = partial(_refusal_of_many, len(limits))
+    array = _real_numbers(actions, limits.shape, refusal).astype(np.float64)
     if moving is not None:
         array[~moving] = 0.0
     finite = np.isfinite(array)
@@ -76,36 +80,27 @@ def clipped_actions(
     return np.minimum(np.maximum(array, -limits), limits)
 
 
-def _two_numbers(action: ArrayLike) -> list[float]:
+def _real_numbers(
+    value: ArrayLike, shape: tuple[int, ...], refusal: Callable[[str], ValueError]
+) -> NDArray[Any]:
     try:
-        array = np.asarray(action)
+        array = np.asarray(value)
     except ValueError:  # ragged
-        raise _refusal(action) from None
-    if array.shape != (2,) or array.dtype.char not in _REAL_NUMBERS:
-        raise _refusal(action)
-    numbers: list[float] = array.tolist()
-    return numbers
-
-
-def _checked_rows(actions: ArrayLike, count: int) -> Array:
-    try:
-        array = np.asarray(actions)
-    except ValueError:  # ragged
-        raise _refusal_of_many(repr(actions), count) from None
-    if array.shape != (count, 2):
-        raise _refusal_of_many(f"shape {array.shape}", count)
+        raise refusal(repr(value)) from None
+    if array.shape != shape:
+        raise refusal(f"shape {array.shape}")
     if array.dtype.char not in _REAL_NUMBERS:
-        raise _refusal_of_many(f"{array.dtype}", count)
-    return array.astype(np.float64)
+        raise refusal(f"{array.dtype}")
+    return array
 
 
-def _refusal(action: ArrayLike) -> ValueError:
+def _refusal(action: ArrayLike, got: str = "") -> ValueError:
     return ValueError(
         f"action must be 2 finite numbers (v [m/s], ω [rad/s]), got {action!r}"
     )
 
 
-def _refusal_of_many(got: str, count: int) -> ValueError:
+def _refusal_of_many(count: int, got: str) -> ValueError:
     return ValueError(
         f"actions must be real numbers of shape ({count}, 2), one row "
         f"(v [m/s], ω [rad/s]) per world, got {got}"

@@ -5,7 +5,7 @@ are uniform between two ends. The number of landmarks never changes.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,15 @@ Factors = Annotated[
 Ends = Annotated[tuple[_Finite, _Finite], expect("2 finite numbers, low and high")]
 
 _FACTORS = ("motion_std", "measurement_std", "start_std", "map_scale")
+
+
+class Tables(Protocol):
+    """The tables of a scenario to which ranges apply."""
+
+    motion: Motion
+    sensor: Sensor
+    start: Start
+    landmarks: LandmarkLayout
 
 
 class Randomise(Part):
@@ -67,24 +76,20 @@ class Randomise(Part):
 
     def changes(
         self,
+        scenario: Tables,
         shares: Mapping[str, float],
         directions: Array,
-        *,
-        motion: Motion,
-        sensor: Sensor,
-        start: Start,
-        landmarks: LandmarkLayout,
     ) -> dict[str, Any]:
         """Compute the changes of a scenario for one point of the ranges.
 
         Parameters
         ----------
+        scenario : Scenario
+            The scenario with these ranges.
         shares : mapping of str to float
             u in [0, 1] for each of `RANGES`: 0 is the low end, 1 the high end.
         directions : ndarray, shape (N, 2)
             Shift of each landmark, in [-1, 1] per axis.
-        motion, sensor, start, landmarks
-            The tables of the scenario with these ranges.
 
         Returns
         -------
@@ -99,12 +104,15 @@ class Randomise(Part):
         scale, shift = drawn.get("map_scale", 1.0), self.landmark_shift
         changes: dict[str, Any] = {
             "randomise": None,
-            "motion": {"std": _times(motion.std, drawn.get("motion_std", 1.0))},
-            "sensor": _sensor_changes(sensor, drawn),
-            "start": _start_changes(start, drawn),
+            "motion": {
+                "std": _times(scenario.motion.std, drawn.get("motion_std", 1.0))
+            },
+            "sensor": _sensor_changes(scenario.sensor, drawn),
+            "start": _start_changes(scenario.start, drawn),
         }
         if scale != 1.0 or shift != 0.0:
-            changes["landmarks"] = _map_changes(landmarks, scale, shift * directions)
+            shifts = shift * directions
+            changes["landmarks"] = _map_changes(scenario.landmarks, scale, shifts)
         return changes
 
 

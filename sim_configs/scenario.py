@@ -133,16 +133,7 @@ class Scenario(Part):
     ) -> Self:
         """Return the scenario at one point of its ranges; see `Randomise.changes`."""
         assert self.randomise is not None
-        return self.with_changes(
-            **self.randomise.changes(
-                shares,
-                directions,
-                motion=self.motion,
-                sensor=self.sensor,
-                start=self.start,
-                landmarks=self.landmarks,
-            )
-        )
+        return self.with_changes(**self.randomise.changes(self, shares, directions))
 
     @classmethod
     def from_table(cls, table: Mapping[str, object]) -> Self:
