@@ -162,7 +162,7 @@ def test_a_heading_better_known_than_at_the_start_is_pointed_out():
         (0.6, 400, "not consistent", "it is too cautious"),
         (1.06, 2000, "nearly consistent", "certain but small"),
         (1.0, 3, "not shown", "more runs are needed"),
-        (0.6, 4, "not shown", "no decision refuses it (5 %), but the 90 % interval"),
+        (0.6, 4, "not shown", "no test rejects it (5 %), but the 90 % interval"),
     ],
 )
 def test_verdicts_on_white_nees(factor, runs, word, said):

@@ -21,7 +21,7 @@ _TEMPLATE = Path(__file__).with_name("html_report.html")
 _SIGNS = {CONSISTENT: "✓", NEARLY: "≈", NOT_CONSISTENT: "✗"}
 _OPEN_SIGN = "?"
 _NOTHING = "–"
-_OUTCOMES = {True: "accepted", False: "refused", None: _NOTHING}
+_OUTCOMES = {True: "accepted", False: "rejected", None: _NOTHING}
 _INSIDE = {CONSISTENT: "yes", NOT_CONSISTENT: "no, outside"}
 _LARGE = 1e5  # written without three decimals
 _FEW = 3  # estimators; a headline counts more of them
@@ -172,10 +172,10 @@ def _decisions(label: str, entry: dict[str, Any]) -> str:
 <div class="wide" role="region" aria-label="Decisions on {escape(label)}" tabindex="0">
 <table><thead><tr><th class="text" scope="col">decision</th><th scope="col">found</th>
 <th scope="col">accepted within</th><th scope="col">p</th><th scope="col">outcome</th>
-<th scope="col">refuses wrongly in</th></tr></thead>
+<th scope="col">rejects wrongly in</th></tr></thead>
 <tbody>{_lines(rows)}</tbody></table></div>
 <p class="note">Final step, time averages and grid share the error rate: together they
-refuse where one has p&nbsp;&lt;&nbsp;0.0167; the time averages only from
+reject where one has p&nbsp;&lt;&nbsp;0.0167; the time averages only from
 {FEW_AVERAGES}&nbsp;runs on, the bootstrap, their check, never. Equivalence: the
 90&nbsp;% interval of the ratio is {_interval(equivalence["interval"])}; inside
 {margin}: {inside} (claims

@@ -136,8 +136,8 @@ def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
         return Verdict(NOT_CONSISTENT, refusal + _outliers(report))
     if verdict.accepted:
         return Verdict(CONSISTENT, f"{_NOT_REFUSED}, and {interval}, {_inside()}")
-    if verdict.verdict == NOT_CONSISTENT:  # refuses in up to 10 %: not enough
-        kept = "no decision refuses it (5 %), but"
+    if verdict.verdict == NOT_CONSISTENT:  # rejects in up to 10 %: not enough
+        kept = "no test rejects it (5 %), but"
         lies = f"{interval}, lies outside {_MARGIN}"
     else:
         kept, lies = f"{_NOT_REFUSED}, but", f"{interval}, is not inside {_MARGIN}"
