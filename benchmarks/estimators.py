@@ -25,7 +25,8 @@ from rich.table import Table
 from second_core import two_processes
 
 from slamgym.estimator import EkfSlam, make_batch, make_estimator
-from slamgym.estimator.filters.ekf import workspace_for
+from slamgym.estimator.filters.gaussian_map import GaussianMap
+from slamgym.estimator.filters.scan_workspace import workspace_for
 from slamgym.estimator.kernels.belief_arrays import BeliefArrays, aligned_zeros
 from slamgym.estimator.kernels.predict import predict
 from slamgym.estimator.kernels.scan_rows import SLOT, new_ledger
@@ -69,7 +70,7 @@ def kernel_step(slam: EkfSlam, readings: NDArray[np.float64]) -> Callable[[], ob
     """One step by the compiled functions alone."""
     state = slam.state_dict()
     size = len(state["mean"])
-    capacity = EkfSlam.capacity_for(len(readings))
+    capacity = GaussianMap.capacity_for(len(readings))
     mean, reference = np.zeros(capacity), np.zeros(capacity)
     covariance = aligned_zeros(capacity, capacity)
     mean[:size], covariance[:size, :size] = state["mean"], state["covariance"]

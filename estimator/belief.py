@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from .models.angles import wrap_angle
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Belief:
     """A Gaussian belief over robot pose and map: a snapshot, safe to keep.
 
@@ -50,6 +50,33 @@ class Belief:
         mean.flags.writeable = covariance.flags.writeable = False
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "covariance", covariance)
+
+    @classmethod
+    def marginal(
+        cls,
+        mean: Array,
+        covariance: Array,
+        slots: Mapping[int, int],
+        landmark_ids: Sequence[int],
+        frame: ErrorFrame = "additive",
+    ) -> Belief:
+        """Return the belief over the pose and some landmarks of a larger state.
+
+        Parameters
+        ----------
+        mean, covariance : ndarray
+            The state; there may be room behind it.
+        slots : mapping from id to int
+            Place of each landmark in the state: column 3 + 2 slot.
+        landmark_ids : sequence of int
+            The landmarks of the belief, in its order.
+        frame : {"additive", "invariant"}
+            Coordinates in which the filter takes its error to be Gaussian.
+        """
+        firsts = [3 + 2 * slots[i] for i in landmark_ids]
+        columns = [0, 1, 2, *(first + axis for first in firsts for axis in (0, 1))]
+        P = covariance[np.ix_(columns, columns)]
+        return cls(mean[columns], P, tuple(landmark_ids), frame)
 
     @property
     def pose(self) -> Array:
@@ -109,6 +136,10 @@ class Belief:
             return invariant_covariance(self.mean, self.covariance)
         return self.covariance
 
+    def __repr__(self) -> str:
+        n = len(self.landmark_ids)
+        return f"Belief of {describe_map(n, self.pose, self.pose_covariance)}"
+
     def _chosen(self, frame: str | None) -> str:
         chosen = self.frame if frame is None else frame
         if chosen not in ("additive", "invariant"):
@@ -116,8 +147,22 @@ class Belief:
         return chosen
 
 
+def describe_map(landmarks: int, pose: Array, pose_covariance: Array) -> str:
+    """Return a pose with its standard deviations and a number of landmarks in words.
+
+    Examples
+    --------
+    >>> describe_map(6, np.array([1.0, 2.0, 0.5]), np.diag([0.01, 0.04, 0.0004]))
+    '6 landmarks, pose (1.000 ± 0.100 m, 2.000 ± 0.200 m, 0.500 ± 0.020 rad)'
+    """
+    std = np.sqrt(pose_covariance.diagonal().clip(0.0))
+    x, y, heading = (f"{p:.3f} ± {s:.3f}" for p, s in zip(pose, std, strict=True))
+    noun = "landmark" if landmarks == 1 else "landmarks"
+    return f"{landmarks} {noun}, pose ({x} m, {y} m, {heading} rad)"
+
+
 class MapView(NamedTuple):
-    """What a filter believes just now: to look at, not to keep or to change."""
+    """The present belief of a filter, without a copy: not to keep or to change."""
 
     mean: Array
     """In the order of the state; there may be room behind it."""
@@ -126,7 +171,7 @@ class MapView(NamedTuple):
     ids: Sequence[int]
     """Landmarks in the order of the state."""
     whole: Sequence[int] | None = None
-    """All landmarks in the map, where the view holds but those around the robot."""
+    """All landmarks in the map, where the view holds only those around the robot."""
 
     @property
     def mapped(self) -> Sequence[int]:

@@ -1,7 +1,10 @@
-"""The report of one update: innovations, NIS, and what became of each reading."""
+"""The report of one update: innovations, NIS, and the outcome of each reading."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +12,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class UpdateReport(NamedTuple):
-    """What one call of :meth:`SlamEstimator.update` did.
+@dataclass(frozen=True, eq=False, repr=False)
+class UpdateReport:
+    """What one call of :meth:`SlamEstimator.update` did: a snapshot, safe to keep.
 
     ``innovation`` rows belong to ``associated_ids``; ν and S are those at the prior.
     """
@@ -24,28 +28,30 @@ class UpdateReport(NamedTuple):
     added_ids: tuple[int, ...] = ()
     """Landmarks that entered the map."""
     rejected_ids: tuple[int, ...] = ()
-    """Mapped landmarks whose readings the chi-square gate refused."""
+    """Mapped landmarks whose readings the chi-square gate rejected."""
     skipped_ids: tuple[int, ...] = ()
-    """Readings too close to use (range below ``min_range``)."""
+    """Landmarks whose readings are too close to use (range below ``min_range``)."""
     near_ids: tuple[int, ...] = ()
     """Mapped landmarks within 10 σ of the robot, where linearising is unsafe."""
-    innovation: Array = np.empty((0, 2))
+    innovation: Array = field(default_factory=lambda: np.empty((0, 2)))
     """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
-    factor: Array | Callable[[], Array] = np.empty((0, 0))
-    """L, shape (2m, 2m), lower triangular, L Lᵀ = S; or a function that gives it."""
+    factor: Array | Callable[[], Array] = field(
+        default_factory=lambda: np.empty((0, 0))
+    )
+    """L, shape (2m, 2m), lower triangular, L Lᵀ = S; or a function that returns it."""
     confirmed_ids: tuple[int, ...] = ()
-    """Of those added: tentative before, seen often enough now."""
+    """Landmarks among ``added_ids`` that were tentative before."""
     removed_ids: tuple[int, ...] = ()
     """Landmarks marginalised: missed too often, or beyond the map's capacity."""
     merged_ids: tuple[tuple[int, int], ...] = ()
-    """Pairs (kept, gone) of landmarks found to be one."""
+    """Pairs (kept, gone) of landmarks that were merged."""
     row_ids: tuple[int | None, ...] = ()
-    """For each row of the scan the landmark that it was taken for, if any; empty where
-    nothing was associated."""
+    """The landmark associated with each row of the scan, None for a row without one;
+    empty without landmark management."""
     tentative_rows: tuple[int, ...] = ()
-    """Rows of the scan that speak for a landmark not yet confirmed."""
+    """Rows of the scan associated with a landmark that is not confirmed yet."""
     ambiguous_rows: tuple[int, ...] = ()
-    """Rows left out: of more than one landmark perhaps, or too close to tell."""
+    """Rows left out: they fit more than one landmark, or are too close to tell."""
 
     @property
     def innovation_factor(self) -> Array:
@@ -57,3 +63,40 @@ class UpdateReport(NamedTuple):
         """S, shape (2m, 2m), of the innovations in the order β1, r1, β2, r2."""
         factor = self.innovation_factor
         return factor @ factor.T
+
+    def replace(self, **changes: Any) -> UpdateReport:
+        """Return a report with some parts changed.
+
+        Examples
+        --------
+        >>> UpdateReport(nis=1.5, degrees_of_freedom=2).replace(added_ids=(7,))
+        UpdateReport: NIS 1.5 of 2 degrees of freedom, 1 added
+        """
+        parts = {name: getattr(self, name) for name in _PARTS}
+        return UpdateReport(**parts | changes)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, UpdateReport):
+            return NotImplemented
+        return np.array_equal(self.innovation_factor, other.innovation_factor) and all(
+            np.array_equal(getattr(self, name), getattr(other, name))
+            if name == "innovation"
+            else getattr(self, name) == getattr(other, name)
+            for name in _PARTS
+            if name != "factor"
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        counts = {
+            name.partition("_")[0]: len(getattr(self, name))
+            for name in _PARTS
+            if name.endswith(("_ids", "_rows")) and name != "row_ids"
+        }
+        parts = [f"{count} {name}" for name, count in counts.items() if count]
+        nis = f"NIS {self.nis:.3g} of {self.degrees_of_freedom} degrees of freedom"
+        return f"UpdateReport: {', '.join([nis, *parts])}"
+
+
+_PARTS = tuple(part.name for part in fields(UpdateReport))

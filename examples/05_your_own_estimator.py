@@ -87,7 +87,7 @@ class TextbookEkf:
         report = self._correct(known) if known else UpdateReport()
         for i, row in new.items():
             self._add(i, row)
-        return report._replace(added_ids=tuple(new))
+        return report.replace(added_ids=tuple(new))
 
     def _correct(self, readings: dict[int, Array]) -> UpdateReport:
         """Correct: x ← x + K ν,  P ← P − K S Kᵀ,  K = P Hᵀ S⁻¹,  S = H P Hᵀ + Q."""

@@ -16,7 +16,9 @@ from ..models.angles import wrap_angle
 from ..support import argument_checks
 from ..support.threads import share_out, usable_cores
 from .batch_results import BatchBeliefs, BatchStorage, BatchTrace
-from .ekf import FRAMES, EkfSlam, workspace_for
+from .ekf import FRAMES, EkfSlam
+from .gaussian_map import GaussianMap
+from .scan_workspace import workspace_for
 
 Array = NDArray[np.float64]
 
@@ -85,7 +87,7 @@ class BatchSlam:
             "initial_pose_std", initial_pose_std, 3
         )
         first = self._first_poses("initial_poses", initial_poses)
-        capacity = EkfSlam.capacity_for(self.landmarks)
+        capacity = GaussianMap.capacity_for(self.landmarks)
         self._means = np.zeros((self.runs, capacity))
         self._references = np.zeros((self.runs, capacity))
         self._covariances = aligned_zeros(self.runs, capacity, capacity)

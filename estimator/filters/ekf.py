@@ -1,36 +1,28 @@
 """EKF-SLAM: the standard filter, on the shared kernels."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from functools import partial
-from itertools import compress
-from math import isfinite, log1p
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..belief import Belief, MapView, describe_map
 from ..error_frames import ErrorFrame
-from ..interface import Belief, UpdateReport
-from ..kernels.belief_arrays import aligned_zeros
-from ..kernels.covariance_update import BLOCK
 from ..kernels.predict import predict
 from ..kernels.rules import ADDITIVE, AT_ESTIMATE, INVARIANT, Rules
-from ..kernels.scan_record import record
-from ..kernels.scan_rows import (
-    ADDED,
-    GATED,
-    OUTCOME,
-    SKIPPED,
-    SLOT,
-    USED,
-    Workspace,
-    new_ledger,
-    new_workspace,
-)
+from ..kernels.scan_rows import SLOT
 from ..kernels.scan_update import DONE, NOT_USABLE, update_belief
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
-from ..support.memory_limit import covariance_bytes, landmarks_that_fit
+from ..support.memory_limit import covariance_bytes
+from ..update_report import UpdateReport
+from .filter_settings import checked_rules
+from .gaussian_map import GaussianMap
+from .motion_noise import MotionNoise
+from .scan_report import ScanReport
+from .scan_workspace import ScanWorkspace, covariances_for
 
 Array = NDArray[np.float64]
 
@@ -106,6 +98,13 @@ class EkfSlam:
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
 
+    map: GaussianMap
+    """The belief, in the arrays that steps change."""
+    rules: Rules
+    """What distinguishes this filter's updates from another's."""
+    rule_values: Array
+    """The rules as the kernels take them."""
+
     def __init__(
         self,
         motion_std: ArrayLike,
@@ -120,31 +119,18 @@ class EkfSlam:
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
     ) -> None:
-        motion = argument_checks.standard_deviations("motion_std", motion_std, 3)
-        sensor = argument_checks.standard_deviations(
-            "measurement_std", measurement_std, 2
-        )
-        self._motion_variance = motion**2
-        self._noise_at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
+        self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest)
+        self.map = GaussianMap()
         self._adopt(
-            Rules(
+            checked_rules(
+                measurement_std,
                 linearisation=self._linearisation,
                 frame=self._frame,
-                correlated=argument_checks.one_of(
-                    "landmark_init", landmark_init, ("full", "independent")
-                )
-                == "full",
-                bearing_std=float(sensor[0]),
-                range_std=float(sensor[1]),
-                range_std_per_metre=argument_checks.at_least(
-                    "range_std_per_metre", range_std_per_metre, 0.0
-                ),
-                min_range=argument_checks.above("min_range", min_range, 0.0),
-                gate=_gate(gate_probability),
-                noise_as_read=argument_checks.one_of(
-                    "range_noise_at", range_noise_at, ("expected", "reading")
-                )
-                == "reading",
+                landmark_init=landmark_init,
+                range_std_per_metre=range_std_per_metre,
+                range_noise_at=range_noise_at,
+                gate_probability=gate_probability,
+                min_range=min_range,
             )
         )
         self.reset(initial_pose, initial_pose_std)
@@ -161,11 +147,7 @@ class EkfSlam:
         """
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
-        self._slots: dict[int, int] = {}
-        self._size = 3
-        self._allocate(landmarks=8)
-        self._mean[:3] = self._reference[:3] = first
-        self._covariance[:3, :3] = np.diag(std**2)
+        self.map.reset(first, np.diag(std**2))
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading.
@@ -179,24 +161,9 @@ class EkfSlam:
             dt, and dt = 0 adds none.
         """
         distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._motion_variance_of(distance, turn, dt)
-        predict(
-            self._mean,
-            self._covariance,
-            self._reference,
-            self._size,
-            distance,
-            turn,
-            variance,
-            self._rules.linearisation,
-        )
-
-    def _motion_variance_of(self, distance: float, turn: float, dt: float) -> Array:
-        if not (isfinite(dt) and dt >= 0):
-            raise ValueError(f"dt must be a finite number >= 0, got {dt!r}")
-        if not (self._noise_at_rest or distance or turn):
-            return self._motion_variance * 0.0
-        return self._motion_variance if dt == 1.0 else self._motion_variance * dt
+        variance = self._motion_noise.over(distance, turn, dt)
+        where = self.rules.linearisation
+        predict(*self.map.arrays, self.map.size, distance, turn, variance, where)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -228,45 +195,79 @@ class EkfSlam:
         """
         readings = argument_checks.scan(measurements)
         count = len(readings)
-        ids = self._identities(landmark_ids, count)
-        self._make_room(count)
-        slots = self._slots
-        self._ledger[SLOT, :count] = [slots.get(i, -1) for i in ids]
-        status, used, nis = update_belief(
-            self._mean,
-            self._covariance,
-            self._reference,
-            self._size,
+        ids = argument_checks.given_identities(landmark_ids, count, self)
+        slots = self.map.slots_of(ids)
+        self._make_room(count, slots.count(-1))
+        ledger = self._workspace.ledger
+        ledger[SLOT, :count] = slots
+        status, used, nis = update_belief(  # screen, correct, add new landmarks
+            *self.map.arrays,
+            self.map.size,
             readings,
             count,
-            self._ledger,
-            *self._workspace,
-            self._rule_values,
+            ledger,
+            *self._workspace.arrays,
+            self.rule_values,
         )
         if status != DONE:
             self._refuse(status, readings, ids)
-        return self._report(ids, used, nis)
+        found = self._workspace.record(used, count)
+        report = ScanReport(nis, ids, found, sequential=self.rules.sequential)
+        if used < count:
+            self.map.add(report.added_ids)
+        return report
 
-    def belief(self) -> Belief:
-        """Return the belief as a snapshot that later steps leave alone."""
-        n = self._size
-        return Belief(
-            self._mean[:n],
-            self._covariance[:n, :n],
-            tuple(self._slots),
-            FRAMES[self._frame],
-        )
+    def remove(self, landmark_ids: LandmarkIds) -> None:
+        """Marginalise landmarks; the belief about all else keeps its last bit.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map; nothing is then removed.
+        """
+        self.map.remove(argument_checks.mapped_identities(landmark_ids, self.map.slots))
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Condition on two mapped landmarks being one, and remove the second.
+
+        Raises
+        ------
+        ValueError
+            Where one is not in the map, or they are the same.
+        numpy.linalg.LinAlgError
+            Where their distance has no uncertainty; nothing is then merged.
+        """
+        argument_checks.two_landmarks(kept, gone)
+        argument_checks.mapped_identities([kept, gone], self.map.slots)
+        at_reference = self.rules.linearisation != AT_ESTIMATE
+        self.map.merge(kept, gone, frame=FRAMES[self._frame], at_reference=at_reference)
+
+    def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
+        """Return the belief as a snapshot, of the whole map or of a part of it.
+
+        Parameters
+        ----------
+        landmark_ids : sequence of int, optional
+            Return the marginal of the pose and these landmarks only, in this order.
+        """
+        if landmark_ids is not None:
+            landmark_ids = argument_checks.mapped_identities(
+                landmark_ids, self.map.slots
+            )
+        return self.map.belief(FRAMES[self._frame], landmark_ids)
+
+    def map_view(self) -> MapView:
+        """Return pose and map without a copy; it is valid until the next step."""
+        return self.map.view()
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return tuple(self.map.slots)
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of mean, covariance, ids and linearisation points."""
-        n = self._size
-        return {
-            "estimator": np.array(type(self).__name__),
-            "mean": self._mean[:n].copy(),
-            "covariance": self._covariance[:n, :n].copy(),
-            "reference": self._reference[:n].copy(),
-            "landmark_ids": np.array(list(self._slots), dtype=np.int64),
-        }
+        return {"estimator": np.array(type(self).__name__), **self.map.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit in a filter of the same settings.
@@ -282,156 +283,48 @@ class EkfSlam:
             Where the state lacks an entry, is of another estimator, or does not fit
             together; the belief is then as before.
         """
-        mean, covariance, reference, ids = _checked_state(state, type(self).__name__)
-        self._allocate(max(8, len(ids)))
-        self._slots = {i: slot for slot, i in enumerate(ids)}
-        self._size = len(mean)
-        self._mean[: len(mean)] = mean
-        self._reference[: len(mean)] = reference
-        self._covariance[: len(mean), : len(mean)] = covariance
+        entries = ("covariance", "landmark_ids", "mean", "reference")
+        argument_checks.refuse_other_state(
+            state, entries, estimator=type(self).__name__
+        )
+        self.map.load_state_dict(state)
 
     def memory_for(self, landmarks: int) -> int:
         """Return what a map of so many landmarks takes at least [bytes]."""
-        return self._covariances * covariance_bytes(landmarks)
-
-    @property
-    def rules(self) -> Rules:
-        """What distinguishes this filter's updates from another's."""
-        return self._rules
-
-    @property
-    def rule_values(self) -> Array:
-        """The rules as the kernels take them."""
-        return self._rule_values
+        return self.map.copies * covariance_bytes(landmarks)
 
     @property
     def motion_values(self) -> Array:
         """(σx², σy², σα²) per step, and 1 where a robot at rest has noise too."""
-        return np.append(self._motion_variance, float(self._noise_at_rest))
+        return np.append(*self._motion_noise)
 
-    @staticmethod
-    def capacity_for(landmarks: int) -> int:
-        """Length of a mean with room for so many landmarks, as the kernels need it."""
-        return (3 + 2 * landmarks) // 4 * 4 + 4
-
-    @property
-    def _covariances(self) -> int:
-        """How many of the size of P an update fills: P, and copies to go back to."""
-        iterated = self._rules.iterations > 1
-        return 1 + iterated + (iterated or self._rules.sequential)
+    def __repr__(self) -> str:
+        pose = self.belief([])
+        found = describe_map(len(self.landmark_ids), pose.pose, pose.covariance)
+        return f"{type(self).__name__} of {found}"
 
     def _adopt(self, rules: Rules) -> None:
-        self._rules = rules
-        self._rule_values = np.array(rules)
-        self._scan_room = 0  # the rules say what a workspace holds
+        self.rules = rules
+        self.rule_values = np.array(rules)
+        self._workspace = ScanWorkspace(rules)
+        self.map.copies = covariances_for(rules)
 
-    def _allocate(self, landmarks: int, more: int = 0) -> None:
-        """Make room for landmarks, and for more to come as far as memory allows."""
-        fitting = landmarks_that_fit(landmarks, landmarks + more, self._covariances)
-        capacity = self.capacity_for(fitting)
-        self._covariance = aligned_zeros(capacity, capacity)  # it may raise: first
-        self._mean = np.zeros(capacity)
-        self._reference = np.zeros(capacity)
-        self._scan_room = 0
+    def _make_room(self, readings: int, new: int) -> None:
+        """Grow the arrays where a scan with so many new landmarks overflows them."""
+        self.map.make_room(new)
+        self._workspace.make_room(readings, self.map.capacity)
 
-    def _make_room(self, readings: int) -> None:
-        """Grow the arrays where a scan could overflow them."""
-        n = self._size
-        if n + 2 * readings >= len(self._mean):
-            mean, covariance, reference = self._mean, self._covariance, self._reference
-            self._allocate(len(self._slots) + readings, more=len(self._slots))
-            self._mean[:n], self._reference[:n] = mean[:n], reference[:n]
-            self._covariance[:n, :n] = covariance[:n, :n]
-        if readings >= self._scan_room:
-            room = 8 + 2 * readings
-            self._workspace = workspace_for(self._rules, room, len(self._mean))
-            self._ledger = new_ledger(room)
-            self._scan_room = room
-
-    def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
-        return argument_checks.given_identities(landmark_ids, count, self)
-
-    def _refuse(self, status: int, readings: Array, ids: list[int]) -> None:
-        """Raise the error of an update that did not go through."""
+    def _refuse(self, status: int, readings: Array, ids: list[int]) -> NoReturn:
+        """Raise the error of an update that failed."""
         if status == NOT_USABLE:
             argument_checks.refuse_unusable(readings, ids)
-        outcomes = self._ledger[OUTCOME, : len(ids)]
-        row = np.flatnonzero(outcomes == USED)[status]
-        raise not_positive_definite(ids[row])
-
-    def _report(self, ids: list[int], used: int, nis: float) -> UpdateReport:
-        _, outcomes, near, _ = self._ledger[:, : len(ids)].tolist()
-        found = record(self._workspace.rows, self._ledger, used, self._rules)
-        having: dict[int, tuple[int, ...]] = {USED: tuple(ids)}
-        if used < len(ids):
-            having = {
-                chosen: tuple(compress(ids, [one == chosen for one in outcomes]))
-                for chosen in (USED, ADDED, GATED, SKIPPED)
-            }
-            for i in having[ADDED]:
-                self._slots[i] = len(self._slots)
-            self._size = 3 + 2 * len(self._slots)
-        return UpdateReport(
-            nis,
-            2 * used,
-            having[USED],
-            having.get(ADDED, ()),
-            having.get(GATED, ()),
-            having.get(SKIPPED, ()),
-            tuple(compress(ids, near)) if any(near) else (),
-            found.innovation,
-            partial(found.joint_factor, sequential=self._rules.sequential),
-        )
-
-
-def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
-    """Allocate what updates by these rules need, with so many readings at most."""
-    repeated = rules.iterations > 1 or rules.sequential
-    return new_workspace(
-        readings,
-        capacity,
-        iterated=rules.iterations > 1,
-        spoilable=repeated or readings > BLOCK,
-    )
+        failed = self._workspace.failed_reading(status, len(ids))
+        raise not_positive_definite(ids[failed])
 
 
 def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:
-    """Make the error of an innovation covariance that cannot be solved."""
+    """Return the error of an innovation covariance that cannot be factored."""
     return np.linalg.LinAlgError(
         "the innovation covariance is not positive definite at the reading of "
         f"landmark {landmark_id}: the belief or measurement_std is degenerate"
     )
-
-
-def _gate(probability: float | None) -> float:
-    """χ²(2) quantile of the gate."""
-    if probability is None:
-        return np.inf
-    if not (isinstance(probability, float) and 0 < probability < 1):
-        raise ValueError(
-            f"gate_probability must lie between 0 and 1, got {probability!r}"
-        )
-    return -2 * log1p(-probability)  # P(χ²₂ > g) = e^{−g/2}
-
-
-def _checked_state(
-    state: Mapping[str, Any], name: str
-) -> tuple[Array, Array, Array, list[int]]:
-    entries = ("covariance", "landmark_ids", "mean", "reference")
-    argument_checks.refuse_other_state(state, entries, estimator=name)
-    saved = np.asarray(state["landmark_ids"])
-    ids = argument_checks.identities(saved, saved.size)
-    size = 3 + 2 * len(ids)
-    mean = argument_checks.finite_vector("state['mean']", state["mean"], size)
-    reference = argument_checks.finite_vector(
-        "state['reference']", state["reference"], size
-    )
-    covariance = argument_checks.as_floats("state['covariance']", state["covariance"])
-    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
-        raise ValueError(
-            f"state['covariance'] must be finite with shape ({size}, {size}), "
-            f"got shape {covariance.shape}"
-        )
-    if not np.array_equal(covariance, covariance.T):
-        raise ValueError("state['covariance'] must be symmetric")
-    return mean, covariance, reference, ids

@@ -37,18 +37,18 @@ class IdealEkfSlam(EkfSlam):
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, the door for the truth closed."""
         super().reset(pose, pose_std)
-        self._adopt(self._rules._replace(linearisation=AT_ESTIMATE))
+        self._adopt(self.rules._replace(linearisation=AT_ESTIMATE))
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the state, and whether the truth has been told."""
-        told = self._rules.linearisation == AT_TRUTH
+        told = self.rules.linearisation == AT_TRUTH
         return {**super().state_dict(), "at_truth": np.array(told)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state; the truth of each step must be told again."""
         super().load_state_dict(state)
         where = AT_TRUTH if state.get("at_truth", False) else AT_ESTIMATE
-        self._adopt(self._rules._replace(linearisation=where))
+        self._adopt(self.rules._replace(linearisation=where))
 
     @staticmethod
     def _check_told(ids: Iterable[int], told: Mapping[int, Array]) -> None:
@@ -76,26 +76,27 @@ class IdealEkfSlam(EkfSlam):
             i: argument_checks.finite_vector(f"landmarks[{i}]", xy, 2)
             for i, xy in landmarks.items()
         }
-        self._check_told(self._slots, told)
+        self._check_told(self.map.slots, told)
         self._true_landmarks = told
-        if self._rules.linearisation != AT_TRUTH:
-            self._adopt(self._rules._replace(linearisation=AT_TRUTH))
-            self._reference[:3] = truth
-        for i, slot in self._slots.items():
-            self._reference[3 + 2 * slot : 5 + 2 * slot] = self._true_landmarks[i]
+        if self.rules.linearisation != AT_TRUTH:
+            self._adopt(self.rules._replace(linearisation=AT_TRUTH))
+            self.map.reference[:3] = truth
+        for i, slot in self.map.slots.items():
+            self.map.reference[3 + 2 * slot : 5 + 2 * slot] = self._true_landmarks[i]
         self._true_pose = truth
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], the covariance along the true way."""
-        if self._rules.linearisation != AT_TRUTH:
+        if self.rules.linearisation != AT_TRUTH:
             super().predict(odometry, dt)
             return
         distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._motion_variance_of(distance, turn, dt)
-        cos, sin = np.cos(self._mean[2]), np.sin(self._mean[2])
-        self._mean[:3] += distance * cos, distance * sin, turn
-        n, heading = self._size, self._reference[2]
-        dx, dy = self._true_pose[:2] - self._reference[:2]
+        variance = self._motion_noise.over(distance, turn, dt)
+        mean, covariance, reference = self.map.arrays
+        cos, sin = np.cos(mean[2]), np.sin(mean[2])
+        mean[:3] += distance * cos, distance * sin, turn
+        n, heading = self.map.size, reference[2]
+        dx, dy = self._true_pose[:2] - reference[:2]
         G = np.eye(n)
         G[:2, 2] = -dy, dx
         F = np.eye(3)
@@ -103,22 +104,22 @@ class IdealEkfSlam(EkfSlam):
             [np.cos(heading), -np.sin(heading)],
             [np.sin(heading), np.cos(heading)],
         ]
-        moved = G @ self._covariance[:n, :n] @ G.T
+        moved = G @ covariance[:n, :n] @ G.T
         moved[:3, :3] += F @ np.diag(variance) @ F.T
-        self._covariance[:n, :n] = (moved + moved.T) / 2
-        self._reference[:3] = self._true_pose
+        covariance[:n, :n] = (moved + moved.T) / 2
+        reference[:3] = self._true_pose
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct the belief with one scan, linearised at the truth."""
-        if self._rules.linearisation == AT_TRUTH and landmark_ids is not None:
+        if self.rules.linearisation == AT_TRUTH and landmark_ids is not None:
             readings = argument_checks.scan(measurements)
-            self._make_room(len(readings))
+            self._make_room(len(readings), len(readings))
             self._check_told(landmark_ids, self._true_landmarks)
-            column = self._size
+            column = self.map.size
             for i, distance in zip(landmark_ids, readings[:, 1], strict=False):
-                if i not in self._slots and distance >= self._rules.min_range:
-                    self._reference[column : column + 2] = self._true_landmarks[i]
+                if i not in self.map.slots and distance >= self.rules.min_range:
+                    self.map.reference[column : column + 2] = self._true_landmarks[i]
                     column += 2
         return super().update(measurements, landmark_ids)

@@ -68,7 +68,7 @@ class InvariantEkfSlam(EkfSlam):
         **settings: Any,
     ) -> None:
         super().__init__(motion_std, measurement_std, **settings)
-        rules = self._rules._replace(
+        rules = self.rules._replace(
             iterations=argument_checks.whole("iterations", iterations, 1),
             sequential=argument_checks.flag("sequential", sequential),
         )

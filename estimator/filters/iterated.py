@@ -49,4 +49,4 @@ class IteratedEkfSlam(EkfSlam):
     ) -> None:
         super().__init__(motion_std, measurement_std, **settings)
         count = argument_checks.whole("iterations", iterations, 1)
-        self._adopt(self._rules._replace(iterations=count))
+        self._adopt(self.rules._replace(iterations=count))

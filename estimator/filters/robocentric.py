@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..interface import Belief, UpdateReport
+from ..belief import Belief, MapView
+from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.jit import jit, njit_internal
+from ..update_report import UpdateReport
 from .ekf import EkfSlam
 
 Array = NDArray[np.float64]
@@ -47,23 +49,25 @@ class RobocentricEkfSlam(EkfSlam):
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map at a pose (3,) known to (3,)."""
         super().reset(pose, pose_std)
-        first, variance = self._mean[:3].copy(), np.diag(self._covariance)[:3].copy()
-        self._mean[:3] = self._covariance[:3, :3] = 0.0
-        self._slots = {i: slot for slot, i in enumerate(RESERVED)}
-        self._size = FIRST_LANDMARK
+        mean, covariance = self.map.mean, self.map.covariance
+        first, variance = mean[:3].copy(), covariance.diagonal()[:3].copy()
+        mean[:3] = covariance[:3, :3] = 0.0
+        self.map.add(RESERVED)
         origin, jacobian = _inverse_pose(first)
-        self._mean[ORIGIN : HEADING + 1] = origin
-        self._covariance[ORIGIN : HEADING + 1, ORIGIN : HEADING + 1] = (
-            jacobian @ np.diag(variance) @ jacobian.T
-        )
+        world = slice(ORIGIN, HEADING + 1)
+        mean[world] = origin
+        covariance[world, world] = jacobian @ np.diag(variance) @ jacobian.T
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct map and way with one scan, then move the frame to the robot."""
+        given = () if landmark_ids is None else landmark_ids
+        if not set(RESERVED).isdisjoint(np.ravel(given).tolist()):
+            raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
         report = super().update(measurements, landmark_ids)
         if np.size(measurements):
-            move_frame(self._mean, self._covariance, self._size)
+            move_frame(self.map.mean, self.map.covariance, self.map.size)
         return report
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -73,19 +77,27 @@ class RobocentricEkfSlam(EkfSlam):
             raise ValueError("state must begin with the world's origin, got landmarks")
         super().load_state_dict(state)
 
-    def _identities(self, landmark_ids: LandmarkIds | None, count: int) -> list[int]:
-        ids = super()._identities(landmark_ids, count)
-        if not set(RESERVED).isdisjoint(ids):
-            raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
-        return ids
+    def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
+        """Return the belief in the world's frame, as :meth:`EkfSlam.belief`."""
+        n, ids = self.map.size, self.landmark_ids
+        mean, jacobian = _in_world(self.map.mean[:n])
+        moved = jacobian @ self.map.covariance[:n, :n] @ jacobian.T
+        whole = Belief(mean, (moved + moved.T) / 2, ids)
+        if landmark_ids is None:
+            return whole
+        slots = {i: slot for slot, i in enumerate(ids)}
+        chosen = argument_checks.mapped_identities(landmark_ids, slots)
+        return Belief.marginal(whole.mean, whole.covariance, slots, chosen)
 
-    def belief(self) -> Belief:
-        """Return the belief in the world's frame."""
-        ids = tuple(self._slots)[len(RESERVED) :]
-        mean, jacobian = _in_world(self._mean[: self._size])
-        covariance = self._covariance[: self._size, : self._size]
-        moved = jacobian @ covariance @ jacobian.T
-        return Belief(mean, (moved + moved.T) / 2, ids)
+    def map_view(self) -> MapView:
+        """Return pose and map in the world's frame; a copy."""
+        whole = self.belief()
+        return MapView(whole.mean, whole.covariance, whole.landmark_ids)
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return tuple(self.map.slots)[len(RESERVED) :]
 
 
 @jit

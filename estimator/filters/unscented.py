@@ -36,13 +36,13 @@ class UnscentedSlam(EkfSlam):
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], through the cubature points."""
         distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._motion_variance_of(distance, turn, dt)
-        n = self._size
+        variance = self._motion_noise.over(distance, turn, dt)
+        n, mean, P = self.map.size, self.map.mean, self.map.covariance
         root = np.zeros((n + 3, n + 3))
-        root[:n, :n] = _square_root(self._covariance[:n, :n])
+        root[:n, :n] = _square_root(P[:n, :n])
         root[n:, n:] = np.diag(np.sqrt(variance))
         deviations = np.sqrt(n + 3) * np.concatenate([root, -root], axis=1)
-        x, y, heading = self._mean[:3, None] + deviations[:3]
+        x, y, heading = mean[:3, None] + deviations[:3]
         along, across = distance + deviations[n], deviations[n + 1]
         cos, sin = np.cos(heading), np.sin(heading)
         poses = np.stack(
@@ -52,28 +52,28 @@ class UnscentedSlam(EkfSlam):
                 heading + turn + deviations[n + 2],
             ]
         )
-        self._mean[:3] = poses.mean(axis=1)
-        moved = poses - self._mean[:3, None]
+        mean[:3] = poses.mean(axis=1)
+        moved = poses - mean[:3, None]
         share = deviations.shape[1]
-        self._covariance[:3, :3] = moved @ moved.T / share
-        self._covariance[:3, 3:n] = moved @ deviations[3:n].T / share
-        self._covariance[3:n, :3] = self._covariance[:3, 3:n].T
+        P[:3, :3] = moved @ moved.T / share
+        P[:3, 3:n] = moved @ deviations[3:n].T / share
+        P[3:n, :3] = P[:3, 3:n].T
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct the belief with one scan, then map the landmarks seen first."""
         readings = argument_checks.scan(measurements)
-        ids = self._identities(landmark_ids, len(readings))
+        ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
         usable = np.array(
             [
-                min(reading[1], self._expected_range(i)) >= self._rules.min_range
+                min(reading[1], self._expected_range(i)) >= self.rules.min_range
                 for i, reading in zip(ids, readings, strict=True)
             ],
             dtype=bool,
         )
-        mapped = np.array([i in self._slots for i in ids], dtype=bool)
+        mapped = np.array([i in self.map.slots for i in ids], dtype=bool)
         known, skipped = mapped & usable, mapped & ~usable
         corrected = UpdateReport()
         if known.any():
@@ -82,14 +82,14 @@ class UnscentedSlam(EkfSlam):
             )
         others = list(compress(ids, ~mapped))
         added = super().update(readings[~mapped], others)
-        return corrected._replace(
+        return corrected.replace(
             added_ids=added.added_ids,
             skipped_ids=(*compress(ids, skipped), *added.skipped_ids),
         )
 
     def _expected_range(self, landmark_id: int) -> float:
         """Range at which the belief expects a landmark [m]; infinite for a new one."""
-        if landmark_id not in self._slots:
+        if landmark_id not in self.map.slots:
             return np.inf
         return float(np.linalg.norm(self._place(landmark_id)[0]))
 
@@ -98,26 +98,26 @@ class UnscentedSlam(EkfSlam):
 
         In the robot's frame, but for its heading: e_l − e_p − J δ e_θ.
         """
-        c = 3 + 2 * self._slots[landmark_id]
-        dx, dy = self._mean[c : c + 2] - self._mean[:2]
+        c = 3 + 2 * self.map.slots[landmark_id]
+        dx, dy = self.map.mean[c : c + 2] - self.map.mean[:2]
         own = [0, 1, 2, c, c + 1]
         H = np.array([[-1, 0, dy, 1, 0], [0, -1, -dx, 0, 1]])
-        return np.array([dx, dy]), H @ self._covariance[np.ix_(own, own)] @ H.T
+        return np.array([dx, dy]), H @ self.map.covariance[np.ix_(own, own)] @ H.T
 
     def _is_near(self, landmark_id: int) -> bool:
         offset, covariance = self._place(landmark_id)
         return bool(offset @ offset < 100 * np.linalg.eigvalsh(covariance)[-1])
 
     def _correct(self, readings: Array, ids: list[int]) -> UpdateReport:
-        n = self._size
+        n = self.map.size
         near = {i for i in ids if self._is_near(i)}
-        columns = 3 + 2 * np.array([self._slots[i] for i in ids])
-        root = _square_root(self._covariance[:n, :n])
+        columns = 3 + 2 * np.array([self.map.slots[i] for i in ids])
+        root = _square_root(self.map.covariance[:n, :n])
         deviations = np.sqrt(n) * np.concatenate([root, -root], axis=1)
-        expected, spread = _through_sensor(self._mean[:n], deviations, columns)
+        expected, spread = _through_sensor(self.map.mean[:n], deviations, columns)
         innovation = readings - expected
         innovation[:, 0] = wrap_angle(innovation[:, 0])
-        at = readings if self._rules.noise_as_read else expected
+        at = readings if self.rules.noise_as_read else expected
         noise = self._noise_variances(at[:, 1])
         kept = self._within_gate(innovation, spread, noise)
         rows = np.repeat(kept, 2)
@@ -127,8 +127,8 @@ class UnscentedSlam(EkfSlam):
         cross = spread @ deviations.T / spread.shape[1]
         gains = np.linalg.solve(factor, cross)
         white = np.linalg.solve(factor, nu)
-        self._mean[:n] += gains.T @ white
-        self._covariance[:n, :n] -= gains.T @ gains
+        self.map.mean[:n] += gains.T @ white
+        self.map.covariance[:n, :n] -= gains.T @ gains
         return UpdateReport(
             nis=float(white @ white),
             degrees_of_freedom=len(nu),
@@ -141,7 +141,7 @@ class UnscentedSlam(EkfSlam):
 
     def _noise_variances(self, ranges: Array) -> Array:
         """Diagonal of Q at these ranges [m], shape (m, 2)."""
-        rules = self._rules
+        rules = self.rules
         range_std = rules.range_std + rules.range_std_per_metre * ranges
         bearing_std = np.full(len(ranges), rules.bearing_std)
         std: Array = np.stack([bearing_std, range_std], axis=1)
@@ -150,13 +150,13 @@ class UnscentedSlam(EkfSlam):
     def _within_gate(
         self, innovation: Array, spread: Array, noise: Array
     ) -> NDArray[np.bool_]:
-        if not np.isfinite(self._rules.gate):
+        if not np.isfinite(self.rules.gate):
             return np.ones(len(innovation), dtype=bool)
         pairs = spread.reshape(len(innovation), 2, -1)
         own = pairs @ pairs.transpose(0, 2, 1) / pairs.shape[2]
         own += noise[:, :, None] * np.eye(2)
         weighted = np.linalg.solve(own, innovation[..., None])[..., 0]
-        return np.asarray((innovation * weighted).sum(axis=1) <= self._rules.gate)
+        return np.asarray((innovation * weighted).sum(axis=1) <= self.rules.gate)
 
 
 def _through_sensor(

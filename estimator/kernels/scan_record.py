@@ -1,18 +1,16 @@
-"""What a report keeps of a scan: the rows that its update has left."""
+"""What a report keeps of a scan: copies of the rows and the ledger of its update."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from .belief_arrays import Array, Int
-from .rules import Rules
 from .scan_rows import (
     COLUMN,
     INNOVATION,
     JACOBIAN,
     META_WIDTH,
     ROOT,
-    prior_system,
 )
 
 
@@ -20,7 +18,7 @@ class ScanRecord(NamedTuple):
     """The stacked system of one scan, copied out of the workspace."""
 
     rows: Array  # (2m, at least 3 + 2m + META_WIDTH)
-    columns: Int  # (m,) first column of each reading's landmark in these rows
+    ledger: Int  # (LEDGER_HEIGHT, readings), its columns counted in these rows
 
     @property
     def innovation(self) -> Array:
@@ -37,7 +35,7 @@ class ScanRecord(NamedTuple):
         H = rows[:, JACOBIAN : JACOBIAN + 5]
         factor = np.zeros((count, count))
         if not sequential:
-            columns = np.repeat(self.columns, 2)
+            columns = np.repeat(self.ledger[COLUMN, : count // 2], 2)
             every = np.arange(count)
             pose = H[:, :3] @ rows[:, :3].T
             x = H[every, 3, None] * rows[:, columns].T
@@ -48,17 +46,28 @@ class ScanRecord(NamedTuple):
         return factor
 
 
-def record(rows: Array, ledger: Int, used: int, rules: Rules) -> ScanRecord:
+def record(rows: Array, ledger: Int, used: int, first: int) -> ScanRecord:
     """Copy what a report needs of a scan out of its rows and its ledger.
 
     Where the map is much larger than the scan, the copy has only the columns of the
     pose and of the landmarks read.
+
+    Parameters
+    ----------
+    rows : ndarray
+        Of the workspace.
+    ledger : ndarray of int64
+        One column for each reading of the scan.
+    used : int
+        Number of readings in use.
+    first : int
+        Row at which the system linearised at the prior begins.
     """
-    first = prior_system(len(rows), rules.iterations)
-    found = rows[first : first + 2 * used]
-    columns = ledger[COLUMN, :used]
+    found, kept = rows[first : first + 2 * used], ledger.copy()
     if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
-        return ScanRecord(found.copy(), columns.copy())
+        return ScanRecord(found.copy(), kept)
+    columns = ledger[COLUMN, :used]
     landmarks = np.stack([columns, columns + 1], axis=1).ravel()
     chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-META_WIDTH, 0)])
-    return ScanRecord(found[:, chosen], 3 + 2 * np.arange(used))
+    kept[COLUMN, :used] = 3 + 2 * np.arange(used)
+    return ScanRecord(found[:, chosen], kept)

@@ -165,7 +165,7 @@ class ManagedSlam:
         self._candidates = plan.candidates
         tidied = self._tidied(readings, plan, missed, report)
         confirmed = set(plan.confirmed)
-        return tidied._replace(
+        return tidied.replace(
             confirmed_ids=tuple(i for i in report.added_ids if i in confirmed),
             row_ids=tuple(plan.row_ids),
             tentative_rows=tuple(plan.tentative_rows),
@@ -287,7 +287,7 @@ class ManagedSlam:
         removed = self._pruning.remove_missing(missed)
         merged = self._pruning.merge(seen)
         removed += self._pruning.keep_capacity(seen)
-        return report._replace(removed_ids=tuple(removed), merged_ids=tuple(merged))
+        return report.replace(removed_ids=tuple(removed), merged_ids=tuple(merged))
 
 
 def _named(name: str, part: Mapping[str, Any]) -> dict[str, Any]:

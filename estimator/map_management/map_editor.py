@@ -22,7 +22,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..filters.ekf import FRAMES, EkfSlam
 from ..filters.marginalise_and_merge import coincide, without_landmarks
 from ..interface import (
     MapView,
@@ -31,8 +30,7 @@ from ..interface import (
     SupportsMerging,
     SupportsRemoval,
 )
-from ..kernels.rules import AT_ESTIMATE
-from .map_view import keeps_own_arrays, view_map
+from .map_view import hides_its_belief, view_map
 
 Array = NDArray[np.float64]
 
@@ -68,11 +66,11 @@ def edit_map(slam: SlamEstimator, *, merging: bool = True) -> MapEditor:
     TypeError
         Where the filter has neither these methods nor a state that can be edited.
     """
-    if keeps_own_arrays(slam):
-        return _ArrayEditor(slam)
-    if isinstance(slam, SupportsRemoval) and (
-        not merging or isinstance(slam, SupportsMerging)
-    ):
+    can_remove, can_merge = (
+        isinstance(slam, ability) and not hides_its_belief(slam)
+        for ability in (SupportsRemoval, SupportsMerging)
+    )
+    if can_remove and (can_merge or not merging):
         return _MethodEditor(slam)
     missing = {"mean", "covariance", "landmark_ids"} - set(slam.state_dict())
     if missing:
@@ -114,39 +112,6 @@ class CachedEditor:
         """Condition on two landmarks being one, and remove the second."""
         self.expire()
         self._editor.merge(kept, gone)
-
-
-class _ArrayEditor:
-    """In place, in the arrays of the standard filter."""
-
-    def __init__(self, slam: EkfSlam) -> None:
-        self._slam = slam
-
-    def map_view(self, within: float = 0.0) -> MapView:
-        return view_map(self._slam)
-
-    def remove(self, ids: Sequence[int]) -> None:
-        slam, n = self._slam, self._slam._size
-        slots = [slam._slots[i] for i in ids]
-        for array in (slam._mean, slam._reference):
-            _refill(array, without_landmarks(array[:n], slots))
-        _refill(slam._covariance, without_landmarks(slam._covariance[:n, :n], slots))
-        left = [i for i in slam._slots if i not in set(ids)]
-        slam._slots = {i: slot for slot, i in enumerate(left)}
-        slam._size = 3 + 2 * len(left)
-
-    def merge(self, kept: int, gone: int) -> None:
-        slam, n = self._slam, self._slam._size
-        at_estimate = slam.rules.linearisation == AT_ESTIMATE
-        slam._mean[:n], slam._covariance[:n, :n] = coincide(
-            slam._mean[:n],
-            slam._covariance[:n, :n],
-            slam._slots[kept],
-            slam._slots[gone],
-            frame=FRAMES[slam._frame],
-            reference=None if at_estimate else slam._reference[:n],
-        )
-        self.remove([gone])
 
 
 class _MethodEditor:
@@ -198,9 +163,3 @@ class _StateEditor:
             state[key] = without_landmarks(np.asarray(state[key]), slots)
         state["landmark_ids"] = np.delete(np.asarray(state["landmark_ids"]), slots)
         self._slam.load_state_dict(state)
-
-
-def _refill(array: Array, content: Array) -> None:
-    """Put a smaller array into a larger one, zeros behind it."""
-    array[...] = 0.0
-    array[tuple(slice(size) for size in content.shape)] = content

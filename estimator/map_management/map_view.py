@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
-from typing import TypeGuard
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
 
 from ..error_frames import ErrorFrame
-from ..filters.ekf import FRAMES, EkfSlam
+from ..filters.ekf import EkfSlam
 from ..interface import (
     Belief,
     MapView,
@@ -20,14 +16,10 @@ from ..interface import (
     SupportsMapView,
 )
 
-Array = NDArray[np.float64]
-
 
 def view_map(slam: SlamEstimator) -> MapView:
     """Return a view of the whole map of a filter, without a copy where possible."""
-    if keeps_own_arrays(slam):
-        return MapView(slam._mean, slam._covariance, list(slam._slots))
-    if isinstance(slam, SupportsMapView):
+    if isinstance(slam, SupportsMapView) and not hides_its_belief(slam):
         return slam.map_view()
     belief = slam.belief()
     return MapView(belief.mean, belief.covariance, belief.landmark_ids)
@@ -35,9 +27,7 @@ def view_map(slam: SlamEstimator) -> MapView:
 
 def mapped_ids(slam: SlamEstimator) -> tuple[int, ...]:
     """Return the landmarks in the map of a filter, in the order of its belief."""
-    if keeps_own_arrays(slam):
-        return tuple(slam._slots)
-    if isinstance(slam, SupportsLandmarkIds):
+    if isinstance(slam, SupportsLandmarkIds) and not hides_its_belief(slam):
         return tuple(slam.landmark_ids)
     return slam.belief().landmark_ids
 
@@ -52,15 +42,13 @@ def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     >>> marginal(slam, [6]).landmarks
     array([[3., 0.]])
     """
-    if keeps_own_arrays(slam):
-        order, frame = slam._slots, FRAMES[slam._frame]
-        return _part(slam._mean, slam._covariance, order, ids, frame)
+    if isinstance(slam, EkfSlam) and not hides_its_belief(slam):
+        return slam.belief(ids)
     if "landmark_ids" in inspect.signature(slam.belief).parameters:
         belief: Belief = slam.belief(landmark_ids=ids)  # type: ignore[call-arg]
         return belief
     whole = slam.belief()
-    order = {i: slot for slot, i in enumerate(whole.landmark_ids)}
-    return _part(whole.mean, whole.covariance, order, ids, whole.frame)
+    return _part(whole, whole.landmark_ids, ids, whole.frame)
 
 
 def marginal_without_joining(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
@@ -74,25 +62,22 @@ def marginal_without_joining(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     view = slam.local_view(0.0)
     if not set(ids) <= set(view.ids):
         return marginal(slam, ids)
-    order = {i: slot for slot, i in enumerate(view.ids)}
-    return _part(view.mean, view.covariance, order, ids, "invariant")
+    return _part(view, view.ids, ids, "invariant")
 
 
-def keeps_own_arrays(slam: object) -> TypeGuard[EkfSlam]:
-    """Return whether a filter believes what the arrays of :class:`EkfSlam` hold.
+def hides_its_belief(slam: object) -> bool:
+    """Return whether a subclass of :class:`EkfSlam` keeps its belief elsewhere.
 
-    A subclass with a belief of its own may keep it elsewhere.
+    Then only ``belief()`` and the saved state are valid, not the map it inherits.
     """
-    return isinstance(slam, EkfSlam) and type(slam).belief is EkfSlam.belief
+    if not isinstance(slam, EkfSlam):
+        return False
+    kind = type(slam)
+    return kind.belief is not EkfSlam.belief and kind.map_view is EkfSlam.map_view
 
 
 def _part(
-    mean: Array,
-    covariance: Array,
-    order: Mapping[int, int],
-    ids: Sequence[int],
-    frame: ErrorFrame,
+    whole: Belief | MapView, order: Sequence[int], ids: Sequence[int], frame: ErrorFrame
 ) -> Belief:
-    columns = [0, 1, 2, *(3 + 2 * order[i] + axis for i in ids for axis in (0, 1))]
-    P = covariance[np.ix_(columns, columns)]
-    return Belief(mean[columns], P, tuple(ids), frame)
+    slots = {i: slot for slot, i in enumerate(order)}
+    return Belief.marginal(whole.mean, whole.covariance, slots, ids, frame)

@@ -80,9 +80,10 @@ class AddsNoNoise(EkfSlam):
 
 class KeepsItsMapOnReset(EkfSlam):
     def reset(self, pose, pose_std):
-        if not hasattr(self, "_slots"):
+        if not hasattr(self, "started"):
             super().reset(pose, pose_std)
-        self._mean[:3] = pose
+        self.started = True
+        self.map.mean[:3] = pose
 
 
 class ReturnsNothing(EkfSlam):
@@ -92,8 +93,8 @@ class ReturnsNothing(EkfSlam):
 
 class SavesLiveArrays(EkfSlam):
     def state_dict(self):
-        n = self._size
-        live = {"mean": self._mean[:n], "covariance": self._covariance[:n, :n]}
+        n, mean, covariance = self.map.size, self.map.mean, self.map.covariance
+        live = {"mean": mean[:n], "covariance": covariance[:n, :n]}
         return super().state_dict() | live
 
 
@@ -114,19 +115,19 @@ class SavesALiveReference(EkfSlam):
 class LoadsTheMeanItself(EkfSlam):
     def load_state_dict(self, state):
         super().load_state_dict({k: v for k, v in state.items() if k != "own"})
-        self._mean = state["own"]
+        self.map.arrays = self.map.arrays._replace(mean=state["own"])
 
     def state_dict(self):
-        return super().state_dict() | {"own": self._mean.copy()}
+        return super().state_dict() | {"own": self.map.mean.copy()}
 
 
 class SavesADictionary(EkfSlam):
     def state_dict(self):
-        return super().state_dict() | {"slots": dict(self._slots)}
+        return super().state_dict() | {"slots": dict(self.map.slots)}
 
     def load_state_dict(self, state):
         super().load_state_dict(state)
-        self._slots = state["slots"]
+        self.map.slots = state["slots"]
 
 
 class RaisesAtNan(EkfSlam):
@@ -138,10 +139,10 @@ class RaisesAtNan(EkfSlam):
 
 class NeverGrowsCertain(EkfSlam):
     def update(self, measurements, landmark_ids=None):
-        n = self._size
-        before = self._covariance[:n, :n].copy()
+        n = self.map.size
+        before = self.map.covariance[:n, :n].copy()
         report = super().update(measurements, landmark_ids)
-        self._covariance[:n, :n] = before
+        self.map.covariance[:n, :n] = before
         return report
 
 

@@ -539,8 +539,8 @@ def test_a_filter_that_was_continued_from_a_saved_state_begins_phases_alike():
         near = each.local_ids
         run(each, drive[60:])
         assert each.local_ids != near
-        size = each._local._size
-        for array in (each._local._mean, each._local._covariance):
+        size = each._local.map.size
+        for array in (each._local.map.mean, each._local.map.covariance):
             assert not array[size:].any()
-        assert not each._local._covariance[:, size:].any()
+        assert not each._local.map.covariance[:, size:].any()
     assert_same_bits(slam.belief(), other.belief())

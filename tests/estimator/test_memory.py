@@ -88,7 +88,7 @@ def test_a_full_filter_takes_room_for_what_fits_and_no_more(leave):
     taken, message = grow_until_refused(slam, 2000)
     assert message.startswith("a covariance of 600 landmarks takes 0.0 GB of memory")
     assert 250 + 50 * taken == 550
-    assert slam._covariance.nbytes <= free + 8 * 1200 * 8
+    assert slam.map.covariance.nbytes <= free + 8 * 1200 * 8
 
 
 def test_the_figures_are_those_of_the_map_and_of_the_machine(leave):

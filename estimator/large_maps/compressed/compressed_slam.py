@@ -14,7 +14,6 @@ from ...filters.invariant import InvariantEkfSlam
 from ...filters.iterated import IteratedEkfSlam
 from ...filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from ...interface import Belief, MapView, UpdateReport
-from ...map_management.map_editor import edit_map
 from ...support import argument_checks
 from ...support.argument_checks import LOWEST_ID, LandmarkIds
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
@@ -176,7 +175,7 @@ class CompressedEkfSlam:
             Where one is not in the map; nothing is then removed.
         """
         ids = argument_checks.mapped_identities(landmark_ids, self._slots)
-        edit_map(self._local).remove([i for i in ids if i in self._near])
+        self._local.remove([i for i in ids if i in self._near])
         for i in ids:
             self._near.pop(i, None)
             self._free.append(self._slots.pop(i))
@@ -198,7 +197,7 @@ class CompressedEkfSlam:
         ids = argument_checks.mapped_identities([kept, gone], self._slots)
         if not all(i in self._near for i in ids):
             self._regroup(ids, max(self._local_size or 0, len(self._near), 2))
-        edit_map(self._local).merge(kept, gone)
+        self._local.merge(kept, gone)
         self._near.pop(gone)
         self._free.append(self._slots.pop(gone))
 

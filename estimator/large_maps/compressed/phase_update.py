@@ -67,37 +67,37 @@ def begin_phase(
     ids : list of int
         Identities of the virtual landmarks, which may be none, then of the local ones.
     """
-    before, size = slam._size, 3 + 2 * len(ids)
-    pose, pose_mean = slam._covariance[:3, :3].copy(), slam._mean[:3].copy()
-    fixed = slam._reference[:3].copy()
-    if not size < len(slam._mean) <= _ROOMY * size:
-        slam._allocate(len(ids), more=len(ids) // 2)
+    gaussian, size = slam.map, 3 + 2 * len(ids)
+    before = gaussian.size
+    pose, pose_mean = gaussian.covariance[:3, :3].copy(), gaussian.mean[:3].copy()
+    fixed = gaussian.reference[:3].copy()
+    if not size < gaussian.capacity <= _ROOMY * size:
+        gaussian.allocate(len(ids), more=len(ids) // 2)
         before = 0
     virtual = size - len(rows)
     step = 2 if virtual == 2 * len(rows) else 1
     for array, head, tail in (
-        (slam._mean, pose_mean, mean),
-        (slam._reference, fixed, reference),
+        (gaussian.mean, pose_mean, mean),
+        (gaussian.reference, fixed, reference),
     ):
         array[:before] = 0.0
         array[:3], array[3 + virtual : size] = head, tail
-    fill_extended(slam._covariance, before, pose, rows, virtual, step)
-    slam._slots = {i: slot for slot, i in enumerate(ids)}
-    slam._size = size
+    fill_extended(gaussian.covariance, before, pose, rows, virtual, step)
+    gaussian.relabel(ids)
 
 
 def end_phase(slam: EkfSlam, virtual: int) -> Phase:
     """Take apart the belief of a filter that ran on an extended state; all copies."""
-    size, rest = slam._size, 3 + 2 * virtual
-    covariance = slam._covariance[:size, :size]
+    size, rest = slam.map.size, 3 + 2 * virtual
+    mean, covariance = slam.map.mean[:size], slam.map.covariance[:size, :size]
     rows = np.concatenate([covariance[:3], covariance[rest:]])
     return Phase(
-        _without(slam._mean[:size], rest),
-        _without(slam._reference[:size], rest),
+        _without(mean, rest),
+        _without(slam.map.reference[:size], rest),
         np.concatenate([rows[:, :3], rows[:, rest:]], axis=1),
         rows[:, 3:rest].copy(),
         -covariance[3:rest, 3:rest],
-        slam._mean[None, 3:rest].copy(),
+        mean[None, 3:rest].copy(),
     )
 
 

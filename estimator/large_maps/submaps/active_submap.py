@@ -1,12 +1,11 @@
 """The submap that the robot is in: an ordinary filter in a frame of its own."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...filters.ekf import FRAMES, EkfSlam
-from ...map_management.map_editor import edit_map
 from .gaussian import Gaussian
 from .landmark_index import LandmarkIndex, link_name
 
@@ -35,34 +34,35 @@ class ActiveSubmap:
         self.filter.reset(ORIGIN, ORIGIN)
 
     def __len__(self) -> int:
-        return len(self.filter._slots)
+        return len(self.filter.map.slots)
 
     def __contains__(self, landmark_id: int) -> bool:
-        return landmark_id in self.filter._slots
+        return landmark_id in self.filter.map.slots
 
     @property
     def names(self) -> tuple[int, ...]:
         """Its landmarks and links, in its order."""
-        return tuple(self.filter._slots)
+        return self.filter.landmark_ids
 
     @property
     def pose(self) -> Array:
         """Of the robot, shape (3,); its heading is not wrapped."""
-        return self.filter._mean[:3]  # no public way to it costs as little
+        return self.filter.map.mean[:3]
 
     @property
     def heading_variance(self) -> float:
         """In the frame of the submap [rad²]."""
-        return float(self.filter._covariance[2, 2])
+        return float(self.filter.map.covariance[2, 2])
 
     @property
     def pose_covariance(self) -> Array:
         """Of the additive error, shape (3, 3)."""
-        return self.filter._covariance[:3, :3].copy()
+        return self.filter.map.covariance[:3, :3].copy()
 
     def gaussian(self) -> Gaussian:
         """Return pose, landmarks and links, in the coordinates of the error."""
-        mean: Array = self.filter.state_dict()["mean"]
+        gaussian = self.filter.map
+        mean = gaussian.mean[: gaussian.size].copy()
         return Gaussian(mean, self.filter.belief().error_covariance())
 
     def remove(
@@ -81,17 +81,13 @@ class ActiveSubmap:
         """
         here = [i for i in ids if i in self]
         links = {i: link_name(slots[i]) for i in here if slots[i] in tied}
-        self._rename(links)
+        self.filter.map.rename(links)
         if alone := [i for i in here if i not in links]:
-            edit_map(self.filter).remove(alone)
+            self.filter.remove(alone)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being one, where it holds both; or rename one."""
         if kept in self and gone in self:
-            edit_map(self.filter).merge(kept, gone)
+            self.filter.merge(kept, gone)
         elif gone in self:
-            self._rename({gone: kept})
-
-    def _rename(self, names: Mapping[int, int]) -> None:
-        slots = self.filter._slots
-        self.filter._slots = {names.get(i, i): slot for i, slot in slots.items()}
+            self.filter.map.rename({gone: kept})

@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...filters.invariant import InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport
-from ...map_management.map_editor import edit_map
-from ...map_management.map_view import view_map
 from ...support import argument_checks
 from ...support.argument_checks import LandmarkIds
 from .store import LostSubmapError
@@ -104,7 +102,7 @@ class Neighbourhood:
     @property
     def nbytes(self) -> int:
         """Memory that its covariance takes [bytes]."""
-        return 0 if self._slam is None else self._slam._covariance.nbytes
+        return 0 if self._slam is None else self._slam.map.covariance.nbytes
 
     def view(self, within: float) -> MapView:
         """Look at pose and near landmarks, without a copy.
@@ -115,10 +113,10 @@ class Neighbourhood:
             How far from the robot to look at least [m].
         """
         slam = self._slam
-        if slam is None or not self._region.covers(slam._mean[:2], within):
+        if slam is None or not self._region.covers(slam.map.mean[:2], within):
             slam = self._take(*self._survey(max(within, *self._reaches)))
         self._reaches[-1] = max(within, self._reaches[-1])
-        return view_map(slam)
+        return slam.map_view()
 
     def renew(self) -> None:
         """Take it anew from the joined map; without one it goes on as it is."""
@@ -154,7 +152,7 @@ class Neighbourhood:
         before = self._slam
         farthest = max(float(readings[:, 1].max()), self._reaches[-1])
         self._reaches = [*self._reaches[1:-1], farthest, 0.0]
-        if not before._slots.keys() | set(report.added_ids) >= set(used):
+        if not before.map.slots.keys() | set(report.added_ids) >= set(used):
             self.renew()
         if self._slam is before:  # else the scan is in it already
             try:
@@ -166,17 +164,17 @@ class Neighbourhood:
         """Marginalise those landmarks that it holds."""
         if self._slam is None:
             return
-        if held := [i for i in ids if i in self._slam._slots]:
-            edit_map(self._slam).remove(held)
+        if held := [i for i in ids if i in self._slam.map.slots]:
+            self._slam.remove(held)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being one, after the submaps have been."""
         if self._slam is None:
             return
-        held = {kept, gone}.intersection(self._slam._slots)
+        held = {kept, gone}.intersection(self._slam.map.slots)
         if len(held) == 2:
             with suppress(np.linalg.LinAlgError):
-                edit_map(self._slam).merge(kept, gone)
+                self._slam.merge(kept, gone)
         elif held:
             self.renew()
         self.remove([gone])

@@ -174,7 +174,8 @@ class SubmapSlam(SubmapQueries):
         index = self._graph.index
         new = tuple(i for i in report.added_ids if i not in index)
         index.add(new)
-        report = report._replace(added_ids=new)
+        if new != report.added_ids:
+            report = report.replace(added_ids=new)
         self._neighbourhood.update(measurements, landmark_ids, report)
         if np.size(measurements) and self._rule.closes(self._active):
             with suppress(OSError):  # the next scan tries again, and raises

@@ -1,0 +1,227 @@
+"""A Gaussian over robot pose and landmarks, in arrays that grow with the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import repeat
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..belief import Belief, MapView
+from ..error_frames import ErrorFrame
+from ..kernels.belief_arrays import BeliefArrays, aligned_zeros
+from ..support import argument_checks
+from ..support.memory_limit import landmarks_that_fit
+from .marginalise_and_merge import coincide, without_landmarks
+
+Array = NDArray[np.float64]
+
+FIRST_ALLOCATION = 8  # landmarks
+
+
+class GaussianMap:
+    """Mean, covariance and linearisation points of a pose and its landmarks.
+
+    The state is (x, y, θ, l1x, l1y, …), landmarks in the order of ``slots``.  The first
+    ``size`` entries of every array are in use; the others are zero, room for more.
+
+    Parameters
+    ----------
+    copies : int
+        Number of covariances of this size that updates of the filter need, for the
+        check of the available memory.
+
+    Examples
+    --------
+    >>> gaussian = GaussianMap()
+    >>> gaussian.reset(np.zeros(3), np.eye(3))
+    >>> gaussian.add([7])
+    >>> gaussian.size, gaussian.slots
+    (5, {7: 0})
+    """
+
+    arrays: BeliefArrays
+    """Mean, covariance and linearisation points, as kernels take them."""
+    size: int
+    """Length of the state, 3 + 2n."""
+    slots: dict[int, int]
+    """Place of each landmark in the state: column 3 + 2 slot."""
+
+    def __init__(self, copies: int = 1) -> None:
+        self.copies = copies
+
+    def reset(self, pose: Array, pose_covariance: Array) -> None:
+        """Start with an empty map at a pose (3,)."""
+        self.allocate(FIRST_ALLOCATION)
+        self.relabel(())
+        self.mean[:3] = self.reference[:3] = pose
+        self.covariance[:3, :3] = pose_covariance
+
+    @property
+    def mean(self) -> Array:
+        """Shape (capacity,); the heading is not wrapped."""
+        return self.arrays.mean
+
+    @property
+    def covariance(self) -> Array:
+        """Shape (capacity, capacity), of the additive error."""
+        return self.arrays.covariance
+
+    @property
+    def reference(self) -> Array:
+        """Shape (capacity,): linearisation points, for filters that fix them."""
+        return self.arrays.reference
+
+    @property
+    def capacity(self) -> int:
+        """Length of the arrays."""
+        return len(self.arrays.mean)
+
+    @staticmethod
+    def capacity_for(landmarks: int) -> int:
+        """Return the length of a mean with room for so many landmarks.
+
+        Kernels need a multiple of 4, and one unused entry.
+        """
+        return (3 + 2 * landmarks) // 4 * 4 + 4
+
+    def allocate(self, landmarks: int, more: int = 0) -> None:
+        """Replace the arrays by zeros with room for landmarks.
+
+        Parameters
+        ----------
+        landmarks : int
+            Landmarks that must have room.
+        more : int
+            Landmarks to come, as far as memory allows.
+        """
+        fitting = landmarks_that_fit(landmarks, landmarks + more, self.copies)
+        capacity = self.capacity_for(fitting)
+        covariance = aligned_zeros(capacity, capacity)  # it may raise: first
+        self.arrays = BeliefArrays(np.zeros(capacity), covariance, np.zeros(capacity))
+
+    def make_room(self, landmarks: int) -> None:
+        """Grow the arrays where so many more landmarks would not fit."""
+        n = self.size
+        if n + 2 * landmarks < len(self.arrays.mean):
+            return
+        mean, covariance, reference = self.arrays
+        self.allocate(len(self.slots) + landmarks, more=len(self.slots))
+        self.mean[:n], self.reference[:n] = mean[:n], reference[:n]
+        self.covariance[:n, :n] = covariance[:n, :n]
+
+    def add(self, ids: Iterable[int]) -> None:
+        """Take landmarks that a kernel has written behind the state into the map."""
+        for i in ids:
+            self.slots[i] = len(self.slots)
+        self.size = 3 + 2 * len(self.slots)
+
+    def relabel(self, ids: Iterable[int]) -> None:
+        """Take the arrays to hold these landmarks instead, in this order."""
+        self.slots = {i: slot for slot, i in enumerate(ids)}
+        self.size = 3 + 2 * len(self.slots)
+
+    def remove(self, ids: Sequence[int]) -> None:
+        """Marginalise landmarks; all other numbers keep their last bit."""
+        n, slots = self.size, [self.slots[i] for i in ids]
+        for array in self.arrays:
+            _refill(array, without_landmarks(array[(slice(n),) * array.ndim], slots))
+        gone = set(ids)
+        self.relabel(i for i in self.slots if i not in gone)
+
+    def merge(
+        self, kept: int, gone: int, *, frame: ErrorFrame, at_reference: bool
+    ) -> None:
+        """Condition on two landmarks being one, and remove the second.
+
+        Parameters
+        ----------
+        kept, gone : int
+            The landmarks.
+        frame : {"additive", "invariant"}
+            Error frame of the filter.
+        at_reference : bool
+            Whether the filter linearises at its reference points.
+        """
+        n = self.size
+        self.mean[:n], self.covariance[:n, :n] = coincide(
+            self.mean[:n],
+            self.covariance[:n, :n],
+            self.slots[kept],
+            self.slots[gone],
+            frame=frame,
+            reference=self.reference[:n] if at_reference else None,
+        )
+        self.remove([gone])
+
+    def slots_of(self, ids: Iterable[int]) -> list[int]:
+        """Return the places of landmarks, -1 for those not in the map."""
+        return list(map(self.slots.get, ids, repeat(-1)))
+
+    def rename(self, names: Mapping[int, int]) -> None:
+        """Give landmarks other identities."""
+        self.slots = {names.get(i, i): slot for i, slot in self.slots.items()}
+
+    def view(self) -> MapView:
+        """Return the whole map without a copy."""
+        return MapView(self.mean, self.covariance, list(self.slots))
+
+    def belief(
+        self, frame: ErrorFrame = "additive", ids: Sequence[int] | None = None
+    ) -> Belief:
+        """Return a snapshot of the whole map, or of the pose and some landmarks."""
+        if ids is not None:
+            return Belief.marginal(self.mean, self.covariance, self.slots, ids, frame)
+        n = self.size
+        return Belief(self.mean[:n], self.covariance[:n, :n], tuple(self.slots), frame)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of the arrays, as far as they are in use."""
+        n = self.size
+        return {
+            "mean": self.mean[:n].copy(),
+            "covariance": self.covariance[:n, :n].copy(),
+            "reference": self.reference[:n].copy(),
+            "landmark_ids": np.array(list(self.slots), dtype=np.int64),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned.
+
+        Raises
+        ------
+        ValueError
+            Where the entries do not fit together; the map is then as before.
+        """
+        saved = np.asarray(state["landmark_ids"])
+        ids = argument_checks.identities(saved, saved.size)
+        size = 3 + 2 * len(ids)
+        mean = argument_checks.finite_vector("state['mean']", state["mean"], size)
+        reference = argument_checks.finite_vector(
+            "state['reference']", state["reference"], size
+        )
+        covariance = _checked_covariance(state["covariance"], size)
+        self.allocate(max(FIRST_ALLOCATION, len(ids)))
+        self.relabel(ids)
+        self.mean[:size], self.reference[:size] = mean, reference
+        self.covariance[:size, :size] = covariance
+
+
+def _checked_covariance(saved: Any, size: int) -> Array:
+    covariance = argument_checks.as_floats("state['covariance']", saved)
+    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
+        raise ValueError(
+            f"state['covariance'] must be finite with shape ({size}, {size}), "
+            f"got shape {covariance.shape}"
+        )
+    if not np.array_equal(covariance, covariance.T):
+        raise ValueError("state['covariance'] must be symmetric")
+    return covariance
+
+
+def _refill(array: Array, content: Array) -> None:
+    """Put a smaller array into a larger one, zeros behind it."""
+    array[...] = 0.0
+    array[tuple(slice(size) for size in content.shape)] = content

@@ -1,0 +1,45 @@
+"""The motion noise of a filter, as far as it depends on what the robot did."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..support import argument_checks
+
+Array = NDArray[np.float64]
+
+
+class MotionNoise(NamedTuple):
+    """Variances of the motion noise, and whether a robot at rest has it too."""
+
+    variance: Array
+    """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
+    at_rest: bool = True
+    """False: odometry of exactly (0, 0) adds no noise."""
+
+    @classmethod
+    def checked(cls, motion_std: ArrayLike, noise_at_rest: bool) -> MotionNoise:
+        """Return the noise of these standard deviations (3,), or refuse them."""
+        std = argument_checks.standard_deviations("motion_std", motion_std, 3)
+        at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
+        return cls(std**2, at_rest)
+
+    def over(self, distance: float, turn: float, dt: float) -> Array:
+        """Return the variances (3,) of one odometry reading over dt steps.
+
+        Raises
+        ------
+        ValueError
+            Where dt is not finite or negative.
+        """
+        if dt == 1.0 and self.at_rest:
+            return self.variance
+        if not (isfinite(dt) and dt >= 0):
+            raise ValueError(f"dt must be a finite number >= 0, got {dt!r}")
+        if not (self.at_rest or distance or turn):
+            return self.variance * 0.0
+        return self.variance * dt
