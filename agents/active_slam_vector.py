@@ -76,7 +76,7 @@ class ActiveSlamVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     ) -> None:
         if render_mode is not None:
             raise ValueError(
-                f"render_mode must be None for worlds side by side, got {render_mode!r}"
+                f"render_mode must be None for vector environments, got {render_mode!r}"
             )
         num_envs = argument_checks.whole("num_envs", num_envs, 1)
         weights, changes = split_settings(settings)

@@ -70,12 +70,12 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         self.scenario = scenario_of(env)
         if not self.scenario.sensor.identities:
             raise ValueError(
-                "sensor.identities must be true where worlds run side by side: the "
+                "sensor.identities must be true for vector environments: the "
                 "batched filters do not associate"
             )
         if not hasattr(type(env.unwrapped), "start_estimates"):
             raise ValueError(
-                "env must be a LandmarkWorldVectorEnv, which tells start_estimates, "
+                "env must be a LandmarkWorldVectorEnv, which has start_estimates, "
                 f"got {type(env.unwrapped).__name__}"
             )
         rows = count_landmark_rows(self.scenario, max_landmarks)

@@ -117,7 +117,7 @@ def choose_batch(
     """
     if not isinstance(estimator, str):
         raise ValueError(
-            f"estimator must be a registered name where worlds run side by side, "
+            "estimator must be a registered name for vector environments, "
             f"got {estimator!r}"
         )
     known = noise_options(find_estimator(estimator), scenario)

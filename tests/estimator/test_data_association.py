@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numeric_jacobian import numeric_jacobian
 
-from slamgym.envs.landmark_world import LandmarkWorldEnv
+from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import make_estimator
 from slamgym.estimator.association.nearest_neighbour import (
     AMBIGUOUS,
