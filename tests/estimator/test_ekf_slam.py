@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from dense_ekf import DenseEkf
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from numba import config
 from numeric_jacobian import numeric_jacobian
 from scipy.stats import chi2
 
@@ -251,6 +252,30 @@ def test_degenerate_innovation_names_the_landmark_and_changes_nothing():
 
 
 @pytest.mark.parametrize(
+    "landmarks",
+    [
+        ((3, 1), (-4, -1)),
+        ((1, 4), (2, -3)),
+        ((-2, 3), (4, -2)),
+        ((-4, -1), (4, -2)),
+        ((5, 2), (-3, 5)),
+        ((-3, 5), (1, 4)),
+        ((4, -2), (3, 1)),
+    ],
+)
+def test_a_covariance_that_only_rounding_keeps_positive_is_refused(landmarks):
+    """Two exact readings of known landmarks have 4 rows, and the pose 3 unknowns."""
+    slam = EkfSlam((0, 0, 0), (0, 0))
+    mean = np.concatenate([np.zeros(3), np.ravel(landmarks)])
+    covariance = np.diag([0.01, 0.01, 0.01, 0, 0, 0, 0])
+    state = {"mean": mean, "reference": mean, "covariance": covariance}
+    slam.load_state_dict({**slam.state_dict(), **state, "landmark_ids": [4, 7]})
+    readings = predict_measurement(mean[:3], np.array(landmarks)).measurement
+    with pytest.raises(np.linalg.LinAlgError, match="landmark 7"):
+        slam.update(readings, [4, 7])
+
+
+@pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda s: s.predict((np.nan, 0)), "odometry must be 2 finite numbers"),
@@ -379,6 +404,7 @@ def test_landmark_truth_lies_within_the_ellipses():
     assert ((errors * weighted).sum(axis=1) < chi2.ppf(0.9999, 2)).all()
 
 
+@pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
 def test_read_only_readings_are_taken_without_compiling_anew():
     slam = make()
     readings = np.array([(0.1, 4.0)])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numeric_jacobian import numeric_jacobian
 
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.unicycle_motion import drive_jit, predict_pose
 
 
 @pytest.mark.parametrize("heading", [-2.5, 0.0, 0.7, 3.1])
@@ -39,3 +39,28 @@ def test_noise_jacobian_equals_central_differences():
 def test_the_robot_drives_before_it_turns():
     pose = predict_pose(np.array([0.0, 0.0, np.pi / 2]), np.array([2.0, 1.0])).pose
     np.testing.assert_allclose(pose, [0.0, 2.0, np.pi / 2 + 1.0], atol=1e-15)
+
+
+@pytest.mark.parametrize("heading", [-2.5, 0.0, 0.7, 3.1, 40.0])
+@pytest.mark.parametrize("odometry", [(0.8, -0.3), (-1.5, 0.0), (0.0, 2.0)])
+def test_the_compiled_equation_equals_value_and_jacobians(heading, odometry):
+    pose, (distance, _) = np.array([1.0, -2.0, heading]), odometry
+    expected = predict_pose(pose, np.array(odometry))
+    *moved, cos, sin = drive_jit(*pose.tolist(), *odometry)
+    np.testing.assert_allclose(moved, expected.pose, rtol=1e-15)
+    G, F = np.eye(3), np.eye(3)
+    G[:2, 2] = -distance * sin, distance * cos
+    F[:2, :2] = (cos, -sin), (sin, cos)
+    np.testing.assert_allclose(G, expected.jacobian_pose, rtol=1e-15)
+    np.testing.assert_allclose(F, expected.jacobian_noise, rtol=1e-15)
+
+
+def test_the_jacobian_entries_of_the_compiled_equation_equal_central_differences():
+    pose, (distance, turn) = np.array([1.0, -2.0, 0.7]), (0.8, -0.3)
+    *_, cos, sin = drive_jit(*pose.tolist(), distance, turn)
+    numeric = numeric_jacobian(
+        lambda p: np.array(drive_jit(*p.tolist(), distance, turn)[:3]), pose
+    )
+    G = np.eye(3)
+    G[:2, 2] = -distance * sin, distance * cos
+    np.testing.assert_allclose(G, numeric, atol=1e-7)
