@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .models.angles import wrap_angle
+from .models.rigid_motion import left_jacobian
 
 Array = NDArray[np.float64]
 ErrorFrame = Literal["additive", "invariant"]
@@ -70,9 +71,7 @@ def invariant_error(true_state: Array, mean: Array) -> Array:
     turn = wrap_angle(np.asarray(true_state[..., 2] - mean[..., 2]))
     true_points, points = _points(true_state), _points(mean)
     moved = true_points - np.exp(1j * turn)[..., None] * points
-    # V(t) is the complex number (e^{it} − 1) / (it) = sinc(t/2) e^{it/2}.
-    spread = np.sinc(turn / (2 * np.pi)) * np.exp(1j * turn / 2)
-    return _state(moved / spread[..., None], turn)
+    return _state(moved / left_jacobian(turn)[..., None], turn)
 
 
 def invariant_covariance(mean: Array, covariance: Array) -> Array:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.angles import wrap_angle
+from ..models.rigid_motion import rotation
 from .nearest_neighbour import Distances, Noise, innovation_distances
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ class TentativeLandmarks(NamedTuple):
         """Follow the robot along odometry (d, α) with noise (σx², σy², σα²)."""
         if not len(self.seen):
             return self
-        back = _rotation(-turn)
+        back = rotation(-turn)
         places = (self.places - (distance, 0.0)) @ back.T
         spread = back @ (self.covariances + np.diag(variance[:2])) @ back.T
         lever = places[:, ::-1] * (-1.0, 1.0)
@@ -113,7 +114,7 @@ class TentativeLandmarks(NamedTuple):
         places, spread = [], []
         for bearing, distance in readings:
             across, along = _variances(np.array([bearing, distance]), noise)
-            direction = _rotation(bearing)
+            direction = rotation(bearing)
             places.append(direction @ (distance, 0.0))
             local = np.diag([along, across * distance**2])
             spread.append(direction @ local @ direction.T)
@@ -130,11 +131,6 @@ class TentativeLandmarks(NamedTuple):
         return TentativeLandmarks(
             self.places[which], self.covariances[which], self.seen[which]
         )
-
-
-def _rotation(angle: float) -> Array:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin], [sin, cos]])
 
 
 def _variances(reading: Array, noise: Noise) -> tuple[float, float]:

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..interface import Belief, SlamEstimator
-from ..models.angles import wrap_angle
+from ..models.bearing_range import predict_measurement
+from ..models.unicycle_motion import predict_pose
 
 Array = NDArray[np.float64]
 Factory = Callable[..., SlamEstimator]
@@ -39,9 +40,7 @@ def make(factory: Factory, **changes: Any) -> SlamEstimator:
 
 def scan(pose: Array, rng: np.random.Generator | None = None) -> Array:
     """Read all landmarks, (n, 2), with noise when an rng is given."""
-    offset = LANDMARKS - pose[:2]
-    bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - pose[2])
-    readings = np.stack([bearing, np.hypot(offset[:, 0], offset[:, 1])], axis=1)
+    readings = predict_measurement(pose, LANDMARKS).measurement
     if rng is not None:
         readings += rng.standard_normal(readings.shape) * NOISE["measurement_std"]
     return readings
@@ -53,8 +52,8 @@ def drive(estimator: SlamEstimator, steps: int, seed: int = 0) -> Array:
     pose = np.zeros(3)
     ids = list(range(len(LANDMARKS)))
     for _ in range(steps):
-        d, turn = np.array([0.3, 0.1]) + rng.standard_normal(2) * (0.05, 0.02)
-        pose += [d * np.cos(pose[2]), d * np.sin(pose[2]), turn]
+        odometry = np.array([0.3, 0.1]) + rng.standard_normal(2) * (0.05, 0.02)
+        pose = predict_pose(pose, odometry).pose
         estimator.predict((0.3, 0.1))
         estimator.update(scan(pose, rng), ids)
     return pose

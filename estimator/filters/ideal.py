@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..interface import UpdateReport
 from ..kernels.rules import AT_ESTIMATE, AT_TRUTH
+from ..models.rigid_motion import rotation
+from ..models.unicycle_motion import drive
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .ekf import EkfSlam
@@ -93,17 +95,13 @@ class IdealEkfSlam(EkfSlam):
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._motion_noise.over(distance, turn, dt)
         mean, covariance, reference = self.map.arrays
-        cos, sin = np.cos(mean[2]), np.sin(mean[2])
-        mean[:3] += distance * cos, distance * sin, turn
+        mean[:3] = drive(mean[0], mean[1], mean[2], distance, turn)[:3]
         n, heading = self.map.size, reference[2]
         dx, dy = self._true_pose[:2] - reference[:2]
         G = np.eye(n)
         G[:2, 2] = -dy, dx
         F = np.eye(3)
-        F[:2, :2] = [
-            [np.cos(heading), -np.sin(heading)],
-            [np.sin(heading), np.cos(heading)],
-        ]
+        F[:2, :2] = rotation(heading)
         moved = G @ covariance[:n, :n] @ G.T
         moved[:3, :3] += F @ np.diag(variance) @ F.T
         covariance[:n, :n] = (moved + moved.T) / 2

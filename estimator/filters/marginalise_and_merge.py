@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..error_frames import ErrorFrame
+from ..models.rigid_motion import left_jacobian
 
 Array = NDArray[np.float64]
 
@@ -175,9 +176,7 @@ def _composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
     turn = shift[2]
     points, moves = _points(mean), _points(shift)
     turned = np.exp(1j * turn) * points
-    # V(t) is the complex number (e^{it} − 1) / (it) = sinc(t/2) e^{it/2}.
-    V = np.sinc(turn / (2 * np.pi)) * np.exp(0.5j * turn)
-    moved = turned + V * (moves - 1j * turn * points)
+    moved = turned + left_jacobian(turn) * (moves - 1j * turn * points)
     way = _state(1j * (moved - points), 0.0)
     cross = np.outer(way, covariance[2])
     P = covariance + (cross + cross.T) + covariance[2, 2] * np.outer(way, way)

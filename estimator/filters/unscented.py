@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..interface import UpdateReport
 from ..models.angles import wrap_angle
+from ..models.unicycle_motion import drive
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .ekf import EkfSlam, not_positive_definite
@@ -43,15 +44,9 @@ class UnscentedSlam(EkfSlam):
         root[n:, n:] = np.diag(np.sqrt(variance))
         deviations = np.sqrt(n + 3) * np.concatenate([root, -root], axis=1)
         x, y, heading = mean[:3, None] + deviations[:3]
-        along, across = distance + deviations[n], deviations[n + 1]
-        cos, sin = np.cos(heading), np.sin(heading)
-        poses = np.stack(
-            [
-                x + along * cos - across * sin,
-                y + along * sin + across * cos,
-                heading + turn + deviations[n + 2],
-            ]
-        )
+        along, across, turned = deviations[n:]
+        x, y, heading, cos, sin = drive(x, y, heading, distance + along, turn)
+        poses = np.stack([x - across * sin, y + across * cos, heading + turned])
         mean[:3] = poses.mean(axis=1)
         moved = poses - mean[:3, None]
         share = deviations.shape[1]

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..association.candidates import Candidates, ScanAssociation
 from ..interface import Belief, MapView, SlamEstimator, UpdateReport, optional_members
+from ..models.rigid_motion import rotation
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .map_editor import CachedEditor, edit_map
@@ -111,8 +112,7 @@ class ManagedSlam:
         if not len(places):
             return places.copy()
         x, y, heading = self._editor.map_view().mean[:3]
-        cos, sin = np.cos(heading), np.sin(heading)
-        return np.asarray(places @ np.array([[cos, sin], [-sin, cos]]) + (x, y))
+        return np.asarray(places @ rotation(heading).T + (x, y))
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""

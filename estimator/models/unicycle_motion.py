@@ -10,7 +10,7 @@ u = (d, α)       odometry: distance driven, then heading turned [m, rad]
 ε = (εx, εy, εα) motion noise in the robot's own frame [m, m, rad], ε ~ N(0, R)
 """
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from ..support.jit import njit_inlined
 
 Array = NDArray[np.float64]
-
-Real = TypeVar("Real", float, NDArray[np.float64])
+Real = Any  # a number, or an array of any shape
 
 
 def drive(
@@ -36,7 +35,7 @@ def drive(
 
     Parameters
     ----------
-    x, y, heading : float or ndarray, any one shape
+    x, y, heading : float or ndarray
         p = (x, y, θ) [m, m, rad].
     distance, turn : float or ndarray
         u = (d, α) [m, rad].

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from .factor import compose
+from ...models.rigid_motion import compose
 
 Array = NDArray[np.float64]
 

@@ -120,16 +120,6 @@ def retract(mean: Array, error: Array, frame: ErrorFrame) -> Array:
     return state_of(points, float(mean[2]) + turn)
 
 
-def compose(start: Array, pose: Array) -> tuple[Array, Array, Array]:
-    """Return start ⊕ pose, shape (3,), and its derivatives by both, (3, 3) each."""
-    c, s = np.cos(start[2]), np.sin(start[2])
-    by_pose = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    moved = by_pose @ pose
-    by_start = np.eye(3)
-    by_start[:2, 2] = -moved[1], moved[0]
-    return start + moved, by_start, by_pose
-
-
 def regularised(covariance: Array) -> Array:
     """Return a covariance with an increased diagonal, so that it can be solved with."""
     largest = float(np.max(np.diagonal(covariance)))

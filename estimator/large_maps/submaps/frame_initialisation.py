@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .factor import compose, regularised
+from ...models.rigid_motion import compose
+from .factor import regularised
 from .store import Submap
 
 Array = NDArray[np.float64]

@@ -17,8 +17,9 @@ from scipy.linalg import block_diag, solve_triangular
 
 from ...error_frames import ErrorFrame, invariant_covariance
 from ...interface import Belief
+from ...models.rigid_motion import compose
 from ..sparse_cholesky.coordinates import pairs
-from .factor import compose, retract
+from .factor import retract
 from .gaussian import Gaussian, points_of, state_of, times
 
 Array = NDArray[np.float64]

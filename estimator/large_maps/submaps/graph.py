@@ -5,10 +5,10 @@ from numpy.typing import NDArray
 
 from ...interface import Belief
 from ...models.angles import wrap_angle
+from ...models.rigid_motion import compose
 from .active_submap import ActiveSubmap
 from .chain import Chain
 from .closed_submaps import ClosedSubmaps
-from .factor import compose
 from .fusion import fuse, part_of
 from .gaussian import Gaussian, with_uncertain_start
 from .landmark_index import LandmarkIndex

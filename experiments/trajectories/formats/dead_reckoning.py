@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ....estimator.models.unicycle_motion import drive
 from ..trajectory import Array
 
 
@@ -33,10 +34,7 @@ def dead_reckoning(start: Array, odometry: Array) -> Array:
     x, y, heading = start.tolist()
     distances, turns = odometry.T
     headings = np.cumsum([heading, *turns])
+    along_x, along_y, *_ = drive(0.0, 0.0, headings[:-1], distances, turns)
     return np.column_stack(
-        [
-            np.cumsum([x, *(distances * np.cos(headings[:-1]))]),
-            np.cumsum([y, *(distances * np.sin(headings[:-1]))]),
-            headings,
-        ]
+        [np.cumsum([x, *along_x]), np.cumsum([y, *along_y]), headings]
     )
