@@ -24,13 +24,14 @@ from slamgym.experiments.monte_carlo import (
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario, place_landmarks
 
+CITY = load_scenario("city")
+NOISE = {"motion_std": CITY.motion.std, "measurement_std": CITY.sensor.std}
+
 
 def city(columns, rows, steps):
     """A corner of the preset, of which the robot drives round every block."""
     blocks = {"columns": columns, "rows": rows}
-    return load_scenario("city").with_changes(
-        steps=steps, landmarks=blocks, controls=blocks
-    )
+    return CITY.with_changes(steps=steps, landmarks=blocks, controls=blocks)
 
 
 # --- honesty, by the laboratory: 64 landmarks, four blocks, each a loop closed ---
@@ -123,9 +124,7 @@ def made(way, folder="."):
 
 def of_city(name, **options):
     """Make a filter with the noise of the city."""
-    world = load_scenario("city")
-    noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
-    return make_estimator(name, **noise, **options)
+    return make_estimator(name, **NOISE, **options)
 
 
 def renaming():
