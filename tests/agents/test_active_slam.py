@@ -61,6 +61,7 @@ def test_gymnasiums_checker_finds_nothing_to_warn_of(level):
     check_env(gym.make(ID, scenario=level).unwrapped)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_checker_of_stable_baselines_finds_nothing_to_warn_of(level):
     checker = pytest.importorskip(
@@ -443,6 +444,7 @@ def compare(batch, infos, world, observation, info):
         np.testing.assert_array_equal(infos[key][world], value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 @pytest.mark.parametrize(
     ("level", "settings"),
@@ -622,6 +624,7 @@ def scores():
     return played
 
 
+@pytest.mark.slow
 def test_whoever_looks_does_better_than_chance(scores):
     chance = mean_of(scores["random"], "total").value
     for name in ("coverage", "greedy", "revisit"):
@@ -630,11 +633,13 @@ def test_whoever_looks_does_better_than_chance(scores):
     assert mean_of(scores["coverage"], "success").value == 1
 
 
+@pytest.mark.slow
 def test_those_who_plan_do_not_touch_a_wall(scores):
     for name in ("coverage", "greedy", "revisit"):
         assert not any(episode.crashed for episode in scores[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BASELINES)
 def test_a_baseline_does_the_same_again(name, scores):
     env = ActiveSlamEnv("active_easy")

@@ -49,6 +49,7 @@ def test_01_goes_round_the_corridor_without_a_bump(run):
     assert_picture("results/01_drive_the_world.png")
 
 
+@pytest.mark.slow
 def test_02_shows_that_the_ekf_says_less_than_half_of_its_heading_error(run):
     pattern = r"(\w+): θ off by (\S+) rad rms, says σθ = (\S+) rad"
     ends = re.findall(pattern, run("02_filter_step_by_step"))

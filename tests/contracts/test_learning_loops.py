@@ -223,6 +223,7 @@ def sb3(torch):
     return pytest.importorskip("stable_baselines3", reason="needs Stable-Baselines3")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("each", IDS)
 def test_the_checker_of_stable_baselines_is_silent_on_the_flat_world(sb3, each):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")

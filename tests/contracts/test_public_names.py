@@ -100,6 +100,7 @@ def test_documented_imports_are_public_and_at_most_two_levels_deep(document):
             assert public is None or set(names) <= set(public), (module, names)
 
 
+@pytest.mark.slow
 def test_pydoc_lists_the_filters():
     classes = pydoc_of("slamgym.estimator").split("\nCLASSES\n")[1]
     for name in slamgym.estimator.__all__:

@@ -35,6 +35,7 @@ def test_importing_slamgym_loads_nothing_heavy():
     assert not heavy & loaded
 
 
+@pytest.mark.slow
 def test_importing_slamgym_takes_hardly_longer_than_importing_gymnasium():
     code = """
 import gymnasium, time

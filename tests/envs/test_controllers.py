@@ -197,6 +197,7 @@ def wander(*, steps, dt, correlation_time=5.0, seed=0):
     return np.array([driver.act(ORIGIN, step) for step in range(steps)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.5, 5.0])
 def test_wandering_has_the_documented_means_and_spreads(dt):
     actions = wander(steps=20_000, dt=dt, correlation_time=1.0)

@@ -101,6 +101,7 @@ def test_blitted_frame_is_nearly_that_of_a_full_draw(renderer):
     assert share_of_different_pixels(blitted, full) < 0.01
 
 
+@pytest.mark.slow
 def test_blitting_is_several_times_faster_than_drawing_everything(renderer):
     moments = [snapshot((2.0 + 0.1 * k, 1.0, 0.5)) for k in range(12)]
     renderer.render(moments[0])

@@ -118,6 +118,7 @@ def test_it_keeps_the_contract(base):
     check_estimator(lambda **noise: CompressedEkfSlam(base=base, **noise))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_it_equals_the_full_filter_while_300_landmarks_come_and_go(base):
     slam, phases = follow_both(base, 300, 1000, mapped=True)
@@ -294,6 +295,7 @@ def test_a_run_stopped_at_any_step_continues_bit_for_bit(base, jumping):
             np.testing.assert_array_equal(value, expected[key], err_msg=key)
 
 
+@pytest.mark.slow
 def test_a_saved_run_continues_bit_for_bit_in_another_process(tmp_path):
     code = """
 import pickle, sys

@@ -80,9 +80,10 @@ def test_every_registered_estimator_is_in_the_family():
     assert {name for name, *_ in FAMILY.values()} == set(list_estimators())
 
 
+@pytest.mark.parametrize("steps", [100, pytest.param(1000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("case", FAMILY)
-def test_equals_its_slow_dense_twin(case):
-    steps = 200 if case == "unscented" else 1000
+def test_equals_its_slow_dense_twin(case, steps):
+    steps = min(steps, 200) if case == "unscented" else steps
     twin = FAMILY[case][2](MOTION_STD, MEASUREMENT_STD, START_STD)
     fast = make(case, initial_pose_std=START_STD)
     rng = np.random.default_rng(1)

@@ -534,6 +534,7 @@ def test_a_saved_run_goes_on_bit_for_bit(name, tmp_path):
     assert any(report.confirmed_ids for report, _ in expected[23:])
 
 
+@pytest.mark.slow
 def test_a_saved_run_goes_on_in_another_process(tmp_path):
     """Both processes find the kernels compiled, since this one has done so."""
     script = (

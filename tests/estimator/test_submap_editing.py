@@ -657,6 +657,7 @@ pickle.dump((slam.belief(), slam.state_dict()), open({result!r}, "wb"))
 """
 
 
+@pytest.mark.slow
 def test_another_process_continues_an_edited_run_from_its_folder(tmp_path):
     folder, state, result = (
         str(tmp_path / name) for name in ("run", "state", "result")

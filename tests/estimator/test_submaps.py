@@ -83,6 +83,7 @@ def test_it_keeps_the_contract(base, limits):
 # --- the joined map against the full filter, and against a dense solution -------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", BASES)
 def test_it_comes_nearer_to_the_full_filter_as_the_noise_shrinks(base):
     differences = []
@@ -430,6 +431,7 @@ pickle.dump(slam.belief(), open({result!r}, "wb"))
 """
 
 
+@pytest.mark.slow
 def test_another_process_continues_from_the_folder(tmp_path):
     folder, state, result = (
         str(tmp_path / name) for name in ("run", "state", "result")

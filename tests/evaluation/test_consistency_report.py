@@ -37,6 +37,7 @@ def test_a_wrong_filter_raises_with_every_sentence(scores, factor):
     assert all(sentence in str(error.value) for sentence in found.sentences())
 
 
+@pytest.mark.slow
 def test_a_consistent_filter_is_accepted_in_95_of_100_cases():
     nees, nis = kalman_scores(np.random.default_rng(2), 200 * 30, 20)
     freedom = np.ones((30, 20), dtype=np.int64)

@@ -75,6 +75,7 @@ def test_the_interval_of_the_time_averages_ends_where_they_are_refused():
         assert (low <= decision.statistic <= high) == decision.accepted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.8, 1.25])
 def test_equivalence_is_claimed_at_the_margin_as_often_as_stated(ratio):
     rng = np.random.default_rng(4)
@@ -92,6 +93,7 @@ def test_covariances_too_small_by_a_fifth_are_found_with_the_stated_power():
     assert 0.85 <= refused <= 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 @pytest.mark.parametrize("name", ["final step", "time average", "bootstrap", "family"])
 def test_a_factor_of_two_is_found_in_either_direction(name, factor, repetitions):

@@ -49,6 +49,7 @@ def test_final_nees_is_chi_square_in_a_world_anchored_at_the_start(drives):
     assert inside == pytest.approx(0.95, abs=3 * np.sqrt(0.95 * 0.05 / RUNS))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("doubt", [0.9, 1.1])
 def test_a_filter_that_errs_by_a_tenth_about_the_noise_is_refused(drives, doubt):
     low, high = ACCEPTED

@@ -430,6 +430,7 @@ def errors_on_utias(public_logs, **options):
     )
 
 
+@pytest.mark.slow
 def test_utias_agrees_with_an_independent_filter(public_logs):
     errors = errors_on_utias(public_logs, range_noise_at="reading")
     assert errors == pytest.approx((0.276, 0.282, 0.158, 0.209), rel=0.05)

@@ -303,6 +303,7 @@ def test_public_logs_survive_the_round_trip(public_logs, tmp_path):
         assert_same_log(log, read_slamlog(tmp_path / "copy.csv"))
 
 
+@pytest.mark.slow
 def test_victoria_park_has_sizes_and_no_identities(public_logs):
     log = read_slamlog(public_logs / "victoria_park.csv")
     scans = [event for event in log.events if isinstance(event, Scan)]
