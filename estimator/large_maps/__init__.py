@@ -1,8 +1,11 @@
 """Filters for maps that grow beyond what a dense covariance allows.
 
-``compressed`` defers the exact update of distant landmarks, ``sparse_information``
-keeps a sparse information matrix, and ``submaps`` builds local maps in frames of their
-own and joins them on demand.
+``compressed`` gives the results of the full filter: it updates the landmarks around the
+robot in each step, and defers the update of the rest.  ``sparse_information`` stores a
+sparse information matrix, and limits its links by discarding odometry information.
+``submaps`` builds independent local maps in frames of their own, and joins them on
+demand.  ``sparse_cholesky`` factorises the sparse matrices of the latter two.  In each
+folder, the module ``…_slam`` holds the public filter.
 """
 
 from lazy_loader import attach_stub

@@ -30,19 +30,19 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from growing_maps_peers import FullWithDsyrk
 
 NOISE = (TOWN_MOTION_STD, MEASUREMENT_STD)
-WHOLE = active_set.WHOLE
+WHOLE = active_set.LARGEST_WHOLE_MAP
 
 
 @pytest.fixture(autouse=True)
 def _small_maps_are_split_too(monkeypatch):
     """So that what is put off is tested where tests are fast."""
-    monkeypatch.setattr(active_set, "WHOLE", 0)
+    monkeypatch.setattr(active_set, "LARGEST_WHOLE_MAP", 0)
 
 
 @pytest.fixture
 def _small_maps_are_whole(monkeypatch):
     """As the filter does unless told a local size."""
-    monkeypatch.setattr(active_set, "WHOLE", WHOLE)
+    monkeypatch.setattr(active_set, "LARGEST_WHOLE_MAP", WHOLE)
 
 
 def forget(full, ids):
@@ -357,7 +357,7 @@ def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
         slam.predict(odometry)
         done.append(0)
         slam.update(readings, ids)
-        waiting.append(slam._far.pending_rank)
+        waiting.append(slam._map.deferred.pending_rank)
     full = 2 * seen * (2 * count) ** 2 / 2
     assert max(done) < 2 * full
     assert sum(step > 0 for step in done) > 5
@@ -541,8 +541,8 @@ def test_a_filter_that_was_continued_from_a_saved_state_begins_phases_alike():
         near = each.local_ids
         run(each, drive[60:])
         assert each.local_ids != near
-        size = each._local.map.size
-        for array in (each._local.map.mean, each._local.map.covariance):
+        size = each._map.filter.map.size
+        for array in (each._map.filter.map.mean, each._map.filter.map.covariance):
             assert not array[size:].any()
-        assert not each._local.map.covariance[:, size:].any()
+        assert not each._map.filter.map.covariance[:, size:].any()
     assert_same_bits(slam.belief(), other.belief())

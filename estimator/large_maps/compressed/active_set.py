@@ -1,30 +1,33 @@
-"""Which landmarks a compressed filter's local map holds, and how many."""
+"""Choice of the local landmarks of a compressed filter, and of their number."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
-# A map of up to so many landmarks is local as a whole: what a split would save in most
-# steps it would lose in those that begin a phase.
-WHOLE = 250
-# Steps that a phase must last to pay for its end.
-SHORT = 4
-# Landmarks of a local map beyond those of a scan, at most, as a multiple of these; and
-# so many mapped landmarks for each of that multiple: a phase's end costs a² n.
-MOST, MAPPED = 2.5, 400
+LARGEST_WHOLE_MAP = 250
+"""Up to this many landmarks, the local map is the whole map."""
+SMALLEST_LOCAL_MAP = 30
+"""Smallest number of landmarks at which a local map may be too large."""
+SHORT_PHASE = 4
+"""Steps after which a phase has paid for its end."""
+LARGEST_RATIO, LANDMARKS_PER_RATIO = 2.5, 400
+"""Limit of the extra landmarks, as a multiple of the landmarks of a scan.
+
+The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
+costs a² n.
+"""
 
 
-def spare_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
-    """Return how many landmarks beyond those of a scan the next local map should hold.
+def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
+    """Return the number of landmarks of the next local map beyond those of a scan.
 
     Parameters
     ----------
     before : int
-        How many the last one did.
+        The last such number.
     read : int
         Mapped landmarks in the scan.
     mapped : int
@@ -34,22 +37,45 @@ def spare_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
 
     Examples
     --------
-    >>> [spare_landmarks(9, 10, mapped, lasted=20) for mapped in (300, 1000, 5000)]
+    >>> [extra_landmarks(9, 10, mapped, lasted=20) for mapped in (300, 1000, 5000)]
     [7, 25, 25]
-    >>> spare_landmarks(9, 10, 1000, lasted=1)  # the readings jump about
+    >>> extra_landmarks(9, 10, 1000, lasted=1)  # scans far apart from each other
     4
     """
-    if lasted < SHORT:
+    if lasted < SHORT_PHASE:
         return before // 2
-    return min(2 * before + 8, int(max(read, 4) * min(MOST, mapped / MAPPED)))
+    ratio = min(LARGEST_RATIO, mapped / LANDMARKS_PER_RATIO)
+    return min(2 * before + 8, int(max(read, 4) * ratio))
 
 
-def nearest_to(
-    place: Array, ids: Sequence[int], points: Array, count: int
-) -> list[int]:
-    """Return the landmarks nearest to a place (2,), by their positions (n, 2)."""
-    count = min(count, len(ids))
-    distances = ((points - place) ** 2).sum(axis=1)
+def choose_local(
+    centre: Array,
+    required: Sequence[int],
+    slots: Mapping[int, int],
+    points: Array,
+    size: int,
+) -> dict[int, None]:
+    """Return the required landmarks, and the nearest to a point up to ``size`` in all.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (2,)
+    required : sequence of int
+    slots : mapping
+        Row in ``points`` by landmark.
+    points : ndarray, shape (n, 2)
+        Positions of the landmarks [m].
+    size : int
+    """
+    chosen = dict.fromkeys(required)
+    if len(chosen) >= size:
+        return chosen
+    ids = list(slots)
+    distances = ((points[list(slots.values())] - centre) ** 2).sum(axis=1)
+    count = min(size + len(required), len(ids))
     nearest = np.argpartition(distances, count - 1)[:count]
-    nearest = nearest[np.argsort(distances[nearest], kind="stable")]
-    return [ids[k] for k in nearest.tolist()]
+    for k in nearest[np.argsort(distances[nearest], kind="stable")].tolist():
+        if len(chosen) >= size:
+            break
+        chosen[ids[k]] = None
+    return chosen
