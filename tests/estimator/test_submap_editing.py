@@ -23,7 +23,7 @@ from slamgym.estimator.filters.marginalise_and_merge import (
     coincide,
     without_landmarks,
 )
-from slamgym.estimator.large_maps.submaps import gauss_newton
+from slamgym.estimator.large_maps.submaps import gauss_newton, neighbourhood
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.angles import wrap_angle
 from slamgym.estimator.models.bearing_range import predict_measurement
@@ -423,13 +423,13 @@ def assert_as_joined(slam, tolerance):
 
 def surveys_of(slam):
     """Return a list that grows with every look at the joined map, by its reach."""
-    survey, reaches = slam._neighbourhood._survey, []
+    survey, reaches = slam._neighbourhood._joined_region, []
 
     def counted(reach):
         reaches.append(reach)
         return survey(reach)
 
-    slam._neighbourhood._survey = counted
+    slam._neighbourhood._joined_region = counted
     return reaches
 
 
@@ -498,12 +498,12 @@ def test_a_look_at_all_there_is_holds_until_a_submap_is_closed():
 
 
 def test_where_there_are_too_many_it_claims_no_more_than_it_holds(monkeypatch):
-    monkeypatch.setattr("slamgym.estimator.large_maps.submaps.neighbourhood.MOST", 15)
+    monkeypatch.setattr(neighbourhood, "LARGEST_COUNT", 15)
     slam, cut = made(submap_size=12), 0
     for odometry, readings, ids, _ in wide_laps(120):
         slam.predict(odometry)
         slam.update(readings, ids)
-        held, extent = set(slam.local_view(25.0).ids), slam._neighbourhood._region
+        held, extent = set(slam.local_view(25.0).ids), slam._neighbourhood._copy.region
         whole = slam.belief()
         away = np.hypot(*(whole.landmarks - whole.pose[:2]).T)
         cut += len(held) < len(whole.landmark_ids)
@@ -541,7 +541,7 @@ def test_it_looks_farther_by_how_far_the_map_may_have_drifted():
 
 @pytest.mark.parametrize("held_is_kept", [True, False])
 def test_it_learns_of_a_merge_with_what_it_does_not_hold(monkeypatch, held_is_kept):
-    monkeypatch.setattr("slamgym.estimator.large_maps.submaps.neighbourhood.MOST", 4)
+    monkeypatch.setattr(neighbourhood, "LARGEST_COUNT", 4)
     slam = made(submap_size=9)
     names = {i: range(20, 60) for i in range(len(LANDMARKS))}
     for odometry, readings, ids, _ in doubled(list(laps(72)), names):

@@ -1,4 +1,4 @@
-"""The submap that the robot is in: an ordinary filter in a frame of its own."""
+"""The submap in use: an ordinary filter in a frame of its own."""
 
 from collections.abc import Collection
 
@@ -10,13 +10,12 @@ from .gaussian import Gaussian
 from .landmark_index import LandmarkIndex, link_name
 
 Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 ORIGIN = (0.0, 0.0, 0.0)
 
 
 class ActiveSubmap:
-    """The present submap, whose landmarks may be removed and merged.
+    """The active submap, with its landmarks and links.
 
     Parameters
     ----------
@@ -30,7 +29,7 @@ class ActiveSubmap:
         """Coordinates of the error."""
 
     def begin(self) -> None:
-        """Begin anew: the robot at the origin of the frame, which is certain."""
+        """Begin a new submap, with the robot at the origin of the frame."""
         self.filter.reset(ORIGIN, ORIGIN)
 
     def __len__(self) -> int:
@@ -41,52 +40,52 @@ class ActiveSubmap:
 
     @property
     def names(self) -> tuple[int, ...]:
-        """Its landmarks and links, in its order."""
+        """Landmarks and links, in the order of the filter."""
         return self.filter.landmark_ids
 
     @property
     def pose(self) -> Array:
-        """Of the robot, shape (3,); its heading is not wrapped."""
+        """(x, y, θ) of the robot, shape (3,); the heading is not wrapped."""
         return self.filter.map.mean[:3]
 
     @property
     def heading_variance(self) -> float:
-        """In the frame of the submap [rad²]."""
+        """Variance of the heading in the frame of the submap [rad²]."""
         return float(self.filter.map.covariance[2, 2])
 
     @property
     def pose_covariance(self) -> Array:
-        """Of the additive error, shape (3, 3)."""
+        """Covariance of the additive pose error, shape (3, 3)."""
         return self.filter.map.covariance[:3, :3].copy()
 
     def gaussian(self) -> Gaussian:
-        """Return pose, landmarks and links, in the coordinates of the error."""
+        """Return pose, landmarks and links, with the error in ``frame``."""
         gaussian = self.filter.map
         mean = gaussian.mean[: gaussian.size].copy()
         return Gaussian(mean, self.filter.belief().error_covariance())
 
     def remove(
-        self, ids: Collection[int], slots: LandmarkIndex, tied: Collection[int]
+        self, ids: Collection[int], index: LandmarkIndex, shared: Collection[int]
     ) -> None:
-        """Marginalise landmarks, but for those that stay as links.
+        """Marginalise landmarks, except those that remain as links.
 
         Parameters
         ----------
         ids : collection of int
-            Mapped landmarks, whether it holds them or not.
-        slots : LandmarkIndex
-            Of these.
-        tied : collection of int
-            Slots that other submaps hold too.
+            Mapped landmarks, in this submap or not.
+        index : LandmarkIndex
+            The mapped landmarks.
+        shared : collection of int
+            Slots that other submaps hold.
         """
         here = [i for i in ids if i in self]
-        links = {i: link_name(slots[i]) for i in here if slots[i] in tied}
+        links = {i: link_name(index[i]) for i in here if index[i] in shared}
         self.filter.map.rename(links)
         if alone := [i for i in here if i not in links]:
             self.filter.remove(alone)
 
     def merge(self, kept: int, gone: int) -> None:
-        """Condition on two landmarks being one, where it holds both; or rename one."""
+        """Merge two landmarks if the submap holds both; otherwise rename the second."""
         if kept in self and gone in self:
             self.filter.merge(kept, gone)
         elif gone in self:

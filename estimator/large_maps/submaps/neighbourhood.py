@@ -1,9 +1,9 @@
-"""What lies around the robot: pose and near landmarks in an ordinary filter.
+"""Pose and near landmarks of the joined map, followed by an ordinary filter.
 
-To tell what a reading is of, and whether two landmarks are one, takes the covariance of
-the pose with the landmarks around it, in every step; to join the submaps in every step
-would take far too long.  So whenever a submap is closed, the map is joined and its part
-around the robot is copied into an invariant filter, which then takes the steps too.
+Data association and merging need the covariance of the pose and the landmarks around it
+in every step, and joining the submaps in every step would be too slow.  The part of the
+joined map around the robot is therefore copied into an invariant filter, which then
+processes each step too.  The copy is replaced whenever a submap is closed.
 """
 
 from __future__ import annotations
@@ -24,190 +24,212 @@ from .store import LostSubmapError
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST = 1000
-"""Landmarks of closed submaps that are looked at, the nearest."""
-FARTHER = 2.0
-"""How much farther is looked than has been asked for, so that it holds for a while."""
-RECENT = 10
-"""Scans that tell how far is looked when it is taken anew."""
+LARGEST_COUNT = 1000
+"""Largest number of landmarks of closed submaps in a neighbourhood."""
+MARGIN = 2.0
+"""Ratio of the copied to the required distance, so that a copy lasts for a while."""
+RECENT_SCANS = 10
+"""Number of scans whose ranges determine the required distance of the next copy."""
 
 
 class Region(NamedTuple):
-    """How far a vicinity reaches."""
+    """The disc that a neighbourhood covers."""
 
     centre: Array
-    """Where the robot was when it was surveyed, shape (2,) [m]."""
+    """Position of the robot when the copy was made, shape (2,) [m]."""
     reach: float
-    """How far from the robot landmarks were to be found in it at least [m]."""
+    """Required distance from the robot [m]."""
     slack: float
-    """By how much landmarks may be nearer than they seem to be [m]."""
+    """Uncertainty of the distances [m]."""
     is_all: bool = False
-    """Whether there is nothing farther away."""
+    """Whether the copy holds all landmarks."""
     farthest: float = np.inf
-    """Distance of the last landmark in it where there were too many [m]."""
+    """Distance of the last landmark, if their number was limited [m]."""
 
     @property
     def radius(self) -> float:
-        """Of the landmarks around the centre that it holds [m]."""
-        wanted = np.inf if self.is_all else FARTHER * (self.reach + self.slack)
+        """Radius of the disc [m]."""
+        wanted = np.inf if self.is_all else MARGIN * (self.reach + self.slack)
         return min(wanted, self.farthest)
 
     def covers(self, position: Array, within: float) -> bool:
-        """Tell whether it holds all that is within a distance of a position (2,)."""
+        """Return whether the disc holds all within a distance of a position (2,)."""
         away = float(np.hypot(*(position - self.centre)))
         return away + within + self.slack <= self.radius
 
     def chosen(self, points: Array) -> tuple[Int, Region]:
-        """Return which of some landmarks (n, 2) lie within, the nearest if many.
+        """Return which landmarks (n, 2) lie in the disc, and the disc.
 
-        Of many, also the extent that those have.
+        If there are too many, the nearest and a smaller disc.
         """
         distance = np.hypot(*(points - self.centre).T)
         inside = np.flatnonzero(distance <= self.radius)
-        if len(inside) <= MOST:
+        if len(inside) <= LARGEST_COUNT:
             return inside, self
-        nearest = inside[np.argsort(distance[inside], kind="stable")[:MOST]]
+        nearest = inside[np.argsort(distance[inside], kind="stable")[:LARGEST_COUNT]]
         farthest = float(distance[nearest[-1]])
         return np.sort(nearest), self._replace(farthest=farthest)
 
 
-Survey = Callable[[float], tuple[Belief, Region]]
+JoinedRegion = Callable[[float], tuple[Belief, Region]]
+
+
+class _Copy(NamedTuple):
+    """A part of the joined map, and the filter that follows the robot in it."""
+
+    slam: InvariantEkfSlam
+    region: Region
 
 
 class Neighbourhood:
-    """A part of the joined map, which an ordinary filter carries on once it is asked.
-
-    Before that, and after :meth:`forget`, it does nothing.
+    """A part of the joined map; empty until :meth:`view` is called.
 
     Parameters
     ----------
     make : callable
-        Makes the filter, whose readings are to pass no gate.
-    survey : callable
-        Gives the joined belief around the robot, so far as it is asked [m].
+        Returns a filter without a gate.
+    joined_region : callable
+        Returns the joined belief around the robot within at least a distance [m].
+    saved : tuple, optional
+        Copy and distances to continue from.
     """
 
-    def __init__(self, make: Callable[[], InvariantEkfSlam], survey: Survey) -> None:
-        self._make, self._survey = make, survey
+    def __init__(
+        self,
+        make: Callable[[], InvariantEkfSlam],
+        joined_region: JoinedRegion,
+        saved: tuple[_Copy, list[float]] | None = None,
+    ) -> None:
+        self._make, self._joined_region = make, joined_region
         self.forget()
+        if saved is not None:
+            self._copy, self._reaches = saved
 
     def forget(self) -> None:
-        """Start a new run."""
-        self._slam: InvariantEkfSlam | None = None
-        self._region = Region(np.zeros(2), 0.0, 0.0)
-        # The farthest that was asked for or read with each of the last scans, and
-        # since then [m].
-        self._reaches = RECENT * [0.0]
+        """Discard the copy, for a new run."""
+        self._copy: _Copy | None = None
+        # Largest distance asked for or measured with each recent scan; the last entry
+        # is for the time since the last scan [m].
+        self._reaches = RECENT_SCANS * [0.0]
 
     @property
     def nbytes(self) -> int:
-        """Memory that its covariance takes [bytes]."""
-        return 0 if self._slam is None else self._slam.map.covariance.nbytes
+        """Memory of the covariance [bytes]."""
+        return 0 if self._copy is None else self._copy.slam.map.covariance.nbytes
 
     def view(self, within: float) -> MapView:
-        """Look at pose and near landmarks, without a copy.
+        """Return pose and near landmarks, without copying arrays.
 
         Parameters
         ----------
         within : float
-            How far from the robot to look at least [m].
+            Distance from the robot that the view covers at least [m].
         """
-        slam = self._slam
-        if slam is None or not self._region.covers(slam.map.mean[:2], within):
-            slam = self._take(*self._survey(max(within, *self._reaches)))
+        copy = self._copy
+        if copy is None or not copy.region.covers(copy.slam.map.mean[:2], within):
+            copy = self._renewed(max(within, *self._reaches))
         self._reaches[-1] = max(within, self._reaches[-1])
-        return slam.map_view()
+        return copy.slam.map_view()
 
     def renew(self) -> None:
-        """Take it anew from the joined map; without one it goes on as it is."""
-        if self._slam is not None:
+        """Replace the copy, if there is one; keep it if the submaps cannot be joined."""
+        if self._copy is not None:
             with suppress(np.linalg.LinAlgError, LostSubmapError):
-                self._take(*self._survey(max(self._reaches)))
+                self._renewed(max(self._reaches))
 
     def predict(self, odometry: ArrayLike, dt: float) -> None:
         """Move the robot."""
-        if self._slam is not None:
-            self._slam.predict(odometry, dt)
+        if self._copy is not None:
+            self._copy.slam.predict(odometry, dt)
 
     def update(
         self, measurements: ArrayLike, ids: LandmarkIds | None, report: UpdateReport
     ) -> None:
-        """Take in what a submap has taken in; known landmarks must be told by now.
+        """Process the measurements that the active submap has used.
 
         Parameters
         ----------
         measurements, ids
             The scan.
         report : UpdateReport
-            Of the submap's filter; ``added_ids`` are those new to the whole map.
+            Of the submap's filter, with ``added_ids`` new to the whole map.
         """
-        if self._slam is None or ids is None:
+        if self._copy is None or ids is None:
             return
-        given = np.asarray(ids).ravel().tolist()
         refused = {*report.rejected_ids, *report.skipped_ids}
-        rows = [row for row, i in enumerate(given) if i not in refused]
-        readings, used = np.asarray(measurements)[rows], [given[row] for row in rows]
-        if not used:
-            return
-        before = self._slam
+        used = {
+            row: i
+            for row, i in enumerate(np.asarray(ids).ravel().tolist())
+            if i not in refused
+        }
+        if used:
+            readings = np.asarray(measurements)[list(used)]
+            self._correct(self._copy, readings, list(used.values()), report.added_ids)
+
+    def _correct(
+        self, before: _Copy, readings: Array, ids: list[int], new: Sequence[int]
+    ) -> None:
+        """Correct the copy; replace it if it lacks a landmark or the update fails."""
         farthest = max(float(readings[:, 1].max()), self._reaches[-1])
         self._reaches = [*self._reaches[1:-1], farthest, 0.0]
-        if not before.map.slots.keys() | set(report.added_ids) >= set(used):
+        if not before.slam.map.slots.keys() | set(new) >= set(ids):
             self.renew()
-        if self._slam is before:  # else the scan is in it already
+        if self._copy is before:  # a new copy contains the scan already
             try:
-                before.update(readings, used)
+                before.slam.update(readings, ids)
             except np.linalg.LinAlgError:
                 self.renew()
 
     def remove(self, ids: Sequence[int]) -> None:
-        """Marginalise those landmarks that it holds."""
-        if self._slam is None:
+        """Marginalise landmarks, as far as the copy holds them."""
+        if self._copy is None:
             return
-        if held := [i for i in ids if i in self._slam.map.slots]:
-            self._slam.remove(held)
+        slam = self._copy.slam
+        if held := [i for i in ids if i in slam.map.slots]:
+            slam.remove(held)
 
     def merge(self, kept: int, gone: int) -> None:
-        """Condition on two landmarks being one, after the submaps have been."""
-        if self._slam is None:
+        """Condition on two landmarks being the same, after the submaps have been."""
+        if self._copy is None:
             return
-        held = {kept, gone}.intersection(self._slam.map.slots)
+        slam = self._copy.slam
+        held = {kept, gone}.intersection(slam.map.slots)
         if len(held) == 2:
             with suppress(np.linalg.LinAlgError):
-                self._slam.merge(kept, gone)
+                slam.merge(kept, gone)
         elif held:
             self.renew()
         self.remove([gone])
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of everything, as arrays; nothing where nobody has looked."""
-        if self._slam is None:
+        """Return copies of the whole state as arrays; empty without a copy."""
+        if self._copy is None:
             return {}
-        extent = self._region
-        numbers = [*extent.centre, extent.reach, extent.slack, extent.is_all]
-        limits = np.array([*numbers, extent.farthest, *self._reaches])
-        return self._slam.state_dict() | {"extent": limits}
+        slam, region = self._copy
+        limits = [*region.centre, region.reach, region.slack, region.is_all]
+        numbers = np.array([*limits, region.farthest, *self._reaches])
+        return slam.state_dict() | {"extent": numbers}
 
     def restored(self, state: Mapping[str, Any]) -> Neighbourhood:
-        """Make another from what :meth:`state_dict` returned."""
-        other = Neighbourhood(self._make, self._survey)
-        if state:
-            argument_checks.refuse_other_state(state, ["extent"])
-            limits = argument_checks.as_floats("state['extent']", state["extent"])
-            if limits.shape != (6 + RECENT,) or np.isnan(limits).any():
-                raise ValueError(
-                    f"state['extent'] must be {6 + RECENT} numbers, got {limits}"
-                )
-            x, y, reach, slack, is_all, farthest, *other._reaches = limits.tolist()
-            centre = np.array([x, y])
-            other._region = Region(centre, reach, slack, bool(is_all), farthest)
-            other._slam = self._make()
-            other._slam.load_state_dict(
-                {k: v for k, v in state.items() if k != "extent"}
+        """Return a neighbourhood that continues from a saved state."""
+        if not state:
+            return Neighbourhood(self._make, self._joined_region)
+        argument_checks.refuse_other_state(state, ["extent"])
+        numbers = argument_checks.as_floats("state['extent']", state["extent"])
+        if numbers.shape != (6 + RECENT_SCANS,) or np.isnan(numbers).any():
+            raise ValueError(
+                f"state['extent'] must be {6 + RECENT_SCANS} numbers, got {numbers}"
             )
-        return other
+        x, y, reach, slack, is_all, farthest, *reaches = numbers.tolist()
+        region = Region(np.array([x, y]), reach, slack, bool(is_all), farthest)
+        slam = self._make()
+        slam.load_state_dict({k: v for k, v in state.items() if k != "extent"})
+        saved = _Copy(slam, region), reaches
+        return Neighbourhood(self._make, self._joined_region, saved)
 
-    def _take(self, belief: Belief, region: Region) -> InvariantEkfSlam:
+    def _renewed(self, reach: float) -> _Copy:
+        """Replace the copy by one that covers at least a distance [m]."""
+        belief, region = self._joined_region(reach)
         slam, P = self._make(), belief.covariance
         state = {
             "estimator": np.array(type(slam).__name__),
@@ -217,5 +239,5 @@ class Neighbourhood:
             "landmark_ids": np.array(belief.landmark_ids, dtype=np.int64),
         }
         slam.load_state_dict(state)
-        self._slam, self._region = slam, region
-        return slam
+        self._copy = _Copy(slam, region)
+        return self._copy
