@@ -101,13 +101,14 @@ class Neighbourhood:
         saved: tuple[_Copy, list[float]] | None = None,
     ) -> None:
         self._make, self._joined_region = make, joined_region
+        self._copy: _Copy | None = None
         self.forget()
         if saved is not None:
             self._copy, self._reaches = saved
 
     def forget(self) -> None:
         """Discard the copy, for a new run."""
-        self._copy: _Copy | None = None
+        self._copy = None
         # Largest distance asked for or measured with each recent scan; the last entry
         # is for the time since the last scan [m].
         self._reaches = RECENT_SCANS * [0.0]
@@ -132,7 +133,7 @@ class Neighbourhood:
         return copy.slam.map_view()
 
     def renew(self) -> None:
-        """Replace the copy, if there is one; keep it if the submaps cannot be joined."""
+        """Replace the copy, if there is one and the submaps can be joined."""
         if self._copy is not None:
             with suppress(np.linalg.LinAlgError, LostSubmapError):
                 self._renewed(max(self._reaches))

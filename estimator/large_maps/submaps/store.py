@@ -144,7 +144,7 @@ class FolderStore:
             If the folder holds another run.
         """
         store = FolderStore(self.folder)
-        found = store._found_run()
+        found = self._found_run()
         if not run:
             if found != self.run:
                 self._refuse(found)
