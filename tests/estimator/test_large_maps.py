@@ -212,7 +212,7 @@ def continued(way, folder, states):
 CHILD = """
 import json, pathlib, pickle, sys
 sys.path.insert(0, {tests!r})
-from test_growing_maps import continued
+from test_large_maps import continued
 found = {{}}
 for way in {ways!r}:
     try:

@@ -539,7 +539,7 @@ def test_a_saved_run_goes_on_in_another_process(tmp_path):
     """Both processes find the kernels compiled, since this one has done so."""
     script = (
         "import sys, numpy as np\n"
-        "from test_landmark_management import TIDY, busy_run, make\n"
+        "from test_map_management import TIDY, busy_run, make\n"
         "slam, (begin, end, where) = make('invariant', TIDY), sys.argv[1:]\n"
         "if int(begin):\n"
         "    slam.load_state_dict(np.load(f'{where}/{begin}.npz'))\n"
