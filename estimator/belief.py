@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -159,6 +159,20 @@ def describe_map(landmarks: int, pose: Array, pose_covariance: Array) -> str:
     x, y, heading = (f"{p:.3f} ± {s:.3f}" for p, s in zip(pose, std, strict=True))
     noun = "landmark" if landmarks == 1 else "landmarks"
     return f"{landmarks} {noun}, pose ({x} m, {y} m, {heading} rad)"
+
+
+class _HasMarginals(Protocol):
+    @property
+    def landmark_ids(self) -> Sequence[int]: ...
+
+    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief: ...
+
+
+def describe_filter(slam: _HasMarginals) -> str:
+    """Return class, number of landmarks and pose of a filter: its ``__repr__``."""
+    pose = slam.belief([])
+    found = describe_map(len(slam.landmark_ids), pose.pose, pose.pose_covariance)
+    return f"{type(slam).__name__} of {found}"
 
 
 class MapView(NamedTuple):

@@ -172,8 +172,11 @@ class ScanAssociation:
                 tentative = tentative.with_sighting(slot, readings[row], noise)
         needed = self._policy.confirm[0]
         enough = tentative.sightings >= needed
+        confirmed = set(np.flatnonzero(enough).tolist())
+        if needed == 1:
+            confirmed.add(NEW)
         for row, slot in pairs:
-            if (slot >= 0 and enough[slot]) or (slot == NEW and needed == 1):
+            if slot in confirmed:
                 self._confirm(row, self._next_id)
             elif slot != AMBIGUOUS:
                 self.tentative_rows.append(row)

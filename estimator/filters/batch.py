@@ -15,9 +15,11 @@ from ..kernels.scan_rows import Workspace
 from ..models.angles import wrap_angle
 from ..support import argument_checks
 from ..support.threads import share_out, usable_cores
+from .batch_arguments import chosen_runs, first_poses, step_data
 from .batch_results import BatchBeliefs, BatchStorage, BatchTrace
-from .ekf import FRAMES, EkfSlam
+from .ekf import EkfSlam
 from .gaussian_map import GaussianMap
+from .map_filter import FRAMES
 from .scan_workspace import workspace_for
 
 Array = NDArray[np.float64]
@@ -86,7 +88,7 @@ class BatchSlam:
         std = argument_checks.standard_deviations(
             "initial_pose_std", initial_pose_std, 3
         )
-        first = self._first_poses("initial_poses", initial_poses)
+        first = first_poses("initial_poses", initial_poses, self.runs)
         capacity = GaussianMap.capacity_for(self.landmarks)
         self._means = np.zeros((self.runs, capacity))
         self._references = np.zeros((self.runs, capacity))
@@ -132,32 +134,18 @@ class BatchSlam:
         -------
         BatchTrace
         """
-        u = argument_checks.as_floats("odometry", odometry)
-        steps = u.shape[1] if u.ndim == 3 else 0
-        z = argument_checks.as_floats("measurements", measurements)
-        seen = np.ascontiguousarray(visible, dtype=np.bool_)
-        count, landmarks = self.runs, self.landmarks
-        for name, array, shape in (
-            ("odometry", u, (count, steps, 2)),
-            ("measurements", z, (count, steps, landmarks, 2)),
-            ("visible", seen, (count, steps, landmarks)),
-        ):
-            if array.shape != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
-        durations = np.ascontiguousarray(
-            np.broadcast_to(np.asarray(dt, dtype=np.float64), (steps,))
+        data, durations = step_data(
+            odometry, measurements, visible, dt, (self.runs, self.landmarks)
         )
-        if not (np.isfinite(durations) & (durations >= 0)).all():
-            raise ValueError(f"dt must be finite numbers >= 0, got {dt!r}")
+        count, steps = data.odometry.shape[:2]
         trace = BatchTrace(
             np.full((count, steps, 3), np.nan),
             np.full((count, steps, 3, 3), np.nan),
             np.full((count, steps), np.nan),
             np.zeros((count, steps), dtype=np.int64),
         )
-        chosen = self._chosen(runs)
+        chosen = chosen_runs(runs, self.runs)
         failed_at = np.where(chosen, self.failed_at, 0)  # the kernel passes these over
-        data = StepData(u, z, seen)
         drive = partial(self._drive, data, durations, trace, failed_at)
         share_out(drive, self.runs, self._threads)
         self.failed_at = np.where(chosen, failed_at, self.failed_at)
@@ -183,8 +171,8 @@ class BatchSlam:
             The runs that start anew, all where not given; the others go on.
         """
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
-        first = self._first_poses("poses", poses)
-        chosen = self._chosen(runs)
+        first = first_poses("poses", poses, self.runs)
+        chosen = chosen_runs(runs, self.runs)
         self._means[chosen] = self._references[chosen] = 0.0
         self._covariances[chosen] = 0.0
         at = np.flatnonzero(chosen)
@@ -246,25 +234,11 @@ class BatchSlam:
             )
         )
 
-    def _chosen(self, runs: ArrayLike | None) -> NDArray[np.bool_]:
-        if runs is None:
-            return np.ones(self.runs, dtype=np.bool_)
-        chosen = np.asarray(runs)
-        if chosen.shape != (self.runs,) or chosen.dtype != np.bool_:
-            raise ValueError(
-                f"runs must be {self.runs} booleans, got {chosen.dtype} with shape "
-                f"{chosen.shape}"
-            )
-        return chosen
-
-    def _first_poses(self, name: str, poses: ArrayLike) -> Array:
-        first = argument_checks.as_floats(name, poses)
-        if first.shape not in ((3,), (self.runs, 3)) or not np.isfinite(first).all():
-            raise ValueError(
-                f"{name} must be finite with shape (3,) or ({self.runs}, 3), "
-                f"got shape {first.shape}"
-            )
-        return np.broadcast_to(first, (self.runs, 3))
+    def __repr__(self) -> str:
+        mapped = self._mapped
+        landmarks = f"{mapped.min()} to {mapped.max()} of {self.landmarks} landmarks"
+        stopped = int((self.failed_at != NEVER).sum())
+        return f"BatchSlam of {self.runs} runs, {landmarks} mapped, {stopped} stopped"
 
     def _drive(
         self,

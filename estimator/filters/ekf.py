@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar, NoReturn
+from typing import ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..belief import Belief, MapView, describe_map
-from ..error_frames import ErrorFrame
 from ..kernels.predict import predict
-from ..kernels.rules import ADDITIVE, AT_ESTIMATE, INVARIANT, Rules
+from ..kernels.rules import ADDITIVE, AT_ESTIMATE, Rules
 from ..kernels.scan_rows import SLOT
 from ..kernels.scan_update import DONE, NOT_USABLE, update_belief
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
-from ..support.memory_limit import covariance_bytes
 from ..update_report import UpdateReport
 from .filter_settings import checked_rules
 from .gaussian_map import GaussianMap
+from .map_filter import MapFilter
 from .motion_noise import MotionNoise
 from .scan_report import ScanReport
-from .scan_workspace import ScanWorkspace, covariances_for
+from .scan_workspace import (
+    ScanWorkspace,
+    covariances_for,
+    not_positive_definite,
+)
 
 Array = NDArray[np.float64]
 
-FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 
-
-class EkfSlam:
+class EkfSlam(MapFilter):
     """Extended Kalman filter over the robot pose and a growing landmark map.
 
     The state is (x, y, θ, l1x, l1y, …), landmarks in the order of first sight; the
@@ -98,10 +97,6 @@ class EkfSlam:
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
 
-    map: GaussianMap
-    """The belief, in the arrays that steps change."""
-    rules: Rules
-    """What distinguishes this filter's updates from another's."""
     rule_values: Array
     """The rules as the kernels take them."""
 
@@ -134,20 +129,6 @@ class EkfSlam:
             )
         )
         self.reset(initial_pose, initial_pose_std)
-
-    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run with an empty map.
-
-        Parameters
-        ----------
-        pose : array_like, shape (3,)
-            Mean of the first pose (x, y, θ) [m, m, rad].
-        pose_std : array_like, shape (3,)
-            Its standard deviation.
-        """
-        first = argument_checks.finite_vector("pose", pose, 3)
-        std = argument_checks.standard_deviations("pose_std", pose_std, 3)
-        self.map.reset(first, np.diag(std**2))
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading.
@@ -211,97 +192,16 @@ class EkfSlam:
         )
         if status != DONE:
             self._refuse(status, readings, ids)
-        found = self._workspace.record(used, count)
-        report = ScanReport(nis, ids, found, sequential=self.rules.sequential)
+        left = self._workspace.copies(used, count)
+        report = ScanReport(nis, ids, left, sequential=self.rules.sequential)
         if used < count:
             self.map.add(report.added_ids)
         return report
-
-    def remove(self, landmark_ids: LandmarkIds) -> None:
-        """Marginalise landmarks; the belief about all else keeps its last bit.
-
-        Raises
-        ------
-        ValueError
-            Where one is not in the map; nothing is then removed.
-        """
-        self.map.remove(argument_checks.mapped_identities(landmark_ids, self.map.slots))
-
-    def merge(self, kept: int, gone: int) -> None:
-        """Condition on two mapped landmarks being one, and remove the second.
-
-        Raises
-        ------
-        ValueError
-            Where one is not in the map, or they are the same.
-        numpy.linalg.LinAlgError
-            Where their distance has no uncertainty; nothing is then merged.
-        """
-        argument_checks.two_landmarks(kept, gone)
-        argument_checks.mapped_identities([kept, gone], self.map.slots)
-        at_reference = self.rules.linearisation != AT_ESTIMATE
-        self.map.merge(kept, gone, frame=FRAMES[self._frame], at_reference=at_reference)
-
-    def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
-        """Return the belief as a snapshot, of the whole map or of a part of it.
-
-        Parameters
-        ----------
-        landmark_ids : sequence of int, optional
-            Return the marginal of the pose and these landmarks only, in this order.
-        """
-        if landmark_ids is not None:
-            landmark_ids = argument_checks.mapped_identities(
-                landmark_ids, self.map.slots
-            )
-        return self.map.belief(FRAMES[self._frame], landmark_ids)
-
-    def map_view(self) -> MapView:
-        """Return pose and map without a copy; it is valid until the next step."""
-        return self.map.view()
-
-    @property
-    def landmark_ids(self) -> tuple[int, ...]:
-        """The mapped landmarks, in the order of the belief."""
-        return tuple(self.map.slots)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return copies of mean, covariance, ids and linearisation points."""
-        return {"estimator": np.array(type(self).__name__), **self.map.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, bit for bit in a filter of the same settings.
-
-        Parameters
-        ----------
-        state : mapping
-            What :meth:`state_dict` returned, also after a trip through ``numpy.savez``.
-
-        Raises
-        ------
-        ValueError
-            Where the state lacks an entry, is of another estimator, or does not fit
-            together; the belief is then as before.
-        """
-        entries = ("covariance", "landmark_ids", "mean", "reference")
-        argument_checks.refuse_other_state(
-            state, entries, estimator=type(self).__name__
-        )
-        self.map.load_state_dict(state)
-
-    def memory_for(self, landmarks: int) -> int:
-        """Return what a map of so many landmarks takes at least [bytes]."""
-        return self.map.copies * covariance_bytes(landmarks)
 
     @property
     def motion_values(self) -> Array:
         """(σx², σy², σα²) per step, and 1 where a robot at rest has noise too."""
         return np.append(*self._motion_noise)
-
-    def __repr__(self) -> str:
-        pose = self.belief([])
-        found = describe_map(len(self.landmark_ids), pose.pose, pose.covariance)
-        return f"{type(self).__name__} of {found}"
 
     def _adopt(self, rules: Rules) -> None:
         self.rules = rules
@@ -320,11 +220,3 @@ class EkfSlam:
             argument_checks.refuse_unusable(readings, ids)
         failed = self._workspace.failed_reading(status, len(ids))
         raise not_positive_definite(ids[failed])
-
-
-def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:
-    """Return the error of an innovation covariance that cannot be factored."""
-    return np.linalg.LinAlgError(
-        "the innovation covariance is not positive definite at the reading of "
-        f"landmark {landmark_id}: the belief or measurement_std is degenerate"
-    )

@@ -6,14 +6,10 @@ from collections.abc import Callable
 from functools import cached_property, partial
 from itertools import compress
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ..kernels.belief_arrays import Array, Int
 from ..kernels.scan_record import ScanRecord
 from ..kernels.scan_rows import ADDED, GATED, NEAR, OUTCOME, SKIPPED, USED
 from ..update_report import UpdateReport
-
-Array = NDArray[np.float64]
 
 
 class ScanReport(UpdateReport):
@@ -25,20 +21,26 @@ class ScanReport(UpdateReport):
         νᵀ S⁻¹ ν.
     ids : list of int
         Landmark of each reading.
-    record : ScanRecord
-        Copies of what the update has left of the scan.
+    copies : tuple of ndarray
+        The parts of a :class:`ScanRecord`.
     sequential : bool
         Whether readings were linearised one after the other.
     """
 
     _ids: list[int]
-    _record: ScanRecord
+    _copies: tuple[Array, Int]
     _sequential: bool
 
     def __init__(
-        self, nis: float, ids: list[int], record: ScanRecord, *, sequential: bool
+        self, nis: float, ids: list[int], copies: tuple[Array, Int], *, sequential: bool
     ) -> None:
-        self.__dict__.update(nis=nis, _ids=ids, _record=record, _sequential=sequential)
+        parts = self.__dict__
+        parts["nis"], parts["_ids"] = nis, ids
+        parts["_copies"], parts["_sequential"] = copies, sequential
+
+    @property
+    def _record(self) -> ScanRecord:
+        return ScanRecord(*self._copies)
 
     @cached_property
     def degrees_of_freedom(self) -> int:

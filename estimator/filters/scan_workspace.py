@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..kernels.belief_arrays import Array, Int
 from ..kernels.covariance_update import BLOCK
 from ..kernels.rules import Rules
-from ..kernels.scan_record import ScanRecord, record
+from ..kernels.scan_record import copy_scan
 from ..kernels.scan_rows import (
     OUTCOME,
     USED,
@@ -42,11 +43,10 @@ class ScanWorkspace:
         self._first_row = prior_system(height, self._rules.iterations)
         self.readings, self.capacity = room, capacity
 
-    def record(self, used: int, readings: int) -> ScanRecord:
-        """Return copies of what the last update has left of its scan."""
-        return record(
-            self.arrays.rows, self.ledger[:, :readings], used, self._first_row
-        )
+    def copies(self, used: int, readings: int) -> tuple[Array, Int]:
+        """Return copies of what the last update has left, for a :class:`ScanRecord`."""
+        ledger, first = self.ledger[:, :readings], self._first_row
+        return copy_scan(self.arrays.rows, ledger, used, first)
 
     def failed_reading(self, status: int, readings: int) -> int:
         """Return the reading whose innovation covariance could not be factored."""
@@ -69,3 +69,11 @@ def covariances_for(rules: Rules) -> int:
     """Return how many arrays of the size of P an update needs: P, and copies of it."""
     iterated = rules.iterations > 1
     return 1 + iterated + (iterated or rules.sequential)
+
+
+def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:
+    """Return the error of an innovation covariance that cannot be factored."""
+    return np.linalg.LinAlgError(
+        "the innovation covariance is not positive definite at the reading of "
+        f"landmark {landmark_id}: the belief or measurement_std is degenerate"
+    )

@@ -12,7 +12,8 @@ from ..models.angles import wrap_angle
 from ..models.unicycle_motion import drive
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
-from .ekf import EkfSlam, not_positive_definite
+from .ekf import EkfSlam
+from .scan_workspace import not_positive_definite
 
 Array = NDArray[np.float64]
 

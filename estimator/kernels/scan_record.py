@@ -46,8 +46,8 @@ class ScanRecord(NamedTuple):
         return factor
 
 
-def record(rows: Array, ledger: Int, used: int, first: int) -> ScanRecord:
-    """Copy what a report needs of a scan out of its rows and its ledger.
+def copy_scan(rows: Array, ledger: Int, used: int, first: int) -> tuple[Array, Int]:
+    """Copy the parts of a :class:`ScanRecord` out of the workspace.
 
     Where the map is much larger than the scan, the copy has only the columns of the
     pose and of the landmarks read.
@@ -65,9 +65,9 @@ def record(rows: Array, ledger: Int, used: int, first: int) -> ScanRecord:
     """
     found, kept = rows[first : first + 2 * used], ledger.copy()
     if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
-        return ScanRecord(found.copy(), kept)
+        return found.copy(), kept
     columns = ledger[COLUMN, :used]
     landmarks = np.stack([columns, columns + 1], axis=1).ravel()
     chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-META_WIDTH, 0)])
     kept[COLUMN, :used] = 3 + 2 * np.arange(used)
-    return ScanRecord(found[:, chosen], kept)
+    return found[:, chosen], kept

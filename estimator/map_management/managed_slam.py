@@ -1,4 +1,4 @@
-"""Any filter, its landmarks managed by a policy."""
+"""Manage the landmarks of any filter by a policy."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..association.candidates import Candidates, ScanAssociation
+from ..filters.motion_noise import MotionNoise
 from ..interface import Belief, MapView, SlamEstimator, UpdateReport, optional_members
 from ..models.rigid_motion import rotation
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
+from ..support.nested_state import with_prefix, without_prefix
 from .map_editor import CachedEditor, edit_map
 from .map_view import mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
@@ -50,8 +52,8 @@ class ManagedSlam:
     Notes
     -----
     Tentative landmarks stay outside the filter's state: clutter then neither moves the
-    pose nor costs anything, and a landmark that comes to nothing leaves no trace.  The
-    price is that the readings before the one that confirms correct nothing.
+    pose nor costs anything, and a landmark that is never confirmed does not change the
+    belief.  The price is that the readings before the confirming one correct nothing.
 
     Examples
     --------
@@ -85,19 +87,20 @@ class ManagedSlam:
         bearing_std, range_std = np.asarray(measurement_std, dtype=np.float64).tolist()
         noise = bearing_std, range_std, float(options.get("range_std_per_metre", 0.0))
         self._noise = noise
-        self._motion_variance = np.asarray(motion_std, dtype=np.float64) ** 2
-        self._noise_at_rest = options.get("noise_at_rest", True)
+        self._motion_noise = MotionNoise.checked(
+            motion_std, options.get("noise_at_rest", True)
+        )
         self._min_range = options.get("min_range", 1e-3)
         merging = self._policy.merge_within is not None
         self._editor = CachedEditor(edit_map(self._filter, merging=merging))
-        self._pruning = MapPruner(self._policy, self._editor, noise)
+        self._pruner = MapPruner(self._policy, self._editor, noise)
         self._candidates = Candidates()
         for name, member in optional_members(self._filter).items():
             setattr(self, name, member)
 
     @property
     def policy(self) -> LandmarkPolicy:
-        """What decides about landmarks."""
+        """The policy that decides about landmarks."""
         return self._policy
 
     @property
@@ -107,7 +110,7 @@ class ManagedSlam:
 
     @property
     def tentative_landmarks(self) -> Array:
-        """Where landmarks not yet confirmed seem to be, shape (t, 2) [m]."""
+        """Estimated positions of tentative landmarks, shape (t, 2) [m]."""
         places = self._candidates.tentative.places
         if not len(places):
             return places.copy()
@@ -118,7 +121,7 @@ class ManagedSlam:
         """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
         self._filter.reset(pose, pose_std)
         self._editor.expire()
-        self._pruning.forget()
+        self._pruner.forget()
         self._candidates = Candidates()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
@@ -126,27 +129,26 @@ class ManagedSlam:
         self._filter.predict(odometry, dt)
         self._editor.expire()
         distance, turn = argument_checks.pair("odometry", odometry)
-        has_noise = self._noise_at_rest or distance or turn
-        variance = self._motion_variance * (dt if has_noise else 0.0)
+        variance = self._motion_noise.over(distance, turn, dt)
         moved = self._candidates.tentative.moved(distance, turn, variance)
         self._candidates = replace(self._candidates, tentative=moved)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
-        """Associate one scan, correct the belief with it, then tidy the map.
+        """Associate one scan, correct the belief with it, then prune the map.
 
         Parameters
         ----------
         measurements : array_like, shape (m, 2)
             Rows (β, r) [rad, m], all seen at once.
         landmark_ids : sequence of int, length m, optional
-            Identity of the landmark behind each row; None: find out.
+            Identity of the landmark behind each row; None: associate the rows.
 
         Returns
         -------
         UpdateReport
-            Of the filter, and what was done to the map.
+            The filter's, with the changes of the map.
 
         Raises
         ------
@@ -156,16 +158,18 @@ class ManagedSlam:
             Where the filter's covariance is degenerate; all is then as before.
         """
         readings = argument_checks.scan(measurements)
-        plan = self._planned(readings, landmark_ids)
+        plan = self._associate(readings, landmark_ids)
         rows = [row for row, i in enumerate(plan.row_ids) if i is not None]
         ids = [i for i in plan.row_ids if i is not None]
-        missed = self._pruning.expected(readings) - plan.explained
+        missed = self._pruner.expected(readings) - plan.explained
         report = self._filter.update(readings[rows], ids)
         self._editor.expire()
         self._candidates = plan.candidates
-        tidied = self._tidied(readings, plan, missed, report)
+        removed, merged = self._prune(readings, plan, missed, report)
         confirmed = set(plan.confirmed)
-        return tidied.replace(
+        return report.replace(
+            removed_ids=tuple(removed),
+            merged_ids=tuple(merged),
             confirmed_ids=tuple(i for i in report.added_ids if i in confirmed),
             row_ids=tuple(plan.row_ids),
             tentative_rows=tuple(plan.tentative_rows),
@@ -180,10 +184,10 @@ class ManagedSlam:
         ValueError
             Where one is not in the map.
         """
-        self._pruning.remove(self._mapped(landmark_ids))
+        self._pruner.remove(self._mapped(landmark_ids))
 
     def merge(self, kept: int, gone: int) -> None:
-        """Make one of two landmarks by hand; it answers to both its identities.
+        """Merge two landmarks by hand; both identities then name the first.
 
         Raises
         ------
@@ -192,7 +196,7 @@ class ManagedSlam:
         """
         argument_checks.two_landmarks(kept, gone)
         self._mapped([kept, gone])
-        self._pruning.join(kept, gone)
+        self._pruner.join(kept, gone)
 
     def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
         mapped = {i: slot for slot, i in enumerate(self.landmark_ids)}
@@ -208,7 +212,7 @@ class ManagedSlam:
         return marginal(self._filter, landmark_ids)
 
     def map_view(self) -> MapView:
-        """Look at pose and map, perhaps without a copy: not to keep, not to change."""
+        """Return pose and map, without a copy where possible, until the next step."""
         return view_map(self._filter)
 
     @property
@@ -217,8 +221,8 @@ class ManagedSlam:
         return mapped_ids(self._filter)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the filter's state and what is remembered of landmarks, as arrays."""
-        return self._remembered() | _named("filter", self._filter.state_dict())
+        """Return the filter's state and the records of landmarks, as arrays."""
+        return self._remembered() | with_prefix("filter", self._filter.state_dict())
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit under the same settings.
@@ -231,78 +235,62 @@ class ManagedSlam:
         """
         name = type(self).__name__
         argument_checks.refuse_other_state(state, self._remembered(), estimator=name)
-        candidates = Candidates.from_state_dict(_part_of(state, "tentative"))
-        before = self._pruning.state_dict()
+        candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
+        before = self._pruner.state_dict()
         try:
-            self._pruning.load_state_dict(_part_of(state, "landmarks"))
-            self._filter.load_state_dict(_part_of(state, "filter"))
+            self._pruner.load_state_dict(without_prefix(state, "landmarks"))
+            self._filter.load_state_dict(without_prefix(state, "filter"))
         except Exception:
-            self._pruning.load_state_dict(before)
+            self._pruner.load_state_dict(before)
             raise
         self._editor.expire()
         self._candidates = candidates
 
     def _remembered(self) -> dict[str, Any]:
-        """Return all of the state but the filter's."""
+        """Return all of the state except the filter's."""
         return {
             "estimator": np.array(type(self).__name__),
-            **_named("landmarks", self._pruning.state_dict()),
-            **_named("tentative", self._candidates.state_dict()),
+            **with_prefix("landmarks", self._pruner.state_dict()),
+            **with_prefix("tentative", self._candidates.state_dict()),
         }
 
-    def _planned(
+    def _associate(
         self, readings: Array, landmark_ids: LandmarkIds | None
     ) -> ScanAssociation:
         plan = ScanAssociation(self._policy, self._candidates, len(readings))
         view = self._editor.map_view(self._reach(readings))
         if landmark_ids is None:
-            _check_finite(readings)
+            argument_checks.refuse_not_finite(readings)
             plan.associate(readings, view, self._noise, self._min_range)
         else:
             given = argument_checks.identities(landmark_ids, len(readings))
-            plan.translate(given, view.mapped, self._pruning.aliases)
+            plan.translate(given, view.mapped, self._pruner.aliases)
         return plan
 
     def _reach(self, readings: Array) -> float:
-        """Return from how far away a landmark may matter for a scan [m]."""
+        """Return the distance within which a landmark may matter for a scan [m]."""
         policy, ranges = self._policy, readings[np.isfinite(readings[:, 1]), 1]
         reach = float(ranges.max(initial=0.0))
         if policy.remove_after is not None and policy.view is not None:
             reach = max(reach, policy.view.max_range)
         return reach + (policy.merge_within or 0.0)
 
-    def _tidied(
+    def _prune(
         self,
         readings: Array,
         plan: ScanAssociation,
         missed: set[int],
         report: UpdateReport,
-    ) -> UpdateReport:
-        """Remove and merge what the policy says, after a scan."""
+    ) -> tuple[list[int], list[tuple[int, int]]]:
+        """Remove and merge what the policy says; return the ids removed and merged."""
         refused = {*report.rejected_ids, *report.skipped_ids}
         seen = set(self._editor.map_view().ids).intersection(plan.row_ids) - refused
         rows = [row for row, i in enumerate(plan.row_ids) if i in seen]
         ids = [i for i in plan.row_ids if i is not None and i in seen]
-        self._pruning.note_sightings(readings[rows], ids)
-        removed = self._pruning.remove_missing(missed)
-        merged = self._pruning.merge(seen)
-        removed += self._pruning.keep_capacity(seen)
-        return report.replace(removed_ids=tuple(removed), merged_ids=tuple(merged))
+        self._pruner.note_sightings(readings[rows], ids)
+        removed = self._pruner.remove_missing(missed)
+        merged = self._pruner.merge(seen)
+        return removed + self._pruner.keep_capacity(seen), merged
 
-
-def _named(name: str, part: Mapping[str, Any]) -> dict[str, Any]:
-    return {f"{name}.{key}": value for key, value in part.items()}
-
-
-def _part_of(state: Mapping[str, Any], name: str) -> dict[str, Any]:
-    start = f"{name}."
-    return {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}
-
-
-def _check_finite(readings: Array) -> None:
-    finite = np.isfinite(readings).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise ValueError(
-            f"measurements must be finite, got {readings[row].tolist()} in row {row}"
-        )
+    def __repr__(self) -> str:
+        return f"Managed {self._filter!r}"

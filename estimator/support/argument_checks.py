@@ -53,12 +53,7 @@ def as_floats(name: str, value: ArrayLike) -> Array:
 
 def scan(measurements: ArrayLike) -> Array:
     """Return ``measurements`` as a writeable float64 array (m, 2), or refuse them."""
-    if (
-        type(measurements) is np.ndarray
-        and measurements.dtype is _FLOAT64
-        and measurements.flags.carray
-        and measurements.shape[1:] == (2,)
-    ):
+    if type(measurements) is np.ndarray and _is_plain_scan(measurements):
         return measurements
     readings = as_floats("measurements", measurements)
     if not readings.flags.writeable:  # another type to numba: it would compile anew
@@ -71,6 +66,12 @@ def scan(measurements: ArrayLike) -> Array:
         "measurements must have shape (m, 2), rows (bearing, range), "
         f"got shape {readings.shape}"
     )
+
+
+def _is_plain_scan(readings: NDArray[Any]) -> bool:
+    """Return whether kernels can take the readings as they are."""
+    is_plain = readings.dtype is _FLOAT64 and readings.flags.carray
+    return is_plain and readings.shape[1:] == (2,)
 
 
 def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
@@ -148,6 +149,16 @@ def two_landmarks(kept: int, gone: int) -> None:
         raise ValueError(f"kept and gone must be two landmarks, got {kept} twice")
 
 
+def refuse_not_finite(readings: Array) -> None:
+    """Refuse readings without identity that are not finite, naming the first."""
+    finite = np.isfinite(readings).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise ValueError(
+            f"measurements must be finite, got {readings[row].tolist()} in row {row}"
+        )
+
+
 def refuse_unusable(readings: Array, ids: Sequence[int]) -> None:
     """Refuse readings that are not finite or too large, naming the first."""
     for usable, rule in (
@@ -189,8 +200,7 @@ def pair(name: str, value: ArrayLike) -> tuple[float, float]:
     """Return ``value`` as two finite floats of a usable size, or refuse it."""
     given: Any = value
     if isinstance(given, np.ndarray):
-        if given.dtype is not _FLOAT64 or type(given) is not np.ndarray:
-            _refuse_masked_and_complex(name, given)
+        _refuse_masked_and_complex(name, given)
         given = given.tolist()  # in half the time that numpy's own numbers take
     try:
         first, second = given

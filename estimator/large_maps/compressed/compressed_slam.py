@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...belief import describe_filter
 from ...filters.ekf import EkfSlam
 from ...filters.first_estimates import FirstEstimatesEkfSlam
 from ...filters.invariant import InvariantEkfSlam
 from ...filters.iterated import IteratedEkfSlam
+from ...filters.map_filter import FRAMES
 from ...filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from ...interface import Belief, MapView, UpdateReport
 from ...support import argument_checks
@@ -79,6 +81,8 @@ class CompressedEkfSlam:
     >>> slam.belief([7]).landmarks  # belief() returns the whole map
     array([[2., 0.]])
     """
+
+    __repr__ = describe_filter
 
     def __init__(
         self,

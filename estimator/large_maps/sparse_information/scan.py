@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lapack, solve_triangular
 
-from ...filters.ekf import EkfSlam, not_positive_definite
+from ...filters.ekf import EkfSlam
+from ...filters.scan_workspace import not_positive_definite
 from ...support import argument_checks
 from .conditional_pose import ConditionalPose, LinearScan, marginalise_pose
 from .linearisation import BASES, linearise_scan

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...interface import Belief, MapView, UpdateReport
+from ...belief import Belief, MapView, describe_filter
+from ...interface import UpdateReport
 from ...models.angles import wrap_angle
 from ...support import argument_checks
 from ...support.argument_checks import LandmarkIds
@@ -88,6 +89,8 @@ range_noise_at, gate_probability, noise_at_rest, min_range
     array([[2., 0.]])
     """
 
+    __repr__ = describe_filter
+
     def __init__(
         self,
         motion_std: ArrayLike,
@@ -103,13 +106,11 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         **settings: Any,
     ) -> None:
         self._scan_rules = ScanRules(motion_std, measurement_std, base=base, **settings)
-        self._sparsity = Sparsity(
-            inf
-            if active_bound is None
-            else argument_checks.whole("active_bound", active_bound, 2),
-            argument_checks.one_of("sparsify", sparsify, ("relocate", "prune"))
-            == "prune",
-        )
+        bound: float = inf
+        if active_bound is not None:
+            bound = argument_checks.whole("active_bound", active_bound, 2)
+        kind = argument_checks.one_of("sparsify", sparsify, ("relocate", "prune"))
+        self._sparsity = Sparsity(bound, kind == "prune")
         self._tolerance = argument_checks.at_least("tolerance", tolerance, 0.0)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self.reset(initial_pose, initial_pose_std)

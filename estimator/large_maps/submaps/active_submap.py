@@ -5,7 +5,8 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from ...filters.ekf import FRAMES, EkfSlam
+from ...filters.ekf import EkfSlam
+from ...filters.map_filter import FRAMES
 from .gaussian import Gaussian
 from .landmark_index import LandmarkIndex, link_name
 

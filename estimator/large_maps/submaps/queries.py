@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...belief import describe_map
 from ...interface import Belief
 from ...support import argument_checks
 from ...support.argument_checks import LandmarkIds
@@ -51,6 +52,11 @@ class SubmapQueries:
         :meth:`join`.  The cost does not depend on the size of the map.
         """
         return self._graph.local_belief()
+
+    def __repr__(self) -> str:
+        pose = self.local_belief()
+        found = describe_map(len(self.landmark_ids), pose.pose, pose.pose_covariance)
+        return f"{type(self).__name__} of {found}"
 
     @property
     def pose(self) -> Array:

@@ -1,0 +1,54 @@
+"""Filters, beliefs and reports show in one line what they hold."""
+
+import numpy as np
+import pytest
+
+from slamgym.estimator import list_estimators, make_batch, make_estimator
+
+NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
+
+
+@pytest.mark.parametrize("name", list_estimators())
+def test_a_filter_shows_class_landmarks_and_pose_and_stays_as_it_is(name):
+    slam = make_estimator(name, **NOISE, initial_pose_std=(0.1, 0.2, 0.01))
+    slam.update([(0.0, 2.0), (1.0, 3.0)], [3, 5])
+    before = slam.belief()
+    shown = repr(slam)
+    assert shown.startswith(f"{type(slam).__name__} of 2 landmarks, pose (0.000 ± 0.1")
+    assert "\n" not in shown
+    np.testing.assert_array_equal(slam.belief().covariance, before.covariance)
+
+
+def test_a_belief_a_report_and_a_managed_filter_show_what_they_hold():
+    slam = make_estimator("ekf", management={"confirm": (1, 1)}, **NOISE)
+    assert repr(slam) == "Managed " + repr(slam.filter)
+    report = slam.update([(0.0, 2.0)])
+    assert repr(report).endswith("of 0 degrees of freedom, 1 added, 1 confirmed")
+    assert repr(slam.belief()).startswith("Belief of 1 landmark, pose (0.000 ± 0.000 m")
+
+
+def test_a_batch_shows_its_runs():
+    batch = make_batch("ekf", runs=3, landmarks=2, **NOISE)
+    assert repr(batch) == "BatchSlam of 3 runs, 0 to 0 of 2 landmarks mapped, 0 stopped"
+
+
+def test_reports_are_snapshots_that_compare_and_survive_a_pickle():
+    import pickle
+
+    slam, other = (make_estimator("ekf", **NOISE) for _ in range(2))
+    for each in (slam, other):
+        each.update([(0.0, 2.0), (1.0, 3.0)], [3, 5])
+    report, same = (
+        each.update([(0.1, 2.1), (0.9, 3.0)], [3, 5]) for each in (slam, other)
+    )
+    kept = pickle.loads(pickle.dumps(same))
+    slam.predict((1.0, 0.1))
+    later = slam.update([(0.1, 1.1), (0.9, 2.0)], [3, 5])
+    assert report == same == kept
+    assert report != later
+    assert report != report.replace(added_ids=(9,))
+    np.testing.assert_allclose(
+        report.nis,
+        report.innovation.ravel()
+        @ np.linalg.solve(report.innovation_covariance, report.innovation.ravel()),
+    )
