@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...filters.ekf import FRAMES, EkfSlam
+from ...filters.ekf import EkfSlam
 from ...filters.invariant import InvariantEkfSlam
 from ...interface import Belief
 from ...support.argument_checks import LOWEST_ID
@@ -102,7 +102,7 @@ class CompressedMap:
             subtract(block, self._combine(root, strip).T, signs)
             covariance[np.ix_(outside, outside)] = symmetric(block)
             del block  # frees memory before the belief takes its copy
-        frame = FRAMES[self.filter.rules.frame]
+        frame = self.filter.frame
         return Belief(mean, covariance, tuple(ids), frame)
 
     def ids_near(self, pose: Belief, within: float) -> list[int]:

@@ -13,7 +13,6 @@ from ...filters.ekf import EkfSlam
 from ...filters.first_estimates import FirstEstimatesEkfSlam
 from ...filters.invariant import InvariantEkfSlam
 from ...filters.iterated import IteratedEkfSlam
-from ...filters.map_filter import FRAMES
 from ...filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from ...interface import Belief, MapView, UpdateReport
 from ...support import argument_checks
