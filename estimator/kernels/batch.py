@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..support.jit import jit, njit_internal
-from .belief_arrays import Array, BeliefArrays, Int
-from .predict import move
+from .belief_arrays import Array, Int
+from .predict import predict
 from .rules import as_rules
-from .scan_rows import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT, Workspace
-from .scan_update import DONE, update_by_scan
+from .scan_rows import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT
+from .scan_update import DONE, update_belief
 from .screen import usable
 
 NEVER = -1
@@ -70,8 +70,8 @@ def drive_runs(
     """
     runs, data = RunArrays(*run_arrays), StepData(*step_data)
     poses, pose_covariances, nis, degrees_of_freedom = trace
-    workspace = Workspace(*workspace_arrays)
-    rules = as_rules(rule_values)
+    rows, before, prior = workspace_arrays
+    linearisation = as_rules(rule_values).linearisation
     landmarks = runs.slots.shape[1]
     ledger = np.zeros((LEDGER_HEIGHT, landmarks), np.int64)
     readings = np.empty((landmarks, 2))
@@ -81,8 +81,8 @@ def drive_runs(
         if failed_at[b] != NEVER:
             failed_at[b] = 0
             continue
-        belief = BeliefArrays(runs.means[b], runs.covariances[b], runs.references[b])
-        slots = runs.slots[b]
+        mean, covariance = runs.means[b], runs.covariances[b]
+        reference, slots = runs.references[b], runs.slots[b]
         for t in range(len(dt)):
             d, turn = data.odometry[b, t, 0], data.odometry[b, t, 1]
             m = gather(
@@ -100,9 +100,19 @@ def drive_runs(
             for i in range(3):
                 variance[i] = motion_values[i] * share
             size = 3 + 2 * runs.mapped[b]
-            move(belief, size, d, turn, variance, rules.linearisation)
-            status, used, nis[b, t] = update_by_scan(
-                belief, size, readings, m, ledger, rules, workspace
+            predict(mean, covariance, reference, size, d, turn, variance, linearisation)
+            status, used, nis[b, t] = update_belief(
+                mean,
+                covariance,
+                reference,
+                size,
+                readings,
+                m,
+                ledger,
+                rows,
+                before,
+                prior,
+                rule_values,
             )
             if status != DONE:
                 nis[b, t] = np.nan
@@ -111,9 +121,9 @@ def drive_runs(
             degrees_of_freedom[b, t] = 2 * used
             runs.mapped[b] += note_new(m, ids, ledger, slots, runs.mapped[b])
             for i in range(3):
-                poses[b, t, i] = belief.mean[i]
+                poses[b, t, i] = mean[i]
                 for j in range(3):
-                    pose_covariances[b, t, i, j] = belief.covariance[i, j]
+                    pose_covariances[b, t, i, j] = covariance[i, j]
 
 
 @njit_internal

@@ -1,8 +1,8 @@
 """Prediction by one odometry reading, compiled; symbols as in the motion model."""
 
 from ..models.unicycle_motion import drive_jit
-from ..support.jit import jit, njit_inlined, njit_internal
-from .belief_arrays import Array, BeliefArrays
+from ..support.jit import jit, njit_internal
+from .belief_arrays import Array
 from .rules import AT_ESTIMATE
 
 
@@ -17,26 +17,11 @@ def predict(
     motion_variance: Array,
     linearisation: int,
 ) -> None:
-    """Move a belief by one odometry reading (d, α), in place; called from Python."""
-    belief = BeliefArrays(mean, covariance, reference)
-    move(belief, size, distance, turn, motion_variance, linearisation)
-
-
-@njit_inlined
-def move(
-    belief: BeliefArrays,
-    size: int,
-    distance: float,
-    turn: float,
-    motion_variance: Array,
-    linearisation: int,
-) -> None:
-    """Move the pose and propagate the covariance, eqs. 1.1 and 1.2.
+    """Move a belief by one odometry reading (d, α), in place; eqs. 1.1 and 1.2.
 
     Linearised elsewhere than at the estimate, G is taken over the displacement between
     the predicted positions, which the reference keeps.
     """
-    mean, covariance, reference = belief
     x, y, heading, cos, sin = drive_jit(mean[0], mean[1], mean[2], distance, turn)
     mean[0], mean[1], mean[2] = x, y, heading
     turned_x, turned_y = -distance * sin, distance * cos

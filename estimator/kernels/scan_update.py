@@ -1,11 +1,11 @@
 """Update of one belief by one scan, compiled: screen, correct, map new landmarks."""
 
-from ..support.jit import jit, njit_inlined
+from ..support.jit import jit
 from .add_landmark import add_landmark
 from .belief_arrays import Array, BeliefArrays, Int
 from .correct import copy_covariance, correct
 from .covariance_update import block_of
-from .rules import Rules, as_rules
+from .rules import as_rules
 from .scan_rows import (
     ADDED,
     MEAN_BEFORE,
@@ -34,10 +34,10 @@ def update_belief(
     prior: Array,
     rule_values: Array,
 ) -> tuple[int, int, float]:
-    """Update one belief with one scan, in place; called from Python.
+    """Update one belief with one scan, in place.
 
-    Call it with ``*belief`` and ``*workspace``, the arrays of these NamedTuples one by
-    one: numba takes microseconds to recognise a NamedTuple.
+    From Python, call it with ``*belief`` and ``*workspace``, the arrays of these
+    NamedTuples one by one: numba takes microseconds to recognise a NamedTuple.
 
     Parameters
     ----------
@@ -69,21 +69,6 @@ def update_belief(
     belief = BeliefArrays(mean, covariance, reference)
     workspace = Workspace(rows, before, prior)
     rules = as_rules(rule_values)
-    return update_by_scan(belief, size, readings, count, ledger, rules, workspace)
-
-
-@njit_inlined
-def update_by_scan(
-    belief: BeliefArrays,
-    size: int,
-    readings: Array,
-    count: int,
-    ledger: Int,
-    rules: Rules,
-    workspace: Workspace,
-) -> tuple[int, int, float]:
-    """Update one belief with one scan; see :func:`update_belief`."""
-    rows = workspace.rows
     for k in range(count):
         if not (usable(readings[k, 0]) and usable(readings[k, 1])):
             return NOT_USABLE, 0, 0.0
