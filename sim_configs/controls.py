@@ -23,6 +23,12 @@ class CommandSequence(Part):
         min_length=1, description="rows (d [m], α [rad], times), per step"
     )
 
+    def cycle(self, dt: float) -> NDArray[np.float64]:
+        """Repeat each command."""
+        times = [times for _, _, times in self.commands]
+        _steps(sum(times), 1.0)  # checks the length
+        return np.repeat([command[:2] for command in self.commands], times, axis=0)
+
 
 class SquareSequence(Part):
     """A counter-clockwise square: four sides, each followed by a quarter turn."""
@@ -32,6 +38,14 @@ class SquareSequence(Part):
     speed: Positive = Field(description="highest speed along a side [m/s]")
     turn_steps: Count = Field(description="steps of each quarter turn")
 
+    def cycle(self, dt: float) -> NDArray[np.float64]:
+        """Drive the four sides."""
+        steps = _steps(self.side, self.speed * dt)
+        _steps(self.turn_steps, 1.0)  # checks the length
+        straight = np.tile([self.side / steps, 0.0], (steps, 1))
+        turn = np.tile([0.0, math.pi / 2 / self.turn_steps], (self.turn_steps, 1))
+        return np.tile(np.concatenate([straight, turn]), (4, 1))
+
 
 class CircleSequence(Part):
     """A counter-clockwise circle, approximated by an inscribed regular polygon."""
@@ -40,6 +54,10 @@ class CircleSequence(Part):
     radius: Positive = Field(description="radius of the circle [m]")
     speed: Positive = Field(description="highest speed along the circle [m/s]")
 
+    def cycle(self, dt: float) -> NDArray[np.float64]:
+        """Drive the sides of the polygon."""
+        return _circle(self.radius, self.speed * dt)
+
 
 class FigureEightSequence(Part):
     """Two circles that touch at the start: counter-clockwise, then clockwise."""
@@ -47,6 +65,11 @@ class FigureEightSequence(Part):
     sequence: Literal["figure_eight"] = "figure_eight"
     radius: Positive = Field(description="radius of both circles [m]")
     speed: Positive = Field(description="highest speed along the circles [m/s]")
+
+    def cycle(self, dt: float) -> NDArray[np.float64]:
+        """Drive the first circle, then its mirror image."""
+        left = _circle(self.radius, self.speed * dt)
+        return np.concatenate([left, left * (1.0, -1.0)])
 
 
 class SpiralSequence(Part):
@@ -67,6 +90,17 @@ class SpiralSequence(Part):
             )
         return self
 
+    def cycle(self, dt: float) -> NDArray[np.float64]:
+        """Turn by α = d / r; the radius r grows with the angle turned so far."""
+        distance, full_angle = self.speed * dt, 2 * math.pi * self.turns
+        growth = (self.outer_radius - self.inner_radius) / full_angle
+        _steps(full_angle * self.outer_radius, distance)  # checks the length
+        turned, turns = 0.0, []
+        while turned < full_angle:
+            turns.append(distance / (self.inner_radius + growth * turned))
+            turned += turns[-1]
+        return np.column_stack([np.full(len(turns), distance), turns])
+
 
 class BlocksSequence(Part):
     """A drive around every block of a city, row by row, alternately east and west.
@@ -82,6 +116,27 @@ class BlocksSequence(Part):
     side: Positive = Field(description="distance between neighbouring streets [m]")
     speed: Positive = Field(description="highest speed along a street [m/s]")
     turn_steps: Count = Field(description="steps of each quarter turn")
+
+    def cycle(self, dt: float) -> NDArray[np.float64]:
+        """Drive the sides in turn, each preceded by the quarter turn into it."""
+        steps, turns = _steps(self.side, self.speed * dt), self.turn_steps
+        _steps(self.rows * (5.0 * self.columns + 1) * (steps + turns), 1.0)
+        east, north, west, south = 0, 1, 2, 3  # quarter turns
+        eastward = [east, north, west, south, east] * self.columns + [north]
+        westward = [west, north, east, south, west] * self.columns + [north]
+        directions = np.concatenate(
+            [westward if row % 2 else eastward for row in range(self.rows)]
+        )
+        # -1, 0 or 1: never back
+        quarters = (np.diff(directions, prepend=east) + 1) % 4 - 1
+        straight = np.tile([self.side / steps, 0.0], (steps, 1))
+        turn = np.tile([0.0, math.pi / 2 / turns], (turns, 1))
+        parts = [
+            part
+            for quarter in quarters.tolist()
+            for part in ([turn * quarter] if quarter else []) + [straight]
+        ]
+        return np.concatenate(parts)
 
 
 ControlSequence = Annotated[
@@ -116,34 +171,7 @@ def command_cycle(controls: ControlSequence, dt: float) -> NDArray[np.float64]:
     >>> command_cycle(square, dt=2.0)[:3].round(4).tolist()
     [[2.0, 0.0], [2.0, 0.0], [0.0, 1.5708]]
     """
-    match controls:
-        case CommandSequence():
-            return _repeat(controls)
-        case SquareSequence():
-            return _square(controls, dt)
-        case CircleSequence():
-            return _circle(controls.radius, controls.speed * dt)
-        case FigureEightSequence():
-            left = _circle(controls.radius, controls.speed * dt)
-            return np.concatenate([left, left * (1.0, -1.0)])
-        case SpiralSequence():
-            return _spiral(controls, dt)
-        case BlocksSequence():
-            return _blocks(controls, dt)
-
-
-def _repeat(sequence: CommandSequence) -> NDArray[np.float64]:
-    times = [times for _, _, times in sequence.commands]
-    _steps(sum(times), 1.0)  # checks the length
-    return np.repeat([command[:2] for command in sequence.commands], times, axis=0)
-
-
-def _square(square: SquareSequence, dt: float) -> NDArray[np.float64]:
-    steps = _steps(square.side, square.speed * dt)
-    _steps(square.turn_steps, 1.0)  # checks the length
-    straight = np.tile([square.side / steps, 0.0], (steps, 1))
-    turn = np.tile([0.0, math.pi / 2 / square.turn_steps], (square.turn_steps, 1))
-    return np.tile(np.concatenate([straight, turn]), (4, 1))
+    return controls.cycle(dt)
 
 
 def _circle(radius: float, longest_step: float) -> NDArray[np.float64]:
@@ -151,39 +179,6 @@ def _circle(radius: float, longest_step: float) -> NDArray[np.float64]:
     steps = max(3, _steps(2 * math.pi * radius, longest_step))
     angle = 2 * math.pi / steps
     return np.tile([2 * radius * math.sin(angle / 2), angle], (steps, 1))
-
-
-def _spiral(spiral: SpiralSequence, dt: float) -> NDArray[np.float64]:
-    """Turn by α = d / r; the radius r grows with the angle turned so far."""
-    distance, full_angle = spiral.speed * dt, 2 * math.pi * spiral.turns
-    growth = (spiral.outer_radius - spiral.inner_radius) / full_angle
-    _steps(full_angle * spiral.outer_radius, distance)  # checks the length
-    turned, turns = 0.0, []
-    while turned < full_angle:
-        turns.append(distance / (spiral.inner_radius + growth * turned))
-        turned += turns[-1]
-    return np.column_stack([np.full(len(turns), distance), turns])
-
-
-def _blocks(blocks: BlocksSequence, dt: float) -> NDArray[np.float64]:
-    """Drive the sides in turn, each preceded by the quarter turn into it."""
-    steps, turns = _steps(blocks.side, blocks.speed * dt), blocks.turn_steps
-    _steps(blocks.rows * (5.0 * blocks.columns + 1) * (steps + turns), 1.0)
-    east, north, west, south = 0, 1, 2, 3  # quarter turns
-    eastward = [east, north, west, south, east] * blocks.columns + [north]
-    westward = [west, north, east, south, west] * blocks.columns + [north]
-    directions = np.concatenate(
-        [westward if row % 2 else eastward for row in range(blocks.rows)]
-    )
-    quarters = (np.diff(directions, prepend=east) + 1) % 4 - 1  # -1, 0 or 1: never back
-    straight = np.tile([blocks.side / steps, 0.0], (steps, 1))
-    turn = np.tile([0.0, math.pi / 2 / turns], (turns, 1))
-    parts = [
-        part
-        for quarter in quarters.tolist()
-        for part in ([turn * quarter] if quarter else []) + [straight]
-    ]
-    return np.concatenate(parts)
 
 
 def _steps(length: float, longest_step: float) -> int:

@@ -41,6 +41,10 @@ class PointsLayout(_Layout):
         """Number of landmarks."""
         return len(self.points)
 
+    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Return the positions."""
+        return np.array(self.points, dtype=np.float64)
+
 
 class GridLayout(_Layout):
     """Landmarks on a square grid, row by row."""
@@ -58,6 +62,11 @@ class GridLayout(_Layout):
         """Number of landmarks."""
         return self.rows * self.columns
 
+    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Return the positions, row by row."""
+        rows, columns = np.divmod(np.arange(self.count), self.columns)
+        return self.origin + self.spacing * np.column_stack([columns, rows])
+
 
 class RingLayout(_Layout):
     """Landmarks evenly spaced on a circle, counter-clockwise from its +x side."""
@@ -68,6 +77,12 @@ class RingLayout(_Layout):
     centre: Point = Field(
         default=(0.0, 0.0), description="centre of the circle (x, y) [m]"
     )
+
+    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Return the positions, counter-clockwise."""
+        angles = 2 * np.pi * np.arange(self.count) / self.count
+        directions = np.column_stack([np.cos(angles), np.sin(angles)])
+        return self.centre + self.radius * directions
 
 
 class CorridorLayout(_Layout):
@@ -83,6 +98,12 @@ class CorridorLayout(_Layout):
     origin: Point = Field(
         default=(0.0, 0.0), description="start of the corridor's centre line (x, y) [m]"
     )
+
+    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Return the positions, from the origin on."""
+        along = np.linspace(0.0, self.length, self.count)
+        across = np.where(np.arange(self.count) % 2 == 0, 0.5, -0.5) * self.width
+        return self.origin + np.column_stack([along, across])
 
 
 class StreetsLayout(_Layout):
@@ -119,6 +140,17 @@ class StreetsLayout(_Layout):
             )
         return self
 
+    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Return the positions: the four fronts of a block, copied to every block."""
+        front = (np.arange(self.per_front) + 0.5) / self.per_front
+        low, high = np.zeros_like(front), np.ones_like(front)
+        x = np.concatenate([front, high, front[::-1], low])
+        y = np.concatenate([low, front, high, front[::-1]])
+        block = self.width / 2 + (self.side - self.width) * np.column_stack([x, y])
+        rows, columns = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        corners = self.side * np.column_stack([columns, rows])
+        return self.origin + (corners[:, None] + block).reshape(-1, 2)
+
 
 class RandomLayout(_Layout):
     """Landmarks uniform in a rectangle, with a minimum distance between them."""
@@ -147,6 +179,27 @@ class RandomLayout(_Layout):
     def is_redrawn(self) -> bool:
         """Whether every episode draws new positions."""
         return self.seed is None
+
+    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Draw the landmarks in turn; reject one that is too near to an earlier one."""
+        if not self.is_redrawn:
+            rng = np.random.default_rng(self.seed)
+        low, high = self.bounds[:2], self.bounds[2:]
+        placed = np.empty((self.count, 2))
+        for index in range(self.count):
+            for _ in range(_TRIES_PER_LANDMARK):
+                point = rng.uniform(low, high)
+                gaps = placed[:index] - point
+                if (np.hypot(gaps[:, 0], gaps[:, 1]) >= self.min_distance).all():
+                    break
+            else:
+                raise ScenarioError(
+                    "landmarks.min_distance must leave room for "
+                    f"{self.count} landmarks in {self.bounds}, got {self.min_distance} "
+                    f"({index} placed, then {_TRIES_PER_LANDMARK} tries failed)"
+                )
+            placed[index] = point
+        return placed
 
 
 LandmarkLayout = Annotated[
@@ -188,21 +241,7 @@ def place_landmarks(
     >>> place_landmarks(layout, np.random.default_rng(0)).tolist()
     [[0.0, 0.0], [3.0, 0.0], [0.0, 3.0], [3.0, 3.0]]
     """
-    match layout:
-        case PointsLayout():
-            return np.array(layout.points, dtype=np.float64)
-        case GridLayout():
-            return _grid(layout)
-        case RingLayout():
-            return _ring(layout)
-        case CorridorLayout():
-            return _corridor(layout)
-        case StreetsLayout():
-            return _streets(layout)
-        case RandomLayout():
-            if not layout.is_redrawn:
-                rng = np.random.default_rng(layout.seed)
-            return _sample(layout, rng)
+    return layout.place(rng)
 
 
 def possible_positions(layout: LandmarkLayout) -> NDArray[np.float64]:
@@ -219,52 +258,3 @@ def possible_positions(layout: LandmarkLayout) -> NDArray[np.float64]:
         left, bottom, right, top = layout.bounds
         return np.array([[left, bottom], [left, top], [right, bottom], [right, top]])
     return place_landmarks(layout, np.random.default_rng(0))  # draws nothing
-
-
-def _grid(layout: GridLayout) -> NDArray[np.float64]:
-    rows, columns = np.divmod(np.arange(layout.count), layout.columns)
-    return layout.origin + layout.spacing * np.column_stack([columns, rows])
-
-
-def _ring(layout: RingLayout) -> NDArray[np.float64]:
-    angles = 2 * np.pi * np.arange(layout.count) / layout.count
-    directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    return layout.centre + layout.radius * directions
-
-
-def _corridor(layout: CorridorLayout) -> NDArray[np.float64]:
-    along = np.linspace(0.0, layout.length, layout.count)
-    across = np.where(np.arange(layout.count) % 2 == 0, 0.5, -0.5) * layout.width
-    return layout.origin + np.column_stack([along, across])
-
-
-def _streets(layout: StreetsLayout) -> NDArray[np.float64]:
-    """Place landmarks on the four fronts of a block, and copy them to every block."""
-    front = (np.arange(layout.per_front) + 0.5) / layout.per_front
-    low, high = np.zeros_like(front), np.ones_like(front)
-    x = np.concatenate([front, high, front[::-1], low])
-    y = np.concatenate([low, front, high, front[::-1]])
-    block = layout.width / 2 + (layout.side - layout.width) * np.column_stack([x, y])
-    rows, columns = np.divmod(np.arange(layout.rows * layout.columns), layout.columns)
-    corners = layout.side * np.column_stack([columns, rows])
-    return layout.origin + (corners[:, None] + block).reshape(-1, 2)
-
-
-def _sample(layout: RandomLayout, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw the landmarks in turn; reject one that is too near to an earlier one."""
-    low, high = layout.bounds[:2], layout.bounds[2:]
-    placed = np.empty((layout.count, 2))
-    for index in range(layout.count):
-        for _ in range(_TRIES_PER_LANDMARK):
-            point = rng.uniform(low, high)
-            gaps = placed[:index] - point
-            if (np.hypot(gaps[:, 0], gaps[:, 1]) >= layout.min_distance).all():
-                break
-        else:
-            raise ScenarioError(
-                f"landmarks.min_distance must leave room for {layout.count} landmarks "
-                f"in {layout.bounds}, got {layout.min_distance} "
-                f"({index} placed, then {_TRIES_PER_LANDMARK} tries failed)"
-            )
-        placed[index] = point
-    return placed

@@ -162,18 +162,18 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         self._steps_left -= 1
         if self._renderer is not None:
             self._renderer.add(self._worlds, ~resetting)
+        rewards, terminated = self._reward(actions, ~resetting)
         if moving is not None:
             self._begin(resetting)
-        truncated = self._steps_left <= 0
-        final = {}
+        truncated = ~terminated & (self._steps_left <= 0)
+        ended, final = terminated | truncated, {}
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
-            self._ended = truncated
-        elif np.count_nonzero(truncated):
-            final = final_infos(self._observations(), self._infos(), truncated)
-            self._begin(truncated)
+            self._ended = ended
+        elif np.count_nonzero(ended):
+            final = final_infos(self._observations(), self._infos(), ended)
+            self._begin(ended)
         infos = {**final, **with_masks(self._infos(), None, self.num_envs)}
-        rewards, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
-        return self._observations(), rewards, terminated, truncated.copy(), infos
+        return self._observations(), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a frame of each world in mode "rgb_array", else None."""
@@ -247,6 +247,10 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         self._ended = self._ended & ~worlds
         if self._renderer is not None:
             self._renderer.begin(self._worlds, worlds)
+
+    def _reward(self, actions: ArrayLike, moving: BoolArray) -> tuple[Array, BoolArray]:
+        """Return the rewards of a step, and which episodes it terminates."""
+        return np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
 
     def _observations(self) -> Observations:
         worlds = self._worlds
