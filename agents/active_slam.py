@@ -10,8 +10,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import AnyArray, Array, ImageArray
 from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
 from ..sim_configs import Scenario
@@ -24,11 +25,10 @@ from .estimator_choice import (
     choose_estimator,
 )
 
-Array = NDArray[np.float64]
 Observation = dict[str, Any]
 
 
-class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
+class ActiveSlamEnv(gymnasium.Env[Observation, AnyArray]):
     """A robot explores a walled floor until it knows every landmark.
 
     ## Description
@@ -180,7 +180,7 @@ class ActiveSlamEnv(gymnasium.Env[Observation, NDArray[Any]]):
         ends = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return seen, float(outcome.rewards[0]), *ends, info
 
-    def render(self) -> NDArray[np.uint8] | None:
+    def render(self) -> ImageArray | None:
         """Return a frame in mode "rgb_array", else None."""
         return self._world.render()
 

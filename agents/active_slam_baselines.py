@@ -15,8 +15,8 @@ import math
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..envs.angles import wrap_angle
 from ..envs.controllers import Waypoints
 from ..sim_configs import Robot, Scenario
@@ -24,8 +24,6 @@ from ..sim_configs.scenario_errors import closest
 from .agent_knowledge import AgentKnowledge, as_points
 from .belief_features import largest_variances, world_bounds
 from .greedy_information import GreedyInformation
-
-Array = NDArray[np.float64]
 
 BASELINES = ("random", "coverage", "greedy", "revisit")
 

@@ -4,12 +4,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from .active_slam import ActiveSlamEnv, Observation
 from .active_slam_baselines import Baseline
 
-Array = NDArray[np.float64]
 Policy = Callable[[Observation, ActiveSlamEnv], Array]
 """Chooses an action from an observation; baselines read ``env.knowledge``."""
 

@@ -5,16 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
+from ..arrays import AnyArray, Array, BoolArray, ComplexArray, IntArray
 from ..sim_configs import Scenario
 from .belief_arrays import BeliefArrays, as_storage
 from .belief_features import belief_features, belief_space, largest_variances
 from .coverage_grid import SECTORS, CoverageGrid
 from .information_reward import check_criterion, effort, landmark_prior_std, uncertainty
-
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _CELLS_PER_LANDMARK = 8.0  # cells that weigh as much as one landmark
 _REACHES = (0.1, 0.4)  # near and far, in diagonals of the floor
@@ -51,7 +48,7 @@ class Progress(NamedTuple):
     beliefs: BeliefArrays
     explored: BoolArray
     """Cells seen so far, as believed, shape (B, C)."""
-    steps: NDArray[np.int64]
+    steps: IntArray
     """Steps so far, shape (B,)."""
     uncertainty: Array
     """Of the map, see `information_reward.uncertainty`, shape (B,)."""
@@ -133,7 +130,7 @@ class ActiveSlamTask:
         truncated = ~terminated & (after.steps >= self.scenario.steps)
         return StepOutcome(rewards, terminated, truncated, success)
 
-    def observe(self, progress: Progress) -> dict[str, NDArray[Any]]:
+    def observe(self, progress: Progress) -> dict[str, AnyArray]:
         """Compute the observation; the keys of the observation space, each (B, k).
 
         All arrays are flat, because Stable-Baselines3 treats two axes as an image.
@@ -165,7 +162,7 @@ class ActiveSlamTask:
         }
 
     def _progress(
-        self, beliefs: BeliefArrays, explored: BoolArray, steps: NDArray[np.int64]
+        self, beliefs: BeliefArrays, explored: BoolArray, steps: IntArray
     ) -> Progress:
         variance = largest_variances(beliefs.landmark_covariances)
         known = beliefs.mapped & (variance <= self.weights.accuracy**2)
@@ -217,7 +214,7 @@ class ActiveSlamTask:
         return self._sector_features(poses, cells, unseen, unit=_CELLS_PER_LANDMARK)
 
     def _sector_features(
-        self, poses: Array, points: NDArray[np.complex128], weights: Array, unit: float
+        self, poses: Array, points: ComplexArray, weights: Array, unit: float
     ) -> Array:
         """Compute near and far sums s, scaled to s / (s + unit) in [0, 1)."""
         sums = np.stack(
@@ -232,7 +229,7 @@ class ActiveSlamTask:
         return (sums / (sums + unit)).reshape(len(poses), -1)
 
 
-def _as_complex(points: Array) -> NDArray[np.complex128]:
+def _as_complex(points: Array) -> ComplexArray:
     return np.asarray(points[..., 0] + 1j * points[..., 1])
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import AnyArray, Array, BoolArray
 from ..envs.vector import LandmarkWorldVectorEnv
 from ..sim_configs import Scenario
 from .active_slam import split_settings
@@ -19,9 +20,7 @@ from .active_slam_task import ActiveSlamTask, Progress
 from .belief_arrays import BeliefArrays, beliefs_of_batch, update_filters
 from .estimator_choice import choose_batch
 
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-Observation = dict[str, NDArray[Any]]
+Observation = dict[str, AnyArray]
 
 
 class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):

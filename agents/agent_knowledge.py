@@ -3,13 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, BoolArray, ComplexArray
 from ..sim_configs import Scenario
 from .coverage_grid import CoverageGrid
 from .estimator_choice import BeliefOfMap, FollowingEstimator
-
-Array = NDArray[np.float64]
 
 
 class AgentKnowledge(NamedTuple):
@@ -20,9 +18,9 @@ class AgentKnowledge(NamedTuple):
     estimator: FollowingEstimator
     """For predictions. A policy that changes its state must restore it."""
     belief: BeliefOfMap
-    explored: NDArray[np.bool_]
+    explored: BoolArray
     """Cells of the grid seen so far, as believed, shape (C,)."""
-    known: NDArray[np.bool_]
+    known: BoolArray
     """Landmarks known to the required accuracy, shape (N,)."""
     accuracy: float
     """Required standard deviation of a landmark [m]."""
@@ -44,6 +42,6 @@ class AgentKnowledge(NamedTuple):
         return np.concatenate([landmarks, as_points(self.grid.cells[~self.explored])])
 
 
-def as_points(numbers: NDArray[np.complex128]) -> Array:
+def as_points(numbers: ComplexArray) -> Array:
     """Return complex numbers x + iy, (K,), as points (K, 2)."""
     return np.column_stack([numbers.real, numbers.imag])

@@ -1,15 +1,13 @@
 """Beliefs as arrays of a fixed size, for one world or many."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import AnyArray, Array, BoolArray
 from ..estimator.filters.batch import BatchSlam
 from ..estimator.filters.batch_results import BatchStorage
 from .estimator_choice import BeliefOfMap
-
-Array = NDArray[np.float64]
 
 
 class BeliefArrays(NamedTuple):
@@ -22,7 +20,7 @@ class BeliefArrays(NamedTuple):
     """Shape (B, 3 + 2N), zeros where a landmark is not mapped; θ in [-π, π)."""
     covariances: Array
     """Of the additive error, shape (B, 3 + 2N, 3 + 2N), zeros where not mapped."""
-    mapped: NDArray[np.bool_]
+    mapped: BoolArray
     """Landmarks in the map, shape (B, N)."""
 
     @property
@@ -107,8 +105,8 @@ def belief_arrays(belief: BeliefOfMap, size: int, *, by_id: bool) -> BeliefArray
 
 def update_filters(
     filters: BatchSlam,
-    observations: dict[str, NDArray[Any]],
-    worlds: NDArray[np.bool_],
+    observations: dict[str, AnyArray],
+    worlds: BoolArray,
     *,
     moved: bool,
 ) -> None:

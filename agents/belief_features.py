@@ -20,13 +20,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import AnyArray, Array
 from ..envs.controllers import planned_path
 from ..estimator.filters.batch_results import BatchStorage
 from ..sim_configs import Scenario
 from ..sim_configs.layouts import possible_positions
 from .belief_kernels import write_features
 
-Array = NDArray[np.float64]
 Bounds = tuple[float, float, float, float]
 
 
@@ -38,7 +38,7 @@ def belief_space(rows: int) -> spaces.Dict:
     >>> list(belief_space(6))[:3]
     ['belief_landmark_correlation', 'belief_landmark_map_std', 'belief_landmark_std']
     """
-    boxes: dict[str, spaces.Space[NDArray[np.float64]]] = {
+    boxes: dict[str, spaces.Space[Array]] = {
         key: spaces.Box(low, 1.0, shape, dtype=np.float64)
         for key, (low, shape) in _ranges_and_shapes(rows).items()
     }
@@ -124,7 +124,7 @@ def belief_features(
         Standard deviations are `on_log_scale`; rows that are not mapped are 0.
     """
     worlds, rows = beliefs.slots.shape
-    features: dict[str, NDArray[Any]] = {
+    features: dict[str, AnyArray] = {
         key: np.empty((worlds, *shape), np.bool_ if key == "belief_mask" else float)
         for key, (_, shape) in _ranges_and_shapes(rows).items()
     }

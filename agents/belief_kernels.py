@@ -5,13 +5,10 @@ Symbols are those of `belief_features`.
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..estimator.support.jit import jit, njit_internal
 
-Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]
 
 SMALLEST_STD, LARGEST_STD = 1e-3, 10.0
@@ -124,13 +121,13 @@ def relative_spread(
 def write_features(  # noqa: PLR0917 (the outputs one by one, in order of their keys)
     means: Array,
     covariances: Array,
-    slots: NDArray[np.int64],
+    slots: IntArray,
     bounds: Rectangle,
     landmark_correlation: Array,
     landmark_map_std: Array,
     landmark_std: Array,
     landmarks: Array,
-    mask: NDArray[np.bool_],
+    mask: BoolArray,
     pose: Array,
     pose_correlation: Array,
     pose_std: Array,

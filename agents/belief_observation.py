@@ -7,8 +7,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import NDArray
 
+from ..arrays import AnyArray
 from ..envs import LandmarkWorldEnv
 from ..estimator.support import argument_checks
 from ..sim_configs import Scenario
@@ -25,7 +25,7 @@ Observation = dict[str, Any]
 
 
 class BeliefObservation(
-    gymnasium.Wrapper[Observation, NDArray[Any], Observation, NDArray[Any]],
+    gymnasium.Wrapper[Observation, AnyArray, Observation, AnyArray],
     RecordConstructorArgs,
 ):
     """Runs an estimator on the observations of a landmark world, and adds its belief.
@@ -69,7 +69,7 @@ class BeliefObservation(
 
     def __init__(
         self,
-        env: gymnasium.Env[Observation, NDArray[Any]],
+        env: gymnasium.Env[Observation, AnyArray],
         estimator: EstimatorChoice = "invariant",
         *,
         estimator_options: Mapping[str, Any] | None = None,

@@ -7,8 +7,8 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
 
+from ..arrays import AnyArray, BoolArray
 from .belief_arrays import BeliefArrays, beliefs_of_batch, update_filters
 from .belief_features import belief_features, world_bounds
 from .belief_observation import (
@@ -19,9 +19,7 @@ from .belief_observation import (
 )
 from .estimator_choice import choose_batch
 
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-Observation = dict[str, NDArray[Any]]
+Observation = dict[str, AnyArray]
 Infos = dict[str, Any]
 
 
@@ -60,7 +58,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
 
     def __init__(
         self,
-        env: VectorEnv[Observation, NDArray[Any], NDArray[Any]],
+        env: VectorEnv[Observation, AnyArray, AnyArray],
         estimator: str = "invariant",
         *,
         estimator_options: Mapping[str, Any] | None = None,
@@ -111,8 +109,8 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         return self._with_beliefs(observations), infos
 
     def step(
-        self, actions: NDArray[Any]
-    ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], Infos]:
+        self, actions: AnyArray
+    ) -> tuple[Observation, AnyArray, AnyArray, AnyArray, Infos]:
         """Step the worlds, then predict and update."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = terminated | truncated
@@ -166,7 +164,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         return with_features(observations, features)
 
 
-def _padded(rows: NDArray[Any], more: int) -> NDArray[Any]:
+def _padded(rows: AnyArray, more: int) -> AnyArray:
     """Append empty rows to the second axis."""
     padding = [(0, 0), (0, more), *((0, 0) for _ in rows.shape[2:])]
     return np.pad(rows, padding)

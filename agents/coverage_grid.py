@@ -11,16 +11,12 @@ c               centre of a cell as x + iy [m]; δ = (c - p) e^{-iθ} in the rob
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, BoolArray, ComplexArray
 from ..envs.robot.wall_contacts import wall_distances
 from ..envs.sensors.bearing_range import BearingRangeSensor
 from ..sim_configs import Scenario
 from .belief_features import Bounds, world_bounds
-
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-ComplexArray = NDArray[np.complex128]
 
 SECTORS = 8
 """Number of directions around the robot, the first straight ahead."""

@@ -8,8 +8,9 @@ from functools import partial
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import AnyArray, BoolArray
 from ..envs.rendering import BeliefLike
 from ..estimator.filters.batch import BatchSlam
 from ..estimator.registry import (
@@ -19,8 +20,6 @@ from ..estimator.registry import (
     make_estimator,
 )
 from ..sim_configs import Scenario
-
-Array = NDArray[np.float64]
 
 
 class BeliefOfMap(BeliefLike, Protocol):
@@ -192,7 +191,7 @@ def checked_belief(estimator: FollowingEstimator, step: int) -> BeliefOfMap:
     return checked
 
 
-def _wrong_shape(part: str, values: NDArray[Any], count: int) -> str | None:
+def _wrong_shape(part: str, values: AnyArray, count: int) -> str | None:
     """Return the message for a wrong shape of a part of a belief, or None."""
     size = 3 + 2 * count
     shapes = {
@@ -208,7 +207,7 @@ def _wrong_shape(part: str, values: NDArray[Any], count: int) -> str | None:
     return f"have {what} of shape {shape} with {count} landmarks, got {values.shape}"
 
 
-def _wrong_number(part: str, values: NDArray[Any]) -> str | None:
+def _wrong_number(part: str, values: AnyArray) -> str | None:
     """Return the message for a wrong number in a part of a belief, or None."""
     finite = np.isfinite(values)
     if not finite.all():
@@ -219,7 +218,7 @@ def _wrong_number(part: str, values: NDArray[Any]) -> str | None:
     return None
 
 
-def _first(part: str, values: NDArray[Any], wrong: NDArray[np.bool_]) -> str:
+def _first(part: str, values: AnyArray, wrong: BoolArray) -> str:
     """Format the first wrong entry, as in "covariance[1, 1] = -0.5"."""
     place = np.argwhere(wrong)[0].tolist()
     return f"{part}{place} = {values[tuple(place)]}"

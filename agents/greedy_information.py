@@ -17,15 +17,13 @@ import math
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, BoolArray
 from ..envs.angles import wrap_angle
 from ..envs.robot import displacement
 from .agent_knowledge import AgentKnowledge
 from .belief_arrays import BeliefArrays, belief_arrays
 from .information_reward import uncertainty
-
-Array = NDArray[np.float64]
 
 _STEPS = 4  # length of a candidate motion
 _TURNS = (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)  # of the largest turn rate
@@ -118,7 +116,7 @@ def _expected(pose: Array, landmarks: Array) -> Array:
     return np.column_stack([bearing, np.hypot(offset[:, 0], offset[:, 1])])
 
 
-def _in_view(knowledge: AgentKnowledge, readings: Array) -> NDArray[np.bool_]:
+def _in_view(knowledge: AgentKnowledge, readings: Array) -> BoolArray:
     sensor = knowledge.scenario.sensor
     near = (readings[:, 1] <= sensor.max_range) & (readings[:, 1] > sensor.min_range)
     return np.asarray(near & (np.abs(readings[:, 0]) <= sensor.field_of_view / 2))

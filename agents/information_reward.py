@@ -22,14 +22,13 @@ from typing import Any, SupportsFloat
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..sim_configs import Scenario
 from .belief_arrays import BeliefArrays
 from .belief_features import world_bounds
 from .belief_observation import BeliefObservation
-
-Array = NDArray[np.float64]
 
 
 def d_optimality(covariance: ArrayLike) -> Array:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from ..arrays import AnyArray, Array, BoolArray
 
 _REAL_NUMBERS = "efd" + np.typecodes["AllInteger"]
 
@@ -40,7 +39,7 @@ def clipped_action(action: ArrayLike, limits: Sequence[float]) -> tuple[float, f
 
 
 def clipped_actions(
-    actions: ArrayLike, limits: Array, moving: NDArray[np.bool_] | None = None
+    actions: ArrayLike, limits: Array, moving: BoolArray | None = None
 ) -> Array:
     """Clip B actions (v, ω) to ± limits [m/s, rad/s].
 
@@ -82,7 +81,7 @@ def clipped_actions(
 
 def _real_numbers(
     value: ArrayLike, shape: tuple[int, ...], refusal: Callable[[str], ValueError]
-) -> NDArray[Any]:
+) -> AnyArray:
     try:
         array = np.asarray(value)
     except ValueError:  # ragged

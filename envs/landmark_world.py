@@ -9,8 +9,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import AnyArray, Array, ComplexArray, ImageArray
 from ..sim_configs import Scenario, load_scenario, place_landmarks
 from ..sim_configs.scenario import refuse_ranges
 from .actions import clipped_action
@@ -27,13 +28,12 @@ from .sensors.noise_streams import (
 from .sensors.odometry import OdometrySensor
 from .spaces import action_space, observation_space
 
-Array = NDArray[np.float64]
 Observation = dict[str, Any]
 
 _FPS = 30
 
 
-class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
+class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
     """A robot drives among point landmarks and measures its motion and the landmarks.
 
     ## Description
@@ -124,7 +124,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
         self._odometer = OdometrySensor(self.scenario)
         self._sensor = BearingRangeSensor(self.scenario)
         self._hides_identities = not self.scenario.sensor.identities
-        self._landmarks: NDArray[np.complex128] = np.empty(0, dtype=np.complex128)
+        self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
         self._motion_noise = NoiseRows(_refuse_to_step)
 
     def reset(
@@ -181,7 +181,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, NDArray[Any]]):
         self._steps_left -= 1
         return observation, 0.0, False, self._steps_left <= 0, info
 
-    def render(self) -> NDArray[np.uint8] | None:
+    def render(self) -> ImageArray | None:
         """Return a frame in mode "rgb_array", else None."""
         self._refuse_before_reset()
         if self._renderer is None:

@@ -12,11 +12,11 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array, BoolArray, IntArray
 from ..estimator.error_frames import ErrorFrame
 from ..estimator.support import argument_checks
-from .chi_square import Array
 from .hypothesis_tests import (
     FamilyTest,
     HypothesisTest,
@@ -66,7 +66,7 @@ class ConsistencyReport:
     time_average: HypothesisTest
     bootstrap: HypothesisTest
     family: FamilyTest
-    family_steps: NDArray[np.int64]
+    family_steps: IntArray
     """Steps of the grid of ``family``."""
     nis: HypothesisTest
     whiteness: HypothesisTest
@@ -233,7 +233,7 @@ def _runs_needed(dof: int) -> tuple[tuple[float, int], ...]:
 class _Scores(NamedTuple):
     nees: Array
     nis: Array
-    degrees_of_freedom: NDArray[np.int64]
+    degrees_of_freedom: IntArray
 
 
 def _same_shape(nees: ArrayLike, nis: ArrayLike, nis_dof: ArrayLike) -> _Scores:
@@ -248,9 +248,7 @@ def _same_shape(nees: ArrayLike, nis: ArrayLike, nis_dof: ArrayLike) -> _Scores:
     return _Scores(scores, scans, freedom)
 
 
-def _gaps(
-    nees: Array, nis: Array, freedom: NDArray[np.int64]
-) -> tuple[int, NDArray[np.bool_]]:
+def _gaps(nees: Array, nis: Array, freedom: IntArray) -> tuple[int, BoolArray]:
     """Return the first step at which any run has a NEES, and which runs failed."""
     known = np.isfinite(nees)
     first = int(known.any(axis=0).argmax())

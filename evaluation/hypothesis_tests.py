@@ -11,11 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from ..arrays import Array, BoolArray, IntArray
 from ..estimator.support import argument_checks
-from .chi_square import Array, Band, chi_square_limits, family_band, to_band
+from .chi_square import Band, chi_square_limits, family_band, to_band
 from .whiteness import ljung_box, normal_scores
 
 
@@ -45,7 +45,7 @@ class FamilyTest(NamedTuple):
     """Band that holds all ratios together (Bonferroni)."""
     p_value: float
     """Smallest adjusted p-value."""
-    rejected: NDArray[np.bool_]
+    rejected: BoolArray
     """Whether each step of the grid is rejected, shape (k,)."""
     error_rate: float
     """Largest probability of rejecting a consistent filter at any step."""
@@ -81,7 +81,7 @@ def final_step_test(
 
 
 def nis_test(
-    nis: Array, degrees_of_freedom: NDArray[np.int64], *, error_rate: float = 0.05
+    nis: Array, degrees_of_freedom: IntArray, *, error_rate: float = 0.05
 ) -> HypothesisTest:
     """Test the sum of the NIS of all runs and steps; two-sided.
 
@@ -139,7 +139,7 @@ def family_test(
 
 def whiteness_test(
     nis: Array,
-    degrees_of_freedom: NDArray[np.int64],
+    degrees_of_freedom: IntArray,
     *,
     lags: int = 10,
     error_rate: float = 0.05,

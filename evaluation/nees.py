@@ -10,17 +10,15 @@ because the additive NEES rejects even the right filter if the heading is uncert
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
+from ..arrays import Array
 from ..estimator.error_frames import (
     ErrorFrame,
     additive_error,
     invariant_covariance,
     invariant_error,
 )
-
-Array = NDArray[np.float64]
 
 SINGULAR = 1e-10
 """Conditional variance, as a share of the variance, below which it counts as zero."""

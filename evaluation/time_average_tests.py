@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import t as student
 
-from .chi_square import Array, Band, to_band
+from ..arrays import Array
+from .chi_square import Band, to_band
 from .hypothesis_tests import HypothesisTest, one_per_run
 
 EQUIVALENCE_MARGIN = Band(0.8, 1.25)

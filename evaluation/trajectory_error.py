@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array
 from ..estimator.models.angles import wrap_angle
 from ..estimator.support.argument_checks import as_floats
-
-Array = NDArray[np.float64]
 
 
 class Alignment(NamedTuple):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from .chi_square import Array
+from ..arrays import Array
 
 
 class LjungBox(NamedTuple):

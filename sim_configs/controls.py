@@ -7,9 +7,9 @@ import math
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from ..arrays import Array
 from .field_types import Command, Count, Part, Positive, broken_rule
 
 _LONGEST_CYCLE = 1_000_000  # steps; a typing error must not fill the memory
@@ -23,7 +23,7 @@ class CommandSequence(Part):
         min_length=1, description="rows (d [m], α [rad], times), per step"
     )
 
-    def cycle(self, dt: float) -> NDArray[np.float64]:
+    def cycle(self, dt: float) -> Array:
         """Repeat each command."""
         times = [times for _, _, times in self.commands]
         _steps(sum(times), 1.0)  # checks the length
@@ -38,7 +38,7 @@ class SquareSequence(Part):
     speed: Positive = Field(description="highest speed along a side [m/s]")
     turn_steps: Count = Field(description="steps of each quarter turn")
 
-    def cycle(self, dt: float) -> NDArray[np.float64]:
+    def cycle(self, dt: float) -> Array:
         """Drive the four sides."""
         steps = _steps(self.side, self.speed * dt)
         _steps(self.turn_steps, 1.0)  # checks the length
@@ -54,7 +54,7 @@ class CircleSequence(Part):
     radius: Positive = Field(description="radius of the circle [m]")
     speed: Positive = Field(description="highest speed along the circle [m/s]")
 
-    def cycle(self, dt: float) -> NDArray[np.float64]:
+    def cycle(self, dt: float) -> Array:
         """Drive the sides of the polygon."""
         return _circle(self.radius, self.speed * dt)
 
@@ -66,7 +66,7 @@ class FigureEightSequence(Part):
     radius: Positive = Field(description="radius of both circles [m]")
     speed: Positive = Field(description="highest speed along the circles [m/s]")
 
-    def cycle(self, dt: float) -> NDArray[np.float64]:
+    def cycle(self, dt: float) -> Array:
         """Drive the first circle, then its mirror image."""
         left = _circle(self.radius, self.speed * dt)
         return np.concatenate([left, left * (1.0, -1.0)])
@@ -90,7 +90,7 @@ class SpiralSequence(Part):
             )
         return self
 
-    def cycle(self, dt: float) -> NDArray[np.float64]:
+    def cycle(self, dt: float) -> Array:
         """Turn by α = d / r; the radius r grows with the angle turned so far."""
         distance, full_angle = self.speed * dt, 2 * math.pi * self.turns
         growth = (self.outer_radius - self.inner_radius) / full_angle
@@ -117,7 +117,7 @@ class BlocksSequence(Part):
     speed: Positive = Field(description="highest speed along a street [m/s]")
     turn_steps: Count = Field(description="steps of each quarter turn")
 
-    def cycle(self, dt: float) -> NDArray[np.float64]:
+    def cycle(self, dt: float) -> Array:
         """Drive the sides in turn, each preceded by the quarter turn into it."""
         steps, turns = _steps(self.side, self.speed * dt), self.turn_steps
         _steps(self.rows * (5.0 * self.columns + 1) * (steps + turns), 1.0)
@@ -150,7 +150,7 @@ ControlSequence = Annotated[
 ]
 
 
-def command_cycle(controls: ControlSequence, dt: float) -> NDArray[np.float64]:
+def command_cycle(controls: ControlSequence, dt: float) -> Array:
     """Compute one cycle of a control sequence.
 
     Parameters
@@ -174,7 +174,7 @@ def command_cycle(controls: ControlSequence, dt: float) -> NDArray[np.float64]:
     return controls.cycle(dt)
 
 
-def _circle(radius: float, longest_step: float) -> NDArray[np.float64]:
+def _circle(radius: float, longest_step: float) -> Array:
     """Follow the regular polygon whose corners lie on the circle."""
     steps = max(3, _steps(2 * math.pi * radius, longest_step))
     angle = 2 * math.pi / steps

@@ -3,9 +3,9 @@
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from ..arrays import Array
 from .field_types import (
     Bounds,
     Count,
@@ -41,7 +41,7 @@ class PointsLayout(_Layout):
         """Number of landmarks."""
         return len(self.points)
 
-    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def place(self, rng: np.random.Generator) -> Array:
         """Return the positions."""
         return np.array(self.points, dtype=np.float64)
 
@@ -62,7 +62,7 @@ class GridLayout(_Layout):
         """Number of landmarks."""
         return self.rows * self.columns
 
-    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def place(self, rng: np.random.Generator) -> Array:
         """Return the positions, row by row."""
         rows, columns = np.divmod(np.arange(self.count), self.columns)
         return self.origin + self.spacing * np.column_stack([columns, rows])
@@ -78,7 +78,7 @@ class RingLayout(_Layout):
         default=(0.0, 0.0), description="centre of the circle (x, y) [m]"
     )
 
-    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def place(self, rng: np.random.Generator) -> Array:
         """Return the positions, counter-clockwise."""
         angles = 2 * np.pi * np.arange(self.count) / self.count
         directions = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -99,7 +99,7 @@ class CorridorLayout(_Layout):
         default=(0.0, 0.0), description="start of the corridor's centre line (x, y) [m]"
     )
 
-    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def place(self, rng: np.random.Generator) -> Array:
         """Return the positions, from the origin on."""
         along = np.linspace(0.0, self.length, self.count)
         across = np.where(np.arange(self.count) % 2 == 0, 0.5, -0.5) * self.width
@@ -140,7 +140,7 @@ class StreetsLayout(_Layout):
             )
         return self
 
-    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def place(self, rng: np.random.Generator) -> Array:
         """Return the positions: the four fronts of a block, copied to every block."""
         front = (np.arange(self.per_front) + 0.5) / self.per_front
         low, high = np.zeros_like(front), np.ones_like(front)
@@ -180,7 +180,7 @@ class RandomLayout(_Layout):
         """Whether every episode draws new positions."""
         return self.seed is None
 
-    def place(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def place(self, rng: np.random.Generator) -> Array:
         """Draw the landmarks in turn; reject one that is too near to an earlier one."""
         if not self.is_redrawn:
             rng = np.random.default_rng(self.seed)
@@ -213,9 +213,7 @@ LandmarkLayout = Annotated[
 ]
 
 
-def place_landmarks(
-    layout: LandmarkLayout, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def place_landmarks(layout: LandmarkLayout, rng: np.random.Generator) -> Array:
     """Compute the positions of the landmarks of a layout.
 
     Parameters
@@ -244,7 +242,7 @@ def place_landmarks(
     return layout.place(rng)
 
 
-def possible_positions(layout: LandmarkLayout) -> NDArray[np.float64]:
+def possible_positions(layout: LandmarkLayout) -> Array:
     """Return points (K, 2) [m] whose convex hull holds every landmark of a layout.
 
     They are the landmarks themselves, or the corners of a random layout's rectangle.

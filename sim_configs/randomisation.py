@@ -8,14 +8,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from ..arrays import Array
 from .field_types import NotNegative, Part, broken_rule, expect
 from .layouts import LandmarkLayout, place_landmarks
 from .scenario_parts import Motion, Sensor, Start
-
-Array = NDArray[np.float64]
 
 _Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _Factor = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
+from ..arrays import Array
 from .controls import ControlSequence, command_cycle
 from .field_types import Name, Part, Positive, Text, Wall, broken_rule, expect
 from .layouts import LandmarkLayout
@@ -128,9 +128,7 @@ class Scenario(Part):
         """
         return self.from_table(_merge(self.model_dump(), changes))
 
-    def drawn_at(
-        self, shares: Mapping[str, float], directions: NDArray[np.float64]
-    ) -> Self:
+    def drawn_at(self, shares: Mapping[str, float], directions: Array) -> Self:
         """Return the scenario at one point of its ranges; see `Randomise.changes`."""
         assert self.randomise is not None
         return self.with_changes(**self.randomise.changes(self, shares, directions))
@@ -150,7 +148,7 @@ class Scenario(Part):
             raise ScenarioError("\n".join(error_lines(error))) from None
 
 
-def action_sequence(scenario: Scenario) -> NDArray[np.float64]:
+def action_sequence(scenario: Scenario) -> Array:
     """Compute the open-loop actions of an episode from the scenario's controls.
 
     Returns

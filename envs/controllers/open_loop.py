@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ...sim_configs import Robot, Scenario, action_sequence
 from .interface import finite_poses, finite_rows
-
-Array = NDArray[np.float64]
 
 
 class OpenLoop:

@@ -1,13 +1,13 @@
 """The path of a scenario's controls without noise and walls."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...sim_configs import Scenario, action_sequence
 from ..robot.drive_equation import displacement
 
 
-def planned_path(scenario: Scenario) -> NDArray[np.float64]:
+def planned_path(scenario: Scenario) -> Array:
     """Compute the poses of the scenario's controls, without noise and walls.
 
     Returns

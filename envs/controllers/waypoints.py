@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ...sim_configs import Robot, Scenario
 from ..angles import wrap_angle
 from .interface import each, finite_pose, finite_poses, finite_rows, positive
 from .planned_path import planned_path
-
-Array = NDArray[np.float64]
 
 _ALIGNED = 0.3  # heading error below which the robot drives while it turns [rad]
 

@@ -11,12 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.text import Text
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...sim_configs import Scenario
 from .ellipses import covariance_ellipses
-
-Array = NDArray[np.floating]
 
 INK, GREY, WALL = "#1b1f24", "#8a9199", "#6b5a4e"
 RAY, ALARM, POSE, MAP = "#e69f00", "#d55e00", "#0072b2", "#009e73"  # Okabe and Ito

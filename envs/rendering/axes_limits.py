@@ -1,13 +1,11 @@
 """The limits of the axes: the part of the plane that a frame shows."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...sim_configs import Scenario
 from ..controllers import planned_path
 from .render_state import RenderState
-
-Array = NDArray[np.floating]
 
 _MARGIN = 0.06  # of the span, on every side
 _EDGE = 0.02  # of the span; a robot this near to the border counts as outside

@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.backend_bases import Event
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+
+from ...arrays import ImageArray
 
 
 class BlittedFigure:
@@ -41,7 +42,7 @@ class BlittedFigure:
             self._canvas.restore_region(self._still)
             self._draw_moving()
 
-    def frame(self) -> NDArray[np.uint8]:
+    def frame(self) -> ImageArray:
         """Draw and copy the present frame, uint8 (H, W, 3)."""
         self.draw()
         pixels = np.asarray(self._canvas.buffer_rgba())

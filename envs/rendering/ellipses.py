@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.floating]
+from ...arrays import Array
 
 _RELATIVE_ROUNDING = 1e-9  # of the larger eigenvalue
 _ABSOLUTE_ROUNDING = 1e-12  # [m²]: a micrometre, squared

@@ -3,15 +3,13 @@
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, ImageArray
 from ...sim_configs import Scenario
 from .render_state import RENDER_MODES, BeliefLike, RenderMode, RenderState
 
 if TYPE_CHECKING:
     from .renderer import WorldRenderer
-
-Array = NDArray[np.float64]
 
 
 class EpisodeRenderer:
@@ -68,7 +66,7 @@ class EpisodeRenderer:
         if self._mode == "human" and self._path:
             self.draw()
 
-    def draw(self) -> NDArray[np.uint8] | None:
+    def draw(self) -> ImageArray | None:
         """Draw the present state: return a frame, or None in mode "human"."""
         if self._renderer is None:
             from .renderer import WorldRenderer  # noqa: PLC0415 (loads matplotlib)

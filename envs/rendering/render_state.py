@@ -2,10 +2,8 @@
 
 from typing import Literal, NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+from ...arrays import Array
 
-Array = NDArray[np.float64]
 RenderMode = Literal["human", "rgb_array"]
 RENDER_MODES: tuple[RenderMode, ...] = ("human", "rgb_array")
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from ...arrays import Array, ImageArray
 from ...sim_configs import Scenario
 from .blitting import BlittedFigure
 from .render_state import RENDER_MODES, RenderMode, RenderState
@@ -18,7 +18,6 @@ from .scene import Scene
 if TYPE_CHECKING:
     from .window import Window
 
-Array = NDArray[np.floating]
 
 _INCHES = 6.0  # side of the figure; its pixels come from the resolution
 
@@ -86,7 +85,7 @@ class WorldRenderer:
         self._fps = fps
         self._drawing: _Drawing | None = None
 
-    def render(self, state: RenderState) -> NDArray[np.uint8] | None:
+    def render(self, state: RenderState) -> ImageArray | None:
         """Draw one state.
 
         Returns

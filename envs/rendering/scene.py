@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...sim_configs import Scenario
 from .artists import (
     ALARM,
@@ -20,8 +20,6 @@ from .artists import (
 )
 from .axes_limits import AxesLimits
 from .render_state import BeliefLike, RenderState
-
-Array = NDArray[np.floating]
 
 _ARROW = np.array([[1.0, 0.0], [-0.75, 0.7], [-0.35, 0.0], [-0.75, -0.7]])
 _ARROW_SHARE = 0.024  # of the width of the axes, so that small robots stay visible

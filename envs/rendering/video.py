@@ -7,15 +7,15 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from ...arrays import ImageArray
 from ...sim_configs.atomic_file import replace_when_written
 
-Frame = NDArray[np.uint8]
 
-
-def write_video(frames: Iterable[Frame], path: str | Path, fps: float = 30.0) -> None:
+def write_video(
+    frames: Iterable[ImageArray], path: str | Path, fps: float = 30.0
+) -> None:
     """Write frames to a video file; an error leaves no partial file.
 
     Parameters
@@ -50,7 +50,7 @@ def write_video(frames: Iterable[Frame], path: str | Path, fps: float = 30.0) ->
             _write_gif(_checked(frames), partial, fps)
 
 
-def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:
+def _checked(frames: Iterable[ImageArray]) -> Iterator[ImageArray]:
     """Yield the frames, checking each against the shape of the first."""
     shape = None
     for k, frame in enumerate(frames):
@@ -68,7 +68,7 @@ def _checked(frames: Iterable[Frame]) -> Iterator[Frame]:
         raise ValueError("frames must hold at least one frame, got none")
 
 
-def _write_gif(frames: Iterator[Frame], path: Path, fps: float) -> None:
+def _write_gif(frames: Iterator[ImageArray], path: Path, fps: float) -> None:
     first = next(frames)
     palette = _palette(first)
     # No dithering keeps flat colours flat; one palette lets Pillow store only changes.
@@ -86,7 +86,7 @@ def _write_gif(frames: Iterator[Frame], path: Path, fps: float) -> None:
     )
 
 
-def _palette(frame: Frame) -> Image.Image:
+def _palette(frame: ImageArray) -> Image.Image:
     """Return 128 colours of one frame and a cube of 125 colours for later frames."""
     own = Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE).getpalette()
     colours = np.reshape(own or [], (-1, 3))
@@ -99,7 +99,7 @@ def _palette(frame: Frame) -> Image.Image:
 
 
 def _write_mp4(
-    ffmpeg: ModuleType, frames: Iterator[Frame], path: Path, fps: float
+    ffmpeg: ModuleType, frames: Iterator[ImageArray], path: Path, fps: float
 ) -> None:
     first = next(frames)
     height, width = (size + size % 2 for size in first.shape[:2])

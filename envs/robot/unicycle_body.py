@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pymunk
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from .drive_equation import displacement
 from .wall_contacts import Wall, WallContacts
 
@@ -59,7 +59,7 @@ class UnicycleBody:
         self.place((0.0, 0.0, 0.0))
 
     @property
-    def pose(self) -> NDArray[np.float64]:
+    def pose(self) -> Array:
         """(x, y, θ), shape (3,) [m, m, rad], a fresh array; θ is not wrapped."""
         return np.array(self._pose)
 

@@ -6,13 +6,10 @@ Symbols are those of `drive_equation`.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, BoolArray, ComplexArray, IndexArray
 from .drive_equation import displacement
 from .wall_contacts import Wall, WallContacts
-
-Array = NDArray[np.float64]
-Places = NDArray[np.intp]
 
 
 class UnicycleBodies:
@@ -58,14 +55,14 @@ class UnicycleBodies:
         """(x, y, θ), shape (B, 3) [m, m, rad], a fresh array; θ is not wrapped."""
         return self._pose.T.copy()
 
-    def place(self, worlds: Places, poses: Array) -> None:
+    def place(self, worlds: IndexArray, poses: Array) -> None:
         """Put some bodies at poses, rows (x, y, θ) [m, m, rad]."""
         pose = self._pose.copy()
         pose[:, worlds] = poses.T
         self._arrive(pose)
 
     def drive(
-        self, commands: Array, slip: Array, moving: NDArray[np.bool_] | None = None
+        self, commands: Array, slip: Array, moving: BoolArray | None = None
     ) -> Array | None:
         """Move along the old headings, then turn.
 
@@ -108,6 +105,6 @@ class UnicycleBodies:
         np.negative(self._sin, out=heading[:, 1])
 
 
-def _as_pairs(numbers: NDArray[np.complex128]) -> Array:
+def _as_pairs(numbers: ComplexArray) -> Array:
     """View complex numbers, (B, 1), as rows (real, imaginary), (B, 2)."""
     return numbers.view(np.float64)

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 import pymunk
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from ...arrays import Array, ComplexArray
+
 Wall = tuple[float, float, float, float]
 
 _SKIN = 1e-6  # distance kept from every wall [m]

@@ -14,16 +14,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ...sim_configs import Scenario
 from ..angles import wrap_bearings
 from .line_of_sight import LineOfSight
 from .noise_streams import MANY_STD, SensorNoise
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 
 _PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
 _UNSEEN = np.array(0.0)
@@ -37,7 +33,7 @@ class AnonymousScan(NamedTuple):
     """(β, r), zeros in empty rows, shape (2, …, M) [rad, m]."""
     mask: BoolArray
     """Rows with a reading, shape (…, M)."""
-    landmark_ids: NDArray[np.int64]
+    landmark_ids: IntArray
     """The true landmark of each row, -1 for clutter and empty rows, shape (…, M)."""
 
 
@@ -167,7 +163,7 @@ def hide_identities(
     return AnonymousScan(packed[:2], packed[1] > 0.0, packed[2].astype(np.int64))
 
 
-def _take(rows: Array, places: NDArray[np.intp]) -> Array:
+def _take(rows: Array, places: IndexArray) -> Array:
     """Reorder the last axis of rows, (3, …, M), by places, (…, M)."""
     if places.ndim == 1:
         return rows[:, places]  # 20 µs faster

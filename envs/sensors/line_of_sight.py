@@ -3,11 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
+from ...arrays import Array, BoolArray, ComplexArray
 
 _MOUNTED = 1e-6  # a landmark this near to the line of a wall is mounted on it [m]
 

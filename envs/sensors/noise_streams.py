@@ -10,11 +10,10 @@ from functools import partial
 from typing import Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...sim_configs import Scenario
 
-Array = NDArray[np.float64]
 Row = TypeVar("Row")
 
 MANY_STD = 10.0

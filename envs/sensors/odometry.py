@@ -13,11 +13,10 @@ With ``noise_in = "motion"`` the robot slips and the odometry reports the comman
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...sim_configs import Scenario
 
-Array = NDArray[np.float64]
 Command = tuple[float, float]
 
 _NO_SLIP = (0.0, 0.0, 0.0)

@@ -7,8 +7,8 @@ single world with the same generator, independent of the other worlds.
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, BoolArray, IndexArray
 from ...sim_configs import Scenario
 from .noise_streams import (
     SensorNoise,
@@ -17,8 +17,6 @@ from .noise_streams import (
     UnitDraws,
     unit_widths,
 )
-
-Array = NDArray[np.float64]
 
 _BLOCK_NUMBERS = 1024  # per world and block: fits the cache, amortises the calls
 _FEWEST_STEPS = 8
@@ -65,7 +63,7 @@ class VectorNoise:
         self._place[worlds] = self._end[worlds] - self._steps
         self._at_least_left = int((self._end - self._place).min())
 
-    def advance(self, moving: NDArray[np.bool_] | None) -> None:
+    def advance(self, moving: BoolArray | None) -> None:
         """Go to the next step in the worlds that move (None: all)."""
         self._place += 1 if moving is None else moving
         self._at_least_left -= 1
@@ -77,7 +75,7 @@ class VectorNoise:
         noise: Array = self._motion.rows(self._place) * self._motion_std
         return noise
 
-    def sensor(self, worlds: NDArray[np.intp] | slice | None) -> SensorNoise:
+    def sensor(self, worlds: IndexArray | slice | None) -> SensorNoise:
         """Return the sensor noise of this step in some worlds (None: all).
 
         Its arrays are valid until the next call.
@@ -120,12 +118,12 @@ class _Source:
             for world in worlds:
                 self._fill(world, 0)
 
-    def rows(self, places: NDArray[np.intp]) -> Array:
+    def rows(self, places: IndexArray) -> Array:
         chosen = self._chosen[: len(places)]
         self._ahead.take(places, 0, chosen, "clip")
         return chosen
 
-    def pairs(self, places: NDArray[np.intp]) -> Array:
+    def pairs(self, places: IndexArray) -> Array:
         """Return the two halves of the rows, shape (2, b, width / 2)."""
         halves = self._ahead.reshape(-1, self.width // 2)
         all_worlds = len(places) == len(self._chosen)

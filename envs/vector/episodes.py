@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import BoolArray
 from ...sim_configs import Scenario
 
-BoolArray = NDArray[np.bool_]
 Infos = dict[str, Any]
 
 

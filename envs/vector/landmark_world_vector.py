@@ -12,8 +12,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import AnyArray, Array, BoolArray, ImageArray
 from ...sim_configs import Scenario, load_scenario
 from ..landmark_world import LandmarkWorldEnv
 from ..rendering.render_state import BeliefLike
@@ -28,13 +29,11 @@ from .episodes import (
 from .vector_rendering import VectorRenderer
 from .world_batch import WorldBatch
 
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Observations = dict[str, Any]
 Infos = dict[str, Any]
 
 
-class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
+class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
     """B landmark worlds of one scenario, simulated together in numpy.
 
     After ``reset(seed=s)`` world i equals, to the bit, a `LandmarkWorldEnv` after
@@ -175,7 +174,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]
         infos = {**final, **with_masks(self._infos(), None, self.num_envs)}
         return self._observations(), rewards, terminated, truncated, infos
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+    def render(self) -> tuple[ImageArray, ...] | None:
         """Return a frame of each world in mode "rgb_array", else None."""
         self._refuse_before_reset()
         if self._renderer is None:

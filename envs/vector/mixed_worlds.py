@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, IntArray
 from ...sim_configs import Scenario
 from ..landmark_world import LandmarkWorldEnv, Observation
-
-Array = NDArray[np.float64]
 
 
 class MixedWorlds:
@@ -74,6 +72,6 @@ class MixedWorlds:
         self.odometry = np.array([each["odometry"] for each in seen])
         self.poses = np.array([each["pose"] for each in infos])
         self.collisions = np.array([each["collision"] for each in infos])
-        self.landmark_ids: NDArray[np.int64] | None = None
+        self.landmark_ids: IntArray | None = None
         if "landmark_ids" in infos[0]:
             self.landmark_ids = np.array([each["landmark_ids"] for each in infos])

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
-from numpy.typing import NDArray
+
+from ...arrays import AnyArray, ImageArray
 
 Info = dict[str, Any]
 
@@ -93,7 +94,7 @@ class _Adapter:
             worlds.num_envs, worlds.single_observation_space, worlds.single_action_space
         )
         self.metadata = worlds.metadata
-        self._actions: NDArray[Any] | None = None
+        self._actions: AnyArray | None = None
 
     def reset(self) -> Any:
         """Start an episode in every world, with the seeds given to `seed`."""
@@ -104,11 +105,11 @@ class _Adapter:
         self._reset_options()
         return observations
 
-    def step_async(self, actions: NDArray[Any]) -> None:
+    def step_async(self, actions: AnyArray) -> None:
         """Store the actions for `step_wait`."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[Any, NDArray[Any], NDArray[Any], list[Info]]:
+    def step_wait(self) -> tuple[Any, AnyArray, AnyArray, list[Info]]:
         """Take the step."""
         observations, rewards, terminated, truncated, infos = self.worlds.step(
             self._actions
@@ -132,7 +133,7 @@ class _Adapter:
         """Close the worlds."""
         self.worlds.close()
 
-    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+    def get_images(self) -> Sequence[ImageArray | None]:
         """Return a frame of every world, or None for each."""
         frames: Any = self.worlds.render()
         return [None] * self.num_envs if frames is None else list(frames)

@@ -3,14 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import BoolArray, ImageArray
 from ...sim_configs import Scenario
 from ..rendering.episode_renderer import EpisodeRenderer
 from ..rendering.render_state import BeliefLike
 from .world_batch import WorldBatch
-
-BoolArray = NDArray[np.bool_]
 
 
 class VectorRenderer:
@@ -43,7 +41,7 @@ class VectorRenderer:
                 bool(batch.collisions[world]),
             )
 
-    def draw(self) -> tuple[NDArray[np.uint8], ...]:
+    def draw(self) -> tuple[ImageArray, ...]:
         """Draw a frame of every world."""
         frames = (renderer.draw() for renderer in self._renderers)
         return tuple(frame for frame in frames if frame is not None)

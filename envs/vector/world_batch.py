@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import AnyArray, Array, BoolArray, IndexArray, IntArray
 from ...sim_configs import Scenario, place_landmarks
 from ...sim_configs.scenario import refuse_ranges
 from ..actions import clipped_actions
@@ -19,10 +20,7 @@ from ..sensors.odometry import VectorOdometrySensor
 from ..sensors.vector_noise import VectorNoise
 from ..spaces import count_rows
 
-Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-Places = NDArray[np.intp]
-Scan = tuple[Array, BoolArray, NDArray[np.int64] | None]
+Scan = tuple[Array, BoolArray, IntArray | None]
 
 _READINGS_AT_ONCE = 8192
 
@@ -98,7 +96,7 @@ class WorldBatch:
         self.odometry = np.zeros((count, 2))
         self.poses = np.zeros((count, 3))
         self.collisions = np.zeros(count, dtype=np.bool_)
-        self.landmark_ids: NDArray[np.int64] | None = None
+        self.landmark_ids: IntArray | None = None
         if self._hides_identities:
             self.landmark_ids = np.full((count, rows), -1)
         self._start_estimates = np.zeros((count, 3))
@@ -192,7 +190,7 @@ class WorldBatch:
             )
         return array
 
-    def _chosen(self, worlds: BoolArray | None) -> Places:
+    def _chosen(self, worlds: BoolArray | None) -> IndexArray:
         if worlds is None:
             return np.arange(self.count)
         chosen = self._truth_values(worlds, "worlds")
@@ -208,7 +206,7 @@ class WorldBatch:
         drawn = centre + start.std * unit
         return (drawn, centre) if start.drawn == "truth" else (centre, drawn)
 
-    def _place_landmarks(self, chosen: Places, streams: list[Streams]) -> None:
+    def _place_landmarks(self, chosen: IndexArray, streams: list[Streams]) -> None:
         layout = self.scenario.landmarks
         if layout.is_redrawn:
             placed = [place_landmarks(layout, each.map) for each in streams]
@@ -230,7 +228,7 @@ class WorldBatch:
         self.odometry, self.collisions = odometry, collisions
         self.poses = self._bodies.poses()
 
-    def _measure_some(self, worlds: Places) -> None:
+    def _measure_some(self, worlds: IndexArray) -> None:
         measurements, mask, ids = self._scan(worlds)
         self.measurements = _replaced(self.measurements, worlds, measurements)
         self.mask = _replaced(self.mask, worlds, mask)
@@ -255,7 +253,7 @@ class WorldBatch:
         all_ids = np.concatenate(ids) if self._hides_identities else None
         return np.concatenate(measurements), np.concatenate(masks), all_ids
 
-    def _scan(self, worlds: Places | slice | None = None) -> Scan:
+    def _scan(self, worlds: IndexArray | slice | None = None) -> Scan:
         bodies, noise = self._bodies, self._noise.sensor(worlds)
         poses = self._landmarks, bodies.position, bodies.inverse_heading
         if worlds is not None:
@@ -269,7 +267,7 @@ class WorldBatch:
         return measurements, mask, ids
 
 
-def _replaced(old: NDArray[Any], worlds: Places, value: Any) -> NDArray[Any]:
+def _replaced(old: AnyArray, worlds: IndexArray, value: Any) -> AnyArray:
     """Return a copy with new values for some worlds."""
     new = old.copy()
     new[worlds] = value

@@ -7,9 +7,9 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatten_space
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ...arrays import AnyArray, Array
+
 Infos = dict[str, Any]
 
 
@@ -54,8 +54,8 @@ class FlattenBatch(VectorWrapper):  # with type parameters since Gymnasium 1.4 o
         return self._flatten(observations), infos
 
     def step(
-        self, actions: NDArray[Any]
-    ) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any], Infos]:
+        self, actions: AnyArray
+    ) -> tuple[Array, AnyArray, AnyArray, AnyArray, Infos]:
         """Take a step in every world."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         if "final_obs" in infos:
@@ -69,7 +69,7 @@ class FlattenBatch(VectorWrapper):  # with type parameters since Gymnasium 1.4 o
         ]
         return np.concatenate(parts, axis=1, dtype=self._dtype)
 
-    def _flatten_final(self, final: NDArray[Any]) -> NDArray[Any]:
+    def _flatten_final(self, final: AnyArray) -> AnyArray:
         flat = np.full_like(final, None)
         for world, last in enumerate(final):
             if last is not None:
