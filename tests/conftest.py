@@ -53,4 +53,4 @@ def sb3():
 def _no_figures_in_reports(monkeypatch):
     """Leave out of report.html what takes most of its time, where only words count."""
     page = "slamgym.experiments.monte_carlo.report.html_report"
-    monkeypatch.setattr(f"{page}.report_figures", lambda *_: ())
+    monkeypatch.setattr(f"{page}.report_figures", lambda *_: {})

@@ -42,9 +42,7 @@ def table_text(summary, width=80):
 
 
 def figure_of(dataset, name):
-    figures = report_figures(dataset, summarise_monte_carlo(dataset))
-    (found,) = (part.figure for part in figures if part.name == name)
-    return found
+    return report_figures(dataset, summarise_monte_carlo(dataset))[name]
 
 
 def line_of(axes, label):
@@ -313,8 +311,8 @@ def test_a_diverged_run_breaks_nothing():
     assert (failure["run"], failure["step"]) == (2, 9)
     json.dumps(summary, allow_nan=False)
     table_text(summary)
-    for part in report_figures(dataset, summary):
-        part.figure.draw_without_rendering()
+    for figure in report_figures(dataset, summary).values():
+        figure.draw_without_rendering()
 
 
 def test_few_runs_are_warned_of():
@@ -412,15 +410,11 @@ def test_curves_are_averages_over_runs():
 
 def test_the_legend_counts_the_steps_that_are_tested():
     dataset = typical(steps=4)
-    (part,) = (
-        part
-        for part in report_figures(dataset, summarise_monte_carlo(dataset))
-        if part.name == "nees"
-    )
-    axes = part.figure.axes[0]
-    lines = [line_of(axes, "95 % band, 4 steps")]
-    assert lines[0].get_ydata()[0] == pytest.approx(family_band(40, 3, 4).low / 3)
-    assert "all 4 marked steps" in part.sentence
+    axes = figure_of(dataset, "nees").axes[0]
+    line = line_of(axes, "95 % band, 4 steps")
+    assert line.get_ydata()[0] == pytest.approx(family_band(40, 3, 4).low / 3)
+    page = html_report(dataset, summarise_monte_carlo(dataset))
+    assert "all 4 marked steps" in page
     line_of(figure_of(typical(), "nees").axes[0], "95 % band, 10 steps")
 
 

@@ -1,6 +1,6 @@
 """Figures of many runs: NEES, heading, NIS and errors over time, per estimator."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -26,19 +26,12 @@ Shown = list[tuple[EstimatorScores, EstimatorLook]]
 _WIDTH = 4.8
 _LOG_FROM = 4.0
 _BINS = 70
-_MOST_DOTS, _FEW_DOTS = 300, 100
+_FEW_DOTS = 100
+MOST_DOTS = 300
+"""Of one estimator in `runs_figure`, which shows quantiles of more runs."""
 
 
-class ReportFigure(NamedTuple):
-    """A figure and its caption."""
-
-    name: str
-    title: str
-    sentence: str
-    figure: Figure
-
-
-def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> list[ReportFigure]:
+def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> dict[str, Figure]:
     """Draw all figures of a report.
 
     Parameters
@@ -50,58 +43,22 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> list[ReportF
 
     Returns
     -------
-    list of ReportFigure
-        Figures of the estimators with successful runs; empty if there is none.
+    dict of str to Figure
+        ``nees``, ``runs``, ``heading``, ``nis`` and ``rmse``, of the estimators with
+        successful runs; empty if there is none.
     """
     frame: ErrorFrame = summary["frame"]
     each = [scores_of(dataset, label, frame) for label in labels_of(dataset)]
     shown = [(scores, look_of(i)) for i, scores in enumerate(each) if scores.good.any()]
     if not shown:
-        return []
-    runs = max(int(scores.good.sum()) for scores, _ in shown)
-    times = grid_steps(summary)
-    knowable = summary["knowable_heading_std"]
-    return [
-        ReportFigure(
-            "nees",
-            "Do the covariances agree with the errors?",
-            f"NEES of the pose / 3, {frame} frame, averaged over {runs} runs: a "
-            "consistent filter stays near 1, in the grey band at most steps (95 % on "
-            f"average){_between(times)}.",
-            nees_figure(shown, frame, summary),
-        ),
-        ReportFigure(
-            "runs",
-            "Every run, or a few bad ones?",
-            f"Time average of NEES / 3, {frame} frame, one dot per run"
-            f"{_quantiles(runs)}; bars are medians. A consistent filter's runs scatter "
-            "around 1, hardly any is above 3.",
-            runs_figure(shown, frame),
-        ),
-        ReportFigure(
-            "heading",
-            "Does it know the uncertainty of its heading?",
-            "The claimed deviation should follow the true error (root mean squares "
-            "over the runs). No reading reveals the orientation of the map, so the "
-            "heading cannot become better known than at the start: the dotted line.",
-            heading_figure(shown, knowable),
-        ),
-        ReportFigure(
-            "nis",
-            "Are the innovations as large as claimed, and white?",
-            "NIS by its degrees of freedom, pooled over runs and neighbouring steps, "
-            "should stay near 1 and be uncorrelated. This is necessary, but not "
-            "sufficient: an overconfident filter can pass.",
-            nis_figure(shown),
-        ),
-        ReportFigure(
-            "rmse",
-            "How large is the position error?",
-            "Root mean square error of the position over the runs, raw: in the frame "
-            "of the start, not aligned with the truth.",
-            rmse_figure(shown),
-        ),
-    ]
+        return {}
+    return {
+        "nees": nees_figure(shown, frame, summary),
+        "runs": runs_figure(shown, frame),
+        "heading": heading_figure(shown, summary["knowable_heading_std"]),
+        "nis": nis_figure(shown),
+        "rmse": rmse_figure(shown),
+    }
 
 
 def nees_figure(shown: Shown, frame: ErrorFrame, summary: dict[str, Any]) -> Figure:
@@ -215,13 +172,6 @@ def grid_steps(summary: dict[str, Any]) -> int:
     return max((len(found["grid"]["steps"]) for found in decisions if found), default=0)
 
 
-def _between(times: int) -> str:
-    if not times:
-        return ""
-    marked = "the marked step" if times == 1 else f"all {times} marked steps"
-    return f" and between the thin lines at {marked} (filled: rejected)"
-
-
 def _steps(times: int) -> str:
     return "1 step" if times == 1 else f"{times} steps"
 
@@ -262,13 +212,9 @@ def _root_mean_square(values: Array) -> Array:
 
 def _dots(values: Array) -> Array:
     """Return the values of few runs, or quantiles of many."""
-    if len(values) <= _MOST_DOTS:
+    if len(values) <= MOST_DOTS:
         return values
-    return np.asarray(np.quantile(values, (np.arange(_MOST_DOTS) + 0.5) / _MOST_DOTS))
-
-
-def _quantiles(runs: int) -> str:
-    return "" if runs <= _MOST_DOTS else f" (of {runs}, {_MOST_DOTS} quantiles)"
+    return np.asarray(np.quantile(values, (np.arange(MOST_DOTS) + 0.5) / MOST_DOTS))
 
 
 def _swarm(values: Array, edges: Array) -> tuple[Array, Array]:

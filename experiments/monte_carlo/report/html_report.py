@@ -4,35 +4,23 @@ import html
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import xarray as xr
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 
 from ....evaluation.consistency_report import FEW_AVERAGES
 from ....sim_configs.atomic_file import replace_when_written
 from ..reproduction import ASSUMED_FILE, python_call
-from .figures import report_figures
+from .figures import MOST_DOTS, grid_steps, report_figures
 from .inline_svg import inline_svg
 from .table import measures, number, percent
 from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT, p_text
 
-_TEMPLATE = Path(__file__).with_name("html_report.html")
-_SIGNS = {CONSISTENT: "✓", NEARLY: "≈", NOT_CONSISTENT: "✗"}
-_OPEN_SIGN = "?"
 _NOTHING = "–"
-_OUTCOMES = {True: "accepted", False: "rejected", None: _NOTHING}
-_INSIDE = {CONSISTENT: "yes", NOT_CONSISTENT: "no, outside"}
 _LARGE = 1e5  # written without three decimals
 _FEW = 3  # estimators; a headline counts more of them
-_DECISIONS = {
-    "final_step": "Final step, χ²",
-    "time_average": "Time averages, t",
-    "bootstrap": "Time averages, bootstrap",
-    "grid": "A grid of steps together, Holm",
-    "nis": "NIS over all scans, χ²",
-    "whiteness": "Whiteness of the NIS, Ljung-Box",
-}
 
 
 def write_html_report(
@@ -63,23 +51,42 @@ def write_html_report(
 
 def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     """Return the report's HTML; see :func:`write_html_report`."""
-    template = Template(_TEMPLATE.read_text(encoding="utf-8"))
-    entries = summary["estimators"]
-    return template.substitute(
-        title=escape(f"{headline(summary)} – slamgym Monte Carlo"),
-        headline=escape(headline(summary)),
-        facts=escape(
-            f"{summary['runs']} runs of {summary['steps']} steps, seed "
-            f"{summary['seed']}; the same worlds and readings for all estimators; "
-            f"decisions in the {summary['frame']} error frame.{_assumption(summary)}"
-        ),
-        verdicts="\n".join(_verdict(*item) for item in entries.items()),
-        numbers=_numbers(summary),
-        decisions="\n".join(_decisions(*item) for item in entries.items()),
-        figures=_figures(dataset, summary),
-        failures=_failures(summary),
-        reproduce=_reproduce(summary),
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        finalize=escape,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
     )
+    entries = summary["estimators"]
+    page = {
+        "headline": headline(summary),
+        "command": summary["command"] or python_call(summary),
+        "described": "; ".join(_described(*entry) for entry in entries.items()),
+        "files": _files(summary),
+        "measures": measures(summary),
+        "figures": report_figures(dataset, summary),
+        "good_runs": max(entry["good_runs"] for entry in entries.values()),
+        "tested": grid_steps(summary),
+    }
+    environment.globals |= {
+        "most_dots": MOST_DOTS,
+        "few_averages": FEW_AVERAGES,
+        "kinds": KINDS,
+        "signs": {CONSISTENT: "✓", NEARLY: "≈", NOT_CONSISTENT: "✗"},
+        "outcomes": {True: "accepted", False: "rejected", None: _NOTHING},
+        "inside": {CONSISTENT: "yes", NOT_CONSISTENT: "no, outside"},
+        "breakable": _breakable,
+        "extreme": _extreme,
+        "interval": _interval,
+        "number": number,
+        "p_value": _p_value,
+        "percent": percent,
+        "svg": lambda *part: Markup(inline_svg(*part)),
+        "verbatim": lambda text: Markup(html.escape(text)),
+    }
+    return environment.get_template("html_report.html").render(summary | page)
 
 
 def headline(summary: dict[str, Any]) -> str:
@@ -102,100 +109,38 @@ def headline(summary: dict[str, Any]) -> str:
     return f"{summary['scenario']}: {said}"
 
 
-def _assumption(summary: dict[str, Any]) -> str:
-    if summary["assumed_toml"] is None:
-        return ""
-    return " The estimators assume other noise than the world has."
+def _files(summary: dict[str, Any]) -> dict[str, str]:
+    """Return the scenario files that the page shows, by their titles."""
+    files = {f"The scenario, {summary['scenario']}.toml": summary["scenario_toml"]}
+    if summary["assumed_toml"]:
+        title = f"The scenario that the estimators assume, {ASSUMED_FILE}"
+        files[title] = summary["assumed_toml"]
+    return files
 
 
-def _verdict(label: str, entry: dict[str, Any]) -> str:
-    word = entry["verdict"]
-    reason = entry["reason"]
-    said = f"{reason[:1].upper()}{reason[1:]}. {entry['heading_sentence']}"
-    warnings = "".join(
-        f'<p class="warning">{escape(line)}</p>' for line in entry["warnings"]
-    )
-    return (
-        f'<li class="{KINDS[word]}"><h3><span>{escape(label)}</span> '
-        f"{_word(word)}</h3><p>{escape(said.strip())}</p>{warnings}</li>"
-    )
+def _described(label: str, entry: dict[str, Any]) -> str:
+    name, options = entry.get("name", label), entry.get("options") or {}
+    listed = ", ".join(f"{key} = {value}" for key, value in options.items())
+    estimator = name if name == label else f"{label}: {name}"
+    return f"{estimator} ({listed})" if listed else estimator
 
 
-def _word(word: str) -> str:
-    sign = _SIGNS.get(word, _OPEN_SIGN)
-    return (
-        f'<span class="word"><span aria-hidden="true">{sign}</span> '
-        f"{escape(word)}</span>"
-    )
-
-
-def _numbers(summary: dict[str, Any]) -> str:
-    entries = summary["estimators"].values()
-    heads = "".join(
-        f'<th scope="col">{_breakable(label)}</th>' for label in summary["estimators"]
-    )
-    words = "".join(
-        f'<td class="{KINDS[entry["verdict"]]}">{_word(entry["verdict"])}</td>'
-        for entry in entries
-    )
-    rows = [f'<tr><th scope="row">verdict</th><td></td>{words}</tr>']
-    for measure in measures(summary):
-        cells = "".join(f"<td>{escape(measure.of(entry))}</td>" for entry in entries)
-        rows.append(
-            f'<tr><th scope="row">{escape(measure.name)}</th>'
-            f'<td class="target">{escape(measure.right)}</td>{cells}</tr>'
-        )
-    return (
-        '<table class="numbers"><thead><tr><td></td><th scope="col">should be</th>'
-        f"{heads}</tr></thead><tbody>{_lines(rows)}</tbody></table>"
-    )
-
-
-def _breakable(label: str) -> str:
+def _breakable(label: str) -> Markup:
     """Allow line breaks in a long name after its punctuation."""
-    return re.sub(r"([_,:=])|(?=\[)", r"\1<wbr>", escape(label))
+    return Markup(re.sub(r"([_,:=])|(?=\[)", r"\1<wbr>", str(escape(label))))
 
 
-def _decisions(label: str, entry: dict[str, Any]) -> str:
-    found = entry["decisions"]
-    if found is None:
-        return ""
-    rows = [_decision(title, found[key]) for key, title in _DECISIONS.items()]
-    equivalence = found["equivalence"]
-    needed = ", ".join(
-        f"{factor}: {runs}" for factor, runs in found["runs_needed"].items()
-    )
-    margin = "[{:g},&nbsp;{:g}]".format(*equivalence["margin"])
-    inside = _INSIDE.get(equivalence["verdict"], equivalence["verdict"])
-    wrongly = percent(equivalence["error_rate"])
-    return f"""<details><summary>The decisions on {escape(label)}</summary>
-<div class="wide" role="region" aria-label="Decisions on {escape(label)}" tabindex="0">
-<table><thead><tr><th class="text" scope="col">decision</th><th scope="col">found</th>
-<th scope="col">accepted within</th><th scope="col">p</th><th scope="col">outcome</th>
-<th scope="col">rejects wrongly in</th></tr></thead>
-<tbody>{_lines(rows)}</tbody></table></div>
-<p class="note">Final step, time averages and grid share the error rate: together they
-reject where one has p&nbsp;&lt;&nbsp;0.0167; the time averages only from
-{FEW_AVERAGES}&nbsp;runs on, the bootstrap, their check, never. Equivalence: the
-90&nbsp;% interval of the ratio is {_interval(equivalence["interval"])}; inside
-{margin}: {inside} (claims
-consistency wrongly in at most {wrongly}). Runs that find covariances too small by a
-factor in 90&nbsp;% of cases: {escape(needed)}.</p></details>"""
-
-
-def _decision(title: str, decision: dict[str, Any]) -> str:
-    found = decision["statistic"]
+def _extreme(found: float | list[float]) -> float:
+    """Return the ratio of the grid that is farthest from 1."""
     if isinstance(found, list):
-        found = max(found, key=lambda ratio: abs(ratio - 1))
-    p_value = _NOTHING
-    if decision["p_value"] is not None:
-        p_value = p_text(decision["p_value"]).removeprefix("p ").removeprefix("= ")
-    return (
-        f'<tr><th scope="row">{escape(title)}</th><td>{number(found)}</td>'
-        f"<td>{_interval(decision['interval'])}</td><td>{escape(p_value)}</td>"
-        f"<td>{_OUTCOMES[decision['accepted']]}</td>"
-        f"<td>{percent(decision['error_rate'])}</td></tr>"
-    )
+        return max(found, key=lambda ratio: abs(ratio - 1))
+    return found
+
+
+def _p_value(p_value: float | None) -> str:
+    if p_value is None:
+        return _NOTHING
+    return p_text(p_value).removeprefix("p ").removeprefix("= ")
 
 
 def _interval(ends: Iterable[float | None]) -> str:
@@ -204,91 +149,18 @@ def _interval(ends: Iterable[float | None]) -> str:
     if len(known) < 2:
         return _NOTHING
     written = [f"{end:.3f}" if end < _LARGE else number(end) for end in known]
-    return f"[{',&nbsp;'.join(written)}]"
+    return f"[{', '.join(written)}]"
 
 
-def _figures(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
-    shown = [
-        f"<figure><figcaption><h3>{escape(part.title)}</h3>"
-        f"<p>{escape(part.sentence)}</p></figcaption>\n"
-        f"{inline_svg(part.figure, part.name, part.title)}</figure>"
-        for part in report_figures(dataset, summary)
-    ]
-    if not shown:
-        return "<p>No run went well, so there is nothing to draw.</p>"
-    return f'<div class="figures">\n{_lines(shown)}\n</div>'
-
-
-def _failures(summary: dict[str, Any]) -> str:
-    rows = [
-        f'<tr><td class="text">{escape(label)}</td><td>{failure["run"]}</td>'
-        f"<td>{failure['step'] if failure['step'] >= 0 else '–'}</td>"
-        f'<td class="message">{escape(failure["message"])}</td></tr>'
-        for label, entry in summary["estimators"].items()
-        for failure in entry["failed_runs"]
-    ]
-    if not rows:
-        return ""
-    return (
-        "<section>\n<h2>Failed runs</h2>\n<p>No figure and no number counts them.</p>\n"
-        '<div class="wide" role="region" aria-label="Failed runs" tabindex="0">'
-        '<table><thead><tr><th class="text" scope="col">estimator</th>'
-        '<th scope="col">run</th><th scope="col">step</th>'
-        '<th class="text" scope="col">message</th></tr></thead>'
-        f"<tbody>{_lines(rows)}</tbody></table></div>\n</section>"
-    )
-
-
-def _reproduce(summary: dict[str, Any]) -> str:
-    command = summary["command"] or python_call(summary)
-    versions = ", ".join(
-        f"{name} {version}" for name, version in summary["versions"].items()
-    )
-    estimators = "; ".join(
-        _described(label, entry) for label, entry in summary["estimators"].items()
-    )
-    facts = {
-        "seed": f"{summary['seed']}; run i is the world of seed {summary['seed']} + i",
-        "estimators": estimators,
-        "versions": versions,
-    }
-    listed = "".join(
-        f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>"
-        for name, text in facts.items()
-    )
-    files = {f"The scenario, {summary['scenario']}.toml": summary["scenario_toml"]}
-    if summary["assumed_toml"]:
-        title = f"The scenario that the estimators assume, {ASSUMED_FILE}"
-        files[title] = summary["assumed_toml"]
-    folded = _lines(
-        f"<details><summary>{escape(title)}</summary>\n"
-        f'<pre tabindex="0"><code>{html.escape(text)}</code></pre></details>'
-        for title, text in files.items()
-    )
-    return (
-        '<pre class="command" tabindex="0"><code>'
-        f"{html.escape(command)}</code></pre>\n<dl>{listed}</dl>\n{folded}"
-    )
-
-
-def _described(label: str, entry: dict[str, Any]) -> str:
-    name, options = entry.get("name", label), entry.get("options") or {}
-    told = ", ".join(f"{key} = {value}" for key, value in options.items())
-    said = name if name == label else f"{label}: {name}"
-    return f"{said} ({told})" if told else said
-
-
-def escape(text: str) -> str:
-    """Write a text as HTML without line breaks before a % or inside an interval.
+def escape(value: object) -> Markup:
+    """Write a value as HTML without line breaks before a % or inside an interval.
 
     Examples
     --------
-    >>> escape("<b> at 5 %, [1, 2]")
-    '&lt;b&gt; at 5&nbsp;%, [1,&nbsp;2]'
+    >>> print(escape("<b> at 5 %, [1, 2]"))
+    &lt;b&gt; at 5&nbsp;%, [1,&nbsp;2]
     """
-    safe = html.escape(text).replace(" %", "&nbsp;%")
-    return re.sub(r"(\[[\d.e+-]+,) ([\d.e+-]+\])", r"\1&nbsp;\2", safe)
-
-
-def _lines(parts: Iterable[str]) -> str:
-    return "\n".join(parts)
+    if isinstance(value, Markup):
+        return value
+    safe = html.escape(str(value)).replace(" %", "&nbsp;%")
+    return Markup(re.sub(r"(\[[\d.e+-]+,) ([\d.e+-]+\])", r"\1&nbsp;\2", safe))
