@@ -1,15 +1,19 @@
 """Drive many worlds side by side, and record them as trajectories."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium.utils import seeding
+from numpy.typing import NDArray
 
 from ...envs.controllers import make_vector_controller
 from ...envs.vector import MixedWorlds, WorldBatch
 from ...sim_configs import Scenario, drawn_scenario
 from .trajectory import Trajectory
 
+_EACH_STEP = ("odometry", "collisions")
+_EACH_SCAN = ("poses", "measurements", "mask", "landmark_ids")
 _CONTROLLER_STREAM, _SCENARIO_STREAM = 1, 2  # beside the seed, so that all differ
 
 
@@ -64,15 +68,23 @@ def drive_episodes(
     worlds.reset([seeding.np_random(seed)[0] for seed in seeds])
     rngs = [np.random.default_rng([seed, _CONTROLLER_STREAM]) for seed in seeds]
     drivers = make_vector_controller(controller, scenarios, rngs)
-    record = _Record(worlds, scenario.steps)
+    record = _empty_record(worlds, scenario.steps)
+    _take(record, _EACH_SCAN, 0, worlds)
     for step in range(scenario.steps):
         actions = drivers.act(worlds.poses, step)
         worlds.step(actions)
-        record.take(step, actions)
+        record["actions"][:, step] = actions
+        _take(record, _EACH_STEP, step, worlds)
+        _take(record, _EACH_SCAN, step + 1, worlds)
         if progress is not None:
             progress(len(seeds))
     return [
-        record.trajectory(place, scenarios[place], controller, seed)
+        Trajectory(
+            scenario=scenarios[place],
+            controller=controller,
+            seed=seed,
+            **{name: array[place] for name, array in record.items()},
+        )
         for place, seed in enumerate(seeds)
     ]
 
@@ -85,56 +97,31 @@ def _worlds(
     return MixedWorlds(scenarios)
 
 
-class _Record:
-    """Record B worlds as arrays that are filled step by step."""
+def _empty_record(
+    worlds: WorldBatch | MixedWorlds, steps: int
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays of B trajectories, shape (B, …) each, to be filled."""
 
-    def __init__(self, worlds: WorldBatch | MixedWorlds, steps: int) -> None:
-        self._worlds = worlds
-        count, rows = worlds.mask.shape
-        self._landmarks = worlds.landmarks
-        self._start_estimates = worlds.start_estimates
-        self._actions = np.empty((count, steps, 2))
-        self._odometry = np.empty((count, steps, 2))
-        self._collisions = np.empty((count, steps), dtype=np.bool_)
-        self._poses = np.empty((count, steps + 1, 3))
-        self._measurements = np.empty((count, steps + 1, rows, 2))
-        self._mask = np.empty((count, steps + 1, rows), dtype=np.bool_)
-        self._landmark_ids = None
-        if worlds.landmark_ids is not None:
-            self._landmark_ids = np.empty((count, steps + 1, rows), dtype=np.int64)
-        self._take_moment(0)
+    def room(name: str, times: int) -> NDArray[Any]:
+        now: NDArray[Any] = getattr(worlds, name)
+        return np.empty((len(now), times, *now.shape[1:]), now.dtype)
 
-    def take(self, step: int, actions: np.ndarray) -> None:
-        """Record an action and the state after it."""
-        self._actions[:, step] = actions
-        self._odometry[:, step] = self._worlds.odometry
-        self._collisions[:, step] = self._worlds.collisions
-        self._take_moment(step + 1)
+    scanned = [name for name in _EACH_SCAN if getattr(worlds, name) is not None]
+    return {
+        "landmarks": worlds.landmarks,
+        "start_estimate": worlds.start_estimates,
+        "actions": np.empty((len(worlds.poses), steps, 2)),
+        **{name: room(name, steps) for name in _EACH_STEP},
+        **{name: room(name, steps + 1) for name in scanned},
+    }
 
-    def _take_moment(self, moment: int) -> None:
-        self._poses[:, moment] = self._worlds.poses
-        self._measurements[:, moment] = self._worlds.measurements
-        self._mask[:, moment] = self._worlds.mask
-        ids = self._worlds.landmark_ids
-        if self._landmark_ids is not None and ids is not None:
-            self._landmark_ids[:, moment] = ids
 
-    def trajectory(
-        self, place: int, scenario: Scenario, controller: str, seed: int
-    ) -> Trajectory:
-        """Return the trajectory of one world."""
-        ids = self._landmark_ids
-        return Trajectory(
-            scenario=scenario,
-            controller=controller,
-            seed=seed,
-            start_estimate=self._start_estimates[place],
-            odometry=self._odometry[place],
-            poses=self._poses[place],
-            landmarks=self._landmarks[place],
-            actions=self._actions[place],
-            measurements=self._measurements[place],
-            mask=self._mask[place],
-            collisions=self._collisions[place],
-            landmark_ids=None if ids is None else ids[place],
-        )
+def _take(
+    record: dict[str, NDArray[Any]],
+    names: Sequence[str],
+    place: int,
+    worlds: WorldBatch | MixedWorlds,
+) -> None:
+    """Record arrays of the worlds, as far as they have them, at an index of time."""
+    for name in record.keys() & set(names):
+        record[name][:, place] = getattr(worlds, name)

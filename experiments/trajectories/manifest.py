@@ -23,7 +23,6 @@ from .trajectory import scenario_from_text
 
 MANIFEST = "manifest.json"
 _KIND = "slamgym trajectories 1"
-_CHUNK = 1 << 20  # [bytes]
 
 
 @dataclass(frozen=True)
@@ -201,8 +200,5 @@ def checksum(path: Path) -> str:
 
 
 def _file_checksum(path: Path) -> str:
-    digest = hashlib.sha256()
     with path.open("rb") as stream:
-        while chunk := stream.read(_CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -7,58 +7,46 @@ per episode: its name, seed, controller, and scenario as TOML.
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
-from ....sim_configs import Scenario
 from ....sim_configs.scenario_files import scenario_text
 from ..trajectory import Trajectory, scenario_from_text
 
 METADATA = "episodes.jsonl"
 
 
-class EpisodeMetadata(NamedTuple):
-    """The data of an episode that its text files do not hold."""
-
-    name: str
-    """Prefix of the names of the episode's files."""
-    seed: int
-    controller: str
-    scenario: Scenario
-
-
-def write_metadata(trajectories: Sequence[Trajectory], folder: Path) -> list[str]:
-    """Write the metadata of a shard, and return the names of its episodes.
+def write_metadata(
+    trajectories: Sequence[Trajectory], folder: Path
+) -> list[tuple[str, Trajectory]]:
+    """Make the folder of a shard with its metadata, and name the episodes.
 
     Returns
     -------
-    list of str
-        Names such as ``"seed_00000007"``.
+    list of (str, Trajectory)
+        Names such as ``"seed_00000007"``, prefixes of the names of the episode's files,
+        and the trajectories.
     """
-    names = [f"seed_{each.seed:08d}" for each in trajectories]
-    lines = [
-        json.dumps(
-            {
-                "name": name,
-                "seed": each.seed,
-                "controller": each.controller,
-                "scenario": scenario_text(each.scenario),
-            }
-        )
-        for name, each in zip(names, trajectories, strict=True)
+    folder.mkdir()
+    named = [(f"seed_{each.seed:08d}", each) for each in trajectories]
+    tables = [
+        {
+            "name": name,
+            "seed": each.seed,
+            "controller": each.controller,
+            "scenario": scenario_text(each.scenario),
+        }
+        for name, each in named
     ]
-    text = "\n".join([*lines, ""])
-    (folder / METADATA).write_text(text, encoding="utf-8", newline="\n")
-    return names
+    write_lines(folder / METADATA, [json.dumps(table) for table in tables])
+    return named
 
 
-def read_metadata(folder: Path) -> Iterator[EpisodeMetadata]:
-    """Yield the metadata of each episode of a shard."""
+def read_metadata(folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield for each episode its name, and its scenario, controller and seed."""
     for line in (folder / METADATA).read_text(encoding="utf-8").splitlines():
         table = json.loads(line)
-        scenario = scenario_from_text(table["scenario"])
-        yield EpisodeMetadata(
-            table["name"], table["seed"], table["controller"], scenario
-        )
+        table["scenario"] = scenario_from_text(table["scenario"])
+        yield table.pop("name"), table
 
 
 def write_lines(path: Path, lines: Sequence[str]) -> None:

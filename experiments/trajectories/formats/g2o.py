@@ -20,19 +20,14 @@ refused.
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ....sim_configs import Scenario
 from ..trajectory import Array, Trajectory, array_of
 from .dead_reckoning import dead_reckoning
-from .episode_files import (
-    EpisodeMetadata,
-    numbers,
-    read_metadata,
-    write_lines,
-    write_metadata,
-)
+from .episode_files import numbers, read_metadata, write_lines, write_metadata
 
 ENDING = ""
 LIBRARIES: tuple[str, ...] = ()
@@ -54,9 +49,7 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
     """Write a shard; see `TrajectoryFormat`."""
     for each in trajectories:
         check(each.scenario)
-    path.mkdir()
-    names = write_metadata(trajectories, path)
-    for name, each in zip(names, trajectories, strict=True):
+    for name, each in write_metadata(trajectories, path):
         landmarks = dict(enumerate(array_of(each, "landmarks")))
         reckoned = dead_reckoning(each.start_estimate, each.odometry)
         first_seen = _first_seen(each, reckoned)
@@ -73,8 +66,8 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
 
 def read(path: Path) -> Iterator[Trajectory]:
     """Yield the trajectories of a shard; see `TrajectoryFormat`."""
-    for about in read_metadata(path):
-        yield _trajectory(path, about)
+    for name, about in read_metadata(path):
+        yield _trajectory(path / name, about)
 
 
 def _vertices(
@@ -162,9 +155,9 @@ def _turned(along: float, aside: float, angle: float) -> tuple[float, float, flo
     )
 
 
-def _trajectory(folder: Path, about: EpisodeMetadata) -> Trajectory:
-    graph = list(_fields(folder / f"{about.name}_gtsam.g2o"))
-    truth = list(_fields(folder / f"{about.name}_truth.g2o"))
+def _trajectory(path: Path, about: dict[str, Any]) -> Trajectory:
+    graph = _fields(path.with_name(f"{path.name}_gtsam.g2o"))
+    truth = _fields(path.with_name(f"{path.name}_truth.g2o"))
     odometry = _table(graph, "EDGE_SE2", (3, 5))
     landmarks = _table(truth, "VERTEX_XY", (2, 3))
     shape = (len(odometry) + 1, len(landmarks))
@@ -175,9 +168,7 @@ def _trajectory(folder: Path, about: EpisodeMetadata) -> Trajectory:
             measurements[place] = float(fields[2]), float(fields[3])
             mask[place] = True
     return Trajectory(
-        scenario=about.scenario,
-        controller=about.controller,
-        seed=about.seed,
+        **about,
         start_estimate=_table(graph, "VERTEX_SE2", (2, 3, 4))[0],
         odometry=odometry,
         poses=_table(truth, "VERTEX_SE2", (2, 3, 4)),
@@ -187,9 +178,8 @@ def _trajectory(folder: Path, about: EpisodeMetadata) -> Trajectory:
     )
 
 
-def _fields(path: Path) -> Iterator[list[str]]:
-    for line in path.read_text(encoding="utf-8").splitlines():
-        yield line.split()
+def _fields(path: Path) -> list[list[str]]:
+    return [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def _table(lines: Iterable[list[str]], tag: str, columns: tuple[int, ...]) -> Array:

@@ -7,6 +7,7 @@ identities.
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from ...logs.events import OdometryRow, Scan
 from ...logs.recording import log_header
 from ...logs.slamlog import SlamLog, read_slamlog, write_slamlog
 from ..trajectory import Trajectory, array_of
-from .episode_files import EpisodeMetadata, read_metadata, write_metadata
+from .episode_files import read_metadata, write_metadata
 
 ENDING = ""
 LIBRARIES: tuple[str, ...] = ()
@@ -28,16 +29,14 @@ def check(scenario: Scenario) -> None:
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:
     """Write a shard; see `TrajectoryFormat`."""
-    path.mkdir()
-    names = write_metadata(trajectories, path)
-    for name, trajectory in zip(names, trajectories, strict=True):
+    for name, trajectory in write_metadata(trajectories, path):
         write_slamlog(to_slamlog(trajectory), path / f"{name}.csv")
 
 
 def read(path: Path) -> Iterator[Trajectory]:
     """Yield the trajectories of a shard; see `TrajectoryFormat`."""
-    for about in read_metadata(path):
-        yield _trajectory(read_slamlog(path / f"{about.name}.csv"), about)
+    for name, about in read_metadata(path):
+        yield _trajectory(read_slamlog(path / f"{name}.csv"), about)
 
 
 def to_slamlog(trajectory: Trajectory) -> SlamLog:
@@ -75,9 +74,9 @@ def to_slamlog(trajectory: Trajectory) -> SlamLog:
     )
 
 
-def _trajectory(log: SlamLog, about: EpisodeMetadata) -> Trajectory:
+def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
     moves = [event for event in log.events if isinstance(event, OdometryRow)]
-    rows = count_rows(about.scenario)
+    rows = count_rows(about["scenario"])
     measurements = np.zeros((len(moves) + 1, rows, 2))
     mask = np.zeros((len(moves) + 1, rows), dtype=np.bool_)
     for event in log.events:
@@ -88,9 +87,7 @@ def _trajectory(log: SlamLog, about: EpisodeMetadata) -> Trajectory:
             measurements[int(event.t), places] = event.measurements
             mask[int(event.t), places] = True
     return Trajectory(
-        scenario=about.scenario,
-        controller=about.controller,
-        seed=about.seed,
+        **about,
         start_estimate=log.start,
         odometry=np.array([(move.d, move.alpha) for move in moves]),
         poses=log.ground_truth[:, 1:],

@@ -32,9 +32,7 @@ def check(scenario: Scenario) -> None:
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:
     """Write a shard; see `TrajectoryFormat`."""
-    path.mkdir()
-    names = write_metadata(trajectories, path)
-    for name, each in zip(names, trajectories, strict=True):
+    for name, each in write_metadata(trajectories, path):
         dt = each.scenario.dt
         write_lines(path / f"{name}_truth.tum", _lines(each.poses, dt))
         path_by_odometry = dead_reckoning(each.start_estimate, each.odometry)
@@ -43,15 +41,13 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
 
 def read(path: Path) -> Iterator[Trajectory]:
     """Yield the trajectories of a shard; see `TrajectoryFormat`."""
-    for about in read_metadata(path):
-        reckoned = _poses(path / f"{about.name}_odometry.tum")
+    for name, about in read_metadata(path):
+        reckoned = _poses(path / f"{name}_odometry.tum")
         yield Trajectory(
-            scenario=about.scenario,
-            controller=about.controller,
-            seed=about.seed,
+            **about,
             start_estimate=reckoned[0],
             odometry=_increments(reckoned),
-            poses=_poses(path / f"{about.name}_truth.tum"),
+            poses=_poses(path / f"{name}_truth.tum"),
         )
 
 
