@@ -20,7 +20,7 @@ from ..arrays import Array
 from ..envs.angles import wrap_angle
 from ..envs.controllers import Waypoints
 from ..sim_configs import Robot, Scenario
-from ..sim_configs.scenario_errors import closest
+from ..sim_configs.scenario_errors import unknown_choice
 from .agent_knowledge import AgentKnowledge, as_points
 from .belief_features import largest_variances, world_bounds
 from .greedy_information import GreedyInformation
@@ -158,10 +158,7 @@ def make_baseline(name: str, scenario: Scenario, rng: np.random.Generator) -> Ba
             return GreedyInformation()
         case "revisit":
             return Revisit()
-    raise ValueError(
-        f"name must be one of {', '.join(BASELINES)}, got {name!r}"
-        f"{closest(name, BASELINES)}"
-    )
+    raise ValueError(unknown_choice("name", name, BASELINES))
 
 
 def coverage_lanes(scenario: Scenario) -> Array:

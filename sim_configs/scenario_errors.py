@@ -31,6 +31,19 @@ def closest(word: str, words: Iterable[str]) -> str:
     return f"; did you mean '{nearest[0]}'?" if nearest else ""
 
 
+def unknown_choice(name: str, value: object, choices: Iterable[str]) -> str:
+    """Return the message that a value is none of the choices.
+
+    Examples
+    --------
+    >>> unknown_choice("format", "npy", ["npz", "tum"])
+    "format must be one of npz, tum, got 'npy'; did you mean 'npz'?"
+    """
+    known = list(choices)
+    suggestion = closest(str(value), known)
+    return f"{name} must be one of {', '.join(known)}, got {value!r}{suggestion}"
+
+
 def error_lines(error: ValidationError) -> list[str]:
     """Convert a validation error of pydantic to one line per mistake.
 
@@ -77,10 +90,7 @@ def _unknown_tag(path: str, context: dict[str, Any]) -> str:
     if "tag" not in context:
         return f"{field} must be given"
     names = [name.strip().strip("'") for name in context["expected_tags"].split(",")]
-    suggestion = closest(context["tag"], names)
-    return (
-        f"{field} must be one of {', '.join(names)}, got {context['tag']!r}{suggestion}"
-    )
+    return unknown_choice(field, context["tag"], names)
 
 
 def _path(location: tuple[str | int, ...]) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...sim_configs import Scenario
-from ...sim_configs.scenario_errors import closest
+from ...sim_configs.scenario_errors import unknown_choice
 from .interface import Controller, VectorController
 from .open_loop import OpenLoop, VectorOpenLoop
 from .planned_path import planned_path
@@ -68,8 +68,7 @@ def make_controller(
             return Waypoints.for_scenario(scenario)
         case "random":
             return RandomWalk.for_scenario(scenario, rng)
-    names, hint = ", ".join(CONTROLLERS), closest(name, CONTROLLERS)
-    raise ValueError(f"name must be one of {names}, got {name!r}{hint}")
+    raise ValueError(unknown_choice("name", name, CONTROLLERS))
 
 
 def make_vector_controller(

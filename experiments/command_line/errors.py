@@ -1,7 +1,9 @@
 """Errors of the command line: one line on standard error, and an exit code."""
 
+import contextlib
 import os
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,15 @@ class BadInputError(ValueError):
 
 class InterruptedRunError(Exception):
     """The user pressed Ctrl-C; the message may name the work that remains."""
+
+
+@contextlib.contextmanager
+def interruptible(message: str) -> Iterator[None]:
+    """Report Ctrl-C in the block with a message about what remains."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise InterruptedRunError(message) from None
 
 
 class OneLineErrors(TyperGroup):

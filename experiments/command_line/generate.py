@@ -4,22 +4,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from . import options
-from .errors import InterruptedRunError
+from .errors import interruptible
 from .program import command
 
 if TYPE_CHECKING:
     from ..trajectories.manifest import Manifest
 
 
-@command(
-    "Write trajectories by the million.",
-    "Drive many episodes of a scenario and write them as a data set: the actions, the "
-    "readings, and the truth. After an interruption, the same command continues where "
-    "it stopped, and the same command always writes the same bytes.",
-    "slamgym generate loop --episodes 1000",
-    "slamgym generate corridor --episodes 50 --controller random --format parquet",
-    "slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]",
-)
+@command
 def generate(
     scenario: options.ScenarioName,
     *,
@@ -59,7 +51,18 @@ def generate(
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Generate trajectories, or continue, and report where they are."""
+    """Write trajectories by the million.
+
+    Drive many episodes of a scenario and write them as a data set: the actions, the
+    readings, and the truth. After an interruption, the same command continues where
+    it stopped, and the same command always writes the same bytes.
+
+    Examples
+    --------
+    slamgym generate loop --episodes 1000
+    slamgym generate corridor --episodes 50 --controller random --format parquet
+    slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]
+    """
     from ..trajectories import generate_trajectories
     from .output_folder import default_folder
     from .reporter import Reporter
@@ -68,22 +71,18 @@ def generate(
     world = chosen_scenario(scenario, steps, set_)
     place = out or default_folder(world.name, controller, format_)
     reporter = Reporter(as_json=as_json)
-    with reporter.progress("driving", unit="steps") as tick:
-        try:
-            manifest = generate_trajectories(
-                world,
-                place,
-                episodes=episodes,
-                controller=controller,
-                seed=seed,
-                format=format_,
-                episodes_per_shard=shard,
-                progress=tick,
-            )
-        except KeyboardInterrupt:
-            raise InterruptedRunError(
-                f"interrupted; whole shards stay in {place}, the same command continues"
-            ) from None
+    stopped = f"interrupted; whole shards stay in {place}, the same command continues"
+    with reporter.progress("driving", unit="steps") as tick, interruptible(stopped):
+        manifest = generate_trajectories(
+            world,
+            place,
+            episodes=episodes,
+            controller=controller,
+            seed=seed,
+            format=format_,
+            episodes_per_shard=shard,
+            progress=tick,
+        )
     size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
     reporter.show_verbatim(_message(manifest, place, size))
     reporter.finish(_summary(manifest, place, size))

@@ -7,9 +7,12 @@ from . import options
 from .program import command
 
 
-@command("List the worlds there are.")
+@command
 def scenarios(as_json: options.AsJson = False) -> None:
-    """List the scenarios that come with slamgym, to run, to film, or to vary."""
+    """List the worlds there are.
+
+    List the scenarios that come with slamgym, to run, to film, or to vary.
+    """
     from ...sim_configs import list_presets, load_scenario
 
     each = [(name, load_scenario(name)) for name in list_presets()]
@@ -25,9 +28,12 @@ def scenarios(as_json: options.AsJson = False) -> None:
     _show("scenarios", rows, as_json=as_json)
 
 
-@command("List the filters there are.")
+@command
 def estimators(as_json: options.AsJson = False) -> None:
-    """List the filters that come with slamgym."""
+    """List the filters there are.
+
+    List the filters that come with slamgym.
+    """
     from ...estimator.registry import find_estimator, list_estimators
 
     rows = [

@@ -3,12 +3,11 @@
 import contextlib
 import shlex
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from . import options
-from .errors import FAILURE, InterruptedRunError
+from .errors import FAILURE, interruptible
 from .option_values import changes
 from .program import command
 
@@ -18,17 +17,7 @@ if TYPE_CHECKING:
 REPORT, SUMMARY = "report.html", "summary.json"
 
 
-@command(
-    "Many runs: are the filters consistent?",
-    "Run filters many times over a scenario, all on the same random numbers, and "
-    "decide with known error rates whether their covariances agree with their errors. "
-    "Writes results.nc (estimator x run x step, for xarray), summary.json and a report "
-    "to open in a browser, report.html.",
-    "slamgym monte-carlo loop --estimators ekf,invariant --runs 200 --out loop",
-    "slamgym monte-carlo six_landmarks -e mine:MyFilter --runs 100 --jobs 4",
-    "slamgym monte-carlo loop --assume motion.std=[0.1,0.1,0.1]",
-    "slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://boss:8786",
-)
+@command
 def monte_carlo(
     scenario: options.ScenarioName,
     *,
@@ -103,7 +92,20 @@ def monte_carlo(
     ] = None,
     as_json: options.AsJson = False,
 ) -> int:
-    """Run, measure and decide; the exit code is 1 if every run failed."""
+    """Many runs: are the filters consistent?
+
+    Run filters many times over a scenario, all on the same random numbers, and
+    decide with known error rates whether their covariances agree with their errors.
+    Writes results.nc (estimator x run x step, for xarray), summary.json and a report
+    to open in a browser, report.html.
+
+    Examples
+    --------
+    slamgym monte-carlo loop --estimators ekf,invariant --runs 200 --out loop
+    slamgym monte-carlo six_landmarks -e mine:MyFilter --runs 100 --jobs 4
+    slamgym monte-carlo loop --assume motion.std=[0.1,0.1,0.1]
+    slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://boss:8786
+    """  # noqa: D400 (the list of commands shows the question)
     from ...sim_configs.atomic_file import replace_when_written
     from .. import monte_carlo
     from ..monte_carlo.measure.estimator_choices import estimator_choices
@@ -127,7 +129,10 @@ def monte_carlo(
         connected(backend, scheduler, jobs),
         reporter.warnings(),
         reporter.progress("running", unit="runs") as tick,
-        _resumable(place),
+        interruptible(
+            f"interrupted; the finished runs are in {place}, "
+            "and the same command continues"
+        ),
         monte_carlo.monte_carlo(
             world,
             estimators,
@@ -178,15 +183,3 @@ def _compile(estimators: str) -> None:
     small = load_scenario("six_landmarks").with_changes(steps=2)
     with contextlib.suppress(Exception):  # the job itself fails too, and reports it
         monte_carlo(small, estimators, 1)
-
-
-@contextlib.contextmanager
-def _resumable(place: Path) -> Iterator[None]:
-    """Report after Ctrl-C where the finished runs are."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise InterruptedRunError(
-            f"interrupted; the finished runs are in {place}, "
-            "and the same command continues"
-        ) from None

@@ -3,6 +3,7 @@
 import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -20,20 +21,10 @@ if TYPE_CHECKING:
     from ..noise_study.many_runs import NoiseEffect
     from ..noise_study.one_run import NoiseRow, NoiseRun
     from ..runs.filter_settings import FilterSettings
-    from .reporter import Reporter, Tick
+    from .reporter import Reporter
 
 
-@command(
-    "Every noise times 10 and divided by 10.",
-    "Multiply and divide each of σx, σy, σα, σβ, σr by 10, one by one. For a log, only "
-    "the filter's assumed noise changes; for a scenario, world and filter change "
-    "together, with the same random numbers. Draws all maps in one figure, and lists "
-    "the areas of the final 3σ ellipses, the errors, and the NEES and NIS, which are 1 "
-    "per degree of freedom for a consistent filter.",
-    "slamgym noise-study data.txt",
-    "slamgym noise-study six_landmarks --seed 3 --out study",
-    "slamgym noise-study six_landmarks --runs 100 -e ekf,invariant",
-)
+@command
 def noise_study(
     source: Annotated[
         str,
@@ -69,11 +60,25 @@ def noise_study(
     out: options.OutFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Run the study, and write figure and tables."""
+    """Every noise times 10 and divided by 10.
+
+    Multiply and divide each of σx, σy, σα, σβ, σr by 10, one by one. For a log, only
+    the filter's assumed noise changes; for a scenario, world and filter change
+    together, with the same random numbers. Draws all maps in one figure, and lists
+    the areas of the final 3σ ellipses, the errors, and the NEES and NIS, which are 1
+    per degree of freedom for a consistent filter.
+
+    Examples
+    --------
+    slamgym noise-study data.txt
+    slamgym noise-study six_landmarks --seed 3 --out study
+    slamgym noise-study six_landmarks --runs 100 -e ekf,invariant
+    """
+    from ..noise_study.one_run import study_log, study_scenario
     from ..runs.filter_settings import settings_for, settings_for_scenario
     from .reporter import Reporter
     from .run_files import read_any_log
-    from .scenario_options import chosen_scenario
+    from .scenario_options import chosen_controller, chosen_scenario, recorded
 
     chosen = assignments("--option", option)
     stds = standard_deviations(motion_std, measurement_std, initial_pose_std)
@@ -81,13 +86,21 @@ def noise_study(
         _refuse({"steps": steps, "set": set_}, "a scenario, not of a log")
         log = read_any_log(Path(source))
         settings = settings_for(log, estimator=estimator, options=chosen, **stds)
-        study = log_study(log, settings)
+        study = one_run_study(log.name, settings, partial(study_log, log, settings))
     else:
         _refuse(stds, "a log; the filter knows the noise of a scenario")
         world = chosen_scenario(source, steps, set_)
         if runs == 1:
             settings = settings_for_scenario(world, estimator=estimator, options=chosen)
-            study = scenario_study(world, settings, controller, seed)
+            chosen_controller(controller, world, seed)  # refuses a wrong name
+            record = partial(recorded, controller=controller, seed=seed)
+            study = one_run_study(
+                world.name,
+                settings,
+                partial(
+                    study_scenario, world, record, estimator=estimator, options=chosen
+                ),
+            )
         else:
             study = effects_study(world, estimator, runs, seed, change, jobs)
     write_study(study, out, Reporter(as_json=as_json))
@@ -115,38 +128,10 @@ class Study(NamedTuple):
     run: "Callable[[Reporter], Results]"
 
 
-def log_study(log: Any, settings: "FilterSettings") -> Study:
-    """Prepare the study of a log; only the filter changes."""
-    from ..noise_study.one_run import study_log
-
-    return _one_run_study(
-        log.name, settings, lambda tick: study_log(log, settings, progress=tick)
-    )
-
-
-def scenario_study(
-    world: "Scenario", settings: "FilterSettings", controller: str, seed: int
+def one_run_study(
+    name: str, settings: "FilterSettings", study: "Callable[..., list[NoiseRun]]"
 ) -> Study:
-    """Prepare the study of one run of a scenario; world and filter change together."""
-    from ..noise_study.one_run import study_scenario
-    from .scenario_options import chosen_controller, recorded
-
-    def run(tick: "Tick") -> "list[NoiseRun]":
-        return study_scenario(
-            world,
-            lambda changed: recorded(changed, controller, seed),
-            estimator=settings.estimator,
-            options=settings.options,
-            progress=tick,
-        )
-
-    chosen_controller(controller, world, seed)  # refuses a wrong name
-    return _one_run_study(world.name, settings, run)
-
-
-def _one_run_study(
-    name: str, settings: "FilterSettings", study: "Callable[[Tick], list[NoiseRun]]"
-) -> Study:
+    """Prepare the study of a log or of one run of a scenario."""
     from ... import __version__
     from ..figures import noise_study_figure
     from ..runs.summary import settings_table
@@ -158,7 +143,7 @@ def _one_run_study(
     def run(reporter: "Reporter") -> Results:
         warm_up(settings, reporter)
         with reporter.progress("filtering") as tick:
-            runs = study(tick)
+            runs = study(progress=tick)
         with reporter.progress("drawing"):
             figure = noise_study_figure([(run.title, run.trace) for run in runs])
         title = f"[bold]{name}[/], noise study of [bold]{estimator}[/]\n"

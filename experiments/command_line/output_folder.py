@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..runs.folder_lock import naming_folder
 from .errors import BadInputError
 
 SUMMARY = "summary.json"
@@ -43,7 +44,8 @@ def output_folder(path: Path) -> Iterator[Path]:
     _refuse_foreign_files(path)
     with _parents(path):
         partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-        _make(partial, path)
+        with naming_folder(path):
+            partial.mkdir()
         try:
             yield partial
             _swap(partial, path)
@@ -114,22 +116,15 @@ def _parents(path: Path) -> Iterator[None]:
     """Make the folders above a path; after an error, remove those that are empty."""
     missing = [folder for folder in path.parents if not folder.exists()]
     try:
-        for folder in reversed(missing):
-            _make(folder, path)
+        with naming_folder(path):
+            for folder in reversed(missing):
+                folder.mkdir()
         yield
     except BaseException:
         with contextlib.suppress(OSError):
             for folder in missing:
                 folder.rmdir()
         raise
-
-
-def _make(folder: Path, path: Path) -> None:
-    try:
-        folder.mkdir()
-    except OSError as error:
-        reason = error.strerror or error
-        raise OSError(f"the folder {path} cannot be written: {reason}") from error
 
 
 def _swap(partial: Path, path: Path) -> None:

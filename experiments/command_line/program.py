@@ -1,6 +1,8 @@
 """The program ``slamgym``, and the decorator by which a command joins it."""
 
+import inspect
 import sys
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -21,59 +23,53 @@ main = typer.Typer(
 )
 
 
-def command(
-    summary: str, text: str = "", *examples: str
-) -> Callable[[_Function], _Function]:
+def command(function: _Function) -> _Function:
     """Register a function as the command of its name, its parameters as the options.
 
-    Parameters
-    ----------
-    summary : str
-        One line for the list of commands.
-    text : str
-        What the command's own help explains; the docstring where empty.
-    *examples : str
-        Command lines that end the help.
+    The first line of its docstring stands in the list of commands. The rest is the
+    command's own help.
     """
-
-    def register(function: _Function) -> _Function:
-        added: _Function = main.command(
-            name=function.__name__.replace("_", "-"),
-            short_help=summary,
-            help=_with_examples(text, examples) if text else None,
-        )(function)
-        return added
-
-    return register
+    summary, text = _help_of(function)
+    added: _Function = main.command(
+        name=function.__name__.replace("_", "-"), short_help=summary, help=text
+    )(function)
+    return added
 
 
-def _with_examples(text: str, examples: tuple[str, ...]) -> str:
-    r"""Compose a help text; click keeps the lines after \b as they are."""
-    lines = "\n".join(f"  {example}" for example in examples)
-    return f"{text}\n\n\b\nExamples:\n{lines}"
+def _help_of(function: Callable[..., Any]) -> tuple[str, str]:
+    r"""Return a docstring's first line, and its rest with the examples indented.
+
+    click keeps the lines after \b as they are.
+    """
+    summary, _, rest = (inspect.getdoc(function) or "").partition("\n\n")
+    text, _, examples = rest.partition("\n\nExamples\n--------\n")
+    lines = textwrap.indent(examples, "  ")
+    return summary, f"{text}\n\n\b\nExamples:\n{lines}" if examples else text
 
 
-@main.callback(
-    invoke_without_command=True,
-    help=_with_examples(
-        "Landmark worlds to drive a robot in, and EKF-SLAM filters to follow it.",
-        (
-            "slamgym scenarios                 list the worlds",
-            "slamgym run six_landmarks         drive in one, filter, draw",
-            "slamgym replay data.txt           filter a log, draw",
-            "slamgym COMMAND --help            explain a command",
-        ),
-    ),
-)
 def _slamgym(
     context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", help="Print the version.")
     ] = False,
 ) -> None:
+    """Run the program.
+
+    Landmark worlds to drive a robot in, and EKF-SLAM filters to follow it.
+
+    Examples
+    --------
+    slamgym scenarios                 list the worlds
+    slamgym run six_landmarks         drive in one, filter, draw
+    slamgym replay data.txt           filter a log, draw
+    slamgym COMMAND --help            explain a command
+    """
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.append(here)  # for the user's own estimators, "module:Class"
     if version:
         typer.echo(f"slamgym {__version__}")
     elif context.invoked_subcommand is None:
         typer.echo(context.get_help())
+
+
+main.callback(invoke_without_command=True, help=_help_of(_slamgym)[1])(_slamgym)

@@ -20,13 +20,7 @@ _DURATION = 12.0  # [s] of a film by default
 _SLOWEST, _FASTEST = 4.0, 30.0  # [frames/s]
 
 
-@command(
-    "Film an episode as .gif or .mp4.",
-    "Film a drive through a scenario: the robot, its readings, the walls, and the "
-    "belief of a filter with its 3σ ellipses.",
-    "slamgym render loop --out loop.gif",
-    "slamgym render corridor --out corridor.mp4 --fps 20 --controller waypoints",
-)
+@command
 def render(
     scenario: options.ScenarioName,
     *,
@@ -52,7 +46,16 @@ def render(
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Drive an episode, and write one frame per step."""
+    """Film an episode as .gif or .mp4.
+
+    Film a drive through a scenario: the robot, its readings, the walls, and the
+    belief of a filter with its 3σ ellipses.
+
+    Examples
+    --------
+    slamgym render loop --out loop.gif
+    slamgym render corridor --out corridor.mp4 --fps 20 --controller waypoints
+    """
     from ...envs.rendering import write_video
     from ..runs.filter_settings import settings_for_scenario
     from .reporter import Reporter

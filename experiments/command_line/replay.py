@@ -10,15 +10,7 @@ from .option_values import assignments, standard_deviations
 from .program import command
 
 
-@command(
-    "Filter a log, compare with the truth, draw.",
-    "Filter a log, and compare with the truth as far as it is known: prints every "
-    "landmark with its Euclidean and Mahalanobis distance to its true place.",
-    "slamgym replay data.txt",
-    "slamgym replay data.txt --landmark-init independent --out homework",
-    "slamgym replay sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1",
-    "slamgym replay results/loop-ekf/log.csv --estimator invariant",
-)
+@command
 def replay(
     log: Annotated[
         Path,
@@ -75,7 +67,18 @@ def replay(
     every_step: options.EveryStep = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Filter a log, and write everything to a folder."""
+    """Filter a log, compare with the truth, draw.
+
+    Filter a log, and compare with the truth as far as it is known: prints every
+    landmark with its Euclidean and Mahalanobis distance to its true place.
+
+    Examples
+    --------
+    slamgym replay data.txt
+    slamgym replay data.txt --landmark-init independent --out homework
+    slamgym replay sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
+    slamgym replay results/loop-ekf/log.csv --estimator invariant
+    """
     from ..runs.filter_settings import settings_for
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter

@@ -5,16 +5,7 @@ from .option_values import assignments
 from .program import command
 
 
-@command(
-    "Drive through a scenario, filter, draw.",
-    "Drive a robot through a scenario and follow it with a filter, which knows the "
-    "scenario's noise. Writes pictures of map, errors and covariance, the log, the "
-    "scenario and the numbers.",
-    "slamgym run six_landmarks",
-    "slamgym run loop --seed 3 --out loop_3",
-    "slamgym run dense --set sensor.max_range=4 --steps 100 --json",
-    "slamgym run mine.toml --controller random --estimator mine:MyFilter",
-)
+@command
 def run(
     scenario: options.ScenarioName,
     *,
@@ -28,7 +19,19 @@ def run(
     every_step: options.EveryStep = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Drive, filter, and write everything to a folder."""
+    """Drive through a scenario, filter, draw.
+
+    Drive a robot through a scenario and follow it with a filter, which knows the
+    scenario's noise. Writes pictures of map, errors and covariance, the log, the
+    scenario and the numbers.
+
+    Examples
+    --------
+    slamgym run six_landmarks
+    slamgym run loop --seed 3 --out loop_3
+    slamgym run dense --set sensor.max_range=4 --steps 100 --json
+    slamgym run mine.toml --controller random --estimator mine:MyFilter
+    """
     from ...sim_configs import save_scenario
     from ..runs.filter_settings import settings_for_scenario
     from .output_folder import default_folder, output_folder

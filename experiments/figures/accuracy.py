@@ -11,20 +11,9 @@ from scipy.special import chdtri
 
 from ...evaluation.trajectory_error import LandmarkDistances, landmark_distances
 from ..runs.trace import RunTrace
+from . import style
 from .map_picture import box_around
-from .style import (
-    ALARM,
-    BLUE,
-    ELLIPSE_HANDLER,
-    GREY,
-    INK,
-    TEAL,
-    EllipseKind,
-    dress,
-    new_figure,
-    set_ellipses,
-    write_title,
-)
+from .style import ALARM, GREY, INK, TEAL, EllipseKind, dress, write_title
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -57,10 +46,10 @@ def truth_figure(trace: RunTrace) -> Figure:
     width, height = limits[1] - limits[0]
     distances = _landmark_distances(trace, landmarks) if landmarks.any() else None
     if distances is None:
-        figure = new_figure(7.2, 6.2 * height / width + 1.5)
+        figure = style.new_figure(7.2, 6.2 * height / width + 1.5)
         area = figure.add_subplot()
     else:  # its height makes the map as high as the bars beside it
-        figure = new_figure(10.8, 5.6 * height / width + 1.5)
+        figure = style.new_figure(10.8, 5.6 * height / width + 1.5)
         area, *beside = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
         names = [f"l{i}" for i in trace.landmark_ids[landmarks]]
         _draw_distances(beside[0], beside[1], distances, names)
@@ -69,14 +58,7 @@ def truth_figure(trace: RunTrace) -> Figure:
     area.set(xlabel="x [m]", ylabel="y [m]")
     keys = _draw_comparison(area, trace, poses, landmarks)
     write_title(area, "Estimate and ground truth", _summary(trace, poses, distances))
-    figure.legend(
-        handles=keys,
-        handler_map=ELLIPSE_HANDLER,
-        loc="outside lower center",
-        ncols=len(keys),
-        frameon=False,
-        fontsize=9,
-    )
+    style.legend_below(figure, keys, columns=len(keys))
     return figure
 
 
@@ -101,10 +83,10 @@ def _draw_comparison(
 ) -> list[Artist]:
     """Draw estimates, truth and the lines between them; return the legend's keys."""
     shown = _LANDMARK.add_to(axes)
-    set_ellipses(shown, trace.landmarks, trace.landmark_covariances)
+    style.set_ellipses(shown, trace.landmarks, trace.landmark_covariances)
     axes.plot(*trace.landmarks.T, ".", color=TEAL, ms=4)
     (path,) = axes.plot(
-        *trace.poses[:, :2].T, color=BLUE, lw=1.6, label="estimated path"
+        *trace.poses[:, :2].T, color=style.BLUE, lw=1.6, label="estimated path"
     )
     keys: list[Artist] = [path, _LANDMARK.legend_key()]
     if poses.any() and trace.true_poses is not None:

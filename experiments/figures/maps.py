@@ -15,7 +15,7 @@ from ...envs.rendering import BlittedFigure
 from ...sim_configs.atomic_file import replace_when_written
 from ..runs.trace import RunTrace
 from .map_picture import MapPicture, map_limits, pose_stride
-from .style import ELLIPSE_HANDLER, dress, new_figure, write_title
+from .style import ELLIPSE_HANDLER, dress, legend_below, new_figure, write_title
 
 Array = NDArray[np.floating]
 
@@ -154,14 +154,7 @@ def _map_parts(trace: RunTrace) -> _MapParts:
     _prepare(axes, limits)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     picture = MapPicture(axes, trace)
-    figure.legend(
-        handles=picture.legend_keys(),
-        handler_map=ELLIPSE_HANDLER,
-        loc="outside lower center",
-        ncols=3,
-        frameon=False,
-        fontsize=9,
-    )
+    legend_below(figure, picture.legend_keys(), columns=3)
     titles = write_title(axes, *_title(trace, 0))
     figure.draw_without_rendering()  # equal axes need a second layout
     return _MapParts(figure, picture, titles, trace)

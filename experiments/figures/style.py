@@ -1,10 +1,12 @@
 """The common style of all figures, and their files."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
@@ -168,3 +170,15 @@ def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)
 
 
 ELLIPSE_HANDLER = {Ellipse: HandlerPatch(patch_func=_lying_ellipse)}
+
+
+def legend_below(figure: Figure, keys: Sequence[Artist], columns: int) -> None:
+    """Put a legend of lines and ellipses below the axes."""
+    figure.legend(
+        handles=list(keys),
+        handler_map=ELLIPSE_HANDLER,
+        loc="outside lower center",
+        ncols=columns,
+        frameon=False,
+        fontsize=9,
+    )

@@ -144,6 +144,13 @@ class EventRecorder:
         self._close_scan()
         self._events.append(row)
 
+    def add_turn_drive_turn(
+        self, line: LogLine, step: int, *, before: float, d: float, after: float
+    ) -> None:
+        """Append a motion of one step as two turn-last rows, the first with dt = 0."""
+        self.add_odometry(line, OdometryRow(float(step), 0.0, before, dt=0.0))
+        self.add_odometry(line, OdometryRow(float(step), d, after, dt=1.0))
+
     def add_reading(self, line: LogLine, reading: Reading) -> None:
         """Append a reading; raise LogError if it contradicts the rows before it."""
         self._advance(line, reading.t)

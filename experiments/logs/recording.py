@@ -12,7 +12,7 @@ from ...envs.controllers import Controller
 from ...envs.landmark_world import LandmarkWorldEnv, Observation
 from ...sim_configs import Scenario, load_scenario
 from .events import OdometryRow, Scan
-from .slamlog import SlamLog
+from .slamlog import SlamLog, numbers
 
 Array = NDArray[np.float64]
 
@@ -123,9 +123,9 @@ def log_header(scenario: Scenario, seed: int) -> dict[str, str]:
         "scenario": scenario.name,
         "seed": str(seed),
         "time": f"steps of {scenario.dt!r} s",
-        "motion_std": _numbers(motion.std),
-        "measurement_std": _numbers(sensor.std),
-        "start_sigma": _numbers(scenario.start.std),
+        "motion_std": numbers(*motion.std),
+        "measurement_std": numbers(*sensor.std),
+        "start_sigma": numbers(*scenario.start.std),
     }
     if sensor.range_std_per_metre:
         header["range_std_per_metre"] = repr(sensor.range_std_per_metre)
@@ -133,7 +133,3 @@ def log_header(scenario: Scenario, seed: int) -> dict[str, str]:
         header["identities"] = "false"
     header["noise_at_rest"] = str(motion.noise_at_rest).lower()
     return header
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return ",".join(repr(float(value)) for value in values)

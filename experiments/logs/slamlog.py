@@ -257,30 +257,31 @@ def _rendered(log: SlamLog) -> Iterator[str]:
     yield FORMAT_LINE
     yield f"# name: {log.name}"
     yield f"# motion: {log.motion}"
-    yield f"# start: {_numbers(*log.start)}"
+    yield f"# start: {numbers(*log.start)}"
     for key, value in log.header.items():
         yield f"# {key}: {value}"
     for landmark_id, position in zip(log.landmark_ids, log.landmarks, strict=True):
-        yield f"landmark,{landmark_id},{_numbers(*position)}"
+        yield f"landmark,{landmark_id},{numbers(*position)}"
     for event in log.events:
         if isinstance(event, OdometryRow):
-            yield f"odometry,{_numbers(event.t, event.d, event.alpha, event.dt)}"
+            yield f"odometry,{numbers(event.t, event.d, event.alpha, event.dt)}"
         else:
             yield from _rendered_scan(event)
     for *position, heading in log.ground_truth:
-        yield f"groundtruth,{_numbers(*position)},{_known(heading)}"
+        yield f"groundtruth,{numbers(*position)},{_known(heading)}"
 
 
 def _rendered_scan(scan: Scan) -> Iterator[str]:
     for k, reading in enumerate(scan.measurements):
         landmark_id = "" if scan.landmark_ids is None else scan.landmark_ids[k]
-        size = "" if scan.sizes is None else f",{_numbers(scan.sizes[k])}"
-        yield f"measurement,{_numbers(scan.t)},{landmark_id},{_numbers(*reading)}{size}"
+        size = "" if scan.sizes is None else f",{numbers(scan.sizes[k])}"
+        yield f"measurement,{numbers(scan.t)},{landmark_id},{numbers(*reading)}{size}"
 
 
-def _numbers(*values: float) -> str:
+def numbers(*values: float) -> str:
+    """Write numbers with commas between, so that reading gives the same bits."""
     return ",".join(repr(float(value)) for value in values)
 
 
 def _known(value: float) -> str:
-    return "" if math.isnan(value) else _numbers(value)
+    return "" if math.isnan(value) else numbers(value)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from joblib import Parallel, effective_n_jobs, parallel_config
 
-from ...sim_configs.scenario_errors import closest
+from ...sim_configs.scenario_errors import unknown_choice
 
 Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed
 Workers = Callable[[Iterable[Call]], Iterable[Any]]
@@ -31,10 +31,7 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
         If an argument does not fit, or Ray is not installed.
     """
     if backend not in (None, *BACKENDS):
-        hint = closest(str(backend), BACKENDS)
-        raise ValueError(
-            f"backend must be one of {', '.join(BACKENDS)}, got '{backend}'{hint}"
-        )
+        raise ValueError(unknown_choice("backend", backend, BACKENDS))
     if jobs not in (None, -1):
         integer("jobs", jobs or 0, 1)
     if backend == "ray":

@@ -34,15 +34,13 @@ def locked_folder(folder: Path) -> Iterator[None]:
     """
     file = folder / WRITER
     lock = FileLock(file, timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise ValueError(
-            f"another process is writing to {folder}{_named(file)}"
-        ) from None
-    except OSError as error:
-        reason = error.strerror or error
-        raise OSError(f"the folder {folder} cannot be written: {reason}") from error
+    with naming_folder(folder):
+        try:
+            lock.acquire()
+        except Timeout:
+            raise ValueError(
+                f"another process is writing to {folder}{_named(file)}"
+            ) from None
     try:
         with contextlib.suppress(OSError):  # on Windows the locked file is not writable
             text = f"process {os.getpid()} on {platform.node() or 'this machine'}\n"
@@ -52,6 +50,16 @@ def locked_folder(folder: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             file.unlink()
         lock.release()
+
+
+@contextlib.contextmanager
+def naming_folder(folder: Path) -> Iterator[None]:
+    """Name the folder in errors of the file system."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise OSError(f"the folder {folder} cannot be written: {reason}") from error
 
 
 def _named(file: Path) -> str:

@@ -140,11 +140,9 @@ def _truth_source(
     poses = true_poses_of(log, times)
     seen = {i for e in log.events if isinstance(e, Scan) for i in _ids(e) or ()}
     landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
-    if not isinstance(estimator, SupportsTruth):
+    if not isinstance(estimator, SupportsTruth) or poses is None:
         return lambda _: None
-    if poses is None or not seen <= set(landmarks):
-        return lambda _: None
-    if not np.isfinite(poses).all():
+    if not (seen <= set(landmarks) and np.isfinite(poses).all()):
         return lambda _: None
     return lambda step: estimator.observe_truth(poses[step], landmarks)
 

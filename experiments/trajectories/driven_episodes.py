@@ -60,13 +60,11 @@ def drive_episodes(
     """
     if not len(seeds):
         raise ValueError(f"seeds must be one or more integers >= 0, got {seeds!r}")
-    scenarios = [
-        drawn_scenario(scenario, np.random.default_rng([seed, _SCENARIO_STREAM]))
-        for seed in seeds
-    ]
+    rngs = _random_generators(seeds, _SCENARIO_STREAM)
+    scenarios = [drawn_scenario(scenario, rng) for rng in rngs]
     worlds = _worlds(scenario, scenarios)
     worlds.reset([seeding.np_random(seed)[0] for seed in seeds])
-    rngs = [np.random.default_rng([seed, _CONTROLLER_STREAM]) for seed in seeds]
+    rngs = _random_generators(seeds, _CONTROLLER_STREAM)
     drivers = make_vector_controller(controller, scenarios, rngs)
     record = _empty_record(worlds, scenario.steps)
     _take(record, _EACH_SCAN, 0, worlds)
@@ -87,6 +85,10 @@ def drive_episodes(
         )
         for place, seed in enumerate(seeds)
     ]
+
+
+def _random_generators(seeds: Sequence[int], stream: int) -> list[np.random.Generator]:
+    return [np.random.default_rng([seed, stream]) for seed in seeds]
 
 
 def _worlds(

@@ -8,7 +8,7 @@ from reprlib import repr as short_repr
 from ...envs.controllers import CONTROLLERS
 from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.scenario_errors import closest
+from ...sim_configs.scenario_errors import unknown_choice
 from .dataset import is_whole
 from .driven_episodes import drive_episodes
 from .formats import TrajectoryFormat, trajectory_format
@@ -88,8 +88,7 @@ def generate_trajectories(
         episodes_per_shard = default_episodes_per_shard(world)
     _check_numbers(episodes_per_shard=(episodes_per_shard, 1))
     if controller not in CONTROLLERS:
-        names, hint = ", ".join(CONTROLLERS), closest(controller, CONTROLLERS)
-        raise ValueError(f"controller must be one of {names}, got {controller!r}{hint}")
+        raise ValueError(unknown_choice("controller", controller, CONTROLLERS))
     layout = trajectory_format(format)
     layout.check(world)
     job = Job(world, controller, seed, episodes, episodes_per_shard, format)

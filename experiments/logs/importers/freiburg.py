@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..events import EventRecorder, OdometryRow, Reading, wrap_bearing
-from ..lines import LogLine, read_lines, shown
+from ..events import EventRecorder, Reading, wrap_bearing
+from ..lines import read_lines, shown
 from ..slamlog import SlamLog
 from .world_file import read_world, world_beside
 
@@ -47,9 +47,14 @@ def read_freiburg(path: str | PathLike[str]) -> SlamLog:
         line.check_count(fields, (3,), ROW_FORMS[kind])
         if kind == "ODOMETRY":
             step += 1
-            _take_odometry(recorder, line, step)
+            before, d, after = map(line.to_real, fields)
+            recorder.add_turn_drive_turn(line, step, before=before, d=d, after=after)
         else:
-            _take_reading(recorder, line, step)
+            bearing = wrap_bearing(line.to_real(fields[2]))
+            landmark_id, distance = line.to_id(fields[0]), line.to_real(fields[1])
+            recorder.add_reading(
+                line, Reading(float(step), landmark_id, bearing, distance)
+            )
     world = world_beside(path)
     ids, landmarks = read_world(world) if world else (np.arange(0), np.empty((0, 2)))
     return SlamLog(
@@ -61,23 +66,4 @@ def read_freiburg(path: str | PathLike[str]) -> SlamLog:
         landmark_ids=ids,
         landmarks=landmarks,
         events=recorder.finish(),
-    )
-
-
-def _take_odometry(recorder: EventRecorder, line: LogLine, step: int) -> None:
-    first_turn, distance, last_turn = map(line.to_real, line.text.split()[1:])
-    recorder.add_odometry(line, OdometryRow(float(step), 0.0, first_turn, dt=0.0))
-    recorder.add_odometry(line, OdometryRow(float(step), distance, last_turn, dt=1.0))
-
-
-def _take_reading(recorder: EventRecorder, line: LogLine, step: int) -> None:
-    _, landmark_id, distance, bearing = line.text.split()
-    recorder.add_reading(
-        line,
-        Reading(
-            float(step),
-            line.to_id(landmark_id),
-            wrap_bearing(line.to_real(bearing)),
-            line.to_real(distance),
-        ),
     )

@@ -95,9 +95,8 @@ def _take_increment(recorder: EventRecorder, line: LogLine, step: int) -> None:
     sign = -1.0 if dx < 0 else 1.0
     direction = math.atan2(sign * dy, abs(dx))
     distance = sign * math.hypot(dx, dy)
-    recorder.add_odometry(line, OdometryRow(float(step), 0.0, direction, dt=0.0))
-    recorder.add_odometry(
-        line, OdometryRow(float(step), distance, turn - direction, dt=1.0)
+    recorder.add_turn_drive_turn(
+        line, step, before=direction, d=distance, after=turn - direction
     )
 
 

@@ -75,21 +75,10 @@ def thinned(
     if len(x) <= most:
         return x, y
     pieces = np.array_split(np.arange(len(x)), most // 2)
-    kept = {int(piece[pick(y[piece])]) for piece in pieces for pick in _EXTREMES}
-    kept |= {0, len(x) - 1}
-    rows = np.array(sorted(kept))
+    lowest = [piece[y[piece].argmin()] for piece in pieces]
+    highest = [piece[::-1][y[piece][::-1].argmax()] for piece in pieces]
+    rows = np.unique([0, *lowest, *highest, len(x) - 1])
     return x[rows], y[rows]
-
-
-def _argmin(values: Array) -> int:
-    return int(np.argmin(values))
-
-
-def _last_argmax(values: Array) -> int:
-    return len(values) - 1 - int(np.argmax(values[::-1]))
-
-
-_EXTREMES = (_argmin, _last_argmax)
 
 
 def plain(label: str) -> str:

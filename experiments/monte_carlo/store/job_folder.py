@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ....sim_configs.atomic_file import replace_when_written
-from ...runs.folder_lock import WRITER, locked_folder
+from ...runs.folder_lock import WRITER, locked_folder, naming_folder
 
 FORMAT = "slamgym monte carlo 1"
 JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
@@ -44,14 +44,14 @@ def claimed(
     OSError
         If it cannot be written.
     """
-    with _naming(path):
+    with naming_folder(path):
         path.mkdir(parents=True, exist_ok=True)
     with locked_folder(path):
         if any(not _is_leftover(entry) for entry in path.iterdir()):
             found = identity_in(path)
             if not fresh:
                 refuse_other(path, found, identity)
-        with _naming(path):
+        with naming_folder(path):
             for leftover in (*path.iterdir(), *(path / BLOCKS).glob(".*")):
                 if _PARTIAL.fullmatch(leftover.name):
                     leftover.unlink()
@@ -115,16 +115,6 @@ def refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> No
 def _is_leftover(entry: Path) -> bool:
     """Whether a writer that was killed at once may have left this file."""
     return entry.name == WRITER or _PARTIAL.fullmatch(entry.name) is not None
-
-
-@contextlib.contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Name the folder in errors of the file system."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or error
-        raise OSError(f"the folder {path} cannot be written: {reason}") from error
 
 
 def _described(key: str, value: Any) -> str:

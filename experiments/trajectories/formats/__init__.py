@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from ....sim_configs import Scenario
-from ....sim_configs.scenario_errors import closest
+from ....sim_configs.scenario_errors import unknown_choice
 from ..trajectory import Trajectory
 
 FORMATS = {
@@ -71,8 +71,7 @@ def trajectory_format(name: str) -> TrajectoryFormat:
 'npy'; did you mean 'npz'?
     """
     if name not in FORMATS:
-        names, hint = ", ".join(FORMATS), closest(name, FORMATS)
-        raise ValueError(f"format must be one of {names}, got {name!r}{hint}")
+        raise ValueError(unknown_choice("format", name, FORMATS))
     try:
         module = import_module(f".{FORMATS[name]}", __name__)
     except ModuleNotFoundError as error:
