@@ -89,10 +89,10 @@ def as_json_text(summary: dict[str, Any]) -> str:
 
 
 def _refuse_foreign_files(path: Path) -> None:
-    if path.exists() and not path.is_dir():
-        raise BadInputError(f"--out must be a folder, got the file {path}")
     if not path.exists():
         return
+    if not path.is_dir():
+        raise BadInputError(f"--out must be a folder, got the file {path}")
     foreign = sorted(set(files_in(path)) - _listed_in_summary(path))
     if foreign:
         raise BadInputError(

@@ -39,7 +39,9 @@ def errors_figure(trace: RunTrace) -> Figure:
         for k, (label, name) in enumerate(_ROWS):
             _draw_error(axes[k], trace.t, errors[:, k], std[:, k])
             axes[k].set_ylabel(label)
-            title = _error_title(name, errors[:, k], std[:, k])
+            inside = np.abs(errors[:, k]) <= 3 * std[:, k]
+            share = np.mean(inside[np.isfinite(errors[:, k])])
+            title = f"{name}: {share:.0%} of the errors within ±3σ"
             write_title(axes[k], title, size=10)
         _legend_above(axes[0], columns=2)
     _draw_nis(axes[-1], trace)
@@ -101,12 +103,6 @@ def _draw_error(axes: Axes, t: Array, error: Array, std: Array) -> None:
     axes.axhline(0, color=GREY, lw=0.6)
     axes.plot(t, error, color=INK, lw=1.2, label="error")
     axes.margins(x=0.01)
-
-
-def _error_title(name: str, error: Array, std: Array) -> str:
-    known = np.isfinite(error)
-    inside = np.mean(np.abs(error[known]) <= 3 * std[known])
-    return f"{name}: {inside:.0%} of the errors within ±3σ"
 
 
 def _draw_nis(axes: Axes, trace: RunTrace) -> None:

@@ -15,6 +15,7 @@ from ...runs.filter_settings import FilterSettings, settings_for_scenario
 
 _PACKAGE = Path(registry.__file__).resolve().parents[1]
 _BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")
+_COMMA = re.compile(r",(?![^\[]*\])")  # outside brackets
 _SPEC = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>[^\]]*)\])?")
 
 
@@ -73,7 +74,10 @@ options={'iterations': 3})
     choices = _choices(estimators)
     if not choices:
         raise ValueError("estimators must name at least one, got none")
-    _refuse_repeated([choice.label for choice in choices])
+    labels = [choice.label for choice in choices]
+    for choice in choices:
+        if labels.count(choice.label) > 1:
+            raise ValueError(f"estimators must differ, got '{choice.label}' twice")
     for choice in choices:
         find_estimator(choice.name)
     return tuple(choices)
@@ -85,19 +89,8 @@ def _choices(
     if isinstance(estimators, Mapping):
         return [_labelled(label, what) for label, what in estimators.items()]
     texts = [estimators] if isinstance(estimators, str) else estimators
-    return [_read(spec) for text in texts for spec in _split(text)]
-
-
-def _refuse_repeated(labels: list[str]) -> None:
-    for label in labels:
-        if labels.count(label) > 1:
-            raise ValueError(f"estimators must differ, got '{label}' twice")
-
-
-def _split(text: str) -> list[str]:
-    """Split at the commas outside brackets."""
-    parts = re.split(r",(?![^\[]*\])", text)
-    return [part.strip() for part in parts if part.strip()]
+    parts = [part for text in texts for part in _COMMA.split(text)]
+    return [_read(part.strip()) for part in parts if part.strip()]
 
 
 def _read(spec: str) -> EstimatorChoice:

@@ -1,7 +1,7 @@
 """Run one filter over many simulated runs: in a batch if possible, else one by one."""
 
 from collections.abc import Mapping
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,9 +89,7 @@ def _in_a_batch(
         threads=threads,
     )
     trace = batch.run(runs.odometry, runs.measurements, runs.visible, runs.dt)
-    finite = np.isfinite(trace.poses).all(axis=2)
-    finite &= np.isfinite(trace.pose_covariances).all(axis=(2, 3))
-    finite &= np.isfinite(trace.nis)
+    finite = _finite(trace)
     beliefs: list[Belief | None] = [batch.belief(run) for run in range(count)]
     finite[:, -1] &= [belief is None or _is_finite_map(belief) for belief in beliefs]
     failures = {}
@@ -122,9 +120,10 @@ def _one_by_one(
         slam = settings.make(runs.initial_poses[run])
         landmarks = dict(enumerate(runs.landmarks[run]))
         for step in range(runs.visible.shape[1]):
-            _tell_truth(slam, runs.true_poses[run, step], landmarks)
+            if isinstance(slam, SupportsTruth):  # it linearises there (``ideal``)
+                slam.observe_truth(runs.true_poses[run, step], landmarks)
             belief = _step(slam, runs, run, step, trace)
-            if not _is_finite(trace, run, step):
+            if not _finite(trace, (run, step)):
                 return Failure(step, _NOT_FINITE)
     except (Exception, SystemExit) as error:
         return Failure(step, f"{type(error).__name__}: {error}")
@@ -149,20 +148,11 @@ def _step(
     return belief
 
 
-def _tell_truth(
-    slam: SlamEstimator, pose: Array, landmarks: Mapping[int, Array]
-) -> None:
-    """Pass the truth to a filter that linearises there (``ideal``)."""
-    if isinstance(slam, SupportsTruth):
-        slam.observe_truth(pose, landmarks)
-
-
-def _is_finite(trace: BatchTrace, run: int, step: int) -> bool:
-    return bool(
-        np.isfinite(trace.nis[run, step])
-        and np.isfinite(trace.poses[run, step]).all()
-        and np.isfinite(trace.pose_covariances[run, step]).all()
-    )
+def _finite(trace: BatchTrace, where: Any = ...) -> NDArray[np.bool_]:
+    """Report where the trace is finite, shape (B, T), or (T,) or () of a part."""
+    poses, covariances = trace.poses[where], trace.pose_covariances[where]
+    known = np.isfinite(poses).all(axis=-1) & np.isfinite(trace.nis[where])
+    return np.asarray(known & np.isfinite(covariances).all(axis=(-2, -1)))
 
 
 def _is_finite_map(belief: Belief) -> bool:

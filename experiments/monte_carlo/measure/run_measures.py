@@ -123,13 +123,11 @@ def _write_failures(block: Block, failures: Mapping[int, Failure]) -> None:
 
 def _empty_block(runs: SimulatedRuns) -> Block:
     sizes = dict(zip(("run", "step", "landmark"), runs.visible.shape, strict=True))
-    return {name: _empty(variable, sizes) for name, variable in VARIABLES.items()}
-
-
-def _empty(variable: Variable, sizes: dict[str, int]) -> NDArray[np.generic]:
-    shape = [sizes[dim] for dim in variable.dims]
-    blank = {"f8": np.nan, "i8": 0, "?": False, "U": ""}[variable.kind]
-    return np.full(shape, blank, dtype=variable.kind)
+    blanks = {"f8": np.nan, "i8": 0, "?": False, "U": ""}
+    return {
+        name: np.full([sizes[dim] for dim in dims], blanks[kind], dtype=kind)
+        for name, (dims, kind, _) in VARIABLES.items()
+    }
 
 
 def _measure_path(truth: Array, filtered: FilteredRuns, run: int) -> dict[str, Value]:

@@ -161,25 +161,15 @@ def _verdict(
 ) -> dict[str, Any]:
     """Write the verdict on an estimator, and the decisions behind it."""
     verdict = judge(report, len(scores.failures), len(scores.good))
-    entries = {
+    return {
         "verdict": verdict.word,
         "reason": verdict.reason,
         "sentence": verdict_sentence(scores.label, verdict),
         "heading_sentence": heading_sentence(heading_std, knowable),
-    }
-    if report is None:
-        nothing: dict[str, Any] = {
-            "accepted": None,
-            "decisions": None,
-            "sentences": [],
-            "warnings": [],
-        }
-        return entries | nothing
-    return entries | {
-        "accepted": report.accepted,
-        "decisions": decisions_table(report),
-        "sentences": list(report.sentences()),
-        "warnings": list(report.warnings()),
+        "accepted": None if report is None else report.accepted,
+        "decisions": None if report is None else decisions_table(report),
+        "sentences": [] if report is None else list(report.sentences()),
+        "warnings": [] if report is None else list(report.warnings()),
     }
 
 
