@@ -9,16 +9,8 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from rich import progress as bars
 from rich.console import Console, RenderableType
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.text import Text
 
 Tick = Callable[[int, int], None]
@@ -76,12 +68,12 @@ class Reporter:
             what is done at the first call, as when a stopped job continues.
         """
         columns = (
-            TextColumn("{task.description:<10}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            *((_Rate(unit), TimeRemainingColumn(compact=True)) if unit else ()),
+            bars.TextColumn("{task.description:<10}"),
+            bars.BarColumn(),
+            bars.MofNCompleteColumn(),
+            *((_Rate(unit), bars.TimeRemainingColumn(compact=True)) if unit else ()),
         )
-        with Progress(
+        with bars.Progress(
             *columns,
             console=self._notes,
             transient=True,
@@ -126,14 +118,14 @@ class Reporter:
             timer.cancel()
 
 
-class _Rate(ProgressColumn):
+class _Rate(bars.ProgressColumn):
     """Column of a progress bar: how many units are done per second."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
         self._unit = unit
 
-    def render(self, task: Task) -> Text:
+    def render(self, task: bars.Task) -> Text:
         """Return the rate, empty until it is known."""
         speed = task.speed or task.finished_speed
         return Text(f"{speed:,.0f} {self._unit}/s" if speed else "")

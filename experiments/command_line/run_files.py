@@ -4,14 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..figures import (
-    covariance_figure,
-    errors_figure,
-    map_figure,
-    map_sequence,
-    save_figure,
-    truth_figure,
-)
+from .. import figures
 from ..logs.importers import read_log
 from ..logs.slamlog import SlamLog, write_slamlog
 from ..logs.steps import steps_of
@@ -109,17 +102,17 @@ def write_figures(
     progress : callable
         Called with (figures done, figures).
     """
-    figures = {"map": map_figure, "covariance": covariance_figure}
-    figures["errors"] = errors_figure
+    drawn = {"map": figures.map_figure, "covariance": figures.covariance_figure}
+    drawn["errors"] = figures.errors_figure
     if trace.true_poses is not None or trace.true_landmarks is not None:
-        figures["truth"] = truth_figure
-    count = len(figures) + every_step
-    for done, (name, draw) in enumerate(figures.items()):
+        drawn["truth"] = figures.truth_figure
+    count = len(drawn) + every_step
+    for done, (name, draw) in enumerate(drawn.items()):
         progress(done, count)
-        save_figure(draw(trace), folder / f"{name}.png")
+        figures.save_figure(draw(trace), folder / f"{name}.png")
     if every_step:
         progress(count - 1, count)
-        map_sequence(trace, folder / "map_steps")
+        figures.map_sequence(trace, folder / "map_steps")
     progress(count, count)
 
 

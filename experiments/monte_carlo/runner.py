@@ -12,12 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from joblib import delayed
 
-from ...estimator.registry import (
-    EstimatorFactory,
-    find_estimator,
-    list_estimators,
-    register_estimator,
-)
+from ...estimator import registry
 from ...sim_configs import Scenario, load_scenario
 from ..runs.blas_threads import one_blas_thread
 from ..runs.filter_settings import FilterSettings
@@ -44,15 +39,15 @@ class _Work:
 
     scenario: Scenario
     settings: tuple[FilterSettings, ...]
-    factories: Mapping[str, EstimatorFactory]
+    factories: Mapping[str, registry.EstimatorFactory]
     seed: int
     threads: int | None
 
     def do(self, span: Span) -> list[Block]:
         """Simulate, filter and measure runs; return one block per estimator."""
         for name, factory in self.factories.items():
-            if ":" not in name and name not in list_estimators():
-                register_estimator(name, factory)
+            if ":" not in name and name not in registry.list_estimators():
+                registry.register_estimator(name, factory)
         runs = simulate_runs(self.scenario, span.size, self.seed + span.first)
         return [
             measure_runs(runs, filter_runs(settings, runs, threads=self.threads))
@@ -139,7 +134,7 @@ def monte_carlo(
     work = _Work(
         world,
         tuple(_checked(choice, assumed_world) for choice in choices),
-        {choice.name: find_estimator(choice.name) for choice in choices},
+        {choice.name: registry.find_estimator(choice.name) for choice in choices},
         job.seed,
         threads=None if workers is None else 1,
     )

@@ -8,13 +8,8 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from ...estimator import registry
 from ...estimator.interface import SlamEstimator
-from ...estimator.registry import (
-    EstimatorFactory,
-    accepted_options,
-    find_estimator,
-    make_estimator,
-)
 from ...sim_configs import Scenario
 from ..logs.events import Scan
 from ..logs.lines import LogError
@@ -63,7 +58,7 @@ class FilterSettings:
             If the name is unknown, or the estimator refuses a value or an option.
         """
         try:
-            return make_estimator(
+            return registry.make_estimator(
                 self.estimator,
                 motion_std=self.motion_std,
                 measurement_std=self.measurement_std,
@@ -126,7 +121,7 @@ def settings_for(
     LogError
         If a value in the header is malformed.
     """
-    factory = find_estimator(estimator)
+    factory = registry.find_estimator(estimator)
     header = dict(log.header)
     if header.get("source") == _COURSE_SOURCE:
         header = {**_COURSE_NOISE, **header}
@@ -183,7 +178,7 @@ def _std(
 
 
 def _header_options(
-    name: str, header: Mapping[str, str], factory: EstimatorFactory
+    name: str, header: Mapping[str, str], factory: registry.EstimatorFactory
 ) -> dict[str, Any]:
     """Return the options in the header that the estimator accepts."""
     options: dict[str, Any] = {}
@@ -192,7 +187,7 @@ def _header_options(
     if "range_std_per_metre" in header:
         key = "range_std_per_metre"
         options[key] = _number(name, key, header[key])
-    return accepted_options(factory, options)
+    return registry.accepted_options(factory, options)
 
 
 def _needed_options(log: SlamLog, header: Mapping[str, str]) -> dict[str, Any]:

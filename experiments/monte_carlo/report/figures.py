@@ -70,8 +70,9 @@ def nees_figure(shown: Shown, frame: ErrorFrame, summary: dict[str, Any]) -> Fig
     axes.axhspan(*band, color=GREY, alpha=0.25, lw=0, label="95 % band")
     if times := grid_steps(summary):
         wide = np.array(family_band(runs, POSE_FREEDOM, times)) / POSE_FREEDOM
-        for end, label in zip(wide, (f"95 % band, {_steps(times)}", None), strict=True):
-            axes.axhline(end, color=GREY, lw=0.8, label=label)
+        label = f"95 % band, {times} step{'s' * (times > 1)}"
+        for end, name in zip(wide, (label, None), strict=True):
+            axes.axhline(end, color=GREY, lw=0.8, label=name)
     extremes = [band]
     for scores, look in shown:
         average = scores.ratios(frame).mean(axis=0)
@@ -127,8 +128,10 @@ def heading_figure(shown: Shown, knowable: float) -> Figure:
     figure = new_figure(_WIDTH, 0.75 + 1.3 * len(shown))
     panels = figure.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)
     for axes, (scores, look) in zip(panels[:, 0], shown, strict=True):
-        claimed = _rms_over_runs(scores, "heading_std")
-        true = _rms_over_runs(scores, "heading_error")
+        claimed, true = (
+            np.degrees(_root_mean_square(scores.over_time(name)))
+            for name in ("heading_std", "heading_error")
+        )
         axes.plot(*thinned(scores.steps, true), color=INK, lw=1.0, label="true error")
         axes.plot(
             *thinned(scores.steps, claimed),
@@ -172,10 +175,6 @@ def grid_steps(summary: dict[str, Any]) -> int:
     return max((len(found["grid"]["steps"]) for found in decisions if found), default=0)
 
 
-def _steps(times: int) -> str:
-    return "1 step" if times == 1 else f"{times} steps"
-
-
 def _mark_grid(
     axes: Axes, decisions: dict[str, Any] | None, look: EstimatorLook
 ) -> None:
@@ -196,11 +195,6 @@ def _mark_grid(
             mew=1.2,
             zorder=3,
         )
-
-
-def _rms_over_runs(scores: EstimatorScores, name: str) -> Array:
-    """Root mean square at each step, in degrees."""
-    return np.asarray(np.degrees(_root_mean_square(scores.over_time(name))))
 
 
 def _root_mean_square(values: Array) -> Array:

@@ -21,15 +21,7 @@ from ....sim_configs.atomic_file import replace_when_written
 from ....sim_configs.scenario_files import scenario_text
 from ..measure.estimator_choices import EstimatorChoice
 from ..measure.run_measures import VARIABLES, Block
-from .job_folder import (
-    BLOCKS,
-    FORMAT,
-    blocks_in,
-    claimed,
-    digest_of,
-    identity_in,
-    refuse_other,
-)
+from . import job_folder
 
 
 class Span(NamedTuple):
@@ -57,7 +49,7 @@ class Job(NamedTuple):
     def identity(self) -> dict[str, Any]:
         """Describe the job in plain values, equal for equal jobs."""
         return {
-            "format": FORMAT,
+            "format": job_folder.FORMAT,
             "scenario": scenario_text(self.scenario),
             "assumed": scenario_text(self.assumed),
             "estimators": {
@@ -109,14 +101,14 @@ class BlockFolder:
         self._path = path
         self._fresh = fresh
         self._identity = job.identity()  # as the sources of its estimators are now
-        self._digest = digest_of(self._identity)
+        self._digest = job_folder.digest_of(self._identity)
         self._kept: dict[int, list[Block]] = {}
         self._claim = contextlib.ExitStack()
 
     def __enter__(self) -> "BlockFolder":
         """Lock the folder."""
         if self._path is not None:
-            claim = claimed(self._path, self._identity, fresh=self._fresh)
+            claim = job_folder.claimed(self._path, self._identity, fresh=self._fresh)
             self._claim.enter_context(claim)
         return self
 
@@ -186,11 +178,12 @@ class BlockFolder:
 
     def _file(self, span: Span) -> Path:
         assert self._path is not None
-        return self._path / BLOCKS / f"runs-{span.first:07d}-{span.stop:07d}.npz"
+        name = f"runs-{span.first:07d}-{span.stop:07d}.npz"
+        return self._path / job_folder.BLOCKS / name
 
     def _files_from(self, first: int) -> list[Path]:
         assert self._path is not None
-        return sorted((self._path / BLOCKS).glob(f"runs-{first:07d}-*.npz"))
+        return sorted((self._path / job_folder.BLOCKS).glob(f"runs-{first:07d}-*.npz"))
 
 
 def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
@@ -214,14 +207,14 @@ def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
     folders = [Path(source) for source in sources]
     if not folders:
         raise ValueError("sources must be at least one folder, got none")
-    place, identity = Path(target), identity_in(folders[0])
+    place, identity = Path(target), job_folder.identity_in(folders[0])
     for folder in folders:
-        refuse_other(folder, identity_in(folder), identity)
-    with claimed(place, identity):
-        digest = digest_of(identity)
+        job_folder.refuse_other(folder, job_folder.identity_in(folder), identity)
+    with job_folder.claimed(place, identity):
+        digest = job_folder.digest_of(identity)
         for folder in folders:
-            for file in blocks_in(folder):
-                _copy_block(file, place / BLOCKS / file.name, digest)
+            for file in job_folder.blocks_in(folder):
+                _copy_block(file, place / job_folder.BLOCKS / file.name, digest)
 
 
 def _copy_block(file: Path, copy: Path, digest: str) -> None:

@@ -177,10 +177,7 @@ def _sizes(job: Job, runs: Span) -> dict[str, int]:
 
 
 def _coordinates(job: Job, runs: Span) -> dict[str, np.ndarray[Any, Any]]:
-    sizes = _sizes(job, runs)
-    return {
+    return {dim: np.arange(size) for dim, size in _sizes(job, runs).items()} | {
         "estimator": np.array([choice.label for choice in job.estimators]),
         "run": np.arange(runs.first, runs.stop),
-        "step": np.arange(sizes["step"]),
-        "landmark": np.arange(sizes["landmark"]),
     }
