@@ -19,6 +19,7 @@ _ERROR_RATE = 0.05
 _DECIDING = 3  # final step, time averages and grid share the error rate
 _SMALLEST_P = 1e-16
 _MARGIN = f"[{EQUIVALENCE_MARGIN.low:g}, {EQUIVALENCE_MARGIN.high:g}]"
+_INSIDE = f"lies inside {_MARGIN}"
 _TOO_SURE = 0.9
 _NOT_REFUSED = "its errors agree with its covariances (5 %)"
 
@@ -126,16 +127,17 @@ def p_text(p_value: float) -> str:
 def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
     """Return the verdict on the successful runs."""
     verdict = report.equivalence
-    interval = f"the 90 % interval of the ratio, {_interval(verdict.interval)}"
+    low, high = max(verdict.interval[0], 0.0), verdict.interval[1]  # of a ratio >= 0
+    interval = f"the 90 % interval of the ratio, [{low:.3f}, {high:.3f}]"
     refusal = _refusal(report)
     if refusal and _is_near_everywhere(report):
         return Verdict(
-            NEARLY, f"{refusal}, which is certain but small: {interval}, {_inside()}"
+            NEARLY, f"{refusal}, which is certain but small: {interval}, {_INSIDE}"
         )
     if refusal:
         return Verdict(NOT_CONSISTENT, refusal + _outliers(report))
     if verdict.accepted:
-        return Verdict(CONSISTENT, f"{_NOT_REFUSED}, and {interval}, {_inside()}")
+        return Verdict(CONSISTENT, f"{_NOT_REFUSED}, and {interval}, {_INSIDE}")
     if verdict.verdict == NOT_CONSISTENT:  # rejects in up to 10 %: not enough
         kept = "no test rejects it (5 %), but"
         lies = f"{interval}, lies outside {_MARGIN}"
@@ -183,11 +185,3 @@ def _outliers(report: ConsistencyReport) -> str:
 
 def _number(ratio: float) -> str:
     return f"{ratio:.3g}" if ratio < 1e6 else f"{ratio:.0e}"
-
-
-def _interval(band: tuple[float, float]) -> str:
-    return f"[{max(band[0], 0.0):.3f}, {band[1]:.3f}]"  # no ratio is below 0
-
-
-def _inside() -> str:
-    return f"lies inside {_MARGIN}"
