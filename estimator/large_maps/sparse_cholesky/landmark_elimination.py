@@ -138,7 +138,7 @@ def _eliminate(
     for child, slots in zip(children, inherited, strict=True):
         at = pairs(place[slots])
         front[np.ix_(at, at)] += child.update
-    node = eliminate(front, pairs(own), pairs(rest))
+    node, _ = eliminate(front, pairs(own), pairs(rest))
     update = front[p:, p:] - node.response.T @ node.response if children else None
     return _Eliminated(node, update)
 

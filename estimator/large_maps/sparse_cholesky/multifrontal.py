@@ -44,27 +44,35 @@ class Node(NamedTuple):
         return sum(array.nbytes for array in self)
 
 
-def eliminate(front: Array, own: Int, rest: Int) -> Node:
+def eliminate(front: Array, own: Int, rest: Int) -> tuple[Node, Array]:
     """Eliminate the first unknowns of a front.
 
     Parameters
     ----------
-    front : ndarray, shape (p + r, p + r)
-        Of the unknowns ``own``, then ``rest``.
+    front : ndarray, shape (p + r, p + r + k)
+        Rows and columns of the unknowns ``own``, then ``rest``; then k right sides.
+
+    Returns
+    -------
+    node : Node
+    solved : ndarray, shape (p, r + k)
+        X, then L⁻¹ b_p of the right sides b; by columns in memory.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         If H_pp is not positive definite.
     """
-    p = len(own)
-    lower, failed = front[:p, :p], 0
-    if p:
-        lower, failed = lapack.dpotrf(lower, lower=1, clean=1)
-    if failed:
-        raise np.linalg.LinAlgError("the information matrix is not positive definite")
-    response = np.ascontiguousarray(_solve(lower, front[:p, p:]))
-    return Node(own, rest, np.ascontiguousarray(lower), response)
+    p, r = len(own), len(rest)
+    try:
+        lower = np.linalg.cholesky(front[:p, :p]).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError as error:
+        raise np.linalg.LinAlgError(
+            "the information matrix is not positive definite"
+        ) from error
+    solved = _solve(lower, front[:p, p:])
+    response = np.ascontiguousarray(solved[:, :r])
+    return Node(own, rest, lower, response), solved
 
 
 def substitute_forward(nodes: Sequence[Node], values: Array) -> None:

@@ -6,13 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from .multifrontal import (
-    Node,
-    eliminate,
-    marginal_covariance,
-    substitute_back,
-    substitute_forward,
-)
+from .multifrontal import Node, eliminate, marginal_covariance, substitute_back
 from .submap_dissection import Part
 
 Array = NDArray[np.float64]
@@ -44,42 +38,46 @@ class SubmapElimination:
         self.cost = 0.0
         """c."""
         self._nodes: list[Node] = []
-        self._forward = np.zeros(size)
-        waiting: list[Array] = []
+        self._solved = np.zeros(size)  # L⁻¹ g
+        updates: list[tuple[Array, Array]] = []
         for part in parts:
             if part.submap >= 0:
                 H, g, cost = quadratic(part.submap)
-                unknowns = np.concatenate([part.interior, part.border])
-                self._forward[unknowns[part.places[0]]] += g
                 self.cost += cost
-                updates = [H]
+                pieces = [(H, g)]
             else:
-                updates = [waiting.pop(-2), waiting.pop()]
-            waiting.append(self._eliminate(part, updates))
-        substitute_forward(self._nodes, self._forward)
+                pieces = [updates.pop(-2), updates.pop()]
+            updates.append(self._eliminate(part, pieces))
 
-    def _eliminate(self, part: Part, updates: list[Array]) -> Array:
-        """Add the updates to the front of a part; return the update of its border."""
+    def _eliminate(
+        self, part: Part, pieces: list[tuple[Array, Array]]
+    ) -> tuple[Array, Array]:
+        """Add (H, g) of the pieces of a part; return the update of its border."""
         count = len(part.interior)
         total = count + len(part.border)
-        front = np.zeros((total, total))
-        for places, update in zip(part.places, updates, strict=True):
-            front[places[:, None], places] += update
+        front = np.zeros((total, total + 1))
+        for places, (H, g) in zip(part.places, pieces, strict=True):
+            front[places[:, None], places] += H
+            front[places, -1] += g
+        rest, right = front[count:, count:-1], front[count:, -1]
         if not count:
-            return front
-        node = eliminate(front, part.interior, part.border)
+            return rest, right
+        node, solved = eliminate(front, part.interior, part.border)
+        response, y = solved[:, :-1], solved[:, -1]
         self._nodes.append(node)
-        return front[count:, count:] - node.response.T @ node.response
+        self._solved[part.interior] = y
+        return rest - response.T @ response, right - response.T @ y
 
     def solution(self) -> Array:
         """Return x = H⁻¹ g, shape (N,)."""
-        x = self._forward.copy()
+        x = self._solved.copy()
         substitute_back(self._nodes, x)
         return x
 
     def decrement(self) -> float:
         """Return gᵀ H⁻¹ g, by which the sum falls at its minimum."""
-        return float(self._forward @ self._forward)
+        solved = [self._solved[node.own] for node in self._nodes]
+        return float(sum(y @ y for y in solved))
 
     def covariance(self, rows: csc_array) -> Array:
         """Return A H⁻¹ Aᵀ, shape (v, v), for a sparse A, shape (v, N)."""
