@@ -7,28 +7,22 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
-from ..arrays import AnyArray, Array, ImageArray
 from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, Progress, RewardWeights
 from .agent_knowledge import AgentKnowledge
 from .belief_arrays import belief_arrays
-from .estimator_choice import (
-    EstimatorChoice,
-    checked_belief,
-    choose_estimator,
-)
+from .estimator_choice import EstimatorChoice, checked_belief, choose_estimator
 
 Observation = dict[str, Any]
 
 
-class ActiveSlamEnv(gymnasium.Env[Observation, AnyArray]):
+class ActiveSlamEnv(LandmarkWorldEnv):
     """A robot explores a walled floor until it knows every landmark.
 
     ## Description
@@ -137,11 +131,8 @@ class ActiveSlamEnv(gymnasium.Env[Observation, AnyArray]):
         **settings: Any,
     ) -> None:
         weights, changes = split_settings(settings)
-        self._world = LandmarkWorldEnv(scenario, render_mode=render_mode, **changes)
-        self.scenario = self._world.scenario
-        self.render_mode = render_mode
+        super().__init__(scenario, render_mode=render_mode, **changes)
         self.task = ActiveSlamTask(self.scenario, weights)
-        self.action_space = self._world.action_space
         self.observation_space = self.task.observation_space
         self._estimator = choose_estimator(estimator, self.scenario, estimator_options)
         self._progress: Progress | None = None
@@ -150,10 +141,8 @@ class ActiveSlamEnv(gymnasium.Env[Observation, AnyArray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode with a new map, and take the first scan."""
-        super().reset(seed=seed)
-        self._world.np_random = self.np_random
-        observation, info = self._world.reset(options=options)
-        self._estimator.reset(self._world.start_estimate, self.scenario.start.std)
+        observation, info = super().reset(seed=seed, options=options)
+        self._estimator.reset(self.start_estimate, self.scenario.start.std)
         self._progress = self.task.begin(self._update(observation, step=0))
         return self._output(info, success=False)
 
@@ -168,7 +157,7 @@ class ActiveSlamEnv(gymnasium.Env[Observation, AnyArray]):
             If the action is not two finite numbers. The world does not change.
         """
         before = self._reached()
-        observation, _, _, _, info = self._world.step(action)
+        observation, _, _, _, info = super().step(action)
         self._estimator.predict(observation["odometry"])
         step = int(before.steps[0]) + 1
         after = self.task.proceed(before, self._update(observation, step=step))
@@ -179,14 +168,6 @@ class ActiveSlamEnv(gymnasium.Env[Observation, AnyArray]):
         seen, info = self._output(info, success=bool(outcome.success[0]))
         ends = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return seen, float(outcome.rewards[0]), *ends, info
-
-    def render(self) -> ImageArray | None:
-        """Return a frame in mode "rgb_array", else None."""
-        return self._world.render()
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._world.close()
 
     @property
     def knowledge(self) -> AgentKnowledge:
@@ -204,11 +185,6 @@ class ActiveSlamEnv(gymnasium.Env[Observation, AnyArray]):
             int(progress.steps[0]),
         )
 
-    @property
-    def landmarks(self) -> Array:
-        """True positions of this episode's landmarks, (N, 2) [m], for figures."""
-        return self._world.landmarks
-
     def _reached(self) -> Progress:
         if self._progress is None:
             raise ResetNeeded("call reset first: there is no episode yet")
@@ -220,7 +196,7 @@ class ActiveSlamEnv(gymnasium.Env[Observation, AnyArray]):
         self._estimator.update(observation["landmarks"][seen], seen.tolist())
         self._belief = checked_belief(self._estimator, step)
         if self.render_mode is not None:
-            self._world.show_belief(self._belief)
+            self.show_belief(self._belief)
         return belief_arrays(self._belief, self.scenario.landmarks.count, by_id=True)
 
     def _output(

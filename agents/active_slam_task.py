@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.spaces.utils import flatten_space
 
 from ..arrays import AnyArray, Array, BoolArray, ComplexArray, IntArray
 from ..sim_configs import Scenario
@@ -100,7 +101,7 @@ class ActiveSlamTask:
             key: spaces.Box(-float(key == "goals"), 1.0, (size,), dtype=np.float64)
             for key, size in sizes.items()
         }
-        belief = {key: _flat(box) for key, box in belief_space(count).spaces.items()}
+        belief = {key: flatten_space(box) for key, box in belief_space(count).items()}
         self.observation_space = spaces.Dict({**belief, **own})
 
     def begin(self, beliefs: BeliefArrays) -> Progress:
@@ -231,9 +232,3 @@ class ActiveSlamTask:
 
 def _as_complex(points: Array) -> ComplexArray:
     return np.asarray(points[..., 0] + 1j * points[..., 1])
-
-
-def _flat(box: spaces.Space[Any]) -> spaces.Box:
-    assert isinstance(box, spaces.Box)
-    kind: Any = box.dtype
-    return spaces.Box(box.low.ravel(), box.high.ravel(), dtype=kind)

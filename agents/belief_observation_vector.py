@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ..arrays import AnyArray, BoolArray
+from ..envs.vector.episodes import final_infos
 from .belief_arrays import BeliefArrays, beliefs_of_batch, update_filters
 from .belief_features import belief_features, world_bounds
 from .belief_observation import (
@@ -136,10 +137,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         if not ended.any():
             return
         shown = self._with_beliefs(last)
-        for world in np.flatnonzero(ended).tolist():
-            infos["final_obs"][world] = {
-                key: rows[world].copy() for key, rows in shown.items()
-            }
+        infos["final_obs"] = final_infos(shown, {}, ended)["final_obs"]
         self._begin(observations, ended)
 
     def _begin(self, observations: Observation, worlds: BoolArray) -> None:

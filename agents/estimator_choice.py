@@ -84,18 +84,25 @@ def choose_estimator(
     >>> type(choose_estimator("ekf", load_scenario("loop"))).__name__
     'EkfSlam'
     """
+    settings = dict(options or {})
+    factory: Any
     if isinstance(estimator, str):
-        return checked_estimator(_named(estimator, scenario, options or {}))
-    if isinstance(estimator, type) or not _has_a_method(estimator):
-        factory = cast("Callable[..., FollowingEstimator]", estimator)
-        settings = noise_options(factory, scenario)
-        estimator = _made_by(factory, scenario, {**settings, **(options or {})})
+        factory = partial(make_estimator, estimator)
+        known = noise_options(find_estimator(estimator), scenario)
+        if not scenario.sensor.identities:
+            known["management"] = True  # associates the readings
+    elif isinstance(estimator, type) or not _has_a_method(estimator):
+        factory = estimator
+        known = noise_options(factory, scenario)
     elif options:
         raise ValueError(
             "estimator_options must be empty with an estimator already made, "
-            f"got {dict(options)!r}"
+            f"got {settings!r}"
         )
-    return checked_estimator(cast("FollowingEstimator", estimator))
+    else:
+        return checked_estimator(cast("FollowingEstimator", estimator))
+    stds = {"motion_std": scenario.motion.std, "measurement_std": scenario.sensor.std}
+    return checked_estimator(factory(**stds, **{**known, **settings}))
 
 
 def choose_batch(
@@ -228,22 +235,3 @@ def _has_a_method(estimator: Any) -> bool:
     return any(hasattr(estimator, method) for method in _METHODS) or not callable(
         estimator
     )
-
-
-def _named(
-    name: str, scenario: Scenario, options: Mapping[str, Any]
-) -> FollowingEstimator:
-    """Make a registered estimator, with data association if identities are hidden."""
-    known: dict[str, Any] = noise_options(find_estimator(name), scenario)
-    if not scenario.sensor.identities:
-        known["management"] = True
-    return _made_by(partial(make_estimator, name), scenario, {**known, **options})
-
-
-def _made_by(
-    factory: Any, scenario: Scenario, options: Mapping[str, Any]
-) -> FollowingEstimator:
-    made: FollowingEstimator = factory(
-        motion_std=scenario.motion.std, measurement_std=scenario.sensor.std, **options
-    )
-    return made

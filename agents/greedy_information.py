@@ -14,7 +14,7 @@ A small term prefers motions that end near a goal. It decides between small valu
 """
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -29,11 +29,6 @@ _STEPS = 4  # length of a candidate motion
 _TURNS = (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)  # of the largest turn rate
 _CLEARANCE = 0.5  # distance kept from walls beyond the robot's radius [m]
 _NEARNESS = 0.03  # value of one metre nearer to a goal [nats per landmark]
-
-
-class _Restorable(Protocol):
-    def state_dict(self) -> dict[str, Any]: ...
-    def load_state_dict(self, state: Any) -> None: ...
 
 
 class GreedyInformation:
@@ -93,8 +88,7 @@ def _belief_after(
 ) -> BeliefArrays:
     """Return the belief after a motion; the estimator's state is restored."""
     estimator: Any = knowledge.estimator
-    restorable: _Restorable = estimator
-    state = restorable.state_dict()
+    state = estimator.state_dict()
     odometry = action * knowledge.scenario.dt
     ids = np.array(knowledge.belief.landmark_ids, dtype=np.int64)
     try:
@@ -105,7 +99,7 @@ def _belief_after(
             estimator.update(readings[seen], ids[seen].tolist())
         after = belief_arrays(estimator.belief(), len(knowledge.known), by_id=True)
     finally:
-        restorable.load_state_dict(state)
+        estimator.load_state_dict(state)
     return after
 
 

@@ -108,9 +108,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         render_mode: str | None = None,
         **changes: object,
     ) -> None:
-        self.scenario = load_scenario(scenario)
-        if changes:
-            self.scenario = self.scenario.with_changes(**changes)
+        self.scenario = load_scenario(scenario).with_changes(**changes)
         refuse_ranges(self.scenario)
         self.action_space = action_space(self.scenario)
         self.observation_space = observation_space(self.scenario)

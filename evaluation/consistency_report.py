@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -230,13 +229,9 @@ def _runs_needed(dof: int) -> tuple[tuple[float, int], ...]:
     return tuple((factor, runs_to_detect(factor, dof)) for factor in FACTORS)
 
 
-class _Scores(NamedTuple):
-    nees: Array
-    nis: Array
-    degrees_of_freedom: IntArray
-
-
-def _same_shape(nees: ArrayLike, nis: ArrayLike, nis_dof: ArrayLike) -> _Scores:
+def _same_shape(
+    nees: ArrayLike, nis: ArrayLike, nis_dof: ArrayLike
+) -> tuple[Array, Array, IntArray]:
     scores = argument_checks.as_floats("nees", nees)
     if scores.ndim != 2 or scores.shape[1] < 2:
         raise ValueError(f"nees must be shape (runs, steps >= 2), got {scores.shape}")
@@ -245,7 +240,7 @@ def _same_shape(nees: ArrayLike, nis: ArrayLike, nis_dof: ArrayLike) -> _Scores:
     for name, array in (("nis", scans), ("nis_dof", freedom)):
         if array.shape != scores.shape:
             raise ValueError(f"{name} must be shape {scores.shape}, got {array.shape}")
-    return _Scores(scores, scans, freedom)
+    return scores, scans, freedom
 
 
 def _gaps(nees: Array, nis: Array, freedom: IntArray) -> tuple[int, BoolArray]:

@@ -8,6 +8,7 @@ has a ratio of 1.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from typing import NamedTuple
 
 import numpy as np
@@ -200,11 +201,7 @@ def runs_to_detect(
     most = 1
     while not found(most):
         most *= 2
-    least = most // 2
-    while most - least > 1:
-        middle = (least + most) // 2
-        least, most = (least, middle) if found(middle) else (middle, most)
-    return most
+    return bisect_left(range(most + 1), True, most // 2 + 1, key=found)
 
 
 def one_per_run(name: str, values: Array, least: int) -> Array:

@@ -118,8 +118,7 @@ def state_nees(
     -------
     ndarray, shape (...)
     """
-    errors, claimed = _in_frame(true_states, means, covariances, frame)
-    return normalised_squared_error(errors, claimed)
+    return normalised_squared_error(*_in_frame(true_states, means, covariances, frame))
 
 
 def landmark_nees(

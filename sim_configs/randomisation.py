@@ -11,14 +11,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from ..arrays import Array
-from .field_types import NotNegative, Part, broken_rule, expect
+from .field_types import NotNegative, Part, Positive, broken_rule, expect
 from .layouts import LandmarkLayout, place_landmarks
 from .scenario_parts import Motion, Sensor, Start
 
 _Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-_Factor = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
 Factors = Annotated[
-    tuple[_Factor, _Factor], expect("2 finite factors > 0, low and high")
+    tuple[Positive, Positive], expect("2 finite factors > 0, low and high")
 ]
 Ends = Annotated[tuple[_Finite, _Finite], expect("2 finite numbers, low and high")]
 

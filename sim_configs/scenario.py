@@ -126,6 +126,8 @@ class Scenario(Part):
         >>> scenario.with_changes(sensor={"max_range": 4.0}, steps=10).sensor.std
         (0.01, 0.08)
         """
+        if not changes:
+            return self
         return self.from_table(_merge(self.model_dump(), changes))
 
     def drawn_at(self, shares: Mapping[str, float], directions: Array) -> Self:

@@ -82,9 +82,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs must be an integer >= 1, got {num_envs!r}")
-        self.scenario = load_scenario(scenario)
-        if changes:
-            self.scenario = self.scenario.with_changes(**changes)
+        self.scenario = load_scenario(scenario).with_changes(**changes)
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
@@ -176,7 +174,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
 
     def render(self) -> tuple[ImageArray, ...] | None:
         """Return a frame of each world in mode "rgb_array", else None."""
-        self._refuse_before_reset()
+        self._begun_worlds()
         if self._renderer is None:
             logger.warn("render shows nothing without a render_mode")
             return None
@@ -195,20 +193,17 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
     @property
     def poses(self) -> Array:
         """True (x, y, θ) of the worlds, shape (B, 3) [m, m, rad], a copy."""
-        self._refuse_before_reset()
-        return self._worlds.poses.copy()
+        return self._begun_worlds().poses.copy()
 
     @property
     def landmarks(self) -> Array:
         """True positions of the landmarks, shape (B, N, 2) [m], a copy."""
-        self._refuse_before_reset()
-        return self._worlds.landmarks
+        return self._begun_worlds().landmarks
 
     @property
     def start_estimates(self) -> Array:
         """Start poses for filters, shape (B, 3) [m, m, rad], a copy."""
-        self._refuse_before_reset()
-        return self._worlds.start_estimates
+        return self._begun_worlds().start_estimates
 
     @property  # type: ignore[misc]
     def np_random(  # type: ignore[override]
@@ -270,9 +265,10 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
             infos["landmark_ids"] = worlds.landmark_ids
         return infos
 
-    def _refuse_before_reset(self) -> None:
+    def _begun_worlds(self) -> WorldBatch:
         if not self._worlds.begun:
             raise ResetNeeded("call reset first: there are no worlds yet")
+        return self._worlds
 
     def _refuse_without_autoreset(self, ended: BoolArray) -> None:
         if self.autoreset_mode == AutoresetMode.DISABLED:

@@ -59,20 +59,16 @@ def to_stable_baselines(worlds: VectorEnv[Any, Any, Any]) -> Any:
     return _adapter_class()(worlds)
 
 
-def _vec_env_module() -> Any:
+@cache
+def _adapter_class() -> Any:
     try:
-        return importlib.import_module("stable_baselines3.common.vec_env")
+        vec_env: Any = importlib.import_module("stable_baselines3.common.vec_env")
     except ImportError as error:
         raise ImportError(
             "to_stable_baselines needs Stable-Baselines3: pip install stable-baselines3"
         ) from error
 
-
-@cache
-def _adapter_class() -> Any:
-    vec_env = _vec_env_module()
-
-    class StableBaselinesWorlds(_Adapter, vec_env.VecEnv):  # type: ignore[misc, name-defined]
+    class StableBaselinesWorlds(_Adapter, vec_env.VecEnv):  # type: ignore[misc]
         """A vector environment of Gymnasium as a ``VecEnv``."""
 
     return StableBaselinesWorlds

@@ -243,13 +243,9 @@ class WorldBatch:
         size = max(1, _READINGS_AT_ONCE // self.mask.shape[1])
         if self.count <= size:
             return self._scan()
-        measurements, masks, ids = zip(
-            *(
-                self._scan(slice(first, first + size))
-                for first in range(0, self.count, size)
-            ),
-            strict=True,
-        )
+        starts = range(0, self.count, size)
+        blocks = [self._scan(slice(first, first + size)) for first in starts]
+        measurements, masks, ids = zip(*blocks, strict=True)
         all_ids = np.concatenate(ids) if self._hides_identities else None
         return np.concatenate(measurements), np.concatenate(masks), all_ids
 
