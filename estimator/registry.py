@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
-from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
@@ -123,9 +122,9 @@ def make_estimator(
     """
     factory = find_estimator(name)
     if management is not None and management is not False:
-        from .map_management.managed_slam import ManagedSlam  # noqa: PLC0415 (heavy)
+        from .map_management import manage  # noqa: PLC0415 (heavy)
 
-        factory = partial(ManagedSlam, factory, management=management)
+        factory = manage(factory, management)
     return factory(
         motion_std=motion_std,
         measurement_std=measurement_std,

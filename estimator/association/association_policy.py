@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import exp
 from typing import Any
 
 from ..support import argument_checks
+
+ASSOCIATIONS = ("nearest", "joint", "compatibility", "hypotheses")
 
 MOST_SCANS = 63  # that fit one mask of a tentative landmark
 
@@ -20,6 +23,27 @@ class AssociationPolicy:
         Where a value is out of range.
     """
 
+    association: str = "nearest"
+    """How readings without identity are assigned to landmarks: "nearest", each reading
+    to its likeliest landmark; "joint", the likeliest assignment of the whole scan;
+    "compatibility", the most pairs that are jointly compatible (JCBB); "hypotheses",
+    several joint assignments, followed until the readings decide between them."""
+    density: float | None = None
+    """Readings per scan from no landmark of the map, clutter and new landmarks
+    [1 / (rad m)]; None: estimate it from the scans so far."""
+    hypotheses: int = 10
+    """Most hypotheses at a time."""
+    branches: int = 3
+    """Most assignments of one scan that a hypothesis splits into."""
+    search_nodes: int = 2000
+    """Limit of the search for joint assignments; beyond it the best found so far is
+    taken."""
+    pair_gate: float = 20.0
+    """A joint assignment pairs a reading and a landmark up to this νᵀ S⁻¹ ν, given the
+    other pairs."""
+    backdate: bool = False
+    """Whether the sightings before the confirming one count: the filter then repeats
+    the scans since the first sighting, with the new landmark in them."""
     match_gate: float = 9.21
     """A reading is of a landmark only up to this νᵀ S⁻¹ ν; χ² of 2 dof, here 99 %."""
     new_gate: float = 25.0
@@ -32,11 +56,23 @@ class AssociationPolicy:
     """Whether landmarks that come with an identity enter at first sight."""
 
     def __post_init__(self) -> None:
+        argument_checks.one_of("association", self.association, ASSOCIATIONS)
+        if self.density is not None:
+            argument_checks.above("density", self.density, 0.0)
+        for name in ("hypotheses", "branches", "search_nodes"):
+            argument_checks.whole(name, getattr(self, name), 1)
+        argument_checks.above("pair_gate", self.pair_gate, 0.0)
+        argument_checks.flag("backdate", self.backdate)
         argument_checks.above("match_gate", self.match_gate, 0.0)
         argument_checks.at_least("new_gate", self.new_gate, self.match_gate)
         argument_checks.at_least("ambiguity", self.ambiguity, 0.0)
         argument_checks.flag("trust_ids", self.trust_ids)
         object.__setattr__(self, "confirm", _k_of_n(self.confirm))
+
+    @property
+    def pair_tail(self) -> float:
+        """P(χ²₂ > pair_gate): the level of joint tests of several pairs."""
+        return exp(-self.pair_gate / 2)
 
 
 def _k_of_n(value: Any) -> tuple[int, int]:

@@ -8,25 +8,66 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..belief import MapView
 from .association_policy import AssociationPolicy
-from .nearest_neighbour import (
-    AMBIGUOUS,
-    NEW,
-    Distances,
-    Noise,
-    innovation_distances,
-    nearest_neighbours,
-)
+from .nearest_neighbour import AMBIGUOUS, NEW, Noise
+from .scan_assignments import assign_nearest, assign_scan
 from .tentative_landmarks import TentativeLandmarks
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
+
+NO_LABEL = -1
+
+LABEL_BITS = 20
+"""A label is the scan of the first sighting, shifted by so many bits, plus its row."""
+
+MEMORY = 0.98
+"""Weight of a scan relative to the one after it, in running averages."""
+
+
+class Sensor(NamedTuple):
+    """What association knows of the sensor."""
+
+    noise: Noise
+    min_range: float
+    """Readings closer than this have no usable bearing [m]."""
+
+
+class UnexplainedDensity(NamedTuple):
+    """A running average of the readings that belong to no landmark of the map.
+
+    Examples
+    --------
+    >>> density = UnexplainedDensity()
+    >>> for _ in range(500):
+    ...     density = density.after(2, longest=8.0)
+    >>> round(density.value * 2 * np.pi * 8.0, 2)
+    2.0
+    """
+
+    readings: float = 1.0
+    scans: float = 2.0
+    longest: float = 1.0
+    """Longest range read so far [m]."""
+
+    @property
+    def value(self) -> float:
+        """Readings per scan and [rad m]."""
+        return self.readings / (self.scans * 2 * np.pi * self.longest)
+
+    def after(self, readings: int, longest: float) -> UnexplainedDensity:
+        """Count one more scan."""
+        return UnexplainedDensity(
+            MEMORY * self.readings + readings,
+            MEMORY * self.scans + 1,
+            max(self.longest, longest),
+        )
 
 
 @dataclass(frozen=True)
@@ -41,6 +82,8 @@ class Candidates:
     """Above all identities so far."""
     scan: int = 0
     """Number of scans so far."""
+    density: UnexplainedDensity = field(default_factory=UnexplainedDensity)
+    """Of readings that belong to no landmark of the map."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
@@ -50,6 +93,7 @@ class Candidates:
             "waiting": np.array(waiting, dtype=np.int64).reshape(-1, 2),
             "next_id": np.array(self.next_id),
             "scan": np.array(self.scan),
+            "density": np.array(self.density),
         }
 
     @classmethod
@@ -62,8 +106,11 @@ class Candidates:
             np.array(state["places"], dtype=np.float64),
             np.array(state["covariances"], dtype=np.float64),
             np.array(state["seen"], dtype=np.uint64),
+            np.array(state["labels"], dtype=np.int64),
         )
-        return cls(tentative, waiting, int(state["next_id"]), int(state["scan"]))
+        density = UnexplainedDensity(*np.asarray(state["density"]).tolist())
+        next_id, scan = int(state["next_id"]), int(state["scan"])
+        return cls(tentative, waiting, next_id, scan, density)
 
 
 class ScanAssociation:
@@ -84,11 +131,14 @@ class ScanAssociation:
         self._policy = policy
         self._tentative = candidates.tentative.next_scan(policy.confirm[1])
         self._waiting = dict(candidates.waiting)
-        self._next_id, self._scan = candidates.next_id, candidates.scan
+        self._next_id, self.scan = candidates.next_id, candidates.scan
+        self._density, self._longest = candidates.density, 0.0
         self.row_ids: list[int | None] = [None] * rows
         """For each row the landmark that the filter associates it with, if any."""
-        self.confirmed: list[int] = []
-        """Landmarks that were tentative before this scan."""
+        self.confirmed: dict[int, int] = {}
+        """Labels of landmarks that were tentative before this scan."""
+        self.labels: list[int] = [NO_LABEL] * rows
+        """For each row the label of its tentative landmark, if any."""
         self.tentative_rows: list[int] = []
         self.ambiguous_rows: list[int] = []
         self.explained: set[int] = set()
@@ -97,34 +147,56 @@ class ScanAssociation:
     @property
     def candidates(self) -> Candidates:
         """The candidates after the scan."""
-        return Candidates(self._tentative, self._waiting, self._next_id, self._scan + 1)
+        density = self._density.after(self.row_ids.count(None), self._longest)
+        tentative, waiting = self._tentative, self._waiting
+        return Candidates(tentative, waiting, self._next_id, self.scan + 1, density)
 
-    def associate(
-        self, readings: Array, view: MapView, noise: Noise, min_range: float
-    ) -> None:
-        """Associate readings (m, 2) that have no identity.
+    @classmethod
+    def alternatives(
+        cls,
+        policy: AssociationPolicy,
+        candidates: Candidates,
+        readings: Array,
+        view: MapView,
+        sensor: Sensor,
+        *,
+        ceiling: float = np.inf,
+    ) -> list[tuple[float, ScanAssociation]]:
+        """Associate readings (m, 2) that have no identity, in every way to consider.
 
-        Readings closer than ``min_range`` [m] have no usable bearing: they are
-        ambiguous.
+        Readings closer than the sensor's least range have no usable bearing: they are
+        ambiguous.  Of associations that cost more than ``ceiling`` only the likeliest
+        is of interest.
+
+        Returns
+        -------
+        list of (float, ScanAssociation)
+            −2 ln of each one's likelihood, up to a constant; the likeliest first.
         """
-        policy = self._policy
-        is_near = readings[:, 1] < min_range
-        self.ambiguous_rows += np.flatnonzero(is_near).tolist()
+        is_near = readings[:, 1] < sensor.min_range
         rows = np.flatnonzero(~is_near)
-        fit = innovation_distances(
-            view.mean,
-            view.covariance,
-            len(view.ids),
-            readings[rows],
-            noise,
-            policy.new_gate,
+        density = policy.density or candidates.density.value
+        found = assign_scan(
+            policy, view, readings[rows], sensor.noise, density, ceiling=ceiling
         )
-        slots = self._neighbours(fit)
+        explained = {view.ids[slot] for slot in found.explained.tolist()}
+        result = []
+        for cost, slots in found.ranked:
+            association = cls(policy, candidates, len(readings))
+            association.explained = explained
+            association.ambiguous_rows += np.flatnonzero(is_near).tolist()
+            association._longest = float(readings[:, 1].max(initial=0.0))
+            association._assign(rows, slots, readings, view, sensor.noise)
+            result.append((cost, association))
+        return result
+
+    def _assign(
+        self, rows: Int, slots: Int, readings: Array, view: MapView, noise: Noise
+    ) -> None:
+        """Take the slots of the map that some rows are assigned to."""
         for row, slot in zip(rows.tolist(), slots.tolist(), strict=True):
             if slot >= 0:
                 self.row_ids[row] = view.ids[slot]
-        fitting = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
-        self.explained = {view.ids[slot] for slot in fitting.tolist()}
         self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         new = rows[slots == NEW]
         if len(new):
@@ -147,28 +219,20 @@ class ScanAssociation:
             if landmark_id in known or self._policy.trust_ids:
                 self.row_ids[row] = landmark_id
             elif self._has_waited(landmark_id):
-                self._confirm(row, landmark_id)
+                self._confirm(row, landmark_id, NO_LABEL)
             else:
                 self.tentative_rows.append(row)
-
-    def _neighbours(self, fit: Distances) -> Int:
-        policy = self._policy
-        return nearest_neighbours(
-            fit,
-            match=policy.match_gate,
-            new=policy.new_gate,
-            ambiguity=policy.ambiguity,
-        )
 
     def _match_tentative(self, rows: Int, readings: Array, noise: Noise) -> None:
         """Match rows that no landmark explains with tentative ones; confirm these."""
         tentative = self._tentative
         fit = tentative.distances(readings[rows], noise, self._policy.new_gate)
-        slots = self._neighbours(fit)
+        slots = assign_nearest(self._policy, fit)
         self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         pairs = list(zip(rows.tolist(), slots.tolist(), strict=True))
         for row, slot in pairs:
             if slot >= 0:
+                self.labels[row] = int(tentative.labels[slot])
                 tentative = tentative.with_sighting(slot, readings[row], noise)
         needed = self._policy.confirm[0]
         enough = tentative.sightings >= needed
@@ -177,22 +241,27 @@ class ScanAssociation:
             confirmed.add(NEW)
         for row, slot in pairs:
             if slot in confirmed:
-                self._confirm(row, self._next_id)
+                self._confirm(row, self._next_id, self.labels[row])
             elif slot != AMBIGUOUS:
                 self.tentative_rows.append(row)
         fresh = rows[(slots == NEW) & (needed > 1)]
-        self._tentative = tentative.chosen(~enough).with_new(readings[fresh], noise)
+        labels = (self.scan << LABEL_BITS) + fresh
+        for row, label in zip(fresh.tolist(), labels.tolist(), strict=True):
+            self.labels[row] = label
+        self._tentative = tentative.chosen(~enough).with_new(
+            readings[fresh], noise, labels
+        )
 
     def _has_waited(self, landmark_id: int) -> bool:
         """Count a sighting of an identity; return whether it has been seen enough."""
         needed, scans = self._policy.confirm
         earlier = self._waiting.pop(landmark_id, ())
-        recent = [*(scan for scan in earlier if scan > self._scan - scans), self._scan]
+        recent = [*(scan for scan in earlier if scan > self.scan - scans), self.scan]
         if len(recent) < needed:
             self._waiting[landmark_id] = recent
         return len(recent) >= needed
 
-    def _confirm(self, row: int, landmark_id: int) -> None:
+    def _confirm(self, row: int, landmark_id: int, label: int) -> None:
         self.row_ids[row] = landmark_id
-        self.confirmed.append(landmark_id)
+        self.confirmed[landmark_id] = label
         self._next_id = max(self._next_id, landmark_id + 1)

@@ -33,7 +33,7 @@ class TentativeLandmarks(NamedTuple):
     Three sightings within five scans make a landmark:
 
     >>> noise, none = (0.1, 0.1, 0.0), TentativeLandmarks.none()
-    >>> one = none.with_new(np.array([[0.0, 4.0]]), noise)
+    >>> one = none.with_new(np.array([[0.0, 4.0]]), noise, np.array([1]))
     >>> two = one.next_scan(5).with_sighting(0, np.array([0.1, 4.1]), noise)
     >>> two.sightings.tolist()
     [2]
@@ -45,11 +45,18 @@ class TentativeLandmarks(NamedTuple):
     """C, shape (t, 2, 2) [m²]."""
     seen: Masks
     """Of each a bit per scan, the latest scan lowest: whether it was seen there."""
+    labels: NDArray[np.int64]
+    """Number of each, different from those of all others before."""
 
     @classmethod
     def none(cls) -> "TentativeLandmarks":
         """Start without any."""
-        return cls(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0, np.uint64))
+        return cls(
+            np.empty((0, 2)),
+            np.empty((0, 2, 2)),
+            np.empty(0, np.uint64),
+            np.empty(0, np.int64),
+        )
 
     @property
     def sightings(self) -> NDArray[np.int64]:
@@ -105,9 +112,11 @@ class TentativeLandmarks(NamedTuple):
         places[which] += gain @ nu
         spread[which] = (corrected + corrected.T) / 2
         seen[which] |= np.uint64(1)
-        return TentativeLandmarks(places, spread, seen)
+        return self._replace(places=places, covariances=spread, seen=seen)
 
-    def with_new(self, readings: Array, noise: Noise) -> "TentativeLandmarks":
+    def with_new(
+        self, readings: Array, noise: Noise, labels: NDArray[np.int64]
+    ) -> "TentativeLandmarks":
         """Add what was seen for the first time in rows (β, r)."""
         if not len(readings):
             return self
@@ -122,6 +131,7 @@ class TentativeLandmarks(NamedTuple):
             np.concatenate([self.places, places]),
             np.concatenate([self.covariances, spread]),
             np.concatenate([self.seen, np.ones(len(readings), np.uint64)]),
+            np.concatenate([self.labels, labels]),
         )
 
     def chosen(self, which: NDArray[np.bool_]) -> "TentativeLandmarks":
@@ -129,7 +139,10 @@ class TentativeLandmarks(NamedTuple):
         if which.all():
             return self
         return TentativeLandmarks(
-            self.places[which], self.covariances[which], self.seen[which]
+            self.places[which],
+            self.covariances[which],
+            self.seen[which],
+            self.labels[which],
         )
 
 

@@ -9,9 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..association.candidates import Candidates, ScanAssociation
+from ..association.candidates import Candidates, ScanAssociation, Sensor
 from ..filters.motion_noise import MotionNoise
-from ..interface import Belief, MapView, SlamEstimator, UpdateReport, optional_members
+from ..interface import (
+    Belief,
+    MapView,
+    SlamEstimator,
+    SupportsLocalView,
+    SupportsTruth,
+    UpdateReport,
+    optional_members,
+)
 from ..models.rigid_motion import rotation
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
@@ -20,6 +28,7 @@ from .map_editor import CachedEditor, edit_map
 from .map_view import mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
+from .recent_scans import RecentScans
 
 Array = NDArray[np.float64]
 
@@ -86,15 +95,17 @@ class ManagedSlam:
         )
         bearing_std, range_std = np.asarray(measurement_std, dtype=np.float64).tolist()
         noise = bearing_std, range_std, float(options.get("range_std_per_metre", 0.0))
-        self._noise = noise
+        self._sensor = Sensor(noise, options.get("min_range", 1e-3))
         self._motion_noise = MotionNoise.checked(
             motion_std, options.get("noise_at_rest", True)
         )
-        self._min_range = options.get("min_range", 1e-3)
         merging = self._policy.merge_within is not None
         self._editor = CachedEditor(edit_map(self._filter, merging=merging))
         self._pruner = MapPruner(self._policy, self._editor, noise)
         self._candidates = Candidates()
+        can_repeat = not isinstance(self._filter, SupportsTruth | SupportsLocalView)
+        window = self._policy.confirm[1] if self._policy.backdate and can_repeat else 0
+        self._recent = RecentScans(self._filter, self._editor, window)
         for name, member in optional_members(self._filter).items():
             setattr(self, name, member)
 
@@ -123,6 +134,7 @@ class ManagedSlam:
         self._editor.expire()
         self._pruner.forget()
         self._candidates = Candidates()
+        self._recent.forget()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
@@ -132,6 +144,7 @@ class ManagedSlam:
         variance = self._motion_noise.over(distance, turn, dt)
         moved = self._candidates.tentative.moved(distance, turn, variance)
         self._candidates = replace(self._candidates, tentative=moved)
+        self._recent.note_motion(distance, turn, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -158,14 +171,39 @@ class ManagedSlam:
             Where the filter's covariance is degenerate; all is then as before.
         """
         readings = argument_checks.scan(measurements)
-        plan = self._associate(readings, landmark_ids)
-        rows = [row for row, i in enumerate(plan.row_ids) if i is not None]
-        ids = [i for i in plan.row_ids if i is not None]
+        if landmark_ids is None:
+            return self.take(readings, self.alternatives(readings)[0][1])
+        plan = ScanAssociation(self._policy, self._candidates, len(readings))
+        view = self._editor.map_view(self._policy.reach(readings))
+        given = argument_checks.identities(landmark_ids, len(readings))
+        plan.translate(given, view.mapped, self._pruner.aliases)
+        return self.take(readings, plan)
+
+    def alternatives(
+        self, readings: Array, ceiling: float = np.inf
+    ) -> list[tuple[float, ScanAssociation]]:
+        """Associate readings (m, 2) without identity, in every way to consider.
+
+        Of those that cost more than ``ceiling`` only the likeliest is of interest; see
+        :meth:`ScanAssociation.alternatives`.
+        """
+        argument_checks.refuse_not_finite(readings)
+        view = self._editor.map_view(self._policy.reach(readings))
+        state = self._policy, self._candidates
+        return ScanAssociation.alternatives(
+            *state, readings, view, self._sensor, ceiling=ceiling
+        )
+
+    def take(self, readings: Array, plan: ScanAssociation) -> UpdateReport:
+        """Correct the belief with readings (m, 2) as associated, then prune the map."""
         missed = self._pruner.expected(readings) - plan.explained
-        report = self._filter.update(readings[rows], ids)
+        report = self._recent.update(readings, plan)
         self._editor.expire()
         self._candidates = plan.candidates
-        removed, merged = self._prune(readings, plan, missed, report)
+        seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
+        seen -= {*report.rejected_ids, *report.skipped_ids}
+        removed, merged = self._pruner.prune(readings, plan.row_ids, seen, missed)
+        self._recent.note_edits(removed, merged)
         confirmed = set(plan.confirmed)
         return report.replace(
             removed_ids=tuple(removed),
@@ -184,7 +222,7 @@ class ManagedSlam:
         ValueError
             Where one is not in the map.
         """
-        self._pruner.remove(self._mapped(landmark_ids))
+        self._recent.note_edits(self._pruner.remove(self._mapped(landmark_ids)), ())
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two landmarks by hand; both identities then name the first.
@@ -197,6 +235,7 @@ class ManagedSlam:
         argument_checks.two_landmarks(kept, gone)
         self._mapped([kept, gone])
         self._pruner.join(kept, gone)
+        self._recent.note_edits((), [(kept, gone)])
 
     def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
         mapped = {i: slot for slot, i in enumerate(self.landmark_ids)}
@@ -234,7 +273,8 @@ class ManagedSlam:
             before.
         """
         name = type(self).__name__
-        argument_checks.refuse_other_state(state, self._remembered(), estimator=name)
+        entries = [k for k in self._remembered() if k.count(".") < 2]
+        argument_checks.refuse_other_state(state, entries, estimator=name)
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
         before = self._pruner.state_dict()
         try:
@@ -245,6 +285,7 @@ class ManagedSlam:
             raise
         self._editor.expire()
         self._candidates = candidates
+        self._recent.load_state_dict(without_prefix(state, "recent"))
 
     def _remembered(self) -> dict[str, Any]:
         """Return all of the state except the filter's."""
@@ -252,45 +293,8 @@ class ManagedSlam:
             "estimator": np.array(type(self).__name__),
             **with_prefix("landmarks", self._pruner.state_dict()),
             **with_prefix("tentative", self._candidates.state_dict()),
+            **with_prefix("recent", self._recent.state_dict()),
         }
-
-    def _associate(
-        self, readings: Array, landmark_ids: LandmarkIds | None
-    ) -> ScanAssociation:
-        plan = ScanAssociation(self._policy, self._candidates, len(readings))
-        view = self._editor.map_view(self._reach(readings))
-        if landmark_ids is None:
-            argument_checks.refuse_not_finite(readings)
-            plan.associate(readings, view, self._noise, self._min_range)
-        else:
-            given = argument_checks.identities(landmark_ids, len(readings))
-            plan.translate(given, view.mapped, self._pruner.aliases)
-        return plan
-
-    def _reach(self, readings: Array) -> float:
-        """Return the distance within which a landmark may matter for a scan [m]."""
-        policy, ranges = self._policy, readings[np.isfinite(readings[:, 1]), 1]
-        reach = float(ranges.max(initial=0.0))
-        if policy.remove_after is not None and policy.view is not None:
-            reach = max(reach, policy.view.max_range)
-        return reach + (policy.merge_within or 0.0)
-
-    def _prune(
-        self,
-        readings: Array,
-        plan: ScanAssociation,
-        missed: set[int],
-        report: UpdateReport,
-    ) -> tuple[list[int], list[tuple[int, int]]]:
-        """Remove and merge what the policy says; return the ids removed and merged."""
-        refused = {*report.rejected_ids, *report.skipped_ids}
-        seen = set(self._editor.map_view().ids).intersection(plan.row_ids) - refused
-        rows = [row for row, i in enumerate(plan.row_ids) if i in seen]
-        ids = [i for i in plan.row_ids if i is not None and i in seen]
-        self._pruner.note_sightings(readings[rows], ids)
-        removed = self._pruner.remove_missing(missed)
-        merged = self._pruner.merge(seen)
-        return removed + self._pruner.keep_capacity(seen), merged
 
     def __repr__(self) -> str:
         return f"Managed {self._filter!r}"

@@ -6,9 +6,14 @@ from difflib import get_close_matches
 from math import sqrt
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..association.association_policy import AssociationPolicy
 from ..support import argument_checks
 from .field_of_view import FieldOfView
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,14 @@ class LandmarkPolicy(AssociationPolicy):
                 "view must be given with remove_after: without it nobody knows what "
                 "should have been seen"
             )
+
+    def reach(self, readings: Array) -> float:
+        """Return the distance within which a landmark may matter for a scan [m]."""
+        ranges = readings[np.isfinite(readings[:, 1]), 1]
+        reach = float(ranges.max(initial=0.0))
+        if self.remove_after is not None and self.view is not None:
+            reach = max(reach, self.view.max_range)
+        return reach + (self.merge_within or 0.0)
 
     @property
     def worst_separation_std(self) -> float:

@@ -67,6 +67,31 @@ class MapPruner:
         mask = policy.view.expects(view.mean[:3].copy(), view.landmarks, scan)
         return {view.ids[slot] for slot in np.flatnonzero(mask).tolist()}
 
+    def prune(
+        self,
+        readings: Array,
+        row_ids: Sequence[int | None],
+        seen: set[int],
+        missed: set[int],
+    ) -> tuple[list[int], list[tuple[int, int]]]:
+        """Remove and merge as the policy states; return the ids removed and merged.
+
+        Parameters
+        ----------
+        readings : ndarray, shape (m, 2)
+            The scan.
+        row_ids : sequence of int or None, length m
+            Landmark of each row.
+        seen, missed : set of int
+            Landmarks that the scan has shown, and those that it should have shown.
+        """
+        rows = [row for row, i in enumerate(row_ids) if i in seen]
+        ids = [i for i in row_ids if i is not None and i in seen]
+        self.note_sightings(readings[rows], ids)
+        removed = self.remove_missing(missed)
+        merged = self.merge(seen)
+        return removed + self.keep_capacity(seen), merged
+
     def remove_missing(self, missed: set[int]) -> list[int]:
         """Remove landmarks that scans should have shown so many times and did not.
 

@@ -110,7 +110,8 @@ def test_every_reading_gets_one_landmark_or_none(squared, log_det, ambiguity, ex
 
 
 def tracked(readings):
-    return TentativeLandmarks.none().with_new(np.array(readings, dtype=float), NOISE)
+    rows, labels = np.array(readings, dtype=float), np.arange(len(readings))
+    return TentativeLandmarks.none().with_new(rows, NOISE, labels)
 
 
 def test_a_tentative_landmark_starts_where_it_was_read():

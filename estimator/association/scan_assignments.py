@@ -1,0 +1,161 @@
+"""Assign the readings of a scan to landmarks of a map, by one of several methods."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from ..belief import MapView
+from ..kernels.joint_readings import UNPAIRED, Problem
+from .association_policy import AssociationPolicy
+from .joint_assignment import best_assignments, innovations_of, predicted_readings
+from .nearest_neighbour import (
+    AMBIGUOUS,
+    NEW,
+    Distances,
+    Noise,
+    innovation_distances,
+    nearest_neighbours,
+)
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+BRANCH_SPREAD = 8.0
+"""Assignments of a scan e^4 times less likely than the best one are not considered."""
+
+
+class Assignment(NamedTuple):
+    """Landmarks of the readings of one scan."""
+
+    cost: float
+    """−2 ln of the likelihood, up to a constant of the scan; 0 by nearest neighbour."""
+    slots: Int
+    """Place in the map of each reading's landmark, `NEW` or `AMBIGUOUS`, shape (m,)."""
+
+
+class Assignments(NamedTuple):
+    """The assignments to consider for one scan."""
+
+    ranked: list[Assignment]
+    """The likeliest first."""
+    explained: Int
+    """Landmarks that some reading may belong to, shape (k,)."""
+
+
+def assign_scan(
+    policy: AssociationPolicy,
+    view: MapView,
+    readings: Array,
+    noise: Noise,
+    density: float,
+    *,
+    ceiling: float = np.inf,
+) -> Assignments:
+    """Assign readings (m, 2) to the landmarks of a map.
+
+    Parameters
+    ----------
+    policy : AssociationPolicy
+        Method, gates and limits.
+    view : MapView
+        Pose and landmarks.
+    readings : ndarray, shape (m, 2)
+        Rows (β, r) [rad, m].
+    noise : Noise
+        Of the sensor.
+    density : float
+        Readings per scan that belong to no landmark of the map [1 / (rad m)].
+    ceiling : float
+        Cost beyond which only the likeliest assignment is of interest.
+    """
+    fit = innovation_distances(
+        view.mean, view.covariance, len(view.ids), readings, noise, policy.new_gate
+    )
+    explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
+    if policy.association == "nearest":
+        ranked = [Assignment(0.0, assign_nearest(policy, fit))]
+        return Assignments(ranked, explained)
+    problem = _problem(policy, fit, explained, readings, noise, density)
+    if explained.size:
+        expected, joint = predicted_readings(view.mean, view.covariance, explained)
+        problem = problem._replace(
+            innovations=innovations_of(readings, expected), joint=joint
+        )
+    most = policy.branches if policy.association == "hypotheses" else 1
+    found = best_assignments(
+        problem,
+        most=most,
+        spread=BRANCH_SPREAD,
+        ceiling=ceiling,
+        nodes=policy.search_nodes,
+    )
+    ranked = [
+        Assignment(float(cost), _slots(policy, marks, distances, explained))
+        for cost, marks, distances in zip(*found[:3], strict=True)
+    ]
+    return Assignments(ranked, explained)
+
+
+def assign_nearest(policy: AssociationPolicy, fit: Distances) -> Int:
+    """Assign each reading to its likeliest landmark, as the policy's gates allow."""
+    return nearest_neighbours(
+        fit,
+        match=policy.match_gate,
+        new=policy.new_gate,
+        ambiguity=policy.ambiguity,
+    )
+
+
+def _problem(
+    policy: AssociationPolicy,
+    fit: Distances,
+    explained: Int,
+    readings: Array,
+    noise: Noise,
+    density: float,
+) -> Problem:
+    """Return the problem of a scan, its innovations still to be filled in."""
+    rows = len(readings)
+    bearing_std, range_std, per_metre = noise
+    variances = np.empty((rows, 2))
+    variances[:, 0] = bearing_std**2
+    variances[:, 1] = (range_std + per_metre * readings[:, 1]) ** 2
+    pairs_first = policy.association == "compatibility"
+    limits = np.full(rows + 1, np.inf)
+    if pairs_first:
+        limits[1:] = chdtri(2.0 * np.arange(1, rows + 1), policy.pair_tail)
+    return Problem(
+        innovations=np.empty((rows, 0, 2)),
+        joint=np.empty((0, 0)),
+        variances=np.maximum(variances, np.finfo(np.float64).tiny),
+        feasible=fit.squared[:, explained] <= policy.pair_gate,
+        missing=0.0 if pairs_first else missing_cost(density),
+        gate=policy.pair_gate,
+        limits=limits,
+        pairs_first=pairs_first,
+    )
+
+
+def missing_cost(density: float) -> float:
+    """Return λ = −2 ln ρ − 2 ln 2π, the cost of a reading without a landmark.
+
+    Examples
+    --------
+    >>> round(missing_cost(0.02), 2)
+    4.15
+    """
+    return float(-2 * np.log(density) - 2 * np.log(2 * np.pi))
+
+
+def _slots(
+    policy: AssociationPolicy, marks: Int, distances: Array, explained: Int
+) -> Int:
+    """Translate marks into slots; unpaired readings near a landmark are ambiguous."""
+    slots = np.where(distances <= policy.new_gate, AMBIGUOUS, NEW)
+    paired = marks != UNPAIRED
+    slots[paired] = explained[marks[paired]]
+    return np.asarray(slots, dtype=np.int64)

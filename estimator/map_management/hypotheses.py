@@ -1,0 +1,252 @@
+"""Several associations of the same readings, followed until one of them is clear."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..association.candidates import ScanAssociation
+from ..interface import Belief, MapView, SlamEstimator, UpdateReport
+from ..support import argument_checks
+from ..support.argument_checks import LandmarkIds
+from .managed_slam import ManagedSlam
+from .policy import LandmarkPolicy, as_policy
+
+Array = NDArray[np.float64]
+
+SPREAD = 16.0
+"""Hypotheses e^8 times less probable than the best one are discarded."""
+
+
+def manage(
+    estimator: Callable[..., SlamEstimator],
+    management: LandmarkPolicy | Mapping[str, Any] | bool,
+) -> Callable[..., ManagedSlam | HypothesisSlam]:
+    """Return what makes a filter managed by a policy, from the keywords of filters."""
+    policy = as_policy(management)
+    kind = HypothesisSlam if policy.association == "hypotheses" else ManagedSlam
+    return partial(kind, estimator, management=policy)
+
+
+@dataclass
+class Hypothesis:
+    """One sequence of associations, and the filter that has followed it."""
+
+    cost: float
+    """−2 ln of its probability, relative to the best hypothesis."""
+    slam: ManagedSlam
+
+
+class HypothesisSlam:
+    """A managed filter that follows several associations side by side.
+
+    Each hypothesis splits into its likeliest joint assignments of a scan.  The costs of
+    the scans add up; hypotheses beyond the number that the policy allows, and those e^8
+    times less probable than the best one, are discarded (Reid 1979).  The belief and
+    the reports are those of the most probable hypothesis.
+
+    Parameters
+    ----------
+    estimator, motion_std, measurement_std, initial_pose, initial_pose_std, management
+        As in :class:`ManagedSlam`.
+    **options
+        Those of the filter.
+
+    References
+    ----------
+    .. [1] D. Reid, An algorithm for tracking multiple targets, IEEE Transactions on
+       Automatic Control 24, 1979.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import EkfSlam
+    >>> slam = HypothesisSlam(
+    ...     EkfSlam,
+    ...     (0.1, 0.1, 0.05),
+    ...     (0.02, 0.1),
+    ...     management={"association": "hypotheses"},
+    ... )
+    >>> for _ in range(3):
+    ...     report = slam.update([(0.5, 4.0)])
+    >>> report.confirmed_ids, len(slam.hypotheses)
+    ((0,), 1)
+    """
+
+    def __init__(
+        self,
+        estimator: Callable[..., SlamEstimator],
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        management: LandmarkPolicy | Mapping[str, Any] | bool = True,
+        **options: Any,
+    ) -> None:
+        self._policy = as_policy(management)
+        self._make = partial(
+            ManagedSlam,
+            estimator,
+            motion_std,
+            measurement_std,
+            management=self._policy,
+            **options,
+        )
+        self._spare: list[ManagedSlam] = []
+        self.hypotheses = [Hypothesis(0.0, self._make())]
+        """The hypotheses, the most probable first."""
+
+    @property
+    def best(self) -> ManagedSlam:
+        """The filter of the most probable hypothesis."""
+        return self.hypotheses[0].slam
+
+    @property
+    def policy(self) -> LandmarkPolicy:
+        """What decides about landmarks."""
+        return self._policy
+
+    @property
+    def filter(self) -> SlamEstimator:
+        """The filter inside the most probable hypothesis."""
+        return self.best.filter
+
+    @property
+    def tentative_landmarks(self) -> Array:
+        """Where landmarks not yet confirmed seem to be, shape (t, 2) [m]."""
+        return self.best.tentative_landmarks
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return self.best.landmark_ids
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
+        self.best.reset(pose, pose_std)
+        self._keep([Hypothesis(0.0, self.best)])
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        motion = argument_checks.pair("odometry", odometry)
+        for hypothesis in self.hypotheses:
+            hypothesis.slam.predict(motion, dt)
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
+    ) -> UpdateReport:
+        """Associate one scan in every hypothesis, and correct the beliefs with it.
+
+        Parameters and errors as in :meth:`ManagedSlam.update`.
+
+        Returns
+        -------
+        UpdateReport
+            That of the most probable hypothesis.
+        """
+        if landmark_ids is not None:
+            reports = [
+                h.slam.update(measurements, landmark_ids) for h in self.hypotheses
+            ]
+            return reports[0]
+        readings = argument_checks.scan(measurements)
+        options = self._options(readings)
+        least = options[0][0]
+        slams = self._branches([k for _, k, _ in options])
+        reports, kept = [], []
+        for (cost, _, plan), slam in zip(options, slams, strict=True):
+            reports.append(slam.take(readings, plan))
+            kept.append(Hypothesis(cost - least, slam))
+        self._keep(kept)
+        return reports[0]
+
+    def remove(self, landmark_ids: LandmarkIds) -> None:
+        """Marginalise landmarks by hand; only the best hypothesis goes on."""
+        self.best.remove(landmark_ids)
+        self._keep(self.hypotheses[:1])
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Make one of two landmarks by hand; only the best hypothesis goes on."""
+        self.best.merge(kept, gone)
+        self._keep(self.hypotheses[:1])
+
+    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
+        """Return the belief of the most probable hypothesis."""
+        return self.best.belief(landmark_ids)
+
+    def map_view(self) -> MapView:
+        """Return the pose and map of the most probable hypothesis without a copy."""
+        return self.best.map_view()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of every hypothesis, as arrays."""
+        state: dict[str, Any] = {
+            "estimator": np.array(type(self).__name__),
+            "costs": np.array([h.cost for h in self.hypotheses]),
+        }
+        for k, hypothesis in enumerate(self.hypotheses):
+            saved = hypothesis.slam.state_dict()
+            state |= {f"{k}.{key}": entry for key, entry in saved.items()}
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state, bit for bit under the same settings.
+
+        Raises
+        ------
+        ValueError
+            Where the state lacks an entry, or is of another estimator; all is then as
+            before.
+        """
+        name = type(self).__name__
+        argument_checks.refuse_other_state(state, ["costs"], estimator=name)
+        loaded = []
+        for k, cost in enumerate(np.asarray(state["costs"]).tolist()):
+            start = f"{k}."
+            part = {
+                key.removeprefix(start): entry
+                for key, entry in state.items()
+                if key.startswith(start)
+            }
+            slam = self._make()
+            slam.load_state_dict(part)
+            loaded.append(Hypothesis(cost, slam))
+        argument_checks.at_least("the number of hypotheses", len(loaded), 1)
+        self._keep(loaded)
+
+    def _options(self, readings: Array) -> list[tuple[float, int, ScanAssociation]]:
+        """Return cost, hypothesis and association of the best, the cheapest first."""
+        options: list[tuple[float, int, ScanAssociation]] = []
+        most, ceiling = self._policy.hypotheses, np.inf
+        for k, h in enumerate(self.hypotheses):
+            found = h.slam.alternatives(readings, ceiling - h.cost)
+            options += [(h.cost + cost, k, plan) for cost, plan in found]
+            options.sort(key=lambda option: option[:2])
+            ceiling = options[0][0] + SPREAD
+            options = [o for o in options[:most] if o[0] <= ceiling]
+            if len(options) == most:
+                ceiling = options[-1][0]
+        return options
+
+    def _branches(self, origins: Sequence[int]) -> list[ManagedSlam]:
+        """Return a filter for each option, copied where a hypothesis splits."""
+        used: set[int] = set()
+        slams = []
+        for k in origins:
+            slam = self.hypotheses[k].slam
+            if k in used:
+                state = slam.state_dict()
+                slam = self._spare.pop() if self._spare else self._make()
+                slam.load_state_dict(state)
+            used.add(k)
+            slams.append(slam)
+        return slams
+
+    def _keep(self, hypotheses: list[Hypothesis]) -> None:
+        """Go on with these, and reuse the filters of the others."""
+        kept = {id(h.slam) for h in hypotheses}
+        self._spare += [h.slam for h in self.hypotheses if id(h.slam) not in kept]
+        self.hypotheses = hypotheses

@@ -1,0 +1,232 @@
+"""The last scans of a run, kept to repeat them once a landmark is confirmed.
+
+The sightings before the confirming one are readings of the new landmark, too.  To apply
+them, the filter goes back to its state before the first of them and repeats the scans
+since then, with the new landmark in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..association.candidates import LABEL_BITS, NO_LABEL, ScanAssociation
+from ..interface import SlamEstimator, UpdateReport
+from .map_editor import CachedEditor
+
+Array = NDArray[np.float64]
+NO_LANDMARK = np.iinfo(np.int64).min
+
+Motion = tuple[float, float, float]
+"""(d, α) [m, rad] and dt."""
+
+
+@dataclass(frozen=True)
+class RecentScan:
+    """One scan, the motion before it, and what was done with it."""
+
+    number: int
+    motions: tuple[Motion, ...]
+    readings: Array
+    """Rows (β, r), shape (m, 2)."""
+    row_ids: tuple[int | None, ...]
+    """Landmark of each row, None where the filter does not use it."""
+    labels: tuple[int, ...]
+    """Label of the tentative landmark of each row, or `NO_LABEL`."""
+    before: Mapping[str, Any] | None = None
+    """State of the filter before the scan, where a tentative landmark begins in it."""
+    removed: tuple[int, ...] = ()
+    """Landmarks removed after it."""
+    merged: tuple[tuple[int, int], ...] = ()
+    """Landmarks merged after it: (kept, gone)."""
+
+    @property
+    def begins(self) -> bool:
+        """Whether a tentative landmark is seen here for the first time."""
+        return any(
+            label != NO_LABEL and label >> LABEL_BITS == self.number
+            for label in self.labels
+        )
+
+    def feed(self, slam: SlamEstimator) -> UpdateReport:
+        """Update a filter with the rows that it uses."""
+        rows = [row for row, i in enumerate(self.row_ids) if i is not None]
+        ids = [i for i in self.row_ids if i is not None]
+        return slam.update(self.readings[rows], ids)
+
+    def edit(self, editor: CachedEditor) -> None:
+        """Remove and merge landmarks as after the scan."""
+        if self.removed:
+            editor.remove(self.removed)
+        for kept, gone in self.merged:
+            editor.merge(kept, gone)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all as arrays."""
+        row_ids = [NO_LANDMARK if i is None else i for i in self.row_ids]
+        before = {f"before.{key}": entry for key, entry in (self.before or {}).items()}
+        return {
+            "number": np.array(self.number),
+            "motions": _motion_array(self.motions),
+            "readings": self.readings.copy(),
+            "row_ids": np.array(row_ids, dtype=np.int64),
+            "labels": np.array(self.labels, dtype=np.int64),
+            "removed": np.array(self.removed, dtype=np.int64),
+            "merged": np.array(self.merged, dtype=np.int64).reshape(-1, 2),
+            **before,
+        }
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any]) -> RecentScan:
+        """Restore what :meth:`state_dict` returned."""
+        row_ids = np.asarray(state["row_ids"]).tolist()
+        start = "before."
+        before = {k.removeprefix(start): v for k, v in state.items() if start in k}
+        return cls(
+            int(state["number"]),
+            _motions(state["motions"]),
+            np.array(state["readings"], dtype=np.float64).reshape(-1, 2),
+            tuple(None if i == NO_LANDMARK else i for i in row_ids),
+            tuple(np.asarray(state["labels"]).tolist()),
+            before or None,
+            tuple(np.asarray(state["removed"]).tolist()),
+            tuple((i, j) for i, j in np.asarray(state["merged"]).tolist()),
+        )
+
+
+class RecentScans:
+    """Feeds the scans of a run to a filter, and repeats the last ones where needed.
+
+    Parameters
+    ----------
+    slam : SlamEstimator
+        The filter.
+    editor : CachedEditor
+        Of its map.
+    window : int
+        Number of scans within which a landmark is confirmed; 0: keep no scans.
+    """
+
+    def __init__(self, slam: SlamEstimator, editor: CachedEditor, window: int) -> None:
+        self._slam, self._editor, self._window = slam, editor, window
+        self.forget()
+
+    def forget(self) -> None:
+        """Start a new run."""
+        self._scans: list[RecentScan] = []
+        self._motions: tuple[Motion, ...] = ()
+
+    def note_motion(self, distance: float, turn: float, dt: float) -> None:
+        """Remember a motion since the last scan."""
+        if self._window:
+            self._motions += ((distance, turn, dt),)
+
+    def note_edits(
+        self, removed: Sequence[int], merged: Sequence[tuple[int, int]]
+    ) -> None:
+        """Remember which landmarks were removed and merged after the last scan."""
+        if self._scans and (removed or merged):
+            last = self._scans[-1]
+            self._scans[-1] = replace(
+                last,
+                removed=(*last.removed, *removed),
+                merged=(*last.merged, *merged),
+            )
+
+    def update(self, readings: Array, plan: ScanAssociation) -> UpdateReport:
+        """Update the filter with a scan, and with earlier sightings if there are any.
+
+        An error leaves the filter and the scans as they were.
+        """
+        row_ids, labels = tuple(plan.row_ids), tuple(plan.labels)
+        scan = RecentScan(plan.scan, self._motions, readings, row_ids, labels)
+        if not self._window:
+            return scan.feed(self._slam)
+        if scan.begins:
+            scan = replace(scan, before=self._slam.state_dict())
+        scans = [*self._scans, scan][-self._window - 1 :]
+        first = _relabel(scans, plan.confirmed)
+        report = scan.feed(self._slam) if first is None else self._repeat(scans, first)
+        self._scans, self._motions = scans, ()
+        return report
+
+    def _repeat(self, scans: list[RecentScan], first: int) -> UpdateReport:
+        """Repeat the scans since one, and renew the states kept before them."""
+        now = self._slam.state_dict()
+        self._editor.expire()
+        try:
+            before = scans[first].before
+            assert before is not None  # a tentative landmark begins here
+            self._slam.load_state_dict(before)
+            report = scans[first].feed(self._slam)
+            for k in range(first + 1, len(scans)):
+                scans[k - 1].edit(self._editor)
+                for distance, turn, dt in scans[k].motions:
+                    self._slam.predict((distance, turn), dt)
+                if scans[k].before is not None:
+                    scans[k] = replace(scans[k], before=self._slam.state_dict())
+                report = scans[k].feed(self._slam)
+        except Exception:
+            self._slam.load_state_dict(now)
+            raise
+        return report
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all as arrays."""
+        scans = {
+            f"{k}.{key}": entry
+            for k, scan in enumerate(self._scans)
+            for key, entry in scan.state_dict().items()
+        }
+        return {"motions": _motion_array(self._motions), **scans}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        parts: dict[int, dict[str, Any]] = {}
+        for key, entry in state.items():
+            if "." in key:
+                k, _, name = key.partition(".")
+                parts.setdefault(int(k), {})[name] = entry
+        self._scans = [RecentScan.from_state_dict(parts[k]) for k in sorted(parts)]
+        self._motions = _motions(state["motions"])
+
+
+def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | None:
+    """Give confirmed landmarks their earlier sightings.
+
+    Parameters
+    ----------
+    scans : list of RecentScan
+        The scans kept, the present one last.
+    confirmed : mapping of int to int
+        Label of each landmark confirmed in the present scan.
+
+    Returns
+    -------
+    int or None
+        Index of the first scan to repeat, if any: of those before which the state of
+        the filter was kept.
+    """
+    names = {label: i for i, label in confirmed.items() if label != NO_LABEL}
+    starts = [k for k, scan in enumerate(scans[:-1]) if scan.before is not None]
+    shown = [k for k in starts if not names.keys().isdisjoint(scans[k].labels)]
+    if not shown:
+        return None
+    for k in range(shown[0], len(scans) - 1):
+        pairs = zip(scans[k].row_ids, scans[k].labels, strict=True)
+        ids = tuple(names.get(label, i) for i, label in pairs)
+        scans[k] = replace(scans[k], row_ids=ids)
+    return shown[0]
+
+
+def _motion_array(motions: Sequence[Motion]) -> Array:
+    return np.array(motions, dtype=np.float64).reshape(-1, 3)
+
+
+def _motions(array: Any) -> tuple[Motion, ...]:
+    rows = np.asarray(array, dtype=np.float64).tolist()
+    return tuple((distance, turn, dt) for distance, turn, dt in rows)

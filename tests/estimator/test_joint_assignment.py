@@ -1,0 +1,175 @@
+"""The joint assignment of a scan, against all assignments that there are."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from slamgym.estimator.association.joint_assignment import (
+    best_assignments,
+    innovations_of,
+    predicted_readings,
+)
+from slamgym.estimator.kernels.joint_readings import UNPAIRED, Problem
+
+MISSING = 2.0
+
+
+def random_problem(rng, *, pairs_first=False):
+    """Return a problem of up to five readings, with a random covariance."""
+    landmarks, rows = rng.integers(1, 6, 2)
+    mean = rng.normal(scale=3.0, size=3 + 2 * landmarks)
+    root = rng.normal(scale=0.15, size=(len(mean), len(mean)))
+    expected, joint = predicted_readings(mean, root @ root.T, np.arange(landmarks))
+    readings = np.column_stack([rng.uniform(-3, 3, rows), rng.uniform(0.5, 5, rows)])
+    limits = np.full(rows + 1, np.inf)
+    if pairs_first:
+        limits = np.append(0.0, chi2.ppf(0.95, 2 * np.arange(1, rows + 1)))
+    return Problem(
+        innovations_of(readings, expected),
+        joint,
+        rng.uniform(0.1, 0.5, (rows, 2)) ** 2,
+        rng.random((rows, landmarks)) < 0.8,
+        0.0 if pairs_first else MISSING,
+        np.inf,
+        limits,
+        pairs_first,
+    )
+
+
+def squared_and_logdet(problem, rows, marks):
+    """Return νᵀ S⁻¹ ν and ln det S of some pairs, the dense way."""
+    at = np.array([(2 * j, 2 * j + 1) for j in marks], dtype=int).ravel()
+    S = problem.joint[np.ix_(at, at)] + np.diag(problem.variances[rows].ravel())
+    nu = problem.innovations[rows, marks].ravel()
+    return nu @ np.linalg.solve(S, nu), np.linalg.slogdet(S)[1]
+
+
+def all_assignments(problem):
+    """Return every assignment as (cost, landmark of each reading), sorted."""
+    rows = len(problem.feasible)
+    options = [[UNPAIRED, *np.flatnonzero(row)] for row in problem.feasible]
+    result = []
+    for marks in product(*options):
+        paired = [i for i in range(rows) if marks[i] != UNPAIRED]
+        chosen = [marks[i] for i in paired]
+        if len(set(chosen)) == len(chosen):
+            squared, logdet = squared_and_logdet(problem, paired, chosen)
+            if problem.pairs_first:
+                result.append((-len(paired), squared, marks))
+            else:
+                unpaired = rows - len(paired)
+                result.append((squared + logdet + MISSING * unpaired, marks))
+    return sorted(result)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_best_assignments_are_those_of_an_exhaustive_search(seed):
+    rng = np.random.default_rng(seed)
+    for _ in range(100):
+        problem = random_problem(rng)
+        found = best_assignments(problem, most=5, nodes=10**6)
+        expected = all_assignments(problem)[:5]
+        assert found.is_complete
+        np.testing.assert_allclose(found.costs, [c for c, _ in expected], rtol=1e-9)
+        assert tuple(found.marks[0]) == tuple(expected[0][1])
+
+
+def is_compatible(problem, marks):
+    """Whether the pairs are jointly compatible at every level of the search.
+
+    The reading with the fewest landmarks comes first, then the smallest innovation.
+    """
+    rows = [i for i in range(len(marks)) if marks[i] != UNPAIRED]
+    options = problem.feasible.sum(axis=1)
+    rows.sort(key=lambda i: (options[i], *problem.innovations[i, 0]))
+    return all(
+        squared_and_logdet(problem, rows[:k], [marks[i] for i in rows[:k]])[0]
+        <= problem.limits[k]
+        for k in range(1, len(rows) + 1)
+    )
+
+
+def test_compatibility_takes_most_pairs_and_then_the_nearest():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        problem = random_problem(rng, pairs_first=True)
+        expected = next(
+            a for a in all_assignments(problem) if is_compatible(problem, a[2])
+        )
+        found = best_assignments(problem, nodes=10**6)
+        assert tuple(found.marks[0]) == tuple(expected[2])
+
+
+def test_the_order_of_the_scan_changes_nothing():
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        problem = random_problem(rng)
+        order = rng.permutation(len(problem.innovations))
+        turned = problem._replace(
+            innovations=problem.innovations[order],
+            variances=problem.variances[order],
+            feasible=problem.feasible[order],
+        )
+        one, other = best_assignments(problem), best_assignments(turned)
+        np.testing.assert_array_equal(one.marks[0][order], other.marks[0])
+        assert one.costs[0] == other.costs[0]
+
+
+def test_the_limit_of_nodes_returns_the_best_so_far_and_says_so():
+    rng = np.random.default_rng(2)
+    rows = landmarks = 12
+    expected = np.column_stack([np.linspace(-0.3, 0.3, landmarks), np.full(12, 5.0)])
+    problem = Problem(
+        innovations_of(expected + rng.normal(scale=0.2, size=(rows, 2)), expected),
+        0.2 * np.eye(2 * landmarks),
+        np.full((rows, 2), 0.04),
+        np.ones((rows, landmarks), dtype=bool),
+        2.0,
+        25.0,
+        np.full(rows + 1, np.inf),
+        False,
+    )
+    few = best_assignments(problem, nodes=50)
+    many = best_assignments(problem, nodes=20_000)
+    assert not few.is_complete
+    assert few.costs[0] >= many.costs[0]
+    assert len(set(few.marks[0][few.marks[0] != UNPAIRED].tolist())) == int(
+        (few.marks[0] != UNPAIRED).sum()
+    )
+
+
+def test_unpaired_readings_are_compared_with_the_landmarks_given_the_pairs():
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        problem = random_problem(rng)
+        found = best_assignments(problem)
+        marks = found.marks[0]
+        paired = np.flatnonzero(marks != UNPAIRED)
+        for row in np.flatnonzero(marks == UNPAIRED):
+            before = squared_and_logdet(problem, paired, marks[paired])[0]
+            least = min(
+                conditional_distance(problem, paired, marks[paired], row, j)
+                for j in range(problem.feasible.shape[1])
+            )
+            assert found.distances[0, row] == pytest.approx(least, rel=1e-8)
+            assert before >= 0
+
+
+def conditional_distance(problem, rows, marks, row, mark):
+    """Return νᵀ S⁻¹ ν of one more pair given others, the dense way."""
+    at = np.array([(2 * j, 2 * j + 1) for j in marks], dtype=int).ravel()
+    C = problem.joint
+    own, cross = (
+        C[2 * mark : 2 * mark + 2, 2 * mark : 2 * mark + 2],
+        C[at][:, 2 * mark : 2 * mark + 2],
+    )
+    nu = problem.innovations[row, mark]
+    S = own + np.diag(problem.variances[row])
+    if len(rows):
+        whole = C[np.ix_(at, at)] + np.diag(problem.variances[rows].ravel())
+        gain = np.linalg.solve(whole, cross).T
+        nu = nu - gain @ problem.innovations[rows, marks].ravel()
+        S = S - gain @ cross
+    return float(nu @ np.linalg.solve(S, nu))
