@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from .error_frames import (
     ErrorFrame,
     additive_error,
@@ -16,8 +17,6 @@ from .error_frames import (
     invariant_error,
 )
 from .models.angles import wrap_angle
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

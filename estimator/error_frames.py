@@ -15,12 +15,11 @@ coordinates, an ellipse in these.  States are (x, y, θ, l1x, l1y, …).
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, ComplexArray
 from .models.angles import wrap_angle
 from .models.rigid_motion import left_jacobian
 
-Array = NDArray[np.float64]
 ErrorFrame = Literal["additive", "invariant"]
 ERROR_FRAMES: tuple[ErrorFrame, ...] = get_args(ErrorFrame)
 
@@ -91,14 +90,14 @@ def invariant_covariance(mean: Array, covariance: Array) -> Array:
     return np.asarray(half - np.swapaxes(lever, -1, -2) * half[..., :, 2:3])
 
 
-def _points(state: Array) -> NDArray[np.complex128]:
+def _points(state: Array) -> ComplexArray:
     """Robot position and landmarks as complex numbers, shape (..., 1 + n)."""
     x = np.concatenate([state[..., :1], state[..., 3::2]], axis=-1)
     y = np.concatenate([state[..., 1:2], state[..., 4::2]], axis=-1)
     return np.asarray(x + 1j * y)
 
 
-def _state(points: NDArray[np.complex128], heading: Array) -> Array:
+def _state(points: ComplexArray, heading: Array) -> Array:
     pairs = np.stack([points.real, points.imag], axis=-1)
     flat = pairs.reshape(*points.shape[:-1], -1)
     return np.concatenate([flat[..., :2], heading[..., None], flat[..., 2:]], axis=-1)

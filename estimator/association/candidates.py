@@ -11,16 +11,13 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, IntArray
 from ..belief import MapView
 from .association_policy import AssociationPolicy
 from .nearest_neighbour import AMBIGUOUS, NEW, Noise
 from .scan_assignments import assign_nearest, assign_scan
 from .tentative_landmarks import TentativeLandmarks
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 NO_LABEL = -1
 
@@ -191,7 +188,12 @@ class ScanAssociation:
         return result
 
     def _assign(
-        self, rows: Int, slots: Int, readings: Array, view: MapView, noise: Noise
+        self,
+        rows: IntArray,
+        slots: IntArray,
+        readings: Array,
+        view: MapView,
+        noise: Noise,
     ) -> None:
         """Take the slots of the map that some rows are assigned to."""
         for row, slot in zip(rows.tolist(), slots.tolist(), strict=True):
@@ -223,7 +225,7 @@ class ScanAssociation:
             else:
                 self.tentative_rows.append(row)
 
-    def _match_tentative(self, rows: Int, readings: Array, noise: Noise) -> None:
+    def _match_tentative(self, rows: IntArray, readings: Array, noise: Noise) -> None:
         """Match rows that no landmark explains with tentative ones; confirm these."""
         tentative = self._tentative
         fit = tentative.distances(readings[rows], noise, self._policy.new_gate)

@@ -23,15 +23,12 @@ The k readings still open add at least the following, since C ⪯ k blockdiag(C�
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, IntArray
 from ..kernels.assignment_search import search_assignments
 from ..kernels.joint_readings import UNPAIRED, Problem, fill_distances
 from ..models.angles import wrap_angle
 from ..models.bearing_range import predict_measurement
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MOST_COST = 1e300
 
@@ -41,7 +38,7 @@ class Solutions(NamedTuple):
 
     costs: Array
     """Shape (M,)."""
-    marks: Int
+    marks: IntArray
     """Landmark 0 … J − 1 of each reading or `UNPAIRED`, shape (M, m)."""
     distances: Array
     """Least νᵀ S⁻¹ ν of each unpaired reading, given the pairs, shape (M, m)."""
@@ -50,7 +47,7 @@ class Solutions(NamedTuple):
 
 
 def predicted_readings(
-    mean: Array, covariance: Array, slots: Int
+    mean: Array, covariance: Array, slots: IntArray
 ) -> tuple[Array, Array]:
     """Return h(x), shape (J, 2), and H P Hᵀ, shape (2J, 2J), of some landmarks.
 

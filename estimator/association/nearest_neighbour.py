@@ -3,13 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, IntArray
 from ..models.bearing_range import wrap_angle_jit
 from ..support.jit import jit
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 Noise = tuple[float, float, float]
 """(σβ, σr, k) of a sensor [rad, m, m/m]: a reading of range r has σr + k r."""
@@ -129,7 +126,7 @@ def _compare(
 
 def nearest_neighbours(
     fit: Distances, *, match: float, new: float, ambiguity: float = 0.0
-) -> Int:
+) -> IntArray:
     """Give each reading at most one landmark, and each landmark at most one reading.
 
     A reading is of the landmark under which it is likeliest, among those whose

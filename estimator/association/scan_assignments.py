@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ...arrays import Array, IntArray
 from ..belief import MapView
 from ..kernels.joint_readings import UNPAIRED, Problem
 from .association_policy import AssociationPolicy
@@ -21,9 +21,6 @@ from .nearest_neighbour import (
     nearest_neighbours,
 )
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 BRANCH_SPREAD = 8.0
 """Assignments of a scan e^4 times less likely than the best one are not considered."""
 
@@ -33,7 +30,7 @@ class Assignment(NamedTuple):
 
     cost: float
     """−2 ln of the likelihood, up to a constant of the scan; 0 by nearest neighbour."""
-    slots: Int
+    slots: IntArray
     """Place in the map of each reading's landmark, `NEW` or `AMBIGUOUS`, shape (m,)."""
 
 
@@ -42,7 +39,7 @@ class Assignments(NamedTuple):
 
     ranked: list[Assignment]
     """The likeliest first."""
-    explained: Int
+    explained: IntArray
     """Landmarks that some reading may belong to, shape (k,)."""
 
 
@@ -100,7 +97,7 @@ def assign_scan(
     return Assignments(ranked, explained)
 
 
-def assign_nearest(policy: AssociationPolicy, fit: Distances) -> Int:
+def assign_nearest(policy: AssociationPolicy, fit: Distances) -> IntArray:
     """Assign each reading to its likeliest landmark, as the policy's gates allow."""
     return nearest_neighbours(
         fit,
@@ -113,7 +110,7 @@ def assign_nearest(policy: AssociationPolicy, fit: Distances) -> Int:
 def _problem(
     policy: AssociationPolicy,
     fit: Distances,
-    explained: Int,
+    explained: IntArray,
     readings: Array,
     noise: Noise,
     density: float,
@@ -152,8 +149,8 @@ def missing_cost(density: float) -> float:
 
 
 def _slots(
-    policy: AssociationPolicy, marks: Int, distances: Array, explained: Int
-) -> Int:
+    policy: AssociationPolicy, marks: IntArray, distances: Array, explained: IntArray
+) -> IntArray:
     """Translate marks into slots; unpaired readings near a landmark are ambiguous."""
     slots = np.where(distances <= policy.new_gate, AMBIGUOUS, NEW)
     paired = marks != UNPAIRED

@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array, BoolArray, IntArray
 from ..models.angles import wrap_angle
 from ..models.rigid_motion import rotation
 from .nearest_neighbour import Distances, Noise, innovation_distances
 
-Array = NDArray[np.float64]
 Masks = NDArray[np.uint64]
 
 
@@ -45,7 +45,7 @@ class TentativeLandmarks(NamedTuple):
     """C, shape (t, 2, 2) [m²]."""
     seen: Masks
     """Of each a bit per scan, the latest scan lowest: whether it was seen there."""
-    labels: NDArray[np.int64]
+    labels: IntArray
     """Number of each, different from those of all others before."""
 
     @classmethod
@@ -59,7 +59,7 @@ class TentativeLandmarks(NamedTuple):
         )
 
     @property
-    def sightings(self) -> NDArray[np.int64]:
+    def sightings(self) -> IntArray:
         """How often each was seen within the scans that count, shape (t,)."""
         return np.bitwise_count(self.seen).astype(np.int64)
 
@@ -115,7 +115,7 @@ class TentativeLandmarks(NamedTuple):
         return self._replace(places=places, covariances=spread, seen=seen)
 
     def with_new(
-        self, readings: Array, noise: Noise, labels: NDArray[np.int64]
+        self, readings: Array, noise: Noise, labels: IntArray
     ) -> "TentativeLandmarks":
         """Add what was seen for the first time in rows (β, r)."""
         if not len(readings):
@@ -134,7 +134,7 @@ class TentativeLandmarks(NamedTuple):
             np.concatenate([self.labels, labels]),
         )
 
-    def chosen(self, which: NDArray[np.bool_]) -> "TentativeLandmarks":
+    def chosen(self, which: BoolArray) -> "TentativeLandmarks":
         """Keep some of them."""
         if which.all():
             return self

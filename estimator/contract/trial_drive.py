@@ -4,13 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..interface import Belief, SlamEstimator
 from ..models.bearing_range import predict_measurement
 from ..models.unicycle_motion import predict_pose
 
-Array = NDArray[np.float64]
 Factory = Callable[..., SlamEstimator]
 
 LANDMARKS = np.array([[4.0, 1.0], [2.0, -3.0], [-1.0, 4.0], [6.0, 5.0]])

@@ -6,8 +6,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array, IntArray
 from ..interface import Belief
 from ..kernels.batch import NEVER, RunArrays, StepData, drive_runs
 from ..kernels.belief_arrays import aligned_zeros
@@ -21,8 +22,6 @@ from .ekf import EkfSlam
 from .gaussian_map import GaussianMap
 from .map_filter import FRAMES
 from .scan_workspace import workspace_for
-
-Array = NDArray[np.float64]
 
 
 class BatchSlam:
@@ -245,7 +244,7 @@ class BatchSlam:
         data: StepData,
         dt: Array,
         trace: BatchTrace,
-        failed_at: NDArray[np.int64],
+        failed_at: IntArray,
         part: slice,
     ) -> None:
         runs = RunArrays(

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array, BoolArray
 from ..kernels.batch import StepData
 from ..support import argument_checks
-
-Array = NDArray[np.float64]
 
 
 def step_data(
@@ -41,7 +40,7 @@ def step_data(
     return StepData(u, z, seen), durations
 
 
-def chosen_runs(runs: ArrayLike | None, count: int) -> NDArray[np.bool_]:
+def chosen_runs(runs: ArrayLike | None, count: int) -> BoolArray:
     """Return which of the runs are chosen, shape (B,); all for None."""
     if runs is None:
         return np.ones(count, dtype=np.bool_)

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from ...arrays import Array, BoolArray, IntArray
 
 
 class BatchTrace(NamedTuple):
@@ -19,7 +16,7 @@ class BatchTrace(NamedTuple):
     """Shape (B, T, 3, 3)."""
     nis: Array
     """νᵀ S⁻¹ ν of each scan, shape (B, T)."""
-    degrees_of_freedom: NDArray[np.int64]
+    degrees_of_freedom: IntArray
     """Of the NIS, shape (B, T)."""
 
 
@@ -30,7 +27,7 @@ class BatchBeliefs(NamedTuple):
     """Shape (B, 3 + 2L), landmarks by id, zeros where not mapped; θ in [-π, π)."""
     covariances: Array
     """Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped."""
-    mapped: NDArray[np.bool_]
+    mapped: BoolArray
     """Which landmarks are in the map, shape (B, L)."""
 
 
@@ -44,13 +41,11 @@ class BatchStorage(NamedTuple):
     """Shape (B, capacity): (x, y, θ), then the landmarks by slot; θ is not wrapped."""
     covariances: Array
     """Of the additive error, shape (B, capacity, capacity)."""
-    slots: NDArray[np.int64]
+    slots: IntArray
     """Shape (B, L): landmark i has column 3 + 2 slots[i]; -1 where not mapped."""
 
     @classmethod
-    def of(
-        cls, means: Array, covariances: Array, slots: NDArray[np.int64]
-    ) -> BatchStorage:
+    def of(cls, means: Array, covariances: Array, slots: IntArray) -> BatchStorage:
         """Return read-only views of the arrays."""
         views = means.view(), covariances.view(), slots.view()
         for view in views:

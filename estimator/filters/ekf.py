@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import ClassVar, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ..kernels.predict import predict
 from ..kernels.rules import ADDITIVE, AT_ESTIMATE, Rules
 from ..kernels.scan_rows import SLOT
@@ -24,8 +25,6 @@ from .scan_workspace import (
     covariances_for,
     not_positive_definite,
 )
-
-Array = NDArray[np.float64]
 
 
 class EkfSlam(MapFilter):

@@ -7,16 +7,14 @@ from itertools import repeat
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..belief import Belief, MapView
 from ..error_frames import ErrorFrame
 from ..kernels.belief_arrays import BeliefArrays, aligned_zeros
 from ..support import argument_checks
 from ..support.memory_limit import landmarks_that_fit
 from .marginalise_and_merge import coincide, without_landmarks
-
-Array = NDArray[np.float64]
 
 FIRST_ALLOCATION = 8  # landmarks
 

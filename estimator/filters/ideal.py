@@ -6,8 +6,9 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ..interface import UpdateReport
 from ..kernels.rules import AT_ESTIMATE, AT_TRUTH
 from ..models.rigid_motion import rotation
@@ -15,8 +16,6 @@ from ..models.unicycle_motion import drive
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .ekf import EkfSlam
-
-Array = NDArray[np.float64]
 
 
 class IdealEkfSlam(EkfSlam):

@@ -8,12 +8,10 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, ComplexArray
 from ..error_frames import ErrorFrame
 from ..models.rigid_motion import left_jacobian
-
-Array = NDArray[np.float64]
 
 
 class ConditionedMap(NamedTuple):
@@ -183,12 +181,12 @@ def _composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
     return ConditionedMap(_state(moved, mean[2] + turn), P)
 
 
-def _points(state: Array) -> NDArray[np.complex128]:
+def _points(state: Array) -> ComplexArray:
     """Robot position and landmarks as complex numbers, shape (1 + n,)."""
     plane = np.delete(state, 2).reshape(-1, 2)
     return np.asarray(plane[:, 0] + 1j * plane[:, 1])
 
 
-def _state(points: NDArray[np.complex128], heading: float) -> Array:
+def _state(points: ComplexArray, heading: float) -> Array:
     flat = np.column_stack([points.real, points.imag]).ravel()
     return np.insert(flat, 2, heading)

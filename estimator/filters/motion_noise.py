@@ -5,12 +5,10 @@ from __future__ import annotations
 from math import isfinite
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ..support import argument_checks
-
-Array = NDArray[np.float64]
 
 
 class MotionNoise(NamedTuple):

@@ -6,16 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ..belief import Belief, MapView
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.jit import jit, njit_internal
 from ..update_report import UpdateReport
 from .ekf import EkfSlam
-
-Array = NDArray[np.float64]
 
 # The state of the shared kernels here: the way since the last scan where they keep the
 # pose, the origin of the world (x, y), its heading and a zero where they keep the first

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import cached_property, partial
 from itertools import compress
 
-from ..kernels.belief_arrays import Array, Int
+from ...arrays import Array, IntArray
 from ..kernels.scan_record import ScanRecord
 from ..kernels.scan_rows import ADDED, GATED, NEAR, OUTCOME, SKIPPED, USED
 from ..update_report import UpdateReport
@@ -28,11 +28,16 @@ class ScanReport(UpdateReport):
     """
 
     _ids: list[int]
-    _copies: tuple[Array, Int]
+    _copies: tuple[Array, IntArray]
     _sequential: bool
 
     def __init__(
-        self, nis: float, ids: list[int], copies: tuple[Array, Int], *, sequential: bool
+        self,
+        nis: float,
+        ids: list[int],
+        copies: tuple[Array, IntArray],
+        *,
+        sequential: bool,
     ) -> None:
         parts = self.__dict__
         parts["nis"], parts["_ids"] = nis, ids

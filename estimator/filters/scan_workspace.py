@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels.belief_arrays import Array, Int
+from ...arrays import Array, IntArray
 from ..kernels.covariance_update import BLOCK
 from ..kernels.rules import Rules
 from ..kernels.scan_record import copy_scan
@@ -43,7 +43,7 @@ class ScanWorkspace:
         self._first_row = prior_system(height, self._rules.iterations)
         self.readings, self.capacity = room, capacity
 
-    def copies(self, used: int, readings: int) -> tuple[Array, Int]:
+    def copies(self, used: int, readings: int) -> tuple[Array, IntArray]:
         """Return copies of what the last update has left, for a :class:`ScanRecord`."""
         ledger, first = self.ledger[:, :readings], self._first_row
         return copy_scan(self.arrays.rows, ledger, used, first)

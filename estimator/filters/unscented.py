@@ -5,8 +5,9 @@ from __future__ import annotations
 from itertools import compress
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array, BoolArray, IntArray
 from ..interface import UpdateReport
 from ..models.angles import wrap_angle
 from ..models.unicycle_motion import drive
@@ -14,8 +15,6 @@ from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .ekf import EkfSlam
 from .scan_workspace import not_positive_definite
-
-Array = NDArray[np.float64]
 
 
 class UnscentedSlam(EkfSlam):
@@ -143,9 +142,7 @@ class UnscentedSlam(EkfSlam):
         std: Array = np.stack([bearing_std, range_std], axis=1)
         return std**2
 
-    def _within_gate(
-        self, innovation: Array, spread: Array, noise: Array
-    ) -> NDArray[np.bool_]:
+    def _within_gate(self, innovation: Array, spread: Array, noise: Array) -> BoolArray:
         if not np.isfinite(self.rules.gate):
             return np.ones(len(innovation), dtype=bool)
         pairs = spread.reshape(len(innovation), 2, -1)
@@ -156,7 +153,7 @@ class UnscentedSlam(EkfSlam):
 
 
 def _through_sensor(
-    mean: Array, deviations: Array, columns: NDArray[np.int64]
+    mean: Array, deviations: Array, columns: IntArray
 ) -> tuple[Array, Array]:
     """Carry points (n, N) through the sensor: mean (m, 2) and deviations (2m, N)."""
     points = np.concatenate([mean[:, None], mean[:, None] + deviations], axis=1)

@@ -7,13 +7,13 @@ far stand at ``level[d]`` of ``shifts`` and ``joints``.
 
 import numpy as np
 
+from ...arrays import Array, BoolArray, IntArray
 from ..support.jit import jit, njit_internal
-from .belief_arrays import Array, Int
-from .joint_readings import PAIR_BONUS, UNPAIRED, Mask, Problem, condition, fit
+from .joint_readings import PAIR_BONUS, UNPAIRED, Problem, condition, fit
 
 
 @njit_internal
-def _decision_order(feasible: Mask, innovations: Array) -> Int:
+def _decision_order(feasible: BoolArray, innovations: Array) -> IntArray:
     """Return the readings with the fewest landmarks first.
 
     Ties are broken by the readings themselves: the order of the scan has no effect.
@@ -41,7 +41,9 @@ def _decision_order(feasible: Mask, innovations: Array) -> Int:
 
 
 @njit_internal
-def _fill_ahead(feasible: Mask, order: Int, ahead: Int, counts: Int) -> None:
+def _fill_ahead(
+    feasible: BoolArray, order: IntArray, ahead: IntArray, counts: IntArray
+) -> None:
     """List the landmarks that the readings from each depth on may belong to."""
     for j in range(feasible.shape[1]):
         last = -1
@@ -54,7 +56,9 @@ def _fill_ahead(feasible: Mask, order: Int, ahead: Int, counts: Int) -> None:
 
 
 @njit_internal
-def _insert(costs: Array, marks: Int, found: int, cost: float, choice: Int) -> int:
+def _insert(
+    costs: Array, marks: IntArray, found: int, cost: float, choice: IntArray
+) -> int:
     """Insert an assignment into the sorted list; return how many are in it."""
     at = min(found, len(costs) - 1)
     if found == len(costs) and not cost < costs[at]:
@@ -74,7 +78,7 @@ def _insert(costs: Array, marks: Int, found: int, cost: float, choice: Int) -> i
 def search_assignments(
     problem: Problem,
     costs: Array,
-    marks: Int,
+    marks: IntArray,
     spread: float,
     ceiling: float,
     nodes: int,

@@ -3,10 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, BoolArray, IntArray
 from ..support.jit import jit, njit_internal
-from .belief_arrays import Array, Int
 from .predict import predict
 from .rules import as_rules
 from .scan_rows import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT
@@ -15,7 +14,7 @@ from .screen import usable
 
 NEVER = -1
 
-Bool = NDArray[np.bool_]
+Bool = BoolArray
 
 
 class RunArrays(NamedTuple):
@@ -24,8 +23,8 @@ class RunArrays(NamedTuple):
     means: Array  # (B, capacity)
     covariances: Array  # (B, capacity, capacity)
     references: Array  # (B, capacity)
-    slots: Int  # (B, L) place of each landmark in the map, -1 where not mapped
-    mapped: Int  # (B,) how many landmarks are
+    slots: IntArray  # (B, L) place of each landmark in the map, -1 where not mapped
+    mapped: IntArray  # (B,) how many landmarks are
 
 
 class StepData(NamedTuple):
@@ -38,11 +37,11 @@ class StepData(NamedTuple):
 
 @jit
 def drive_runs(
-    run_arrays: tuple[Array, Array, Array, Int, Int],
+    run_arrays: tuple[Array, Array, Array, IntArray, IntArray],
     step_data: tuple[Array, Array, Bool],
     dt: Array,
-    trace: tuple[Array, Array, Array, Int],
-    failed_at: Int,
+    trace: tuple[Array, Array, Array, IntArray],
+    failed_at: IntArray,
     motion_values: Array,
     rule_values: Array,
     workspace_arrays: tuple[Array, Array, Array],
@@ -130,10 +129,10 @@ def drive_runs(
 def gather(
     measurements: Array,
     visible: Bool,
-    slots: Int,
+    slots: IntArray,
     readings: Array,
-    ids: Int,
-    ledger: Int,
+    ids: IntArray,
+    ledger: IntArray,
 ) -> int:
     """Collect the readings of one step, and their landmarks' places in the map.
 
@@ -152,7 +151,9 @@ def gather(
 
 
 @njit_internal
-def note_new(m: int, ids: Int, ledger: Int, slots: Int, mapped: int) -> int:
+def note_new(
+    m: int, ids: IntArray, ledger: IntArray, slots: IntArray, mapped: int
+) -> int:
     """Give the added landmarks their places in the map; return how many there are."""
     added = 0
     for k in range(m):

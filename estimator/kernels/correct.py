@@ -1,7 +1,8 @@
 """One correction of a belief, compiled: linearise, condition, compose; iterated."""
 
+from ...arrays import Array, IntArray
 from ..support.jit import njit_inlined, njit_internal
-from .belief_arrays import Array, BeliefArrays, Int
+from .belief_arrays import BeliefArrays
 from .covariance_update import absorb, block_of, mirror, times
 from .linearise import linearise
 from .retract import retract, transport
@@ -22,7 +23,7 @@ from .scan_rows import (
 def correct(
     belief: BeliefArrays,
     size: int,
-    ledger: Int,
+    ledger: IntArray,
     rules: Rules,
     workspace: Workspace,
     top: int,

@@ -8,8 +8,8 @@ longer.
 
 import numpy as np
 
+from ...arrays import Array, IntArray
 from ..support.jit import fma, njit_internal
-from .belief_arrays import Array, Int
 from .scan_rows import CORRECTION, FIRST, INNOVATION, JACOBIAN, ROOT, VARIANCE, WHITE
 
 # Share of a variance below which the remainder counts as rounding.
@@ -31,7 +31,7 @@ def absorb(
     covariance: Array,
     size: int,
     rows: Array,
-    columns: Int,
+    columns: IntArray,
     top: int,
     bottom: int,
     block: int,
@@ -224,7 +224,7 @@ def downdate(
 
 
 @njit_internal
-def _refresh_for(covariance: Array, size: int, columns: Int) -> None:
+def _refresh_for(covariance: Array, size: int, columns: IntArray) -> None:
     """Complete the rows of P that the next readings look at."""
     for pose in range(0, 4, 2):
         _refresh(covariance, size, pose)

@@ -7,12 +7,9 @@ only; :mod:`slamgym.estimator.association.joint_assignment` has the equations.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, BoolArray, IntArray
 from ..support.jit import jit, njit_internal
-from .belief_arrays import Array, Int
-
-Mask = NDArray[np.bool_]
 
 UNPAIRED = -1
 
@@ -29,7 +26,7 @@ class Problem(NamedTuple):
     """C = H P Hᵀ of all expected readings, shape (2J, 2J)."""
     variances: Array
     """Diagonal of Q for each reading, shape (m, 2)."""
-    feasible: Mask
+    feasible: BoolArray
     """Pairs to consider, shape (m, J)."""
     missing: float
     """λ."""
@@ -60,7 +57,7 @@ def condition(
     innovation: Array,
     variance: Array,
     j: int,
-    ahead: Int,
+    ahead: IntArray,
     shifts: Array,
     joints: Array,
     here: int,
@@ -90,7 +87,7 @@ def condition(
 
 
 @jit
-def fill_distances(problem: Problem, marks: Int, distances: Array) -> None:
+def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
     """Find the least νᵀ S⁻¹ ν of each unpaired reading, given the pairs.
 
     Parameters

@@ -4,13 +4,13 @@ For a reading of the landmark in columns c, c+1 of the state only five columns o
 differ from zero: (x, y, θ, c, c+1).  A row of H is stored as these five entries.
 """
 
+from ...arrays import Array
 from ..models.bearing_range import (
     expected_reading_jit,
     reading_slopes_jit,
     wrap_angle_jit,
 )
 from ..support.jit import njit_internal
-from .belief_arrays import Array
 from .rules import AT_REFERENCE, AT_TRUTH, PROJECTED
 from .scan_rows import INNOVATION, JACOBIAN, READING
 

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...arrays import Array
 from ..support.jit import njit_inlined
-from .belief_arrays import Array
 
 # Where Jacobians are taken.
 AT_ESTIMATE = 0

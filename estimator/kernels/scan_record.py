@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .belief_arrays import Array, Int
+from ...arrays import Array, IntArray
 from .scan_rows import (
     COLUMN,
     INNOVATION,
@@ -18,7 +18,7 @@ class ScanRecord(NamedTuple):
     """The stacked system of one scan, copied out of the workspace."""
 
     rows: Array  # (2m, at least 3 + 2m + META_WIDTH)
-    ledger: Int  # (LEDGER_HEIGHT, readings), its columns counted in these rows
+    ledger: IntArray  # (LEDGER_HEIGHT, readings), its columns counted in these rows
 
     @property
     def innovation(self) -> Array:
@@ -46,7 +46,9 @@ class ScanRecord(NamedTuple):
         return factor
 
 
-def copy_scan(rows: Array, ledger: Int, used: int, first: int) -> tuple[Array, Int]:
+def copy_scan(
+    rows: Array, ledger: IntArray, used: int, first: int
+) -> tuple[Array, IntArray]:
     """Copy the parts of a :class:`ScanRecord` out of the workspace.
 
     Where the map is much larger than the scan, the copy has only the columns of the

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...arrays import Array, IntArray
 from ..support.jit import njit_internal
-from .belief_arrays import Array, Int, aligned_zeros
+from .belief_arrays import aligned_zeros
 
 # The first rows are vectors over the whole state.
 CORRECTION = 0  # δ
@@ -71,7 +72,7 @@ def new_workspace(
     )
 
 
-def new_ledger(readings: int) -> Int:
+def new_ledger(readings: int) -> IntArray:
     """Allocate the ledger of a scan of at most so many readings."""
     return np.zeros((LEDGER_HEIGHT, readings), dtype=np.int64)
 

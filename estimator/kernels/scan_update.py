@@ -1,8 +1,9 @@
 """Update of one belief by one scan, compiled: screen, correct, map new landmarks."""
 
+from ...arrays import Array, IntArray
 from ..support.jit import jit
 from .add_landmark import add_landmark
-from .belief_arrays import Array, BeliefArrays, Int
+from .belief_arrays import BeliefArrays
 from .correct import copy_covariance, correct
 from .covariance_update import block_of
 from .rules import as_rules
@@ -28,7 +29,7 @@ def update_belief(
     size: int,
     readings: Array,
     count: int,
-    ledger: Int,
+    ledger: IntArray,
     rows: Array,
     before: Array,
     prior: Array,

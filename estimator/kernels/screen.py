@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from ...arrays import Array, IntArray
 from ..support.argument_checks import LARGEST
 from ..support.jit import njit_internal
-from .belief_arrays import Array, BeliefArrays, Int
+from .belief_arrays import BeliefArrays
 from .linearise import linearise
 from .rules import Rules
 from .scan_rows import (
@@ -37,7 +38,7 @@ def screen(
     count: int,
     rules: Rules,
     rows: Array,
-    ledger: Int,
+    ledger: IntArray,
 ) -> int:
     """Decide the outcome of every reading and collect those to use.
 

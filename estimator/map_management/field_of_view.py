@@ -5,14 +5,12 @@ from dataclasses import dataclass
 from math import inf, pi
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, BoolArray
 from ..models.angles import wrap_angle
 from ..support import argument_checks
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Visibility = Callable[[Array, Array], Mask]
+Visibility = Callable[[Array, Array], BoolArray]
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class FieldOfView:
         if self.visible is not None and not callable(self.visible):
             raise ValueError(f"visible must be callable or None, got {self.visible!r}")
 
-    def expects(self, pose: Array, landmarks: Array, readings: Array) -> Mask:
+    def expects(self, pose: Array, landmarks: Array, readings: Array) -> BoolArray:
         """Tell which landmarks a scan should hold.
 
         Parameters
@@ -94,7 +92,7 @@ class FieldOfView:
         return np.asarray(expected)
 
 
-def _asked(visible: Visibility, pose: Array, landmarks: Array) -> Mask:
+def _asked(visible: Visibility, pose: Array, landmarks: Array) -> BoolArray:
     answer = np.asarray(visible(pose.copy(), landmarks.copy()))
     if answer.shape != (len(landmarks),) or answer.dtype != np.bool_:
         raise ValueError(

@@ -8,16 +8,15 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ..association.candidates import ScanAssociation
 from ..interface import Belief, MapView, SlamEstimator, UpdateReport
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .managed_slam import ManagedSlam
 from .policy import LandmarkPolicy, as_policy
-
-Array = NDArray[np.float64]
 
 SPREAD = 16.0
 """Hypotheses e^8 times less probable than the best one are discarded."""

@@ -4,10 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
+from ...arrays import Array, IntArray
 
 
 class LandmarkRecords:
@@ -33,8 +31,8 @@ class LandmarkRecords:
 
     def __init__(self) -> None:
         self.ids: tuple[int, ...] = ()
-        self.sightings: Int = np.zeros(0, dtype=np.int64)
-        self.misses: Int = np.zeros(0, dtype=np.int64)
+        self.sightings: IntArray = np.zeros(0, dtype=np.int64)
+        self.misses: IntArray = np.zeros(0, dtype=np.int64)
         self.information: Array = np.zeros((0, 3))
         self._slots: dict[int, int] = {}
 
@@ -75,11 +73,11 @@ class LandmarkRecords:
         self.information[slots, 1] += (along - across) * cos * sin
         self.information[slots, 2] += along * sin * sin + across * cos * cos
 
-    def slots(self, ids: Iterable[int]) -> Int:
+    def slots(self, ids: Iterable[int]) -> IntArray:
         """Return the places of landmarks in the order of the map."""
         return np.array([self._slots[i] for i in ids], dtype=np.int64)
 
-    def note_misses(self, slots: Int) -> None:
+    def note_misses(self, slots: IntArray) -> None:
         """Count for some landmarks a scan that should have shown them and did not."""
         self.misses[slots] += 1
 

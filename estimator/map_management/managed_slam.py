@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ..association.candidates import Candidates, ScanAssociation, Sensor
 from ..filters.motion_noise import MotionNoise
 from ..interface import (
@@ -29,8 +30,6 @@ from .map_view import mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
 from .recent_scans import RecentScans
-
-Array = NDArray[np.float64]
 
 
 class ManagedSlam:

@@ -7,13 +7,11 @@ from math import sqrt
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..association.association_policy import AssociationPolicy
 from ..support import argument_checks
 from .field_of_view import FieldOfView
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -4,17 +4,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, IntArray
 from ..association.nearest_neighbour import Noise
 from ..filters.marginalise_and_merge import separation
 from ..interface import MapView
 from .landmark_records import LandmarkRecords
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 class MapPruner:
@@ -167,7 +164,7 @@ class MapPruner:
                 return view.ids[kept], view.ids[gone]
         return None
 
-    def _places(self, view: MapView, ids: Sequence[int]) -> Int:
+    def _places(self, view: MapView, ids: Sequence[int]) -> IntArray:
         """Return where landmarks stand in the order of a view."""
         if view.whole is None:
             return self._records.slots(ids)
@@ -199,5 +196,5 @@ def _renamed(pair: tuple[int, int], old: int, new: int) -> tuple[int, int]:
     return _ordered(i, j)
 
 
-def _pairs(pairs: Sequence[tuple[int, int]]) -> Int:
+def _pairs(pairs: Sequence[tuple[int, int]]) -> IntArray:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)

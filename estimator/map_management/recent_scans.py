@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..association.candidates import LABEL_BITS, NO_LABEL, ScanAssociation
 from ..interface import SlamEstimator, UpdateReport
 from .map_editor import CachedEditor
 
-Array = NDArray[np.float64]
 NO_LANDMARK = np.iinfo(np.int64).min
 
 Motion = tuple[float, float, float]

@@ -3,9 +3,10 @@
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Angle = TypeVar("Angle", float, NDArray[np.float64])
+from ...arrays import Array
+
+Angle = TypeVar("Angle", float, Array)
 
 
 def wrap_angle(angle: Angle) -> Angle:

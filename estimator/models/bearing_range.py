@@ -14,12 +14,10 @@ z = (β, r)     bearing from the robot's heading, and range [rad, m]
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..support.jit import njit_inlined, njit_internal
 from .angles import wrap_angle
-
-Array = NDArray[np.float64]
 
 wrap_angle_jit = njit_internal(wrap_angle)
 

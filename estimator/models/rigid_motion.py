@@ -17,11 +17,9 @@ References
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, ComplexArray
 from ..support.jit import njit_inlined
-
-Array = NDArray[np.float64]
 
 
 def rotation(angle: float) -> Array:
@@ -52,7 +50,7 @@ def compose(start: Array, pose: Array) -> tuple[Array, Array, Array]:
     return start + moved, by_start, by_pose
 
 
-def left_jacobian(turn: Array) -> NDArray[np.complex128]:
+def left_jacobian(turn: Array) -> ComplexArray:
     """Return V(t) as a complex number, sinc(t/2) e^{it/2}; any shape.
 
     Examples

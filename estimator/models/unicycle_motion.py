@@ -13,11 +13,10 @@ u = (d, α)       odometry: distance driven, then heading turned [m, rad]
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..support.jit import njit_inlined
 
-Array = NDArray[np.float64]
 Real = Any  # a number, or an array of any shape
 
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...arrays import AnyArray, Array
 from .memory_limit import covariance_bytes
 
-Array = NDArray[np.float64]
 LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 
 # Largest reading or odometry [m, rad]; their squares, and products, stay finite.
@@ -68,7 +68,7 @@ def scan(measurements: ArrayLike) -> Array:
     )
 
 
-def _is_plain_scan(readings: NDArray[Any]) -> bool:
+def _is_plain_scan(readings: AnyArray) -> bool:
     """Return whether kernels can take the readings as they are."""
     is_plain = readings.dtype is _FLOAT64 and readings.flags.carray
     return is_plain and readings.shape[1:] == (2,)
@@ -92,7 +92,7 @@ def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
     return ids
 
 
-def _as_signed(array: NDArray[Any], given: LandmarkIds) -> NDArray[Any]:
+def _as_signed(array: AnyArray, given: LandmarkIds) -> AnyArray:
     """Return ids that are unsigned or none at all, or refuse what is neither."""
     if array.size and (array.dtype.kind not in "iu" or array.ndim != 1):
         raise ValueError(f"landmark_ids must be integers, got {given!r}")
@@ -255,7 +255,7 @@ def flag(name: str, value: bool) -> bool:
     return bool(value)
 
 
-def _refuse_masked_and_complex(name: str, value: NDArray[Any]) -> None:
+def _refuse_masked_and_complex(name: str, value: AnyArray) -> None:
     """Numpy would take what lies under a mask, and half of a complex number."""
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(f"{name} must be an array without a mask, got {value!r}")

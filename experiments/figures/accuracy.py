@@ -6,17 +6,14 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ...arrays import Array, BoolArray
 from ...evaluation.trajectory_error import LandmarkDistances, landmark_distances
 from ..runs.trace import RunTrace
 from . import style
 from .map_picture import box_around
 from .style import ALARM, GREY, INK, TEAL, EllipseKind, dress, write_title
-
-Array = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 _LANDMARK = EllipseKind("estimated landmark, 3σ", TEAL, fill=0.15)
 _MOST_ERRORS = 80  # error lines along the path
@@ -62,7 +59,7 @@ def truth_figure(trace: RunTrace) -> Figure:
     return figure
 
 
-def _known(truth: Array | None) -> Mask:
+def _known(truth: Array | None) -> BoolArray:
     """Return which rows of a truth hold a position."""
     if truth is None:
         return np.zeros(0, dtype=bool)
@@ -79,7 +76,7 @@ def _limits(trace: RunTrace) -> Array:
 
 
 def _draw_comparison(
-    axes: Axes, trace: RunTrace, poses: Mask, landmarks: Mask
+    axes: Axes, trace: RunTrace, poses: BoolArray, landmarks: BoolArray
 ) -> list[Artist]:
     """Draw estimates, truth and the lines between them; return the legend's keys."""
     shown = _LANDMARK.add_to(axes)
@@ -118,7 +115,7 @@ def _join(axes: Axes, estimates: Array, truth: Array, *, width: float) -> None:
     axes.add_collection(lines, autolim=False)
 
 
-def _landmark_distances(trace: RunTrace, known: Mask) -> LandmarkDistances:
+def _landmark_distances(trace: RunTrace, known: BoolArray) -> LandmarkDistances:
     truth = np.asarray(trace.true_landmarks)[known]
     return landmark_distances(
         trace.landmarks[known], trace.landmark_covariances[known], truth
@@ -155,7 +152,9 @@ def _draw_bars(axes: Axes, values: Array) -> None:
     axes.tick_params(axis="y", length=0)
 
 
-def _summary(trace: RunTrace, poses: Mask, distances: LandmarkDistances | None) -> str:
+def _summary(
+    trace: RunTrace, poses: BoolArray, distances: LandmarkDistances | None
+) -> str:
     parts = [trace.estimator]
     if poses.any() and trace.true_poses is not None:
         error = trace.poses[poses, :2] - trace.true_poses[poses, :2]

@@ -6,11 +6,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ...arrays import Array
 from ...estimator.models.angles import wrap_angle
 from ..runs.trace import RunTrace
 from .style import ALARM, BLUE, GREY, INK, TEAL, dress, new_figure, write_title
-
-Array = NDArray[np.floating]
 
 _ROWS = (("x error [m]", "x"), ("y error [m]", "y"), ("θ error [rad]", "θ"))
 _LOG_FROM = 8.0  # times the band's upper bound: larger NIS needs a logarithmic axis

@@ -6,10 +6,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..runs.trace import RunTrace
 from .style import GREY, INK, new_figure, write_title
-
-Array = NDArray[np.floating]
 
 _MOST_LABELS = 30  # rows; larger maps name only some of their landmarks
 _UNDEFINED = "#c9ced4"

@@ -13,12 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..runs.trace import RunTrace
 from .style import GREY, INK, EllipseKind, set_ellipses
-
-Array = NDArray[np.floating]
 
 PREDICTED = EllipseKind("predicted pose, 3σ", "#d216c6", (0, (4, 3)), width=1.2)
 UPDATED = EllipseKind("updated pose, 3σ", "#1d4ed8", fill=0.12, width=1.3)

@@ -11,13 +11,12 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 from PIL import Image
 
+from ...arrays import Array
 from ...envs.rendering import BlittedFigure
 from ...sim_configs.atomic_file import replace_when_written
 from ..runs.trace import RunTrace
 from .map_picture import MapPicture, map_limits, pose_stride
 from .style import ELLIPSE_HANDLER, dress, legend_below, new_figure, write_title
-
-Array = NDArray[np.floating]
 
 
 def map_figure(trace: RunTrace, step: int | None = None) -> Figure:

@@ -15,12 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerPatch
 from matplotlib.patches import Ellipse
 from matplotlib.text import Text
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...envs.rendering import covariance_ellipses
 from ...sim_configs.atomic_file import replace_when_written
-
-Array = NDArray[np.floating]
 
 INK, GREY, PALE = "#1b1f24", "#6b737c", "#e8eaed"
 BLUE, ORANGE, ALARM, TEAL = "#0072b2", "#e69f00", "#d55e00", "#009e73"  # Okabe, Ito

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Array, IntArray
 from ...estimator.models.angles import wrap_angle
 from .lines import LogLine
 
@@ -56,9 +57,9 @@ class Scan:
     """
 
     t: float
-    measurements: NDArray[np.float64]
-    landmark_ids: NDArray[np.int64] | None = None
-    sizes: NDArray[np.float64] | None = None
+    measurements: Array
+    landmark_ids: IntArray | None = None
+    sizes: Array | None = None
 
     def __post_init__(self) -> None:
         readings = float_array("measurements", self.measurements, columns=2)
@@ -78,7 +79,7 @@ class Scan:
             object.__setattr__(self, name, column)
 
 
-def float_array(name: str, value: ArrayLike, *, columns: int) -> NDArray[np.float64]:
+def float_array(name: str, value: ArrayLike, *, columns: int) -> Array:
     """Return a table of numbers as an array of shape (n, columns), or raise ValueError.
 
     Examples

@@ -9,14 +9,12 @@ the left, which the header gives in metres as ``groundtruth_offset: a,b``::
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...evaluation.trajectory_error import PositionAccuracy, poses_at, position_accuracy
 from .events import Scan
 from .lines import LogError
 from .slamlog import SlamLog
-
-Array = NDArray[np.floating]
 
 
 def true_poses_of(log: SlamLog, times: Array) -> Array | None:

@@ -6,15 +6,13 @@ from typing import Any, cast
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...envs.controllers import Controller
 from ...envs.landmark_world import LandmarkWorldEnv, Observation
 from ...sim_configs import Scenario, load_scenario
 from .events import OdometryRow, Scan
 from .slamlog import SlamLog, numbers
-
-Array = NDArray[np.float64]
 
 
 def record_episode(

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Literal, cast, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, IntArray
 from .events import EventRecorder, OdometryRow, Reading, Scan, float_array
 from .lines import LogError, LogLine, read_lines, shown, to_lines, write_whole
 
@@ -78,13 +78,11 @@ class SlamLog:
     name: str
     header: dict[str, str] = field(default_factory=dict)
     motion: Motion = "turn-last"
-    start: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    landmark_ids: NDArray[np.int64] = field(
-        default_factory=lambda: np.empty(0, dtype=np.int64)
-    )
-    landmarks: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
+    start: Array = field(default_factory=lambda: np.zeros(3))
+    landmark_ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    landmarks: Array = field(default_factory=lambda: np.empty((0, 2)))
     events: tuple[OdometryRow | Scan, ...] = ()
-    ground_truth: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4)))
+    ground_truth: Array = field(default_factory=lambda: np.empty((0, 4)))
 
     def __post_init__(self) -> None:
         ids = np.asarray(self.landmark_ids, dtype=np.int64)
@@ -245,7 +243,7 @@ def _motion(line: LogLine | None) -> Motion:
     return cast(Motion, _value(line))
 
 
-def _start(line: LogLine | None) -> NDArray[np.float64]:
+def _start(line: LogLine | None) -> Array:
     if line is None:
         return np.zeros(3)
     fields = _value(line).split(",")

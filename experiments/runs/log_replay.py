@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...estimator.interface import Belief, SlamEstimator, SupportsJoin, SupportsTruth
 from ...estimator.map_management.managed_slam import ManagedSlam
 from ...estimator.map_management.map_view import marginal_without_joining
@@ -20,7 +20,6 @@ from .memory_check import refuse_large_map
 from .run_recorder import MapChanges, ReadingCounts, RunRecorder
 from .trace import RunTrace
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], object]
 
 _MOST_MAPS = 500  # kept of a run by default

@@ -1,10 +1,10 @@
 """Statistics over the finite entries of arrays; None where there is none."""
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ...arrays import AnyArray
 
 
 def finite(value: float) -> float | None:
@@ -12,7 +12,7 @@ def finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def mean(values: NDArray[Any]) -> float | None:
+def mean(values: AnyArray) -> float | None:
     """Average over the entries that are finite.
 
     Examples
@@ -24,14 +24,14 @@ def mean(values: NDArray[Any]) -> float | None:
     return finite(known.mean()) if len(known) else None
 
 
-def root_mean_square(values: NDArray[Any]) -> float | None:
+def root_mean_square(values: AnyArray) -> float | None:
     """Take the root of the mean square of the entries that are finite."""
     with np.errstate(over="ignore"):
         square = mean(np.asarray(values) ** 2)
     return None if square is None else math.sqrt(square)
 
 
-def quotient(values: NDArray[Any], freedom: NDArray[Any]) -> float | None:
+def quotient(values: AnyArray, freedom: AnyArray) -> float | None:
     """Divide sums, over the entries whose value is finite.
 
     Parameters
@@ -44,7 +44,7 @@ def quotient(values: NDArray[Any], freedom: NDArray[Any]) -> float | None:
     return finite(values[known].sum() / total) if total else None
 
 
-def standard_error(values: NDArray[Any]) -> float | None:
+def standard_error(values: AnyArray) -> float | None:
     """Return the standard error of the mean, s / √M; None for fewer than two.
 
     Examples

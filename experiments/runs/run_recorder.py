@@ -4,8 +4,8 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...estimator.interface import Belief, SlamEstimator, SupportsJoin, UpdateReport
 from ...estimator.map_management.map_view import (
     mapped_ids,
@@ -16,8 +16,6 @@ from ..logs.ground_truth import true_landmarks_of, true_poses_of
 from ..logs.slamlog import SlamLog
 from .map_history import MapHistory
 from .trace import RunTrace
-
-Array = NDArray[np.float64]
 
 
 class ReadingCounts(NamedTuple):

@@ -6,13 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 from gymnasium.utils import seeding
-from numpy.typing import NDArray
 
+from ...arrays import Array, BoolArray
 from ...envs.vector import WorldBatch
 from ...estimator.support.memory_limit import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
-
-Array = NDArray[np.float64]
 
 
 class SimulatedRuns(NamedTuple):
@@ -22,7 +20,7 @@ class SimulatedRuns(NamedTuple):
     """(d, α) before each scan, shape (B, T, 2) [m, rad]; zeros before the first."""
     measurements: Array
     """Rows (β, r), shape (B, T, L, 2) [rad, m]."""
-    visible: NDArray[np.bool_]
+    visible: BoolArray
     """Whether a landmark is read, shape (B, T, L)."""
     true_poses: Array
     """(x, y, θ), shape (B, T, 3) [m, m, rad]."""

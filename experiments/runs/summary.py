@@ -5,10 +5,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ... import __version__
+from ...arrays import Array
 from ...evaluation import nees
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
 from ..logs.ground_truth import path_accuracy
@@ -16,8 +16,6 @@ from .filter_settings import FilterSettings
 from .log_replay import Replay
 from .nan_statistics import finite
 from .trace import RunTrace
-
-Array = NDArray[np.floating]
 
 _SHARE = 0.95  # probability of the interval of the NIS
 

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...estimator.error_frames import ErrorFrame
 from ...evaluation.trajectory_error import landmark_covariances
 
-Array = NDArray[np.floating]
 Integers = NDArray[np.integer]
 
 

@@ -1,12 +1,11 @@
 """Drive many worlds side by side, and record them as trajectories."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from gymnasium.utils import seeding
-from numpy.typing import NDArray
 
+from ...arrays import AnyArray
 from ...envs.controllers import make_vector_controller
 from ...envs.vector import MixedWorlds, WorldBatch
 from ...sim_configs import Scenario, drawn_scenario
@@ -99,13 +98,11 @@ def _worlds(
     return MixedWorlds(scenarios)
 
 
-def _empty_record(
-    worlds: WorldBatch | MixedWorlds, steps: int
-) -> dict[str, NDArray[Any]]:
+def _empty_record(worlds: WorldBatch | MixedWorlds, steps: int) -> dict[str, AnyArray]:
     """Return the arrays of B trajectories, shape (B, …) each, to be filled."""
 
-    def room(name: str, times: int) -> NDArray[Any]:
-        now: NDArray[Any] = getattr(worlds, name)
+    def room(name: str, times: int) -> AnyArray:
+        now: AnyArray = getattr(worlds, name)
         return np.empty((len(now), times, *now.shape[1:]), now.dtype)
 
     scanned = [name for name in _EACH_SCAN if getattr(worlds, name) is not None]
@@ -119,7 +116,7 @@ def _empty_record(
 
 
 def _take(
-    record: dict[str, NDArray[Any]],
+    record: dict[str, AnyArray],
     names: Sequence[str],
     place: int,
     worlds: WorldBatch | MixedWorlds,

@@ -3,14 +3,9 @@
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...sim_configs import Scenario, load_scenario
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +53,9 @@ class Trajectory:
     landmarks: Array | None = None
     actions: Array | None = None
     measurements: Array | None = None
-    mask: NDArray[np.bool_] | None = None
-    collisions: NDArray[np.bool_] | None = None
-    landmark_ids: NDArray[np.int64] | None = None
+    mask: BoolArray | None = None
+    collisions: BoolArray | None = None
+    landmark_ids: IntArray | None = None
 
     @property
     def steps(self) -> int:
@@ -87,7 +82,7 @@ def scenario_from_text(text: str) -> Scenario:
     return load_scenario(tomllib.loads(text))
 
 
-def array_of(trajectory: Trajectory, name: str) -> NDArray[Any]:
+def array_of(trajectory: Trajectory, name: str) -> AnyArray:
     """Return an array of a trajectory that its format requires.
 
     Raises
@@ -101,7 +96,7 @@ def array_of(trajectory: Trajectory, name: str) -> NDArray[Any]:
             f"the trajectory of seed {trajectory.seed} must have {name} to be written "
             "in this format, got None"
         )
-    array: NDArray[Any] = value
+    array: AnyArray = value
     return array
 
 

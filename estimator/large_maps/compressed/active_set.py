@@ -3,9 +3,8 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ....arrays import Array
 
 LARGEST_WHOLE_MAP = 250
 """Up to this many landmarks, the local map is the whole map."""

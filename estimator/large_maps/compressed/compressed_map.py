@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
 from ...filters.invariant import InvariantEkfSlam
 from ...interface import Belief
@@ -25,9 +26,6 @@ from .phase_update import (
     virtual_landmarks,
 )
 from .saved_state import SavedState
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 class CompressedMap:
@@ -243,6 +241,6 @@ class CompressedMap:
     def _phase(self) -> Phase:
         return end_phase(self.filter, self._virtual)
 
-    def _columns(self, ids: Sequence[int]) -> Int:
+    def _columns(self, ids: Sequence[int]) -> IntArray:
         """Return the columns of landmarks in the map's arrays."""
         return pairs([self.slots[i] for i in ids])

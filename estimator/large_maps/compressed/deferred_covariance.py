@@ -4,13 +4,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, IntArray
 from ...support.memory_limit import refuse_beyond_memory
 from .row_exchange import read_columns, write_columns
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 # Rows of one block: of 64 landmarks.
 BLOCK = 128
@@ -81,7 +78,7 @@ class DeferredCovariance:
         while self.width < columns:
             self._blocks.append(np.zeros((BLOCK, self.width + BLOCK)))
 
-    def read(self, columns: Int, rows: Array) -> None:
+    def read(self, columns: IntArray, rows: Array) -> None:
         """Fill rows (c, width), of ascending columns, what is pending taken off."""
         bounds = self._bounds(columns)
         for (first, block), start, end in zip(
@@ -97,7 +94,7 @@ class DeferredCovariance:
                 missing[columns < done, :done] = 0.0
             rows[:, : len(root)] -= missing
 
-    def put(self, columns: Int, rows: Array, places: Int) -> None:
+    def put(self, columns: IntArray, rows: Array, places: IntArray) -> None:
         """Store the rows of ascending columns (c,), which stand at ``places`` (c,)."""
         bounds = self._bounds(columns)
         for (first, block), start, end in zip(
@@ -134,7 +131,7 @@ class DeferredCovariance:
                 self._under_way, self._done = False, 0
         self._credit = 0.0
 
-    def marginal(self, columns: Int) -> Array:
+    def marginal(self, columns: IntArray) -> Array:
         """Return the covariance (c, c) of some columns; exactly symmetric."""
         covariance = np.empty((len(columns), len(columns)))
         for first, block in self._enumerate():
@@ -210,7 +207,7 @@ class DeferredCovariance:
         """First row and array of each block."""
         return [(k * BLOCK, block) for k, block in enumerate(self._blocks)]
 
-    def _bounds(self, columns: Int) -> list[int]:
+    def _bounds(self, columns: IntArray) -> list[int]:
         """How many of ascending columns lie before each block, and in all."""
         starts = np.arange(0, self.width + 1, BLOCK)
         bounds: list[int] = np.searchsorted(columns, starts).tolist()
@@ -254,7 +251,7 @@ def stored_bytes(landmarks: int) -> int:
     return 8 * BLOCK**2 * blocks * (blocks + 1) // 2
 
 
-def _of(root: Array, columns: Int) -> Array:
+def _of(root: Array, columns: IntArray) -> Array:
     """Rows of W, zero beyond its end: those columns are younger than it."""
     if len(root) > columns.max(initial=0):
         chosen: Array = root[columns]

@@ -23,13 +23,10 @@ and the rows of S read as complex numbers all of the above holds as it stands.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array
 from ...filters.ekf import EkfSlam
 from .row_exchange import fill_extended, unpivot
-
-Array = NDArray[np.float64]
-
 
 # A filter's arrays may be larger than needed by this factor.
 _ROOMY = 3

@@ -1,16 +1,11 @@
 """Moving columns and rows between the arrays of a map and a local map, compiled."""
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ....arrays import Array, IntArray
 from ...support.jit import jit
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @jit
-def read_columns(block: Array, first: int, columns: Int, rows: Array) -> None:
+def read_columns(block: Array, first: int, columns: IntArray, rows: Array) -> None:
     """Copy some columns of a block into rows (c, width), from column ``first`` on.
 
     Row by row: neighbours lie in one cache line.
@@ -22,7 +17,7 @@ def read_columns(block: Array, first: int, columns: Int, rows: Array) -> None:
 
 @jit
 def write_columns(
-    block: Array, first: int, columns: Int, rows: Array, places: Int
+    block: Array, first: int, columns: IntArray, rows: Array, places: IntArray
 ) -> None:
     """Copy rows, those at ``places``, from column ``first`` on, into some columns."""
     for i in range(len(block)):
@@ -63,7 +58,7 @@ def fill_extended(
 
 
 @jit
-def unpivot(factor: Array, places: Int, rows: Array) -> None:
+def unpivot(factor: Array, places: IntArray, rows: Array) -> None:
     """Move an upper triangular factor's columns to their places, its first rows."""
     for i in range(len(rows)):
         for j in range(i, len(places)):

@@ -4,13 +4,11 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array
 from ...support import argument_checks
 from .deferred_covariance import DeferredCovariance
 from .phase_update import virtual_landmarks
-
-Array = NDArray[np.float64]
 
 _LOCAL = ("mean", "covariance", "reference", "landmark_ids")
 _OWN = ("landmark_ids", "slots", "points", "references", "strip", "origin", "numbers")

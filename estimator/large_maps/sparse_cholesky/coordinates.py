@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Int = NDArray[np.int64]
+from ....arrays import IntArray
 
 
-def pairs(places: Sequence[int] | Int) -> Int:
+def pairs(places: Sequence[int] | IntArray) -> IntArray:
     """Return the two columns of each landmark, in turn: 2 p, 2 p + 1.
 
     Examples

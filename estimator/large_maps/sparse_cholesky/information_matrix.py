@@ -4,11 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
+from ....arrays import Array, BoolArray, IntArray
 
 _ARRAY_OBJECTS = 220
 """Memory of two empty array objects [bytes]."""
@@ -23,7 +21,7 @@ class InformationMatrix:
     """
 
     def __init__(self) -> None:
-        self._links: list[Int] = []
+        self._links: list[IntArray] = []
         self._blocks: list[Array] = []
         self._place = np.zeros(0, dtype=np.int64)  # scratch; -1 between calls
 
@@ -51,16 +49,16 @@ class InformationMatrix:
         if len(self._place) < count:
             self._place = np.full(2 * count, -1, dtype=np.int64)
 
-    def dense(self, slots: Int) -> Array:
+    def dense(self, slots: IntArray) -> Array:
         """Return the rows and columns of a few landmarks, shape (2k, 2k)."""
         return np.asarray(self.submatrix(slots, slots).toarray())
 
-    def diagonal(self, slots: Int) -> Array:
+    def diagonal(self, slots: IntArray) -> Array:
         """Return the diagonal blocks of landmarks, shape (k, 2, 2)."""
         counts, links, blocks = self.rows(slots)
         return np.asarray(blocks[links == np.repeat(slots, counts)])
 
-    def submatrix(self, rows: Int, columns: Int) -> bsr_array:
+    def submatrix(self, rows: IntArray, columns: IntArray) -> bsr_array:
         """Return the blocks of some rows and columns, shape (2r, 2c), sparse."""
         shape = (2 * len(rows), 2 * len(columns))
         if not (len(rows) and len(columns)):
@@ -74,7 +72,7 @@ class InformationMatrix:
         starts = np.searchsorted(owner, np.arange(len(rows) + 1))
         return bsr_array((blocks[wanted], place[wanted], starts), shape=shape)
 
-    def replace(self, slots: Int, dense: Array) -> None:
+    def replace(self, slots: IntArray, dense: Array) -> None:
         """Replace the rows and columns of a few landmarks, omitting zero blocks."""
         k = len(slots)
         blocks = dense.reshape(k, 2, k, 2).transpose(0, 2, 1, 3)
@@ -91,9 +89,9 @@ class InformationMatrix:
             )
         inside[slots] = -1
 
-    def nearest_by_links(self, slots: Int, count: int) -> Int:
+    def nearest_by_links(self, slots: IntArray, count: int) -> IntArray:
         """Return up to ``count`` other landmarks, fewest links away first."""
-        found: list[Int] = []
+        found: list[IntArray] = []
         missing, front, place = count, slots, self._place
         place[slots] = 0
         while missing > 0 and len(front):
@@ -106,21 +104,21 @@ class InformationMatrix:
         place[slots] = place[result] = -1
         return result
 
-    def links(self, slot: int) -> Int:
+    def links(self, slot: int) -> IntArray:
         """Return the landmarks linked with a landmark, including itself."""
         return self._links[slot]
 
-    def is_filled(self, slots: Int) -> NDArray[np.bool_]:
+    def is_filled(self, slots: IntArray) -> BoolArray:
         """Return which landmarks have a nonempty row, shape (k,)."""
         return np.array([len(self._links[i]) > 0 for i in slots.tolist()], dtype=bool)
 
-    def neighbours(self, slots: Int) -> Int:
+    def neighbours(self, slots: IntArray) -> IntArray:
         """Return all landmarks linked with the given ones, without these."""
         if not len(slots):
             return slots
         return np.setdiff1d(self.rows(slots)[1], slots)
 
-    def rows(self, slots: Int) -> tuple[Int, Int, Array]:
+    def rows(self, slots: IntArray) -> tuple[IntArray, IntArray, Array]:
         """Return row lengths, links and blocks of landmarks, row after row."""
         rows: Sequence[int] = slots.tolist()
         if not rows:
@@ -131,7 +129,7 @@ class InformationMatrix:
         blocks = np.concatenate([self._blocks[i] for i in rows])
         return counts, np.concatenate(links), blocks
 
-    def state_dict(self) -> dict[str, Array | Int]:
+    def state_dict(self) -> dict[str, Array | IntArray]:
         """Return copies of all rows, one after another."""
         counts, links, blocks = self.rows(np.arange(len(self)))
         return {"counts": counts, "links": links, "blocks": blocks}
@@ -155,7 +153,7 @@ class InformationMatrix:
         self._place = np.full(2 * len(counts), -1, dtype=np.int64)
 
 
-def _check_rows(counts: Int, links: Int, blocks: Array) -> None:
+def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:
     if counts.sum() != len(links) or blocks.shape != (len(links), 2, 2):
         raise ValueError(
             f"state['matrix_links'] and state['matrix_blocks'] must have "

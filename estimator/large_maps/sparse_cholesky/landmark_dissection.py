@@ -9,12 +9,9 @@ affect any other branch.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, BoolArray, IntArray
 from .information_matrix import InformationMatrix
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 LEAF = 150
 """Largest number of landmarks in a leaf."""
@@ -35,8 +32,8 @@ class LandmarkDissection:
         self.nodes = np.append(self.nodes, more)
 
     def revise(
-        self, matrix: InformationMatrix, first: Array, changed: Int
-    ) -> tuple[Int, list[int]]:
+        self, matrix: InformationMatrix, first: Array, changed: IntArray
+    ) -> tuple[IntArray, list[int]]:
         """Update the tree after rows of the matrix changed.
 
         Parameters
@@ -72,7 +69,7 @@ class LandmarkDissection:
         dissected = self._dissect_large_leaves(matrix, first, np.unique(after))
         return np.union1d(before, after), dissected
 
-    def check(self, matrix: InformationMatrix, local: Int) -> None:
+    def check(self, matrix: InformationMatrix, local: IntArray) -> None:
         """Raise a ValueError if linked landmarks, not both local, are unrelated."""
         is_local = np.zeros(len(matrix), dtype=bool)
         is_local[local] = True
@@ -80,13 +77,13 @@ class LandmarkDissection:
         if not (is_local[owners] | is_local[links]).all():
             raise ValueError("state['nodes'] must keep linked landmarks in one branch")
 
-    def _insert(self, matrix: InformationMatrix, new: Int) -> None:
+    def _insert(self, matrix: InformationMatrix, new: IntArray) -> None:
         """Assign each landmark to the deepest node among its links."""
         for slot in new.tolist():
             linked = self.nodes[matrix.links(slot)]
             self.nodes[slot] = max(int(linked.max(initial=0)), 1)
 
-    def _raise_linked(self, matrix: InformationMatrix, changed: Int) -> None:
+    def _raise_linked(self, matrix: InformationMatrix, changed: IntArray) -> None:
         """Move landmarks up to a common ancestor with all their links."""
         owners, links = self._unrelated(matrix, changed)
         for slot, link in zip(owners.tolist(), links.tolist(), strict=True):
@@ -95,7 +92,9 @@ class LandmarkDissection:
             if shared != other:  # otherwise the other landmark has moved up already
                 self.nodes[slot] = shared
 
-    def _unrelated(self, matrix: InformationMatrix, slots: Int) -> tuple[Int, Int]:
+    def _unrelated(
+        self, matrix: InformationMatrix, slots: IntArray
+    ) -> tuple[IntArray, IntArray]:
         """Return the pairs of these landmarks and their links in unrelated branches."""
         counts, links, _ = matrix.rows(slots)
         owners = np.repeat(slots, counts)
@@ -103,7 +102,7 @@ class LandmarkDissection:
         return owners[apart], links[apart]
 
     def _dissect_large_leaves(
-        self, matrix: InformationMatrix, first: Array, touched: Int
+        self, matrix: InformationMatrix, first: Array, touched: IntArray
     ) -> list[int]:
         """Dissect leaves that have grown, or their branch if it becomes too deep."""
         dissected: list[int] = []
@@ -125,12 +124,12 @@ class LandmarkDissection:
                 return top
         return leaf
 
-    def _below(self, node: int) -> Int:
+    def _below(self, node: int) -> IntArray:
         """Return the landmarks of a node and its descendants."""
         return np.flatnonzero(descends(self.nodes, node))
 
     def _dissect(
-        self, matrix: InformationMatrix, first: Array, slots: Int, top: int
+        self, matrix: InformationMatrix, first: Array, slots: IntArray, top: int
     ) -> None:
         """Assign landmarks to a node and new descendants of it."""
         part = matrix.submatrix(slots, slots)
@@ -162,8 +161,8 @@ class LandmarkDissection:
 
 
 def _is_linked(
-    rows: Int, starts: Int, links: Int, others: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+    rows: IntArray, starts: IntArray, links: IntArray, others: BoolArray
+) -> BoolArray:
     """Return which rows of a sparse matrix link to one of the others."""
     n = starts[rows + 1] - starts[rows]
     ends = np.cumsum(n)
@@ -172,18 +171,18 @@ def _is_linked(
     return np.asarray(hits[ends] > hits[ends - n])
 
 
-def depth(nodes: Int) -> Int:
+def depth(nodes: IntArray) -> IntArray:
     """Return the levels of nodes below the root; -1 for 0."""
     return np.frexp(nodes.astype(np.float64))[1].astype(np.int64) - 1
 
 
-def descends(nodes: Int, node: int) -> NDArray[np.bool_]:
+def descends(nodes: IntArray, node: int) -> BoolArray:
     """Return which nodes are this node or its descendants."""
     below = depth(nodes) - (node.bit_length() - 1)
     return np.asarray((below >= 0) & (nodes >> np.maximum(below, 0) == node))
 
 
-def related(nodes: Int, others: Int) -> NDArray[np.bool_]:
+def related(nodes: IntArray, others: IntArray) -> BoolArray:
     """Return which pairs are on one path from the root; 0 is related to all nodes."""
     apart = depth(nodes) - depth(others)
     up = nodes >> np.maximum(apart, 0)
@@ -201,7 +200,7 @@ def common_ancestor(one: int, other: int) -> int:
     return one
 
 
-def with_ancestors(nodes: Int) -> set[int]:
+def with_ancestors(nodes: IntArray) -> set[int]:
     """Return nodes and all their ancestors, without 0."""
     found: set[int] = set()
     front = set(nodes.tolist()) - {0}

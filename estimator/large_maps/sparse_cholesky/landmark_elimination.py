@@ -12,9 +12,9 @@ the nodes above the old and the new local map are computed again.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
+from ....arrays import Array, BoolArray, IntArray
 from .coordinates import pairs
 from .information_matrix import InformationMatrix
 from .landmark_dissection import LandmarkDissection, descends, with_ancestors
@@ -26,9 +26,6 @@ from .multifrontal import (
     substitute_forward,
 )
 from .schur_complement import SchurComplement
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 class _Eliminated(NamedTuple):
@@ -63,7 +60,9 @@ class LandmarkElimination:
         """Memory of the cached nodes [bytes]."""
         return sum(part.nbytes for part in self._cache.values())
 
-    def revise(self, matrix: InformationMatrix, first: Array, changed: Int) -> None:
+    def revise(
+        self, matrix: InformationMatrix, first: Array, changed: IntArray
+    ) -> None:
         """Update the elimination order after rows changed, and drop invalid nodes."""
         nodes, dissected = self.dissection.revise(matrix, first, changed)
         invalid = with_ancestors(np.append(nodes, np.array(dissected, dtype=np.int64)))
@@ -74,8 +73,8 @@ class LandmarkElimination:
             self._cache.pop(node, None)
 
     def eliminate(
-        self, matrix: InformationMatrix, local: Int
-    ) -> tuple[list[Node], Array, Int]:
+        self, matrix: InformationMatrix, local: IntArray
+    ) -> tuple[list[Node], Array, IntArray]:
         """Eliminate all landmarks except the local ones.
 
         Returns
@@ -109,7 +108,7 @@ class LandmarkElimination:
         return [part.node for part in done.values()], done[1].update, slots
 
 
-def _by_node(slots: Int, nodes: Int) -> dict[int, Int]:
+def _by_node(slots: IntArray, nodes: IntArray) -> dict[int, IntArray]:
     """Group landmarks by their nodes."""
     order = slots[np.argsort(nodes[slots], kind="stable")]
     names, starts = np.unique(nodes[order], return_index=True)
@@ -119,8 +118,8 @@ def _by_node(slots: Int, nodes: Int) -> dict[int, Int]:
 
 def _eliminate(
     matrix: InformationMatrix,
-    own: Int,
-    beyond: NDArray[np.bool_],
+    own: IntArray,
+    beyond: BoolArray,
     children: list[_Eliminated],
 ) -> _Eliminated:
     """Eliminate a node's own landmarks; ``beyond`` marks those not below the node."""
@@ -147,18 +146,21 @@ class RestFactor:
     """Factor of all landmarks except the local ones, made when it is first used."""
 
     def __init__(
-        self, elimination: LandmarkElimination, matrix: InformationMatrix, local: Int
+        self,
+        elimination: LandmarkElimination,
+        matrix: InformationMatrix,
+        local: IntArray,
     ) -> None:
         self._elimination, self._matrix, self._local = elimination, matrix, local
-        self._done: tuple[list[Node], Array, Int] | None = None
+        self._done: tuple[list[Node], Array, IntArray] | None = None
 
-    def _eliminated(self) -> tuple[list[Node], Array, Int]:
+    def _eliminated(self) -> tuple[list[Node], Array, IntArray]:
         if self._done is None:
             self._done = self._elimination.eliminate(self._matrix, self._local)
         return self._done
 
     @property
-    def slots(self) -> Int:
+    def slots(self) -> IntArray:
         """The eliminated landmarks, H."""
         return self._eliminated()[2]
 
@@ -181,7 +183,7 @@ class RestFactor:
         substitute_back(nodes, values)
         return -values[pairs(slots)]
 
-    def covariance(self, slots: Int) -> tuple[Array, Array]:
+    def covariance(self, slots: IntArray) -> tuple[Array, Array]:
         """Return blocks of Λ_HH⁻¹ and rows of T.
 
         Parameters
@@ -207,7 +209,7 @@ class RestFactor:
                 response[:, column] = -remainder[unknown]
         return covariance, response
 
-    def border(self) -> tuple[Int, Int]:
+    def border(self) -> tuple[IntArray, IntArray]:
         """Return the columns of B in the local map, and in the root's front."""
         place = np.full(len(self._matrix), -1)
         place[self._local] = np.arange(len(self._local))

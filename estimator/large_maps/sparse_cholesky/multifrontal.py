@@ -18,20 +18,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 from scipy.sparse import csc_array
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
+from ....arrays import Array, IntArray
 
 
 class Node(NamedTuple):
     """One eliminated front."""
 
-    own: Int
+    own: IntArray
     """p, the unknowns that the node eliminates."""
-    rest: Int
+    rest: IntArray
     """r, the unknowns that the front links with them."""
     lower: Array
     """L, shape (p, p)."""
@@ -44,7 +42,7 @@ class Node(NamedTuple):
         return sum(array.nbytes for array in self)
 
 
-def eliminate(front: Array, own: Int, rest: Int) -> tuple[Node, Array]:
+def eliminate(front: Array, own: IntArray, rest: IntArray) -> tuple[Node, Array]:
     """Eliminate the first unknowns of a front.
 
     Parameters

@@ -4,15 +4,13 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from ....arrays import Array, IntArray
 from .information_matrix import InformationMatrix
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 Solver = Callable[[Array], Array]
 
 LARGEST_DENSE = 150
@@ -45,9 +43,9 @@ class SchurComplement(NamedTuple):
     where B ⊂ L are the local landmarks linked with H.
     """
 
-    slots: Int
+    slots: IntArray
     """H."""
-    border: Int
+    border: IntArray
     """Columns of B in L, shape (c,)."""
     response: Array
     """T, shape (2h, c); not computed, (0, c), if H is the whole rest of the map."""
@@ -62,7 +60,7 @@ class SubsetFactor:
     def __init__(
         self,
         matrix: InformationMatrix,
-        slots: Int,
+        slots: IntArray,
         response: Array,
         solve: Solver | None = None,
     ) -> None:
@@ -85,7 +83,7 @@ class SubsetFactor:
 
 
 def eliminate_subset(
-    matrix: InformationMatrix, local: Int, subset: Int
+    matrix: InformationMatrix, local: IntArray, subset: IntArray
 ) -> SchurComplement:
     """Eliminate some landmarks around a local map.
 
@@ -110,7 +108,7 @@ def eliminate_subset(
     )
 
 
-def solver(matrix: InformationMatrix, slots: Int) -> Solver:
+def solver(matrix: InformationMatrix, slots: IntArray) -> Solver:
     """Factorise the rows and columns of some landmarks."""
     if not len(slots):
         return np.copy

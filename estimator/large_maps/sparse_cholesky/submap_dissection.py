@@ -16,10 +16,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
+from ....arrays import Array, IntArray
 
 
 class Part(NamedTuple):
@@ -27,15 +25,15 @@ class Part(NamedTuple):
 
     submap: int
     """-1 if the part joins the two most recent parts that are not joined yet."""
-    interior: Int
+    interior: IntArray
     """Unknowns that no submap outside the part touches."""
-    border: Int
+    border: IntArray
     """All other unknowns of the part."""
-    places: tuple[Int, ...]
+    places: tuple[IntArray, ...]
     """Positions in (interior, border) of the submap's or each half's unknowns."""
 
 
-def dissect(unknowns: Sequence[Int], positions: Array) -> list[Part]:
+def dissect(unknowns: Sequence[IntArray], positions: Array) -> list[Part]:
     """Halve the submaps recursively; return all parts, halves before their union.
 
     Parameters
@@ -48,7 +46,9 @@ def dissect(unknowns: Sequence[Int], positions: Array) -> list[Part]:
     touches = np.bincount(np.concatenate(unknowns))
     parts: list[Part] = []
 
-    def close(submap: int, pieces: Sequence[tuple[Int, Int]]) -> tuple[Int, Int]:
+    def close(
+        submap: int, pieces: Sequence[tuple[IntArray, IntArray]]
+    ) -> tuple[IntArray, IntArray]:
         """Join pieces (unknowns, number of submaps inside that touch each)."""
         union, places = np.unique(
             np.concatenate([piece[0] for piece in pieces]), return_inverse=True
@@ -63,7 +63,7 @@ def dissect(unknowns: Sequence[Int], positions: Array) -> list[Part]:
         parts.append(Part(submap, union[done], union[~done], where))
         return union[~done], inside[~done]
 
-    def halve(chosen: Int) -> tuple[Int, Int]:
+    def halve(chosen: IntArray) -> tuple[IntArray, IntArray]:
         if len(chosen) == 1:
             touched = unknowns[chosen[0]]
             return close(int(chosen[0]), [(touched, np.ones_like(touched))])
@@ -73,7 +73,9 @@ def dissect(unknowns: Sequence[Int], positions: Array) -> list[Part]:
     return parts
 
 
-def _halves(chosen: Int, unknowns: Sequence[Int], positions: Array) -> tuple[Int, Int]:
+def _halves(
+    chosen: IntArray, unknowns: Sequence[IntArray], positions: Array
+) -> tuple[IntArray, IntArray]:
     """Cut along x or y, whichever leaves fewer unknowns on both sides."""
     middle = len(chosen) // 2
     cuts = []

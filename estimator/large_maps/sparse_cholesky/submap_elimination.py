@@ -3,13 +3,12 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
+from ....arrays import Array
 from .multifrontal import Node, eliminate, marginal_covariance, substitute_back
 from .submap_dissection import Part
 
-Array = NDArray[np.float64]
 Quadratic = tuple[Array, Array, float]
 """(H, g, c) of the function c − 2 gᵀ x + xᵀ H x."""
 

@@ -3,10 +3,8 @@
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
+from ....arrays import Array, IntArray
 
 SMALLEST_LOCAL_MAP = 50
 """Smallest number of landmarks in a new local map."""
@@ -29,8 +27,8 @@ def local_map_size(mapped: int, readings: int, required: int) -> int:
 
 
 def choose_local(
-    mapped: Int, points: Array, centre: Array, required: Int, size: int
-) -> Int:
+    mapped: IntArray, points: Array, centre: Array, required: IntArray, size: int
+) -> IntArray:
     """Return the required landmarks and those nearest to a point, ``size`` in all."""
     distances = ((points[mapped] - centre) ** 2).sum(axis=1)
     count = min(size, len(mapped))
@@ -53,6 +51,6 @@ def larger_elimination_count(count: float) -> float:
     return GROWTH * count if count < GROWTH * FIRST_COUNT else inf
 
 
-def union(first: Int, second: Int) -> Int:
+def union(first: IntArray, second: IntArray) -> IntArray:
     """Return the first slots, then those of the second that are not among them."""
     return np.concatenate([first, second[~np.isin(second, first)]])

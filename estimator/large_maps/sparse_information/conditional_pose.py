@@ -14,14 +14,11 @@ pose that is known exactly or a robot that cannot slip sideways.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from ....arrays import Array, BoolArray, IntArray
 from ...models.unicycle_motion import predict_pose
 from ..sparse_cholesky.coordinates import pairs
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 LARGEST_HEADING_STD = 0.3
 """The pose is not taken from measurements with a larger heading uncertainty [rad]."""
@@ -40,7 +37,7 @@ class ConditionalPose(NamedTuple):
     """x̄, the linearisation point of every base except "ekf", shape (2,) [m]."""
 
     @property
-    def is_linked(self) -> Flags:
+    def is_linked(self) -> BoolArray:
         """Which local landmarks are active, i.e. linked with the pose, shape (k,)."""
         return np.asarray(self.gain.any(axis=0).reshape(-1, 2).any(axis=1))
 
@@ -56,10 +53,10 @@ class LinearScan(NamedTuple):
     """H_l, shape (n, 2, 2)."""
     variance: Array
     """Diagonal of Q, shape (n, 2)."""
-    landmarks: NDArray[np.int64]
+    landmarks: IntArray
     """Positions of the landmarks in the local map, shape (n,)."""
 
-    def subset(self, chosen: Flags) -> "LinearScan":
+    def subset(self, chosen: BoolArray) -> "LinearScan":
         """Return some of the measurements."""
         return LinearScan(
             self.innovation[chosen],
@@ -175,7 +172,7 @@ def relocate(
 
 
 def cut_links(
-    pose: ConditionalPose, information: Array, weak: Flags
+    pose: ConditionalPose, information: Array, weak: BoolArray
 ) -> ConditionalPose:
     """Remove the links between the pose and weak landmarks, as the SEIF does.
 

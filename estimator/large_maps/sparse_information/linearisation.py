@@ -12,15 +12,12 @@ a landmark use the same l̄, the information of the whole map does not observe i
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, IntArray
 from ...models.angles import wrap_angle
 from ...models.bearing_range import predict_measurement
 from .conditional_pose import ConditionalPose, LinearScan
 from .local_information import LocalInformation
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 ESTIMATE, FIRST, CONSTRAINED = BASES = (
     "ekf",
@@ -33,7 +30,7 @@ def linearise_scan(
     base: str,
     local: LocalInformation,
     pose: ConditionalPose,
-    places: Int,
+    places: IntArray,
     readings: Array,
     variance: Array,
 ) -> LinearScan:
@@ -83,7 +80,7 @@ def linearise_new_landmarks(
     base: str,
     local: LocalInformation,
     pose: ConditionalPose,
-    places: Int,
+    places: IntArray,
     variance: Array,
 ) -> LinearScan:
     """Linearise the first measurements of landmarks, at the initial estimates.

@@ -3,18 +3,14 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve, lapack
 
+from ....arrays import Array, BoolArray, IntArray
 from ..sparse_cholesky.coordinates import pairs
 from ..sparse_cholesky.information_matrix import InformationMatrix
 from ..sparse_cholesky.landmark_elimination import LandmarkElimination, RestFactor
 from ..sparse_cholesky.schur_complement import SchurComplement, eliminate_subset
 from .conditional_pose import ConditionalPose, MapMeasurement
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 
 class SparseMap:
@@ -45,7 +41,7 @@ class SparseMap:
 class FixedLandmarks:
     """Landmarks O linked with the eliminated ones, held at their means."""
 
-    slots: Int
+    slots: IntArray
     """O."""
     response: Array
     """W = Λ_OH T, shape (2o, c): their residual is b + W δ_B."""
@@ -74,7 +70,7 @@ class LocalInformation:
     Λ_LL − C gives the same solution for L as the whole map.
     """
 
-    slots: Int
+    slots: IntArray
     points: Array
     """Means, shape (2k,) [m]."""
     first: Array
@@ -122,7 +118,7 @@ class LocalInformation:
         moved = pose._replace(mean=pose.mean + pose.gain @ delta)
         return replace(self, points=self.points + delta), moved
 
-    def extended(self, slots: Int, points: Array) -> "LocalInformation":
+    def extended(self, slots: IntArray, points: Array) -> "LocalInformation":
         """Append landmarks without information, at these points."""
         return replace(
             self,
@@ -132,7 +128,7 @@ class LocalInformation:
             information=np.pad(self.information, (0, 2 * len(slots))),
         )
 
-    def without(self, gone: Flags, information: Array) -> "LocalInformation":
+    def without(self, gone: BoolArray, information: Array) -> "LocalInformation":
         """Drop landmarks, shape (k,); ``information`` is that of the others."""
         rest = ~np.repeat(gone, 2)
         place = np.cumsum(rest) - 1
@@ -147,7 +143,7 @@ class LocalInformation:
 
 
 def begin_local_map(
-    map_: SparseMap, pose: ConditionalPose, slots: Int, count: float
+    map_: SparseMap, pose: ConditionalPose, slots: IntArray, count: float
 ) -> tuple[LocalInformation, ConditionalPose]:
     """Choose local landmarks, and eliminate landmarks around them.
 
@@ -197,7 +193,7 @@ def begin_local_map(
     return local.settle(pose, residual)
 
 
-def _eliminate(map_: SparseMap, slots: Int, count: float) -> SchurComplement:
+def _eliminate(map_: SparseMap, slots: IntArray, count: float) -> SchurComplement:
     """Eliminate the nearest landmarks by links, or the whole rest of the map."""
     matrix = map_.information
     if count >= len(matrix) - len(slots):

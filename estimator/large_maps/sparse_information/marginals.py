@@ -4,17 +4,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from ....arrays import Array, IntArray
 from ..sparse_cholesky.coordinates import pairs
 from ..sparse_cholesky.landmark_elimination import RestFactor
 from ..sparse_cholesky.schur_complement import SchurComplement
 from .conditional_pose import ConditionalPose
 from .local_information import LocalInformation, SparseMap
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 class Marginal(NamedTuple):
@@ -31,7 +28,7 @@ def marginal(
     local: LocalInformation,
     rest: RestFactor,
     pose: ConditionalPose,
-    slots: Int,
+    slots: IntArray,
 ) -> Marginal:
     """Return the marginal of the pose and some landmarks.
 

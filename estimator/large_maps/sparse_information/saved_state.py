@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ....arrays import IntArray
 from ...support import argument_checks
 from ..sparse_cholesky.landmark_elimination import RestFactor
 from ..sparse_cholesky.schur_complement import Factor, SchurComplement, SubsetFactor
@@ -14,7 +15,6 @@ from .local_information import FixedLandmarks, LocalInformation, SparseMap
 from .sparse_belief import SparseBelief
 
 Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 _PARTS = {
     "matrix": ("counts", "links", "blocks"),
@@ -116,7 +116,9 @@ def _slots(state: Mapping[str, Any], count: int) -> tuple[dict[int, int], list[i
     return dict(zip(ids, slots, strict=True)), free
 
 
-def _eliminated(map_: SparseMap, local: Int, around: dict[str, Any]) -> SchurComplement:
+def _eliminated(
+    map_: SparseMap, local: IntArray, around: dict[str, Any]
+) -> SchurComplement:
     """Return the saved complement; its factor is made when it is first used."""
     slots, response = around["slots"], around["response"]
     factor: Factor = SubsetFactor(map_.information, slots, response)
@@ -125,7 +127,9 @@ def _eliminated(map_: SparseMap, local: Int, around: dict[str, Any]) -> SchurCom
     return SchurComplement(**around, factor=factor)
 
 
-def _load_dissection(state: Mapping[str, Any], map_: SparseMap, local: Int) -> None:
+def _load_dissection(
+    state: Mapping[str, Any], map_: SparseMap, local: IntArray
+) -> None:
     """Load the elimination order; insert landmarks that it does not contain."""
     matrix, count = map_.information, len(map_.information)
     nodes = np.asarray(state["nodes"])

@@ -6,9 +6,10 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import lapack, solve_triangular
 
+from ....arrays import Array, BoolArray, IntArray
 from ...filters.ekf import EkfSlam
 from ...filters.scan_workspace import not_positive_definite
 from ...support import argument_checks
@@ -16,19 +17,15 @@ from .conditional_pose import ConditionalPose, LinearScan, marginalise_pose
 from .linearisation import BASES, linearise_scan
 from .local_information import LocalInformation
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
-Flags = NDArray[np.bool_]
-
 
 class Screened(NamedTuple):
     """n measurements of mapped landmarks, m of which are used."""
 
-    skipped: Flags
+    skipped: BoolArray
     """Landmark expected below the minimum range, shape (n,)."""
-    gated: Flags
+    gated: BoolArray
     """Rejected by the gate, shape (n,)."""
-    near: Flags
+    near: BoolArray
     """Robot within 10 σ of the landmark, shape (n,)."""
     scan: LinearScan
     """The m used measurements, linearised at the prior."""
@@ -85,7 +82,7 @@ class ScanRules:
         self,
         pose: ConditionalPose,
         local: LocalInformation,
-        places: Int,
+        places: IntArray,
         readings: Array,
         ids: list[int],
     ) -> Screened:
@@ -134,7 +131,7 @@ def _squared_distances(innovation: Array, blocks: Array) -> Array:
     return np.asarray((innovation * solved).sum(axis=1))
 
 
-def _is_too_near(scan: LinearScan, blocks: Array, distance: Array) -> Flags:
+def _is_too_near(scan: LinearScan, blocks: Array, distance: Array) -> BoolArray:
     """Return whether the robot is within 10 σ of each landmark, as :class:`EkfSlam`.
 
     A landmark's covariance in the robot frame is H_l⁻¹ (S − Q) H_l⁻ᵀ.

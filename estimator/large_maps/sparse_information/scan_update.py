@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, IntArray
 from ...interface import UpdateReport
 from .conditional_pose import ConditionalPose
 from .local_information import LocalInformation
@@ -17,9 +17,6 @@ from .sparsification import (
     correct_and_relocate,
     prune,
 )
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 class Sparsity(NamedTuple):
@@ -46,7 +43,7 @@ def process_scan(
     sparsity: Sparsity,
     scan: tuple[Array, list[int]],
     slots: Mapping[int, int],
-    free_slots: Int,
+    free_slots: IntArray,
 ) -> ScanResult:
     """Return belief and report after a scan, without changing the old belief.
 
@@ -86,7 +83,7 @@ def process_scan(
         pose = prune(local, pose, seen, sparsity.bound)
     close = np.sort(np.append(np.flatnonzero(~far), mapped[screened.skipped]))
 
-    def of(rows: Int) -> tuple[int, ...]:
+    def of(rows: IntArray) -> tuple[int, ...]:
         return tuple(ids[k] for k in rows.tolist())
 
     report = UpdateReport(
@@ -118,7 +115,7 @@ def _absorb(
 
 
 def _exceeds_bound(
-    pose: ConditionalPose, seen: Int, new: int, sparsity: Sparsity
+    pose: ConditionalPose, seen: IntArray, new: int, sparsity: Sparsity
 ) -> bool:
     """Return whether a scan makes too many landmarks active and can give a new pose.
 

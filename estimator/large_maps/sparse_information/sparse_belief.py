@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, BoolArray, IntArray
 from ..sparse_cholesky.coordinates import pairs
 from ..sparse_cholesky.landmark_elimination import RestFactor
 from .active_set import (
@@ -26,10 +26,6 @@ from .local_information import (
 )
 from .marginals import Marginal, marginal, means
 from .sparsification import State, marginalise, merge_landmarks
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass
@@ -63,7 +59,7 @@ class SparseBelief:
         local, start = begin_local_map(map_, start, nothing, FIRST_COUNT)
         return cls({}, [], map_, local, start, pose[:2].copy())
 
-    def free_slots(self, count: int) -> Int:
+    def free_slots(self, count: int) -> IntArray:
         """Return slots for new landmarks."""
         fresh = len(self.slots) + len(self.free)
         slots = self.free[::-1] + list(range(fresh, fresh + count))
@@ -130,7 +126,7 @@ class SparseBelief:
         points = means(self.map_, self.local).reshape(-1, 2)
         return points[list(self.slots.values())]
 
-    def ids_of(self, slots: Int) -> tuple[int, ...]:
+    def ids_of(self, slots: IntArray) -> tuple[int, ...]:
         """Return the landmarks in these slots, in the order of the belief."""
         chosen = set(slots.tolist())
         return tuple(i for i, slot in self.slots.items() if slot in chosen)
@@ -150,7 +146,7 @@ class SparseBelief:
         stored = map_.information.nbytes + map_.elimination.nbytes
         return stored + sum(array.nbytes for array in arrays)
 
-    def _include_links(self, ids: Sequence[int], *, exact: bool) -> Flags:
+    def _include_links(self, ids: Sequence[int], *, exact: bool) -> BoolArray:
         """Add landmarks and all their links to the local map; return their flags."""
         slots = np.array([self.slots[i] for i in ids])
         linked = np.append(slots, self.map_.information.neighbours(slots))
@@ -158,7 +154,7 @@ class SparseBelief:
         self._change_local_map(chosen, self._first_count(exact=exact))
         return np.isin(self.local.slots, slots)
 
-    def _drop(self, ids: Sequence[int], gone: Flags, rest: State) -> None:
+    def _drop(self, ids: Sequence[int], gone: BoolArray, rest: State) -> None:
         """Replace the local map by one without some landmarks; free their slots."""
         stays = np.repeat(~gone, 2)
         information = np.where(stays & stays[:, None], self.local.information, 0.0)
@@ -174,7 +170,7 @@ class SparseBelief:
             return inf
         return first_elimination_count(self.count, enlarged=self.enlarged)
 
-    def _change_local_map(self, slots: Int, count: float) -> None:
+    def _change_local_map(self, slots: IntArray, count: float) -> None:
         """Write the local map back, and begin another one."""
         old, pose = self.local.slots, self.pose
         write_back(self.map_, self.local)

@@ -7,8 +7,9 @@ from math import inf
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ....arrays import Array
 from ...belief import Belief, MapView, describe_filter
 from ...interface import UpdateReport
 from ...models.angles import wrap_angle
@@ -21,8 +22,6 @@ from .saved_state import as_arrays, checked_state
 from .scan import ScanRules
 from .scan_update import ScanResult, Sparsity, process_scan
 from .sparse_belief import SparseBelief
-
-Array = NDArray[np.float64]
 
 
 class SparseInformationSlam:

@@ -1,16 +1,12 @@
 """Changes of the belief, with the steps that limit the links of the pose."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, BoolArray, IntArray
 from ...models.bearing_range import locate_landmark
 from .conditional_pose import ConditionalPose, LinearScan, correct, cut_links, relocate
 from .linearisation import linearise_new_landmarks, linearise_scan
 from .local_information import LocalInformation
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 State = tuple[LocalInformation, ConditionalPose]
 
@@ -48,7 +44,7 @@ def correct_and_relocate(
 
 
 def add_landmarks(
-    base: str, state: State, slots: Int, readings: Array, variance: Array
+    base: str, state: State, slots: IntArray, readings: Array, variance: Array
 ) -> State:
     """Initialise new landmarks from their first measurements, shape (n, 2)."""
     local, pose = state
@@ -61,7 +57,7 @@ def add_landmarks(
 
 
 def prune(
-    local: LocalInformation, pose: ConditionalPose, seen: Int, bound: float
+    local: LocalInformation, pose: ConditionalPose, seen: IntArray, bound: float
 ) -> ConditionalPose:
     """Cut the weakest links of the pose; links to just measured landmarks go last."""
     linked = pose.is_linked
@@ -76,7 +72,9 @@ def prune(
     return cut_links(pose, local.information, weak)
 
 
-def marginalise(local: LocalInformation, pose: ConditionalPose, gone: Flags) -> State:
+def marginalise(
+    local: LocalInformation, pose: ConditionalPose, gone: BoolArray
+) -> State:
     """Marginalise landmarks whose links are all local.
 
     With 0 the marginalised landmarks and r the rest::
@@ -99,7 +97,7 @@ def marginalise(local: LocalInformation, pose: ConditionalPose, gone: Flags) -> 
 
 
 def merge_landmarks(
-    local: LocalInformation, pose: ConditionalPose, kept: int, gone: Flags
+    local: LocalInformation, pose: ConditionalPose, kept: int, gone: BoolArray
 ) -> State:
     """Condition on two landmarks being the same; drop the second.
 

@@ -2,15 +2,11 @@
 
 from collections.abc import Collection
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ....arrays import Array
 from ...filters.ekf import EkfSlam
 from ...filters.map_filter import FRAMES
 from .gaussian import Gaussian
 from .landmark_index import LandmarkIndex, link_name
-
-Array = NDArray[np.float64]
 
 ORIGIN = (0.0, 0.0, 0.0)
 

@@ -1,11 +1,9 @@
 """Frame of the active submap, by composition of the submaps before it."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array
 from ...models.rigid_motion import compose
-
-Array = NDArray[np.float64]
 
 
 class Chain:

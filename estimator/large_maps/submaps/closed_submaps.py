@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, IntArray
 from ...error_frames import ErrorFrame
 from .frame_initialisation import (
     FrameInitialisation,
@@ -17,9 +17,6 @@ from .joining import JoinedMap
 from .merging import merged
 from .neighbourhood import Region
 from .store import Submap, SubmapStore
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 ROUGHLY_CONVERGED = 0.1
 """Decrement at which to stop while computing initial frames."""
@@ -53,7 +50,7 @@ class ClosedSubmaps:
         """Slots of the landmarks in the submaps, including links."""
         self._initialisation = FrameInitialisation()
         self._joined: JoinedMap | None = None
-        self._whole: tuple[Int, Gaussian] | None = None
+        self._whole: tuple[IntArray, Gaussian] | None = None
 
     def __len__(self) -> int:
         return len(self.summaries)
@@ -111,7 +108,9 @@ class ClosedSubmaps:
             self._joined = JoinedMap(self.load, self.summaries, self._frame, frames)
         return self._joined
 
-    def marginal(self, slots: Int, known: Array, *, remember: bool = False) -> Gaussian:
+    def marginal(
+        self, slots: IntArray, known: Array, *, remember: bool = False
+    ) -> Gaussian:
         """Return the last frame and some landmarks, given the first frame.
 
         Parameters
@@ -132,8 +131,8 @@ class ClosedSubmaps:
         return self._whole[1]
 
     def near(
-        self, slots: Int, count: int, region: Region, known: Array
-    ) -> tuple[Int, Region]:
+        self, slots: IntArray, count: int, region: Region, known: Array
+    ) -> tuple[IntArray, Region]:
         """Return which of some landmarks lie within a region, and the actual region.
 
         Parameters

@@ -15,14 +15,12 @@ Gaussian, N(0, P).
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from ....arrays import Array
 from ...error_frames import ErrorFrame
 from ...models.angles import wrap_angle
 from .gaussian import Complex, points_of, state_of
-
-Array = NDArray[np.float64]
 
 SMALLEST_RATIO = 1e-5
 """Lower bound of a standard deviation, relative to the largest of the submap."""

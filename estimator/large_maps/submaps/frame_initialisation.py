@@ -12,14 +12,12 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, IntArray
 from ...models.rigid_motion import compose
 from .factor import regularised
 from .store import Submap
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 Refine = Callable[[int, int, Array], Array]
 
 LARGEST_COMPOSED = 4
@@ -29,7 +27,7 @@ LARGEST_COMPOSED = 4
 class SubmapSummary(NamedTuple):
     """The part of a closed submap that stays in memory."""
 
-    slots: Int
+    slots: IntArray
     """Its landmarks, shape (n,)."""
     mean: Array
     """As in the submap, shape (3 + 2n,)."""

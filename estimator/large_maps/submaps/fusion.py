@@ -12,9 +12,9 @@ orientation of the whole map.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
 
+from ....arrays import Array, IntArray
 from ...error_frames import ErrorFrame, invariant_covariance
 from ...interface import Belief
 from ...models.rigid_motion import compose
@@ -22,12 +22,12 @@ from ..sparse_cholesky.coordinates import pairs
 from .factor import retract
 from .gaussian import Gaussian, points_of, state_of, times
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
-
 
 def fuse(
-    world: Gaussian, local: Gaussian, frame: ErrorFrame, common: tuple[Int, Int]
+    world: Gaussian,
+    local: Gaussian,
+    frame: ErrorFrame,
+    common: tuple[IntArray, IntArray],
 ) -> Gaussian:
     """Fuse the active submap with the map.
 
@@ -77,7 +77,7 @@ def _root(S: Array) -> Array:
 
 
 def _difference(
-    mean: Array, own: Array, frame: ErrorFrame, common: tuple[Int, Int]
+    mean: Array, own: Array, frame: ErrorFrame, common: tuple[IntArray, IntArray]
 ) -> tuple[Array, Array]:
     """Return the Jacobian by (ξ, local error), and the innovation."""
     count = len(common[0])
@@ -98,7 +98,7 @@ def _difference(
 
 
 def _composed(
-    mean: Array, own: Array, covariance: Array, frame: ErrorFrame, known: Int
+    mean: Array, own: Array, covariance: Array, frame: ErrorFrame, known: IntArray
 ) -> Gaussian:
     """Return robot, map and new landmarks in the world, with additive error."""
     fresh = np.setdiff1d(np.arange((len(own) - 3) // 2), known)
@@ -125,7 +125,9 @@ def _composed(
     return Gaussian(state_of(points, float(pose[2])), (moved + moved.T) / 2)
 
 
-def part_of(map_: Gaussian, order: Int, wanted: Int, ids: tuple[int, ...]) -> Belief:
+def part_of(
+    map_: Gaussian, order: IntArray, wanted: IntArray, ids: tuple[int, ...]
+) -> Belief:
     """Return the marginal of the pose and some landmarks.
 
     Parameters

@@ -4,9 +4,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ....arrays import Array
 
 ITERATIONS, HALVINGS, MEMORY = 100, 8, 5
 

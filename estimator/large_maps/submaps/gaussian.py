@@ -6,10 +6,10 @@ With a point (x, y) as x + iy, the rotation R(θ) is e^{iθ} and J = [0 −1; 1 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from ....arrays import Array, ComplexArray
+
+Complex = ComplexArray
 
 
 class Gaussian(NamedTuple):

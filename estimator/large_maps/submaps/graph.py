@@ -1,8 +1,8 @@
 """The graph of a run: closed submaps, the active submap, and their common landmarks."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, IntArray
 from ...interface import Belief
 from ...models.angles import wrap_angle
 from ...models.rigid_motion import compose
@@ -15,10 +15,7 @@ from .landmark_index import LandmarkIndex
 from .neighbourhood import Region
 from .store import Submap
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
-
-NO_SLOTS: Int = np.empty(0, dtype=np.int64)
+NO_SLOTS: IntArray = np.empty(0, dtype=np.int64)
 
 
 class SubmapGraph:
@@ -137,14 +134,14 @@ class SubmapGraph:
         self.index.remove(gone)
 
     @property
-    def _active_slots(self) -> Int:
+    def _active_slots(self) -> IntArray:
         return self.index.slots_of(self.active.names)
 
-    def _in_closed(self, slots: Int) -> Int:
+    def _in_closed(self, slots: IntArray) -> IntArray:
         """Return the slots that closed submaps hold."""
         return slots[[slot in self.closed.slots for slot in slots.tolist()]]
 
-    def _fused(self, closed: Int, world: Gaussian, ids: tuple[int, ...]) -> Belief:
+    def _fused(self, closed: IntArray, world: Gaussian, ids: tuple[int, ...]) -> Belief:
         """Fuse the active submap with closed landmarks; return a part of the result."""
         slots, active = self._active_slots, self.active
         _, in_world, in_local = np.intersect1d(closed, slots, return_indices=True)

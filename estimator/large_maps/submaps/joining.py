@@ -11,9 +11,9 @@ orientation.  Frame 0 is the start of the run, and fixed.
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 
+from ....arrays import Array, IntArray
 from ...error_frames import ErrorFrame
 from ..sparse_cholesky.coordinates import pairs
 from ..sparse_cholesky.submap_dissection import dissect
@@ -25,9 +25,6 @@ from .gauss_newton import Iterate, minimise
 from .gaussian import Gaussian
 from .private_landmarks import PrivateLandmarks, private_landmarks
 from .store import Submap
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 CONVERGED = 1e-9
 """Decrement at which to stop: the step is then below 1e-4 standard deviations."""
@@ -94,7 +91,7 @@ class JoinedMap:
         """Memory of the joined map, without the submaps [bytes]."""
         return self._factors.nbytes + self.frames.nbytes + self._points.nbytes
 
-    def marginal(self, slots: Int) -> Gaussian:
+    def marginal(self, slots: IntArray) -> Gaussian:
         """Return the last frame and some landmarks, given frame 0.
 
         Parameters
@@ -160,17 +157,17 @@ class JoinedMap:
         )
         return FactorError(error, jacobian if index else jacobian[:, 3:])
 
-    def _unknowns(self, index: int) -> Int:
+    def _unknowns(self, index: int) -> IntArray:
         """Return the unknowns of a submap: two frames, one if it is the first."""
         frames = np.arange(3 * max(index - 1, 0), 3 * index + 3)
         return np.concatenate([frames, 3 * self._count + pairs(self._shared[index])])
 
-    def _shared_rows(self, submap: Submap) -> Int:
+    def _shared_rows(self, submap: Submap) -> IntArray:
         """Return the rows of pose and shared landmarks in the state of a submap."""
         shared = np.flatnonzero(self._place[submap.slots] >= 0)
         return np.concatenate([np.arange(3), 3 + pairs(shared)])
 
-    def _private_landmarks(self, index: int, wanted: Int) -> PrivateLandmarks:
+    def _private_landmarks(self, index: int, wanted: IntArray) -> PrivateLandmarks:
         submap = self._load(index)
         rows = self._shared_rows(submap)
         error = self._error(index, submap.mean[rows])

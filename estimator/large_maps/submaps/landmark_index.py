@@ -8,11 +8,9 @@ have.  No belief contains it, and the same landmark seen again is a new one.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import IntArray
 from ...support.argument_checks import LOWEST_ID, LandmarkIds, refuse_reserved
-
-Int = NDArray[np.int64]
 
 
 class LandmarkIndex(Mapping[int, int]):
@@ -61,7 +59,7 @@ class LandmarkIndex(Mapping[int, int]):
         """Remove a landmark; return its slot, which is not used again."""
         return self._slots.pop(landmark_id)
 
-    def slots_of(self, names: Sequence[int]) -> Int:
+    def slots_of(self, names: Sequence[int]) -> IntArray:
         """Return the slots of landmarks and links by their names, shape (n,)."""
         slots = (self._slots.get(name) for name in names)
         known = [

@@ -7,14 +7,12 @@ so that the result depends only on the submap and on the list of merged landmark
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array
 from ...error_frames import ErrorFrame
 from ...filters.marginalise_and_merge import coincide, without_landmarks
 from .factor import retract
 from .store import Submap
-
-Array = NDArray[np.float64]
 
 
 def merged(submap: Submap, renamed: Mapping[int, int], frame: ErrorFrame) -> Submap:

@@ -13,16 +13,14 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ....arrays import Array, IntArray
 from ...filters.invariant import InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport
 from ...support import argument_checks
 from ...support.argument_checks import LandmarkIds
 from .store import LostSubmapError
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 LARGEST_COUNT = 1000
 """Largest number of landmarks of closed submaps in a neighbourhood."""
@@ -57,7 +55,7 @@ class Region(NamedTuple):
         away = float(np.hypot(*(position - self.centre)))
         return away + within + self.slack <= self.radius
 
-    def chosen(self, points: Array) -> tuple[Int, Region]:
+    def chosen(self, points: Array) -> tuple[IntArray, Region]:
         """Return which landmarks (n, 2) lie in the disc, and the disc.
 
         If there are too many, the nearest and a smaller disc.

@@ -3,17 +3,14 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
+from ....arrays import Array, IntArray
 from ...error_frames import ErrorFrame
 from ..sparse_cholesky.coordinates import pairs
 from .factor import FactorError, inverse_spread, regularised
 from .gaussian import times
 from .store import Submap
-
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 class PrivateLandmarks(NamedTuple):
@@ -29,8 +26,8 @@ class PrivateLandmarks(NamedTuple):
 
 def private_landmarks(
     submap: Submap,
-    shared: Int,
-    wanted: Int,
+    shared: IntArray,
+    wanted: IntArray,
     start: Array,
     factor: FactorError,
     frame: ErrorFrame,

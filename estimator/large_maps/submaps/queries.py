@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ....arrays import Array
 from ...belief import describe_map
 from ...interface import Belief
 from ...support import argument_checks
 from ...support.argument_checks import LandmarkIds
 from .graph import SubmapGraph
 from .neighbourhood import Neighbourhood
-
-Array = NDArray[np.float64]
 
 
 class SubmapQueries:

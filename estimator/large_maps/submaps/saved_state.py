@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ....arrays import IntArray
 from ...support import argument_checks
 from .active_submap import ActiveSubmap
 from .chain import Chain
@@ -17,7 +18,6 @@ from .merging import merged
 from .store import FolderStore, MemoryStore, Submap, SubmapStore
 
 Array = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 SHAPES = {
     "start": (4, 3),
@@ -115,7 +115,7 @@ def _part(state: Mapping[str, Any], start: str) -> dict[str, Any]:
     return {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}
 
 
-def _numbers(state: Mapping[str, Any], key: str, limit: int) -> Int:
+def _numbers(state: Mapping[str, Any], key: str, limit: int) -> IntArray:
     numbers = np.asarray(state[key])
     if numbers.dtype.kind != "i" or not ((numbers >= 0) & (numbers < limit)).all():
         raise ValueError(f"state[{key!r}] must be whole numbers from 0 to {limit - 1}")

@@ -9,10 +9,8 @@ from typing import NamedTuple, Protocol
 from uuid import uuid4
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Int = NDArray[np.int64]
+from ....arrays import Array, IntArray
 
 CACHE_SIZE = 8
 """Number of submaps of a folder that are kept in memory."""
@@ -28,7 +26,7 @@ class LostSubmapError(ValueError):
 class Submap(NamedTuple):
     """A closed submap in its own frame."""
 
-    slots: Int
+    slots: IntArray
     """Slots of its landmarks in the whole map, shape (n,)."""
     mean: Array
     """Last pose, where the next submap begins, and landmarks, shape (3 + 2n,)."""

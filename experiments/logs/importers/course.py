@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, IntArray
 from ..events import EventRecorder, OdometryRow, Reading, Scan, wrap_bearing
 from ..lines import LogError, LogLine, read_lines
 from ..slamlog import SlamLog
@@ -67,9 +67,7 @@ def read_course(path: str | PathLike[str]) -> SlamLog:
     )
 
 
-def _truth(
-    path: str | PathLike[str], first_scan: Scan
-) -> tuple[NDArray[np.int64], NDArray[np.float64], str]:
+def _truth(path: str | PathLike[str], first_scan: Scan) -> tuple[IntArray, Array, str]:
     """Return the ids, the true positions, and their source."""
     ids = np.arange(len(first_scan.measurements))
     world = world_beside(path)

@@ -15,14 +15,12 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, IntArray
 from ....evaluation.trajectory_error import poses_at
 from ..events import EventRecorder, OdometryRow, Reading, Scan, wrap_bearing
 from ..lines import LogError, LogLine, read_lines
 from ..slamlog import SlamLog
-
-Array = NDArray[np.float64]
 
 ODOMETRY_STEP = 0.1  # [s]
 TRUTH_STEP = 0.2  # [s]
@@ -137,7 +135,7 @@ def _read_barcodes(folder: Path) -> dict[int, int]:
     return {line.to_id(code): line.to_id(subject) for line, (subject, code) in pairs}
 
 
-def _read_landmarks(folder: Path) -> tuple[NDArray[np.int64], Array]:
+def _read_landmarks(folder: Path) -> tuple[IntArray, Array]:
     """Read subject numbers (n,) and true positions (n, 2) [m]."""
     lines = _lines(folder / "Landmark_Groundtruth.dat", "subject x y σx σy")
     rows = [(line, line.text.split()) for line in lines]

@@ -4,14 +4,14 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array, IntArray
 from ..lines import read_lines
 
 
 def read_world(
     path: str | PathLike[str],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[IntArray, Array]:
     """Read landmark ids (n,) and positions (n, 2) [m].
 
     Raises

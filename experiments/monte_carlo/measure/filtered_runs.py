@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import BoolArray
 from ....estimator.filters.batch import BatchSlam, can_batch
 from ....estimator.filters.batch_results import BatchTrace
 from ....estimator.filters.ekf import EkfSlam
@@ -13,8 +13,6 @@ from ....estimator.interface import Belief, SlamEstimator, SupportsTruth
 from ...runs.filter_settings import FilterSettings
 from ...runs.memory_check import refuse_large_maps
 from ...runs.simulated_runs import SimulatedRuns
-
-Array = NDArray[np.float64]
 
 _NOT_FINITE = "the pose, its covariance or the NIS is not finite"
 _MAP_NOT_FINITE = "the belief about the map is not finite"
@@ -148,7 +146,7 @@ def _step(
     return belief
 
 
-def _finite(trace: BatchTrace, where: Any = ...) -> NDArray[np.bool_]:
+def _finite(trace: BatchTrace, where: Any = ...) -> BoolArray:
     """Report where the trace is finite, shape (B, T), or (T,) or () of a part."""
     poses, covariances = trace.poses[where], trace.pose_covariances[where]
     known = np.isfinite(poses).all(axis=-1) & np.isfinite(trace.nis[where])

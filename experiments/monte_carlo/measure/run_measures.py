@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ....arrays import Array
 from ....estimator.error_frames import ERROR_FRAMES
 from ....estimator.interface import Belief
 from ....estimator.models.angles import wrap_angle
@@ -17,7 +18,6 @@ from ....evaluation.trajectory_error import ellipse_areas, position_accuracy
 from ...runs.simulated_runs import SimulatedRuns
 from .filtered_runs import Failure, FilteredRuns
 
-Array = NDArray[np.float64]
 Block = dict[str, NDArray[np.generic]]
 
 Value = NDArray[np.generic] | float

@@ -7,11 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import NDArray
 
+from ....arrays import AnyArray, Array
 from ...figures.style import ALARM, BLUE, INK, ORANGE, TEAL
-
-Array = NDArray[np.float64]
 
 PURPLE, SKY = "#cc79a7", "#56b4e9"  # Okabe, Ito
 _COLOURS = (BLUE, ORANGE, TEAL, PURPLE, SKY, ALARM)
@@ -53,8 +51,8 @@ def look_of(place: int) -> EstimatorLook:
 
 
 def thinned(
-    x: NDArray[Any], y: Array, *, most: int = _MOST_POINTS
-) -> tuple[NDArray[Any], Array]:
+    x: AnyArray, y: Array, *, most: int = _MOST_POINTS
+) -> tuple[AnyArray, Array]:
     """Leave out points of a line that would not be visible, but no peak.
 
     The line is cut into pieces; each keeps its lowest and its highest point.

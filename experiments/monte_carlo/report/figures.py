@@ -7,6 +7,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ....arrays import Array
 from ....estimator.error_frames import ErrorFrame
 from ....evaluation.chi_square import average_band, family_band
 from ...figures.style import GREY, INK, dress, new_figure
@@ -19,7 +20,7 @@ from .estimator_lines import (
     thinned,
 )
 from .nis_figures import nis_figure
-from .scores import POSE_FREEDOM, Array, EstimatorScores, labels_of, scores_of
+from .scores import POSE_FREEDOM, EstimatorScores, labels_of, scores_of
 
 Shown = list[tuple[EstimatorScores, EstimatorLook]]
 

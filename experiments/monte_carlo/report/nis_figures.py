@@ -6,10 +6,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.stats import chi2
 
+from ....arrays import Array
 from ....evaluation.whiteness import autocorrelation, normal_scores
 from ...figures.style import GREY, dress, new_figure
 from .estimator_lines import EstimatorLook, legend_above, plain
-from .scores import Array, EstimatorScores
+from .scores import EstimatorScores
 
 _MOST_BLOCKS = 60
 _LAGS = 10

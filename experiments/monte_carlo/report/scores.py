@@ -10,12 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from ....arrays import Array, BoolArray, IntArray
 from ....estimator.error_frames import ErrorFrame
 from ...runs.nan_statistics import quotient
-
-Array = NDArray[np.float64]
 
 POSE_FREEDOM, POINT_FREEDOM = 3, 2
 _FIRST = 1
@@ -38,14 +36,14 @@ class EstimatorScores(NamedTuple):
     label: str
     first: int
     """First step that has a NEES, >= 1."""
-    good: NDArray[np.bool_]
+    good: BoolArray
     """Which of all runs succeeded, shape (runs,)."""
     failures: tuple[FailedRun, ...]
     results: xr.Dataset
     """Of all runs and steps."""
 
     @property
-    def steps(self) -> NDArray[np.int64]:
+    def steps(self) -> IntArray:
         """Numbers of the steps after the start, shape (K,)."""
         return np.arange(_FIRST, self.results.sizes["step"])
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from ....arrays import Array
 from ....estimator.models.unicycle_motion import drive
-from ..trajectory import Array
 
 
 def dead_reckoning(start: Array, odometry: Array) -> Array:

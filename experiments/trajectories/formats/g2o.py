@@ -24,8 +24,9 @@ from typing import Any
 
 import numpy as np
 
+from ....arrays import Array
 from ....sim_configs import Scenario
-from ..trajectory import Array, Trajectory, array_of
+from ..trajectory import Trajectory, array_of
 from .dead_reckoning import dead_reckoning
 from .episode_files import numbers, read_metadata, write_lines, write_metadata
 

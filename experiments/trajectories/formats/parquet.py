@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from ....arrays import AnyArray, Array
 from ....sim_configs import Scenario
 from ....sim_configs.scenario_files import scenario_text
-from ..trajectory import Array, Trajectory, array_of, scenario_from_text
+from ..trajectory import Trajectory, array_of, scenario_from_text
 
 ENDING = ""
 LIBRARIES = ("pyarrow",)
@@ -91,25 +91,25 @@ def _step_table(trajectory: Trajectory) -> Any:
     return pa.table(columns)
 
 
-def _later(values: NDArray[Any]) -> Any:
+def _later(values: AnyArray) -> Any:
     """Prepend null, for the start, to a column."""
     return pa.array([None, *values.tolist()], type=pa.from_numpy_dtype(values.dtype))
 
 
-def _lists(rows: NDArray[Any]) -> Any:
+def _lists(rows: AnyArray) -> Any:
     """Return one list of fixed length per row."""
     flat = pa.array(np.ascontiguousarray(rows).ravel())
     return pa.FixedSizeListArray.from_arrays(flat, rows.shape[1])
 
 
 def _trajectory(episode: dict[str, Any], steps: Any) -> Trajectory:
-    def column(name: str) -> NDArray[Any]:
-        values: NDArray[Any] = steps[name].combine_chunks().to_numpy(False)
+    def column(name: str) -> AnyArray:
+        values: AnyArray = steps[name].combine_chunks().to_numpy(False)
         return values
 
-    def rows(name: str) -> NDArray[Any]:
+    def rows(name: str) -> AnyArray:
         flat = steps[name].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        table: NDArray[Any] = flat.reshape(steps.num_rows, -1)
+        table: AnyArray = flat.reshape(steps.num_rows, -1)
         return table
 
     def pairs(*names: str) -> Array:

@@ -14,11 +14,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ....arrays import Array
 from ....estimator.models.angles import wrap_angle
 from ....sim_configs import Scenario
-from ..trajectory import Array, Trajectory
+from ..trajectory import Trajectory
 from .dead_reckoning import dead_reckoning
 from .episode_files import numbers, read_metadata, write_lines, write_metadata
 
@@ -59,7 +59,7 @@ def _lines(poses: Array, dt: float) -> list[str]:
 
 
 def _poses(path: Path) -> Array:
-    table: NDArray[np.float64] = np.loadtxt(path, ndmin=2)
+    table: Array = np.loadtxt(path, ndmin=2)
     half = np.arctan2(table[:, 6], table[:, 7])
     heading = [wrap_angle(2.0 * angle) for angle in half.tolist()]
     return np.column_stack([table[:, 1:3], heading])
