@@ -38,12 +38,15 @@ def test_importing_slamgym_loads_nothing_heavy():
 @pytest.mark.slow
 def test_importing_slamgym_takes_hardly_longer_than_importing_gymnasium():
     code = """
-import gymnasium, time
-start = time.process_time()
+import time
+times = [time.process_time()]
+import gymnasium
+times.append(time.process_time())
 import slamgym
-print(time.process_time() - start)
+times.append(time.process_time())
+print((times[2] - times[1]) / (times[1] - times[0]))
 """
-    assert min(float(run_python(code)) for _ in range(3)) < 0.03
+    assert min(float(run_python(code)) for _ in range(3)) < 0.1
 
 
 def test_importing_the_estimators_loads_no_statistics_and_no_pictures():
