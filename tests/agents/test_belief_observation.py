@@ -381,6 +381,7 @@ def test_the_wrapper_survives_a_spec_written_as_json():
         np.testing.assert_array_equal(ours[key], theirs[key])
 
 
+@pytest.mark.slow
 def test_frames_show_the_belief():
     plain, shown = (world(render_mode="rgb_array") for _ in range(2))
     shown = BeliefObservation(shown, "ekf")
@@ -500,6 +501,7 @@ def test_a_belief_in_rows_keeps_every_number():
     assert np.count_nonzero(rows.covariances) == np.count_nonzero(kept)
 
 
+@pytest.mark.slow
 def test_the_example_shows_that_going_home_keeps_the_map_better(
     tmp_path, monkeypatch, capsys
 ):

@@ -58,12 +58,14 @@ def test_02_shows_that_the_ekf_says_less_than_half_of_its_heading_error(run):
     assert 0.9 < ratio["invariant"] < 1.15
 
 
+@pytest.mark.slow
 def test_03_replays_a_drive_of_its_own(run):
     printed = run("03_replay_the_course_log")
     assert printed.count("off by") == 2 * 6
     assert_picture("results/03_map.png")
 
 
+@pytest.mark.slow
 def test_03_reproduces_the_published_distances(run, public_logs):
     printed = run(
         "03_replay_the_course_log", str(public_logs / "raw" / "cmu16833" / "data.txt")
@@ -131,6 +133,7 @@ def test_06_turns_held_arrows_into_actions():
     assert "escape" in keys
 
 
+@pytest.mark.slow
 def test_07_draws_the_picture_of_the_readme(run):
     printed = run("07_honest_ellipses")
     assert "standard EKF: 0 of 20" in printed

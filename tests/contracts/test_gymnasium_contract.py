@@ -8,10 +8,11 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
+from presets import PRESETS
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.sim_configs import action_sequence, list_presets, load_scenario
+from slamgym.sim_configs import action_sequence, load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
 HIDDEN = {"scenario": "hidden_identities"}
@@ -23,7 +24,7 @@ def same(observation, other):
         np.testing.assert_array_equal(observation[key], other[key])
 
 
-@pytest.mark.parametrize("preset", list_presets())
+@pytest.mark.parametrize("preset", PRESETS)
 def test_gymnasiums_checker_finds_nothing_to_warn_of(preset):
     env = gym.make(ID, scenario=preset).unwrapped
     check_env(env)  # pytest makes an error of a warning
@@ -31,7 +32,7 @@ def test_gymnasiums_checker_finds_nothing_to_warn_of(preset):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", list_presets())
+@pytest.mark.parametrize("preset", PRESETS)
 def test_every_observation_of_an_episode_lies_in_its_space(preset):
     env = LandmarkWorldEnv(preset)
     rng = np.random.default_rng(0)
@@ -67,7 +68,7 @@ def test_keyword_arguments_survive_a_spec_written_as_json():
     same(env.reset(seed=0)[0], rebuilt.reset(seed=0)[0])
 
 
-@pytest.mark.parametrize("preset", list_presets())
+@pytest.mark.parametrize("preset", PRESETS)
 def test_a_scenario_as_plain_data_survives_a_spec_too(preset):
     scenario = load_scenario(preset)
     env = gym.make(ID, scenario=json.loads(json.dumps(scenario.model_dump())))

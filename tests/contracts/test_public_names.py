@@ -81,6 +81,7 @@ def test_a_package_lists_its_public_names_and_each_can_be_imported(stub):
     assert all(hasattr(package, name) for name in package.__all__)
 
 
+@pytest.mark.slow
 def test_a_public_name_is_the_object_and_not_the_module_of_the_same_name():
     code = (
         "import slamgym.estimator.check_estimator, slamgym.experiments.runs\n"

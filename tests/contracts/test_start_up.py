@@ -49,6 +49,7 @@ print((times[2] - times[1]) / (times[1] - times[0]))
     assert min(float(run_python(code)) for _ in range(3)) < 0.1
 
 
+@pytest.mark.slow
 def test_importing_the_estimators_loads_no_statistics_and_no_pictures():
     code = "import sys; from slamgym import EkfSlam; print(*sys.modules)"
     loaded = run_python(code).split()

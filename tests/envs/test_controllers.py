@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from presets import PRESETS
 
 from slamgym.envs.controllers import (
     CONTROLLERS,
@@ -13,7 +14,7 @@ from slamgym.envs.controllers import (
     make_controller,
     planned_path,
 )
-from slamgym.sim_configs import Robot, list_presets, load_scenario
+from slamgym.sim_configs import Robot, load_scenario
 
 ORIGIN = (0.0, 0.0, 0.0)
 ROBOT = Robot(max_speed=0.5, max_turn_rate=0.8)
@@ -91,7 +92,7 @@ def test_open_loop_clips_to_the_limits():
     assert driver.act(ORIGIN, 0).tolist() == [-0.5, 0.8]
 
 
-@pytest.mark.parametrize("name", list_presets())
+@pytest.mark.parametrize("name", PRESETS)
 def test_open_loop_drives_the_planned_path(name):
     scenario = load_scenario(name)
     controller = make_controller("open_loop", scenario, rng())
@@ -174,7 +175,7 @@ def test_step_zero_begins_with_the_first_waypoint_again():
     assert np.array_equal(driver.act(ORIGIN, 0), first)
 
 
-@pytest.mark.parametrize("name", list_presets())
+@pytest.mark.parametrize("name", PRESETS)
 def test_waypoints_keep_near_the_planned_path_of_a_preset(name):
     scenario = load_scenario(name)
     controller = make_controller("waypoints", scenario, rng())

@@ -547,6 +547,7 @@ def test_frames_are_pictures_of_the_present():
     env.close()
 
 
+@pytest.mark.slow
 def test_worlds_that_are_not_watched_load_no_matplotlib():
     code = (
         "import sys, slamgym, gymnasium\n"

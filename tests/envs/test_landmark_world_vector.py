@@ -259,6 +259,7 @@ def test_gymnasiums_episode_statistics_go_on_top():
 # --- pictures ---
 
 
+@pytest.mark.slow
 def test_frames_are_those_of_the_single_worlds():
     changes = {"render_mode": "rgb_array", **EVERYTHING}
     vector, other = native(2, **changes), sync(2, **changes)
@@ -273,6 +274,7 @@ def test_frames_are_those_of_the_single_worlds():
     other.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES[:2], ids=str)
 def test_pictures_follow_the_worlds_from_episode_to_episode(mode):
     changes = {"render_mode": "rgb_array", "steps": 3, "landmarks": EVERYTHING_MAP}

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from presets import PRESETS
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.controllers import (
@@ -13,7 +14,7 @@ from slamgym.envs.controllers import (
     make_controller,
     make_vector_controller,
 )
-from slamgym.sim_configs import Robot, list_presets, load_scenario
+from slamgym.sim_configs import Robot, load_scenario
 
 
 def generators(count):
@@ -26,7 +27,7 @@ def one_by_one(singles, poses, step):
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-@pytest.mark.parametrize("preset", list_presets())
+@pytest.mark.parametrize("preset", PRESETS)
 def test_every_robot_drives_as_with_a_controller_of_its_own(preset, name):
     scenario = load_scenario(preset).with_changes(steps=150)
     envs = [LandmarkWorldEnv(scenario) for _ in range(3)]

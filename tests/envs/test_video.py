@@ -40,6 +40,7 @@ def test_gif_keeps_white_and_shows_colours_that_come_later(tmp_path):
     np.testing.assert_allclose(last[3, 3], [213, 94, 0], atol=32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(40, 60), (41, 63)])
 def test_mp4_holds_every_frame(tmp_path, size):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")

@@ -733,6 +733,7 @@ def test_with_identities_the_default_policy_changes_nothing_in_closed_submaps():
     assert same(managed.belief(), bare.belief())
 
 
+@pytest.mark.slow
 def test_submaps_associate_as_a_full_filter_does():
     """Readings without identity, with clutter; landmarks vanish and come back."""
     full, joined = make("invariant", TIDY), make("submaps", TIDY, **SMALL)
@@ -802,6 +803,7 @@ def test_merging_true_duplicates_keeps_submaps_consistent():
     assert in_band(np.array(errors), 15)
 
 
+@pytest.mark.slow
 def test_the_capacity_of_submaps_counts_the_landmarks_far_away_too():
     landmarks = np.column_stack([np.arange(0, 42, 3.0), np.tile([3.0, -3.0], 7)])
     slam, gone = make("submaps", {"capacity": 8}, **SMALL), []

@@ -102,6 +102,7 @@ def test_the_figures_are_those_of_the_map_and_of_the_machine(leave):
         EkfSlam(*NOISE).update(readings, range(9000))
 
 
+@pytest.mark.slow
 def test_what_a_map_takes_is_what_its_filter_holds():
     slam = map_all(CompressedEkfSlam(*NOISE), 1000)
     map_all(slam, 1000)

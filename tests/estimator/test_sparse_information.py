@@ -116,6 +116,7 @@ def counted(report):
     return report.degrees_of_freedom, ids
 
 
+@pytest.mark.slow
 def test_without_a_bound_it_is_the_ekf_with_local_maps_that_change():
     full = map_all(EkfSlam(*NOISE), 300)
     slam = SparseInformationSlam(*NOISE, active_bound=None, tolerance=0.0)
@@ -276,6 +277,7 @@ def test_with_a_bound_links_stay_few_and_without_they_do_not():
     assert len(large.active_ids) <= 14
 
 
+@pytest.mark.slow
 def test_marginals_are_blocks_of_the_dense_inverse():
     slam = run(SparseInformationSlam(*NOISE, active_bound=12), wander(1000, 400))
     whole = slam.belief()
@@ -547,6 +549,7 @@ def test_pruning_is_the_step_of_the_seif():
     )
 
 
+@pytest.mark.slow
 def test_merging_is_an_exact_reading_that_two_landmarks_are_one():
     slam = run(SparseInformationSlam(*NOISE, active_bound=12), wander(1000, 300))
     far, active = slam.landmark_ids[0], slam.active_ids[-1]

@@ -368,6 +368,7 @@ def wide_laps(steps, seed=0):
         yield odometry, readings[ids], ids, pose
 
 
+@pytest.mark.slow
 def test_what_lies_around_is_a_part_of_a_large_map_and_moves_with_the_robot():
     slam = made(submap_size=12)
     seen, nees = [], []
@@ -449,6 +450,7 @@ def test_a_scan_for_which_it_is_taken_anew_counts_once():
     assert taken > 2
 
 
+@pytest.mark.slow
 def test_what_was_asked_once_is_not_held_for_ever():
     slam, sizes = made(submap_size=12), []
     surveys = surveys_of(slam)
@@ -464,6 +466,7 @@ def test_what_was_asked_once_is_not_held_for_ever():
     assert len(surveys) < 3 * slam.closed_count  # it is not taken anew in every step
 
 
+@pytest.mark.slow
 def test_when_it_is_taken_anew_it_holds_what_scans_tell_of():
     """Nobody asks how far they reach."""
     slam, closed, met = made(submap_size=12), 0, 0

@@ -66,6 +66,7 @@ def test_averages_of_a_filter_that_never_forgets_are_refused_as_often(runs):
     assert 0.035 <= np.mean(refused) <= 0.07
 
 
+@pytest.mark.slow
 def test_the_interval_of_the_time_averages_ends_where_they_are_refused():
     """Between them lies the correction for skewness and its inverse."""
     rng = np.random.default_rng(8)

@@ -41,6 +41,7 @@ def final_nees(drives, doubt=1.0):
     return np.array(nees)
 
 
+@pytest.mark.slow
 def test_final_nees_is_chi_square_in_a_world_anchored_at_the_start(drives):
     nees = final_nees(drives)
     low, high = ACCEPTED

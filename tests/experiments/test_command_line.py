@@ -429,6 +429,7 @@ def test_without_a_command_the_help_is_shown():
     assert printed() == printed("--help")
 
 
+@pytest.mark.slow
 def test_help_and_scenarios_load_neither_numba_nor_matplotlib():
     program = (
         "import sys\n"

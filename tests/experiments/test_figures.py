@@ -217,6 +217,7 @@ def test_view_is_the_same_at_every_step_and_holds_the_whole_run():
     assert ((low < points) & (points < high)).all()
 
 
+@pytest.mark.slow
 def test_one_huge_ellipse_does_not_make_all_others_tiny():
     huge = np.array([1e6 * np.eye(2), *make_trace().first_landmark_covariances[1:]])
     calm = typical(map_figure).axes[0]
@@ -445,6 +446,7 @@ def test_only_outer_panels_are_labelled():
     assert labels[-2:] == [("x [m]", "y [m]"), ("x [m]", "")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_any_number_of_variations_is_laid_out(count):
     figure = noise_study_figure([(str(k), make_trace()) for k in range(count)])
@@ -470,6 +472,7 @@ def small_figure():
     return figure
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
 def test_saved_figures_are_complete_and_equal(tmp_path, suffix):
     for name in ("one", "other"):

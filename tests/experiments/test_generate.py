@@ -16,6 +16,7 @@ import gymnasium
 import jobs_to_kill
 import numpy as np
 import pytest
+from presets import PRESETS
 
 from slamgym.envs.controllers import CONTROLLERS
 from slamgym.experiments.command_line import reporter
@@ -36,7 +37,7 @@ from slamgym.experiments.trajectories.generate import (
     generate_trajectories,
 )
 from slamgym.experiments.trajectories.manifest import checksum, read_manifest
-from slamgym.sim_configs import list_presets, load_scenario
+from slamgym.sim_configs import load_scenario
 
 LOOP = load_scenario("loop").with_changes(steps=30)
 RANGES = {"motion_std": [0.5, 2.0], "landmark_shift": 0.5}
@@ -68,7 +69,7 @@ def format_or_skip(name):
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-@pytest.mark.parametrize("preset", list_presets())
+@pytest.mark.parametrize("preset", PRESETS)
 def test_an_episode_is_the_log_that_slamgym_run_makes_of_its_seed(
     preset, controller, tmp_path
 ):

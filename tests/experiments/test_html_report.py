@@ -171,6 +171,7 @@ def test_the_scenario_can_be_taken_from_the_page():
     assert tomllib.loads(html.unescape(text))["name"] == "six_landmarks"
 
 
+@pytest.mark.slow
 def test_runs_that_all_failed_leave_a_page_without_figures():
     failures = [
         (label, run, 3, "boom") for label in ("ekf", "invariant") for run in range(40)

@@ -445,6 +445,7 @@ def test_wrong_utias_line_is_named(utias, name, line, message):
         read_log(utias)
 
 
+@pytest.mark.slow
 def test_public_utias_log_equals_its_slamlog(public_logs):
     end = 89.9  # the sample holds 90 s
     log = read_log(public_logs / "raw" / "utias_d6")

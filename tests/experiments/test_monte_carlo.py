@@ -184,6 +184,7 @@ def test_results_on_disk_are_those_in_memory(whole, tmp_path):
             assert written[name].attrs == whole[name].attrs, name
 
 
+@pytest.mark.slow
 def test_more_runs_build_on_those_there_are(whole, tmp_path):
     monte_carlo(
         "six_landmarks", "ekf,invariant", 12, block_size=8, out=tmp_path
@@ -205,6 +206,7 @@ def test_more_runs_build_on_those_there_are(whole, tmp_path):
         xr.testing.assert_equal(fewer.load(), whole.isel(run=slice(0, 18)))
 
 
+@pytest.mark.slow
 def test_parts_of_two_machines_are_one_job(whole, tmp_path):
     job = {"estimators": "ekf,invariant", "block_size": 8}
     one, two, both = (tmp_path / name for name in ("one", "two", "both"))

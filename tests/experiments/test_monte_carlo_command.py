@@ -150,6 +150,7 @@ def test_an_interrupted_job_says_that_it_goes_on(here):
     assert list(blocks.glob("runs-*.npz"))
 
 
+@pytest.mark.slow
 def test_a_noise_study_over_many_runs_writes_figure_and_table(here):
     result = slamgym(
         *("noise-study", "anchored", "--runs", 3, "-e", "ekf,invariant"),

@@ -256,6 +256,7 @@ def test_notes_group_failures_and_warn_of_few_runs():
     assert summarise_monte_carlo(typical())["notes"] == []
 
 
+@pytest.mark.slow
 def test_notes_tell_why_all_runs_failed():
     failures = [(label, run, 3, "boom") for label in FILTERS for run in range(40)]
     summary = summarise_monte_carlo(with_failures(typical(), failures))
@@ -300,6 +301,7 @@ def test_fewer_than_two_good_runs_decide_nothing_and_break_nothing(good):
     report_figures(dataset, summary)
 
 
+@pytest.mark.slow
 def test_a_diverged_run_breaks_nothing():
     dataset = typical().copy(deep=True)
     row = {"estimator": "ekf", "run": 2, "step": slice(9, None)}
@@ -397,6 +399,7 @@ def test_labels_with_markup_reach_the_table_as_they_are():
     assert "y[iterations=3]" in text
 
 
+@pytest.mark.slow
 def test_curves_are_averages_over_runs():
     axes = figure_of(typical(), "nees").axes[0]
     line = line_of(axes, "ekf")

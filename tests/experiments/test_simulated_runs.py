@@ -44,7 +44,7 @@ def one_by_one(scenario, runs, seed):
 
 @pytest.mark.parametrize(
     "scenario",
-    [*SCENARIOS, BEGINNING, WALLED],
+    [*SCENARIOS, pytest.param(BEGINNING, marks=pytest.mark.slow), WALLED],
     ids=[*SCENARIOS, "beginning of city", "walled"],
 )
 def test_runs_are_the_single_worlds_of_their_seeds_to_the_last_bit(scenario):
