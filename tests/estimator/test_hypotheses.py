@@ -69,6 +69,7 @@ def slippery_drive():
     return world, drive(world)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["joint", "hypotheses"])
 def test_a_scan_decided_as_a_whole_holds_where_the_robot_slips(method, slippery_drive):
     world, scans = slippery_drive

@@ -264,6 +264,7 @@ def test_long_runs_of_several_estimators_stay_below_2_megabytes():
     assert len(page_of(long).encode()) < 2e6
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_chromium_has_nothing_to_complain_of(report, tmp_path):
     _, messages = run_chromium(report, "--dump-dom")
@@ -274,6 +275,7 @@ def test_chromium_has_nothing_to_complain_of(report, tmp_path):
     assert any("undefined_function" in message for message in messages)
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_chromium_asks_the_network_for_nothing(report, tmp_path):
     asking = tmp_path / "asking.html"
@@ -282,6 +284,7 @@ def test_chromium_asks_the_network_for_nothing(report, tmp_path):
     assert requests_of(asking, tmp_path) == ["http://127.0.0.1:9/picture.png"]
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_chromium_runs_no_script_of_hostile_results(tmp_path):
     path = tmp_path / "report.html"
@@ -291,6 +294,7 @@ def test_chromium_runs_no_script_of_hostile_results(tmp_path):
     assert messages == []
 
 
+@pytest.mark.slow
 @needs_chromium
 @pytest.mark.parametrize("dark", [False, True])
 def test_chromium_shows_every_figure_in_light_and_dark(report, tmp_path, dark):
@@ -310,6 +314,7 @@ def test_chromium_shows_every_figure_in_light_and_dark(report, tmp_path, dark):
         assert len(np.unique(part.reshape(-1, 3), axis=0)) > 30
 
 
+@pytest.mark.slow
 @needs_chromium
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_page_does_not_scroll_sideways(report, tmp_path, width):
@@ -320,6 +325,7 @@ def test_the_page_does_not_scroll_sideways(report, tmp_path, width):
     assert all(wide >= min(0.9 * (width - 32), 400) for _, _, wide, _ in boxes)
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_two_estimators_fit_a_telephone_and_more_of_them_show_that_they_scroll(
     report, tmp_path
