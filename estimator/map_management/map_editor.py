@@ -119,11 +119,10 @@ class _MethodEditor:
 
     def __init__(self, slam: Any) -> None:
         self._slam = slam
+        self._is_local = isinstance(slam, SupportsLocalView)
 
     def map_view(self, within: float = 0.0) -> MapView:
-        if isinstance(self._slam, SupportsLocalView):
-            return self._slam.local_view(within)
-        return view_map(self._slam)
+        return self._slam.local_view(within) if self._is_local else view_map(self._slam)
 
     def remove(self, ids: Sequence[int]) -> None:
         self._slam.remove(ids)

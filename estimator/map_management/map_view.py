@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 from ..error_frames import ErrorFrame
 from ..filters.ekf import EkfSlam
@@ -19,7 +20,7 @@ from ..interface import (
 
 def view_map(slam: SlamEstimator) -> MapView:
     """Return a view of the whole map of a filter, without a copy where possible."""
-    if isinstance(slam, SupportsMapView) and not hides_its_belief(slam):
+    if isinstance(slam, EkfSlam | SupportsMapView) and not hides_its_belief(slam):
         return slam.map_view()
     belief = slam.belief()
     return MapView(belief.mean, belief.covariance, belief.landmark_ids)
@@ -27,7 +28,7 @@ def view_map(slam: SlamEstimator) -> MapView:
 
 def mapped_ids(slam: SlamEstimator) -> tuple[int, ...]:
     """Return the landmarks in the map of a filter, in the order of its belief."""
-    if isinstance(slam, SupportsLandmarkIds) and not hides_its_belief(slam):
+    if isinstance(slam, EkfSlam | SupportsLandmarkIds) and not hides_its_belief(slam):
         return tuple(slam.landmark_ids)
     return slam.belief().landmark_ids
 
@@ -44,7 +45,7 @@ def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     """
     if isinstance(slam, EkfSlam) and not hides_its_belief(slam):
         return slam.belief(ids)
-    if "landmark_ids" in inspect.signature(slam.belief).parameters:
+    if _takes_landmark_ids(getattr(slam.belief, "__func__", slam.belief)):
         belief: Belief = slam.belief(landmark_ids=ids)  # type: ignore[call-arg]
         return belief
     whole = slam.belief()
@@ -57,7 +58,8 @@ def marginal_without_joining(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     Of a filter that joins its map it is taken from ``local_view``, where that holds
     these landmarks; its error is then judged in the invariant frame.
     """
-    if not isinstance(slam, SupportsJoin):
+    # The first test takes far less time than the second, and mostly decides.
+    if not hasattr(slam, "join") or not isinstance(slam, SupportsJoin):
         return marginal(slam, ids)
     view = slam.local_view(0.0)
     if not set(ids) <= set(view.ids):
@@ -74,6 +76,11 @@ def hides_its_belief(slam: object) -> bool:
         return False
     kind = type(slam)
     return kind.belief is not EkfSlam.belief and kind.map_view is EkfSlam.map_view
+
+
+@lru_cache(maxsize=64)
+def _takes_landmark_ids(belief: Callable[..., Belief]) -> bool:
+    return "landmark_ids" in inspect.signature(belief).parameters
 
 
 def _part(
