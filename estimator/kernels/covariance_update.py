@@ -1,4 +1,4 @@
-"""Covariance update by many readings at once, compiled: the core of the update.
+"""Kalman gain and covariance update for many readings at once, compiled.
 
 ``system`` holds two rows for each reading, from the row FIRST of the workspace on:
 :mod:`.scan_rows` lists their columns.  The covariance has room for whole vector
