@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+TOP = {file.name for file in (ROOT / "src" / "slamgym").iterdir() if file.is_file()}
 PARTS = ("agents", "envs", "estimator", "evaluation", "experiments", "sim_configs")
 
 
@@ -58,11 +59,10 @@ def test_the_wheel_holds_every_module_and_the_data(wheel):
     sources = {
         f"slamgym/{file.relative_to(ROOT)}"
         for part in PARTS
-        for suffix in ("py", "pyi", "toml", "json")
+        for suffix in ("py", "pyi", "toml", "json", "html")
         for file in (ROOT / part).rglob(f"*.{suffix}")
     }
-    top = {"slamgym/__init__.py", "slamgym/__init__.pyi", "slamgym/py.typed"}
-    assert sources | top <= inside
+    assert sources | {f"slamgym/{name}" for name in TOP} <= inside
     assert "slamgym/sim_configs/presets/six_landmarks.toml" in inside
 
 
@@ -74,8 +74,7 @@ def test_the_wheel_holds_nothing_else(wheel):
         name
         for name in inside
         if not name.startswith(homes)
-        and name.removeprefix("slamgym/")
-        not in {"__init__.py", "__init__.pyi", "py.typed"}
+        and name.removeprefix("slamgym/") not in TOP
         and not name.split("/")[0].endswith(".dist-info")
     ]
     assert strangers == []
