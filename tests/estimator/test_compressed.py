@@ -2,10 +2,10 @@
 
 import io
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 from drives import MEASUREMENT_STD
@@ -295,35 +295,26 @@ def test_a_run_stopped_at_any_step_continues_bit_for_bit(base, jumping):
             np.testing.assert_array_equal(value, expected[key], err_msg=key)
 
 
+def saved_and_continued(saved, which):
+    slam = CompressedEkfSlam(*NOISE, base="invariant")
+    drive = list(wander(300, 60))
+    if which == "first":
+        run(map_all(slam, 300), drive[:25])
+        saved.write_bytes(pickle.dumps(slam.state_dict()))
+    else:
+        slam.load_state_dict(pickle.loads(saved.read_bytes()))
+    return run(slam, drive[25:]).belief()
+
+
 @pytest.mark.slow
 def test_a_saved_run_continues_bit_for_bit_in_another_process(tmp_path):
-    code = """
-import pickle, sys
-sys.path.insert(0, sys.argv[2])
-from test_compressed import NOISE, CompressedEkfSlam, map_all, run, wander
-slam = CompressedEkfSlam(*NOISE, base="invariant")
-drive, saved = list(wander(300, 60)), sys.argv[1] + "/saved.pickle"
-if sys.argv[3] == "first":
-    run(map_all(slam, 300), drive[:25])
-    pickle.dump(slam.state_dict(), open(saved, "wb"))
-else:
-    slam.load_state_dict(pickle.load(open(saved, "rb")))
-run(slam, drive[25:])
-belief = slam.belief()
-print(belief.mean.tobytes().hex(), belief.covariance.tobytes().hex())
-"""
     run(CompressedEkfSlam(*NOISE, base="invariant"), wander(300, 60))  # compiles
-    here = str(Path(__file__).parent)
     first, second = (
-        subprocess.run(
-            [sys.executable, "-c", code, str(tmp_path), here, which],
-            check=True,
-            capture_output=True,
-        ).stdout
+        forked.result_of(saved_and_continued, tmp_path / "saved.pickle", which)
         for which in ("first", "second")
     )
-    assert len(first) > 600 * 600
-    assert first == second
+    assert len(first.mean) > 600
+    assert_same_bits(first, second)
 
 
 def test_a_state_is_shared_with_nobody():

@@ -1,12 +1,10 @@
 """What all filters for growing maps promise alike: honest, resumable, exact removal."""
 
 import hashlib
-import json
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -209,19 +207,16 @@ def continued(way, folder, states):
     return later
 
 
-CHILD = """
-import json, pathlib, pickle, sys
-sys.path.insert(0, {tests!r})
-from test_large_maps import continued
-found = {{}}
-for way in {ways!r}:
-    try:
-        saved = pathlib.Path({folder!r}, way, "states.pickle").read_bytes()
-        found[way] = continued(way, pathlib.Path({folder!r}, way), pickle.loads(saved))
-    except Exception as error:
-        found[way] = repr(error)
-print(json.dumps(found))
-"""
+def all_continued(folder):
+    """Go on from the states of every way; return what came of it, or the error."""
+    found = {}
+    for way in WAYS:
+        try:
+            states = pickle.loads((folder / way / "states.pickle").read_bytes())
+            found[way] = continued(way, folder / way, states)
+        except Exception as error:
+            found[way] = repr(error)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -232,10 +227,7 @@ def both_processes(tmp_path_factory):
         (folder / way).mkdir()
         states, here[way] = stopped(way, folder / way)
         (folder / way / "states.pickle").write_bytes(pickle.dumps(states))
-    tests = str(Path(__file__).parent)
-    code = CHILD.format(tests=tests, ways=tuple(WAYS), folder=str(folder))
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
-    return here, json.loads(done.stdout)
+    return here, forked.result_of(all_continued, folder)
 
 
 @pytest.mark.slow

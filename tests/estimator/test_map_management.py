@@ -1,11 +1,9 @@
 """The policy: who enters the map, who leaves it, who is one."""
 
 import re
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
@@ -534,27 +532,22 @@ def test_a_saved_run_goes_on_bit_for_bit(name, tmp_path):
     assert any(report.confirmed_ids for report, _ in expected[23:])
 
 
+def part_of_a_run(begin, end, folder):
+    slam = make("invariant", TIDY)
+    if begin:
+        slam.load_state_dict(np.load(folder / f"{begin}.npz"))
+    busy_run(slam, end - begin, start=begin)
+    np.savez(folder / f"{end}.npz", **slam.state_dict())
+
+
 @pytest.mark.slow
 def test_a_saved_run_goes_on_in_another_process(tmp_path):
     """Both processes find the kernels compiled, since this one has done so."""
-    script = (
-        "import sys, numpy as np\n"
-        "from test_map_management import TIDY, busy_run, make\n"
-        "slam, (begin, end, where) = make('invariant', TIDY), sys.argv[1:]\n"
-        "if int(begin):\n"
-        "    slam.load_state_dict(np.load(f'{where}/{begin}.npz'))\n"
-        "busy_run(slam, int(end) - int(begin), start=int(begin))\n"
-        "np.savez(f'{where}/{end}.npz', **slam.state_dict())\n"
-    )
     busy_run(make("invariant", TIDY), 25)
     states = []
     for spans in ([(0, 25)], [(0, 15), (15, 25)]):
         for begin, end in spans:
-            subprocess.run(
-                [sys.executable, "-c", script, str(begin), str(end), str(tmp_path)],
-                check=True,
-                cwd=Path(__file__).parent,
-            )
+            forked.result_of(part_of_a_run, begin, end, tmp_path)
         with np.load(tmp_path / "25.npz") as state:
             states.append(dict(state))
     one, other = states

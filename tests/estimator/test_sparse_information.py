@@ -1,10 +1,8 @@
 """Sparse information: exact without a bound, conservative and sparse with one."""
 
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 from dense_ekf import DenseEkf
@@ -371,18 +369,10 @@ def test_removing_landmarks_changes_nothing_about_the_others():
     assert len(slam.belief().landmark_ids) == len(stays) + 2
 
 
-SCRIPT = """
-import io, sys
-sys.path.insert(0, {tests!r})
-import numpy as np
-from test_sparse_information import NOISE, SparseInformationSlam, run, wander
-state = np.load({saved!r})
-slam = SparseInformationSlam(*NOISE, active_bound=12)
-slam.load_state_dict(state)
-run(slam, list(wander(1000, 400))[{steps}:])
-belief = slam.belief()
-np.savez({result!r}, mean=belief.mean, covariance=belief.covariance)
-"""
+def continued(saved, steps):
+    slam = SparseInformationSlam(*NOISE, active_bound=12)
+    slam.load_state_dict(np.load(saved))
+    return run(slam, list(wander(1000, 400))[steps:]).belief()
 
 
 @pytest.mark.slow
@@ -393,17 +383,10 @@ def test_another_process_continues_with_the_same_bits(tmp_path, steps):
     slam.belief([])  # asking leaves no trace
     np.savez(tmp_path / "saved.npz", **slam.state_dict())
     run(slam, drive[steps:])
-    script = SCRIPT.format(
-        tests=str(Path(__file__).parent),
-        saved=str(tmp_path / "saved.npz"),
-        result=str(tmp_path / "result.npz"),
-        steps=steps,
-    )
-    subprocess.run([sys.executable, "-c", script], check=True)
-    result, belief = np.load(tmp_path / "result.npz"), slam.belief()
+    result = forked.result_of(continued, tmp_path / "saved.npz", steps)
+    belief = slam.belief()
     assert len(belief.landmark_ids) > 1.3 * len(slam.local_ids)
-    np.testing.assert_array_equal(result["mean"], belief.mean)
-    np.testing.assert_array_equal(result["covariance"], belief.covariance)
+    assert_same_bits(result, belief)
 
 
 def test_a_saved_state_that_does_not_fit_is_refused_and_nothing_changes():

@@ -1,10 +1,6 @@
 """Removing and merging landmarks of submaps, and looking around in their map."""
 
-import pickle
-import subprocess
-import sys
-from pathlib import Path
-
+import forked
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -649,31 +645,18 @@ def test_an_edited_run_continues_bit_for_bit(tmp_path, base, on_disk, cut):
     )
 
 
-CONTINUE = """
-import pickle, sys
-sys.path[:0] = [{tests!r}]
-from test_submap_editing import edited_run, laps, made
-slam = made(folder={folder!r}, submap_size=9)
-slam.load_state_dict(pickle.load(open({state!r}, "rb")))
-edited_run(slam, list(laps(75)), start=45)
-pickle.dump((slam.belief(), slam.state_dict()), open({result!r}, "wb"))
-"""
+def continued(folder, state):
+    slam = made(folder=folder, submap_size=9)
+    slam.load_state_dict(state)
+    edited_run(slam, list(laps(75)), start=45)
+    return slam.belief(), slam.state_dict()
 
 
 @pytest.mark.slow
 def test_another_process_continues_an_edited_run_from_its_folder(tmp_path):
-    folder, state, result = (
-        str(tmp_path / name) for name in ("run", "state", "result")
-    )
-    drive = list(laps(75))
+    folder, drive = str(tmp_path / "run"), list(laps(75))
     slam = edited_run(made(folder=folder, submap_size=9), drive[:45])
-    with Path(state).open("wb") as file:
-        pickle.dump(slam.state_dict(), file)
-    tests = str(Path(__file__).parent)
-    code = CONTINUE.format(tests=tests, folder=folder, state=state, result=result)
-    subprocess.run([sys.executable, "-c", code], check=True)
-    with Path(result).open("rb") as file:
-        belief, after = pickle.load(file)
+    belief, after = forked.result_of(continued, folder, slam.state_dict())
     whole = edited_run(made(submap_size=9), drive)
     assert_same_bits(whole.belief(), belief)
     expected = whole.state_dict()

@@ -1,10 +1,6 @@
 """Submaps: independent pieces, joined into the map that all of the data make."""
 
-import pickle
-import subprocess
-import sys
-from pathlib import Path
-
+import forked
 import numpy as np
 import pytest
 from numeric_jacobian import numeric_jacobian
@@ -420,31 +416,16 @@ def test_a_saved_run_continues_bit_for_bit(tmp_path, base, joined, on_disk):
     assert_same_bits(expected.local_belief(), found.local_belief())
 
 
-CONTINUE = """
-import pickle, sys
-sys.path[:0] = [{tests!r}]
-from test_submaps import laps, made, run
-slam = made(folder={folder!r})
-slam.load_state_dict(pickle.load(open({state!r}, "rb")))
-run(slam, list(laps(70))[45:])
-pickle.dump(slam.belief(), open({result!r}, "wb"))
-"""
+def continued(folder, state):
+    slam = made(folder=folder)
+    slam.load_state_dict(state)
+    return run(slam, list(laps(70))[45:]).belief()
 
 
-@pytest.mark.slow
 def test_another_process_continues_from_the_folder(tmp_path):
-    folder, state, result = (
-        str(tmp_path / name) for name in ("run", "state", "result")
-    )
-    drive = list(laps(70))
+    folder, drive = str(tmp_path / "run"), list(laps(70))
     slam = run(made(folder=folder), drive[:45])
-    with Path(state).open("wb") as file:
-        pickle.dump(slam.state_dict(), file)
-    tests = str(Path(__file__).parent)
-    code = CONTINUE.format(tests=tests, folder=folder, state=state, result=result)
-    subprocess.run([sys.executable, "-c", code], check=True)
-    with Path(result).open("rb") as file:
-        found = pickle.load(file)
+    found = forked.result_of(continued, folder, slam.state_dict())
     assert_same_bits(run(made(), drive).belief(), found)
 
 
