@@ -50,7 +50,7 @@ class UpdateReport:
     tentative_rows: tuple[int, ...] = ()
     """Rows of the scan associated with a landmark that is not confirmed yet."""
     ambiguous_rows: tuple[int, ...] = ()
-    """Rows left out: they fit more than one landmark, or are too close to tell."""
+    """Rows left out: they fit more than one landmark, or their range is too short."""
 
     @property
     def innovation_factor(self) -> Array:

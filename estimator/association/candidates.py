@@ -148,46 +148,7 @@ class ScanAssociation:
         tentative, waiting = self._tentative, self._waiting
         return Candidates(tentative, waiting, self._next_id, self.scan + 1, density)
 
-    @classmethod
-    def alternatives(
-        cls,
-        policy: AssociationPolicy,
-        candidates: Candidates,
-        readings: Array,
-        view: MapView,
-        sensor: Sensor,
-        *,
-        ceiling: float = np.inf,
-    ) -> list[tuple[float, ScanAssociation]]:
-        """Associate readings (m, 2) that have no identity, in every way to consider.
-
-        Readings closer than the sensor's least range have no usable bearing: they are
-        ambiguous.  Of associations that cost more than ``ceiling`` only the likeliest
-        is of interest.
-
-        Returns
-        -------
-        list of (float, ScanAssociation)
-            −2 ln of each one's likelihood, up to a constant; the likeliest first.
-        """
-        is_near = readings[:, 1] < sensor.min_range
-        rows = np.flatnonzero(~is_near)
-        density = policy.density or candidates.density.value
-        found = assign_scan(
-            policy, view, readings[rows], sensor.noise, density, ceiling=ceiling
-        )
-        explained = {view.ids[slot] for slot in found.explained.tolist()}
-        result = []
-        for cost, slots in found.ranked:
-            association = cls(policy, candidates, len(readings))
-            association.explained = explained
-            association.ambiguous_rows += np.flatnonzero(is_near).tolist()
-            association._longest = float(readings[:, 1].max(initial=0.0))
-            association._assign(rows, slots, readings, view, sensor.noise)
-            result.append((cost, association))
-        return result
-
-    def _assign(
+    def assign(
         self,
         rows: IntArray,
         slots: IntArray,
@@ -195,10 +156,16 @@ class ScanAssociation:
         view: MapView,
         noise: Noise,
     ) -> None:
-        """Take the slots of the map that some rows are assigned to."""
+        """Take the slots of the map that some rows are assigned to.
+
+        Rows that no landmark explains may belong to a tentative one; the other rows of
+        the scan have no usable bearing and are ambiguous.
+        """
+        self._longest = float(readings[:, 1].max(initial=0.0))
         for row, slot in zip(rows.tolist(), slots.tolist(), strict=True):
             if slot >= 0:
                 self.row_ids[row] = view.ids[slot]
+        self.ambiguous_rows += sorted(set(range(len(readings))) - set(rows.tolist()))
         self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         new = rows[slots == NEW]
         if len(new):
@@ -267,3 +234,37 @@ class ScanAssociation:
         self.row_ids[row] = landmark_id
         self.confirmed[landmark_id] = label
         self._next_id = max(self._next_id, landmark_id + 1)
+
+
+def associate(
+    policy: AssociationPolicy,
+    candidates: Candidates,
+    readings: Array,
+    view: MapView,
+    sensor: Sensor,
+    ceiling: float = np.inf,
+) -> list[tuple[float, ScanAssociation]]:
+    """Associate readings (m, 2) that have no identity, in every way to consider.
+
+    Readings closer than the sensor's least range have no usable bearing: they are
+    ambiguous.  Of associations that cost more than ``ceiling`` only the likeliest is of
+    interest.
+
+    Returns
+    -------
+    list of (float, ScanAssociation)
+        −2 ln of each one's likelihood, up to a constant; the likeliest first.
+    """
+    rows = np.flatnonzero(readings[:, 1] >= sensor.min_range)
+    density = policy.density or candidates.density.value
+    found = assign_scan(
+        policy, view, readings[rows], sensor.noise, density, ceiling=ceiling
+    )
+    explained = {view.ids[slot] for slot in found.explained.tolist()}
+    result = []
+    for cost, slots in found.ranked:
+        association = ScanAssociation(policy, candidates, len(readings))
+        association.explained = set(explained)
+        association.assign(rows, slots, readings, view, sensor.noise)
+        result.append((cost, association))
+    return result

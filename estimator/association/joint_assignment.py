@@ -30,8 +30,6 @@ from ..kernels.joint_readings import UNPAIRED, Problem, fill_distances
 from ..models.angles import wrap_angle
 from ..models.bearing_range import predict_measurement
 
-MOST_COST = 1e300
-
 
 class Solutions(NamedTuple):
     """The best assignments, the cheapest first."""
@@ -137,7 +135,7 @@ def best_assignments(
         visited = search_assignments(problem, costs, marks, spread, ceiling, nodes)
     else:
         costs[0] = rows * problem.missing
-    count = int((costs <= min(costs[0] + spread, MOST_COST)).sum())
+    count = int((np.isfinite(costs) & (costs <= costs[0] + spread)).sum())
     if problem.feasible.size:
         fill_distances(problem, marks[:count], distances[:count])
     return Solutions(costs[:count], marks[:count], distances[:count], visited < nodes)

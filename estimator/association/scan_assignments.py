@@ -76,12 +76,18 @@ def assign_scan(
     if policy.association == "nearest":
         ranked = [Assignment(0.0, assign_nearest(policy, fit))]
         return Assignments(ranked, explained)
-    problem = _problem(policy, fit, explained, readings, noise, density)
-    if explained.size:
-        expected, joint = predicted_readings(view.mean, view.covariance, explained)
-        problem = problem._replace(
-            innovations=innovations_of(readings, expected), joint=joint
-        )
+    expected, joint = predicted_readings(view.mean, view.covariance, explained)
+    pairs_first = policy.association == "compatibility"
+    problem = Problem(
+        innovations=innovations_of(readings, expected),
+        joint=joint,
+        variances=_variances(readings, noise),
+        feasible=fit.squared[:, explained] <= policy.pair_gate,
+        missing=0.0 if pairs_first else missing_cost(density),
+        gate=policy.pair_gate,
+        limits=_limits(policy, len(readings)),
+        pairs_first=pairs_first,
+    )
     most = policy.branches if policy.association == "hypotheses" else 1
     found = best_assignments(
         problem,
@@ -107,34 +113,20 @@ def assign_nearest(policy: AssociationPolicy, fit: Distances) -> IntArray:
     )
 
 
-def _problem(
-    policy: AssociationPolicy,
-    fit: Distances,
-    explained: IntArray,
-    readings: Array,
-    noise: Noise,
-    density: float,
-) -> Problem:
-    """Return the problem of a scan, its innovations still to be filled in."""
-    rows = len(readings)
+def _variances(readings: Array, noise: Noise) -> Array:
+    """Return (σβ², σr²) of each reading, shape (m, 2); above 0, for their logarithm."""
     bearing_std, range_std, per_metre = noise
-    variances = np.empty((rows, 2))
-    variances[:, 0] = bearing_std**2
-    variances[:, 1] = (range_std + per_metre * readings[:, 1]) ** 2
-    pairs_first = policy.association == "compatibility"
+    std = np.empty((len(readings), 2))
+    std[:, 0], std[:, 1] = bearing_std, range_std + per_metre * readings[:, 1]
+    return np.maximum(std**2, np.finfo(np.float64).tiny)
+
+
+def _limits(policy: AssociationPolicy, rows: int) -> Array:
+    """Return the largest νᵀ S⁻¹ ν of 0 … m pairs together."""
     limits = np.full(rows + 1, np.inf)
-    if pairs_first:
+    if policy.association == "compatibility":
         limits[1:] = chdtri(2.0 * np.arange(1, rows + 1), policy.pair_tail)
-    return Problem(
-        innovations=np.empty((rows, 0, 2)),
-        joint=np.empty((0, 0)),
-        variances=np.maximum(variances, np.finfo(np.float64).tiny),
-        feasible=fit.squared[:, explained] <= policy.pair_gate,
-        missing=0.0 if pairs_first else missing_cost(density),
-        gate=policy.pair_gate,
-        limits=limits,
-        pairs_first=pairs_first,
-    )
+    return limits
 
 
 def missing_cost(density: float) -> float:

@@ -63,7 +63,12 @@ def condition(
     here: int,
     to: int,
 ) -> None:
-    """H ← h + K (z − h), C ← C − K C for one pair, of the landmarks ``ahead``."""
+    """Condition the expected readings of the landmarks ``ahead`` on one pair.
+
+    ::
+
+        h ← h + K (z − h),  C ← C − K C
+    """
     C, shift, after, moved = joints[here], shifts[here], joints[to], shifts[to]
     s00 = C[2 * j, 2 * j] + variance[0]
     s10 = C[2 * j + 1, 2 * j]

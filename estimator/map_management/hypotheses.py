@@ -15,8 +15,12 @@ from ..association.candidates import ScanAssociation
 from ..interface import Belief, MapView, SlamEstimator, UpdateReport
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
+from ..support.nested_state import with_prefix, without_prefix
 from .managed_slam import ManagedSlam
 from .policy import LandmarkPolicy, as_policy
+
+Option = tuple[float, int, ScanAssociation]
+"""Cost, the hypothesis that it continues, and the association of the scan."""
 
 SPREAD = 16.0
 """Hypotheses e^8 times less probable than the best one are discarded."""
@@ -139,28 +143,24 @@ class HypothesisSlam:
     ) -> UpdateReport:
         """Associate one scan in every hypothesis, and correct the beliefs with it.
 
-        Parameters and errors as in :meth:`ManagedSlam.update`.
+        Parameters and errors as in :meth:`ManagedSlam.update`.  A hypothesis whose
+        filter fails is discarded, as long as another one succeeds.
 
         Returns
         -------
         UpdateReport
             That of the most probable hypothesis.
         """
-        if landmark_ids is not None:
-            reports = [
-                h.slam.update(measurements, landmark_ids) for h in self.hypotheses
-            ]
-            return reports[0]
         readings = argument_checks.scan(measurements)
-        options = self._options(readings)
-        least = options[0][0]
-        slams = self._branches([k for _, k, _ in options])
-        reports, kept = [], []
-        for (cost, _, plan), slam in zip(options, slams, strict=True):
-            reports.append(slam.take(readings, plan))
-            kept.append(Hypothesis(cost - least, slam))
-        self._keep(kept)
-        return reports[0]
+        if landmark_ids is None:
+            options = self._options(readings)
+        else:
+            plans = [h.slam.as_given(readings, landmark_ids) for h in self.hypotheses]
+            options = [
+                (h.cost, k, plan)
+                for k, (h, plan) in enumerate(zip(self.hypotheses, plans, strict=True))
+            ]
+        return self._advance(readings, options)
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise landmarks by hand; only the best hypothesis goes on."""
@@ -187,8 +187,7 @@ class HypothesisSlam:
             "costs": np.array([h.cost for h in self.hypotheses]),
         }
         for k, hypothesis in enumerate(self.hypotheses):
-            saved = hypothesis.slam.state_dict()
-            state |= {f"{k}.{key}": entry for key, entry in saved.items()}
+            state |= with_prefix(str(k), hypothesis.slam.state_dict())
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -202,23 +201,20 @@ class HypothesisSlam:
         """
         name = type(self).__name__
         argument_checks.refuse_other_state(state, ["costs"], estimator=name)
-        loaded = []
-        for k, cost in enumerate(np.asarray(state["costs"]).tolist()):
-            start = f"{k}."
-            part = {
-                key.removeprefix(start): entry
-                for key, entry in state.items()
-                if key.startswith(start)
-            }
-            slam = self._make()
-            slam.load_state_dict(part)
-            loaded.append(Hypothesis(cost, slam))
-        argument_checks.at_least("the number of hypotheses", len(loaded), 1)
+        costs = np.asarray(state["costs"]).tolist()
+        argument_checks.at_least("the number of hypotheses", len(costs), 1)
+        loaded = [Hypothesis(cost, self._fresh()) for cost in costs]
+        try:
+            for k, hypothesis in enumerate(loaded):
+                hypothesis.slam.load_state_dict(without_prefix(state, str(k)))
+        except Exception:
+            self._spare += [h.slam for h in loaded]
+            raise
         self._keep(loaded)
 
-    def _options(self, readings: Array) -> list[tuple[float, int, ScanAssociation]]:
+    def _options(self, readings: Array) -> list[Option]:
         """Return cost, hypothesis and association of the best, the cheapest first."""
-        options: list[tuple[float, int, ScanAssociation]] = []
+        options: list[Option] = []
         most, ceiling = self._policy.hypotheses, np.inf
         for k, h in enumerate(self.hypotheses):
             found = h.slam.alternatives(readings, ceiling - h.cost)
@@ -237,12 +233,31 @@ class HypothesisSlam:
         for k in origins:
             slam = self.hypotheses[k].slam
             if k in used:
-                state = slam.state_dict()
-                slam = self._spare.pop() if self._spare else self._make()
+                state, slam = slam.state_dict(), self._fresh()
                 slam.load_state_dict(state)
             used.add(k)
             slams.append(slam)
         return slams
+
+    def _advance(self, readings: Array, options: Sequence[Option]) -> UpdateReport:
+        """Continue with the options whose filter succeeds; return the first report."""
+        slams = self._branches([k for _, k, _ in options])
+        reports, kept, errors = [], [], []
+        for (cost, _, plan), slam in zip(options, slams, strict=True):
+            try:
+                reports.append(slam.take(readings, plan))
+                kept.append(Hypothesis(cost, slam))
+            except np.linalg.LinAlgError as error:
+                errors.append(error)
+        if not kept:
+            raise errors[0]
+        least = kept[0].cost
+        self._keep([Hypothesis(h.cost - least, h.slam) for h in kept])
+        return reports[0]
+
+    def _fresh(self) -> ManagedSlam:
+        """Return a filter that no hypothesis uses."""
+        return self._spare.pop() if self._spare else self._make()
 
     def _keep(self, hypotheses: list[Hypothesis]) -> None:
         """Go on with these, and reuse the filters of the others."""

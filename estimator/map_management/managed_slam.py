@@ -10,17 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
-from ..association.candidates import Candidates, ScanAssociation, Sensor
+from ..association.candidates import Candidates, ScanAssociation, Sensor, associate
 from ..filters.motion_noise import MotionNoise
-from ..interface import (
-    Belief,
-    MapView,
-    SlamEstimator,
-    SupportsLocalView,
-    SupportsTruth,
-    UpdateReport,
-    optional_members,
-)
+from ..interface import Belief, MapView, SlamEstimator, UpdateReport, optional_members
 from ..models.rigid_motion import rotation
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
@@ -61,7 +53,7 @@ class ManagedSlam:
     -----
     Tentative landmarks stay outside the filter's state: clutter then neither moves the
     pose nor costs anything, and a landmark that is never confirmed does not change the
-    belief.  The price is that the readings before the confirming one correct nothing.
+    belief.  Readings before the confirming one correct nothing unless backdated.
 
     Examples
     --------
@@ -102,8 +94,7 @@ class ManagedSlam:
         self._editor = CachedEditor(edit_map(self._filter, merging=merging))
         self._pruner = MapPruner(self._policy, self._editor, noise)
         self._candidates = Candidates()
-        can_repeat = not isinstance(self._filter, SupportsTruth | SupportsLocalView)
-        window = self._policy.confirm[1] if self._policy.backdate and can_repeat else 0
+        window = self._policy.confirm[1] if self._policy.backdate else 0
         self._recent = RecentScans(self._filter, self._editor, window)
         for name, member in optional_members(self._filter).items():
             setattr(self, name, member)
@@ -172,25 +163,27 @@ class ManagedSlam:
         readings = argument_checks.scan(measurements)
         if landmark_ids is None:
             return self.take(readings, self.alternatives(readings)[0][1])
+        return self.take(readings, self.as_given(readings, landmark_ids))
+
+    def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
+        """Associate readings (m, 2) by their identities."""
+        given = argument_checks.identities(landmark_ids, len(readings))
         plan = ScanAssociation(self._policy, self._candidates, len(readings))
         view = self._editor.map_view(self._policy.reach(readings))
-        given = argument_checks.identities(landmark_ids, len(readings))
         plan.translate(given, view.mapped, self._pruner.aliases)
-        return self.take(readings, plan)
+        return plan
 
     def alternatives(
         self, readings: Array, ceiling: float = np.inf
     ) -> list[tuple[float, ScanAssociation]]:
         """Associate readings (m, 2) without identity, in every way to consider.
 
-        Of those that cost more than ``ceiling`` only the likeliest is of interest; see
-        :meth:`ScanAssociation.alternatives`.
+        Of those that cost more than ``ceiling`` only the likeliest is of interest.
         """
         argument_checks.refuse_not_finite(readings)
         view = self._editor.map_view(self._policy.reach(readings))
-        state = self._policy, self._candidates
-        return ScanAssociation.alternatives(
-            *state, readings, view, self._sensor, ceiling=ceiling
+        return associate(
+            self._policy, self._candidates, readings, view, self._sensor, ceiling
         )
 
     def take(self, readings: Array, plan: ScanAssociation) -> UpdateReport:
@@ -271,20 +264,22 @@ class ManagedSlam:
             Where the state lacks an entry, or is of another estimator; all is then as
             before.
         """
-        name = type(self).__name__
         entries = [k for k in self._remembered() if k.count(".") < 2]
-        argument_checks.refuse_other_state(state, entries, estimator=name)
+        argument_checks.refuse_other_state(
+            state, entries, estimator=type(self).__name__
+        )
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
-        before = self._pruner.state_dict()
+        before = self._pruner.state_dict(), self._recent.state_dict()
         try:
             self._pruner.load_state_dict(without_prefix(state, "landmarks"))
+            self._recent.load_state_dict(without_prefix(state, "recent"))
             self._filter.load_state_dict(without_prefix(state, "filter"))
         except Exception:
-            self._pruner.load_state_dict(before)
+            self._pruner.load_state_dict(before[0])
+            self._recent.load_state_dict(before[1])
             raise
         self._editor.expire()
         self._candidates = candidates
-        self._recent.load_state_dict(without_prefix(state, "recent"))
 
     def _remembered(self) -> dict[str, Any]:
         """Return all of the state except the filter's."""

@@ -15,8 +15,18 @@ import numpy as np
 
 from ...arrays import Array
 from ..association.candidates import LABEL_BITS, NO_LABEL, ScanAssociation
-from ..interface import SlamEstimator, UpdateReport
+from ..interface import (
+    SlamEstimator,
+    SupportsLocalView,
+    SupportsTruth,
+    UpdateReport,
+)
+from ..support import argument_checks
+from ..support.nested_state import with_prefix, without_prefix
 from .map_editor import CachedEditor
+
+ENTRIES = ["number", "motions", "readings", "row_ids", "labels", "removed", "merged"]
+"""What the saved state of a scan holds, beside the state of the filter."""
 
 NO_LANDMARK = np.iinfo(np.int64).min
 
@@ -67,7 +77,6 @@ class RecentScan:
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
         row_ids = [NO_LANDMARK if i is None else i for i in self.row_ids]
-        before = {f"before.{key}": entry for key, entry in (self.before or {}).items()}
         return {
             "number": np.array(self.number),
             "motions": _motion_array(self.motions),
@@ -76,22 +85,21 @@ class RecentScan:
             "labels": np.array(self.labels, dtype=np.int64),
             "removed": np.array(self.removed, dtype=np.int64),
             "merged": np.array(self.merged, dtype=np.int64).reshape(-1, 2),
-            **before,
+            **with_prefix("before", self.before or {}),
         }
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any]) -> RecentScan:
         """Restore what :meth:`state_dict` returned."""
+        argument_checks.refuse_other_state(state, ENTRIES)
         row_ids = np.asarray(state["row_ids"]).tolist()
-        start = "before."
-        before = {k.removeprefix(start): v for k, v in state.items() if start in k}
         return cls(
             int(state["number"]),
             _motions(state["motions"]),
             np.array(state["readings"], dtype=np.float64).reshape(-1, 2),
             tuple(None if i == NO_LANDMARK else i for i in row_ids),
             tuple(np.asarray(state["labels"]).tolist()),
-            before or None,
+            without_prefix(state, "before") or None,
             tuple(np.asarray(state["removed"]).tolist()),
             tuple((i, j) for i, j in np.asarray(state["merged"]).tolist()),
         )
@@ -108,10 +116,17 @@ class RecentScans:
         Of its map.
     window : int
         Number of scans within which a landmark is confirmed; 0: keep no scans.
+
+    Notes
+    -----
+    No scans are kept of filters for large maps, whose states are expensive to copy, and
+    of those that need the truth at every step.
     """
 
     def __init__(self, slam: SlamEstimator, editor: CachedEditor, window: int) -> None:
-        self._slam, self._editor, self._window = slam, editor, window
+        can_repeat = not isinstance(slam, SupportsTruth | SupportsLocalView)
+        self._slam, self._editor = slam, editor
+        self._window = window if can_repeat else 0
         self.forget()
 
     def forget(self) -> None:
@@ -176,22 +191,22 @@ class RecentScans:
 
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
-        scans = {
-            f"{k}.{key}": entry
-            for k, scan in enumerate(self._scans)
-            for key, entry in scan.state_dict().items()
+        state: dict[str, Any] = {
+            "motions": _motion_array(self._motions),
+            "count": np.array(len(self._scans)),
         }
-        return {"motions": _motion_array(self._motions), **scans}
+        for k, scan in enumerate(self._scans):
+            state |= with_prefix(str(k), scan.state_dict())
+        return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        parts: dict[int, dict[str, Any]] = {}
-        for key, entry in state.items():
-            if "." in key:
-                k, _, name = key.partition(".")
-                parts.setdefault(int(k), {})[name] = entry
-        self._scans = [RecentScan.from_state_dict(parts[k]) for k in sorted(parts)]
-        self._motions = _motions(state["motions"])
+        motions = _motions(state["motions"])
+        self._scans = [
+            RecentScan.from_state_dict(without_prefix(state, str(k)))
+            for k in range(int(state["count"]))
+        ]
+        self._motions = motions
 
 
 def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | None:

@@ -155,10 +155,7 @@ def test_a_refused_scan_leaves_everything_as_it_was(method, slippery_drive):
     for bad in ([(np.nan, 2.0)], [(0.1, 2.0, 3.0)]):
         with pytest.raises(ValueError, match="measurements"):
             slam.update(bad)
-    after = slam.state_dict()
-    assert before.keys() == after.keys()
-    for key, entry in before.items():
-        np.testing.assert_array_equal(entry, after[key])
+    assert_same_state(before, slam.state_dict())
 
 
 def test_hypotheses_are_as_many_as_the_policy_allows(slippery_drive):
@@ -217,3 +214,86 @@ def test_every_filter_takes_joint_assignments(name, slippery_drive):
 def test_a_policy_refuses_what_makes_no_sense(field, value):
     with pytest.raises(ValueError, match=field):
         make(slippery_world(), **{field: value})
+
+
+def failing_after(slam, steps):
+    """Make the filter inside fail at its next update after so many."""
+    update, count = slam.filter.update, iter(range(steps))
+
+    def fail(*arguments):
+        if next(count, None) is None:
+            raise np.linalg.LinAlgError("the innovation covariance is degenerate")
+        return update(*arguments)
+
+    slam.filter.update = fail
+
+
+def several_hypotheses(scans, world):
+    slam = make(world, association="hypotheses")
+    follow(slam, scans[:40])
+    assert len(slam.hypotheses) > 1
+    return slam
+
+
+def test_a_hypothesis_whose_filter_fails_is_discarded(slippery_drive):
+    world, scans = slippery_drive
+    slam = several_hypotheses(scans, world)
+    failing = slam.best
+    failing_after(failing, 0)
+    slam.predict(scans[40][0])
+    slam.update(scans[40][1])
+    assert failing not in [h.slam for h in slam.hypotheses]
+    assert slam.hypotheses[0].cost == 0.0
+
+
+def test_where_every_filter_fails_nothing_has_changed(slippery_drive):
+    world, scans = slippery_drive
+    slam = several_hypotheses(scans, world)
+    before = slam.state_dict()
+    for hypothesis in slam.hypotheses:
+        failing_after(hypothesis.slam, 0)
+    slam._spare, make_filter = [], slam._make
+
+    def make_failing():
+        fresh = make_filter()
+        failing_after(fresh, 0)
+        return fresh
+
+    slam._make = make_failing
+    with pytest.raises(np.linalg.LinAlgError, match="degenerate"):
+        slam.update(scans[40][1])
+    assert_same_state(before, slam.state_dict())
+
+
+def assert_same_state(before, after):
+    assert before.keys() == after.keys()
+    for key, entry in before.items():
+        np.testing.assert_array_equal(entry, after[key])
+
+
+@pytest.mark.parametrize("method", ["joint", "hypotheses"])
+def test_a_state_that_cannot_be_loaded_leaves_everything_as_it_was(
+    method, slippery_drive
+):
+    world, scans = slippery_drive
+    slam = make(world, association=method, backdate=True)
+    follow(slam, scans[:20])
+    before = slam.state_dict()
+    other = make(world, association=method, backdate=True)
+    follow(other, scans[:30])
+    saved = other.state_dict()
+    broken = {key: saved[key] for key in saved if not key.endswith(".row_ids")}
+    with pytest.raises(ValueError, match="must hold 'row_ids'"):
+        slam.load_state_dict(broken)
+    assert_same_state(before, slam.state_dict())
+
+
+def test_loading_again_and_again_makes_no_more_filters(slippery_drive):
+    world, scans = slippery_drive
+    slam = several_hypotheses(scans, world)
+    state = slam.state_dict()
+    slam.load_state_dict(state)
+    count = len(slam._spare)
+    for _ in range(3):
+        slam.load_state_dict(state)
+    assert len(slam._spare) == count

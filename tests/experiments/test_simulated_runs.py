@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from presets import slow_city
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments.runs.simulated_runs import simulate_runs
@@ -11,12 +12,8 @@ SEED = 30
 WALLED = load_scenario("corridor").with_changes(
     steps=60, sensor={"occlusion": True, "dropout": 0.1}, start={"drawn": "estimate"}
 )
-# The city has 10,000 landmarks: all its 3000 steps would be gigabytes of readings.
-BEGINNING = load_scenario("city").with_changes(steps=300)
 SCENARIOS = [
-    preset
-    for preset in list_presets()
-    if load_scenario(preset).sensor.identities and preset != "city"
+    preset for preset in list_presets() if load_scenario(preset).sensor.identities
 ]
 
 
@@ -42,11 +39,7 @@ def one_by_one(scenario, runs, seed):
     return [np.array(column) for column in columns]
 
 
-@pytest.mark.parametrize(
-    "scenario",
-    [*SCENARIOS, pytest.param(BEGINNING, marks=pytest.mark.slow), WALLED],
-    ids=[*SCENARIOS, "beginning of city", "walled"],
-)
+@pytest.mark.parametrize("scenario", [*slow_city(SCENARIOS), WALLED], ids=str)
 def test_runs_are_the_single_worlds_of_their_seeds_to_the_last_bit(scenario):
     fast, slow = simulate_runs(scenario, 3, SEED), one_by_one(scenario, 3, SEED)
     for name, array, other in zip(fast._fields, fast, slow, strict=True):

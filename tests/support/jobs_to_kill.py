@@ -16,7 +16,7 @@ from slamgym.sim_configs import load_scenario
 
 
 def two_filters(folder):
-    """Run a Monte Carlo of which every run is a block."""
+    """Run a Monte Carlo in blocks of one run."""
     monte_carlo("six_landmarks", "ekf,invariant", 20, block_size=1, out=folder)
 
 

@@ -19,7 +19,7 @@ from .local_information import LocalInformation
 
 
 class Screened(NamedTuple):
-    """n measurements of mapped landmarks, m of which are used."""
+    """n measurements of mapped landmarks; m are used."""
 
     skipped: BoolArray
     """Landmark expected below the minimum range, shape (n,)."""
