@@ -14,7 +14,7 @@ from ..error_frames import ErrorFrame
 from ..kernels.belief_arrays import BeliefArrays, aligned_zeros
 from ..support import argument_checks
 from ..support.memory_limit import landmarks_that_fit
-from .marginalise_and_merge import coincide, without_landmarks
+from .landmark_merging import coincide
 
 FIRST_ALLOCATION = 8  # landmarks
 
@@ -205,6 +205,29 @@ class GaussianMap:
         self.relabel(ids)
         self.mean[:size], self.reference[:size] = mean, reference
         self.covariance[:size, :size] = covariance
+
+
+def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
+    """Drop the entries of landmarks from a mean, or rows and columns from a covariance.
+
+    Dropping entries of a Gaussian marginalises them: all other numbers keep their last
+    bit.
+
+    Parameters
+    ----------
+    array : ndarray, shape (3 + 2n,) or (3 + 2n, 3 + 2n)
+    slots : iterable of int
+        The landmarks to drop.
+
+    Examples
+    --------
+    >>> without_landmarks(np.arange(7.0), [0])
+    array([0., 1., 2., 5., 6.])
+    """
+    columns = [column for slot in slots for column in (3 + 2 * slot, 4 + 2 * slot)]
+    for axis in range(array.ndim):
+        array = np.delete(array, columns, axis=axis)
+    return array
 
 
 def _checked_covariance(saved: Any, size: int) -> Array:

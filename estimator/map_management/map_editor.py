@@ -22,7 +22,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..filters.marginalise_and_merge import coincide, without_landmarks
+from ..filters.gaussian_map import without_landmarks
+from ..filters.landmark_merging import coincide
 from ..interface import (
     MapView,
     SlamEstimator,

@@ -15,10 +15,8 @@ from test_submaps import (
     run,
 )
 
-from slamgym.estimator.filters.marginalise_and_merge import (
-    coincide,
-    without_landmarks,
-)
+from slamgym.estimator.filters.gaussian_map import without_landmarks
+from slamgym.estimator.filters.landmark_merging import coincide
 from slamgym.estimator.large_maps.submaps import gauss_newton, neighbourhood
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.angles import wrap_angle

@@ -10,7 +10,8 @@ import numpy as np
 
 from ....arrays import Array
 from ...error_frames import ErrorFrame
-from ...filters.marginalise_and_merge import coincide, without_landmarks
+from ...filters.gaussian_map import without_landmarks
+from ...filters.landmark_merging import coincide
 from .factor import retract
 from .store import Submap
 

@@ -1,10 +1,9 @@
-"""Edit a Gaussian map: take landmarks out of it, make two of them one.
+"""Merge two landmarks of a Gaussian map: their offset, and the condition that it is 0.
 
 Pure functions of mean (3 + 2n,) and covariance P (3 + 2n, 3 + 2n) in the order
 (x, y, θ, l1x, l1y, …); a landmark is named by its slot 0 … n − 1.
 """
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from ..models.rigid_motion import left_jacobian
 
 
 class ConditionedMap(NamedTuple):
-    """Mean and covariance of robot and map after a condition."""
+    """Mean and covariance of robot and map after conditioning."""
 
     mean: Array
     """Shape (3 + 2n,)."""
@@ -24,16 +23,16 @@ class ConditionedMap(NamedTuple):
 
 
 class Separation(NamedTuple):
-    """How far two landmarks lie from each other, and how well that is known."""
+    """Offset of two landmarks and its covariance."""
 
     offset: Array
-    """l_i − l_j, shape (2,) [m]."""
+    """D = l_i − l_j, shape (2,) [m]."""
     covariance: Array
-    """C of it, shape (2, 2) [m²]."""
+    """C, shape (2, 2) [m²]."""
 
     @property
     def squared(self) -> float:
-        """Dᵀ C⁻¹ D, χ² of 2 degrees of freedom if both are one; infinite without C."""
+        """Dᵀ C⁻¹ D: χ² of 2 degrees of freedom if both are one; ∞ if C is singular."""
         (a, b), (_, c) = self.covariance
         determinant = a * c - b * b
         if not determinant > 0:
@@ -43,31 +42,8 @@ class Separation(NamedTuple):
 
     @property
     def largest_std(self) -> float:
-        """Standard deviation in the direction known worst [m]."""
+        """Standard deviation in the most uncertain direction [m]."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance)[-1], 0.0)))
-
-
-def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
-    """Drop the entries of landmarks from a mean, or rows and columns from a covariance.
-
-    To leave out entries of a Gaussian is to marginalise them: all other numbers keep
-    their last bit.
-
-    Parameters
-    ----------
-    array : ndarray, shape (3 + 2n,) or (3 + 2n, 3 + 2n)
-    slots : iterable of int
-        The landmarks to drop.
-
-    Examples
-    --------
-    >>> without_landmarks(np.arange(7.0), [0])
-    array([0., 1., 2., 5., 6.])
-    """
-    columns = [column for slot in slots for column in (3 + 2 * slot, 4 + 2 * slot)]
-    for axis in range(array.ndim):
-        array = np.delete(array, columns, axis=axis)
-    return array
 
 
 def separation(mean: Array, covariance: Array, one: int, other: int) -> Separation:
@@ -80,7 +56,7 @@ def separation(mean: Array, covariance: Array, one: int, other: int) -> Separati
     Parameters
     ----------
     mean, covariance : ndarray
-        The map; entries beyond it do no harm.
+        The map; entries behind it are ignored.
     one, other : int
         Slots i and j.
     """
@@ -99,19 +75,19 @@ def coincide(
     frame: ErrorFrame = "additive",
     reference: Array | None = None,
 ) -> ConditionedMap:
-    """Condition a map on two of its landmarks being one: a reading of distance zero.
+    """Condition a map on two of its landmarks being one.
 
-    The reading 0 = l_i − l_j has no noise.  With D = l̂_i − l̂_j::
+    The condition is a measurement 0 = l_i − l_j without noise.  With D = l̂_i − l̂_j::
 
         H = [… −J D …  I … −I …],   S = H P Hᵀ = L Lᵀ,   A = L⁻¹ H P
         δ = −Aᵀ L⁻¹ D,    P ← P − Aᵀ A
 
-    The columns are those of θ, l_i and l_j.  The reading does not tell a turn of the
-    whole map, and H must not either: its heading column, which multiplies an offset
-    that is but noise, is J D with D taken at the points where the filter linearises.
-    The additive EKF has none there, for it is linear in its own error.  In the
-    invariant frame δ is composed with the state, and P carried along, as
-    :class:`~slamgym.estimator.filters.invariant.InvariantEkfSlam` does.
+    The columns are those of θ, l_i and l_j.  The condition holds no information about a
+    rotation of the whole map, and neither must H.  Its heading column is therefore
+    −J D, with D taken at the points where the filter linearises.  The additive EKF has
+    no heading column, since the condition is linear in its error.  In the invariant
+    frame δ is composed with the state and P follows, as in
+    :class:`~slamgym.estimator.filters.invariant.InvariantEkfSlam`.
 
     Parameters
     ----------
@@ -127,16 +103,16 @@ def coincide(
     Returns
     -------
     ConditionedMap
-        In it both landmarks have the same mean and covariance; drop either.
+        Both landmarks have the same mean and covariance in it; drop either.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If C is not positive definite: then nothing can be said of their distance.
+        If C is not positive definite.
 
     Examples
     --------
-    Two equally good estimates of one landmark meet halfway, twice as certain:
+    Two equally good estimates of one landmark meet halfway, with half the variance:
 
     >>> P = np.diag([0, 0, 0, 1.0, 1.0, 1.0, 1.0])
     >>> mean, P = coincide(np.array([0, 0, 0, 4.0, 0, 6.0, 0]), P, 0, 1)
@@ -164,7 +140,7 @@ def coincide(
 
 
 def _composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
-    """Compose an invariant correction with the state, and carry P along.
+    """Compose an invariant correction with the state, and transform P to match.
 
     ::
 
