@@ -8,13 +8,15 @@ from typing import Any, Protocol, runtime_checkable
 from numpy.typing import ArrayLike
 
 from .belief import Belief, MapView
-from .update_report import UpdateReport
+from .update_report import ScanDecisions, UpdateReport
 
 __all__ = [
     "Belief",
     "MapView",
+    "ScanDecisions",
     "SlamEstimator",
     "SupportsBeliefLimit",
+    "SupportsDecisions",
     "SupportsJoin",
     "SupportsLandmarkIds",
     "SupportsLocalView",
@@ -68,6 +70,15 @@ class SupportsTruth(Protocol):
         self, pose: ArrayLike, landmarks: Mapping[int, ArrayLike]
     ) -> None:
         """Pass the true pose (3,) and landmarks before the predict of a step."""
+
+
+@runtime_checkable
+class SupportsDecisions(Protocol):
+    """An estimator that associates readings and lists its decisions about them."""
+
+    @property
+    def decisions(self) -> Sequence[ScanDecisions]:
+        """The decisions about every scan since the start, as they stand now."""
 
 
 @runtime_checkable

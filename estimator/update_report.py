@@ -4,11 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..arrays import Array
+
+
+class ScanDecisions(NamedTuple):
+    """Which landmark each reading of one scan was given to, as decided in the end."""
+
+    row_ids: tuple[int | None, ...]
+    """The landmark of each row; None where the filter did not use the row."""
+    added: tuple[int, ...] = ()
+    """Landmarks that entered the map with this scan; the row of each confirmed it."""
+    removed: tuple[int, ...] = ()
+    """Landmarks that left the map after it."""
+    merged: tuple[tuple[int, int], ...] = ()
+    """Landmarks merged after it, (kept, gone); the second ones left the map."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -1,8 +1,8 @@
 """How good an estimate is: numbers in, verdicts out.
 
-``trajectory_error`` and ``nees`` measure.  ``hypothesis_tests``, ``whiteness`` and
-``time_average_tests`` test with known error rates.  ``consistency_report`` collects the
-tests on one filter.
+``trajectory_error``, ``nees``, ``association_scores`` and ``gospa`` measure.
+``hypothesis_tests``, ``whiteness`` and ``time_average_tests`` test with known error
+rates.  ``consistency_report`` collects the tests on one filter.
 """
 
 from lazy_loader import attach_stub

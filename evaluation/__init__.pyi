@@ -1,9 +1,15 @@
+from .association_scores import AssociationScores as AssociationScores
+from .association_scores import landmark_identities as landmark_identities
+from .association_scores import places_of as places_of
+from .association_scores import score_association as score_association
 from .chi_square import Band as Band
 from .chi_square import average_band as average_band
 from .chi_square import family_band as family_band
 from .consistency_report import ConsistencyReport as ConsistencyReport
 from .consistency_report import assert_consistent as assert_consistent
 from .consistency_report import evaluate_consistency as evaluate_consistency
+from .gospa import Gospa as Gospa
+from .gospa import gospa as gospa
 from .hypothesis_tests import FamilyTest as FamilyTest
 from .hypothesis_tests import HypothesisTest as HypothesisTest
 from .hypothesis_tests import family_test as family_test

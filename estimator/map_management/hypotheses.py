@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array
 from ..association.candidates import ScanAssociation
-from ..interface import Belief, MapView, SlamEstimator, UpdateReport
+from ..interface import Belief, MapView, ScanDecisions, SlamEstimator, UpdateReport
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.nested_state import with_prefix, without_prefix
@@ -127,6 +127,11 @@ class HypothesisSlam:
         """The mapped landmarks, in the order of the belief."""
         return self.best.landmark_ids
 
+    @property
+    def decisions(self) -> Sequence[ScanDecisions]:
+        """What the most probable hypothesis has decided about the scans so far."""
+        return self.best.decisions
+
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
         self.best.reset(pose, pose_std)
@@ -233,8 +238,8 @@ class HypothesisSlam:
         for k in origins:
             slam = self.hypotheses[k].slam
             if k in used:
-                state, slam = slam.state_dict(), self._fresh()
-                slam.load_state_dict(state)
+                slam = self._fresh()
+                slam.follow(self.hypotheses[k].slam)
             used.add(k)
             slams.append(slam)
         return slams

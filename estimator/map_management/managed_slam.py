@@ -17,6 +17,7 @@ from ..models.rigid_motion import rotation
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.nested_state import with_prefix, without_prefix
+from ..update_report import ScanDecisions
 from .map_editor import CachedEditor, edit_map
 from .map_view import mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
@@ -113,10 +114,13 @@ class ManagedSlam:
     def tentative_landmarks(self) -> Array:
         """Estimated positions of tentative landmarks, shape (t, 2) [m]."""
         places = self._candidates.tentative.places
-        if not len(places):
-            return places.copy()
         x, y, heading = self._editor.map_view().mean[:3]
         return np.asarray(places @ rotation(heading).T + (x, y))
+
+    @property
+    def decisions(self) -> Sequence[ScanDecisions]:
+        """What was decided about the scans since the start or the last loaded state."""
+        return self._recent.decisions
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
@@ -196,11 +200,11 @@ class ManagedSlam:
         seen -= {*report.rejected_ids, *report.skipped_ids}
         removed, merged = self._pruner.prune(readings, plan.row_ids, seen, missed)
         self._recent.note_edits(removed, merged)
-        confirmed = set(plan.confirmed)
+        added = self.decisions[-1].added
         return report.replace(
             removed_ids=tuple(removed),
             merged_ids=tuple(merged),
-            confirmed_ids=tuple(i for i in report.added_ids if i in confirmed),
+            confirmed_ids=tuple(i for i in added if i in plan.confirmed),
             row_ids=tuple(plan.row_ids),
             tentative_rows=tuple(plan.tentative_rows),
             ambiguous_rows=tuple(plan.ambiguous_rows),
@@ -234,10 +238,7 @@ class ManagedSlam:
         return argument_checks.mapped_identities(landmark_ids, mapped)
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
-        """Return the present belief, of the whole map or of pose and some landmarks.
-
-        Tentative landmarks are not in it.
-        """
+        """Return the present belief, of the whole map or of pose and some landmarks."""
         if landmark_ids is None:
             return self._filter.belief()
         return marginal(self._filter, landmark_ids)
@@ -280,6 +281,11 @@ class ManagedSlam:
             raise
         self._editor.expire()
         self._candidates = candidates
+
+    def follow(self, other: ManagedSlam) -> None:
+        """Continue from the state of another filter, and from its decisions."""
+        self.load_state_dict(other.state_dict())
+        self._recent.decisions = list(other.decisions)
 
     def _remembered(self) -> dict[str, Any]:
         """Return all of the state except the filter's."""

@@ -16,6 +16,7 @@ import numpy as np
 from ...arrays import Array
 from ..association.candidates import LABEL_BITS, NO_LABEL, ScanAssociation
 from ..interface import (
+    ScanDecisions,
     SlamEstimator,
     SupportsLocalView,
     SupportsTruth,
@@ -133,6 +134,8 @@ class RecentScans:
         """Start a new run."""
         self._scans: list[RecentScan] = []
         self._motions: tuple[Motion, ...] = ()
+        self.decisions: list[ScanDecisions] = []
+        """About every scan since the start, or since a saved state was loaded."""
 
     def note_motion(self, distance: float, turn: float, dt: float) -> None:
         """Remember a motion since the last scan."""
@@ -143,6 +146,11 @@ class RecentScans:
         self, removed: Sequence[int], merged: Sequence[tuple[int, int]]
     ) -> None:
         """Remember which landmarks were removed and merged after the last scan."""
+        if self.decisions and (removed or merged):
+            made = self.decisions[-1]
+            self.decisions[-1] = made._replace(
+                removed=(*made.removed, *removed), merged=(*made.merged, *merged)
+            )
         if self._scans and (removed or merged):
             last = self._scans[-1]
             self._scans[-1] = replace(
@@ -159,14 +167,30 @@ class RecentScans:
         row_ids, labels = tuple(plan.row_ids), tuple(plan.labels)
         scan = RecentScan(plan.scan, self._motions, readings, row_ids, labels)
         if not self._window:
-            return scan.feed(self._slam)
+            report = scan.feed(self._slam)
+            self.decisions.append(_decided(plan, report))
+            return report
         if scan.begins:
             scan = replace(scan, before=self._slam.state_dict())
         scans = [*self._scans, scan][-self._window - 1 :]
         first = _relabel(scans, plan.confirmed)
         report = scan.feed(self._slam) if first is None else self._repeat(scans, first)
         self._scans, self._motions = scans, ()
+        self.decisions.append(_decided(plan, report))
+        if first is not None:
+            self._revise_decisions(scans[first:-1])
         return report
+
+    def _revise_decisions(self, scans: Sequence[RecentScan]) -> None:
+        """Note the landmarks that the readings of earlier scans belong to now."""
+        newest = self._scans[-1].number
+        for scan in scans:
+            place = len(self.decisions) - 1 - (newest - scan.number)
+            if place >= 0:
+                made = self.decisions[place]
+                pairs = zip(made.row_ids, scan.row_ids, scan.labels, strict=True)
+                ids = tuple(new if label != NO_LABEL else i for i, new, label in pairs)
+                self.decisions[place] = made._replace(row_ids=ids)
 
     def _repeat(self, scans: list[RecentScan], first: int) -> UpdateReport:
         """Repeat the scans since one, and renew the states kept before them."""
@@ -207,6 +231,17 @@ class RecentScans:
             for k in range(int(state["count"]))
         ]
         self._motions = motions
+        self.decisions = []
+
+
+def _decided(plan: ScanAssociation, report: UpdateReport) -> ScanDecisions:
+    """Return what became of the rows of a scan."""
+    new = {*report.added_ids, *plan.confirmed}.difference(report.skipped_ids)
+    unused = {*report.rejected_ids, *report.skipped_ids} - new
+    row_ids = tuple(None if i in unused else i for i in plan.row_ids)
+    return ScanDecisions(
+        row_ids, tuple(i for i in row_ids if i in new and i is not None)
+    )
 
 
 def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | None:

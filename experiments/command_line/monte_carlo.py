@@ -48,6 +48,7 @@ def monte_carlo(
             f"motion.std=[0.1,0.1,0.1]. {options.REPEATED}",
         ),
     ] = None,
+    resolution: options.Resolution = 0.0,
     jobs: options.Jobs = None,
     backend: Annotated[
         str | None,
@@ -104,6 +105,7 @@ def monte_carlo(
     slamgym monte-carlo loop --estimators ekf,invariant --runs 200 --out loop
     slamgym monte-carlo six_landmarks -e mine:MyFilter --runs 100 --jobs 4
     slamgym monte-carlo loop --assume motion.std=[0.1,0.1,0.1]
+    slamgym monte-carlo hidden_identities -e 'ekf[management={association="joint"}]'
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://boss:8786
     """  # noqa: D400 (the list of commands shows the question)
     from ...sim_configs.atomic_file import replace_when_written
@@ -145,6 +147,7 @@ def monte_carlo(
             block_size=block_size,
             first_run=first_run,
             fresh=fresh,
+            resolution=resolution,
             command=shlex.join(["slamgym", *sys.argv[1:]]),
             progress=tick,
         ) as results,

@@ -107,6 +107,15 @@ InitialPoseStd = Annotated[
         "A,B,C", "σx,σy,σθ of the first pose [m, m, rad].", "from the log, else 0,0,0"
     ),
 ]
+Resolution = Annotated[
+    float,
+    option(
+        "R",
+        "In scores of association, true landmarks nearer to each other than R count as "
+        "one [m].",
+        "each counts",
+    ),
+]
 Jobs = Annotated[
     int | None,
     option(

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 from joblib import delayed
 
 from ...estimator import registry
+from ...estimator.interface import SupportsTruth
 from ...sim_configs import Scenario, load_scenario
 from ..runs.blas_threads import one_blas_thread
 from ..runs.filter_settings import FilterSettings
-from ..runs.simulated_runs import simulate_runs
+from ..runs.simulated_runs import SimulatedRuns, simulate_runs
+from .measure.association_measures import KNOWN_IDS_ATE, known_ids_errors
 from .measure.estimator_choices import EstimatorChoice, estimator_choices
 from .measure.filtered_runs import filter_runs
 from .measure.run_measures import Block, measure_runs
@@ -42,6 +44,7 @@ class _Work:
     factories: Mapping[str, registry.EstimatorFactory]
     seed: int
     threads: int | None
+    resolution: float
 
     def do(self, span: Span) -> list[Block]:
         """Simulate, filter and measure runs; return one block per estimator."""
@@ -49,10 +52,14 @@ class _Work:
             if ":" not in name and name not in registry.list_estimators():
                 registry.register_estimator(name, factory)
         runs = simulate_runs(self.scenario, span.size, self.seed + span.first)
-        return [
-            measure_runs(runs, filter_runs(settings, runs, threads=self.threads))
-            for settings in self.settings
-        ]
+        return [self._measure(settings, runs) for settings in self.settings]
+
+    def _measure(self, settings: FilterSettings, runs: SimulatedRuns) -> Block:
+        filtered = filter_runs(settings, runs, threads=self.threads)
+        block = measure_runs(runs, filtered, resolution=self.resolution)
+        if runs.true_ids is not None:
+            block[KNOWN_IDS_ATE] = known_ids_errors(settings, runs, self.threads)
+        return block
 
 
 def monte_carlo(
@@ -68,6 +75,7 @@ def monte_carlo(
     block_size: int = BLOCK_SIZE,
     first_run: int = 0,
     fresh: bool = False,
+    resolution: float = 0.0,
     command: str = "",
     progress: Progress | None = None,
 ) -> "xr.Dataset":
@@ -102,6 +110,9 @@ def monte_carlo(
         :func:`~slamgym.experiments.monte_carlo.merge_blocks`.
     fresh : bool
         Whether to remove what an earlier job left in ``out``.
+    resolution : float
+        True landmarks nearer to each other count as one place [m], in the scores of a
+        world that hides identities.
     command : str, optional
         Command that reproduces the results, to be stored with them.
     progress : callable, optional
@@ -110,8 +121,9 @@ def monte_carlo(
     Returns
     -------
     xarray.Dataset
-        The variables of ``run_measures.VARIABLES`` over (estimator, run, step); opened
-        from ``out`` if given.
+        The variables of ``run_measures.VARIABLES`` over (estimator, run, step), and
+        where the world hides identities, of ``HIDDEN_VARIABLES``; opened from ``out``
+        if given.
 
     Raises
     ------
@@ -125,11 +137,19 @@ def monte_carlo(
     >>> dict(results.pose_nees_invariant.sizes)
     {'estimator': 2, 'run': 2, 'step': 30}
     """
-    world, choices = _with_identities(scenario), estimator_choices(estimators)
+    world, choices = load_scenario(scenario), estimator_choices(estimators)
     assumed_world = world if assumed is None else load_scenario(assumed)
+    if assumed_world.sensor.identities != world.sensor.identities:
+        raise ValueError(
+            "assumed must agree with scenario in sensor.identities: only its noise "
+            "may differ"
+        )
     size = integer("block_size", block_size, 1)
     asked = _span(integer("first_run", first_run, 0), integer("runs", runs, 1), size)
-    job = Job(world, assumed_world, choices, integer("seed", seed, 0), size)
+    if not 0 <= resolution < float("inf"):
+        raise ValueError(f"resolution must be a number >= 0, got {resolution!r}")
+    whole_seed = integer("seed", seed, 0)
+    job = Job(world, assumed_world, choices, whole_seed, size, float(resolution))
     workers = engage_workers(jobs, backend)
     work = _Work(
         world,
@@ -137,6 +157,7 @@ def monte_carlo(
         {choice.name: registry.find_estimator(choice.name) for choice in choices},
         job.seed,
         threads=None if workers is None else 1,
+        resolution=job.resolution,
     )
     path = None if out is None else Path(out)
     with one_blas_thread(), BlockFolder(job, path, fresh=fresh) as folder:
@@ -189,15 +210,13 @@ def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:
     if choice.name == "submaps" and "folder" in choice.options:
         raise ValueError("folder holds the submaps of one run: leave it out of many")
     settings = choice.settings(scenario)
-    settings.make(scenario.start.pose)
+    slam = settings.make(scenario.start.pose)
+    if not scenario.sensor.identities and isinstance(slam, SupportsTruth):
+        raise ValueError(
+            f"estimator '{choice.name}' linearises at the true landmarks: it needs "
+            "sensor.identities = true"
+        )
     return settings
-
-
-def _with_identities(source: Scenario | Mapping[str, object] | str | Path) -> Scenario:
-    scenario = load_scenario(source)
-    if not scenario.sensor.identities:
-        raise ValueError(f"scenario '{scenario.name}' must not hide identities")
-    return scenario
 
 
 def _span(first_run: int, runs: int, block_size: int) -> Span:

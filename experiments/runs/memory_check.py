@@ -68,7 +68,7 @@ def refuse_large_maps(
     MemoryError
         With the required and the available memory.
     """
-    read = runs.visible.any(axis=1).sum(axis=1).tolist()  # by each run
+    read = runs.identified().visible.any(axis=1).sum(axis=1).tolist()  # by each run
     _refuse_beyond_limit(max(read), estimator)
     if not isinstance(estimator, SupportsMemoryEstimate):
         return

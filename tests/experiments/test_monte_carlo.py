@@ -25,7 +25,11 @@ from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
 from slamgym.experiments.monte_carlo.measure.filtered_runs import filter_runs
-from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES, measure_runs
+from slamgym.experiments.monte_carlo.measure.run_measures import (
+    HIDDEN_VARIABLES,
+    VARIABLES,
+    measure_runs,
+)
 from slamgym.experiments.monte_carlo.store.result_blocks import merge_blocks
 from slamgym.experiments.monte_carlo.store.results import load_results
 from slamgym.experiments.runs.filter_settings import settings_for, settings_for_scenario
@@ -131,6 +135,40 @@ def test_deviations_and_areas_are_those_of_the_claimed_covariances():
         np.testing.assert_allclose(block["position_std"][run], scale * np.sqrt(13.0))
         np.testing.assert_allclose(block["heading_std"][run], scale * 5.0)
         np.testing.assert_allclose(block["pose_area"][run], scale**2 * 54 * np.pi)
+
+
+@pytest.fixture(scope="module")
+def hidden():
+    world = load_scenario("hidden_identities").with_changes(steps=40)
+    managed = {"management": {"association": "hypotheses", "confirm": (2, 3)}}
+    options = {"default": "invariant", "managed": ("invariant", managed)}
+    return monte_carlo(world, options, 3, block_size=2)
+
+
+def test_readings_without_identity_are_associated_and_scored(hidden):
+    assert set(hidden.data_vars) == set(HIDDEN_VARIABLES)
+    assert not hidden.failed.any()
+    for which in ("raw", "aligned"):
+        parts = sum(hidden[f"gospa_{which}_{p}"] for p in ("localisation", "missed"))
+        whole = parts + hidden[f"gospa_{which}_false"]
+        np.testing.assert_allclose(hidden[f"gospa_{which}_distance"] ** 2, whole)
+    assert (hidden.association_map_size <= 20).all()
+    assert (hidden.association_precision > 0.9).all()
+    assert (hidden.association_new_correct > 2).all()
+    assert np.isfinite(hidden.landmark_rmse).all()
+
+
+def test_lost_runs_are_told_by_the_same_filter_with_known_identities(hidden):
+    known = load_scenario("hidden_identities").with_changes(
+        steps=40, sensor={"identities": True, "clutter": 0.0, "max_clutter": 0}
+    )
+    twin = monte_carlo(known, "invariant", 3)
+    for label in hidden.estimator.values:
+        np.testing.assert_allclose(
+            hidden.known_ids_ate.sel(estimator=label),
+            twin.ate.sel(estimator="invariant"),
+            rtol=1e-12,
+        )
 
 
 def test_the_ideal_filter_is_told_the_truth():
@@ -434,7 +472,9 @@ def test_memory_grows_with_the_block_and_not_with_the_runs(tmp_path):
         ({"estimators": None}, "estimators must be names"),
         ({"backend": "lokey"}, "did you mean 'loky'"),
         ({"block_size": 0}, "block_size must be"),
-        ({"scenario": "hidden_identities"}, "must not hide identities"),
+        ({"resolution": -1.0}, "resolution must be a number >= 0"),
+        ({"assumed": "hidden_identities"}, "must agree with scenario in sensor.ident"),
+        ({"scenario": "hidden_identities", "estimators": "ideal"}, "true landmarks"),
     ],
 )
 def test_what_cannot_be_run_is_refused_before_anything_is_written(

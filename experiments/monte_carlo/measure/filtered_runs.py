@@ -10,6 +10,7 @@ from ....estimator.filters.batch import BatchSlam, can_batch
 from ....estimator.filters.batch_results import BatchTrace
 from ....estimator.filters.ekf import EkfSlam
 from ....estimator.interface import Belief, SlamEstimator, SupportsTruth
+from ...runs.association import DecisionRecorder, RunDecisions
 from ...runs.filter_settings import FilterSettings
 from ...runs.memory_check import refuse_large_maps
 from ...runs.simulated_runs import SimulatedRuns
@@ -35,6 +36,8 @@ class FilteredRuns(NamedTuple):
     """Final beliefs; None for a run that failed."""
     failures: Mapping[int, Failure]
     """By the index of the run."""
+    decisions: Mapping[int, RunDecisions] = {}
+    """About readings without identity, by the index of the run."""
 
 
 def filter_runs(
@@ -55,20 +58,22 @@ def filter_runs(
         Threads of a batch; all cores by default.
     """
     first = settings.make(runs.initial_poses[0])
-    refuse_large_maps(runs, first, at_once=can_batch(first))
-    if can_batch(first):
+    is_batch = can_batch(first) and runs.true_ids is None
+    refuse_large_maps(runs, first, at_once=is_batch)
+    if is_batch:
         return _in_a_batch(cast(EkfSlam, first), settings, runs, threads)
     count, steps, _ = runs.visible.shape
     trace = _empty_trace(count, steps)
     beliefs: list[Belief | None] = []
     failures: dict[int, Failure] = {}
+    decisions: dict[int, RunDecisions] = {}
     for run in range(count):
-        failure = _one_by_one(settings, runs, run, trace, beliefs)
+        failure = _one_by_one(settings, runs, run, trace, beliefs, decisions)
         if failure is not None:
             _erase(trace, run, failure.step)
             beliefs.append(None)
             failures[run] = failure
-    return FilteredRuns(trace, beliefs, failures)
+    return FilteredRuns(trace, beliefs, failures, decisions)
 
 
 def _in_a_batch(
@@ -101,7 +106,7 @@ def _in_a_batch(
 def _why(settings: FilterSettings, runs: SimulatedRuns, run: int, step: int) -> Failure:
     """Repeat a run that failed in a batch, for the message of the single filter."""
     trace = _empty_trace(*runs.visible.shape[:2])
-    failure = _one_by_one(settings, runs, run, trace, [])
+    failure = _one_by_one(settings, runs, run, trace, [], {})
     return failure or Failure(step, _NOT_FINITE)
 
 
@@ -111,16 +116,18 @@ def _one_by_one(
     run: int,
     trace: BatchTrace,
     beliefs: list[Belief | None],
+    decisions: dict[int, RunDecisions],
 ) -> Failure | None:
-    """Filter one run into its row of the trace, and append its final belief."""
+    """Filter one run into its row of the trace; keep final belief and decisions."""
     step = 0
     try:
         slam = settings.make(runs.initial_poses[run])
+        recorder = DecisionRecorder(slam)
         landmarks = dict(enumerate(runs.landmarks[run]))
         for step in range(runs.visible.shape[1]):
             if isinstance(slam, SupportsTruth):  # it linearises there (``ideal``)
                 slam.observe_truth(runs.true_poses[run, step], landmarks)
-            belief = _step(slam, runs, run, step, trace)
+            belief = _step(slam, runs, run, step, trace, recorder)
             if not _finite(trace, (run, step)):
                 return Failure(step, _NOT_FINITE)
     except (Exception, SystemExit) as error:
@@ -128,16 +135,29 @@ def _one_by_one(
     if not _is_finite_map(belief):
         return Failure(step, _MAP_NOT_FINITE)
     beliefs.append(belief)
+    made = recorder.result()
+    if made is not None and runs.true_ids is not None:
+        decisions[run] = made
     return None
 
 
 def _step(
-    slam: SlamEstimator, runs: SimulatedRuns, run: int, step: int, trace: BatchTrace
+    slam: SlamEstimator,
+    runs: SimulatedRuns,
+    run: int,
+    step: int,
+    trace: BatchTrace,
+    recorder: DecisionRecorder,
 ) -> Belief:
     if step > 0:  # the first scan is before any motion
         slam.predict(runs.odometry[run, step], runs.dt[step])
     seen = np.flatnonzero(runs.visible[run, step])
-    report = slam.update(runs.measurements[run, step, seen], seen.tolist())
+    readings = runs.measurements[run, step, seen]
+    if runs.true_ids is None:
+        report = slam.update(readings, seen.tolist())
+    else:
+        report = slam.update(readings)
+        recorder.add(report, runs.true_ids[run, step, seen])
     belief = slam.belief()
     trace.poses[run, step] = belief.pose
     trace.pose_covariances[run, step] = belief.pose_covariance

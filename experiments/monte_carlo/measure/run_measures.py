@@ -15,7 +15,9 @@ from ....estimator.interface import Belief
 from ....estimator.models.angles import wrap_angle
 from ....evaluation import nees
 from ....evaluation.trajectory_error import ellipse_areas, position_accuracy
+from ....sim_configs import Scenario
 from ...runs.simulated_runs import SimulatedRuns
+from .association_measures import MEANINGS, identified, measure_association
 from .filtered_runs import Failure, FilteredRuns
 
 Block = dict[str, NDArray[np.generic]]
@@ -68,7 +70,20 @@ VARIABLES: dict[str, Variable] = {
 }
 
 
-def measure_runs(runs: SimulatedRuns, filtered: FilteredRuns) -> Block:
+HIDDEN_VARIABLES: dict[str, Variable] = VARIABLES | {
+    name: Variable(RUN, "f8", meaning) for name, meaning in MEANINGS.items()
+}
+"""Those of a world that hides identities."""
+
+
+def variables_of(scenario: Scenario) -> dict[str, Variable]:
+    """Return the variables of the results in a world."""
+    return VARIABLES if scenario.sensor.identities else HIDDEN_VARIABLES
+
+
+def measure_runs(
+    runs: SimulatedRuns, filtered: FilteredRuns, *, resolution: float = 0.0
+) -> Block:
     """Measure a filter's runs against the truth.
 
     Parameters
@@ -77,18 +92,22 @@ def measure_runs(runs: SimulatedRuns, filtered: FilteredRuns) -> Block:
         B runs of T steps among L landmarks.
     filtered : FilteredRuns
         The beliefs of a filter in these runs.
+    resolution : float
+        True landmarks nearer to each other count as one place [m], where identities are
+        hidden.
 
     Returns
     -------
     dict
-        The `VARIABLES`, shape (B,), (B, T) or (B, L) each; nan where undefined.
+        The `VARIABLES`, or the `HIDDEN_VARIABLES`, shape (B,), (B, T) or (B, L) each;
+        nan where undefined.
     """
     block = _empty_block(runs)
     failures = dict(filtered.failures)
     for run in range(len(runs.visible)):
         with np.errstate(all="ignore"):  # a diverged run may overflow
             measured = _measure_path(runs.true_poses[run], filtered, run)
-            map_measures = _try_to_measure_map(runs, run, filtered.beliefs[run])
+            map_measures = _try_to_measure_map(runs, run, filtered, resolution)
         if isinstance(map_measures, Failure):
             failures[run] = map_measures
         else:
@@ -100,13 +119,20 @@ def measure_runs(runs: SimulatedRuns, filtered: FilteredRuns) -> Block:
 
 
 def _try_to_measure_map(
-    runs: SimulatedRuns, run: int, belief: Belief | None
+    runs: SimulatedRuns, run: int, filtered: FilteredRuns, resolution: float
 ) -> dict[str, Value] | Failure:
     """Measure the final map; a malformed belief of a user's estimator is a failure."""
+    belief = filtered.beliefs[run]
     if belief is None:
         return {}
     try:
-        return _measure_map(runs.true_poses[run, -1], runs.landmarks[run], belief)
+        if runs.true_ids is not None:
+            made = filtered.decisions.get(run)
+            belief = identified(belief, {} if made is None else made.identities())
+        return {
+            **_measure_map(runs.true_poses[run, -1], runs.landmarks[run], belief),
+            **measure_association(runs, filtered, run, resolution),
+        }
     except Exception as error:
         message = f"the final belief is no map of this world: {error}"
         return Failure(runs.visible.shape[1] - 1, message)
@@ -122,11 +148,13 @@ def _write_failures(block: Block, failures: Mapping[int, Failure]) -> None:
 
 
 def _empty_block(runs: SimulatedRuns) -> Block:
-    sizes = dict(zip(("run", "step", "landmark"), runs.visible.shape, strict=True))
+    shape = (*runs.visible.shape[:2], runs.landmarks.shape[1])
+    sizes = dict(zip(("run", "step", "landmark"), shape, strict=True))
+    variables = VARIABLES if runs.true_ids is None else HIDDEN_VARIABLES
     blanks = {"f8": np.nan, "i8": 0, "?": False, "U": ""}
     return {
         name: np.full([sizes[dim] for dim in dims], blanks[kind], dtype=kind)
-        for name, (dims, kind, _) in VARIABLES.items()
+        for name, (dims, kind, _) in variables.items()
     }
 
 

@@ -10,6 +10,7 @@ from ....estimator.error_frames import ErrorFrame
 from ....evaluation.chi_square import average_band
 from ....evaluation.consistency_report import ConsistencyReport, evaluate_consistency
 from ...runs.nan_statistics import finite, mean, quotient, root_mean_square
+from .association import association_summary
 from .decision_entries import decisions_table
 from .scores import (
     POINT_FREEDOM,
@@ -113,7 +114,7 @@ def summarise_estimator(
         ``heading_std_end``, ``{claimed, true}`` [rad]; ``rmse`` of position [m] and
         heading [rad]; ``ate`` and ``landmark_rmse``, ``{raw, aligned}`` [m];
         ``landmark_mahalanobis``, root mean square; ``area`` of the 3σ ellipses at the
-        end [m²].
+        end [m²]; ``association``, see :func:`.association.association_summary`.
     """
     heading = _heading_std_end(scores)
     per_run = scores.ratios(frame).mean(axis=1)
@@ -150,6 +151,7 @@ def summarise_estimator(
             "pose": mean(scores.per_run("pose_area")),
             "landmark": mean(scores.per_run("landmark_area")),
         },
+        "association": association_summary(scores),
     }
 
 

@@ -71,10 +71,71 @@ def measures(summary: dict[str, Any]) -> list[Measure]:
         Measure("… aligned [m]", "", at("ate", "aligned")),
         Measure("landmark RMSE, raw [m]", "", at("landmark_rmse", "raw")),
         Measure("… aligned [m]", "", at("landmark_rmse", "aligned")),
+        *_association_measures(summary),
         Measure(
             f"failed runs of {runs}", "0", lambda entry: str(len(entry["failed_runs"]))
         ),
     ]
+
+
+def _association_measures(summary: dict[str, Any]) -> list[Measure]:
+    """List the rows of a world that hides identities."""
+    entries = [entry["association"] for entry in summary["estimators"].values()]
+    if None in entries:
+        return []
+
+    def at(
+        *keys: str, write: Callable[[float], str] = number
+    ) -> Callable[[Entry], str]:
+        return lambda entry: _cell(entry["association"], keys, write)
+
+    cutoff, runs = entries[0]["gospa"]["cutoff"], summary["runs"]
+    size = entries[0]["true_map_size"]
+    true_size = "" if size is None else number(size)
+    return [
+        Measure("path (ATE), median run, raw [m]", "", at("median_ate", "hidden")),
+        Measure("… with known identities [m]", "", at("median_ate", "known")),
+        Measure(f"GOSPA of the map, {cutoff:g} m, raw [m]", "", _gospa("raw")),
+        Measure("… aligned [m]", "", _gospa("aligned")),
+        Measure("… landmarks missed, false", "0, 0", _missed_and_false),
+        Measure("landmarks in the map", true_size, at("map_size")),
+        Measure("… new ones correct", true_size, at("new_correct")),
+        Measure("… duplicates", "0", at("duplicate")),
+        Measure("… of clutter", "0", at("ghost")),
+        Measure("readings given right", "", at("correct")),
+        Measure("… wrong", "0", at("wrong")),
+        Measure("… not used", "0", at("missed")),
+        Measure("… clutter used", "0", at("clutter_used")),
+        Measure("precision", "1", at("precision", write=share)),
+        Measure("recall", "1", at("recall", write=share)),
+        Measure(
+            f"bad runs of {runs}",
+            "0",
+            lambda entry: str(entry["association"]["bad_runs"]["count"]),
+        ),
+    ]
+
+
+def _gospa(which: str) -> Callable[[Entry], str]:
+    keys = ("association", "gospa", which, "distance")
+    return lambda entry: _cell(entry, keys, number)
+
+
+def _missed_and_false(entry: Entry) -> str:
+    found = entry["association"]["gospa"]["aligned"]
+    keys = ("missed_count", "false_count")
+    return ", ".join(_cell(found, (key,), number) for key in keys)
+
+
+def share(value: float) -> str:
+    """Write a share that should be 1.
+
+    Examples
+    --------
+    >>> share(0.98765), share(1.0)
+    ('.988', '1.000')
+    """
+    return f"{value:.3f}".removeprefix("0")
 
 
 def monte_carlo_table(summary: dict[str, Any]) -> Table:

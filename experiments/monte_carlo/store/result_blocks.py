@@ -20,7 +20,7 @@ from ....sim_configs import Scenario
 from ....sim_configs.atomic_file import replace_when_written
 from ....sim_configs.scenario_files import scenario_text
 from ..measure.estimator_choices import EstimatorChoice
-from ..measure.run_measures import VARIABLES, Block
+from ..measure.run_measures import Block, Variable, variables_of
 from . import job_folder
 
 
@@ -45,6 +45,13 @@ class Job(NamedTuple):
     estimators: tuple[EstimatorChoice, ...]
     seed: int
     block_size: int
+    resolution: float = 0.0
+    """True landmarks nearer to each other count as one place [m]."""
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """The variables of its results."""
+        return variables_of(self.scenario)
 
     def identity(self) -> dict[str, Any]:
         """Describe the job in plain values, equal for equal jobs."""
@@ -64,6 +71,7 @@ class Job(NamedTuple):
             },
             "seed": self.seed,
             "block_size": self.block_size,
+            **({"resolution": self.resolution} if self.resolution else {}),
         }
 
     def spans(self, runs: Span) -> list[Span]:
@@ -172,7 +180,10 @@ class BlockFolder:
         file = self._files_from(span.first)[-1]  # the longest
         with np.load(file, allow_pickle=False) as arrays:
             return [
-                {name: arrays[f"{number}/{name}"][: span.size] for name in VARIABLES}
+                {
+                    name: arrays[f"{number}/{name}"][: span.size]
+                    for name in self._job.variables
+                }
                 for number in range(len(self._job.estimators))
             ]
 

@@ -13,7 +13,7 @@ import xarray as xr
 
 from .... import __version__
 from ....sim_configs.atomic_file import replace_when_written
-from ..measure.run_measures import VARIABLES, Block
+from ..measure.run_measures import VARIABLES, Block, Variable
 from .job_folder import RESULTS
 from .result_blocks import Job, Span
 
@@ -40,16 +40,16 @@ def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Da
     sizes = _sizes(job, runs)
     arrays: dict[str, Any] = {
         name: np.empty(
-            [sizes[dim] for dim in _dims(name)],
+            [sizes[dim] for dim in _dims(variable)],
             object if variable.kind == "U" else variable.kind,
         )
-        for name, variable in VARIABLES.items()
+        for name, variable in job.variables.items()
     }
-    _fill(arrays, blocks, runs)
+    _fill(arrays, job, blocks, runs)
     return xr.Dataset(
         {
-            name: (_dims(name), arrays[name], {"long_name": variable.meaning})
-            for name, variable in VARIABLES.items()
+            name: (_dims(variable), arrays[name], {"long_name": variable.meaning})
+            for name, variable in job.variables.items()
         },
         {dim: (dim, values) for dim, values in _coordinates(job, runs).items()},
         attributes(job, runs, command),
@@ -114,12 +114,12 @@ def _write(path: Path, job: Job, blocks: Blocks, runs: Span, command: str) -> No
             file.createDimension(dim, size)
         for dim, values in _coordinates(job, runs).items():
             file.createVariable(dim, _stored(values.dtype.kind), (dim,))[:] = values
-        for name, variable in VARIABLES.items():
-            made = file.createVariable(name, _stored(variable.kind), _dims(name))
+        for name, variable in job.variables.items():
+            made = file.createVariable(name, _stored(variable.kind), _dims(variable))
             made.long_name = variable.meaning
             if variable.kind == "?":
                 made.setncattr("dtype", "bool")  # xarray gives it back as such
-        _fill(file.variables, blocks, runs)
+        _fill(file.variables, job, blocks, runs)
         file.setncatts(attributes(job, runs, command))
 
 
@@ -135,6 +135,7 @@ def attributes(job: Job, runs: Span, command: str) -> dict[str, Any]:
         "seed": job.seed,
         "runs": runs.size,
         "block_size": job.block_size,
+        "resolution": job.resolution,
         "versions": json.dumps(_versions()),
         "command": command,
         "comment": _FROM_TRUTH,
@@ -147,13 +148,17 @@ def _versions() -> dict[str, str]:
 
 
 def _fill(
-    arrays: MutableMapping[str, Any] | Mapping[str, Any], blocks: Blocks, runs: Span
+    arrays: MutableMapping[str, Any] | Mapping[str, Any],
+    job: Job,
+    blocks: Blocks,
+    runs: Span,
 ) -> None:
+    variables = job.variables
     for span, parts in blocks:
         rows = slice(span.first - runs.first, span.stop - runs.first)
         for number, block in enumerate(parts):
             for name, values in block.items():
-                text = VARIABLES[name].kind == "U"
+                text = variables[name].kind == "U"
                 part = values.astype(object) if text else values
                 arrays[name][number, rows] = part
 
@@ -163,8 +168,8 @@ def _stored(kind: str) -> Any:
     return {"?": "i1", "i": "i8", "U": str}.get(kind, kind)
 
 
-def _dims(name: str) -> tuple[str, ...]:
-    return ("estimator", *VARIABLES[name].dims)
+def _dims(variable: Variable) -> tuple[str, ...]:
+    return ("estimator", *variable.dims)
 
 
 def _sizes(job: Job, runs: Span) -> dict[str, int]:

@@ -1,0 +1,277 @@
+"""How well readings without identity were associated, by their true landmarks.
+
+The identity of a mapped landmark is the true landmark of the reading that confirmed it,
+the one with which it entered the map.  Every reading counts once, by the decision that
+stands at the end of the run::
+
+                     the reading is of …
+    given to …       a true landmark            clutter
+    a mapped one     correct or wrong           clutter_used
+    a new one        new_correct or duplicate   ghost
+    none             missed, if mapped          -
+
+Readings before the confirming one count where the filter applied them in the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from ..estimator.interface import ScanDecisions
+from ..estimator.support.argument_checks import as_floats
+
+CLUTTER = -1
+"""The true landmark of a reading that has none."""
+
+
+class AssociationScores(NamedTuple):
+    """Counts of readings, and sizes of maps."""
+
+    correct: int
+    """Readings given to the mapped landmark that they are of."""
+    wrong: int
+    """Readings of a true landmark given to a mapped landmark of another place."""
+    new_correct: int
+    """New landmarks of a place that was not in the map."""
+    duplicate: int
+    """New landmarks of a place that was in the map already."""
+    ghost: int
+    """New landmarks confirmed by clutter."""
+    missed: int
+    """Readings of a place in the map that were given to no landmark."""
+    clutter_used: int
+    """Clutter given to a mapped landmark."""
+    map_size: int
+    """Landmarks in the map at the end."""
+    true_map_size: int
+    """Places seen often enough to be known, by the rule of confirmation."""
+
+    @property
+    def precision(self) -> float:
+        """Share of correct ones among readings given to mapped landmarks, or nan."""
+        return _share(self.correct, self.correct + self.wrong + self.clutter_used)
+
+    @property
+    def recall(self) -> float:
+        """Share of correct ones among readings of places in the map, or nan."""
+        return _share(
+            self.correct, self.correct + self.wrong + self.duplicate + self.missed
+        )
+
+    def as_dict(self) -> dict[str, float]:
+        """Return all by name, with precision and recall."""
+        shares = {"precision": self.precision, "recall": self.recall}
+        return {**self._asdict(), **shares}
+
+
+def score_association(
+    decisions: Sequence[ScanDecisions],
+    true_ids: Sequence[ArrayLike],
+    *,
+    places: Mapping[int, int] | None = None,
+    confirm: tuple[int, int] = (1, 1),
+) -> AssociationScores:
+    """Compare the decisions about all readings of a run with the truth.
+
+    Parameters
+    ----------
+    decisions : sequence of ScanDecisions
+        One per scan.
+    true_ids : sequence of array_like of int, shape (m,)
+        Per scan the true landmark of each reading, -1 for clutter.
+    places : mapping of int to int, optional
+        Place of each true landmark, see :func:`places_of`; landmarks of one place count
+        as one.  By default, each is a place of its own.
+    confirm : (int, int)
+        (k, n): a place is known once it was seen in k of n successive scans.
+
+    Returns
+    -------
+    AssociationScores
+
+    Raises
+    ------
+    ValueError
+        If decisions and true ids do not match.
+
+    Examples
+    --------
+    >>> scans = [ScanDecisions((0,), added=(0,)), ScanDecisions((0, None))]
+    >>> score_association(scans, [[7], [7, -1]]).as_dict()["correct"]
+    1
+    """
+    scans = _checked(decisions, true_ids)
+    seen = [[_place(places, i) for i in row.tolist()] for row in scans]
+    owners = _owners(zip(decisions, seen, strict=True))
+    counts = dict.fromkeys(AssociationScores._fields, 0)
+    in_map: dict[int, int] = {}
+    for made, scan in zip(decisions, seen, strict=True):
+        new: set[int] = set()
+        for landmark, place in zip(made.row_ids, scan, strict=True):
+            is_new = landmark in made.added and landmark not in new
+            outcome = _outcome(landmark, place, in_map, owners, is_new=is_new)
+            if outcome is not None:
+                counts[outcome] += 1
+            if is_new and landmark is not None:
+                new.add(landmark)
+                in_map[landmark] = place
+        for gone in (*made.removed, *(gone for _, gone in made.merged)):
+            in_map.pop(gone, None)
+    counts["map_size"] = len(in_map)
+    counts["true_map_size"] = len(known_places(seen, confirm))
+    return AssociationScores(**counts)
+
+
+def landmark_identities(
+    decisions: Sequence[ScanDecisions], true_ids: Sequence[ArrayLike]
+) -> dict[int, int]:
+    """Return the true landmark, -1 for clutter, of all landmarks that were ever mapped.
+
+    Parameters
+    ----------
+    decisions, true_ids
+        As in :func:`score_association`.
+    """
+    scans = _checked(decisions, true_ids)
+    return _owners(zip(decisions, (row.tolist() for row in scans), strict=True))
+
+
+def places_of(
+    landmark_ids: ArrayLike, landmarks: ArrayLike, resolution: float
+) -> dict[int, int]:
+    """Group true landmarks that are nearer to each other than a resolution.
+
+    Parameters
+    ----------
+    landmark_ids : array_like of int, shape (n,)
+        Their identities.
+    landmarks : array_like, shape (n, 2)
+        Their positions [m].
+    resolution : float
+        R [m]: landmarks connected by gaps below it are one place.
+
+    Returns
+    -------
+    dict of int to int
+        For each landmark the least identity in its place.
+
+    Raises
+    ------
+    ValueError
+        If the resolution is negative, or the arrays do not match.
+
+    Examples
+    --------
+    >>> places_of([3, 5, 8], [(0, 0), (0.4, 0), (2, 0)], resolution=0.5)
+    {3: 3, 5: 3, 8: 8}
+    """
+    ids = np.asarray(landmark_ids, dtype=np.int64)
+    positions = as_floats("landmarks", landmarks).reshape(-1, 2)
+    if ids.shape != (len(positions),):
+        raise ValueError(
+            "landmark_ids must have one entry per landmark, got shape "
+            f"{ids.shape} for {len(positions)}"
+        )
+    if not 0 <= resolution < np.inf:
+        raise ValueError(f"resolution must be a number >= 0, got {resolution!r}")
+    gap = np.nextafter(resolution, 0.0)  # query_pairs includes its distance
+    pairs = cKDTree(positions).query_pairs(gap, output_type="ndarray")
+    if resolution == 0:
+        pairs = pairs[:0]
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(ids), len(ids)))
+    _, group = connected_components(graph, directed=False)
+    least = {g: int(ids[group == g].min()) for g in set(group.tolist())}
+    return {int(i): least[g] for i, g in zip(ids, group.tolist(), strict=True)}
+
+
+def known_places(seen: Sequence[Sequence[int]], confirm: tuple[int, int]) -> set[int]:
+    """Return the places seen in k of n successive scans.
+
+    Parameters
+    ----------
+    seen : sequence of sequence of int
+        The places that each scan shows, -1 for clutter.
+    confirm : (int, int)
+        (k, n).
+
+    Examples
+    --------
+    >>> sorted(known_places([[1, 2], [-1], [2], [], [1, 2]], confirm=(2, 3)))
+    [2]
+    """
+    needed, window = confirm
+    sightings: dict[int, list[int]] = {}
+    for number, scan in enumerate(seen):
+        for place in set(scan) - {CLUTTER}:
+            sightings.setdefault(place, []).append(number)
+    lag = needed - 1
+    return {
+        place
+        for place, scans in sightings.items()
+        if any(b - a < window for a, b in zip(scans, scans[lag:], strict=False))
+    }
+
+
+def _outcome(
+    landmark: int | None,
+    place: int,
+    in_map: Mapping[int, int],
+    owners: Mapping[int, int],
+    *,
+    is_new: bool,
+) -> str | None:
+    """Return which count one decision adds to; None for a harmless one."""
+    is_clutter = place == CLUTTER
+    if landmark is None:
+        return "missed" if not is_clutter and place in in_map.values() else None
+    if is_new:
+        is_known = place in in_map.values()
+        return "ghost" if is_clutter else "duplicate" if is_known else "new_correct"
+    if is_clutter:
+        return "clutter_used"
+    return "correct" if owners.get(landmark) == place else "wrong"
+
+
+def _owners(
+    scans: Iterator[tuple[ScanDecisions, list[int]]],
+) -> dict[int, int]:
+    """Return whose reading confirmed each landmark."""
+    owners: dict[int, int] = {}
+    for made, truth in scans:
+        for landmark in made.added:
+            owners.setdefault(landmark, truth[made.row_ids.index(landmark)])
+    return owners
+
+
+def _checked(
+    decisions: Sequence[ScanDecisions], true_ids: Sequence[ArrayLike]
+) -> list[np.ndarray[tuple[int, ...], np.dtype[np.int64]]]:
+    if len(decisions) != len(true_ids):
+        raise ValueError(
+            f"true_ids must be of {len(decisions)} scans, got {len(true_ids)}"
+        )
+    scans = [np.asarray(row, dtype=np.int64) for row in true_ids]
+    for number, (made, row) in enumerate(zip(decisions, scans, strict=True)):
+        if row.shape != (len(made.row_ids),):
+            raise ValueError(
+                f"true_ids[{number}] must have one entry per reading, got shape "
+                f"{row.shape} for {len(made.row_ids)}"
+            )
+    return scans
+
+
+def _place(places: Mapping[int, int] | None, landmark: int) -> int:
+    if places is None or landmark == CLUTTER:
+        return landmark
+    return places.get(landmark, landmark)
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")

@@ -1,0 +1,114 @@
+"""Measure how well a run associated readings without identity.
+
+A run is lost if its path error is more than `LOST` above that of the same filter with
+known identities on the same readings.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....arrays import Array
+from ....estimator.interface import Belief
+from ....evaluation.association_scores import AssociationScores
+from ....evaluation.gospa import Gospa
+from ...runs.association import RunAssociation, TrueLandmarks, compare_association
+from ...runs.filter_settings import FilterSettings
+from ...runs.simulated_runs import SimulatedRuns
+from .filtered_runs import FilteredRuns, filter_runs
+
+LOST = 1.0
+"""Path error above that with known identities [m]."""
+
+COUNTS = AssociationScores._fields
+SHARES = ("precision", "recall")
+MAPS = ("raw", "aligned")
+
+KNOWN_IDS_ATE = "known_ids_ate"
+
+PREFIX = "association_"
+
+MEANINGS: dict[str, str] = {
+    **{f"{PREFIX}{name}": f"{name.replace('_', ' ')}, see docs" for name in COUNTS},
+    f"{PREFIX}precision": "share of correct ones among readings of mapped landmarks",
+    f"{PREFIX}recall": "share of correct ones among readings of mapped places",
+    **{
+        f"gospa_{which}_{part}": f"GOSPA of the final map, {which}: {part}"
+        for which in MAPS
+        for part in Gospa._fields
+    },
+    KNOWN_IDS_ATE: "path error of the same filter with known identities, raw [m]",
+}
+"""Of the variables that only a world without identities has; nan where unknown."""
+
+
+def measure_association(
+    runs: SimulatedRuns, filtered: FilteredRuns, run: int, resolution: float
+) -> Mapping[str, NDArray[np.generic] | float]:
+    """Measure one run; empty where its filter tells no decisions, or failed.
+
+    Parameters
+    ----------
+    runs : SimulatedRuns
+        The runs.
+    filtered : FilteredRuns
+        The beliefs of a filter in them.
+    run : int
+        Index of the run.
+    resolution : float
+        True landmarks nearer to each other count as one place [m].
+    """
+    made, belief = filtered.decisions.get(run), filtered.beliefs[run]
+    if made is None or belief is None:
+        return {}
+    truth = TrueLandmarks(np.arange(runs.landmarks.shape[1]), runs.landmarks[run])
+    found = compare_association(
+        made, truth, belief.landmark_ids, belief.landmarks, resolution=resolution
+    )
+    return _values(found)
+
+
+def _values(found: RunAssociation) -> dict[str, float]:
+    scores = found.scores.as_dict()
+    parts = {"raw": found.raw, "aligned": found.aligned}
+    return {
+        **{f"{PREFIX}{name}": float(value) for name, value in scores.items()},
+        **{
+            f"gospa_{which}_{part}": float(value)
+            for which, whole in parts.items()
+            for part, value in whole._asdict().items()
+        },
+    }
+
+
+def identified(belief: Belief, identities: Mapping[int, int]) -> Belief:
+    """Return a belief about true landmarks by their identity.
+
+    Of several mapped landmarks that are of one true landmark, the first counts; those
+    of none are left out.
+    """
+    chosen: dict[int, int] = {}
+    for landmark in belief.landmark_ids:
+        chosen.setdefault(identities.get(landmark, -1), landmark)
+    chosen.pop(-1, None)
+    slots = {landmark: slot for slot, landmark in enumerate(belief.landmark_ids)}
+    part = Belief.marginal(
+        belief.mean, belief.covariance, slots, list(chosen.values()), belief.frame
+    )
+    return replace(part, landmark_ids=tuple(chosen))
+
+
+def known_ids_errors(
+    settings: FilterSettings, runs: SimulatedRuns, threads: int | None
+) -> Array:
+    """Return the path errors of the same filter with known identities, (B,) [m].
+
+    It has no landmark management; nan in runs that fail.
+    """
+    options = {k: v for k, v in settings.options.items() if k != "management"}
+    plain = replace(settings, options=options)
+    known = filter_runs(plain, runs.identified(), threads=threads)
+    gaps = known.trace.poses[:, :, :2] - runs.true_poses[:, :, :2]
+    return np.asarray(np.sqrt((gaps**2).sum(axis=2).mean(axis=1)))

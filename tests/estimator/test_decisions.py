@@ -1,0 +1,99 @@
+"""What a managed filter remembers of its decisions about readings."""
+
+import numpy as np
+import pytest
+
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.estimator import make_estimator
+from slamgym.estimator.interface import SupportsDecisions
+from slamgym.sim_configs import action_sequence, load_scenario
+
+NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
+AHEAD = [(0.0, 5.0)]
+
+
+def managed(**policy):
+    return make_estimator("invariant", **NOISE, management=policy or True)
+
+
+@pytest.fixture(scope="module")
+def slippery():
+    """Readings among sixty landmarks a metre apart, of a robot that slips."""
+    fields = load_scenario("hidden_identities").model_dump()
+    fields["landmarks"] |= {"count": 60, "min_distance": 1.0}
+    fields["motion"]["std"] = (0.05, 0.0, 0.06)
+    world = load_scenario(fields)
+    env = LandmarkWorldEnv(world)
+    observation, _ = env.reset(seed=4)
+    scans = []
+    for action in action_sequence(world)[:50]:
+        readings = observation["landmarks"][observation["mask"]]
+        scans.append((observation["odometry"], readings))
+        observation, *_ = env.step(action)
+    noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+    return noise, scans
+
+
+def test_only_an_estimator_that_associates_lists_decisions():
+    assert isinstance(managed(), SupportsDecisions)
+    assert isinstance(managed(association="hypotheses"), SupportsDecisions)
+    assert not isinstance(make_estimator("invariant", **NOISE), SupportsDecisions)
+
+
+@pytest.mark.parametrize("backdate", [False, True])
+def test_the_confirming_scan_adds_a_landmark_and_may_revise_the_earlier_ones(backdate):
+    slam = managed(backdate=backdate, confirm=(3, 8))
+    reports = [slam.update(AHEAD) for _ in range(4)]
+    assert [made.added for made in slam.decisions] == [(), (), (0,), ()]
+    assert [report.confirmed_ids for report in reports] == [(), (), (0,), ()]
+    first = 0 if backdate else None
+    assert [made.row_ids[0] for made in slam.decisions] == [first, first, 0, 0]
+
+
+def test_what_management_does_to_the_map_is_part_of_the_decisions():
+    slam = managed(confirm=(1, 1))
+    slam.update([(0.0, 5.0), (1.0, 5.0), (2.0, 5.0)])
+    slam.remove([1])
+    slam.merge(0, 2)
+    (made,) = slam.decisions
+    assert (made.added, made.removed, made.merged) == ((0, 1, 2), (1,), ((0, 2),))
+
+
+def test_a_rejected_reading_is_given_to_no_landmark():
+    options = {"gate_probability": 0.5, "management": {"confirm": (1, 1)}}
+    slam = make_estimator("ekf", **NOISE, **options)
+    slam.update(AHEAD)
+    report = slam.update([(0.03, 5.2)])
+    assert report.row_ids == report.rejected_ids == (0,)
+    assert slam.decisions[-1].row_ids == (None,)
+
+
+def test_a_new_run_and_a_loaded_state_begin_without_decisions():
+    slam = managed()
+    slam.update(AHEAD)
+    slam.load_state_dict(slam.state_dict())
+    assert list(slam.decisions) == []
+    slam.update(AHEAD)
+    slam.reset((0, 0, 0), (0, 0, 0))
+    assert list(slam.decisions) == []
+
+
+@pytest.mark.parametrize("backdate", [False, True])
+@pytest.mark.parametrize("method", ["joint", "hypotheses"])
+def test_a_filter_told_the_decisions_has_the_same_belief(method, backdate, slippery):
+    """Those at the end: hypotheses and confirmed landmarks revise earlier ones."""
+    noise, scans = slippery
+    policy = {"association": method, "backdate": backdate}
+    slam = make_estimator("invariant", **noise, management=policy)
+    told = make_estimator("invariant", **noise)
+    for odometry, readings in scans:
+        slam.predict(odometry)
+        slam.update(readings)
+    assert len(slam.decisions) == len(scans)
+    for (odometry, readings), made in zip(scans, slam.decisions, strict=True):
+        told.predict(odometry)
+        rows = [row for row, i in enumerate(made.row_ids) if i is not None]
+        told.update(readings[rows], [made.row_ids[row] for row in rows])
+    expected = told.belief(slam.landmark_ids)
+    np.testing.assert_allclose(slam.belief().mean, expected.mean, atol=1e-9)
+    np.testing.assert_allclose(slam.belief().covariance, expected.covariance, atol=1e-9)
