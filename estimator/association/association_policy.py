@@ -31,6 +31,9 @@ class AssociationPolicy:
     density: float | None = None
     """Readings per scan from no landmark of the map, clutter and new landmarks
     [1 / (rad m)]; None: estimate it from the scans so far."""
+    detection: float = 0.9
+    """Probability that a landmark of the map is read where a joint assignment pairs it
+    with a reading."""
     hypotheses: int = 10
     """Most hypotheses at a time."""
     branches: int = 3
@@ -59,6 +62,9 @@ class AssociationPolicy:
         argument_checks.one_of("association", self.association, ASSOCIATIONS)
         if self.density is not None:
             argument_checks.above("density", self.density, 0.0)
+        argument_checks.above("detection", self.detection, 0.0)
+        if self.detection >= 1.0:
+            raise ValueError(f"detection must be below 1, got {self.detection!r}")
         for name in ("hypotheses", "branches", "search_nodes"):
             argument_checks.whole(name, getattr(self, name), 1)
         argument_checks.above("pair_gate", self.pair_gate, 0.0)

@@ -3,11 +3,12 @@
 An assignment gives each reading one landmark or none, and each landmark at most one
 reading.  Its cost is −2 ln of its likelihood, up to a constant of the scan::
 
-    cost = νᵀ S⁻¹ ν + ln det S + λ u,    λ = −2 ln ρ − 2 ln 2π
+    cost = νᵀ S⁻¹ ν + ln det S + λ u,    λ = −2 ln ρ − 2 ln 2π + 2 ln(D / (1 − D))
 
 ν and S = H P Hᵀ + Q belong to the paired readings together, u counts the readings left
-out, and ρ is the density of readings that come from no landmark of the map: clutter and
-landmarks that are not mapped yet [1 / (rad m)].
+out, ρ is the density of readings that come from no landmark of the map, clutter and
+landmarks that are not mapped yet [1 / (rad m)], and D is the probability that a
+landmark in view is read.
 
 A depth-first branch and bound decides one reading after the other.  A pair conditions
 the expected readings of all landmarks.  By the chain rule of the Gaussian, the cost of
@@ -26,9 +27,8 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ..kernels.assignment_search import search_assignments
-from ..kernels.joint_readings import UNPAIRED, Problem, fill_distances
+from ..kernels.joint_readings import UNPAIRED, Problem, fill_distances, fill_expected
 from ..models.angles import wrap_angle
-from ..models.bearing_range import predict_measurement
 
 
 class Solutions(NamedTuple):
@@ -56,19 +56,10 @@ def predicted_readings(
     slots : ndarray of int64, shape (J,)
         Places of the landmarks in the map.
     """
-    columns = (3 + 2 * slots[:, None] + np.arange(2)).ravel()
-    expected = predict_measurement(mean[:3], mean[columns].reshape(-1, 2))
     count = len(slots)
-    H = np.zeros((2 * count, 3 + 2 * count))
-    H[:, :3] = expected.jacobian_pose.reshape(-1, 3)
-    for i in range(2):
-        for j in range(2):
-            H[np.arange(i, 2 * count, 2), np.arange(3 + j, 3 + 2 * count, 2)] = (
-                expected.jacobian_landmark[:, i, j]
-            )
-    used = np.concatenate([[0, 1, 2], columns])
-    C = H @ covariance[np.ix_(used, used)] @ H.T
-    return expected.measurement, (C + C.T) / 2
+    expected, joint = np.empty((count, 2)), np.empty((2 * count, 2 * count))
+    fill_expected(mean, covariance, slots, expected, joint)
+    return expected, joint
 
 
 def innovations_of(readings: Array, expected: Array) -> Array:

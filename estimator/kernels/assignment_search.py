@@ -13,18 +13,27 @@ from .joint_readings import PAIR_BONUS, UNPAIRED, Problem, condition, fit
 
 
 @njit_internal
+def _candidates(feasible: BoolArray) -> tuple[IntArray, IntArray]:
+    """List the landmarks that each reading may belong to, and count them."""
+    listed = np.zeros(feasible.shape, np.int64)
+    counts = np.zeros(len(feasible), np.int64)
+    for i in range(feasible.shape[0]):
+        for j in range(feasible.shape[1]):
+            if feasible[i, j]:
+                listed[i, counts[i]] = j
+                counts[i] += 1
+    return listed, counts
+
+
+@njit_internal
 def _decision_order(feasible: BoolArray, innovations: Array) -> IntArray:
     """Return the readings with the fewest landmarks first.
 
     Ties are broken by the readings themselves: the order of the scan has no effect.
     """
-    rows, landmarks = feasible.shape
-    order = np.arange(rows)
-    options = np.zeros(rows, np.int64)
-    for i in range(rows):
-        for j in range(landmarks):
-            options[i] += feasible[i, j]
-    for i in range(1, rows):
+    _, options = _candidates(feasible)
+    order = np.arange(len(options))
+    for i in range(1, len(options)):
         k = i
         while k > 0:
             one, other = order[k - 1], order[k]
@@ -41,23 +50,35 @@ def _decision_order(feasible: BoolArray, innovations: Array) -> IntArray:
 
 
 @njit_internal
-def _fill_ahead(
-    feasible: BoolArray, order: IntArray, ahead: IntArray, counts: IntArray
-) -> None:
-    """List the landmarks that the readings from each depth on may belong to."""
-    for j in range(feasible.shape[1]):
-        last = -1
-        for depth in range(len(order)):
+def _needed(feasible: BoolArray, order: IntArray) -> tuple[IntArray, IntArray]:
+    """Sort the landmarks by when they are needed last, the latest first.
+
+    Returns
+    -------
+    tuple of ndarray
+        The landmarks in this order, shape (J,), and how many of them the readings from
+        each depth on may belong to, shape (m + 1,).
+    """
+    rows, landmarks = feasible.shape
+    last = np.full(landmarks, -1)
+    for depth in range(rows):
+        for j in range(landmarks):
             if feasible[order[depth], j]:
-                last = depth
-        for depth in range(last + 1):
-            ahead[depth, counts[depth]] = j
-            counts[depth] += 1
+                last[j] = depth
+    counts = np.zeros(rows + 1, np.int64)
+    for depth in range(rows):
+        counts[depth] = (last >= depth).sum()
+    return np.argsort(-last, kind="mergesort"), counts
 
 
 @njit_internal
 def _insert(
-    costs: Array, marks: IntArray, found: int, cost: float, choice: IntArray
+    costs: Array,
+    marks: IntArray,
+    found: int,
+    cost: float,
+    choice: IntArray,
+    names: IntArray,
 ) -> int:
     """Insert an assignment into the sorted list; return how many are in it."""
     at = min(found, len(costs) - 1)
@@ -70,7 +91,7 @@ def _insert(
         at -= 1
     costs[at] = cost
     for i in range(len(choice)):
-        marks[at, i] = choice[i]
+        marks[at, i] = UNPAIRED if choice[i] == UNPAIRED else names[choice[i]]
     return min(found + 1, len(costs))
 
 
@@ -101,17 +122,29 @@ def search_assignments(
     int
         Number of nodes visited.
     """
-    innovations, joint, variances, feasible, missing, gate, limits, pairs_first = (
-        problem
+    variances, missing, gate, limits, pairs_first = (
+        problem.variances,
+        problem.missing,
+        problem.gate,
+        problem.limits,
+        problem.pairs_first,
     )
-    rows, landmarks = feasible.shape
-    order = _decision_order(feasible, innovations)
-    ahead = np.zeros((rows + 1, landmarks), np.int64)
-    counts = np.zeros(rows + 1, np.int64)
-    _fill_ahead(feasible, order, ahead, counts)
+    rows, landmarks = problem.feasible.shape
+    order = _decision_order(problem.feasible, problem.innovations)
+    names, counts = _needed(problem.feasible, order)
+    innovations = problem.innovations[:, names]
+    listed, options = _candidates(problem.feasible[:, names])
     shifts = np.zeros((rows + 1, landmarks, 2))
     joints = np.empty((rows + 1, 2 * landmarks, 2 * landmarks))
-    joints[0] = joint
+    for a in range(landmarks):
+        for b in range(landmarks):
+            for i in range(2):
+                for k in range(2):
+                    value = problem.joint[2 * names[a] + i, 2 * names[b] + k]
+                    joints[0, 2 * a + i, 2 * b + k] = value
+    least_base = np.log(variances[:, 0] * variances[:, 1])
+    if pairs_first:
+        least_base[:] = -PAIR_BONUS
     level = np.zeros(rows + 1, np.int64)
     cost, squared = np.zeros(rows + 1), np.zeros(rows + 1)
     pairs = np.zeros(rows + 1, np.int64)
@@ -125,7 +158,7 @@ def search_assignments(
     while depth >= 0:
         best = -1
         if depth == rows:
-            found = _insert(costs, marks, found, cost[depth], choice)
+            found = _insert(costs, marks, found, cost[depth], choice, names)
         elif found == 0 or visited < nodes:
             row, here = order[depth], level[depth]
             if is_new:  # list what the reading may be: nothing, or a landmark
@@ -134,8 +167,8 @@ def search_assignments(
                 child_squared[depth, 0] = 0.0
                 count = 1
                 left = limits[pairs[depth] + 1] - squared[depth]
-                for j in range(landmarks):
-                    if not feasible[row, j] or taken[j]:
+                for j in listed[row, : options[row]]:
+                    if taken[j]:
                         continue
                     z, q = innovations[row], variances[row]
                     x, determinant = fit(z, q, shifts[here], joints[here], j, 1.0)
@@ -171,7 +204,7 @@ def search_assignments(
                 innovations[row],
                 variances[row],
                 j,
-                ahead[depth + 1, : counts[depth + 1]],
+                counts[depth + 1],
                 shifts,
                 joints,
                 here,
@@ -181,12 +214,9 @@ def search_assignments(
             bound, here = cost[depth + 1], level[depth + 1]
             for k in range(depth + 1, rows):  # a lower bound on the open readings
                 i = order[k]
-                base = -PAIR_BONUS
-                if not pairs_first:
-                    base = np.log(variances[i, 0] * variances[i, 1])
-                least = missing
-                for a in range(landmarks):
-                    if feasible[i, a] and not taken[a]:
+                base, least = least_base[i], missing
+                for a in listed[i, : options[i]]:
+                    if not taken[a]:
                         x, _ = fit(
                             innovations[i],
                             variances[i],

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
+from ..models.bearing_range import expected_reading_jit, reading_slopes_jit
+from ..models.bearing_range import wrap_angle_jit as wrap
 from ..support.jit import jit, njit_internal
 
 UNPAIRED = -1
@@ -38,6 +40,46 @@ class Problem(NamedTuple):
     """Most pairs first, then the least νᵀ S⁻¹ ν, in place of the likelihood."""
 
 
+@jit
+def fill_expected(
+    mean: Array, P: Array, slots: IntArray, expected: Array, joint: Array
+) -> None:
+    """Fill h(x), shape (J, 2), and C = H P Hᵀ, shape (2J, 2J), of some landmarks.
+
+    Parameters
+    ----------
+    mean, P : ndarray
+        (x, y, θ, l1x, …) and its covariance; there may be more behind the landmarks.
+    slots : ndarray of int64, shape (J,)
+        Places of the landmarks in the map.
+    """
+    H, columns = np.empty((2 * len(slots), 5)), np.empty((len(slots), 5), np.int64)
+    columns[:, :3] = np.arange(3)
+    for j in range(len(slots)):
+        c = 3 + 2 * slots[j]
+        columns[j, 3], columns[j, 4] = c, c + 1
+        dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+        bearing, expected[j, 1] = expected_reading_jit(dx, dy, mean[2])
+        expected[j, 0] = wrap(bearing)
+        slopes = reading_slopes_jit(dx, dy)
+        for i in range(2):
+            x, y = slopes[2 * i], slopes[2 * i + 1]
+            row = H[2 * j + i]
+            row[0], row[1], row[2], row[3], row[4] = -x, -y, i - 1.0, x, y
+    left = np.empty(5)
+    for a in range(2 * len(slots)):
+        for j in range(a // 2 + 1):
+            for n in range(5):
+                left[n] = 0.0
+                for k in range(5):
+                    left[n] += H[a, k] * P[columns[a // 2, k], columns[j, n]]
+            for b in (2 * j, 2 * j + 1):
+                value = 0.0
+                for n in range(5):
+                    value += left[n] * H[b, n]
+                joint[a, b] = joint[b, a] = value
+
+
 @njit_internal
 def fit(
     innovation: Array, variance: Array, shift: Array, C: Array, j: int, inflation: float
@@ -57,13 +99,13 @@ def condition(
     innovation: Array,
     variance: Array,
     j: int,
-    ahead: IntArray,
+    count: int,
     shifts: Array,
     joints: Array,
     here: int,
     to: int,
 ) -> None:
-    """Condition the expected readings of the landmarks ``ahead`` on one pair.
+    """Condition the expected readings of the first ``count`` landmarks on one pair.
 
     ::
 
@@ -75,20 +117,18 @@ def condition(
     s11 = C[2 * j + 1, 2 * j + 1] + variance[1]
     n0, n1 = innovation[j, 0] - shift[j, 0], innovation[j, 1] - shift[j, 1]
     determinant = s00 * s11 - s10 * s10
-    cross = np.empty((2 * len(ahead), 2))
-    for p in range(2 * len(ahead)):
-        a = 2 * ahead[p // 2] + p % 2
-        for k in range(2):
-            b = 2 * j + k
-            cross[p, k] = C[max(a, b), min(a, b)]
-    for p in range(2 * len(ahead)):
-        a = 2 * ahead[p // 2] + p % 2
-        k0 = (cross[p, 0] * s11 - cross[p, 1] * s10) / determinant
-        k1 = (cross[p, 1] * s00 - cross[p, 0] * s10) / determinant
+    cross = np.empty((2, 2 * count))
+    for k in range(2):
+        b = 2 * j + k
+        for a in range(2 * count):
+            cross[k, a] = C[max(a, b), min(a, b)]
+    for a in range(2 * count):
+        k0 = (cross[0, a] * s11 - cross[1, a] * s10) / determinant
+        k1 = (cross[1, a] * s00 - cross[0, a] * s10) / determinant
         moved[a // 2, a % 2] = shift[a // 2, a % 2] + k0 * n0 + k1 * n1
-        for q in range(p + 1):
-            b = 2 * ahead[q // 2] + q % 2
-            after[a, b] = C[a, b] - k0 * cross[q, 0] - k1 * cross[q, 1]
+        row, old = after[a], C[a]
+        for b in range(a + 1):
+            row[b] = old[b] - k0 * cross[0, b] - k1 * cross[1, b]
 
 
 @jit
@@ -103,7 +143,6 @@ def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
     """
     innovations, joint, variances = problem[:3]
     rows, landmarks = problem[3].shape
-    every = np.arange(landmarks)
     shifts = np.zeros((2, landmarks, 2))
     joints = np.empty((2, 2 * landmarks, 2 * landmarks))
     for s in range(len(marks)):
@@ -116,7 +155,7 @@ def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
                     innovations[i],
                     variances[i],
                     marks[s, i],
-                    every,
+                    landmarks,
                     shifts,
                     joints,
                     here,

@@ -25,6 +25,10 @@ Option = tuple[float, int, ScanAssociation]
 SPREAD = 16.0
 """Hypotheses e^8 times less probable than the best one are discarded."""
 
+SAME = 0.3
+"""Hypotheses of the same landmarks whose means differ by less than so many σ in every
+coordinate are the same."""
+
 
 def manage(
     estimator: Callable[..., SlamEstimator],
@@ -43,6 +47,18 @@ class Hypothesis:
     cost: float
     """−2 ln of its probability, relative to the best hypothesis."""
     slam: ManagedSlam
+
+
+def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the hypotheses that differ from all that are more probable.
+
+    Readings that were left out long ago no longer matter.
+    """
+    chosen: list[Hypothesis] = []
+    for hypothesis in hypotheses:
+        if not any(h.slam.resembles(hypothesis.slam, SAME) for h in chosen):
+            chosen.append(hypothesis)
+    return chosen
 
 
 class HypothesisSlam:
@@ -256,6 +272,7 @@ class HypothesisSlam:
                 errors.append(error)
         if not kept:
             raise errors[0]
+        kept = distinct(kept)
         least = kept[0].cost
         self._keep([Hypothesis(h.cost - least, h.slam) for h in kept])
         return reports[0]

@@ -19,7 +19,7 @@ from ..support.argument_checks import LandmarkIds
 from ..support.nested_state import with_prefix, without_prefix
 from ..update_report import ScanDecisions
 from .map_editor import CachedEditor, edit_map
-from .map_view import mapped_ids, marginal, view_map
+from .map_view import is_near, mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
 from .recent_scans import RecentScans
@@ -189,6 +189,12 @@ class ManagedSlam:
         return associate(
             self._policy, self._candidates, readings, view, self._sensor, ceiling
         )
+
+    def resembles(self, other: ManagedSlam, tolerance: float) -> bool:
+        """Return whether another run has the same landmarks, and nearly their means."""
+        labels, others = (s._candidates.tentative.labels for s in (self, other))
+        views = self._editor.map_view(), other._editor.map_view()
+        return np.array_equal(labels, others) and is_near(*views, tolerance)
 
     def take(self, readings: Array, plan: ScanAssociation) -> UpdateReport:
         """Correct the belief with readings (m, 2) as associated, then prune the map."""

@@ -6,6 +6,8 @@ import inspect
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 
+import numpy as np
+
 from ..error_frames import ErrorFrame
 from ..filters.ekf import EkfSlam
 from ..interface import (
@@ -16,6 +18,7 @@ from ..interface import (
     SupportsLandmarkIds,
     SupportsMapView,
 )
+from ..models.angles import wrap_angle
 
 
 def view_map(slam: SlamEstimator) -> MapView:
@@ -31,6 +34,20 @@ def mapped_ids(slam: SlamEstimator) -> tuple[int, ...]:
     if isinstance(slam, EkfSlam | SupportsLandmarkIds) and not hides_its_belief(slam):
         return tuple(slam.landmark_ids)
     return slam.belief().landmark_ids
+
+
+def is_near(one: MapView, other: MapView, tolerance: float) -> bool:
+    """Return whether two maps of the same landmarks have nearly the same mean.
+
+    They differ by at most ``tolerance`` σ in every coordinate.
+    """
+    if one.ids != other.ids:
+        return False
+    size = 3 + 2 * len(one.ids)
+    gap = other.mean[:size] - one.mean[:size]
+    gap[2] = wrap_angle(float(gap[2]))
+    variances = np.diagonal(one.covariance)[:size]
+    return bool((gap**2 <= tolerance**2 * variances).all())
 
 
 def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:

@@ -172,6 +172,31 @@ def test_hypotheses_are_as_many_as_the_policy_allows(slippery_drive):
         assert len(costs) <= 4
 
 
+def test_hypotheses_of_nearly_the_same_belief_become_one():
+    world = slippery_world()
+    slam = make(world, association="hypotheses", confirm=(1, 1))
+    slam.update([(0.0, 4.0), (1.0, 5.0)])
+    state = slam.state_dict()
+    assert state["costs"].tolist() == [0.0]
+
+    def hypotheses_after(shift):
+        """Load two hypotheses, the second shifted by so many σ, and look again."""
+        twin = {key: value.copy() for key, value in state.items()}
+        twin["costs"] = np.array([0.0, 1.0])
+        for key in state:
+            if key.startswith("0."):
+                twin["1." + key[2:]] = state[key].copy()
+        mean, covariance = twin["1.filter.mean"], twin["1.filter.covariance"]
+        mean[3] += shift * np.sqrt(covariance[3, 3])
+        other = make(world, association="hypotheses", confirm=(1, 1))
+        other.load_state_dict(twin)
+        other.update(np.empty((0, 2)))
+        return len(other.hypotheses)
+
+    assert hypotheses_after(0.2) == 1
+    assert hypotheses_after(0.4) == 2
+
+
 def test_one_hypothesis_with_one_branch_is_the_joint_assignment(slippery_drive):
     world, scans = slippery_drive
     joint = make(world, association="joint")
@@ -204,6 +229,8 @@ def test_every_filter_takes_joint_assignments(name, slippery_drive):
     [
         ("association", "nearst"),
         ("density", 0.0),
+        ("detection", 0.0),
+        ("detection", 1.0),
         ("hypotheses", 0),
         ("branches", 1.5),
         ("search_nodes", 0),
@@ -229,26 +256,31 @@ def failing_after(slam, steps):
 
 
 def several_hypotheses(scans, world):
-    slam = make(world, association="hypotheses")
-    follow(slam, scans[:40])
-    assert len(slam.hypotheses) > 1
-    return slam
+    """Follow the drive until two associations are left; return the next step too."""
+    slam = make(world, association="hypotheses", detection=0.5)
+    for k, (odometry, readings, _) in enumerate(scans):
+        if k:
+            slam.predict(odometry)
+        slam.update(readings)
+        if len(slam.hypotheses) > 1:
+            return slam, scans[k + 1]
+    raise AssertionError("no scan left two hypotheses")
 
 
 def test_a_hypothesis_whose_filter_fails_is_discarded(slippery_drive):
     world, scans = slippery_drive
-    slam = several_hypotheses(scans, world)
+    slam, (odometry, readings, _) = several_hypotheses(scans, world)
     failing = slam.best
     failing_after(failing, 0)
-    slam.predict(scans[40][0])
-    slam.update(scans[40][1])
+    slam.predict(odometry)
+    slam.update(readings)
     assert failing not in [h.slam for h in slam.hypotheses]
     assert slam.hypotheses[0].cost == 0.0
 
 
 def test_where_every_filter_fails_nothing_has_changed(slippery_drive):
     world, scans = slippery_drive
-    slam = several_hypotheses(scans, world)
+    slam, (_, readings, _) = several_hypotheses(scans, world)
     before = slam.state_dict()
     for hypothesis in slam.hypotheses:
         failing_after(hypothesis.slam, 0)
@@ -261,7 +293,7 @@ def test_where_every_filter_fails_nothing_has_changed(slippery_drive):
 
     slam._make = make_failing
     with pytest.raises(np.linalg.LinAlgError, match="degenerate"):
-        slam.update(scans[40][1])
+        slam.update(readings)
     assert_same_state(before, slam.state_dict())
 
 
@@ -290,7 +322,7 @@ def test_a_state_that_cannot_be_loaded_leaves_everything_as_it_was(
 
 def test_loading_again_and_again_makes_no_more_filters(slippery_drive):
     world, scans = slippery_drive
-    slam = several_hypotheses(scans, world)
+    slam, _ = several_hypotheses(scans, world)
     state = slam.state_dict()
     slam.load_state_dict(state)
     count = len(slam._spare)

@@ -12,6 +12,7 @@ from slamgym.estimator.association.joint_assignment import (
     predicted_readings,
 )
 from slamgym.estimator.kernels.joint_readings import UNPAIRED, Problem
+from slamgym.estimator.models.bearing_range import predict_measurement
 
 MISSING = 2.0
 
@@ -62,6 +63,23 @@ def all_assignments(problem):
                 unpaired = rows - len(paired)
                 result.append((squared + logdet + MISSING * unpaired, marks))
     return sorted(result)
+
+
+def test_expected_readings_are_those_of_the_dense_equations():
+    rng = np.random.default_rng(3)
+    mean = rng.normal(scale=3.0, size=3 + 2 * 6)
+    root = rng.normal(scale=0.15, size=(len(mean), len(mean)))
+    P, slots = root @ root.T, np.array([4, 0, 5])
+    expected, joint = predicted_readings(mean, P, slots)
+    prediction = predict_measurement(mean[:3], mean[3:].reshape(-1, 2)[slots])
+    H = np.zeros((6, len(mean)))
+    for k, slot in enumerate(slots):
+        H[2 * k : 2 * k + 2, :3] = prediction.jacobian_pose[k]
+        H[2 * k : 2 * k + 2, 3 + 2 * slot : 5 + 2 * slot] = (
+            prediction.jacobian_landmark[k]
+        )
+    np.testing.assert_allclose(expected, prediction.measurement, atol=1e-14)
+    np.testing.assert_allclose(joint, H @ P @ H.T, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("seed", range(10))
