@@ -3,6 +3,7 @@ from . import filters as filters
 from . import large_maps as large_maps
 from . import map_management as map_management
 from . import models as models
+from . import smoother as smoother
 from .check_estimator import EstimatorContractError as EstimatorContractError
 from .check_estimator import check_estimator as check_estimator
 from .filters import BatchSlam as BatchSlam
@@ -29,3 +30,7 @@ from .registry import list_estimators as list_estimators
 from .registry import make_batch as make_batch
 from .registry import make_estimator as make_estimator
 from .registry import register_estimator as register_estimator
+from .smoother import Drive as Drive
+from .smoother import RecordedSlam as RecordedSlam
+from .smoother import SmoothedDrive as SmoothedDrive
+from .smoother import smooth as smooth

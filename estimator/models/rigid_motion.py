@@ -50,6 +50,17 @@ def compose(start: Array, pose: Array) -> tuple[Array, Array, Array]:
     return start + moved, by_start, by_pose
 
 
+def composed(
+    x: float, y: float, heading: float, dx: float, dy: float, turn: float
+) -> tuple[float, float, float, float, float]:
+    """Return (x, y, θ) ⊕ (dx, dy, turn) entry by entry, and (cos, sin) of θ."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    return x + cos * dx - sin * dy, y + sin * dx + cos * dy, heading + turn, cos, sin
+
+
+composed_jit = njit_inlined(composed)
+
+
 def left_jacobian(turn: Array) -> ComplexArray:
     """Return V(t) as a complex number, sinc(t/2) e^{it/2}; any shape.
 

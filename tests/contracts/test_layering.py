@@ -32,7 +32,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         association
         filters
         map_management
-        large_maps
+        large_maps smoother
         registry contract
         check_estimator
     """,

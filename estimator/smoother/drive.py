@@ -1,0 +1,253 @@
+"""Record the data of a whole drive: motions, scans and the noise of both."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...arrays import Array, IntArray
+from ..filters.filter_settings import checked_rules
+from ..filters.motion_noise import MotionNoise
+from ..kernels.predict import predict
+from ..kernels.rules import ADDITIVE, AT_ESTIMATE, Rules
+from ..support import argument_checks
+from .drive_arrays import DriveArrays, landmark_order, noise_factors
+
+
+class Motion(NamedTuple):
+    """The odometry between two poses."""
+
+    steps: tuple[tuple[float, float, float], ...]
+    """(d, α, dt) of each reading [m, rad, -]."""
+    increment: Array
+    """Where they lead, in the frame of the first pose, shape (3,) [m, m, rad]."""
+    covariance: Array
+    """Of the noise in that frame, shape (3, 3)."""
+
+
+class Sightings(NamedTuple):
+    """The readings of one pose."""
+
+    measurements: Array
+    """Rows (β, r), shape (m, 2) [rad, m]."""
+    ids: IntArray
+    """Landmark of each, shape (m,)."""
+
+
+class Drive:
+    """The motions and scans of a drive, with the noise that filters assume.
+
+    It takes what a filter takes, step by step.  A pose of the drive is where a scan was
+    taken; readings of odometry between two scans are composed, and their noise is
+    propagated to first order as in a filter's prediction (exactly, for a single one).
+
+    Parameters
+    ----------
+    motion_std : array_like, shape (3,)
+        (σx, σy, σα) of the motion noise in the robot frame [m, m, rad], per step of
+        dt = 1.  Zeros are exact: such a motion is certain in that direction.
+    measurement_std : array_like, shape (2,)
+        (σβ, σr) of the measurement noise [rad, m].
+    initial_pose, initial_pose_std : array_like, shape (3,)
+        Mean and standard deviation of the first pose [m, m, rad].
+    range_std_per_metre, range_noise_at, noise_at_rest, min_range
+        As in :class:`~slamgym.estimator.EkfSlam`.
+
+    Raises
+    ------
+    ValueError
+        Where an argument has the wrong shape, is not finite or negative, or a reading
+        would have no noise.
+
+    Examples
+    --------
+    >>> drive = Drive(motion_std=(0.1, 0.1, 0.05), measurement_std=(0.02, 0.1))
+    >>> drive.update([(0.0, 5.0)], [7])
+    >>> drive.predict((2.0, 0.0))
+    >>> drive.update([(0.0, 3.0)], [7])
+    >>> drive.poses, drive.landmark_ids
+    (2, (7,))
+    """
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        initial_pose: ArrayLike = (0.0, 0.0, 0.0),
+        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        range_std_per_metre: float = 0.0,
+        range_noise_at: str = "expected",
+        noise_at_rest: bool = True,
+        min_range: float = 1e-3,
+    ) -> None:
+        self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest)
+        self.rules = _sensor_rules(
+            measurement_std, range_std_per_metre, range_noise_at, min_range
+        )
+        self.initial_pose = argument_checks.finite_vector(
+            "initial_pose", initial_pose, 3
+        )
+        self.initial_pose_std = argument_checks.standard_deviations(
+            "initial_pose_std", initial_pose_std, 3
+        )
+        self._motions: list[Motion] = [Motion((), np.zeros(3), np.zeros((3, 3)))]
+        self._sightings: list[list[Sightings]] = [[]]
+        self._pending: list[tuple[float, float, float]] = []
+
+    @property
+    def poses(self) -> int:
+        """Number of poses: the first one, and one at every later scan."""
+        return len(self._motions)
+
+    @property
+    def readings(self) -> int:
+        """Number of readings."""
+        return sum(len(scan.ids) for scans in self._sightings for scan in scans)
+
+    @property
+    def motions(self) -> Sequence[Motion]:
+        """The motion to each pose; that to the first one is empty."""
+        return self._motions
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The landmarks that are read, in the order of their first reading."""
+        ids = (int(i) for scans in self._sightings for scan in scans for i in scan.ids)
+        return tuple(dict.fromkeys(ids))
+
+    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
+        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        distance, turn = argument_checks.pair("odometry", odometry)
+        self.motion_noise.over(distance, turn, dt)  # refuses a wrong dt
+        self._pending.append((distance, turn, float(dt)))
+
+    def update(
+        self, measurements: ArrayLike, landmark_ids: argument_checks.LandmarkIds
+    ) -> None:
+        """Add one scan at the present pose; readings below ``min_range`` are skipped.
+
+        Parameters
+        ----------
+        measurements : array_like, shape (m, 2)
+            Rows (β, r) [rad, m].
+        landmark_ids : sequence of int, length m
+            Identity of the landmark behind each row, without repetition.
+
+        Raises
+        ------
+        ValueError
+            Where the arguments are malformed; the drive is then as before.
+        """
+        readings = argument_checks.scan(measurements)
+        ids = argument_checks.identities(landmark_ids, len(readings))
+        argument_checks.refuse_unusable(readings, ids)
+        self.end_motion()
+        usable = readings[:, 1] >= self.rules.min_range
+        chosen = np.array(ids, dtype=np.int64)[usable]
+        self._sightings[-1].append(Sightings(readings[usable], chosen))
+
+    def end_motion(self) -> None:
+        """Make the present place a pose of the drive, also without a scan."""
+        if self._pending:
+            self._motions.append(self._composed(self._pending))
+            self._sightings.append([])
+            self._pending = []
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Take the readings of one landmark to be of another."""
+        for scans in self._sightings:
+            for scan in scans:
+                scan.ids[scan.ids == gone] = kept
+
+    def forget(self, landmark_ids: Collection[int]) -> None:
+        """Drop all readings of some landmarks."""
+        gone = np.array(list(landmark_ids), dtype=np.int64)
+        for scans in self._sightings:
+            kept = (~np.isin(scan.ids, gone) for scan in scans)
+            pairs = zip(scans, kept, strict=True)
+            scans[:] = [Sightings(z[keep], ids[keep]) for (z, ids), keep in pairs]
+
+    def sightings(self, pose: int) -> Sightings:
+        """Return all readings of one pose."""
+        scans = self._sightings[pose]
+        if len(scans) == 1:
+            return scans[0]
+        none = Sightings(np.empty((0, 2)), np.empty(0, dtype=np.int64))
+        columns = zip(none, *scans, strict=True)
+        return Sightings(*(np.concatenate(parts) for parts in columns))
+
+    def arrays(self) -> tuple[DriveArrays, IntArray]:
+        """Return the data as kernels take it, and the landmarks in their order.
+
+        Raises
+        ------
+        ValueError
+            Where there is no reading.
+        """
+        scans = [self.sightings(pose) for pose in range(self.poses)]
+        ids = np.concatenate([scan.ids for scan in scans])
+        if not len(ids):
+            raise ValueError(
+                f"a drive to smooth must hold readings of landmarks, got none in its "
+                f"{self.poses} poses"
+            )
+        firsts = np.cumsum([0, *(len(scan.ids) for scan in scans)], dtype=np.int64)
+        order, widths = landmark_order(ids, firsts)
+        by_id = np.argsort(order)
+        slots = by_id[np.searchsorted(order[by_id], ids)]
+        covariances = np.array([motion.covariance for motion in self._motions])
+        covariances[0] = np.diag(self.initial_pose_std**2)
+        arrays = DriveArrays(
+            self.initial_pose,
+            np.array([motion.increment for motion in self._motions]),
+            *noise_factors(covariances),
+            firsts,
+            np.concatenate([scan.measurements for scan in scans]),
+            2 * slots,
+            widths,
+        )
+        return arrays, order
+
+    def _composed(self, steps: Sequence[tuple[float, float, float]]) -> Motion:
+        """Compose readings of odometry as a filter predicts from a certain pose 0."""
+        pose, covariance = np.zeros(3), np.zeros((3, 3))
+        for distance, turn, dt in steps:
+            variance = self.motion_noise.over(distance, turn, dt)
+            predict(pose, covariance, pose, 3, distance, turn, variance, AT_ESTIMATE)
+        return Motion(tuple(steps), pose, covariance)
+
+    def __repr__(self) -> str:
+        readings = sum(len(scan.ids) for scans in self._sightings for scan in scans)
+        landmarks = len(self.landmark_ids)
+        return (
+            f"Drive of {self.poses} poses, {readings} readings of {landmarks} landmarks"
+        )
+
+
+def _sensor_rules(
+    measurement_std: ArrayLike,
+    range_std_per_metre: float,
+    range_noise_at: str,
+    min_range: float,
+) -> Rules:
+    """Return the noise of the sensor as rules; refuse a sensor without noise."""
+    rules = checked_rules(
+        measurement_std,
+        linearisation=AT_ESTIMATE,
+        frame=ADDITIVE,
+        landmark_init="full",
+        range_std_per_metre=range_std_per_metre,
+        range_noise_at=range_noise_at,
+        gate_probability=None,
+        min_range=min_range,
+    )
+    if not (rules.bearing_std and (rules.range_std or rules.range_std_per_metre)):
+        raise ValueError(
+            "measurement_std must be > 0 to smooth, got "
+            f"({rules.bearing_std:g}, {rules.range_std:g})"
+        )
+    return rules

@@ -1,0 +1,193 @@
+"""Levenberg-Marquardt over all poses and landmarks of a drive."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from ...arrays import Array
+from ..models.angles import wrap_angle
+from ..support.memory_limit import refuse_beyond_memory
+from .cost import CAUCHY, HUBER, SQUARED, range_stds, total_cost
+from .drive_arrays import DriveArrays
+from .elimination import Elimination, eliminate, new_elimination
+from .relocation import relocate
+from .substitution import substitute
+
+KINDS = {None: SQUARED, "huber": HUBER, "cauchy": CAUCHY}
+SLACK = 1e-12  # of the cost, in rounding
+REWEIGHTED = 30  # iterations; from then on the noise of the ranges is fixed
+RELOCATED = 5  # iterations from one search for better places of landmarks to the next
+FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
+
+
+class Noise(NamedTuple):
+    """The noise of the sensor, and how much an outlier counts."""
+
+    rule_values: Array
+    """The rules of a filter, see :class:`..kernels.rules.Rules`."""
+    bearing_std: float
+    """σβ [rad]."""
+    kind: float
+    """Of the robust kernel, one of `KINDS`."""
+    scale: float
+    """Of the robust kernel, in standard deviations."""
+
+
+class Estimate(NamedTuple):
+    """Poses and landmarks."""
+
+    poses: Array
+    """Shape (N, 3), heading not wrapped."""
+    landmarks: Array
+    """Shape (2n,), in the order of the elimination."""
+
+
+class Minimum(NamedTuple):
+    """The most likely poses and landmarks, and the system linearised there."""
+
+    estimate: Estimate
+    elimination: Elimination
+    information: Array
+    """Of the landmarks, shape (2n, 2n)."""
+    cost: float
+    first_cost: float
+    iterations: int
+
+
+class Optimiser:
+    """Minimise the cost of a drive.
+
+    The noise of a range that grows with the range is that at the latest estimate, and
+    fixed within an iteration, as in a filter's update.
+    """
+
+    def __init__(self, drive: DriveArrays, noise: Noise) -> None:
+        self._drive, self._noise = drive, noise
+        poses, landmarks = len(drive.increments), int(drive.widths[0]) // 2
+        refuse_beyond_memory(
+            f"smoothing {poses} poses among {landmarks} landmarks",
+            8 * (6 * poses * 2 * landmarks + 3 * (2 * landmarks) ** 2),
+            "smooth a part of the drive, or a drive with fewer landmarks",
+        )
+        self._room = new_elimination(poses, landmarks)
+        self._owners = np.repeat(np.arange(poses), np.diff(drive.firsts))
+        self._by_landmark = np.argsort(drive.columns, kind="stable")
+
+    def minimise(self, start: Estimate, tolerance: float, most: int) -> Minimum:
+        """Iterate until no pose or landmark moves more than the tolerance [m, rad].
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            Where that takes more than ``most`` iterations, or no step lowers the cost.
+        """
+        estimate, damping = start, 0.0
+        stds = self.range_stds(estimate)
+        first_cost = cost = self.cost(estimate, stds)
+        # A start that contradicts a motion without noise is no bound of the cost.
+        is_bound = bool(self._drive.factors[1:].any(axis=1).all())
+        for iteration in range(1, most + 1):
+            if iteration <= REWEIGHTED:
+                stds = self.range_stds(estimate)
+            cost = self.cost(estimate, stds) if is_bound else np.inf
+            is_bound = True
+            estimate, damping, moved = self._descend(estimate, stds, cost, damping)
+            is_found = moved <= tolerance and damping <= FIRST_DAMPING
+            if is_found or iteration % RELOCATED == 0:
+                relocated = self._relocate(estimate)
+                if is_found and not relocated:
+                    return self._at(estimate, first_cost, iteration)
+        raise np.linalg.LinAlgError(
+            f"smoothing did not converge in {most} iterations: the last one moved a "
+            f"pose or landmark by {moved:.3g}, the cost fell from {first_cost:.4g} to "
+            f"{self.cost(estimate, stds):.4g}; a better start, another noise or a "
+            "robust kernel may help"
+        )
+
+    def range_stds(self, estimate: Estimate) -> Array:
+        """Return σr of each reading, shape (M,), at the range it should have."""
+        return range_stds(*estimate, self._drive, self._noise.rule_values)
+
+    def cost(self, estimate: Estimate, stds: Array) -> float:
+        """Return the cost, with σr of every reading given."""
+        _, bearing_std, kind, scale = self._noise
+        return total_cost(*estimate, self._drive, stds, bearing_std, kind, scale)
+
+    def linearise(self, estimate: Estimate, stds: Array, damping: float = 0.0) -> Array:
+        """Eliminate the poses; return the information of the landmarks, (2n, 2n)."""
+        room, drive = self._room, self._drive
+        sensor = self._noise[1:]
+        eliminate(*estimate, drive, stds, sensor, damping, room)
+        rows = room.rows.reshape(-1, len(room.right))
+        information = -(rows.T @ rows)
+        n = len(room.blocks)
+        at = np.arange(n)
+        information.reshape(n, 2, n, 2)[at, :, at, :] += room.blocks
+        return information
+
+    def _descend(
+        self, estimate: Estimate, stds: Array, cost: float, damping: float
+    ) -> tuple[Estimate, float, float]:
+        """Take one step that does not raise the cost; return it, damping and length."""
+        while damping <= MOST_DAMPING:
+            moved = self._step(estimate, stds, damping)
+            longest = _distance(estimate, moved)
+            if self.cost(moved, stds) <= cost * (1 + SLACK) + SLACK:
+                lower = damping / 10
+                return moved, lower if lower >= FIRST_DAMPING else 0.0, longest
+            damping = max(FIRST_DAMPING, 10 * damping)
+        raise np.linalg.LinAlgError(
+            f"smoothing diverged: no step lowers the cost of {cost:.4g}"
+        )
+
+    def _relocate(self, estimate: Estimate) -> int:
+        """Move landmarks out of local minima, in place; return how many."""
+        noise, drive = self._noise, self._drive
+        robust = noise.kind, noise.scale
+        rules = noise.rule_values
+        return relocate(
+            *estimate, drive, self._by_landmark, self._owners, rules, robust
+        )
+
+    def _step(self, estimate: Estimate, stds: Array, damping: float) -> Estimate:
+        information = self.linearise(estimate, stds, damping)
+        factor = factorised(information)
+        landmark_step = cho_solve(factor, self._room.right)
+        poses = substitute(estimate.poses, self._drive, landmark_step, self._room)
+        return Estimate(poses, estimate.landmarks + landmark_step)
+
+    def _at(self, estimate: Estimate, first_cost: float, iterations: int) -> Minimum:
+        """Return the minimum with the system linearised there, not damped."""
+        stds = self.range_stds(estimate)
+        information, cost = self.linearise(estimate, stds), self.cost(estimate, stds)
+        return Minimum(estimate, self._room, information, cost, first_cost, iterations)
+
+
+def _distance(one: Estimate, other: Estimate) -> float:
+    """Return the largest difference of a coordinate; headings are wrapped."""
+    turns = wrap_angle(one.poses[:, 2] - other.poses[:, 2])
+    gaps = one.poses[:, :2] - other.poses[:, :2], one.landmarks - other.landmarks
+    return max(float(abs(part).max()) for part in (turns, *gaps))
+
+
+def factorised(information: Array) -> tuple[Array, bool]:
+    """Return the Cholesky factor of the landmarks' information.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where it is not positive definite.
+    """
+    if not np.isfinite(information).all():
+        raise np.linalg.LinAlgError("smoothing diverged: its system is not finite")
+    try:
+        factor, lower = cho_factor(information, lower=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        raise np.linalg.LinAlgError(
+            "the readings do not determine all landmarks: their information is not "
+            "positive definite"
+        ) from None
+    return factor, lower

@@ -1,0 +1,167 @@
+"""What the smoother knows of a drive: all poses and landmarks, and any covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+
+from ...arrays import Array
+from ..belief import Belief
+from ..models.angles import wrap_angle
+from ..support import argument_checks
+from ..support.argument_checks import LandmarkIds
+from .optimiser import Minimum, factorised
+from .substitution import conditionals
+
+
+class SmoothedDrive:
+    """The most likely poses and landmarks of a drive, given all its readings.
+
+    ::
+
+        P_l = S⁻¹,    P_k = Π_k + Ψ_k P_l Ψ_kᵀ,    P_kl = Ψ_k P_l
+        P_jk = Π_j Φ_{j+1}ᵀ … Φ_kᵀ + Ψ_j P_l Ψ_kᵀ    for j < k
+
+    with the Schur complement S of the landmarks and Π, Φ, Ψ of
+    :func:`.substitution.conditionals`.
+
+    Parameters
+    ----------
+    minimum : Minimum
+        Of the cost.
+    order : sequence of int
+        The landmarks in the order of the elimination.
+    landmark_ids : sequence of int
+        The same landmarks in the order of beliefs.
+    """
+
+    def __init__(
+        self, minimum: Minimum, order: Sequence[int], landmark_ids: Sequence[int]
+    ) -> None:
+        estimate, elimination = minimum.estimate, minimum.elimination
+        self.cost = minimum.cost
+        """Half the sum of the squared, normalised residuals; of a robust kernel, ρ."""
+        self.first_cost = minimum.first_cost
+        """The cost at the start."""
+        self.iterations = minimum.iterations
+        """Steps of Levenberg-Marquardt."""
+        self.landmark_ids = tuple(landmark_ids)
+        """In the order of their first reading."""
+        self.poses = estimate.poses.copy()
+        """(x, y, θ), shape (N, 3) [m, m, rad], heading in [-π, π)."""
+        self.poses[:, 2] = wrap_angle(self.poses[:, 2])
+        self._slots = {i: slot for slot, i in enumerate(order)}
+        self._all = estimate.landmarks
+        self.landmarks = self._all[self._columns(self.landmark_ids)].reshape(-1, 2)
+        """Positions in the order of `landmark_ids`, shape (n, 2) [m]."""
+        self._covariances, self._transitions = conditionals(estimate.poses, elimination)
+        self._sensitivity = elimination.rows
+        self._factor = factorised(minimum.information)
+        identity = np.eye(len(self._all))
+        self._landmark_covariance = cho_solve(self._factor, identity)
+
+    @property
+    def pose_covariances(self) -> Array:
+        """Marginal covariance of each pose, shape (N, 3, 3)."""
+        rows = self._sensitivity.reshape(-1, len(self._all))
+        root = solve_triangular(self._factor[0], rows.T, lower=True)
+        root = root.T.reshape(self._sensitivity.shape)
+        return np.asarray(self._covariances + root @ root.transpose(0, 2, 1))
+
+    @property
+    def landmark_covariances(self) -> Array:
+        """Marginal covariance of each landmark, shape (n, 2, 2) [m²]."""
+        columns = self._columns(self.landmark_ids).reshape(-1, 2)
+        blocks = self._landmark_covariance[columns[:, :, None], columns[:, None, :]]
+        return np.asarray(blocks)
+
+    def covariance(
+        self, poses: Sequence[int], landmark_ids: LandmarkIds | None = None
+    ) -> Array:
+        """Return the joint covariance of some poses and landmarks.
+
+        Parameters
+        ----------
+        poses : sequence of int
+            Which poses; negative ones count from the end.
+        landmark_ids : sequence of int, optional
+            Which landmarks; all where not given.
+
+        Returns
+        -------
+        ndarray, shape (3p + 2m, 3p + 2m)
+            Of the additive error, in the order given.
+
+        Raises
+        ------
+        ValueError
+            Where a pose does not exist or a landmark has no reading.
+        """
+        chosen = [self._pose(pose) for pose in poses]
+        columns = self._columns(self._known(landmark_ids))
+        to_landmarks = self._sensitivity[chosen].reshape(-1, len(self._all))
+        spread = to_landmarks @ self._landmark_covariance
+        count = 3 * len(chosen)
+        joint = np.empty((count + len(columns),) * 2)
+        joint[:count, :count] = spread @ to_landmarks.T + self._given_map(chosen)
+        joint[:count, count:] = spread[:, columns]
+        joint[count:, :count] = joint[:count, count:].T
+        joint[count:, count:] = self._landmark_covariance[np.ix_(columns, columns)]
+        return (joint + joint.T) / 2
+
+    def belief(self, pose: int = -1, landmark_ids: LandmarkIds | None = None) -> Belief:
+        """Return the belief about one pose and some landmarks, given the whole drive.
+
+        Parameters
+        ----------
+        pose : int
+            Which pose; the last one by default.
+        landmark_ids : sequence of int, optional
+            Which landmarks, in this order; all where not given.
+        """
+        ids = self._known(landmark_ids)
+        mean = np.concatenate(
+            [self.poses[self._pose(pose)], self._all[self._columns(ids)]]
+        )
+        return Belief(mean, self.covariance([pose], ids), tuple(ids), "invariant")
+
+    def _given_map(self, poses: Sequence[int]) -> Array:
+        """Return the joint covariance of some poses if the map was known."""
+        blocks = np.empty((len(poses), 3, len(poses), 3))
+        for at, first in enumerate(poses):
+            later = {pose for pose in poses if pose >= first}
+            moved = self._covariances[first]
+            for k in range(first, max(later) + 1):
+                if k > first:
+                    moved = self._transitions[k] @ moved
+                for other in [i for i, pose in enumerate(poses) if pose == k]:
+                    blocks[other, :, at] = moved
+                    blocks[at, :, other] = moved.T
+        return blocks.reshape(3 * len(poses), -1)
+
+    def _columns(self, ids: Sequence[int]) -> Array:
+        firsts = np.array([2 * self._slots[i] for i in ids], dtype=np.int64)
+        return np.asarray(np.stack([firsts, firsts + 1], axis=1).ravel())
+
+    def _known(self, landmark_ids: LandmarkIds | None) -> list[int]:
+        if landmark_ids is None:
+            return list(self.landmark_ids)
+        ids = argument_checks.identities(landmark_ids, np.size(landmark_ids))
+        for i in ids:
+            if i not in self._slots:
+                raise ValueError(f"landmark {i} has no reading in the drive")
+        return ids
+
+    def _pose(self, pose: int) -> int:
+        count = len(self.poses)
+        if not -count <= pose < count:
+            raise ValueError(f"poses must be below {count}, got {pose}")
+        return pose % count
+
+    def __repr__(self) -> str:
+        return (
+            f"SmoothedDrive of {len(self.poses)} poses and {len(self.landmarks)} "
+            f"landmarks, cost {self.cost:.6g} after {self.iterations} iterations"
+        )

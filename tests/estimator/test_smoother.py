@@ -1,0 +1,394 @@
+"""The batch smoother against dense least squares, RTS, GTSAM, and its own promises."""
+
+import numpy as np
+import pytest
+from dense_smoother import DenseSmoother
+from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+
+from slamgym.estimator import make_estimator
+from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.smoother import Drive, RecordedSlam, smooth
+from slamgym.estimator.smoother.batch_smoother import filtered
+
+START_STD = (0.1, 0.2, 0.05)
+RANGE = 7.0  # of the sensor [m]
+
+
+def recorded(seed=3, steps=12, start_std=START_STD, **settings):
+    """Return a drive, and its moves and scans as plain lists."""
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD} | settings
+    result = Drive(**noise, initial_pose_std=start_std)
+    result.end_motion()
+    moves, scans = [], [(np.empty((0, 2)), np.empty(0, dtype=int))]
+    for odometry, readings, _ in drive(seed, steps):
+        seen = np.flatnonzero(readings[:, 1] < RANGE)
+        result.predict(odometry)
+        result.update(readings[seen], seen)
+        moves.append(odometry)
+        scans.append((readings[seen], seen))
+    return result, moves, scans
+
+
+def dense_twin(made, moves, scans, **noise):
+    """Return the dense twin and its state of a smoothed drive."""
+    settings = (MOTION_STD, MEASUREMENT_STD, START_STD)
+    places = dict(zip(made.landmark_ids, made.landmarks, strict=True))
+    order = sorted(places)
+    slots = {i: slot for slot, i in enumerate(order)}
+    indexed = [(z, [slots[i] for i in ids]) for z, ids in scans]
+    state = np.concatenate([made.poses.ravel(), *(places[i] for i in order)])
+    return DenseSmoother(moves, indexed, *settings), state, order
+
+
+@pytest.fixture(scope="module")
+def example():
+    result, moves, scans = recorded()
+    return smooth(result), moves, scans
+
+
+def test_poses_and_landmarks_are_those_of_dense_least_squares(example):
+    made, moves, scans = example
+    twin, state, _ = dense_twin(made, moves, scans)
+    rng = np.random.default_rng(0)
+    found, _ = twin.solve(state + 0.01 * rng.standard_normal(len(state)))
+    assert found == pytest.approx(state, abs=1e-7)  # differences are good to that
+
+
+def test_cost_is_half_the_sum_of_squares(example):
+    made, moves, scans = example
+    twin, state, _ = dense_twin(made, moves, scans)
+    assert made.cost == pytest.approx((twin.residual(state) ** 2).sum() / 2)
+    assert made.cost < made.first_cost
+
+
+def test_every_covariance_is_that_of_dense_least_squares(example):
+    made, moves, scans = example
+    twin, state, order = dense_twin(made, moves, scans)
+    _, expected = twin.solve(state, iterations=1)
+    joint = made.covariance(range(len(made.poses)), order)
+    assert joint == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_marginals_are_parts_of_the_joint_covariance(example):
+    made, *_ = example
+    first, last = made.pose_covariances[0], made.pose_covariances[-1]
+    pair = made.covariance([-1, 0], [])
+    assert pair[:3, :3] == pytest.approx(last)
+    assert pair[3:, 3:] == pytest.approx(first)
+    belief = made.belief(landmark_ids=[4, 0])
+    places = dict(zip(made.landmark_ids, made.landmarks, strict=True))
+    covariances = dict(zip(made.landmark_ids, made.landmark_covariances, strict=True))
+    assert belief.landmarks.tolist() == [places[4].tolist(), places[0].tolist()]
+    assert belief.landmark_covariances[1] == pytest.approx(covariances[0])
+    assert belief.pose_covariance == pytest.approx(last)
+    assert belief.pose.tolist() == made.poses[-1].tolist()
+
+
+def test_a_linear_drive_is_smoothed_as_rauch_tung_and_striebel_do():
+    rng = np.random.default_rng(1)
+    steps, motion_std, range_std, places = 15, 0.3, 0.1, np.array([40.0, 50.0])
+    made = Drive((motion_std, 0, 0), (0.1, range_std), initial_pose_std=(0.5, 0, 0))
+    x, readings, moves = 0.5 * rng.standard_normal(), [], rng.uniform(0.2, 1.0, steps)
+    for k in range(steps):
+        if k:
+            x += moves[k] + motion_std * rng.standard_normal()
+            made.predict((moves[k], 0.0))
+        seen = [0] if k % 3 else [0, 1]
+        ranges = places[seen] - x + range_std * rng.standard_normal(len(seen))
+        made.update(np.column_stack([np.zeros(len(seen)), ranges]), seen)
+        readings.append((seen, ranges))
+    smoothed = smooth(made)
+    means, covariances = rauch_tung_striebel(
+        readings, moves, 0.5, motion_std, range_std
+    )
+    assert smoothed.poses[:, 0] == pytest.approx(means[:, 0], abs=1e-11)
+    assert smoothed.landmarks[:, 0] == pytest.approx(means[-1, 1:], abs=1e-11)
+    for k in range(steps):
+        part = smoothed.covariance([k])[np.ix_([0, 3, 5], [0, 3, 5])]
+        assert part == pytest.approx(covariances[k], rel=1e-11, abs=1e-12)
+    assert not smoothed.poses[:, 1:].any()
+
+
+def rauch_tung_striebel(readings, moves, start_std, motion_std, range_std):
+    """Filter (x, l0, l1) forwards from the first scan, then smooth backwards."""
+    mean = np.array([0.0, *readings[0][1]])
+    P = np.full((3, 3), start_std**2) + np.diag([0, 1, 1]) * range_std**2
+    Q = np.diag([motion_std**2, 0, 0])
+    filtered_, predicted = [(mean, P)], [(mean, P)]
+    for move, (seen, ranges) in zip(moves[1:], readings[1:], strict=True):
+        mean = mean + np.array([move, 0, 0])
+        P = P + Q
+        predicted.append((mean, P))
+        for i, z in zip(seen, ranges, strict=True):
+            H = np.array([-1.0, *(np.arange(2) == i)])
+            K = P @ H / (H @ P @ H + range_std**2)
+            mean = mean + K * (z - H @ mean)
+            T = np.eye(3) - np.outer(K, H)
+            P = T @ P @ T.T + np.outer(K, K) * range_std**2
+        filtered_.append((mean, P))
+    means, covariances = [mean], [P]
+    for (m, P), (m1, P1) in zip(filtered_[-2::-1], predicted[:0:-1], strict=True):
+        G = np.linalg.solve(P1, P).T
+        means.insert(0, m + G @ (means[0] - m1))
+        covariances.insert(0, P + G @ (covariances[0] - P1) @ G.T)
+    return np.array(means), covariances
+
+
+def test_gtsam_finds_the_same_poses_landmarks_and_marginals():
+    gtsam = pytest.importorskip("gtsam", reason="solves the same graph")
+    import gtsam_batch
+
+    made, moves, scans = recorded(seed=4, steps=60)
+    smoothed, (poses, places) = smooth(made), filtered(made)
+    settings = (MOTION_STD, MEASUREMENT_STD, START_STD)
+    graph = gtsam_batch.graph_of(moves, scans, *settings)
+    solution = gtsam_batch.solve(graph, gtsam_batch.values_of(poses, places))
+    assert graph.error(solution) == pytest.approx(smoothed.cost, rel=1e-12)
+    marginals = gtsam.Marginals(graph, solution)
+    for k in range(made.poses):
+        gap = gtsam_batch.pose_of(solution, k) - smoothed.poses[k]
+        assert np.append(gap[:2], wrap_angle(gap[2])) == pytest.approx(0, abs=1e-8)
+        theirs = gtsam_batch.world_covariance(marginals, solution, k)
+        ours = smoothed.pose_covariances[k]
+        assert theirs == pytest.approx(ours, rel=1e-6, abs=1e-6 * abs(ours).max())
+    for i, ours in enumerate(smoothed.landmark_covariances):
+        key = gtsam_batch.L(smoothed.landmark_ids[i])
+        assert solution.atPoint2(key) == pytest.approx(smoothed.landmarks[i], abs=1e-8)
+        theirs = marginals.marginalCovariance(key)
+        assert theirs == pytest.approx(ours, rel=1e-6, abs=1e-6 * abs(ours).max())
+
+
+def test_a_motion_without_noise_in_a_direction_is_kept_exactly():
+    made, moves, _ = recorded(motion_std=(0.05, 0.0, 0.02))
+    poses = smooth(made).poses
+    cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    dx, dy = np.diff(poses[:, :2], axis=0).T
+    assert cos * dy - sin * dx == pytest.approx(0, abs=1e-12)
+    assert np.hypot(dx, dy) != pytest.approx([d for d, _ in moves], abs=1e-3)
+
+
+def test_noise_that_vanishes_tends_to_a_motion_without_noise():
+    exact, nearly = (
+        smooth(recorded(motion_std=(0.05, std, 0.02))[0]) for std in (0.0, 1e-5)
+    )
+    assert nearly.poses == pytest.approx(exact.poses, abs=1e-6)
+    assert nearly.pose_covariances == pytest.approx(exact.pose_covariances, rel=1e-4)
+
+
+def test_a_known_start_does_not_move():
+    made, *_ = recorded(start_std=(0, 0, 0))
+    smoothed = smooth(made)
+    assert smoothed.poses[0].tolist() == [0, 0, 0]
+    assert not smoothed.pose_covariances[0].any()
+
+
+def test_composed_odometry_is_one_motion():
+    parts, whole = (Drive((0.1, 0.1, 0.05), (0.02, 0.1)) for _ in range(2))
+    for made in (parts, whole):
+        made.update([(0.3, 5.0), (-0.8, 4.0)], [0, 1])
+    parts.predict((0.0, 0.2), 0.0)  # a turn without noise, then a drive
+    parts.predict((1.0, 0.2), 1.0)
+    turned = np.array([np.cos(0.2), np.sin(0.2), 0.4])
+    assert parts.poses == 1
+    for made in (parts, whole):
+        if made is whole:
+            made.predict((1.0, 0.4))
+        made.update([(-0.2, 4.2), (-1.4, 4.1)], [0, 1])
+    assert parts.motions[1].increment == pytest.approx(turned)
+    spread = np.diag([0.01, 0.01, 0.0025])
+    assert parts.motions[1].covariance == pytest.approx(spread)
+    assert smooth(parts).cost != pytest.approx(smooth(whole).cost)
+
+
+def test_odometry_over_several_readings_has_the_noise_of_a_filter():
+    made = Drive((0.1, 0.05, 0.03), (0.02, 0.1), initial_pose=(1.0, 2.0, 0.5))
+    slam = make_estimator(
+        "ekf",
+        motion_std=(0.1, 0.05, 0.03),
+        measurement_std=(0.02, 0.1),
+        initial_pose=(1.0, 2.0, 0.5),
+    )
+    for odometry, dt in (((1.0, 0.3), 1.0), ((0.5, -0.6), 2.0), ((2.0, 0.1), 0.5)):
+        made.predict(odometry, dt)
+        slam.predict(odometry, dt)
+    made.update([(0.3, 5.0), (1.0, 3.0)], [0, 1])
+    smoothed = smooth(made)
+    assert smoothed.poses[-1] == pytest.approx(slam.belief().pose)
+    assert smoothed.pose_covariances[-1] == pytest.approx(slam.belief().pose_covariance)
+
+
+@pytest.mark.parametrize("robust", ["huber", "cauchy"])
+def test_a_robust_kernel_finds_a_minimum_and_discounts_an_outlier(robust):
+    made, moves, scans = recorded()
+    readings, _ = scans[5]
+    readings[0] += (0.4, -1.5)
+    plain, robustly = (
+        smooth(spoiled(moves, scans), robust=kernel) for kernel in (None, robust)
+    )
+    clean = smooth(made)
+    assert (
+        abs(robustly.poses - clean.poses).max()
+        < abs(plain.poses - clean.poses).max() / 3
+    )
+    scale = {"huber": 1.345, "cauchy": 2.3849}[robust]
+    twin, state, _ = dense_twin(robustly, moves, scans)
+
+    def cost(state):
+        residual = twin.residual(state)
+        rows = 3 * len(scans)
+        e = np.hypot(*residual[rows:].reshape(-1, 2).T)
+        tail = {
+            "huber": np.where(e < scale, e**2 / 2, scale * e - scale**2 / 2),
+            "cauchy": scale**2 / 2 * np.log1p((e / scale) ** 2),
+        }
+        return (residual[:rows] ** 2).sum() / 2 + tail[robust].sum()
+
+    assert cost(state) == pytest.approx(robustly.cost)
+    gradient = [
+        cost(state + 1e-6 * e) - cost(state - 1e-6 * e) for e in np.eye(len(state))
+    ]
+    assert np.array(gradient) / 2e-6 == pytest.approx(0, abs=1e-4)
+
+
+def spoiled(moves, scans):
+    made = Drive(MOTION_STD, MEASUREMENT_STD, initial_pose_std=START_STD)
+    made.end_motion()
+    for move, (readings, seen) in zip(moves, scans[1:], strict=True):
+        made.predict(move)
+        made.update(readings, seen)
+    return made
+
+
+def test_noise_that_grows_with_the_range_is_that_of_the_expected_range():
+    made, *_ = recorded(measurement_std=(0.02, 0.0), range_std_per_metre=0.02)
+    smoothed = smooth(made)
+    fixed, *_ = recorded(measurement_std=(0.02, 0.1))
+    assert smoothed.cost != pytest.approx(smooth(fixed).cost, rel=1e-2)
+    read, *_ = recorded(
+        measurement_std=(0.02, 0.0), range_std_per_metre=0.02, range_noise_at="reading"
+    )
+    assert not np.allclose(smooth(read).poses, smoothed.poses, atol=1e-4)
+
+
+def test_a_landmark_on_the_wrong_side_of_the_path_is_moved():
+    made, *_ = recorded(steps=40, start_std=(0, 0, 0))
+    found = smooth(made)
+    places = dict(zip(found.landmark_ids, found.landmarks, strict=True))
+    mirrored = places | {0: places[0] * (1, -1)}
+    again = smooth(made, start=found.poses, landmarks=mirrored)
+    assert again.landmarks == pytest.approx(found.landmarks, abs=1e-7)
+
+
+def test_the_start_does_not_change_the_solution():
+    made, *_ = recorded(steps=30)
+    found = smooth(made)
+    poses = found.poses + 0.05 * np.random.default_rng(0).standard_normal((31, 3))
+    again = smooth(made, start=poses)
+    assert again.poses == pytest.approx(found.poses, abs=1e-8)
+    assert again.landmarks == pytest.approx(found.landmarks, abs=1e-8)
+
+
+def test_a_drive_without_readings_is_refused():
+    made = Drive(MOTION_STD, MEASUREMENT_STD)
+    made.predict((1.0, 0.0))
+    with pytest.raises(ValueError, match="must hold readings of landmarks, got none"):
+        smooth(made)
+
+
+def test_a_landmark_without_a_reading_is_refused():
+    made, *_ = recorded()
+    with pytest.raises(ValueError, match="landmark 77 has no reading in the drive"):
+        smooth(made, landmarks={77: (1.0, 2.0)})
+    with pytest.raises(ValueError, match="landmark 77 has no reading in the drive"):
+        smooth(made).belief(landmark_ids=[77])
+
+
+def test_a_solution_that_is_not_found_is_an_error():
+    made, *_ = recorded()
+    with pytest.raises(np.linalg.LinAlgError, match="did not converge in 1 iteration"):
+        smooth(made, iterations=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"start": np.zeros((2, 3))}, r"start must be finite poses \(13, 3\), got"),
+        ({"robust": "tukey"}, "robust must be 'huber' or 'cauchy', got 'tukey'"),
+        ({"robust": "huber", "robust_scale": 0}, "robust_scale must be .* > 0, got 0"),
+        ({"tolerance": 0}, "tolerance must be a finite number > 0, got 0"),
+        ({"iterations": 0}, "iterations must be a whole number >= 1, got 0"),
+        ({"landmarks": {0: (1, np.nan)}}, r"landmarks\[0\] must be 2 finite numbers"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, message):
+    made, *_ = recorded()
+    with pytest.raises(ValueError, match=message):
+        smooth(made, **arguments)
+
+
+def test_a_sensor_without_noise_is_refused():
+    with pytest.raises(ValueError, match=r"measurement_std must be > 0 to smooth"):
+        Drive(MOTION_STD, (0.1, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("scan", "ids"),
+    [([(0.0, np.nan)], [0]), ([(0.0, 1.0)], [0, 1]), ([(0, 1), (0, 2)], [3, 3])],
+)
+def test_a_refused_scan_leaves_the_drive_as_it_was(scan, ids):
+    made, *_ = recorded(steps=2)
+    made.predict((1.0, 0.0))
+    before = repr(made)
+    with pytest.raises(ValueError, match=r"measurements|landmark_ids"):
+        made.update(scan, ids)
+    assert repr(made) == before
+    assert made.poses == 3
+
+
+def test_readings_below_the_minimum_range_are_skipped():
+    made = Drive(MOTION_STD, MEASUREMENT_STD, min_range=1.0)
+    made.update([(0.0, 0.5), (0.1, 2.0)], [0, 1])
+    assert made.landmark_ids == (1,)
+
+
+def test_a_recorded_filter_gives_its_associations_to_the_drive():
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    managed = make_estimator("invariant", management=True, **noise)
+    slam, plain = RecordedSlam(managed, Drive(**noise)), Drive(**noise)
+    for odometry, readings, _ in drive(5, 40, landmarks=SIX):
+        slam.predict(odometry)
+        slam.update(readings)
+        plain.predict(odometry)
+        plain.update(readings, range(6))
+    smoothed, expected = smooth(slam.drive, start=slam.poses), smooth(plain)
+    gaps = np.linalg.norm(smoothed.landmarks[:, None] - expected.landmarks, axis=2)
+    assert sorted(gaps.argmin(axis=1)) == [0, 1, 2, 3, 4, 5]
+    assert (gaps.min(axis=1) < 0.3).all()  # the first two scans are not associated
+    assert 6 * 35 < slam.drive.readings <= 6 * 38
+    assert slam.drive.poses == 41
+
+
+def test_merged_and_removed_landmarks_leave_the_drive():
+    made = Drive(MOTION_STD, MEASUREMENT_STD)
+    made.update([(0.1, 2.0), (0.4, 3.0)], [0, 1])
+    made.predict((0.5, 0.0))
+    made.update([(0.15, 1.6), (1.0, 2.0)], [2, 3])
+    made.merge(0, 2)
+    made.forget([3])
+    assert made.landmark_ids == (0, 1)
+    assert smooth(made).landmark_ids == (0, 1)
+
+
+def test_recording_does_not_change_the_filter():
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    alone = make_estimator("invariant", **noise)
+    slam = RecordedSlam(make_estimator("invariant", **noise), Drive(**noise))
+    for odometry, readings, _ in drive(6, 5):
+        for each in (alone, slam):
+            each.predict(odometry)
+            each.update(readings, list(range(6)))
+    assert slam.belief().mean.tolist() == alone.belief().mean.tolist()
+    assert slam.poses[-1].tolist() == alone.belief().pose.tolist()
+    assert slam.landmark_ids == alone.landmark_ids
+    with pytest.raises(ValueError, match="cannot be reset"):
+        slam.reset((0, 0, 0), (0, 0, 0))

@@ -1,0 +1,45 @@
+"""The batch smoother as dense least squares with numeric Jacobians: the slow twin."""
+
+import numpy as np
+from numeric_jacobian import numeric_jacobian
+
+from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
+
+
+class DenseSmoother:
+    """Poses 0 … K and landmarks as one vector (x0, y0, θ0, x1, …, l0x, l0y, …).
+
+    moves are odometry (d, α) to poses 1 … K, scans [(readings, landmark indices)].
+    """
+
+    def __init__(self, moves, scans, motion_std, measurement_std, start_std):
+        self.moves, self.scans = moves, scans
+        self.motion_std, self.measurement_std = motion_std, measurement_std
+        self.start_std = np.asarray(start_std, dtype=float)
+
+    def residual(self, state):
+        """Whitened residuals of the prior, the motions and the readings."""
+        poses = state[: 3 * len(self.scans)].reshape(-1, 3)
+        landmarks = state[3 * len(self.scans) :].reshape(-1, 2)
+        parts = [poses[0] / self.start_std]
+        for k, odometry in enumerate(self.moves):
+            motion = predict_pose(poses[k], np.asarray(odometry))
+            slip = poses[k + 1] - motion.pose
+            slip[2] = wrap_angle(slip[2])
+            parts.append(motion.jacobian_noise.T @ slip / self.motion_std)
+        for pose, (readings, seen) in zip(poses, self.scans, strict=True):
+            expected = predict_measurement(pose, landmarks[seen]).measurement
+            innovation = np.asarray(readings).reshape(-1, 2) - expected
+            innovation[:, 0] = wrap_angle(innovation[:, 0])
+            parts.append((innovation / self.measurement_std).ravel())
+        return np.concatenate(parts)
+
+    def solve(self, state, iterations=8):
+        """Gauss-Newton; return the state and its covariance."""
+        for _ in range(iterations):
+            J = numeric_jacobian(self.residual, state)
+            state = state - np.linalg.lstsq(J, self.residual(state), rcond=None)[0]
+        J = numeric_jacobian(self.residual, state)
+        return state, np.linalg.inv(J.T @ J)
