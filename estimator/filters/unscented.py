@@ -1,4 +1,4 @@
-"""The unscented EKF-SLAM: cubature points instead of Jacobians."""
+"""Unscented EKF-SLAM: cubature points instead of Jacobians."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .scan_workspace import not_positive_definite
 
 
 class UnscentedSlam(EkfSlam):
-    """Unscented filter with cubature points, angles wrapped; dense, O(n³) per step.
+    """Unscented filter with cubature points and wrapped angles; dense, O(n³) per step.
 
-    The belief is carried through the models by the 2N points mean ± √N Lᵢ, L Lᵀ = P,
-    each of weight 1/2N [1]_ [2]_; the motion noise is part of the state it is carried
-    by.  New landmarks enter linearised as in ``ekf``.  It needs no Jacobian, and it
-    is as falsely certain of its heading as the EKF: for comparison, not for use.
+    The models transform the 2N points mean ± √N Lᵢ, L Lᵀ = P, each of weight 1/2N [1]_
+    [2]_.  To predict, the state is extended by the motion noise.  New landmarks are
+    initialised by linearisation, as in ``ekf``.  The filter needs no Jacobians, but is
+    as overconfident about its heading as the EKF: use it for comparison only.
 
     Parameters are those of :class:`EkfSlam`.
 
@@ -57,7 +57,7 @@ class UnscentedSlam(EkfSlam):
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
-        """Correct the belief with one scan, then map the landmarks seen first."""
+        """Correct the belief with one scan, then add its new landmarks to the map."""
         readings = argument_checks.scan(measurements)
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
@@ -83,15 +83,15 @@ class UnscentedSlam(EkfSlam):
         )
 
     def _expected_range(self, landmark_id: int) -> float:
-        """Range at which the belief expects a landmark [m]; infinite for a new one."""
+        """Return the expected range of a landmark [m]; infinite for a new one."""
         if landmark_id not in self.map.slots:
             return np.inf
         return float(np.linalg.norm(self._place(landmark_id)[0]))
 
     def _place(self, landmark_id: int) -> tuple[Array, Array]:
-        """Where a landmark lies from the robot, (2,), and the covariance of that.
+        """Return the offset δ (2,) of a landmark from the robot and its covariance.
 
-        In the robot's frame, but for its heading: e_l − e_p − J δ e_θ.
+        The axes are those of the world, the error is e_l − e_p − J δ e_θ.
         """
         c = 3 + 2 * self.map.slots[landmark_id]
         dx, dy = self.map.mean[c : c + 2] - self.map.mean[:2]
@@ -155,7 +155,7 @@ class UnscentedSlam(EkfSlam):
 def _through_sensor(
     mean: Array, deviations: Array, columns: IntArray
 ) -> tuple[Array, Array]:
-    """Carry points (n, N) through the sensor: mean (m, 2) and deviations (2m, N)."""
+    """Predict the readings of points (n, N): mean (m, 2) and deviations (2m, N)."""
     points = np.concatenate([mean[:, None], mean[:, None] + deviations], axis=1)
     dx, dy = points[columns] - points[0], points[columns + 1] - points[1]
     bearing = np.arctan2(dy, dx) - points[2]
@@ -175,7 +175,7 @@ def _through_sensor(
 
 
 def _factor(S: Array, ids: list[int]) -> Array:
-    """Return the Cholesky factor of S, or name the reading at which it fails."""
+    """Return the Cholesky factor of S; an error names the reading that spoils it."""
     try:
         return np.asarray(np.linalg.cholesky(S))
     except np.linalg.LinAlgError:

@@ -1,4 +1,4 @@
-"""What a robot should see: the part of the world its sensor reaches."""
+"""Landmarks that a scan should show: those in the field of view of the sensor."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ Visibility = Callable[[Array, Array], BoolArray]
 
 @dataclass(frozen=True)
 class FieldOfView:
-    """The reach of a sensor, and what may stand in its way.
+    """The field of view of a sensor, and what may hide a landmark in it.
 
-    A landmark counts as one that should be seen only if it is within the reach by some
-    margin, not hidden, and not behind another reading.
+    A scan is expected to show a landmark that lies inside the limits by a margin, is
+    not hidden, and is not behind another reading.
 
     Raises
     ------
     ValueError
-        Where a limit is not a number, or the limits leave nothing to see.
+        If a limit is not a number, or the field of view is empty.
 
     Examples
     --------
@@ -34,19 +34,19 @@ class FieldOfView:
     """
 
     max_range: float
-    """Reach [m]."""
+    """Largest range [m]."""
     min_range: float = 0.0
-    """Landmarks nearer than this are not seen [m]."""
+    """Smallest range [m]."""
     angle: float = 2 * pi
-    """Width, half of it to each side of the heading [rad]."""
+    """Full angle, centred on the heading [rad]."""
     range_margin: float = 0.5
-    """How far inside the range limits a landmark must lie to be missed [m]."""
+    """Landmarks nearer than this to a range limit are not expected [m]."""
     bearing_margin: float = 0.05
-    """How far inside the edges of the angle a landmark must lie to be missed [rad]."""
+    """Landmarks nearer than this to an edge of the angle are not expected [rad]."""
     shadow: float = 0.0
-    """A landmark within this angle of a nearer reading may be behind it [rad]."""
+    """A landmark within this angle of a nearer reading may be hidden by it [rad]."""
     visible: Visibility | None = None
-    """Called with a pose (3,) and landmarks (n, 2): which of them nothing hides."""
+    """Function of a pose (3,) and landmarks (n, 2): True, shape (n,), if not hidden."""
 
     def __post_init__(self) -> None:
         for name in ("min_range", "range_margin", "bearing_margin", "shadow"):
@@ -60,16 +60,16 @@ class FieldOfView:
             raise ValueError(f"visible must be callable or None, got {self.visible!r}")
 
     def expects(self, pose: Array, landmarks: Array, readings: Array) -> BoolArray:
-        """Tell which landmarks a scan should hold.
+        """Return which landmarks a scan should show.
 
         Parameters
         ----------
         pose : ndarray, shape (3,)
-            From where (x, y, θ) [m, m, rad].
+            Pose (x, y, θ) of the scan [m, m, rad].
         landmarks : ndarray, shape (n, 2)
-            Where they are believed to be [m].
+            Estimated positions [m].
         readings : ndarray, shape (m, 2)
-            What the scan holds, rows (β, r), behind which others may hide.
+            The scan, rows (β, r) [rad, m], which may hide landmarks behind them.
 
         Returns
         -------
@@ -88,15 +88,17 @@ class FieldOfView:
             in_front = readings[:, 1] < distance[:, None]
             expected &= ~((aside <= self.shadow) & in_front).any(axis=1)
         if self.visible is not None and expected.any():
-            expected[expected] = _asked(self.visible, pose, landmarks[expected])
+            expected[expected] = _checked_answer(
+                self.visible, pose, landmarks[expected]
+            )
         return np.asarray(expected)
 
 
-def _asked(visible: Visibility, pose: Array, landmarks: Array) -> BoolArray:
+def _checked_answer(visible: Visibility, pose: Array, landmarks: Array) -> BoolArray:
     answer = np.asarray(visible(pose.copy(), landmarks.copy()))
     if answer.shape != (len(landmarks),) or answer.dtype != np.bool_:
         raise ValueError(
-            f"visible must answer {len(landmarks)} landmarks with as many booleans, "
+            f"visible must return {len(landmarks)} booleans, one per landmark, "
             f"got {answer.dtype} of shape {answer.shape}"
         )
     return answer

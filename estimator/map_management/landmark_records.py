@@ -1,4 +1,4 @@
-"""What landmark management remembers of each landmark in the map."""
+"""Records that landmark management keeps of each mapped landmark."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -11,13 +11,14 @@ from ...arrays import Array, IntArray
 class LandmarkRecords:
     """Sightings, misses and information of the landmarks, in the order of the map.
 
-    The information of a landmark is its block of the information matrix: what all
-    its readings said of its place as seen from where the robot was::
+    The information of a landmark is its block of the information matrix, summed over
+    all its readings with the pose of the robot taken as known::
 
-        Λ = Σ H_lᵀ Q⁻¹ H_l,   H_l = [a; e],  e towards the landmark, a across by 1/r
+        Λ = Σ H_lᵀ Q⁻¹ H_l,   H_l = [a / r; e]
         content = ½ ln det Λ
 
-    It is what goes to waste when the landmark is marginalised and never found again.
+    with the unit vectors e towards the landmark and a across.  This information is lost
+    when the landmark is marginalised and never seen again.
 
     Examples
     --------
@@ -37,7 +38,7 @@ class LandmarkRecords:
         self._slots: dict[int, int] = {}
 
     def follow(self, ids: Sequence[int]) -> None:
-        """Take the map's order: keep who is there still, begin who is new."""
+        """Adopt the order of the map: keep records of its landmarks, start new ones."""
         if self.ids == tuple(ids):
             return
         old = {i: k for k, i in enumerate(self.ids)}
@@ -54,14 +55,14 @@ class LandmarkRecords:
     def note_sightings(
         self, ids: Sequence[int], bearings: Array, along: Array, across: Array
     ) -> None:
-        """Count sightings of some landmarks, all arrays of shape (m,).
+        """Count one sighting of each landmark; all arrays have shape (m,).
 
         Parameters
         ----------
         ids : sequence of int
             The landmarks, without repetition.
         bearings : ndarray
-            Directions of the world in which they were seen [rad].
+            Directions in the world frame in which they were seen [rad].
         along, across : ndarray
             Information of each reading along the line of sight and across it [1/m²].
         """
@@ -78,28 +79,28 @@ class LandmarkRecords:
         return np.array([self._slots[i] for i in ids], dtype=np.int64)
 
     def note_misses(self, slots: IntArray) -> None:
-        """Count for some landmarks a scan that should have shown them and did not."""
+        """Count one miss of each landmark: a scan should have shown it and did not."""
         self.misses[slots] += 1
 
     def overdue(self, misses: int) -> list[int]:
-        """Return the landmarks missed so many times since they were last seen."""
+        """Return the landmarks missed at least ``misses`` times since last seen."""
         return [self.ids[k] for k in np.flatnonzero(self.misses >= misses)]
 
     def join(self, kept: int, gone: int) -> None:
-        """Count what was known of one landmark for another."""
+        """Add the records of one landmark to those of another."""
         i, j = self._slots[kept], self._slots[gone]
         self.sightings[i] += self.sightings[j]
         self.information[i] += self.information[j]
         self.misses[i] = min(self.misses[i], self.misses[j])
 
     def by_information(self, ids: Sequence[int]) -> list[int]:
-        """Sort landmarks by information content, the least and latest first."""
+        """Sort landmarks by information, the least first, of equals the newest."""
         xx, xy, yy = self.information[self.slots(ids)[::-1]].T
         order = np.argsort(xx * yy - xy * xy, kind="stable")
         return [ids[len(ids) - 1 - k] for k in order.tolist()]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of all, as arrays."""
+        """Return copies of all records, as arrays."""
         return {
             "ids": np.array(self.ids, dtype=np.int64),
             "sightings": self.sightings.copy(),
@@ -108,7 +109,7 @@ class LandmarkRecords:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take back what :meth:`state_dict` returned."""
+        """Restore what :meth:`state_dict` returned."""
         self.ids = tuple(np.asarray(state["ids"]).tolist())
         self._slots = {i: k for k, i in enumerate(self.ids)}
         self.sightings = np.array(state["sightings"], dtype=np.int64)

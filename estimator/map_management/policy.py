@@ -1,4 +1,4 @@
-"""The policy by which landmarks enter a map, stay in it, become one, and leave it."""
+"""The policy that decides when landmarks enter a map, are merged, and are removed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -16,15 +16,15 @@ from .field_of_view import FieldOfView
 
 @dataclass(frozen=True)
 class LandmarkPolicy(AssociationPolicy):
-    """What to do with the landmarks of any filter: one object, for ``management=``.
+    """Settings of landmark management, for the argument ``management`` of any filter.
 
-    The default associates readings without identity and wants a new landmark confirmed;
-    it removes and merges nothing.
+    The default associates readings without identity and confirms new landmarks before
+    they enter the map; it removes and merges none.
 
     Raises
     ------
     ValueError
-        Where a value is out of range, or two do not go together.
+        If a value is out of range, or two contradict each other.
 
     Examples
     --------
@@ -35,22 +35,22 @@ class LandmarkPolicy(AssociationPolicy):
     ...     measurement_std=(0.02, 0.1),
     ...     management=LandmarkPolicy(confirm=(2, 3)),
     ... )
-    >>> slam.update([(0.0, 5.0)]).added_ids  # nobody says of what
+    >>> slam.update([(0.0, 5.0)]).added_ids  # without identity
     ()
     >>> slam.update([(0.01, 5.1)]).confirmed_ids
     (0,)
     """
 
     view: FieldOfView | None = None
-    """What the sensor reaches; needed to tell who is missing."""
+    """Field of view of the sensor; required by ``remove_after``."""
     remove_after: int | None = None
-    """So many scans in turn that should have shown a landmark and did not remove it."""
+    """Remove a landmark missed in this many scans since it was last seen."""
     merge_within: float | None = None
-    """Two landmarks are never closer than this [m]; those that seem so are merged."""
+    """Smallest distance of two landmarks [m]; landmarks estimated closer are merged."""
     merge_gate: float = 9.21
-    """Two landmarks may be one only up to this Dᵀ C⁻¹ D of their offset D."""
+    """Largest Dᵀ C⁻¹ D, of the offset D, at which two landmarks may be one."""
     capacity: int | None = None
-    """Most landmarks in the map; beyond it the least informative are removed."""
+    """Largest number of landmarks; beyond it the least informative are removed."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,8 +64,8 @@ class LandmarkPolicy(AssociationPolicy):
             raise ValueError(f"view must be a FieldOfView or None, got {self.view!r}")
         if self.remove_after is not None and self.view is None:
             raise ValueError(
-                "view must be given with remove_after: without it nobody knows what "
-                "should have been seen"
+                "view must be given with remove_after: it determines which landmarks "
+                "a scan should show"
             )
 
     def reach(self, readings: Array) -> float:
@@ -78,21 +78,21 @@ class LandmarkPolicy(AssociationPolicy):
 
     @property
     def worst_separation_std(self) -> float:
-        """Up to which σ of their offset two landmarks can be told apart [m].
+        """Largest σ of an offset at which two landmarks can be told apart [m].
 
-        Two that are ``merge_within`` apart must fail the test in 99.8 % of cases: their
-        offset is so many σ that even 3 σ less is outside the gate.
+        Two landmarks at the distance ``merge_within`` must fail the test in 99.8 % of
+        cases: their offset, less 3 σ, must still lie outside the gate.
         """
         return (self.merge_within or 0.0) / (sqrt(self.merge_gate) + 3.0)
 
 
 def as_policy(value: "LandmarkPolicy | Mapping[str, Any] | bool") -> LandmarkPolicy:
-    """Return a policy from what may stand for one: itself, its fields, or True.
+    """Return a policy, given as such, by its fields, or as True for the default.
 
     Raises
     ------
     ValueError
-        Where it is none, or names an unknown field.
+        If the value is none of these, or names an unknown field.
 
     Examples
     --------

@@ -314,7 +314,7 @@ def test_a_visibility_model_that_answers_nonsense_is_refused():
     )
     slam.update(polar([(5, 1), (4, -2)]), [0, 1])
     before = slam.state_dict()
-    with pytest.raises(ValueError, match="visible must answer 2 landmarks"):
+    with pytest.raises(ValueError, match="visible must return 2 booleans"):
         slam.update(polar([(5, 1)]), [0])
     assert all(np.array_equal(before[k], v) for k, v in slam.state_dict().items())
 

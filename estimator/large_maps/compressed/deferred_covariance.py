@@ -1,4 +1,4 @@
-"""The covariance between the landmarks of a large map, downdated when there is time."""
+"""Covariance between the landmarks of a large map, with deferred downdates."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -9,53 +9,53 @@ from ....arrays import Array, IntArray
 from ...support.memory_limit import refuse_beyond_memory
 from .row_exchange import read_columns, write_columns
 
-# Rows of one block: of 64 landmarks.
+# Rows of one block: 64 landmarks.
 BLOCK = 128
-# Downdates of fewer rows than this wait for more: a thin product is bound by memory.
+# Smallest rank to apply; smaller downdates wait: memory limits thin products.
 WORTHWHILE = 40
 
 
 class Downdate(NamedTuple):
-    """A change that the stored covariance still lacks: P ← P − W diag(s) Wᵀ."""
+    """A change not yet applied to the stored covariance: P ← P − W diag(s) Wᵀ."""
 
     root: Array  # W, shape (width, rank)
     signs: Array  # s, shape (rank,), each 1 or -1
 
 
 class DeferredCovariance:
-    """Lower half of a growing covariance, in blocks of rows, with downdates pending.
+    """Lower half of a growing covariance, in blocks of rows, with pending downdates.
 
-    Block k holds rows 128 k to 128 (k + 1) of P and its columns up to the last of them:
-    half the memory of a square, growth without a copy, and every block is contiguous,
-    so that BLAS changes it in place::
+    Block k holds rows 128 k to 128 (k + 1) of P, as far as the diagonal.  This takes
+    half the memory of a square and grows without a copy.  Every block is contiguous, so
+    that BLAS changes it in place::
 
         P = stored − W diag(s) Wᵀ
 
-    of which W is small and read with P, and taken off the blocks one by one by
-    :meth:`work`.  A local map may read the rows of its landmarks and keep better ones:
-    what is stored for these then has no meaning until it puts them back.
+    W is small.  Reading subtracts its product, and :meth:`work` applies it to one block
+    after the other.  A local map may read the rows of its landmarks and update its
+    copy; the stored rows of these landmarks are invalid until it puts them back.
     """
 
     def __init__(self) -> None:
         self._blocks: list[Array] = []
         self._pending: list[Downdate] = []
-        self._under_way = False  # whether the first downdate is being taken off …
-        self._done = 0  # … and from how many blocks it has been
-        self._credit = 0.0  # multiplications granted and not yet spent
+        self._under_way = False  # whether the first downdate is being applied
+        self._done = 0  # number of blocks to which it has been applied
+        self._credit = 0.0  # multiplications granted and not yet used
 
     @property
     def width(self) -> int:
-        """Number of rows and columns there is room for."""
+        """Number of rows and columns of the blocks."""
         return BLOCK * len(self._blocks)
 
     @property
     def pending_rank(self) -> int:
-        """Rank of what the stored covariance still lacks."""
+        """Rank of all pending downdates."""
         return sum(len(downdate.signs) for downdate in self._pending)
 
     @property
     def nbytes(self) -> int:
-        """Memory that blocks and pending downdates take [bytes]."""
+        """Size of blocks and pending downdates [bytes]."""
         roots = [downdate.root for downdate in self._pending]
         return sum(array.nbytes for array in self._blocks + roots)
 
@@ -65,7 +65,7 @@ class DeferredCovariance:
         Raises
         ------
         MemoryError
-            Where they are more than memory holds; nothing is then appended.
+            If memory does not suffice; nothing is then appended.
         """
         if self.width >= columns:
             return
@@ -79,7 +79,7 @@ class DeferredCovariance:
             self._blocks.append(np.zeros((BLOCK, self.width + BLOCK)))
 
     def read(self, columns: IntArray, rows: Array) -> None:
-        """Fill rows (c, width), of ascending columns, what is pending taken off."""
+        """Fill rows (c, width) of P at ascending columns (c,), downdates subtracted."""
         bounds = self._bounds(columns)
         for (first, block), start, end in zip(
             self._enumerate(), bounds, bounds[1:], strict=False
@@ -95,7 +95,7 @@ class DeferredCovariance:
             rows[:, : len(root)] -= missing
 
     def put(self, columns: IntArray, rows: Array, places: IntArray) -> None:
-        """Store the rows of ascending columns (c,), which stand at ``places`` (c,)."""
+        """Store the rows of ascending columns (c,), found at ``places`` (c,)."""
         bounds = self._bounds(columns)
         for (first, block), start, end in zip(
             self._enumerate(), bounds, bounds[1:], strict=False
@@ -104,18 +104,18 @@ class DeferredCovariance:
                 own = rows[places[start:end], : first + BLOCK]
                 block[columns[start:end] - first] = own
             write_columns(block, first, columns[:end], rows, places)
-        for root, _ in self._pending:  # nothing is, any longer, for these
+        for root, _ in self._pending:  # the rows put are up to date
             root[columns[columns < len(root)]] = 0.0
 
     def defer(self, root: Array, signs: Array) -> None:
-        """Subtract W diag(s) Wᵀ, W of shape (width, rank), when there is time."""
+        """Subtract W diag(s) Wᵀ later, W of shape (width, rank)."""
         if len(signs):
             self._pending.append(Downdate(root, signs))
 
     def work(self, rank: int) -> None:
-        """Take pending downdates off as many blocks as a downdate of some rank costs.
+        """Apply pending downdates, for the cost of one full downdate of this rank.
 
-        What is left of that grant, for blocks are taken whole, stays for the next call.
+        Blocks are changed as a whole; unused cost is kept for the next call.
         """
         self._credit += rank * (self.width * (self.width + BLOCK) / 2)
         while self._begin():
@@ -149,7 +149,7 @@ class DeferredCovariance:
         return symmetric(covariance)
 
     def diagonal(self) -> Array:
-        """Return the variances as stored, shape (width,): nothing pending taken off."""
+        """Return the stored variances (width,), without pending downdates."""
         diagonals = [block.diagonal(first) for first, block in self._enumerate()]
         return np.concatenate([np.empty(0), *diagonals])
 
@@ -204,17 +204,17 @@ class DeferredCovariance:
         self._under_way, self._done, self._credit = bool(under_way), int(done), credit
 
     def _enumerate(self) -> list[tuple[int, Array]]:
-        """First row and array of each block."""
+        """Return the first row and the array of each block."""
         return [(k * BLOCK, block) for k, block in enumerate(self._blocks)]
 
     def _bounds(self, columns: IntArray) -> list[int]:
-        """How many of ascending columns lie before each block, and in all."""
+        """Return how many of ascending columns lie before each block, and in all."""
         starts = np.arange(0, self.width + 1, BLOCK)
         bounds: list[int] = np.searchsorted(columns, starts).tolist()
         return bounds
 
     def _begin(self) -> bool:
-        """Whether there is a downdate to take off: join those that wait for one."""
+        """Return whether a downdate is under way; join the pending ones to start it."""
         if not self._under_way and self.pending_rank >= WORTHWHILE:
             width = max(len(downdate.root) for downdate in self._pending)
             root = np.zeros((width, self.pending_rank))
@@ -228,12 +228,12 @@ class DeferredCovariance:
         return self._under_way
 
     def _apply(self, k: int) -> None:
-        """Take the downdate under way off one block."""
+        """Apply the downdate under way to one block."""
         from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
 
         root, signs = self._pending[0]
         first, last = k * BLOCK, (k + 1) * BLOCK
-        # Fortran order: the transpose of each of these is contiguous, nothing is copied
+        # The transposes are contiguous in Fortran order: dgemm copies none of them.
         dgemm(
             -1.0,
             root[:last].T,
@@ -252,7 +252,7 @@ def stored_bytes(landmarks: int) -> int:
 
 
 def _of(root: Array, columns: IntArray) -> Array:
-    """Rows of W, zero beyond its end: those columns are younger than it."""
+    """Return rows of W; columns newer than W have zeros."""
     if len(root) > columns.max(initial=0):
         chosen: Array = root[columns]
         return chosen
@@ -263,7 +263,7 @@ def _of(root: Array, columns: IntArray) -> Array:
 
 
 def subtract(covariance: Array, root: Array, signs: Array) -> None:
-    """P ← P − W diag(s) Wᵀ in place, a few rows at a time: no second matrix."""
+    """P ← P − W diag(s) Wᵀ in place, a few rows at a time, without a second matrix."""
     for first in range(0, len(covariance), BLOCK):
         own = slice(first, first + BLOCK)
         covariance[own] -= (root[own] * signs) @ root.T

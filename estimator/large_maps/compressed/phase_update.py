@@ -1,23 +1,23 @@
-"""What a local map remembers of its phase for the rest of the map: exact deferral.
+"""Exact deferral: a phase in a local map, and its effect on the rest of the map.
 
-Let S (s, width) be the covariance, at the beginning of a phase, of the s local
-coordinates x_a (pose and local landmarks) with everything else, x_b.  In the phase
-only x_a is read.  The ordinary filter then runs on an extended state (x_a, y)::
+At the beginning of a phase let S (s, width) be the covariance of the s local
+coordinates x_a (pose and local landmarks) with all others, x_b.  The phase only
+measures x_a.  The ordinary filter then runs on an extended state (x_a, y)::
 
     mean (x_a, 0),   covariance [P_aa  I; I  0]
 
-in which y stands for coordinates of which x_b is a linear function, x_b = S ᵀ y + what
-does not change.  Whatever the phase brought, with its end result [P_aa Φ; Φᵀ −Ψ]::
+x_b is a linear function of y, x_b = Sᵀ y + terms that do not change.  With the final
+covariance [P_aa Φ; Φᵀ −Ψ] and mean (x_a, y), the phase changes the rest of the map by::
 
     x_b ← x_b + Sᵀ y,   P_ab ← Φ S,   P_bb ← P_bb − Sᵀ Ψ S
 
 (Guivant and Nebot, 2001, in the form of an augmented state.)
 
-In the invariant frame a correction also turns and shears points,
+In the invariant frame a correction also rotates and shears points,
 q⁺ = q + V(t) δq, and the covariance is transported, P ← T P Tᵀ, e_q⁺ = e_q + J (q⁺ − q)
-e_θ.  Both are linear in q read as a complex number, J = i.  So there y is a complex
-number for each of the s coordinates, a *virtual landmark* at the origin, and with x_b
-and the rows of S read as complex numbers all of the above holds as it stands.
+e_θ.  Both are linear in q read as a complex number, J = i.  There y is one complex
+number for each of the s coordinates, a *virtual landmark* at the origin.  With x_b and
+the rows of S read as complex numbers, the equations above hold unchanged.
 """
 
 from typing import NamedTuple
@@ -33,10 +33,10 @@ _ROOMY = 3
 
 
 class Phase(NamedTuple):
-    """The end result of a phase, cut into its parts."""
+    """The parts of the filter's belief at the end of a phase."""
 
     mean: Array  # (a,) of pose and local landmarks
-    reference: Array  # (a,) where they are linearised, if a filter keeps that
+    reference: Array  # (a,) their linearisation points, for filters that fix them
     covariance: Array  # P_aa, (a, a)
     gain: Array  # Φ, (a, e)
     loss: Array  # Ψ, (e, e)
@@ -44,25 +44,25 @@ class Phase(NamedTuple):
 
 
 def virtual_landmarks(coordinates: int, invariant: bool) -> int:
-    """How many landmarks the extension takes the place of."""
+    """Return the number of landmarks whose places the extension takes."""
     return coordinates if invariant else (coordinates + 1) // 2
 
 
 def begin_phase(
     slam: EkfSlam, mean: Array, rows: Array, reference: Array, ids: list[int]
 ) -> None:
-    """Give a filter a local map in place of its map, and the extension between.
+    """Replace the map of a filter by the extension, followed by a local map.
 
     Parameters
     ----------
     slam : EkfSlam
-        It keeps pose and covariance of the pose.
+        The pose and its covariance are kept.
     mean, reference : ndarray, shape (2n,)
         Of the n local landmarks.
     rows : ndarray, shape (3 + 2n, 2n)
-        Covariance of pose and local landmarks with these; the lower half counts.
+        Covariance of pose and local landmarks with these; the lower half is used.
     ids : list of int
-        Identities of the virtual landmarks, which may be none, then of the local ones.
+        Identities of the virtual landmarks, if any, then of the local ones.
     """
     gaussian, size = slam.map, 3 + 2 * len(ids)
     before = gaussian.size
@@ -84,7 +84,7 @@ def begin_phase(
 
 
 def end_phase(slam: EkfSlam, virtual: int) -> Phase:
-    """Take apart the belief of a filter that ran on an extended state; all copies."""
+    """Split the belief of a filter that ran on an extended state; return copies."""
     size, rest = slam.map.size, 3 + 2 * virtual
     mean, covariance = slam.map.mean[:size], slam.map.covariance[:size, :size]
     rows = np.concatenate([covariance[:3], covariance[rest:]])
@@ -114,8 +114,8 @@ def combine(coefficients: Array, strip: Array, invariant: bool) -> Array:
 def roots(loss: Array, invariant: bool) -> tuple[Array, Array]:
     """Factor Ψ = U diag(s) Uᵀ at its numerical rank.
 
-    Its rank is that of what was really read, well below its size.  Transport makes Ψ
-    indefinite.
+    The rank of Ψ is that of the measurements of the phase, far below its size.  In the
+    invariant frame, Ψ is indefinite.
 
     Returns
     -------

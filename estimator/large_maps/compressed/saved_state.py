@@ -1,4 +1,4 @@
-"""Checks of a saved compressed filter, before anything is changed."""
+"""Check the saved state of a compressed filter before anything changes."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ _OWN = ("landmark_ids", "slots", "points", "references", "strip", "origin", "num
 
 
 class SavedState(NamedTuple):
-    """A compressed filter's state, as it holds it."""
+    """The attributes of a compressed filter, read from a saved state."""
 
     local: dict[str, Any]
     far: DeferredCovariance
@@ -28,7 +28,7 @@ class SavedState(NamedTuple):
 def checked_state(
     state: Mapping[str, Any], name: str, base: str, invariant: bool
 ) -> SavedState:
-    """Read what ``CompressedEkfSlam.state_dict`` returned, or refuse it."""
+    """Read what ``CompressedEkfSlam.state_dict`` returned; refuse what does not fit."""
     far = DeferredCovariance()
     entries = [*_OWN, *(f"local_{k}" for k in _LOCAL)]
     entries += [f"far_{k}" for k in far.state_dict()]
