@@ -1,16 +1,18 @@
 """Simulate many runs of one scenario as arrays, the input of a batch of filters."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from gymnasium.utils import seeding
 
-from ...arrays import Array, BoolArray, IntArray
-from ...envs.vector import WorldBatch
+from ...arrays import AnyArray, Array, BoolArray, IntArray
+from ...envs.vector import MixedWorlds, WorldBatch
 from ...estimator.support.memory_limit import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
+
+_EACH_SCAN = ("odometry", "measurements", "mask", "poses", "landmark_ids")
 
 
 class SimulatedRuns(NamedTuple):
@@ -77,38 +79,47 @@ def simulate_runs(
         raise ValueError(f"runs must be >= 1, got {runs}")
     actions, batch = action_sequence(world), WorldBatch(world, runs)
     batch.reset([seeding.np_random(seed + i)[0] for i in range(runs)])
-    result = _room(batch, len(actions) + 1)
-    _store(result, 0, batch)
-    for step, action in enumerate(actions, start=1):
-        batch.step(np.tile(action, (runs, 1)))
-        _store(result, step, batch)
-    return result
-
-
-def _room(batch: WorldBatch, scans: int) -> SimulatedRuns:
-    runs, rows = batch.mask.shape
-    is_hidden = batch.landmark_ids is not None
+    scans, rows = len(actions) + 1, batch.mask.shape[1]
     refuse_beyond_memory(
         f"a block of {runs} runs of {scans} scans of {rows} landmarks",
         # a reading, whether there is one, and where it is hidden, of what
-        (25 if is_hidden else 17) * runs * scans * rows,
+        (17 if batch.landmark_ids is None else 25) * runs * scans * rows,
         "take fewer runs at a time (block_size), or fewer steps",
     )
+    record = empty_record(batch, _EACH_SCAN, scans)
+    take(record, 0, batch)
+    for step, action in enumerate(actions, start=1):
+        batch.step(np.tile(action, (runs, 1)))
+        take(record, step, batch)
     return SimulatedRuns(
-        odometry=np.empty((runs, scans, 2)),
-        measurements=np.empty((runs, scans, rows, 2)),
-        visible=np.empty((runs, scans, rows), dtype=np.bool_),
-        true_poses=np.empty((runs, scans, 3)),
+        odometry=record["odometry"],
+        measurements=record["measurements"],
+        visible=record["mask"],
+        true_poses=record["poses"],
         landmarks=batch.landmarks,
         initial_poses=batch.start_estimates,
-        true_ids=np.empty((runs, scans, rows), dtype=np.int64) if is_hidden else None,
+        true_ids=record.get("landmark_ids"),
     )
 
 
-def _store(result: SimulatedRuns, scan: int, batch: WorldBatch) -> None:
-    result.odometry[:, scan] = batch.odometry
-    result.measurements[:, scan] = batch.measurements
-    result.visible[:, scan] = batch.mask
-    result.true_poses[:, scan] = batch.poses
-    if result.true_ids is not None and batch.landmark_ids is not None:
-        result.true_ids[:, scan] = batch.landmark_ids
+def empty_record(
+    worlds: WorldBatch | MixedWorlds, names: Sequence[str], times: int
+) -> dict[str, AnyArray]:
+    """Return arrays (B, times, …) to record arrays (B, …) of B worlds by their names.
+
+    Arrays that the worlds do not have are left out.
+    """
+    now = {name: getattr(worlds, name) for name in names}
+    return {
+        name: np.empty((len(array), times, *array.shape[1:]), array.dtype)
+        for name, array in now.items()
+        if array is not None
+    }
+
+
+def take(
+    record: Mapping[str, AnyArray], place: int, worlds: WorldBatch | MixedWorlds
+) -> None:
+    """Record the present arrays of the worlds at an index of time."""
+    for name, array in record.items():
+        array[:, place] = getattr(worlds, name)

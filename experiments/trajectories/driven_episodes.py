@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from gymnasium.utils import seeding
 
-from ...arrays import AnyArray
 from ...envs.controllers import make_vector_controller
 from ...envs.vector import MixedWorlds, WorldBatch
 from ...sim_configs import Scenario, drawn_scenario
+from ..runs.simulated_runs import empty_record, take
 from .trajectory import Trajectory
 
 _EACH_STEP = ("odometry", "collisions")
@@ -65,16 +65,24 @@ def drive_episodes(
     worlds.reset([seeding.np_random(seed)[0] for seed in seeds])
     rngs = _random_generators(seeds, _CONTROLLER_STREAM)
     drivers = make_vector_controller(controller, scenarios, rngs)
-    record = _empty_record(worlds, scenario.steps)
-    _take(record, _EACH_SCAN, 0, worlds)
+    actions = np.empty((len(seeds), scenario.steps, 2))
+    each_step = empty_record(worlds, _EACH_STEP, scenario.steps)
+    each_scan = empty_record(worlds, _EACH_SCAN, scenario.steps + 1)
+    take(each_scan, 0, worlds)
     for step in range(scenario.steps):
-        actions = drivers.act(worlds.poses, step)
-        worlds.step(actions)
-        record["actions"][:, step] = actions
-        _take(record, _EACH_STEP, step, worlds)
-        _take(record, _EACH_SCAN, step + 1, worlds)
+        actions[:, step] = drivers.act(worlds.poses, step)
+        worlds.step(actions[:, step])
+        take(each_step, step, worlds)
+        take(each_scan, step + 1, worlds)
         if progress is not None:
             progress(len(seeds))
+    record = {
+        "landmarks": worlds.landmarks,
+        "start_estimate": worlds.start_estimates,
+        "actions": actions,
+        **each_step,
+        **each_scan,
+    }
     return [
         Trajectory(
             scenario=scenarios[place],
@@ -96,31 +104,3 @@ def _worlds(
     if scenario.randomise is None:
         return WorldBatch(scenario, len(scenarios))
     return MixedWorlds(scenarios)
-
-
-def _empty_record(worlds: WorldBatch | MixedWorlds, steps: int) -> dict[str, AnyArray]:
-    """Return the arrays of B trajectories, shape (B, …) each, to be filled."""
-
-    def room(name: str, times: int) -> AnyArray:
-        now: AnyArray = getattr(worlds, name)
-        return np.empty((len(now), times, *now.shape[1:]), now.dtype)
-
-    scanned = [name for name in _EACH_SCAN if getattr(worlds, name) is not None]
-    return {
-        "landmarks": worlds.landmarks,
-        "start_estimate": worlds.start_estimates,
-        "actions": np.empty((len(worlds.poses), steps, 2)),
-        **{name: room(name, steps) for name in _EACH_STEP},
-        **{name: room(name, steps + 1) for name in scanned},
-    }
-
-
-def _take(
-    record: dict[str, AnyArray],
-    names: Sequence[str],
-    place: int,
-    worlds: WorldBatch | MixedWorlds,
-) -> None:
-    """Record arrays of the worlds, as far as they have them, at an index of time."""
-    for name in record.keys() & set(names):
-        record[name][:, place] = getattr(worlds, name)
