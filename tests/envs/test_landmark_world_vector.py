@@ -26,8 +26,15 @@ EVERYTHING = {
     "landmarks": {"seed": None, "min_distance": 0.5},
     "start": {"std": [0.1, 0.1, 0.1]},
 }
+# All of it, with 10,000 landmarks, is compared in `test_world_batch`.
+CORNER = {"columns": 10, "rows": 10}
 WORLDS_TO_TEST = {
-    **{name: {"scenario": name} for name in list_presets()},
+    **{name: {"scenario": name} for name in list_presets() if name != "city"},
+    "a corner of the city": {
+        "scenario": "city",
+        "landmarks": CORNER,
+        "controls": CORNER,
+    },
     "everything": EVERYTHING,
 }
 MODES = list(AutoresetMode)

@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.sparse import csc_array
 
-from slamgym.estimator import check_estimator
+from slamgym.estimator import EkfSlam, check_estimator
 from slamgym.estimator.large_maps.sparse_cholesky.submap_dissection import dissect
 from slamgym.estimator.large_maps.sparse_cholesky.submap_elimination import (
     SubmapElimination,
@@ -26,7 +26,9 @@ from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.angles import wrap_angle
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.unicycle_motion import predict_pose
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.evaluation.nees import pose_nees
+from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.sim_configs import load_scenario
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.03, 0.02, 0.01]), np.array([0.02, 0.05])
 LANDMARKS = np.random.default_rng(0).uniform(-4, 16, (16, 2))
@@ -314,16 +316,32 @@ def test_the_landmarks_and_the_pose_are_where_the_covariance_says():
 
 @pytest.mark.slow
 def test_in_the_loop_it_is_honest_where_the_ekf_is_not():
-    choices = {
-        "ekf": ("ekf", {}),
-        "submaps": (SubmapSlam, {"submap_size": 8}),
-    }
-    results = monte_carlo("loop", choices, runs=5)
-    assert not results.failed.any()
-    nees = results.pose_nees_invariant.isel(step=slice(1, None)).mean(("run", "step"))
-    nees = dict(zip(results.estimator.values, nees.values / 3, strict=True))
-    assert nees["ekf"] > 4
-    assert nees["submaps"] < 1.8
+    world, nees = load_scenario("loop"), {"ekf": [], "submaps": []}
+    data = simulate_runs(world, 5, 0)
+    for run_, first in enumerate(data.initial_poses):
+        start = {"initial_pose": first, "initial_pose_std": world.start.std}
+        noise = world.motion.std, world.sensor.std
+        filters = {
+            "ekf": EkfSlam(*noise, **start),
+            "submaps": SubmapSlam(*noise, submap_size=8, **start),
+        }
+        for step, odometry in enumerate(data.odometry[run_]):
+            ids = np.flatnonzero(data.visible[run_, step])
+            for name, slam in filters.items():
+                slam.predict(odometry, data.dt[step])
+                slam.update(data.measurements[run_, step, ids], ids)
+                if step % 5 == 4:
+                    belief = slam.belief([])
+                    nees[name].append(
+                        pose_nees(
+                            data.true_poses[run_, step],
+                            belief.pose,
+                            belief.pose_covariance,
+                            frame="invariant",
+                        )
+                    )
+    assert np.mean(nees["ekf"]) / 3 > 4
+    assert np.mean(nees["submaps"]) / 3 < 1.8
 
 
 # --- the mathematics ------------------------------------------------------------------

@@ -173,7 +173,7 @@ def test_dask_is_asked_for_by_name(here):
     done = subprocess.run(
         [
             *(script, "monte-carlo", "six_landmarks", "-e", "ekf", "--runs", "6"),
-            *("--backend", "dask", "--jobs", "2", "--block-size", "2", "--out", "out"),
+            *("--backend", "dask", "--jobs", "1", "--block-size", "2", "--out", "out"),
         ],
         capture_output=True,
         text=True,

@@ -194,9 +194,12 @@ def test_few_runs_of_a_filter_that_is_far_off_are_found(runs):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("runs", range(2, 7))
-def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs):
+def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs, monkeypatch):
     world = load_scenario("six_landmarks").with_changes(steps=12)
     for seed in (0, 5, 9):
+        if seed:  # their figures are made, too, but not written
+            page = "slamgym.experiments.monte_carlo.report.html_report"
+            monkeypatch.setattr(f"{page}.inline_svg", lambda *_: "")
         dataset = monte_carlo(world, "ekf", runs, seed)
         summary = summarise_monte_carlo(dataset)
         json.dumps(summary, allow_nan=False)
