@@ -55,15 +55,20 @@ class AssociationScores(NamedTuple):
 
     @property
     def precision(self) -> float:
-        """Share of correct ones among readings given to mapped landmarks, or nan."""
-        return _share(self.correct, self.correct + self.wrong + self.clutter_used)
+        """Share of right decisions among readings given to landmarks, or nan."""
+        right = self.correct + self.new_correct
+        errors = self.wrong + self.duplicate + self.ghost + self.clutter_used
+        return _share(right, right + errors)
 
     @property
     def recall(self) -> float:
-        """Share of correct ones among readings of places in the map, or nan."""
-        return _share(
-            self.correct, self.correct + self.wrong + self.duplicate + self.missed
-        )
+        """Share of right decisions among readings of landmarks, or nan.
+
+        Readings of a place that is not mapped yet and that are given to no landmark
+        count neither way.
+        """
+        right = self.correct + self.new_correct
+        return _share(right, right + self.wrong + self.duplicate + self.missed)
 
     def as_dict(self) -> dict[str, float]:
         """Return all by name, with precision and recall."""

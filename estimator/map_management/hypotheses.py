@@ -255,7 +255,8 @@ class HypothesisSlam:
             slam = self.hypotheses[k].slam
             if k in used:
                 slam = self._fresh()
-                slam.follow(self.hypotheses[k].slam)
+                slam.load_state_dict(self.hypotheses[k].slam.state_dict())
+                slam.decisions.extend(self.hypotheses[k].slam.decisions)
             used.add(k)
             slams.append(slam)
         return slams

@@ -29,8 +29,7 @@ class ManagedSlam:
     """A filter of any kind that associates, confirms, removes and merges landmarks.
 
     Around the filter's own ``update`` a :class:`LandmarkPolicy` decides which landmark
-    each reading is of, when a new one has been seen often enough, which ones should
-    have been seen and were not, which two are one, and which to give up.
+    each reading is of, which new ones to believe, and which to merge or to give up.
 
     Parameters
     ----------
@@ -118,7 +117,7 @@ class ManagedSlam:
         return np.asarray(places @ rotation(heading).T + (x, y))
 
     @property
-    def decisions(self) -> Sequence[ScanDecisions]:
+    def decisions(self) -> list[ScanDecisions]:
         """What was decided about the scans since the start or the last loaded state."""
         return self._recent.decisions
 
@@ -206,11 +205,11 @@ class ManagedSlam:
         seen -= {*report.rejected_ids, *report.skipped_ids}
         removed, merged = self._pruner.prune(readings, plan.row_ids, seen, missed)
         self._recent.note_edits(removed, merged)
-        added = self.decisions[-1].added
+        made = self.decisions[-1]
         return report.replace(
             removed_ids=tuple(removed),
             merged_ids=tuple(merged),
-            confirmed_ids=tuple(i for i in added if i in plan.confirmed),
+            confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
             row_ids=tuple(plan.row_ids),
             tentative_rows=tuple(plan.tentative_rows),
             ambiguous_rows=tuple(plan.ambiguous_rows),
@@ -287,11 +286,6 @@ class ManagedSlam:
             raise
         self._editor.expire()
         self._candidates = candidates
-
-    def follow(self, other: ManagedSlam) -> None:
-        """Continue from the state of another filter, and from its decisions."""
-        self.load_state_dict(other.state_dict())
-        self._recent.decisions = list(other.decisions)
 
     def _remembered(self) -> dict[str, Any]:
         """Return all of the state except the filter's."""

@@ -59,6 +59,15 @@ def replay(
         ),
     ] = None,
     option: options.EstimatorOptions = None,
+    hide_identities: Annotated[
+        bool,
+        options.option(
+            "--hide-identities",
+            "Let the filter associate the readings of a log that identifies them, and "
+            "score it.",
+        ),
+    ] = False,
+    resolution: options.Resolution = 0.0,
     robot: Annotated[
         int | None,
         options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
@@ -79,6 +88,7 @@ def replay(
     slamgym replay sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
     slamgym replay results/loop-ekf/log.csv --estimator invariant
     """
+    from ..logs.anonymous import without_identities
     from ..runs.filter_settings import settings_for
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
@@ -92,6 +102,8 @@ def replay(
     }
     given = {name: value for name, value in named.items() if value is not None}
     drive = read_any_log(log, robot)
+    if hide_identities:
+        drive = without_identities(drive)
     settings = settings_for(
         drive,
         estimator=estimator,
@@ -101,5 +113,7 @@ def replay(
     reporter = Reporter(as_json=as_json)
     place = out or default_folder(drive.name, estimator)
     with output_folder(place) as folder:
-        summary = filter_and_write(drive, settings, folder, every_step, reporter)
+        summary = filter_and_write(
+            drive, settings, folder, every_step, reporter, resolution=resolution
+        )
     show_run(summary, place, reporter)

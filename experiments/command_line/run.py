@@ -17,6 +17,7 @@ def run(
     set_: options.ScenarioChanges = None,
     out: options.OutFolder = None,
     every_step: options.EveryStep = None,
+    resolution: options.Resolution = 0.0,
     as_json: options.AsJson = False,
 ) -> None:
     """Drive through a scenario, filter, draw.
@@ -30,6 +31,7 @@ def run(
     slamgym run six_landmarks
     slamgym run loop --seed 3 --out loop_3
     slamgym run dense --set sensor.max_range=4 --steps 100 --json
+    slamgym run hidden_identities -e invariant --resolution 0.5
     slamgym run mine.toml --controller random --estimator mine:MyFilter
     """
     from ...sim_configs import save_scenario
@@ -49,5 +51,7 @@ def run(
         with reporter.progress("driving") as tick:
             log = recorded(world, controller, seed, tick)
         save_scenario(world, folder / "scenario.toml")
-        summary = filter_and_write(log, settings, folder, every_step, reporter)
+        summary = filter_and_write(
+            log, settings, folder, every_step, reporter, resolution=resolution
+        )
     show_run(summary, place, reporter)

@@ -4,6 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rich.table import Table
+from rich.text import Text
+
 from .. import figures
 from ..logs.importers import read_log
 from ..logs.slamlog import SlamLog, write_slamlog
@@ -12,6 +15,7 @@ from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import replay
 from ..runs.summary import summarise
 from ..runs.trace import RunTrace
+from .association_table import association_table
 from .errors import BadInputError
 from .output_folder import write_summary
 from .reporter import Reporter
@@ -44,6 +48,8 @@ def filter_and_write(
     folder: Path,
     every_step: bool | None,
     reporter: Reporter,
+    *,
+    resolution: float = 0.0,
 ) -> dict[str, Any]:
     """Filter a log, and write figures, log.csv (slamlog 1) and summary.json.
 
@@ -59,6 +65,8 @@ def filter_and_write(
         Whether to draw the map after every step; None: if there are few steps.
     reporter : Reporter
         Shows the progress.
+    resolution : float
+        True landmarks nearer to each other count as one in scores of association [m].
 
     Returns
     -------
@@ -79,7 +87,7 @@ def filter_and_write(
     with reporter.progress("drawing") as tick:
         write_figures(folder, run.trace, every_step=every_step, progress=tick)
     write_slamlog(run.log, folder / "log.csv")
-    return write_summary(folder, summarise(run, settings))
+    return write_summary(folder, summarise(run, settings, resolution=resolution))
 
 
 def write_figures(
@@ -125,6 +133,18 @@ def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
         "",
         key_figures(summary),
         "",
+        *_association(summary),
+        *_warnings(summary),
         written(str(place), summary["files"]),
     )
     reporter.finish({**summary, "out": str(place)})
+
+
+def _association(summary: dict[str, Any]) -> tuple[Table | str, ...]:
+    scores = summary["association"]
+    return () if scores is None else (association_table(scores), "")
+
+
+def _warnings(summary: dict[str, Any]) -> tuple[Text | str, ...]:
+    lines = [Text(f"Warning: {text}", "yellow") for text in summary["warnings"]]
+    return (*lines, "") if lines else ()

@@ -13,6 +13,9 @@ from ...arrays import Array, IntArray
 from ...estimator.models.angles import wrap_angle
 from .lines import LogLine
 
+NO_LANDMARK = -1
+"""The true id of a reading that is of no landmark."""
+
 
 @dataclass(frozen=True)
 class OdometryRow:
@@ -49,6 +52,9 @@ class Scan:
         Landmark of each row, without repetition; None if unknown.
     sizes : ndarray, shape (m,), or None
         Diameters of the seen objects [m], if the sensor measures them.
+    true_ids : ndarray of int64, shape (m,), or None
+        The true landmark of each row, -1 for none, where it is known but hidden: for
+        scores, not for filters.
 
     Raises
     ------
@@ -60,13 +66,15 @@ class Scan:
     measurements: Array
     landmark_ids: IntArray | None = None
     sizes: Array | None = None
+    true_ids: IntArray | None = None
 
     def __post_init__(self) -> None:
         readings = float_array("measurements", self.measurements, columns=2)
         if not len(readings):
             raise ValueError("measurements must be m >= 1 rows (bearing, range), got 0")
         object.__setattr__(self, "measurements", readings)
-        for name, dtype in (("landmark_ids", np.int64), ("sizes", np.float64)):
+        columns = {"landmark_ids": np.int64, "sizes": np.float64, "true_ids": np.int64}
+        for name, dtype in columns.items():
             value = getattr(self, name)
             if value is None:
                 continue
@@ -101,6 +109,7 @@ class Reading(NamedTuple):
     bearing: float
     range: float
     size: float | None = None
+    true_id: int | None = None
 
 
 def wrap_bearing(angle: float) -> float:
@@ -183,17 +192,20 @@ class EventRecorder:
             raise line.error("ids in all rows of a scan or in none", "both")
         if (first.size is None) != (reading.size is None):
             raise line.error("sizes in all rows of a scan or in none", "both")
+        if (first.true_id is None) != (reading.true_id is None):
+            raise line.error("true ids in all rows of a scan or in none", "both")
 
     def _close_scan(self) -> None:
         if not self._readings:
             return
-        times, ids, bearings, ranges, sizes = zip(*self._readings, strict=True)
+        times, ids, bearings, ranges, sizes, true = zip(*self._readings, strict=True)
         self._events.append(
             Scan(
                 t=times[0],
                 measurements=np.column_stack([bearings, ranges]),
                 landmark_ids=None if ids[0] is None else np.array(ids, dtype=np.int64),
                 sizes=None if sizes[0] is None else np.array(sizes, dtype=np.float64),
+                true_ids=None if true[0] is None else np.array(true, dtype=np.int64),
             )
         )
         self._readings.clear()

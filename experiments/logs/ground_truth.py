@@ -6,13 +6,14 @@ the left, which the header gives in metres as ``groundtruth_offset: a,b``::
     antenna = position + C(θ) (a, b),    C(θ) = [cos θ, -sin θ; sin θ, cos θ]
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from ...arrays import Array
 from ...evaluation.trajectory_error import PositionAccuracy, poses_at, position_accuracy
-from .events import Scan
+from .anonymous import hides_identities
+from .events import NO_LANDMARK
 from .lines import LogError
 from .slamlog import SlamLog
 
@@ -41,12 +42,16 @@ def true_poses_of(log: SlamLog, times: Array) -> Array | None:
 
 
 def true_landmarks_of(
-    log: SlamLog, ids: Sequence[int], landmarks: Array
+    log: SlamLog,
+    ids: Sequence[int],
+    landmarks: Array,
+    identities: Mapping[int, int] | None = None,
 ) -> Array | None:
     """Look up the true positions of some landmarks, in their order.
 
-    If the log does not identify its readings, the ids are the filter's own. A landmark
-    is then paired with the nearest true one, if each is the nearest of the other.
+    If the log does not identify its readings, the ids are the filter's own. Without
+    their identities a landmark is then paired with the nearest true one, if each is the
+    nearest of the other.
 
     Parameters
     ----------
@@ -56,23 +61,22 @@ def true_landmarks_of(
         Ids of the landmarks.
     landmarks : ndarray, shape (n, 2)
         Their estimated positions [m].
+    identities : mapping of int to int, optional
+        The true landmark of each id that is the filter's own.
 
     Returns
     -------
     ndarray, shape (n, 2), or None
         Positions [m], nan where unknown; None if all are unknown.
     """
-    if len(ids) and len(log.landmarks) and not _identifies_readings(log):
+    if identities is not None:
+        ids = [identities.get(i, NO_LANDMARK) for i in ids]
+    elif ids and len(log.landmarks) and hides_identities(log):
         return _nearest(log.landmarks, landmarks)
     known = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
     if not any(i in known for i in ids):
         return None
     return np.array([known.get(i, np.full(2, np.nan)) for i in ids])
-
-
-def _identifies_readings(log: SlamLog) -> bool:
-    scans = (event for event in log.events if isinstance(event, Scan))
-    return all(scan.landmark_ids is not None for scan in scans)
 
 
 def _nearest(truth: Array, landmarks: Array) -> Array:

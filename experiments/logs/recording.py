@@ -43,8 +43,8 @@ def record_episode(
     SlamLog
         The log; it starts at the initial pose of filters. The header holds the noise as
         ``motion_std``, ``measurement_std`` and ``start_sigma``, where
-        :func:`~slamgym.experiments.runs.settings_for` finds it. Scans have no ids if
-        the scenario hides identities.
+        :func:`~slamgym.experiments.runs.settings_for` finds it. If the scenario hides
+        identities, scans have true ids instead of ids.
 
     Examples
     --------
@@ -61,7 +61,7 @@ def record_episode(
         "slamgym/LandmarkWorld-v0", scenario=world, disable_env_checker=True
     )
     observation, info = env.reset(seed=seed)
-    events: list[OdometryRow | Scan] = [*_scan(0.0, observation, world)]
+    events: list[OdometryRow | Scan] = [*_scan(0.0, observation, info)]
     poses = [info["pose"]]
     for step in range(world.steps):
         action = controller.act(info["pose"], step)
@@ -69,7 +69,7 @@ def record_episode(
         distance, turn = observation["odometry"].tolist()
         t = float(step + 1)
         events.append(OdometryRow(t, distance, turn, dt=1.0))
-        events += _scan(t, observation, world)
+        events += _scan(t, observation, info)
         poses.append(info["pose"])
         if progress is not None:
             progress(step + 1, world.steps)
@@ -78,13 +78,15 @@ def record_episode(
     return log
 
 
-def _scan(t: float, observation: Observation, scenario: Scenario) -> list[Scan]:
+def _scan(t: float, observation: Observation, info: dict[str, Any]) -> list[Scan]:
     """Return the scan of one step, if anything was seen."""
     seen = observation["mask"]
     if not seen.any():
         return []
-    ids = np.flatnonzero(seen) if scenario.sensor.identities else None
-    return [Scan(t, observation["landmarks"][seen], ids)]
+    readings = observation["landmarks"][seen]
+    if "landmark_ids" in info:  # the world hides identities
+        return [Scan(t, readings, true_ids=info["landmark_ids"][seen])]
+    return [Scan(t, readings, np.flatnonzero(seen))]
 
 
 def _log(

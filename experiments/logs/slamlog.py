@@ -5,8 +5,10 @@ A CSV file with a header of ``# key: value`` lines, the first one
 
     landmark,id,x,y                             true position
     odometry,t,d,alpha,dt                       drive and turn until t
-    measurement,t,id,bearing,range[,size]       id empty when unknown
+    measurement,t,id,bearing,range[,size[,true_id]]     id empty when unknown
     groundtruth,t,x,y,theta                     theta empty when unknown
+
+A true id, -1 for a reading of no landmark, is for scores alone: no filter is given it.
 
 Units are metres, radians, and seconds or steps. Odometry and measurement rows have the
 order in which a filter consumes them; consecutive measurement rows of equal t are one
@@ -23,7 +25,14 @@ from typing import Literal, cast, get_args
 import numpy as np
 
 from ...arrays import Array, IntArray
-from .events import EventRecorder, OdometryRow, Reading, Scan, float_array
+from .events import (
+    NO_LANDMARK,
+    EventRecorder,
+    OdometryRow,
+    Reading,
+    Scan,
+    float_array,
+)
 from .lines import LogError, LogLine, read_lines, shown, to_lines, write_whole
 
 __all__ = [
@@ -40,7 +49,7 @@ FORMAT_LINE = "# format: slamlog 1"
 ROW_FORMS = {
     "landmark": "landmark,id,x,y",
     "odometry": "odometry,t,d,alpha,dt",
-    "measurement": "measurement,t,id,bearing,range[,size]",
+    "measurement": "measurement,t,id,bearing,range[,size[,true_id]]",
     "groundtruth": "groundtruth,t,x,y,theta",
 }
 
@@ -173,7 +182,7 @@ class _SlamlogParser:
         kind, *fields = (part.strip() for part in line.text.split(","))
         if kind not in ROW_FORMS:
             raise line.error("a row of " + ", ".join(ROW_FORMS), shown(kind))
-        counts = (4, 5) if kind == "measurement" else (ROW_FORMS[kind].count(","),)
+        counts = (4, 5, 6) if kind == "measurement" else (ROW_FORMS[kind].count(","),)
         line.check_count(fields, counts, ROW_FORMS[kind])
         getattr(self, f"_take_{kind}")(line, fields)
 
@@ -197,9 +206,13 @@ class _SlamlogParser:
     def _take_measurement(self, line: LogLine, fields: list[str]) -> None:
         t, bearing, distance = map(line.to_real, (fields[0], fields[2], fields[3]))
         landmark_id = line.to_id(fields[1]) if fields[1] else None
-        size = line.to_real(fields[4]) if len(fields) == 5 else None
+        size, true_id = None, None
+        if len(fields) == 6:
+            true_id = NO_LANDMARK if fields[5] == "-1" else line.to_id(fields[5])
+        if fields[4:5] not in ([], [""]) or len(fields) == 5:
+            size = line.to_real(fields[4])
         self.recorder.add_reading(
-            line, Reading(t, landmark_id, bearing, distance, size)
+            line, Reading(t, landmark_id, bearing, distance, size, true_id)
         )
 
     def _take_groundtruth(self, line: LogLine, fields: list[str]) -> None:
@@ -273,6 +286,8 @@ def _rendered_scan(scan: Scan) -> Iterator[str]:
     for k, reading in enumerate(scan.measurements):
         landmark_id = "" if scan.landmark_ids is None else scan.landmark_ids[k]
         size = "" if scan.sizes is None else f",{numbers(scan.sizes[k])}"
+        if scan.true_ids is not None:
+            size = f"{size or ','},{scan.true_ids[k]}"
         yield f"measurement,{numbers(scan.t)},{landmark_id},{numbers(*reading)}{size}"
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from ...arrays import Array, IntArray
 from ...estimator.interface import (
@@ -25,6 +26,8 @@ from ...evaluation.association_scores import (
 from ...evaluation.gospa import CUTOFF, Gospa, gospa
 from ...evaluation.trajectory_error import Alignment, align_positions
 from .nan_statistics import finite
+
+NAMES = (*AssociationScores._fields, "precision", "recall")
 
 
 class TrueLandmarks(NamedTuple):
@@ -54,7 +57,8 @@ class RunDecisions(NamedTuple):
 class RunAssociation(NamedTuple):
     """The association of a run, compared with the truth."""
 
-    scores: AssociationScores
+    scores: AssociationScores | None
+    """None where the true landmark of some reading is unknown."""
     raw: Gospa
     """Error of the final map."""
     aligned: Gospa
@@ -64,11 +68,13 @@ class RunAssociation(NamedTuple):
 
     def as_dict(self) -> dict[str, Any]:
         """Return all as plain JSON types; None where undefined."""
-        counts = {name: finite(v) for name, v in self.scores.as_dict().items()}
-        whole = {name: getattr(self.scores, name) for name in self.scores._fields}
+        values: dict[str, Any] = dict.fromkeys(NAMES)
+        if self.scores is not None:
+            values |= self.scores._asdict()
+            values["precision"] = finite(self.scores.precision)
+            values["recall"] = finite(self.scores.recall)
         return {
-            **counts,
-            **whole,
+            **values,
             "resolution": self.resolution,
             "gospa": {
                 "raw": self.raw._asdict(),
@@ -90,30 +96,33 @@ class DecisionRecorder:
     def __init__(self, slam: SlamEstimator) -> None:
         self._slam = slam
         self._reported: list[ScanDecisions] = []
-        self._true_ids: list[IntArray] = []
+        self._true_ids: list[IntArray | None] = []
 
-    def add(self, report: UpdateReport, true_ids: IntArray) -> None:
-        """Note an update with readings of true landmarks, shape (m,)."""
+    def add(self, report: UpdateReport, true_ids: IntArray | None) -> None:
+        """Note an update with readings of true landmarks, shape (m,), if known."""
         self._true_ids.append(true_ids)
         if not isinstance(self._slam, SupportsDecisions):
             added = tuple(i for i in report.row_ids if i in report.added_ids)
             self._reported.append(ScanDecisions(report.row_ids, added))
 
     def result(self) -> RunDecisions | None:
-        """Return the decisions as they stand now; None if the estimator tells none."""
+        """Return the decisions as they stand now.
+
+        None where the estimator tells none, or a true landmark is unknown.
+        """
         made: Sequence[ScanDecisions] = self._reported
         if isinstance(self._slam, SupportsDecisions):
             made = self._slam.decisions
-        rows = [len(scan.row_ids) for scan in made]
-        if rows != [len(ids) for ids in self._true_ids]:
+        true_ids = [ids for ids in self._true_ids if ids is not None]
+        if [len(scan.row_ids) for scan in made] != [len(ids) for ids in true_ids]:
             return None
         policy = getattr(self._slam, "policy", None)
         known = policy if isinstance(policy, LandmarkPolicy) else LandmarkPolicy()
-        return RunDecisions(made, self._true_ids, known.confirm)
+        return RunDecisions(made, true_ids, known.confirm)
 
 
 def compare_association(
-    run: RunDecisions,
+    run: RunDecisions | None,
     truth: TrueLandmarks,
     landmark_ids: Sequence[int],
     landmarks: Array,
@@ -124,8 +133,8 @@ def compare_association(
 
     Parameters
     ----------
-    run : RunDecisions
-        The decisions.
+    run : RunDecisions or None
+        The decisions, if known.
     truth : TrueLandmarks
         The true landmarks.
     landmark_ids : sequence of int
@@ -136,21 +145,40 @@ def compare_association(
         True landmarks nearer to each other count as one place [m].
     """
     places = places_of(truth.ids, truth.positions, resolution)
-    scores = score_association(
-        run.decisions, run.true_ids, places=places, confirm=run.confirm
-    )
-    seen = [[places.get(i, i) for i in scan.tolist()] for scan in run.true_ids]
-    known = known_places(seen, run.confirm)
     place = np.array([places[i] for i in truth.ids.tolist()], dtype=np.int64)
-    is_known = np.isin(place, list(known))
+    scores, is_known = None, np.ones(len(place), dtype=np.bool_)
+    if run is not None:
+        scores = score_association(
+            run.decisions, run.true_ids, places=places, confirm=run.confirm
+        )
+        seen = [[places.get(i, i) for i in scan.tolist()] for scan in run.true_ids]
+        is_known = np.isin(place, list(known_places(seen, run.confirm)))
+        identities = run.identities()
+    else:
+        identities = mutual_nearest(truth, landmark_ids, landmarks)
     there, of = truth.positions[is_known], place[is_known]
-    moved = alignment(run.identities(), truth, landmark_ids, landmarks)
+    moved = alignment(identities, truth, landmark_ids, landmarks)
     return RunAssociation(
         scores,
         gospa(landmarks, there, places=of),
         gospa(moved.apply(landmarks), there, places=of),
         resolution,
     )
+
+
+def mutual_nearest(
+    truth: TrueLandmarks, landmark_ids: Sequence[int], landmarks: Array
+) -> dict[int, int]:
+    """Pair mapped and true landmarks that are nearest to each other."""
+    if not len(landmarks) or not len(truth.ids):
+        return {}
+    gaps = cdist(landmarks, truth.positions)
+    nearest, back = gaps.argmin(axis=1), gaps.argmin(axis=0)
+    return {
+        i: int(truth.ids[j])
+        for k, (i, j) in enumerate(zip(landmark_ids, nearest.tolist(), strict=True))
+        if back[j] == k
+    }
 
 
 def alignment(

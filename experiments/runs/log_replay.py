@@ -1,19 +1,22 @@
 """Feed a log to an estimator, and keep what it believes at every step."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from ...arrays import Array
 from ...estimator.interface import Belief, SlamEstimator, SupportsJoin, SupportsTruth
+from ...estimator.map_management.hypotheses import HypothesisSlam
 from ...estimator.map_management.managed_slam import ManagedSlam
 from ...estimator.map_management.map_view import marginal_without_joining
+from ..logs.anonymous import hides_identities, true_ids_of
 from ..logs.events import Scan
 from ..logs.ground_truth import true_poses_of
 from ..logs.slamlog import SlamLog
 from ..logs.steps import Step, predictions, steps_of
+from .association import DecisionRecorder, RunDecisions
 from .blas_threads import one_blas_thread
 from .map_history import MapHistory
 from .memory_check import refuse_large_map
@@ -42,6 +45,10 @@ class Replay:
     """Their readings, counted by what became of them."""
     changes: MapChanges = field(default_factory=MapChanges)
     """Changes of its map."""
+    last_seen: Mapping[int, int] = field(default_factory=dict)
+    """The step of the last reading of each landmark."""
+    decisions: RunDecisions | None = None
+    """What it decided about readings without identity, if the log tells their truth."""
 
 
 def replay(
@@ -105,14 +112,17 @@ def replay(
     most = _MOST_JOINED if isinstance(estimator, SupportsJoin) else _MOST_MAPS
     history = MapHistory(None if keep_history else most)
     recorder = RunRecorder(estimator, len(steps), history)
+    decisions = DecisionRecorder(estimator)
     with one_blas_thread():
         for number, step in enumerate(steps):
             with _naming_time(log, step):
                 show_truth(number)
-                _take(step, log, estimator, recorder)
+                _take(step, log, estimator, recorder, decisions)
             if progress is not None:
                 progress(number + 1, len(steps))
-    trace = recorder.trace(name or _name_of(estimator), times, log)
+    made = decisions.result() if hides_identities(log) else None
+    identities = None if made is None else made.identities()
+    trace = recorder.trace(name or _name_of(estimator), times, log, identities)
     return Replay(
         log,
         trace,
@@ -120,13 +130,16 @@ def replay(
         scans=sum(step.scan is not None for step in steps),
         readings=recorder.counts(),
         changes=recorder.changes(),
+        last_seen=recorder.last_seen,
+        decisions=made,
     )
 
 
 def _name_of(estimator: SlamEstimator) -> str:
     """Return the name of its class; for a managed filter, that of the filter."""
-    inner = estimator.filter if isinstance(estimator, ManagedSlam) else estimator
-    return type(inner).__name__
+    if isinstance(estimator, ManagedSlam | HypothesisSlam):
+        return type(estimator.filter).__name__
+    return type(estimator).__name__
 
 
 def _truth_source(
@@ -141,13 +154,19 @@ def _truth_source(
     landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
     if not isinstance(estimator, SupportsTruth) or poses is None:
         return lambda _: None
+    if hides_identities(log):  # the estimator's ids are its own
+        return lambda _: None
     if not (seen <= set(landmarks) and np.isfinite(poses).all()):
         return lambda _: None
     return lambda step: estimator.observe_truth(poses[step], landmarks)
 
 
 def _take(
-    step: Step, log: SlamLog, estimator: SlamEstimator, recorder: RunRecorder
+    step: Step,
+    log: SlamLog,
+    estimator: SlamEstimator,
+    recorder: RunRecorder,
+    decisions: DecisionRecorder,
 ) -> None:
     for row in step.motions:
         for odometry, dt in predictions(row, log.motion):
@@ -156,6 +175,7 @@ def _take(
     report = None
     if step.scan is not None:
         report = estimator.update(step.scan.measurements, _ids(step.scan))
+        decisions.add(report, true_ids_of(step.scan))
     recorder.add(predicted, report)
 
 

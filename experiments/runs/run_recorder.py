@@ -1,6 +1,7 @@
 """Record what an estimator believes during a run, step by step, as a trace."""
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +66,8 @@ class RunRecorder:
         self._readings: Counter[str] = Counter()
         self._changes: Counter[str] = Counter()
         self._ids: tuple[int, ...] = ()
+        self.last_seen: dict[int, int] = {}
+        """The step of the last reading of each landmark."""
 
     def add(self, predicted: Belief, report: UpdateReport | None) -> None:
         """Record one step, after the scan at its end."""
@@ -76,6 +79,8 @@ class RunRecorder:
             self._nis[step] = report.nis
             self._dof[step] = report.degrees_of_freedom
             self._count(report)
+            seen = (*report.associated_ids, *report.added_ids)
+            self.last_seen |= dict.fromkeys(seen, step)
             self._keep_new(mapped_ids(self._slam))
         self._updated.put(step, updated)
         if step == self._steps - 1:
@@ -105,8 +110,14 @@ class RunRecorder:
         for change in ("confirmed", "removed", "merged"):
             self._changes[change] += len(getattr(report, f"{change}_ids"))
 
-    def trace(self, name: str, times: Array, log: SlamLog) -> RunTrace:
-        """Return the trace of the run."""
+    def trace(
+        self,
+        name: str,
+        times: Array,
+        log: SlamLog,
+        identities: Mapping[int, int] | None = None,
+    ) -> RunTrace:
+        """Return the trace of the run; identities are those of its own landmarks."""
         belief = self.belief
         first = [self._first[i] for i in belief.landmark_ids]
         first_covariance = self._first_covariance
@@ -132,7 +143,7 @@ class RunRecorder:
             ),
             landmark_history=self._history,
             true_landmarks=true_landmarks_of(
-                log, belief.landmark_ids, belief.landmarks
+                log, belief.landmark_ids, belief.landmarks, identities
             ),
             first_covariance=first_covariance,
             final_covariance=belief.covariance,

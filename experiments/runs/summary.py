@@ -11,16 +11,24 @@ from ... import __version__
 from ...arrays import Array
 from ...evaluation import nees
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
+from ..logs.anonymous import hides_identities
 from ..logs.ground_truth import path_accuracy
+from .association import TrueLandmarks, compare_association
 from .filter_settings import FilterSettings
 from .log_replay import Replay
 from .nan_statistics import finite
+from .run_warnings import run_warnings
 from .trace import RunTrace
 
 _SHARE = 0.95  # probability of the interval of the NIS
 
 
-def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[str, Any]:
+def summarise(
+    replay: Replay,
+    settings: FilterSettings | None = None,
+    *,
+    resolution: float = 0.0,
+) -> dict[str, Any]:
     """Summarise a run.
 
     Every number is finite; values that need missing ground truth are None.
@@ -31,6 +39,8 @@ def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[st
         The run.
     settings : FilterSettings, optional
         Settings of its estimator, to be included.
+    resolution : float
+        True landmarks nearer to each other count as one place [m], in ``association``.
 
     Returns
     -------
@@ -40,8 +50,10 @@ def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[st
         landmarks confirmed, removed and merged, and the most in the map; ``nis``, see
         :func:`nis_summary`; ``nees``, see :func:`nees_summary`; ``ate``, the root mean
         square distance of the path from the truth at the times of the truth, and
-        ``landmark_rmse``, that of the map, both ``{raw, aligned}`` [m]; ``log``,
-        ``estimator``, ``settings``, and ``slamgym``, the version.
+        ``landmark_rmse``, that of the map, both ``{raw, aligned}`` [m];
+        ``association``, see :func:`association_summary`; ``warnings``, see
+        :func:`.run_warnings.run_warnings`; ``log``, ``estimator``, ``settings``, and
+        ``slamgym``, the version.
     """
     log, trace = replay.log, replay.trace
     return {
@@ -60,7 +72,34 @@ def summarise(replay: Replay, settings: FilterSettings | None = None) -> dict[st
         "nees": nees_summary(trace),
         "ate": _rmse(path_accuracy(log, trace.t, trace.poses)),
         "landmark_rmse": _rmse(map_accuracy(trace)),
+        "association": association_summary(replay, resolution),
+        "warnings": run_warnings(replay),
     }
+
+
+def association_summary(replay: Replay, resolution: float) -> dict[str, Any] | None:
+    """Summarise how well readings without identity were associated.
+
+    Returns
+    -------
+    dict or None
+        ``correct``, ``wrong``, ``new_correct``, ``duplicate``, ``ghost``, ``missed``,
+        ``clutter_used``, ``map_size`` and ``true_map_size``, numbers of
+        :class:`~slamgym.evaluation.AssociationScores`; ``precision`` and ``recall``;
+        the ``resolution`` [m]; ``gospa`` of the map, ``raw`` and ``aligned``, with
+        their parts, see :class:`~slamgym.evaluation.Gospa`, and the ``cutoff`` [m].
+        Without true ids all but ``gospa`` is None, and it compares the map with all
+        true landmarks.  None if all readings have identities, or the true landmarks are
+        unknown.
+    """
+    log, trace = replay.log, replay.trace
+    if not hides_identities(log) or not len(log.landmarks):
+        return None
+    truth = TrueLandmarks(log.landmark_ids, log.landmarks)
+    ids = trace.landmark_ids.tolist()
+    return compare_association(
+        replay.decisions, truth, ids, trace.landmarks, resolution=resolution
+    ).as_dict()
 
 
 def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:

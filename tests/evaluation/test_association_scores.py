@@ -44,7 +44,7 @@ def test_every_kind_of_decision_is_counted_once():
         "duplicate": 1,
     }
     scores = score_association(decisions, true_ids)
-    assert (scores.precision, scores.recall) == (1 / 5, 1 / 5)
+    assert (scores.precision, scores.recall) == (3 / 9, 3 / 7)
     assert (scores.map_size, scores.true_map_size) == (4, 3)
 
 

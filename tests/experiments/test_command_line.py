@@ -118,6 +118,30 @@ def test_a_run_answers_with_the_numbers_of_its_summary_file(finished_run):
     assert np.shape(summary["pose_covariance"]) == (3, 3)
 
 
+def test_a_run_without_identities_prints_and_saves_its_scores(here, without_pictures):
+    world = ("hidden_identities", "--steps", 30, "--estimator", "invariant")
+    drive = (*world, "--option", 'management={association="joint"}', "--out", "out")
+    text = printed("run", *drive, "--resolution", 0.5)
+    summary = json.loads((here / "out/summary.json").read_text())
+    scores = summary["association"]
+    assert scores["resolution"] == 0.5
+    assert f"{scores['correct']} correct, {scores['wrong']} wrong" in text
+    assert "GOSPA of the map" in text
+    again = answered("replay", "out/log.csv", *drive[3:7], "--out", "again")
+    assert again["association"]["correct"] > 0.9 * scores["correct"]
+
+
+def test_a_log_can_be_replayed_without_its_identities(log, without_pictures):
+    rows = [f"odometry,{t},0,0,1\nmeasurement,{t},7,-0.01,4.1\n" for t in range(2, 9)]
+    log.write_text(LOG + "".join(rows))
+    assert answered("replay", log)["association"] is None
+    scores = answered("replay", log, "--hide-identities", "--out", "hidden")
+    assert scores["settings"]["options"]["management"] is True
+    assert scores["association"]["map_size"] == 1
+    assert scores["association"]["true_map_size"] == 1
+    assert ",,-0.01,4.1,,7" in (log.parent / "hidden/log.csv").read_text()
+
+
 def test_the_scenario_of_a_run_is_saved_with_its_changes(finished_run):
     folder, _ = finished_run
     expected = load_scenario("six_landmarks").with_changes(steps=4)

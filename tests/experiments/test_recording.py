@@ -107,6 +107,22 @@ def test_hidden_identities_stay_hidden():
     assert all(scan.landmark_ids is None for scan in scans)
 
 
+def test_the_truth_behind_hidden_readings_is_kept_beside_them():
+    log = recorded("hidden_identities", steps=12)
+    sensor = {"identities": True, "clutter": 0.0, "max_clutter": 0}
+    told = recorded("hidden_identities", steps=12, sensor=sensor)
+    known, clutter = [e for e in told.events if isinstance(e, Scan)], 0
+    hidden = [e for e in log.events if isinstance(e, Scan)]
+    for scan, other in zip(hidden, known, strict=True):
+        real = scan.true_ids >= 0
+        order = np.argsort(scan.true_ids[real])
+        assert scan.true_ids[real][order].tolist() == other.landmark_ids.tolist()
+        readings = scan.measurements[real][order]
+        np.testing.assert_array_equal(readings, other.measurements)
+        clutter += (~real).sum()
+    assert clutter > 3
+
+
 def test_a_filter_starts_where_the_world_says_and_not_at_the_truth():
     drawn = recorded("six_landmarks", start={"drawn": "estimate"}, steps=2)
     assert drawn.ground_truth[0, 1:].tolist() == [0.0, 0.0, 0.0]

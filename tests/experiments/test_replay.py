@@ -1,18 +1,23 @@
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, UpdateReport, make_estimator
+from slamgym.experiments.logs.anonymous import without_identities
 from slamgym.experiments.logs.ground_truth import path_accuracy, true_poses_of
 from slamgym.experiments.logs.importers import read_log
+from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import LogError, OdometryRow, Scan, SlamLog
 from slamgym.experiments.logs.steps import steps_of
 from slamgym.experiments.runs.filter_settings import FilterSettings, settings_for
 from slamgym.experiments.runs.log_replay import replay
 from slamgym.experiments.runs.map_history import MapHistory
 from slamgym.experiments.runs.summary import pose_nees, summarise
+from slamgym.sim_configs import load_scenario
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
 
@@ -51,6 +56,66 @@ def told_of(log):
     listener = Listener()
     replay(log, listener)
     return listener.calls
+
+
+def test_a_filter_is_never_told_the_true_ids():
+    hidden = Scan(0.0, [(0.1, 5.0), (0.2, 4.0)], true_ids=[7, -1])
+    assert told_of(SlamLog("drive", events=(hidden,))) == [
+        ("update", [[0.1, 5.0], [0.2, 4.0]], None)
+    ]
+
+
+def circles(clutter=0.5, steps=80):
+    """Record a drive whose readings have no identity."""
+    changes = {"sensor": {"clutter": clutter}, "steps": steps}
+    world = load_scenario("hidden_identities").with_changes(**changes)
+    driver = make_controller("open_loop", world, np.random.default_rng(0))
+    return record_episode(world, driver, seed=2)
+
+
+@pytest.mark.parametrize("method", ["nearest", "hypotheses"])
+def test_the_summary_scores_readings_without_identity(method):
+    log = circles()
+    settings = settings_for(log, options={"management": {"association": method}})
+    done = replay(log, settings.make(log.start))
+    summary = summarise(done)["association"]
+    ids, size = done.decisions.identities(), len(done.belief.landmark_ids)
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    assert summary["map_size"] == summary["new_correct"] == size > 10
+    assert summary["correct"] == done.readings.associated > 300
+    assert summary["wrong"] == summary["ghost"] == summary["duplicate"] == 0
+    truth = dict(zip(log.landmark_ids.tolist(), log.landmarks.tolist(), strict=True))
+    expected = [truth[ids[i]] for i in done.belief.landmark_ids]
+    assert done.trace.true_landmarks.tolist() == expected
+    assert done.trace.estimator == "EkfSlam"
+
+
+def test_a_known_log_whose_identities_are_hidden_is_scored():
+    world = load_scenario("six_landmarks").with_changes(steps=20)
+    driver = make_controller("open_loop", world, np.random.default_rng(0))
+    log = record_episode(world, driver, seed=1)
+    assert (
+        summarise(replay(log, settings_for(log).make(log.start)))["association"] is None
+    )
+    hidden = without_identities(log)
+    settings = settings_for(hidden)
+    assert settings.options == {"management": True}
+    scores = summarise(replay(hidden, settings.make(log.start)))["association"]
+    assert scores["correct"] + scores["new_correct"] > 80
+
+
+def test_without_true_ids_the_map_is_compared_with_all_landmarks():
+    log = circles()
+    plain = [
+        replace(event, true_ids=None) if isinstance(event, Scan) else event
+        for event in log.events
+    ]
+    plain = replace(log, events=plain)
+    settings = settings_for(plain)
+    summary = summarise(replay(plain, settings.make(plain.start)))["association"]
+    assert summary["correct"] is summary["precision"] is summary["map_size"] is None
+    aligned = summary["gospa"]["aligned"]
+    assert aligned["missed_count"] == 20 - aligned["pairs"] > 0
 
 
 def short_drive(**changes):

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slamgym.experiments.logs.anonymous import hides_identities, without_identities
 from slamgym.experiments.logs.slamlog import (
     LogError,
     OdometryRow,
@@ -65,6 +66,7 @@ def assert_same_log(one, other):
             np.testing.assert_array_equal(a.measurements, b.measurements)
             np.testing.assert_equal(a.landmark_ids, b.landmark_ids)
             np.testing.assert_equal(a.sizes, b.sizes)
+            np.testing.assert_equal(a.true_ids, b.true_ids)
 
 
 def test_header_is_parsed_and_its_other_keys_are_kept(tmp_path):
@@ -98,6 +100,45 @@ def test_fields_land_in_their_places(tmp_path):
     assert first.landmark_ids.tolist() == [4, 2]
     assert row == OdometryRow(t=1.0, d=3.0, alpha=0.1, dt=1.0)
     assert (last.t, last.landmark_ids, last.sizes.tolist()) == (2.5, None, [0.35])
+
+
+def test_true_ids_stand_behind_the_size_and_are_no_ids(tmp_path):
+    rows = "measurement,0,,0.1,5,,7", "measurement,0,,0.2,4,,-1"
+    sized = "measurement,1,,0.1,5,0.3,7"
+    path = saved(tmp_path, logged(*rows, "odometry,1,0,0,1", sized))
+    log = read_slamlog(path)
+    first, _, second = log.events
+    assert first.landmark_ids is first.sizes is second.landmark_ids is None
+    assert (first.true_ids.tolist(), second.true_ids.tolist()) == ([7, -1], [7])
+    assert second.sizes.tolist() == [0.3]
+    write_slamlog(log, tmp_path / "copy.csv")
+    assert_same_log(read_slamlog(tmp_path / "copy.csv"), log)
+    assert "measurement,0.0,,0.2,4.0,,-1" in (tmp_path / "copy.csv").read_text()
+
+
+def test_a_file_written_before_true_ids_is_read_and_written_as_it_was(tmp_path):
+    old = "measurement,0.0,4,1.1,6.7\nmeasurement,0.0,2,1.3,12.4\n"
+    old += "odometry,1.0,3.0,0.1,1.0\nmeasurement,2.5,,0.3,9.0,0.35\n"
+    header = "# format: slamlog 1\n# name: old\n# motion: turn-last\n"
+    path = saved(tmp_path, header + "# start: 0.0,0.0,0.0\n" + old)
+    log = read_slamlog(path)
+    assert all(e.true_ids is None for e in log.events if isinstance(e, Scan))
+    write_slamlog(log, tmp_path / "again.csv")
+    assert (tmp_path / "again.csv").read_bytes() == path.read_bytes()
+
+
+def test_hidden_identities_become_true_ids(tmp_path):
+    log = read_slamlog(saved(tmp_path, TEXT))
+    hidden = without_identities(log)
+    assert hides_identities(hidden)
+    assert hidden.header["identities"] == "false"
+    for before, after in zip(log.events, hidden.events, strict=True):
+        if isinstance(before, Scan):
+            assert after.landmark_ids is None
+            np.testing.assert_equal(after.true_ids, before.landmark_ids)
+            np.testing.assert_array_equal(after.measurements, before.measurements)
+        else:
+            assert after is before
 
 
 def test_unknown_true_heading_is_nan(tmp_path):
@@ -149,7 +190,10 @@ def test_every_float_survives_the_round_trip(tmp_path_factory, numbers, dt):
         ("odometry,0.5,3,0,1", "expected t >= 1.0, the time before, got 0.5"),
         ("measurement,0.5,1,0,1", "expected t >= 1.0, the time before, got 0.5"),
         ("measurement,1,0,0.1", "expected measurement,t,id,bearing,range"),
-        ("measurement,1,0,0.1,2,3,4", "expected measurement,t,id,bearing,range"),
+        ("measurement,1,0,0.1,2,3,4,5", "expected measurement,t,id,bearing,range"),
+        ("measurement,1,6,0.1,2,,-2", "expected an id (a whole number >= 0), got '-2'"),
+        ("measurement,1,6,0.1,2,", "expected a finite number, got ''"),
+        ("measurement,1,6,0,2,,6", "expected true ids in all rows of a scan or in no"),
         ("measurement,1,-3,0.1,2", "expected an id (a whole number >= 0), got '-3'"),
         ("measurement,1,1.0,0.1,2", "expected an id (a whole number >= 0), got '1.0'"),
         (f"measurement,1,{'9' * 30},0,2", "expected an id"),

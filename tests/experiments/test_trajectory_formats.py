@@ -28,7 +28,7 @@ LIBRARIES = {"parquet": ["pyarrow"], "minari": ["minari", "pyarrow"]}
 EVERYTHING = set(ARRAYS)
 READ_BY_FILTERS = EVERYTHING - {"actions", "collisions", "landmark_ids"}
 EXACT = {
-    "slamlog": READ_BY_FILTERS,
+    "slamlog": READ_BY_FILTERS | {"landmark_ids"},
     "npz": EVERYTHING,
     "parquet": EVERYTHING,
     "minari": EVERYTHING,

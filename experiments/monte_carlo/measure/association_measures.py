@@ -32,8 +32,8 @@ PREFIX = "association_"
 
 MEANINGS: dict[str, str] = {
     **{f"{PREFIX}{name}": f"{name.replace('_', ' ')}, see docs" for name in COUNTS},
-    f"{PREFIX}precision": "share of correct ones among readings of mapped landmarks",
-    f"{PREFIX}recall": "share of correct ones among readings of mapped places",
+    f"{PREFIX}precision": "share of right ones among readings given to landmarks",
+    f"{PREFIX}recall": "share of right ones among readings of landmarks",
     **{
         f"gospa_{which}_{part}": f"GOSPA of the final map, {which}: {part}"
         for which in MAPS
@@ -71,7 +71,7 @@ def measure_association(
 
 
 def _values(found: RunAssociation) -> dict[str, float]:
-    scores = found.scores.as_dict()
+    scores = {} if found.scores is None else found.scores.as_dict()
     parts = {"raw": found.raw, "aligned": found.aligned}
     return {
         **{f"{PREFIX}{name}": float(value) for name, value in scores.items()},

@@ -1,8 +1,8 @@
 """Shards as folders of slamlog CSVs, one per episode: the input of a filter, exact.
 
-A log holds the start, odometry, measurements, true poses and landmarks; reading gives
-the same bits. It does not hold the actions, the collisions, and the true ids of hidden
-identities.
+A log holds the start, odometry, measurements, true poses and landmarks, and the true
+ids of hidden identities; reading gives the same bits. It does not hold the actions and
+the collisions.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ import numpy as np
 
 from ....envs.spaces import count_rows
 from ....sim_configs import Scenario
-from ...logs.events import OdometryRow, Scan
+from ...logs.events import NO_LANDMARK, OdometryRow, Scan
 from ...logs.recording import log_header
 from ...logs.slamlog import SlamLog, read_slamlog, write_slamlog
 from ..trajectory import Trajectory, array_of
@@ -53,15 +53,20 @@ def to_slamlog(trajectory: Trajectory) -> SlamLog:
     landmarks = array_of(trajectory, "landmarks")
     measurements = array_of(trajectory, "measurements")
     mask = array_of(trajectory, "mask")
-    known = trajectory.scenario.sensor.identities
+    true_ids = trajectory.landmark_ids
     events: list[OdometryRow | Scan] = []
     for step, seen in enumerate(mask):
         if step > 0:
             distance, turn = trajectory.odometry[step - 1].tolist()
             events.append(OdometryRow(float(step), distance, turn, dt=1.0))
         if seen.any():
-            ids = np.flatnonzero(seen) if known else None
-            events.append(Scan(float(step), measurements[step][seen], ids))
+            readings = measurements[step][seen]
+            if trajectory.scenario.sensor.identities:
+                scan = Scan(float(step), readings, np.flatnonzero(seen))
+            else:
+                of = None if true_ids is None else true_ids[step][seen]
+                scan = Scan(float(step), readings, true_ids=of)
+            events.append(scan)
     times = np.arange(len(trajectory.poses), dtype=np.float64)
     return SlamLog(
         name=trajectory.scenario.name,
@@ -79,6 +84,9 @@ def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
     rows = count_rows(about["scenario"])
     measurements = np.zeros((len(moves) + 1, rows, 2))
     mask = np.zeros((len(moves) + 1, rows), dtype=np.bool_)
+    true_ids = None
+    if not about["scenario"].sensor.identities and _tells_true_ids(log):
+        true_ids = np.full(mask.shape, NO_LANDMARK, dtype=np.int64)
     for event in log.events:
         if isinstance(event, Scan):
             places = event.landmark_ids
@@ -86,6 +94,8 @@ def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
                 places = np.arange(len(event.measurements))
             measurements[int(event.t), places] = event.measurements
             mask[int(event.t), places] = True
+            if true_ids is not None and event.true_ids is not None:
+                true_ids[int(event.t), places] = event.true_ids
     return Trajectory(
         **about,
         start_estimate=log.start,
@@ -94,4 +104,10 @@ def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
         landmarks=log.landmarks,
         measurements=measurements,
         mask=mask,
+        landmark_ids=true_ids,
     )
+
+
+def _tells_true_ids(log: SlamLog) -> bool:
+    scans = (event for event in log.events if isinstance(event, Scan))
+    return all(scan.true_ids is not None for scan in scans)
