@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -13,13 +12,18 @@ from numpy.typing import ArrayLike
 
 from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
+from ..estimator.filters.batch import can_batch
+from ..estimator.filters.batch_results import BatchStorage
+from ..estimator.filters.ekf import EkfSlam
 from ..sim_configs import Scenario
-from .active_slam_task import ActiveSlamTask, Progress, RewardWeights
+from .active_slam_task import ActiveSlamTask, split_settings
 from .agent_knowledge import AgentKnowledge
-from .belief_arrays import belief_arrays
+from .belief_arrays import belief_storage, live_storage
 from .estimator_choice import EstimatorChoice, checked_belief, choose_estimator
 
 Observation = dict[str, Any]
+
+_ONE_WORLD = np.ones(1, dtype=np.bool_)
 
 
 class ActiveSlamEnv(LandmarkWorldEnv):
@@ -38,7 +42,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
 
     ## Observation Space
     ``Dict`` of float64 arrays within [-1, 1] and a bool mask; see
-    `ActiveSlamTask.observe` and `belief_features`. All values derive from the belief
+    `ActiveSlamTask` and `belief_features`. All values derive from the belief
     and the walls. N is the number of landmarks, row i is landmark i. Positions of
     landmarks are in the robot's frame, ahead along the heading and aside to the left,
     in diagonals of the floor; zeros where not mapped.
@@ -135,7 +139,6 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         self.task = ActiveSlamTask(self.scenario, weights)
         self.observation_space = self.task.observation_space
         self._estimator = choose_estimator(estimator, self.scenario, estimator_options)
-        self._progress: Progress | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -143,8 +146,8 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         """Start an episode with a new map, and take the first scan."""
         observation, info = super().reset(seed=seed, options=options)
         self._estimator.reset(self.start_estimate, self.scenario.start.std)
-        self._progress = self.task.begin(self._update(observation, step=0))
-        return self._output(info, success=False)
+        self.task.begin(self._update(observation, step=0), _ONE_WORLD)
+        return self._output(info)
 
     def step(
         self, action: ArrayLike
@@ -156,64 +159,55 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         ValueError
             If the action is not two finite numbers. The world does not change.
         """
-        before = self._reached()
+        step = self._steps() + 1
         observation, _, _, _, info = super().step(action)
         self._estimator.predict(observation["odometry"])
-        step = int(before.steps[0]) + 1
-        after = self.task.proceed(before, self._update(observation, step=step))
-        self._progress = after
-        collision = np.array([info["collision"]])
+        beliefs = self._update(observation, step=step)
         actions = np.asarray(action, dtype=np.float64)[None]
-        outcome = self.task.reward(before, after, actions, collision)
-        seen, info = self._output(info, success=bool(outcome.success[0]))
+        collision = np.array([info["collision"]])
+        outcome = self.task.proceed(beliefs, _ONE_WORLD, actions, collision)
+        seen, info = self._output(info)
         ends = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return seen, float(outcome.rewards[0]), *ends, info
 
     @property
     def knowledge(self) -> AgentKnowledge:
         """The knowledge of an agent at this step, for policies that plan."""
-        progress = self._reached()
+        step, episodes = self._steps(), self.task.episodes
         return AgentKnowledge(
             self.scenario,
             self.task.grid,
             self._estimator,
-            self._belief,
-            progress.explored[0],
-            progress.known[0],
+            self._estimator.belief(),
+            episodes.explored[0].copy(),
+            episodes.known[0].copy(),
             self.task.weights.accuracy,
             self.task.prior_std,
-            int(progress.steps[0]),
+            step,
         )
 
-    def _reached(self) -> Progress:
-        if self._progress is None:
+    def _steps(self) -> int:
+        if not self.task.begun:
             raise ResetNeeded("call reset first: there is no episode yet")
-        return self._progress
+        return int(self.task.episodes.steps[0])
 
-    def _update(self, observation: Observation, *, step: int) -> Any:
+    def _update(self, observation: Observation, *, step: int) -> BatchStorage:
         """Update the estimator with one scan; return its belief."""
         seen = np.flatnonzero(observation["mask"])
         self._estimator.update(observation["landmarks"][seen], seen.tolist())
-        self._belief = checked_belief(self._estimator, step)
-        if self.render_mode is not None:
-            self.show_belief(self._belief)
-        return belief_arrays(self._belief, self.scenario.landmarks.count, by_id=True)
+        count = self.scenario.landmarks.count
+        if self.render_mode is None and can_batch(self._estimator):
+            return live_storage(cast("EkfSlam", self._estimator), count)
+        belief = checked_belief(self._estimator, step)
+        self.show_belief(belief)
+        return belief_storage(belief, count, by_id=True)
 
-    def _output(
-        self, info: dict[str, Any], *, success: bool
-    ) -> tuple[Observation, dict[str, Any]]:
-        progress = self._reached()
-        rows = self.task.observe(progress)
+    def _output(self, info: dict[str, Any]) -> tuple[Observation, dict[str, Any]]:
+        rows = self.task.observations()
+        shares = rows["progress"][0]
         counts = {
-            "mapped": int(progress.beliefs.mapped.sum()),
-            "known": int(progress.known.sum()),
-            "success": success,
+            "mapped": round(shares[1] * self.scenario.landmarks.count),
+            "known": int(self.task.episodes.known.sum()),
+            "success": bool(self.task.outcome.success[0]),
         }
         return {key: row[0] for key, row in rows.items()}, {**info, **counts}
-
-
-def split_settings(settings: Mapping[str, Any]) -> tuple[RewardWeights, dict[str, Any]]:
-    """Split settings into reward weights and changes of the scenario."""
-    own = {field.name for field in fields(RewardWeights)}
-    weights = RewardWeights(**{key: settings[key] for key in settings if key in own})
-    return weights, {key: settings[key] for key in settings if key not in own}

@@ -1,21 +1,29 @@
 """The rules of active SLAM, for one world or for many."""
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass, fields
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.utils import flatten_space
+from numpy.typing import ArrayLike
 
-from ..arrays import AnyArray, Array, BoolArray, ComplexArray, IntArray
+from ..arrays import AnyArray, BoolArray
+from ..estimator.filters.batch_results import BatchStorage
 from ..sim_configs import Scenario
-from .belief_arrays import BeliefArrays, as_storage
-from .belief_features import belief_features, belief_space, largest_variances
+from .active_slam_kernels import Episodes, StepOutcome, advance
+from .belief_features import belief_space, empty_features
 from .coverage_grid import SECTORS, CoverageGrid
-from .information_reward import check_criterion, effort, landmark_prior_std, uncertainty
+from .information_reward import CRITERIA, check_criterion, landmark_prior_std
 
-_CELLS_PER_LANDMARK = 8.0  # cells that weigh as much as one landmark
-_REACHES = (0.1, 0.4)  # near and far, in diagonals of the floor
+_SIZES = {  # of the entries besides the belief
+    "goals": 9,
+    "progress": 4,
+    "uncertain": 2 * SECTORS,
+    "unexplored": 2 * SECTORS,
+    "walls": SECTORS,
+}
 
 
 @dataclass(frozen=True)
@@ -43,33 +51,8 @@ class RewardWeights:
             )
 
 
-class Progress(NamedTuple):
-    """The progress of episodes in B worlds."""
-
-    beliefs: BeliefArrays
-    explored: BoolArray
-    """Cells seen so far, as believed, shape (B, C)."""
-    steps: IntArray
-    """Steps so far, shape (B,)."""
-    uncertainty: Array
-    """Of the map, see `information_reward.uncertainty`, shape (B,)."""
-    variances: Array
-    """Worst variance of each landmark, 0 where not mapped, shape (B, N) [m²]."""
-    known: BoolArray
-    """Landmarks known to the required accuracy, shape (B, N)."""
-
-
-class StepOutcome(NamedTuple):
-    """The outcome of one step in B worlds; arrays of shape (B,)."""
-
-    rewards: Array
-    terminated: BoolArray
-    truncated: BoolArray
-    success: BoolArray
-
-
 class ActiveSlamTask:
-    """Computes observations, rewards and ends of episodes; has no state of its own.
+    """Computes observations, rewards and ends of the episodes of B worlds.
 
     Parameters
     ----------
@@ -77,158 +60,163 @@ class ActiveSlamTask:
         With walls and with identities.
     weights : RewardWeights
         Rewards and costs.
+    count : int
+        B, the number of worlds.
+
+    Attributes
+    ----------
+    observation_space : gymnasium.spaces.Dict
+        Of one world. All arrays are flat, because Stable-Baselines3 treats two axes as
+        an image:
+
+        =============== ====== ====================================================
+        ``belief_…``           see `belief_features`; rows flattened
+        ``goals``       (9,)   bearing (cos, sin) and distance of three: the nearest
+                               cell not yet seen, the nearest mapped landmark not yet
+                               known, and the landmark known best; zeros where there is
+                               none, the first of those that are within 1e-9
+        ``progress``    (4,)   shares: of the floor explored, of landmarks mapped, of
+                               landmarks known, of time left
+        ``uncertain``   (16,)  density of mapped, not yet known landmarks, near and far,
+                               in 8 directions from straight ahead counter-clockwise
+        ``unexplored``  (16,)  the same of cells not yet seen
+        ``walls``       (8,)   distance d to the wall, as d / (d + longest step)
+        =============== ====== ====================================================
+    episodes : Episodes
+        Their progress.
+    outcome : StepOutcome
+        Of the last step.
     """
 
-    def __init__(self, scenario: Scenario, weights: RewardWeights) -> None:
+    def __init__(
+        self, scenario: Scenario, weights: RewardWeights, count: int = 1
+    ) -> None:
         if not scenario.sensor.identities:
             raise ValueError(
                 f"scenario must have sensor.identities = true, got false in "
                 f"'{scenario.name}'"
             )
-        self.scenario = scenario
-        self.weights = weights
+        self.scenario, self.weights = scenario, weights
         self.grid = CoverageGrid(scenario)
         self.prior_std = landmark_prior_std(scenario)
-        count = scenario.landmarks.count
-        sizes = {
-            "goals": 9,
-            "progress": 4,
-            "uncertain": 2 * SECTORS,
-            "unexplored": 2 * SECTORS,
-            "walls": SECTORS,
+        landmarks, cells = scenario.landmarks.count, len(self.grid.cells)
+        belief = belief_space(landmarks).items()
+        self.observation_space = spaces.Dict(
+            {
+                **{key: flatten_space(box) for key, box in belief},
+                **{
+                    key: spaces.Box(-float(key == "goals"), 1.0, (size,), np.float64)
+                    for key, size in _SIZES.items()
+                },
+            }
+        )
+        self._shape = count, landmarks
+        self._rules = _rules(scenario, weights, self.prior_std)
+        self._scratch = (
+            np.zeros((5, max(cells, landmarks))),
+            np.zeros(landmarks),
+            np.zeros((2 * landmarks, 2 * landmarks)),
+        )
+        self._forms = {
+            **{
+                key: (row.shape, row.dtype)
+                for key, row in empty_features(*self._shape).items()
+            },
+            **{key: ((count, size), np.dtype(float)) for key, size in _SIZES.items()},
         }
-        own = {
-            key: spaces.Box(-float(key == "goals"), 1.0, (size,), dtype=np.float64)
-            for key, size in sizes.items()
-        }
-        belief = {key: flatten_space(box) for key, box in belief_space(count).items()}
-        self.observation_space = spaces.Dict({**belief, **own})
+        self._rows: dict[str, AnyArray] = {}
+        self.episodes = Episodes(
+            np.zeros((count, cells), dtype=np.bool_),
+            np.zeros(count, dtype=np.int64),
+            np.zeros(count),
+            np.zeros(self._shape, dtype=np.bool_),
+        )
+        self.outcome = _no_outcome(count)
 
-    def begin(self, beliefs: BeliefArrays) -> Progress:
-        """Return the progress after the first scan."""
-        steps = np.zeros(len(beliefs.means), dtype=np.int64)
-        return self._progress(beliefs, self.grid.visible_from(beliefs.poses), steps)
+    @property
+    def begun(self) -> bool:
+        """Whether there are episodes."""
+        return bool(self._rows)
 
-    def proceed(self, before: Progress, beliefs: BeliefArrays) -> Progress:
-        """Return the progress after a step and its scan."""
-        explored = before.explored | self.grid.visible_from(beliefs.poses)
-        return self._progress(beliefs, explored, before.steps + 1)
+    def begin(self, beliefs: BatchStorage, worlds: BoolArray) -> None:
+        """Begin episodes in some worlds, (B,), after their first scan."""
+        rows = self._rows or self._empty_rows()
+        self._rows = {key: row.copy() for key, row in rows.items()}
+        self.outcome.success[worlds] = False
+        self._advance(beliefs, worlds, moved=False)
 
-    def reward(
-        self, before: Progress, after: Progress, actions: Any, collisions: BoolArray
+    def proceed(
+        self,
+        beliefs: BatchStorage,
+        worlds: BoolArray,
+        actions: ArrayLike,
+        collisions: BoolArray,
     ) -> StepOutcome:
-        """Compute the rewards of a step, and which episodes end."""
-        weights, robot = self.weights, self.scenario.robot
-        left = 1.0 - after.steps / self.scenario.steps
-        success = after.known.all(axis=1) & ~collisions
-        limits = robot.max_speed, robot.max_turn_rate
-        rewards = before.uncertainty - after.uncertainty
-        rewards = rewards - weights.step_cost
-        rewards -= weights.effort_cost * effort(actions, limits)
-        rewards -= weights.crash_cost * collisions
-        rewards += weights.success_reward * (1.0 + left) * success
-        terminated = success | collisions
-        truncated = ~terminated & (after.steps >= self.scenario.steps)
-        return StepOutcome(rewards, terminated, truncated, success)
+        """Take some worlds, (B,), through a step and its scan.
 
-    def observe(self, progress: Progress) -> dict[str, AnyArray]:
-        """Compute the observation; the keys of the observation space, each (B, k).
-
-        All arrays are flat, because Stable-Baselines3 treats two axes as an image.
-
-        =============== =========== ===============================================
-        ``belief_…``                see `belief_features`; rows flattened
-        ``goals``       (B, 9)      bearing (cos, sin) and distance of three: the
-                                    nearest cell not yet seen, the nearest mapped
-                                    landmark not yet known, and the landmark known best;
-                                    zeros where there is none
-        ``progress``    (B, 4)      shares: of the floor explored, of landmarks mapped,
-                                    of landmarks known, of time left
-        ``uncertain``   (B, 16)     density of mapped, not yet known landmarks,
-                                    near and far, in 8 directions from straight ahead
-                                    counter-clockwise
-        ``unexplored``  (B, 16)     the same of cells not yet seen
-        ``walls``       (B, 8)      distance d to the wall, as d / (d + longest step)
-        =============== =========== ===============================================
+        The observations of other worlds are undefined until `begin`.
         """
-        beliefs, grid = progress.beliefs, self.grid
-        belief = belief_features(as_storage(beliefs), grid.bounds)
+        self._rows = self._empty_rows()
+        self.outcome = _no_outcome(self._shape[0])
+        self._advance(beliefs, worlds, actions, collisions, moved=True)
+        return self.outcome
+
+    def observations(self) -> dict[str, AnyArray]:
+        """Return the observations of all worlds: arrays that no later step changes."""
+        count = self._shape[0]
         return {
-            **{key: rows.reshape(len(rows), -1) for key, rows in belief.items()},
-            "goals": self._goals(progress),
-            "progress": self._shares(progress),
-            "uncertain": self._uncertain(progress),
-            "unexplored": self._unexplored(progress),
-            "walls": self._walls(beliefs.poses),
+            key: row if row.ndim == 2 else row.reshape(count, -1)
+            for key, row in self._rows.items()
         }
 
-    def _progress(
-        self, beliefs: BeliefArrays, explored: BoolArray, steps: IntArray
-    ) -> Progress:
-        variance = largest_variances(beliefs.landmark_covariances)
-        known = beliefs.mapped & (variance <= self.weights.accuracy**2)
-        measure = uncertainty(beliefs, self.weights.criterion, self.prior_std)
-        return Progress(beliefs, explored, steps, measure, variance, known)
-
-    def _walls(self, poses: Array) -> Array:
-        distances = self.grid.wall_distances(poses)
-        return distances / (
-            distances + self.scenario.robot.max_speed * self.scenario.dt
+    def _advance(
+        self,
+        beliefs: BatchStorage,
+        worlds: BoolArray,
+        actions: ArrayLike = ((0.0, 0.0),),
+        collisions: BoolArray | None = None,
+        *,
+        moved: bool,
+    ) -> None:
+        rows = tuple(self._rows.values())
+        first = len(rows) - len(_SIZES)
+        worlds_now: tuple[Any, ...] = (  # a `Worlds`
+            tuple(beliefs),
+            np.asarray(actions, dtype=np.float64),
+            worlds if collisions is None else collisions,
+            tuple(self.episodes),
+            tuple(self.outcome),
+            rows[:first],
+            rows[first:],
         )
+        plan = self.grid.plan
+        advance(worlds, moved, worlds_now, plan, self._rules, self._scratch)
 
-    def _goals(self, progress: Progress) -> Array:
-        beliefs, cells = progress.beliefs, self.grid.cells
-        position = beliefs.poses[:, :1] + 1j * beliefs.poses[:, 1:2]
-        places = _as_complex(beliefs.landmarks)
-        unknown = beliefs.mapped & ~progress.known
-        costs = [
-            np.where(progress.explored, np.inf, np.abs(cells - position)),
-            np.where(unknown, np.abs(places - position), np.inf),
-            np.where(beliefs.mapped, progress.variances, np.inf),
-        ]
-        ways = [
-            self.grid.direction_to_cheapest(beliefs.poses, points, cost)
-            for points, cost in zip((cells, places, places), costs, strict=True)
-        ]
-        return np.concatenate(ways, axis=1)
-
-    def _shares(self, progress: Progress) -> Array:
-        return np.stack(
-            [
-                progress.explored.mean(axis=1),
-                progress.beliefs.mapped.mean(axis=1),
-                progress.known.mean(axis=1),
-                1.0 - np.minimum(progress.steps / self.scenario.steps, 1.0),
-            ],
-            axis=1,
-        )
-
-    def _uncertain(self, progress: Progress) -> Array:
-        beliefs = progress.beliefs
-        points = _as_complex(beliefs.landmarks)
-        unknown = (beliefs.mapped & ~progress.known).astype(np.float64)
-        return self._sector_features(beliefs.poses, points, unknown, unit=1.0)
-
-    def _unexplored(self, progress: Progress) -> Array:
-        unseen = (~progress.explored).astype(np.float64)
-        poses, cells = progress.beliefs.poses, self.grid.cells
-        return self._sector_features(poses, cells, unseen, unit=_CELLS_PER_LANDMARK)
-
-    def _sector_features(
-        self, poses: Array, points: ComplexArray, weights: Array, unit: float
-    ) -> Array:
-        """Compute near and far sums s, scaled to s / (s + unit) in [0, 1)."""
-        sums = np.stack(
-            [
-                self.grid.sector_sums(
-                    poses, points, weights, share * self.grid.diagonal
-                )
-                for share in _REACHES
-            ],
-            axis=1,
-        )
-        return (sums / (sums + unit)).reshape(len(poses), -1)
+    def _empty_rows(self) -> dict[str, AnyArray]:
+        return {key: np.empty(*form) for key, form in self._forms.items()}
 
 
-def _as_complex(points: Array) -> ComplexArray:
-    return np.asarray(points[..., 0] + 1j * points[..., 1])
+def split_settings(settings: Mapping[str, Any]) -> tuple[RewardWeights, dict[str, Any]]:
+    """Split settings into reward weights and changes of the scenario."""
+    own = {field.name for field in fields(RewardWeights)}
+    weights = RewardWeights(**{key: settings[key] for key in settings if key in own})
+    return weights, {key: settings[key] for key in settings if key not in own}
+
+
+def _rules(
+    scenario: Scenario, weights: RewardWeights, prior_std: tuple[float, float]
+) -> tuple[Any, ...]:
+    robot = scenario.robot
+    return (  # a `Rules`
+        list(CRITERIA).index(weights.criterion),
+        *map(float, astuple(weights)[1:]),
+        (robot.max_speed, robot.max_turn_rate),
+        robot.max_speed * scenario.dt,
+        scenario.steps,
+        prior_std,
+    )
+
+
+def _no_outcome(count: int) -> StepOutcome:
+    no = np.zeros((3, count), dtype=np.bool_)
+    return StepOutcome(np.zeros(count), no[0], no[1], no[2])

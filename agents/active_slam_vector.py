@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -14,10 +13,10 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, BoolArray
 from ..envs.vector import LandmarkWorldVectorEnv
+from ..estimator.filters.batch_results import BatchBeliefs
 from ..sim_configs import Scenario
-from .active_slam import split_settings
-from .active_slam_task import ActiveSlamTask, Progress
-from .belief_arrays import BeliefArrays, beliefs_of_batch, update_filters
+from .active_slam_task import ActiveSlamTask, split_settings
+from .belief_arrays import update_filters
 from .estimator_choice import choose_batch
 
 Observation = dict[str, AnyArray]
@@ -76,33 +75,26 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
             **changes,
         )
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
-        self.task = ActiveSlamTask(self.scenario, weights)
+        self.task = ActiveSlamTask(self.scenario, weights, num_envs)
         self.single_observation_space = self.task.observation_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         count = self.scenario.landmarks.count
         self._filters = choose_batch(
             estimator, self.scenario, num_envs, count, estimator_options
         )
-        self._progress: Progress | None = None
-        self._success = np.zeros(num_envs, dtype=np.bool_)
 
-    def beliefs(self) -> BeliefArrays:
+    def beliefs(self) -> BatchBeliefs:
         """Return the present beliefs of all filters."""
-        return self._reached().beliefs
-
-    def _reached(self) -> Progress:
-        if self._progress is None:
+        if not self.task.begun:
             raise ResetNeeded("call reset first: there are no episodes yet")
-        return self._progress
+        return self._filters.beliefs()
 
     def _reward(self, actions: ArrayLike, moving: BoolArray) -> tuple[Array, BoolArray]:
-        before = self._reached()
         self._filter(moving, moved=True)
-        after = self.task.proceed(before, beliefs_of_batch(self._filters))
-        taken = np.where(moving[:, None], actions, 0.0)
-        outcome = self.task.reward(before, after, taken, self._worlds.collisions)
-        self._progress, self._success = after, outcome.success & moving
-        return np.where(moving, outcome.rewards, 0.0), outcome.terminated & moving
+        outcome = self.task.proceed(
+            self._filters.storage(), moving, actions, self._worlds.collisions
+        )
+        return outcome.rewards, outcome.terminated
 
     def _begin(self, worlds: BoolArray, seeds: Sequence[int | None] = ()) -> None:
         """Start episodes in some worlds, each with its first scan."""
@@ -110,26 +102,22 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         estimates = self._worlds.start_estimates
         self._filters.reset(estimates, self.scenario.start.std, runs=worlds)
         self._filter(worlds, moved=False)
-        begun = self.task.begin(beliefs_of_batch(self._filters))
-        if self._progress is not None:
-            old = self._progress
-            begun = begun._replace(
-                explored=np.where(worlds[:, None], begun.explored, old.explored),
-                steps=np.where(worlds, 0, old.steps),
-            )
-        self._progress, self._success = begun, self._success & ~worlds
+        self.task.begin(self._filters.storage(), worlds)
 
     def _filter(self, worlds: BoolArray, *, moved: bool) -> None:
         update_filters(self._filters, super()._observations(), worlds, moved=moved)
 
     def _observations(self) -> Observation:
-        return self.task.observe(self._reached())
+        observations = self.task.observations()
+        if self.autoreset_mode != AutoresetMode.DISABLED:
+            return observations
+        # a partial reset repeats them: the caller must not write into the originals
+        return {key: rows.copy() for key, rows in observations.items()}
 
     def _infos(self) -> dict[str, Any]:
-        progress = self._reached()
         return {
             **super()._infos(),
-            "mapped": progress.beliefs.mapped.sum(axis=1),
-            "known": progress.known.sum(axis=1),
-            "success": self._success,
+            "mapped": (self._filters.storage().slots >= 0).sum(axis=1),
+            "known": self.task.episodes.known.sum(axis=1),
+            "success": self.task.outcome.success.copy(),
         }

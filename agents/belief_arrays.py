@@ -1,64 +1,16 @@
-"""Beliefs as arrays of a fixed size, for one world or many."""
-
-from typing import NamedTuple
+"""Beliefs in the storage of a batch of filters, for one world or many."""
 
 import numpy as np
 
-from ..arrays import AnyArray, Array, BoolArray
+from ..arrays import AnyArray, BoolArray
 from ..estimator.filters.batch import BatchSlam
 from ..estimator.filters.batch_results import BatchStorage
+from ..estimator.filters.ekf import EkfSlam
 from .estimator_choice import BeliefOfMap
 
 
-class BeliefArrays(NamedTuple):
-    """Beliefs of B worlds over a pose and N landmarks; row i is landmark i.
-
-    The state is (x, y, θ, l0x, l0y, l1x, …).
-    """
-
-    means: Array
-    """Shape (B, 3 + 2N), zeros where a landmark is not mapped; θ in [-π, π)."""
-    covariances: Array
-    """Of the additive error, shape (B, 3 + 2N, 3 + 2N), zeros where not mapped."""
-    mapped: BoolArray
-    """Landmarks in the map, shape (B, N)."""
-
-    @property
-    def poses(self) -> Array:
-        """(x, y, θ), shape (B, 3) [m, m, rad]."""
-        return self.means[:, :3]
-
-    @property
-    def landmarks(self) -> Array:
-        """Positions, shape (B, N, 2) [m], zeros where not mapped."""
-        return self.means[:, 3:].reshape(len(self.means), -1, 2)
-
-    @property
-    def landmark_covariances(self) -> Array:
-        """Marginal covariance of each landmark, shape (B, N, 2, 2) [m²]."""
-        count = self.mapped.shape[1]
-        blocks = self.covariances[:, 3:, 3:].reshape(-1, count, 2, count, 2)
-        each = np.arange(count)
-        return np.moveaxis(blocks[:, each, :, each, :], 0, 1)
-
-
-def as_storage(beliefs: BeliefArrays) -> BatchStorage:
-    """Convert beliefs to the storage format of a batch of filters."""
-    rows = np.arange(beliefs.mapped.shape[1])
-    return BatchStorage.of(
-        np.ascontiguousarray(beliefs.means),
-        np.ascontiguousarray(beliefs.covariances),
-        np.where(beliefs.mapped, rows, -1),
-    )
-
-
-def beliefs_of_batch(batch: BatchSlam) -> BeliefArrays:
-    """Return the beliefs of a batch of filters."""
-    return BeliefArrays(*batch.beliefs())
-
-
-def belief_arrays(belief: BeliefOfMap, size: int, *, by_id: bool) -> BeliefArrays:
-    """Convert the belief of one world to arrays of a fixed size; B = 1.
+def belief_storage(belief: BeliefOfMap, size: int, *, by_id: bool) -> BatchStorage:
+    """Store the belief of one world as a batch of filters does; B = 1.
 
     Parameters
     ----------
@@ -80,27 +32,35 @@ def belief_arrays(belief: BeliefOfMap, size: int, *, by_id: bool) -> BeliefArray
     >>> from slamgym.estimator import EkfSlam
     >>> slam = EkfSlam((0.1, 0.1, 0.1), (0.1, 0.1))
     >>> _ = slam.update([(0.0, 2.0)], landmark_ids=[1])
-    >>> rows = belief_arrays(slam.belief(), size=3, by_id=True)
-    >>> rows.mapped.tolist(), rows.landmarks[0, 1].tolist()
-    ([[False, True, False]], [2.0, 0.0])
+    >>> storage = belief_storage(slam.belief(), size=3, by_id=True)
+    >>> storage.slots.tolist(), storage.means[0, 3:5].tolist()
+    ([[-1, 0, -1]], [2.0, 0.0])
     """
     ids = belief.landmark_ids
-    at = list(ids) if by_id else list(range(len(ids)))
-    if at and not (min(at) >= 0 and max(at) < size):
-        what = f"identity {max(at)}" if by_id else f"{len(at)} landmarks"
+    rows = list(ids) if by_id else list(range(len(ids)))
+    if rows and not (min(rows) >= 0 and max(rows) < size):
+        what = f"identity {max(rows)}" if by_id else f"{len(rows)} landmarks"
         raise ValueError(
             f"max_landmarks must leave room for the whole map, got {size} rows for a "
             f"map with {what}"
         )
-    state = [0, 1, 2, *(3 + 2 * row + axis for row in at for axis in (0, 1))]
-    means = np.zeros((1, 3 + 2 * size))
-    covariances = np.zeros((1, 3 + 2 * size, 3 + 2 * size))
-    mapped = np.zeros((1, size), dtype=np.bool_)
-    means[0, state[:3]] = belief.pose
-    means[0, state[3:]] = np.ravel(belief.landmarks)
-    covariances[0, np.array(state)[:, None], state] = belief.covariance
-    mapped[0, at] = True
-    return BeliefArrays(means, covariances, mapped)
+    capacity, used = 3 + 2 * size, 3 + 2 * len(rows)
+    means, covariances = np.zeros((1, capacity)), np.zeros((1, capacity, capacity))
+    slots = np.full((1, size), -1, dtype=np.int64)
+    means[0, :3] = belief.pose
+    means[0, 3:used] = np.ravel(belief.landmarks)
+    covariances[0, :used, :used] = belief.covariance
+    slots[0, rows] = np.arange(len(rows))
+    return BatchStorage(means, covariances, slots)
+
+
+def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
+    """Return the arrays of a filter that can run in batches, without a copy; B = 1."""
+    gaussian = estimator.map
+    slots = np.full((1, size), -1, dtype=np.int64)
+    for landmark, slot in gaussian.slots.items():
+        slots[0, landmark] = slot
+    return BatchStorage(gaussian.mean[None], gaussian.covariance[None], slots)
 
 
 def update_filters(

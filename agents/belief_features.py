@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array
 from ..envs.controllers import planned_path
@@ -90,9 +90,7 @@ def world_bounds(scenario: Scenario) -> Bounds:
     return left, bottom, right, top
 
 
-def belief_features(
-    beliefs: BatchStorage, bounds: Bounds
-) -> dict[str, NDArray[np.generic]]:
+def belief_features(beliefs: BatchStorage, bounds: Bounds) -> dict[str, AnyArray]:
     """Convert beliefs to observations.
 
     The result for a world does not depend on the other worlds or on the order in which
@@ -123,13 +121,18 @@ def belief_features(
 
         Standard deviations are `on_log_scale`; rows that are not mapped are 0.
     """
-    worlds, rows = beliefs.slots.shape
-    features: dict[str, AnyArray] = {
+    features = empty_features(*beliefs.slots.shape)
+    rows: Any = tuple(features.values())
+    write_features(*beliefs, bounds, rows)
+    return features
+
+
+def empty_features(worlds: int, rows: int) -> dict[str, AnyArray]:
+    """Return arrays for the features of B beliefs over N landmarks, not yet filled."""
+    return {
         key: np.empty((worlds, *shape), np.bool_ if key == "belief_mask" else float)
         for key, (_, shape) in _ranges_and_shapes(rows).items()
     }
-    write_features(*beliefs, bounds, *features.values())
-    return features
 
 
 def largest_variances(covariances: ArrayLike) -> Array:

@@ -11,6 +11,9 @@ from ..estimator.support.jit import jit, njit_internal
 
 Rectangle = tuple[float, float, float, float]
 
+FeatureArrays = tuple[Array, Array, Array, Array, BoolArray, Array, Array, Array]
+"""Of B worlds, in the alphabetical order of their keys, see `belief_features`."""
+
 SMALLEST_STD, LARGEST_STD = 1e-3, 10.0
 """Standard deviations [m, rad] that `on_log_scale` maps to 0 and to 1."""
 
@@ -117,47 +120,56 @@ def relative_spread(
     )
 
 
+@njit_internal
+def largest_variance(covariance: Array, x: int) -> float:
+    """Compute the larger eigenvalue of the block at columns x and x + 1."""
+    xx, yy = covariance[x, x], covariance[x + 1, x + 1]
+    across = math.hypot(0.5 * (xx - yy), covariance[x, x + 1])
+    return float(0.5 * (xx + yy) + across)
+
+
+@njit_internal
+def write_belief_features(
+    b: int,
+    mean: Array,
+    covariance: Array,
+    slots: IntArray,
+    bounds: Rectangle,
+    features: FeatureArrays,
+) -> None:
+    """Write the features of one belief into row b, see `belief_features`."""
+    corr, map_std, std, landmarks, mask, poses, pose_corr, pose_std = features
+    left, bottom, right, top = bounds
+    diagonal = math.hypot(right - left, top - bottom)
+    write_pose_features(mean, covariance, bounds, poses[b], pose_corr[b], pose_std[b])
+    cos, sin = poses[b, 2], poses[b, 3]
+    for i in range(len(slots)):
+        mask[b, i] = slots[i] >= 0
+        if not mask[b, i]:
+            corr[b, i] = map_std[b, i] = 0.0
+            std[b, i] = 0.0
+            landmarks[b, i] = 0.0
+            continue
+        x = 3 + 2 * slots[i]
+        dx, dy = mean[x] - mean[0], mean[x + 1] - mean[1]
+        landmarks[b, i, 0] = _clip((cos * dx + sin * dy) / diagonal, -1.0, 1.0)
+        landmarks[b, i, 1] = _clip((cos * dy - sin * dx) / diagonal, -1.0, 1.0)
+        xx, xy, yy = relative_spread(covariance, x, dx, dy)
+        aa, ab, bb = _turned(xx, xy, yy, cos, sin)
+        ahead, aside = _root(aa), _root(bb)
+        std[b, i, 0], std[b, i, 1] = _on_log_scale(ahead), _on_log_scale(aside)
+        corr[b, i] = _correlation(ab, ahead * aside)
+        map_std[b, i] = _on_log_scale(_root(largest_variance(covariance, x)))
+
+
 @jit
-def write_features(  # noqa: PLR0917 (the outputs one by one, in order of their keys)
+def write_features(
     means: Array,
     covariances: Array,
     slots: IntArray,
     bounds: Rectangle,
-    landmark_correlation: Array,
-    landmark_map_std: Array,
-    landmark_std: Array,
-    landmarks: Array,
-    mask: BoolArray,
-    pose: Array,
-    pose_correlation: Array,
-    pose_std: Array,
+    features: FeatureArrays,
 ) -> None:
     """Write the features of all beliefs, see `belief_features`."""
-    left, bottom, right, top = bounds
-    diagonal = math.hypot(right - left, top - bottom)
     for b in range(len(means)):
-        mean, covariance = means[b], covariances[b]
-        write_pose_features(
-            mean, covariance, bounds, pose[b], pose_correlation[b], pose_std[b]
-        )
-        cos, sin = pose[b, 2], pose[b, 3]
-        for i in range(slots.shape[1]):
-            mask[b, i] = slots[b, i] >= 0
-            if not mask[b, i]:
-                landmark_correlation[b, i] = landmark_map_std[b, i] = 0.0
-                landmark_std[b, i] = 0.0
-                landmarks[b, i] = 0.0
-                continue
-            x = 3 + 2 * slots[b, i]
-            dx, dy = mean[x] - mean[0], mean[x + 1] - mean[1]
-            landmarks[b, i, 0] = _clip((cos * dx + sin * dy) / diagonal, -1.0, 1.0)
-            landmarks[b, i, 1] = _clip((cos * dy - sin * dx) / diagonal, -1.0, 1.0)
-            xx, xy, yy = relative_spread(covariance, x, dx, dy)
-            aa, ab, bb = _turned(xx, xy, yy, cos, sin)
-            ahead, aside = _root(aa), _root(bb)
-            landmark_std[b, i, 0] = _on_log_scale(ahead)
-            landmark_std[b, i, 1] = _on_log_scale(aside)
-            landmark_correlation[b, i] = _correlation(ab, ahead * aside)
-            xx, yy = covariance[x, x], covariance[x + 1, x + 1]
-            across = math.hypot(0.5 * (xx - yy), covariance[x, x + 1])
-            landmark_map_std[b, i] = _on_log_scale(_root(0.5 * (xx + yy) + across))
+        write_belief_features(b, means[b], covariances[b], slots[b], bounds, features)

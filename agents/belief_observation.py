@@ -10,9 +10,10 @@ from gymnasium.utils import RecordConstructorArgs
 
 from ..arrays import AnyArray
 from ..envs import LandmarkWorldEnv
+from ..estimator.filters.batch_results import BatchBeliefs, BatchStorage
 from ..estimator.support import argument_checks
 from ..sim_configs import Scenario
-from .belief_arrays import BeliefArrays, as_storage, belief_arrays
+from .belief_arrays import belief_storage
 from .belief_features import belief_features, belief_space, world_bounds
 from .estimator_choice import (
     BeliefOfMap,
@@ -89,7 +90,7 @@ class BeliefObservation(
         self._estimator = choose_estimator(estimator, self.scenario, estimator_options)
         self.observation_space = with_belief(env.observation_space, self._rows)
         self._belief: BeliefOfMap | None = None
-        self._beliefs: BeliefArrays | None = None
+        self._storage: BatchStorage | None = None
         self._steps = 0
 
     @property
@@ -100,11 +101,11 @@ class BeliefObservation(
         return self._belief
 
     @property
-    def beliefs(self) -> BeliefArrays:
+    def beliefs(self) -> BatchBeliefs:
         """The present belief as arrays of a fixed size, with B = 1."""
-        if self._beliefs is None:
+        if self._storage is None:
             raise gymnasium.error.ResetNeeded("call reset first: there is no belief")
-        return self._beliefs
+        return self._storage.beliefs()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -131,10 +132,10 @@ class BeliefObservation(
         self._estimator.update(observation["landmarks"][seen], ids)
         belief = checked_belief(self._estimator, self._steps)
         self._belief = belief
-        self._beliefs = belief_arrays(belief, self._rows, by_id=self._by_id)
+        self._storage = belief_storage(belief, self._rows, by_id=self._by_id)
         if self.env.render_mode is not None:
             self.env.get_wrapper_attr("show_belief")(belief)
-        features = belief_features(as_storage(self._beliefs), self._bounds)
+        features = belief_features(self._storage, self._bounds)
         return with_features(
             observation, {key: row[0] for key, row in features.items()}
         )

@@ -10,7 +10,8 @@ from gymnasium.vector.utils import batch_space
 
 from ..arrays import AnyArray, BoolArray
 from ..envs.vector.episodes import final_infos
-from .belief_arrays import BeliefArrays, beliefs_of_batch, update_filters
+from ..estimator.filters.batch_results import BatchBeliefs
+from .belief_arrays import update_filters
 from .belief_features import belief_features, world_bounds
 from .belief_observation import (
     count_landmark_rows,
@@ -91,11 +92,11 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         self._begun = False
 
     @property
-    def beliefs(self) -> BeliefArrays:
+    def beliefs(self) -> BatchBeliefs:
         """The present beliefs of the filters."""
         if not self._begun:
             raise ResetNeeded("call reset first: there are no beliefs")
-        return beliefs_of_batch(self._filters)
+        return self._filters.beliefs()
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

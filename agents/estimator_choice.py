@@ -188,14 +188,37 @@ def checked_belief(estimator: FollowingEstimator, step: int) -> BeliefOfMap:
             f"got {type(belief).__name__} without {missing[0]}"
         )
     arrays = {part: np.asarray(parts[part]) for part in _ARRAYS}
+    checked: BeliefOfMap = belief
+    if _is_sound(len(belief.landmark_ids), *arrays.values()):
+        return checked
     shapes = partial(_wrong_shape, count=len(belief.landmark_ids))
     for problem_of, error in ((shapes, TypeError), (_wrong_number, ValueError)):
         for part, array in arrays.items():
             problem = problem_of(part, array)
             if problem:
                 raise error(f"{name} must {problem} at step {step}")
-    checked: BeliefOfMap = belief
     return checked
+
+
+def _is_sound(
+    count: int,
+    pose: AnyArray,
+    pose_covariance: AnyArray,
+    landmarks: AnyArray,
+    covariance: AnyArray,
+) -> bool:
+    """Return whether shapes and numbers are certainly right: a quick look."""
+    size, finite = 3 + 2 * count, np.isfinite
+    return (
+        pose.shape == (3,)
+        and pose_covariance.shape == (3, 3)
+        and landmarks.shape == (count, 2)
+        and covariance.shape == (size, size)
+        and bool(finite(pose).all() and finite(pose_covariance).all())
+        and bool(finite(landmarks).all() and finite(covariance).all())
+        and pose_covariance.diagonal().min() >= 0.0
+        and covariance.diagonal().min() >= 0.0
+    )
 
 
 def _wrong_shape(part: str, values: AnyArray, count: int) -> str | None:

@@ -21,8 +21,9 @@ import numpy as np
 from ..arrays import Array, BoolArray
 from ..envs.angles import wrap_angle
 from ..envs.robot import displacement
+from ..estimator.filters.batch_results import BatchBeliefs
 from .agent_knowledge import AgentKnowledge
-from .belief_arrays import BeliefArrays, belief_arrays
+from .belief_arrays import belief_storage
 from .information_reward import uncertainty
 
 _STEPS = 4  # length of a candidate motion
@@ -61,9 +62,10 @@ def _value(knowledge: AgentKnowledge, action: Array) -> float:
     )
 
 
-def belief_rows(knowledge: AgentKnowledge) -> BeliefArrays:
+def belief_rows(knowledge: AgentKnowledge) -> BatchBeliefs:
     """Return the present belief as arrays."""
-    return belief_arrays(knowledge.belief, len(knowledge.known), by_id=True)
+    size = len(knowledge.known)
+    return belief_storage(knowledge.belief, size, by_id=True).beliefs()
 
 
 def _poses_ahead(knowledge: AgentKnowledge, action: Array) -> Array:
@@ -85,7 +87,7 @@ def _is_free(knowledge: AgentKnowledge, poses: Array) -> bool:
 
 def _belief_after(
     knowledge: AgentKnowledge, action: Array, poses: Array
-) -> BeliefArrays:
+) -> BatchBeliefs:
     """Return the belief after a motion; the estimator's state is restored."""
     estimator: Any = knowledge.estimator
     state = estimator.state_dict()
@@ -97,7 +99,9 @@ def _belief_after(
             readings = _expected(pose, knowledge.belief.landmarks)
             seen = _in_view(knowledge, readings)
             estimator.update(readings[seen], ids[seen].tolist())
-        after = belief_arrays(estimator.belief(), len(knowledge.known), by_id=True)
+        after = belief_storage(
+            estimator.belief(), len(knowledge.known), by_id=True
+        ).beliefs()
     finally:
         estimator.load_state_dict(state)
     return after
@@ -133,5 +137,5 @@ def _distance_to_goals(knowledge: AgentKnowledge, pose: Array) -> float:
     return float(away.min()) if len(away) else 0.0
 
 
-def _measure(knowledge: AgentKnowledge, beliefs: BeliefArrays) -> float:
+def _measure(knowledge: AgentKnowledge, beliefs: BatchBeliefs) -> float:
     return uncertainty(beliefs, "D", knowledge.prior_std).item()

@@ -25,8 +25,8 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
+from ..estimator.filters.batch_results import BatchBeliefs
 from ..sim_configs import Scenario
-from .belief_arrays import BeliefArrays
 from .belief_features import world_bounds
 from .belief_observation import BeliefObservation
 
@@ -78,12 +78,12 @@ def check_criterion(criterion: str) -> None:
         )
 
 
-def map_covariances(beliefs: BeliefArrays, prior_std: ArrayLike) -> Array:
+def map_covariances(beliefs: BatchBeliefs, prior_std: ArrayLike) -> Array:
     """Return the joint covariance of all landmarks, mapped or not.
 
     Parameters
     ----------
-    beliefs : BeliefArrays
+    beliefs : BatchBeliefs
         Of B worlds with N landmarks.
     prior_std : float or array_like, shape (2,)
         Of the coordinates of an unmapped landmark [m].
@@ -100,12 +100,12 @@ def map_covariances(beliefs: BeliefArrays, prior_std: ArrayLike) -> Array:
     return joint
 
 
-def uncertainty(beliefs: BeliefArrays, criterion: str, prior_std: ArrayLike) -> Array:
+def uncertainty(beliefs: BatchBeliefs, criterion: str, prior_std: ArrayLike) -> Array:
     """Compute the uncertainty of maps.
 
     Parameters
     ----------
-    beliefs : BeliefArrays
+    beliefs : BatchBeliefs
         Of B worlds with N landmarks.
     criterion : {"D", "A", "E"}
         D and A are divided by N, the number of landmarks.

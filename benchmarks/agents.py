@@ -31,12 +31,14 @@ from interleaved import (
 from rich.console import Console
 from rich.table import Table
 
+from slamgym.agents import ActiveSlamEnv
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.vector import FlattenBatch, to_stable_baselines
 
 Call = Callable[[], object]
 Worlds = VectorEnv[Any, Any, Any]
 ID = "slamgym/LandmarkWorld-v0"
+ACTIVE = "slamgym/ActiveSlam-v0"
 BARE = "bare Space.step"
 SINGLE = "single world"
 BARE_STEPS = 200  # per call, so that the loop around them costs nothing
@@ -66,6 +68,19 @@ def steps_of(worlds: Any, **goals: Any) -> Case:
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (count, 2))
     actions = actions.astype(np.float32)
     return Case(lambda: worlds.step(actions), count, **goals)
+
+
+def active_cases() -> dict[str, Case]:
+    """Active SLAM, resets included: many worlds, and a single one."""
+    cases = {}
+    for level, at_most in (("easy", 8.0), ("medium", 12.0), ("hard", 15.0)):
+        for count in (64, 1024):
+            name = f"ActiveSlam, {level}, {count}"
+            worlds = gymnasium.make_vec(ACTIVE, count, scenario=f"active_{level}")
+            cases[name] = steps_of(worlds, at_most=at_most)
+        env = ActiveSlamEnv(f"active_{level}")
+        cases[f"ActiveSlam, {level}, single"] = single_case(env, at_most=200.0)
+    return cases
 
 
 def native(count: int, mode: str = "NextStep", **changes: Any) -> Worlds:
@@ -111,30 +126,32 @@ def stable_baselines_cases() -> dict[str, Case]:
     }
 
 
-def single_case() -> Case:
+def single_case(env: LandmarkWorldEnv, **goals: Any) -> Case:
     """Step one world, unwrapped, as the peers are."""
-    env = LandmarkWorldEnv("six_landmarks", steps=EPISODE)
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(BARE_STEPS)]
 
     def call() -> None:
         for action in actions:
-            env.step(action)
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
 
-    return Case(call, BARE_STEPS)
+    return Case(call, BARE_STEPS, **goals)
 
 
 def main() -> int:
     peers = peer_calls()
     bare = Case(bare_steps(BARE_STEPS), BARE_STEPS)
-    cases = {BARE: bare, SINGLE: single_case()}
+    world = LandmarkWorldEnv("six_landmarks", steps=EPISODE)
+    cases = {BARE: bare, SINGLE: single_case(world)}
     cases |= {
         name: Case(call, 1, slower_than=(SINGLE, PEERS_SLOWER))
         for name, call in peers.items()
         if call is not None
     }
-    cases |= world_cases() | flat_cases() | stable_baselines_cases()
+    cases |= world_cases() | active_cases() | flat_cases() | stable_baselines_cases()
     calls = {name: case.call for name, case in cases.items()}
     per_call = time_interleaved(calls, rounds=21)
     times = {

@@ -186,19 +186,7 @@ class BatchSlam:
 
         A run that has stopped still has the belief it stopped with.
         """
-        mapped = self._slots >= 0
-        places = 3 + 2 * np.where(mapped, self._slots, 0)
-        pose = np.broadcast_to(np.arange(3), (self.runs, 3))
-        pairs = (places[:, :, None] + np.arange(2)).reshape(self.runs, -1)
-        at = np.concatenate([pose, pairs], axis=1)
-        held = np.ones(at.shape, dtype=np.bool_)
-        held[:, 3:] = np.repeat(mapped, 2, axis=1)
-        row = np.arange(self.runs)[:, None]
-        means = self._means[row, at] * held
-        covariances = self._covariances[row[:, :, None], at[:, :, None], at[:, None]]
-        covariances *= held[:, :, None] & held[:, None]
-        means[:, 2] = wrap_angle(means[:, 2])
-        return BatchBeliefs(means, covariances, mapped)
+        return self.storage().beliefs()
 
     def storage(self) -> BatchStorage:
         """Return the arrays that the runs work on, without a copy.

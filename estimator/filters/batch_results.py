@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from ...arrays import Array, BoolArray, IntArray
+from ..models.angles import wrap_angle
 
 
 class BatchTrace(NamedTuple):
@@ -30,6 +33,24 @@ class BatchBeliefs(NamedTuple):
     mapped: BoolArray
     """Which landmarks are in the map, shape (B, L)."""
 
+    @property
+    def poses(self) -> Array:
+        """(x, y, θ), shape (B, 3) [m, m, rad]."""
+        return self.means[:, :3]
+
+    @property
+    def landmarks(self) -> Array:
+        """Positions, shape (B, L, 2) [m], zeros where not mapped."""
+        return self.means[:, 3:].reshape(len(self.means), -1, 2)
+
+    @property
+    def landmark_covariances(self) -> Array:
+        """Marginal covariance of each landmark, shape (B, L, 2, 2) [m²]."""
+        count = self.mapped.shape[1]
+        blocks = self.covariances[:, 3:, 3:].reshape(-1, count, 2, count, 2)
+        each = np.arange(count)
+        return np.moveaxis(blocks[:, each, :, each, :], 0, 1)
+
 
 class BatchStorage(NamedTuple):
     """The arrays that hold the beliefs of all runs: live and read-only.
@@ -51,3 +72,19 @@ class BatchStorage(NamedTuple):
         for view in views:
             view.flags.writeable = False
         return cls(*views)
+
+    def beliefs(self) -> BatchBeliefs:
+        """Return the beliefs with the landmarks by id, as a snapshot."""
+        runs, mapped = len(self.slots), self.slots >= 0
+        places = 3 + 2 * np.where(mapped, self.slots, 0)
+        pose = np.broadcast_to(np.arange(3), (runs, 3))
+        pairs = (places[:, :, None] + np.arange(2)).reshape(runs, -1)
+        at = np.concatenate([pose, pairs], axis=1)
+        held = np.ones(at.shape, dtype=np.bool_)
+        held[:, 3:] = np.repeat(mapped, 2, axis=1)
+        row = np.arange(runs)[:, None]
+        means = self.means[row, at] * held
+        covariances = self.covariances[row[:, :, None], at[:, :, None], at[:, None]]
+        covariances *= held[:, :, None] & held[:, None]
+        means[:, 2] = wrap_angle(means[:, 2])
+        return BatchBeliefs(means, covariances, mapped)

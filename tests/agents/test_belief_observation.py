@@ -18,7 +18,7 @@ from numpy_belief_features import (
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.agents import BeliefObservation, BeliefObservationVector
-from slamgym.agents.belief_arrays import as_storage, belief_arrays
+from slamgym.agents.belief_arrays import belief_storage
 from slamgym.agents.belief_features import belief_features, world_bounds
 from slamgym.agents.belief_kernels import on_log_scale as log_scale_of_one
 from slamgym.agents.belief_kernels import write_features
@@ -138,7 +138,7 @@ def test_every_number_is_written_where_nothing_is_mapped(batch):
         np.full(row.shape, True if row.dtype == bool else np.nan)
         for row in rows.values()
     ]
-    write_features(*batch.storage(), FLOOR, *shown)
+    write_features(*batch.storage(), FLOOR, tuple(shown))
     for key, written in zip(rows, shown, strict=True):
         np.testing.assert_array_equal(written, rows[key])
         if "landmark" in key:
@@ -149,8 +149,8 @@ def test_features_do_not_depend_on_how_a_belief_is_stored(batch):
     """A batch, and each of its beliefs by itself with its landmarks in rows."""
     many = belief_features(batch.storage(), FLOOR)
     for run in range(RUNS):
-        rows = belief_arrays(batch.belief(run), LANDMARKS, by_id=True)
-        alone = belief_features(as_storage(rows), FLOOR)
+        rows = belief_storage(batch.belief(run), LANDMARKS, by_id=True)
+        alone = belief_features(rows, FLOOR)
         for key, values in many.items():
             np.testing.assert_array_equal(values[run], alone[key][0])
 
@@ -493,7 +493,7 @@ def test_a_belief_in_rows_keeps_every_number():
     slam = EkfSlam((0.1, 0.1, 0.1), (0.1, 0.1))
     slam.predict((1.0, 0.2))
     slam.update([(0.3, 2.0), (-0.3, 3.0)], landmark_ids=[4, 1])
-    rows = belief_arrays(slam.belief(), 5, by_id=True)
+    rows = belief_storage(slam.belief(), 5, by_id=True).beliefs()
     state = [0, 1, 2, 11, 12, 5, 6]
     np.testing.assert_array_equal(rows.means[0][state], slam.belief().mean)
     kept = rows.covariances[0][np.ix_(state, state)]

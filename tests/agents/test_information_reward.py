@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.agents import BeliefObservation, BeliefObservationVector, InformationReward
-from slamgym.agents.belief_arrays import belief_arrays
+from slamgym.agents.belief_arrays import belief_storage
 from slamgym.agents.information_reward import (
     CRITERIA,
     a_optimality,
@@ -66,7 +66,7 @@ def test_a_singular_covariance_has_no_entropy():
 
 
 def test_landmarks_not_yet_mapped_count_with_the_prior(slam):
-    rows = belief_arrays(slam.belief(), 4, by_id=True)
+    rows = belief_storage(slam.belief(), 4, by_id=True).beliefs()
     joint = map_covariances(rows, (3.0, 2.0))[0]
     covariance = slam.belief().covariance
     order = [5, 6, 3, 4]  # the map holds landmark 2, then landmark 0
@@ -83,9 +83,9 @@ def test_a_first_sight_is_worth_what_a_measurement_of_the_prior_is():
     """Known pose, prior N(0, σ²): the gain is the mutual information of the two."""
     prior, noise = 50.0, 0.1
     slam = EkfSlam((0, 0, 0), (noise / 2.0, noise))
-    before = belief_arrays(slam.belief(), 1, by_id=True)
+    before = belief_storage(slam.belief(), 1, by_id=True).beliefs()
     slam.update([(0.0, 2.0)], landmark_ids=[0])
-    after = belief_arrays(slam.belief(), 1, by_id=True)
+    after = belief_storage(slam.belief(), 1, by_id=True).beliefs()
     gain = uncertainty(before, "D", prior) - uncertainty(after, "D", prior)
     assert gain.item() == pytest.approx(2 * np.log(prior / noise))
 
@@ -96,7 +96,7 @@ def test_to_look_again_never_makes_a_known_pose_less_sure(criterion):
     measures = []
     for _ in range(5):
         slam.update([(0.0, 2.0), (0.5, 3.0)], landmark_ids=[0, 1])
-        rows = belief_arrays(slam.belief(), 3, by_id=True)
+        rows = belief_storage(slam.belief(), 3, by_id=True).beliefs()
         measures.append(uncertainty(rows, criterion, 5.0).item())
     if criterion == "E":  # the third landmark is still anywhere
         assert measures == [25.0] * 5
@@ -105,7 +105,7 @@ def test_to_look_again_never_makes_a_known_pose_less_sure(criterion):
 
 
 def test_measures_are_per_landmark(slam):
-    rows = belief_arrays(slam.belief(), 4, by_id=True)
+    rows = belief_storage(slam.belief(), 4, by_id=True).beliefs()
     joint = map_covariances(rows, 2.0)[0]
     for criterion, whole in (("D", d_optimality), ("A", a_optimality)):
         assert uncertainty(rows, criterion, 2.0)[0] == whole(joint) / 4
