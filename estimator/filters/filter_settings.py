@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from math import inf, log1p
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from ...arrays import Array
 from ..kernels.rules import Rules
 from ..support import argument_checks
 
@@ -38,6 +40,13 @@ def checked_rules(
         gate=_gate(gate_probability),
         noise_as_read=range_noise_at == "reading",
     )
+
+
+def reading_variances(rules: Rules, ranges: Array) -> Array:
+    """Return (σβ², σr²) of readings at these ranges [m], shape (m, 2)."""
+    range_std = rules.range_std + rules.range_std_per_metre * ranges
+    bearing_std = np.full(len(ranges), rules.bearing_std)
+    return np.column_stack([bearing_std, range_std]) ** 2
 
 
 def _gate(probability: float | None) -> float:

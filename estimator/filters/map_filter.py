@@ -68,8 +68,7 @@ class MapFilter:
         numpy.linalg.LinAlgError
             Where their distance has no uncertainty; nothing is then merged.
         """
-        argument_checks.two_landmarks(kept, gone)
-        argument_checks.mapped_identities([kept, gone], self.map.slots)
+        argument_checks.two_landmarks(kept, gone, self.map.slots)
         at_reference = self.rules.linearisation != AT_ESTIMATE
         self.map.merge(kept, gone, frame=self.frame, at_reference=at_reference)
 

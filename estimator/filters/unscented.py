@@ -14,6 +14,7 @@ from ..models.unicycle_motion import drive
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .ekf import EkfSlam
+from .filter_settings import reading_variances
 from .scan_workspace import not_positive_definite
 
 
@@ -113,7 +114,7 @@ class UnscentedSlam(EkfSlam):
         innovation = readings - expected
         innovation[:, 0] = wrap_angle(innovation[:, 0])
         at = readings if self.rules.noise_as_read else expected
-        noise = self._noise_variances(at[:, 1])
+        noise = reading_variances(self.rules, at[:, 1])
         kept = self._within_gate(innovation, spread, noise)
         rows = np.repeat(kept, 2)
         spread, nu = spread[rows], innovation.ravel()[rows]
@@ -133,14 +134,6 @@ class UnscentedSlam(EkfSlam):
             innovation=innovation[kept],
             factor=factor,
         )
-
-    def _noise_variances(self, ranges: Array) -> Array:
-        """Diagonal of Q at these ranges [m], shape (m, 2)."""
-        rules = self.rules
-        range_std = rules.range_std + rules.range_std_per_metre * ranges
-        bearing_std = np.full(len(ranges), rules.bearing_std)
-        std: Array = np.stack([bearing_std, range_std], axis=1)
-        return std**2
 
     def _within_gate(self, innovation: Array, spread: Array, noise: Array) -> BoolArray:
         if not np.isfinite(self.rules.gate):

@@ -223,7 +223,8 @@ class ManagedSlam:
         ValueError
             Where one is not in the map.
         """
-        self._recent.note_edits(self._pruner.remove(self._mapped(landmark_ids)), ())
+        ids = argument_checks.mapped_identities(landmark_ids, self._slots)
+        self._recent.note_edits(self._pruner.remove(ids), ())
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two landmarks by hand; both identities then name the first.
@@ -233,14 +234,13 @@ class ManagedSlam:
         ValueError
             Where one is not in the map, or they are the same.
         """
-        argument_checks.two_landmarks(kept, gone)
-        self._mapped([kept, gone])
+        argument_checks.two_landmarks(kept, gone, self._slots)
         self._pruner.join(kept, gone)
         self._recent.note_edits((), [(kept, gone)])
 
-    def _mapped(self, landmark_ids: LandmarkIds) -> list[int]:
-        mapped = {i: slot for slot, i in enumerate(self.landmark_ids)}
-        return argument_checks.mapped_identities(landmark_ids, mapped)
+    @property
+    def _slots(self) -> dict[int, int]:
+        return {i: slot for slot, i in enumerate(self.landmark_ids)}
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
         """Return the present belief, of the whole map or of pose and some landmarks."""

@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..filters.gaussian_map import without_landmarks
 from ..filters.landmark_merging import coincide
@@ -32,8 +31,6 @@ from ..interface import (
     SupportsRemoval,
 )
 from .map_view import hides_its_belief, view_map
-
-Array = NDArray[np.float64]
 
 
 class MapEditor(Protocol):

@@ -143,10 +143,11 @@ def mapped_identities(
     return ids
 
 
-def two_landmarks(kept: int, gone: int) -> None:
-    """Refuse to make one landmark of one."""
+def two_landmarks(kept: int, gone: int, mapped: Mapping[int, int]) -> list[int]:
+    """Return the ids of two different landmarks of a map."""
     if kept == gone:
         raise ValueError(f"kept and gone must be two landmarks, got {kept} twice")
+    return mapped_identities([kept, gone], mapped)
 
 
 def refuse_not_finite(readings: Array) -> None:

@@ -173,8 +173,7 @@ class CompressedEkfSlam:
         ValueError
             If one is not in the map or both are the same; nothing is then merged.
         """
-        argument_checks.two_landmarks(kept, gone)
-        ids = argument_checks.mapped_identities([kept, gone], self._map.slots)
+        ids = argument_checks.two_landmarks(kept, gone, self._map.slots)
         local = self._map.local
         if not all(i in local for i in ids):
             self._map.change_local_map(ids, max(self._local_size or 0, len(local), 2))

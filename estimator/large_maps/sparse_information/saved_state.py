@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ....arrays import IntArray
 from ...support import argument_checks
@@ -13,8 +12,6 @@ from ..sparse_cholesky.schur_complement import Factor, SchurComplement, SubsetFa
 from .conditional_pose import ConditionalPose
 from .local_information import FixedLandmarks, LocalInformation, SparseMap
 from .sparse_belief import SparseBelief
-
-Array = NDArray[np.float64]
 
 _PARTS = {
     "matrix": ("counts", "links", "blocks"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +10,8 @@ from scipy.linalg import lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...filters.ekf import EkfSlam
+from ...filters.filter_settings import reading_variances
+from ...filters.motion_noise import MotionNoise
 from ...filters.scan_workspace import not_positive_definite
 from ...support import argument_checks
 from .conditional_pose import ConditionalPose, LinearScan, marginalise_pose
@@ -55,28 +56,14 @@ class ScanRules:
         }
         if unknown:
             raise TypeError(f"SparseInformationSlam has no option {min(unknown)!r}")
-        checked = EkfSlam(motion_std, measurement_std, **settings)
-        self.rules = checked.rules
-        self._motion_values = checked.motion_values
+        self.rules = EkfSlam(motion_std, measurement_std, **settings).rules
+        at_rest = settings.get("noise_at_rest", True)
+        self.motion_noise = MotionNoise.checked(motion_std, at_rest)
         if min(self.rules.bearing_std, self.rules.range_std) <= 0:
             raise ValueError(
                 "measurement_std must be 2 finite numbers > 0, because an exact "
                 f"measurement has infinite information, got {measurement_std!r}"
             )
-
-    def motion_variance(self, distance: float, turn: float, dt: float) -> Array:
-        """Return (σx², σy², σα²) of a motion, shape (3,)."""
-        if not (isfinite(dt) and dt >= 0):
-            raise ValueError(f"dt must be a finite number >= 0, got {dt!r}")
-        moves = distance or turn or self._motion_values[3]
-        return self._motion_values[:3] * (dt if moves else 0.0)
-
-    def variance(self, distance: Array) -> Array:
-        """Return the diagonal of Q at these ranges, shape (n, 2)."""
-        rules = self.rules
-        range_std = rules.range_std + rules.range_std_per_metre * distance
-        bearing = np.full(len(distance), rules.bearing_std)
-        return np.column_stack([bearing, range_std]) ** 2
 
     def screen(
         self,
@@ -95,7 +82,7 @@ class ScanRules:
         kept = ~skipped
         places, readings = places[kept], readings[kept]
         at = readings[:, 1] if self.rules.noise_as_read else expected[kept]
-        variance = self.variance(at)
+        variance = reading_variances(self.rules, at)
         scan = linearise_scan(self.base, local, pose, places, readings, variance)
         S = _innovation_covariance(pose, local, scan)
         blocks = np.array(

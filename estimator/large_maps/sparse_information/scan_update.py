@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ....arrays import Array, IntArray
+from ...filters.filter_settings import reading_variances
 from ...interface import UpdateReport
 from .conditional_pose import ConditionalPose
 from .local_information import LocalInformation
@@ -75,7 +76,7 @@ def process_scan(
     local, pose = state
     seen, added = screened.scan.landmarks, free_slots[: len(new)]
     if len(new):
-        variance = rules.variance(readings[new, 1])
+        variance = reading_variances(rules.rules, readings[new, 1])
         local, pose = add_landmarks(rules.base, state, added, readings[new], variance)
         count = len(local.slots)
         seen = np.append(seen, np.arange(count - len(new), count))

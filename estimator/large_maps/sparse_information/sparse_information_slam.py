@@ -123,7 +123,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
         distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._scan_rules.motion_variance(distance, turn, dt)
+        variance = self._scan_rules.motion_noise.over(distance, turn, dt)
         self._belief.pose = move(
             self._belief.pose,
             np.array([distance, turn]),
@@ -196,8 +196,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             If one is not in the map or both are the same; nothing is then merged.
         """
-        argument_checks.two_landmarks(kept, gone)
-        argument_checks.mapped_identities([kept, gone], self._belief.slots)
+        argument_checks.two_landmarks(kept, gone, self._belief.slots)
         self._belief.merge(kept, gone, exact=self._is_exact)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:

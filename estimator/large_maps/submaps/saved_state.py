@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ....arrays import IntArray
 from ...support import argument_checks
@@ -16,8 +15,6 @@ from .graph import SubmapGraph
 from .landmark_index import LandmarkIndex, refuse_link_names, slot_of_link
 from .merging import merged
 from .store import FolderStore, MemoryStore, Submap, SubmapStore
-
-Array = NDArray[np.float64]
 
 SHAPES = {
     "start": (4, 3),

@@ -222,8 +222,7 @@ class SubmapSlam(SubmapQueries):
         numpy.linalg.LinAlgError
             If the covariance of their distance is singular; nothing is then merged.
         """
-        argument_checks.two_landmarks(kept, gone)
-        argument_checks.mapped_identities([kept, gone], self._graph.index)
+        argument_checks.two_landmarks(kept, gone, self._graph.index)
         self._claim_folder()
         self._graph.merge(kept, gone)
         self._neighbourhood.merge(kept, gone)
