@@ -1,15 +1,15 @@
-"""Landmarks seen too rarely to be believed, kept outside the map until they are.
+"""Tentative landmarks: seen too rarely to be in the map, and kept outside it.
 
-Each is a place q in the robot's own frame with a covariance C, which odometry and
-further sightings move::
+Each has a position q in the robot's frame with a covariance C.  Odometry and further
+sightings change both::
 
     predict   q ← R(−α) (q − (d, 0)),   C ← R(−α) (C + diag(σx², σy²)) R(α)
               C ← C + σα² (J q) (J q)ᵀ
     sighting  H = ∂(β, r)/∂q,   S = H C Hᵀ + Q
               q ← q + C Hᵀ S⁻¹ ν,   C ← C − C Hᵀ S⁻¹ H C
 
-so that the filter's belief, its jumps and its frame have no part in it, and nothing
-has to be taken back when a landmark turns out to be none.
+They do not depend on the belief of the filter or its frame.  A tentative landmark that
+is never confirmed leaves the belief unchanged.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ Masks = NDArray[np.uint64]
 
 
 class TentativeLandmarks(NamedTuple):
-    """Some tentative landmarks; methods return what becomes of them.
+    """Tentative landmarks; methods return changed copies.
 
     Examples
     --------
@@ -44,13 +44,13 @@ class TentativeLandmarks(NamedTuple):
     covariances: Array
     """C, shape (t, 2, 2) [m²]."""
     seen: Masks
-    """Of each a bit per scan, the latest scan lowest: whether it was seen there."""
+    """One bit per scan, the latest scan lowest: whether the landmark was seen, (t,)."""
     labels: IntArray
-    """Number of each, different from those of all others before."""
+    """Unique number of each, shape (t,)."""
 
     @classmethod
     def none(cls) -> "TentativeLandmarks":
-        """Start without any."""
+        """Return no tentative landmarks."""
         return cls(
             np.empty((0, 2)),
             np.empty((0, 2, 2)),
@@ -60,7 +60,7 @@ class TentativeLandmarks(NamedTuple):
 
     @property
     def sightings(self) -> IntArray:
-        """How often each was seen within the scans that count, shape (t,)."""
+        """Number of sightings of each within the scans that count, shape (t,)."""
         return np.bitwise_count(self.seen).astype(np.int64)
 
     def moved(
@@ -77,7 +77,7 @@ class TentativeLandmarks(NamedTuple):
         return self._replace(places=places, covariances=spread)
 
     def next_scan(self, scans: int) -> "TentativeLandmarks":
-        """Begin a scan: forget sightings that are ``scans`` old, then who has none."""
+        """Begin a scan: drop sightings ``scans`` old, then landmarks without any."""
         if not len(self.seen):
             return self
         window = np.uint64((1 << scans) - 1)
@@ -85,7 +85,7 @@ class TentativeLandmarks(NamedTuple):
         return self._replace(seen=seen).chosen(seen > 0)
 
     def distances(self, readings: Array, noise: Noise, largest: float) -> Distances:
-        """Compare readings with all, see :func:`innovation_distances`."""
+        """Compare readings with all landmarks; see :func:`innovation_distances`."""
         t = len(self.seen)
         mean, covariance = np.zeros(3 + 2 * t), np.zeros((3 + 2 * t, 3 + 2 * t))
         mean[3:] = self.places.ravel()
@@ -96,7 +96,7 @@ class TentativeLandmarks(NamedTuple):
     def with_sighting(
         self, which: int, reading: Array, noise: Noise
     ) -> "TentativeLandmarks":
-        """Correct a place by one more reading (β, r) of it."""
+        """Correct one landmark by another reading (β, r) of it."""
         (x, y), C = self.places[which], self.covariances[which]
         distance = np.hypot(x, y)
         H = np.array(
@@ -117,7 +117,7 @@ class TentativeLandmarks(NamedTuple):
     def with_new(
         self, readings: Array, noise: Noise, labels: IntArray
     ) -> "TentativeLandmarks":
-        """Add what was seen for the first time in rows (β, r)."""
+        """Add landmarks seen for the first time, by their readings, rows (β, r)."""
         if not len(readings):
             return self
         places, spread = [], []
@@ -135,7 +135,7 @@ class TentativeLandmarks(NamedTuple):
         )
 
     def chosen(self, which: BoolArray) -> "TentativeLandmarks":
-        """Keep some of them."""
+        """Return some of them."""
         if which.all():
             return self
         return TentativeLandmarks(
@@ -147,6 +147,6 @@ class TentativeLandmarks(NamedTuple):
 
 
 def _variances(reading: Array, noise: Noise) -> tuple[float, float]:
-    """Of bearing and range of a reading."""
+    """Return the variances of bearing and range of a reading."""
     bearing_std, range_std, per_metre = noise
     return bearing_std**2, float(range_std + per_metre * reading[1]) ** 2

@@ -1,4 +1,4 @@
-"""The robocentric EKF-SLAM: the map lives in the robot's own frame."""
+"""Robocentric EKF-SLAM: the map is estimated in the robot's frame."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from ..support.jit import jit, njit_internal
 from ..update_report import UpdateReport
 from .ekf import EkfSlam
 
-# The state of the shared kernels here: the way since the last scan where they keep the
-# pose, the origin of the world (x, y), its heading and a zero where they keep the first
-# two landmarks, then the landmarks, all in the robot's frame at the last scan.
+# The state that the kernels see, in the robot's frame at the last scan: the motion
+# since that scan in place of the pose; the world's origin (x, y), its heading and a
+# zero in place of the first two landmarks; then the landmarks.
 ORIGIN, HEADING, FIRST_LANDMARK = 3, 5, 7
-RESERVED = (-(2**63), 1 - 2**63)  # ids that hold these two places
+RESERVED = (-(2**63), 1 - 2**63)  # ids of these two places
 
 
 class RobocentricEkfSlam(EkfSlam):
     """EKF-SLAM with world origin and landmarks estimated in the robot's frame.
 
-    After Castellanos et al. [1]_.  Between scans only the way w = (x, y, θ) driven
-    since the last one is estimated, starting from zero with no uncertainty; a scan is
-    linearised at w and the map in the frame of the last scan, and then the frame moves
-    along: every point q and the world's heading φ in the robot's frame become::
+    After Castellanos et al. [1]_.  Between scans, the filter estimates only the motion
+    w = (x, y, θ) since the last scan, which starts at zero without uncertainty.  A scan
+    is linearised at w and the map in the frame of the last scan.  Then the frame moves
+    to the robot.  Every point q and the world's heading φ in the robot's frame become::
 
         q ← R(−θ_w) (q − (x_w, y_w)),    φ ← φ − θ_w,    w ← 0
 
-    so no Jacobian is taken at an absolute pose.  The heading stays consistent; in long
-    loops the covariance of the map does not.  Beliefs are mapped to the world's frame.
+    Therefore no Jacobian depends on an absolute pose.  The heading stays consistent;
+    the covariance of the map does not in long loops.  Beliefs are in the world's frame.
 
     Parameters are those of :class:`EkfSlam`.
 
@@ -60,7 +60,7 @@ class RobocentricEkfSlam(EkfSlam):
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
-        """Correct map and way with one scan, then move the frame to the robot."""
+        """Correct map and motion with one scan, then move the frame to the robot."""
         given = () if landmark_ids is None else landmark_ids
         if not set(RESERVED).isdisjoint(np.ravel(given).tolist()):
             raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
@@ -101,10 +101,10 @@ class RobocentricEkfSlam(EkfSlam):
 
 @jit
 def move_frame(mean: Array, covariance: Array, size: int) -> None:
-    """Express all in the robot's present frame: x ← f(x), P ← T P Tᵀ, in O(size²).
+    """Move the frame to the robot: x ← f(x), P ← T P Tᵀ, in O(size²).
 
-    T turns every pair of rows by −θ_w, after taking from it the rows of (x_w, y_w), and
-    takes J q⁺ times the row of θ_w from it.
+    T subtracts the rows of (x_w, y_w) from every pair of rows, rotates the pair by
+    −θ_w, and subtracts J q⁺ times the row of θ_w.
     """
     c, s = np.cos(mean[2]), np.sin(mean[2])
     for i in range(ORIGIN, size, 2):
@@ -133,7 +133,7 @@ def _transpose(covariance: Array, size: int) -> None:
 
 @njit_internal
 def _turn_rows(mean: Array, covariance: Array, size: int, c: float, s: float) -> None:
-    """P ← T P, but for the rows of the way, which come to nothing."""
+    """P ← T P, except for the rows of the motion, which become zero."""
     for i in range(ORIGIN, size, 2):
         if i == HEADING:
             for j in range(size):
@@ -150,9 +150,9 @@ def _turn_rows(mean: Array, covariance: Array, size: int, c: float, s: float) ->
 
 
 def _in_world(state: Array) -> tuple[Array, Array]:
-    """Bring a robot-centred state to the world's frame, with the derivative.
+    """Transform a robocentric state to the world's frame; return its Jacobian too.
 
-    A point q lies at R(−φ) (q − o), the robot's heading is θ_w − φ.
+    A point q lies at R(−φ) (q − o), and the robot's heading is θ_w − φ.
     """
     origin, heading = state[ORIGIN:HEADING], state[HEADING]
     c, s = np.cos(heading), np.sin(heading)
@@ -172,7 +172,7 @@ def _in_world(state: Array) -> tuple[Array, Array]:
 
 
 def _inverse_pose(pose: Array) -> tuple[Array, Array]:
-    """Return the world seen from the robot, and its derivative by the pose."""
+    """Return the pose of the world in the robot's frame and its Jacobian."""
     x, y, heading = pose
     c, s = np.cos(heading), np.sin(heading)
     inverse = np.array([-c * x - s * y, s * x - c * y, -heading])

@@ -1,4 +1,4 @@
-"""Moving columns and rows between the arrays of a map and a local map, compiled."""
+"""Copy rows and columns between the arrays of a map and a local map, compiled."""
 
 from ....arrays import Array, IntArray
 from ...support.jit import jit
@@ -8,7 +8,7 @@ from ...support.jit import jit
 def read_columns(block: Array, first: int, columns: IntArray, rows: Array) -> None:
     """Copy some columns of a block into rows (c, width), from column ``first`` on.
 
-    Row by row: neighbours lie in one cache line.
+    The copy runs row by row, because neighbours share a cache line.
     """
     for i in range(len(block)):
         for j in range(len(columns)):
@@ -19,7 +19,7 @@ def read_columns(block: Array, first: int, columns: IntArray, rows: Array) -> No
 def write_columns(
     block: Array, first: int, columns: IntArray, rows: Array, places: IntArray
 ) -> None:
-    """Copy rows, those at ``places``, from column ``first`` on, into some columns."""
+    """Copy the rows at ``places``, from column ``first`` on, into some columns."""
     for i in range(len(block)):
         for j in range(len(columns)):
             block[i, columns[j]] = rows[places[j], first + i]
@@ -29,19 +29,19 @@ def write_columns(
 def fill_extended(
     covariance: Array, before: int, pose: Array, rows: Array, virtual: int, step: int
 ) -> None:
-    """Put a local map into the covariance of a filter, extended by what is deferred.
+    """Put a local map and the extension of a phase into the covariance of a filter.
 
     Parameters
     ----------
     covariance : ndarray, shape (capacity, capacity)
-        Overwritten; of its first ``before`` rows and columns something was in use.
+        Overwritten; its first ``before`` rows and columns were in use.
     pose : ndarray, shape (3, 3)
         Covariance of the pose.
     rows : ndarray, shape (a, a - 3)
-        That of pose and local landmarks with the landmarks, of which the lower half
-        of the last a - 3 rows counts.
+        Covariance of pose and local landmarks with the local landmarks.  Of the last
+        a - 3 rows, only the lower half is used.
     virtual, step : int
-        Columns of the extension, of which each real coordinate has every ``step``-th.
+        Number of columns of the extension; every ``step``-th belongs to a coordinate.
     """
     size = max(before, len(rows) + virtual)
     covariance[:size, :size] = 0.0
@@ -59,7 +59,7 @@ def fill_extended(
 
 @jit
 def unpivot(factor: Array, places: IntArray, rows: Array) -> None:
-    """Move an upper triangular factor's columns to their places, its first rows."""
+    """Copy the first rows of a triangular factor, its columns to their places."""
     for i in range(len(rows)):
         for j in range(i, len(places)):
             rows[i, places[j]] = factor[i, j]
