@@ -1,6 +1,7 @@
 """The Monte Carlo runner: same bits however it is run, and what it says of rubbish."""
 
 import errno
+import json
 import os
 import resource
 import signal
@@ -20,9 +21,10 @@ import xarray as xr
 
 from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, make_estimator
+from slamgym.evaluation import AssociationScores, Gospa
 from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.logs.recording import record_episode
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
 from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
 from slamgym.experiments.monte_carlo.measure.filtered_runs import filter_runs
 from slamgym.experiments.monte_carlo.measure.run_measures import (
@@ -30,6 +32,8 @@ from slamgym.experiments.monte_carlo.measure.run_measures import (
     VARIABLES,
     measure_runs,
 )
+from slamgym.experiments.monte_carlo.report.html_report import html_report
+from slamgym.experiments.monte_carlo.report.table import measures
 from slamgym.experiments.monte_carlo.store.result_blocks import merge_blocks
 from slamgym.experiments.monte_carlo.store.results import load_results
 from slamgym.experiments.runs.filter_settings import settings_for, settings_for_scenario
@@ -56,6 +60,38 @@ class CrashesAtTimes(OneByOne):
         if self.belief().landmarks[0, 0] < 2.9:
             raise RuntimeError("a wheel came off")
         return report
+
+
+class Associates:
+    """An estimator with an association of its own, hidden in another class."""
+
+    def __init__(self, **options):
+        self._slam = make_estimator("ekf", **options, management=True)
+
+    def reset(self, pose, pose_std):
+        self._slam.reset(pose, pose_std)
+
+    def predict(self, odometry, dt=1.0):
+        self._slam.predict(odometry, dt)
+
+    def update(self, measurements, landmark_ids=None):
+        return self._slam.update(measurements, landmark_ids)
+
+    def belief(self):
+        return self._slam.belief()
+
+    def state_dict(self):
+        return self._slam.state_dict()
+
+    def load_state_dict(self, state):
+        self._slam.load_state_dict(state)
+
+
+class SaysNothing(Associates):
+    """The same, with reports that name no rows."""
+
+    def update(self, measurements, landmark_ids=None):
+        return super().update(measurements, landmark_ids).replace(row_ids=())
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +205,65 @@ def test_lost_runs_are_told_by_the_same_filter_with_known_identities(hidden):
             twin.ate.sel(estimator="invariant"),
             rtol=1e-12,
         )
+
+
+def test_the_summary_holds_the_scores_of_association(hidden):
+    entry = summarise_monte_carlo(hidden)["estimators"]["managed"]
+    scores, row = entry["association"], hidden.sel(estimator="managed")
+    for name in (*AssociationScores._fields, "precision", "recall"):
+        assert scores[name] == pytest.approx(float(row[f"association_{name}"].mean()))
+    for part in Gospa._fields:
+        expected = float(row[f"gospa_aligned_{part}"].mean())
+        assert scores["gospa"]["aligned"][part] == pytest.approx(expected)
+    assert scores["median_ate"]["hidden"] == float(row.ate.median())
+    assert scores["median_ate"]["known"] == float(row.known_ids_ate.median())
+    assert json.loads(json.dumps(entry, allow_nan=False)) == entry
+
+
+def test_runs_worse_by_a_metre_than_with_known_identities_and_failed_ones_are_bad(
+    hidden,
+):
+    results = hidden.copy(deep=True)
+    results["ate"].loc[{"estimator": "managed", "run": 0}] = 1.1 + float(
+        results.known_ids_ate.sel(estimator="managed", run=0)
+    )
+    results["failed"].loc[{"estimator": "managed", "run": 1}] = True
+    summary = summarise_monte_carlo(results)
+    bad = summary["estimators"]["managed"]["association"]["bad_runs"]
+    assert bad == {"count": 2, "share": 2 / 3, "margin": 1.0}
+    assert summary["estimators"]["default"]["association"]["bad_runs"]["count"] == 0
+
+
+def test_a_report_shows_association_only_where_identities_are_hidden(hidden, whole):
+    rows = [measure.name for measure in measures(summarise_monte_carlo(hidden))]
+    assert {"precision", "recall", "… duplicates"} <= set(rows)
+    assert not {"precision", "recall"} & {
+        measure.name for measure in measures(summarise_monte_carlo(whole))
+    }
+    page = html_report(hidden, summarise_monte_carlo(hidden))
+    assert "precision" in page
+    assert "above that of the same filter with known identities" in page
+
+
+def test_landmarks_nearer_than_the_resolution_are_one_place():
+    world = load_scenario("hidden_identities").with_changes(steps=20)
+    coarse = monte_carlo(world, "ekf", 1, resolution=100.0)
+    assert coarse.association_true_map_size.item() == 1
+    assert coarse.association_new_correct.item() == 1
+    assert coarse.association_duplicate.item() == coarse.association_map_size - 1 > 2
+    assert coarse.attrs["resolution"] == 100.0
+
+
+def test_an_estimator_that_associates_by_itself_is_scored_by_its_reports():
+    world = load_scenario("hidden_identities").with_changes(steps=20)
+    unmanaged = {"management": False}
+    own = {"own": (Associates, unmanaged), "silent": (SaysNothing, unmanaged)}
+    results = monte_carlo(world, own, 1)
+    assert not results.failed.any()
+    own, silent = (results.sel(estimator=label, run=0) for label in ("own", "silent"))
+    assert own.association_correct > 20
+    assert np.isnan(silent.association_correct)
+    assert np.isnan(silent.landmark_rmse)
 
 
 def test_the_ideal_filter_is_told_the_truth():

@@ -27,6 +27,7 @@ from slamgym.experiments.monte_carlo.report.scores import scores_of
 from slamgym.experiments.monte_carlo.report.summary import summarise_monte_carlo
 from slamgym.experiments.monte_carlo.report.table import measures, monte_carlo_table
 from slamgym.experiments.monte_carlo.report.verdict import KINDS, judge
+from slamgym.experiments.monte_carlo.report.warnings import run_warnings
 from slamgym.sim_configs import load_scenario
 
 FAILURES = (
@@ -475,3 +476,22 @@ def test_no_two_of_many_estimators_look_alike():
     assert len({(look.colour, str(look.dashes)) for look in looks}) == 30
     neighbours = itertools.pairwise(str(look.dashes) for look in looks)
     assert all(one != two for one, two in neighbours)
+
+
+def test_warnings_name_unused_readings_and_innovations_of_another_size():
+    entry = {"good_runs": 40, "failure_groups": [], "unused_readings": 0.12, "nis": 3.0}
+    first, second = run_warnings({"ekf": entry}, 40)
+    assert first.startswith("ekf: 12% of the readings corrected nothing")
+    assert "NIS is 3 per degree of freedom" in second
+    managed = entry | {"options": {"management": True}, "nis": 1.0}
+    assert run_warnings({"ekf": managed}, 40) == []
+    split = {"map_size": 25.0, "true_map_size": 20.0}
+    (warning,) = run_warnings({"ekf": managed | {"association": split}}, 40)
+    assert "25.0 landmarks on average where 20.0 were seen" in warning
+
+
+def test_readings_that_a_gate_rejects_are_counted():
+    results = monte_carlo("six_landmarks", "ekf[gate_probability=0.5],ekf", 20)
+    strict, loose = summarise_monte_carlo(results)["estimators"].values()
+    assert loose["unused_readings"] == 0.0
+    assert 0.4 < strict["unused_readings"] < 0.9

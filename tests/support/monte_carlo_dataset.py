@@ -107,6 +107,7 @@ def at_the_end(drives, trace, batch):
     found = {name: (dims[name], np.array([row[name] for row in rows])) for name in dims}
     found["failed"] = RUN, batch.failed_at >= 0
     found["failed_at"] = RUN, np.asarray(batch.failed_at)
+    found["readings"] = RUN, drives.visible.sum(axis=(1, 2))
     found["message"] = RUN, np.full(batch.runs, "", dtype=object)
     return found
 

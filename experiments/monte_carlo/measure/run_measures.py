@@ -45,6 +45,7 @@ VARIABLES: dict[str, Variable] = {
     "heading_nees": Variable(STEP, "f8", "NEES of the heading, 1 degree, any frame"),
     "nis": Variable(STEP, "f8", "NIS of the scan"),
     "nis_dof": Variable(STEP, "i8", "its degrees of freedom"),
+    "readings": Variable(RUN, "i8", "number of readings"),
     "position_error": Variable(STEP, "f8", "distance to the true position [m]"),
     "heading_error": Variable(STEP, "f8", "true minus estimated heading [rad]"),
     "heading_std": Variable(STEP, "f8", "claimed deviation of the heading [rad]"),
@@ -114,6 +115,7 @@ def measure_runs(
             measured |= map_measures
         for name, value in measured.items():
             block[name][run] = value
+    block["readings"] = runs.visible.sum(axis=(1, 2))
     _write_failures(block, failures)
     return block
 

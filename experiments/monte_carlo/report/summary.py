@@ -10,6 +10,7 @@ from ....estimator.error_frames import ErrorFrame
 from ....evaluation.chi_square import average_band
 from ....evaluation.consistency_report import ConsistencyReport, evaluate_consistency
 from ...runs.nan_statistics import finite, mean, quotient, root_mean_square
+from ..measure.association_measures import KNOWN_IDS_ATE
 from .association import association_summary
 from .decision_entries import decisions_table
 from .scores import (
@@ -114,7 +115,9 @@ def summarise_estimator(
         ``heading_std_end``, ``{claimed, true}`` [rad]; ``rmse`` of position [m] and
         heading [rad]; ``ate`` and ``landmark_rmse``, ``{raw, aligned}`` [m];
         ``landmark_mahalanobis``, root mean square; ``area`` of the 3σ ellipses at the
-        end [m²]; ``association``, see :func:`.association.association_summary`.
+        end [m²]; ``association``, see :func:`.association.association_summary`;
+        ``unused_readings``, the share of readings of known identity that corrected
+        nothing and added no landmark, None where identities are hidden.
     """
     heading = _heading_std_end(scores)
     per_run = scores.ratios(frame).mean(axis=1)
@@ -152,6 +155,7 @@ def summarise_estimator(
             "landmark": mean(scores.per_run("landmark_area")),
         },
         "association": association_summary(scores),
+        "unused_readings": _unused_readings(scores),
     }
 
 
@@ -253,6 +257,16 @@ def _nees_at_the_end(
         "landmarks": quotient(each, np.full(each.shape, POINT_FREEDOM)),
         "relative_map": quotient(relative, scores.per_run("relative_map_dof")),
     }
+
+
+def _unused_readings(scores: EstimatorScores) -> float | None:
+    """Divide the readings that a gate or the least range rejected by all readings."""
+    if KNOWN_IDS_ATE in scores.results:
+        return None
+    corrected = scores.per_run("nis_dof").sum(axis=1) / 2
+    added = scores.per_run("relative_map_dof") / 2
+    readings = scores.per_run("readings")
+    return quotient(readings - corrected - added, readings)
 
 
 def _heading_std_end(scores: EstimatorScores) -> dict[str, float | None]:

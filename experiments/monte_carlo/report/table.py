@@ -109,7 +109,7 @@ def _association_measures(summary: dict[str, Any]) -> list[Measure]:
         Measure("precision", "1", at("precision", write=share)),
         Measure("recall", "1", at("recall", write=share)),
         Measure(
-            f"bad runs of {runs}",
+            f"lost or failed runs of {runs}",
             "0",
             lambda entry: str(entry["association"]["bad_runs"]["count"]),
         ),
@@ -152,7 +152,7 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
             f"{summary['scenario']}: {summary['runs']} runs of {summary['steps']} "
             f"steps, seed {summary['seed']}"
         ),
-        caption="Averages over runs and steps; heading and RMSE are root mean squares.",
+        caption=_caption(entries),
         pad_edge=False,
         box=None,
     )
@@ -168,6 +168,22 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
         cells = [Text(measure.of(entry)) for entry in entries.values()]
         table.add_row(Text(measure.name), Text(measure.right), *cells)
     return table
+
+
+def _caption(entries: dict[str, Entry]) -> str:
+    text = "Averages over runs and steps; heading and RMSE are root mean squares."
+    scores = next((entry["association"] for entry in entries.values()), None)
+    if scores is None:
+        return text
+    return f"{text} {lost_run_text(scores)}"
+
+
+def lost_run_text(scores: dict[str, Any]) -> str:
+    """Write what a lost run is."""
+    return (
+        f"A run is lost if its path error is more than {scores['bad_runs']['margin']:g}"
+        " m above that of the same filter with known identities."
+    )
 
 
 def number(value: float) -> str:

@@ -1,11 +1,15 @@
 """Warnings about the results of a Monte Carlo: too few runs, and failed runs."""
 
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from ....evaluation.consistency_report import FEW_RUNS
+from ...runs.run_warnings import MOST_REJECTED, NIS_RANGE
 from .scores import FailedRun
+
+LARGE_MAP = 1.2
+"""Ratio of map sizes above which a map is split."""
 
 _MOST_GROUPS = 3
 _LETTERS = 160  # of a message
@@ -38,7 +42,8 @@ def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[st
     Parameters
     ----------
     entries : mapping
-        By label, each with ``good_runs`` and ``failure_groups``.
+        By label, each with ``good_runs`` and ``failure_groups``, and perhaps ``nis``,
+        ``unused_readings`` and ``association``.
     runs : int
         Number of all runs.
 
@@ -59,6 +64,8 @@ def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[st
     """
     failed = {label: _failed(label, entry, runs) for label, entry in entries.items()}
     found = [sentence for sentence in failed.values() if sentence]
+    for label, entry in entries.items():
+        found += [f"{label}: {text}" for text in _suspicions(entry) if text]
     if runs < FEW_RUNS:
         found.append(f"Only {runs} runs: below {FEW_RUNS} little can be shown.")
         return found
@@ -69,6 +76,30 @@ def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[st
                 f"{FEW_RUNS} little can be shown."
             )
     return found
+
+
+def _suspicions(entry: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the numbers of an estimator give away, empty for nothing."""
+    unused, nis = entry.get("unused_readings") or 0.0, entry.get("nis")
+    is_managed = "management" in entry.get("options", {})  # it may leave readings out
+    if unused > MOST_REJECTED and not is_managed:
+        yield (
+            f"{unused:.0%} of the readings corrected nothing, rejected by a gate or "
+            "too near: such a filter may starve."
+        )
+    if nis is not None and not NIS_RANGE[0] <= nis <= NIS_RANGE[1]:
+        amount = "too much" if nis < 1 else "too little"
+        yield (
+            f"NIS is {nis:.3g} per degree of freedom: the filter assumes {amount} "
+            "noise, or associates wrongly."
+        )
+    scores = entry.get("association") or {}
+    size, true_size = scores.get("map_size"), scores.get("true_map_size")
+    if size and true_size and size > LARGE_MAP * true_size:
+        yield (
+            f"the map has {size:.1f} landmarks on average where {true_size:.1f} were "
+            "seen: it is split."
+        )
 
 
 def _failed(label: str, entry: Mapping[str, Any], runs: int) -> str:
