@@ -49,8 +49,16 @@ def sb3():
     return library
 
 
+REPORT = "slamgym.experiments.monte_carlo.report.html_report"
+
+
 @pytest.fixture
 def _no_figures_in_reports(monkeypatch):
     """Leave out of report.html what takes most of its time, where only words count."""
-    page = "slamgym.experiments.monte_carlo.report.html_report"
-    monkeypatch.setattr(f"{page}.report_figures", lambda *_: {})
+    monkeypatch.setattr(f"{REPORT}.report_figures", lambda *_: {})
+
+
+@pytest.fixture
+def _figures_in_reports_are_blank(monkeypatch):
+    """Make the figures of report.html, but do not render them."""
+    monkeypatch.setattr(f"{REPORT}.inline_svg", lambda *_: "")

@@ -73,6 +73,11 @@ def hostile_results():
 
 
 @pytest.fixture(scope="module")
+def hostile_page():
+    return page_of(hostile_results())
+
+
+@pytest.fixture(scope="module")
 def report(tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "report.html"
     dataset = with_failures(typical(), [("ekf", 3, 12, "LinAlgError: <lost>")])
@@ -98,6 +103,7 @@ def test_the_page_says_verdicts_numbers_and_how_to_do_it_again(report):
     assert outline.texts.index("ekf") < text.index("In numbers")
 
 
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_numbers_on_the_page_are_those_of_the_summary():
     dataset = typical()
     page = page_of(dataset)
@@ -152,15 +158,14 @@ def test_the_page_asks_for_nothing_and_runs_nothing(report):
 
 
 @pytest.mark.slow
-def test_whatever_names_and_messages_hold_is_shown_as_text():
-    page = page_of(hostile_results())
-    outline = Outline(page)
+def test_whatever_names_and_messages_hold_is_shown_as_text(hostile_page):
+    outline = Outline(hostile_page)
     assert not outline.open
     assert "script" not in {tag for tag, _ in outline.elements}
     shown = [text.replace("\xa0", " ") for text in outline.texts]
     assert sum(HOSTILE in text for text in shown) >= 8
-    assert html.escape(HOSTILE).replace(" %", "&nbsp;%") in page
-    drawn = re.findall(r"<text[^>]*>([^<]*)</text>", page)
+    assert html.escape(HOSTILE).replace(" %", "&nbsp;%") in hostile_page
+    drawn = re.findall(r"<text[^>]*>([^<]*)</text>", hostile_page)
     assert HOSTILE in map(html.unescape, drawn)
 
 
@@ -238,7 +243,7 @@ def test_the_same_results_give_the_same_bytes():
     assert page_of(typical()) == page_of(typical().copy(deep=True))
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_a_failure_leaves_the_old_report(report, tmp_path, monkeypatch):
     path = tmp_path / "report.html"
     path.write_text("old")
@@ -286,9 +291,9 @@ def test_chromium_asks_the_network_for_nothing(report, tmp_path):
 
 @pytest.mark.slow
 @needs_chromium
-def test_chromium_runs_no_script_of_hostile_results(tmp_path):
+def test_chromium_runs_no_script_of_hostile_results(hostile_page, tmp_path):
     path = tmp_path / "report.html"
-    path.write_text(page_of(hostile_results()), encoding="utf-8")
+    path.write_text(hostile_page, encoding="utf-8")
     dom, messages = run_chromium(path, "--dump-dom")
     assert "<script" not in dom
     assert messages == []

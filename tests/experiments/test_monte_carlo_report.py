@@ -195,12 +195,11 @@ def test_few_runs_of_a_filter_that_is_far_off_are_found(runs):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("runs", range(2, 7))
-def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs, monkeypatch):
+def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs, request):
     world = load_scenario("six_landmarks").with_changes(steps=12)
     for seed in (0, 5, 9):
-        if seed:  # their figures are made, too, but not written
-            page = "slamgym.experiments.monte_carlo.report.html_report"
-            monkeypatch.setattr(f"{page}.inline_svg", lambda *_: "")
+        if seed:
+            request.getfixturevalue("_figures_in_reports_are_blank")
         dataset = monte_carlo(world, "ekf", runs, seed)
         summary = summarise_monte_carlo(dataset)
         json.dumps(summary, allow_nan=False)
@@ -381,7 +380,7 @@ def test_a_bound_of_the_heading_too_small_to_matter_is_left_out(std, bound):
     assert row.right == bound
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_a_word_has_one_colour_on_terminal_and_page():
     summary = summarise_monte_carlo(typical())
     styles = {"good": "green", "bad": "red", "open": "yellow"}
@@ -413,6 +412,7 @@ def test_curves_are_averages_over_runs():
     np.testing.assert_allclose(line.get_ydata(), np.sqrt((errors**2).mean(axis=0)))
 
 
+@pytest.mark.usefixtures("_figures_in_reports_are_blank")
 def test_the_legend_counts_the_steps_that_are_tested():
     dataset = typical(steps=4)
     axes = figure_of(dataset, "nees").axes[0]
