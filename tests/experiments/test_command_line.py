@@ -91,14 +91,14 @@ def refused(*arguments, code=2):
 def finished_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     summary = answered(
-        "run", "six_landmarks", "--seed", 2, "--steps", 4, "--out", folder / "out"
+        "run", "six_landmarks", "--seed", 2, "--steps", 2, "--out", folder / "out"
     )
     return folder / "out", summary
 
 
 def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
     folder, summary = finished_run
-    steps = [f"map_steps/step_{k:03d}.png" for k in range(5)]
+    steps = [f"map_steps/step_{k:03d}.png" for k in range(3)]
     names = ["covariance.png", "errors.png", "map.png", "truth.png", *steps]
     for name in names:
         with Image.open(folder / name) as picture:
@@ -112,7 +112,7 @@ def test_a_run_answers_with_the_numbers_of_its_summary_file(finished_run):
     folder, summary = finished_run
     saved = json.loads((folder / "summary.json").read_text())
     assert {**saved, "out": str(folder)} == summary
-    assert summary["steps"] == 4
+    assert summary["steps"] == 2
     assert set(summary) >= {"landmarks", "pose", "pose_covariance", "nis", "nees"}
     assert len(summary["landmarks"]) == 6
     assert np.shape(summary["pose_covariance"]) == (3, 3)
@@ -144,7 +144,7 @@ def test_a_log_can_be_replayed_without_its_identities(log, without_pictures):
 
 def test_the_scenario_of_a_run_is_saved_with_its_changes(finished_run):
     folder, _ = finished_run
-    expected = load_scenario("six_landmarks").with_changes(steps=4)
+    expected = load_scenario("six_landmarks").with_changes(steps=2)
     assert load_scenario(folder / "scenario.toml") == expected
 
 

@@ -48,6 +48,7 @@ def refused(*arguments):
     return result.stderr
 
 
+@pytest.mark.slow
 def test_results_summary_and_report_are_written_and_told(here):
     arguments = ("monte-carlo", "six_landmarks", "--runs", 40, "--out", "out")
     result = slamgym(*arguments)

@@ -19,6 +19,8 @@ from slamgym.sim_configs import load_scenario
 
 RUNS = 30
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def effects():

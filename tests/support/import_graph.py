@@ -71,14 +71,34 @@ def defining_module(module, name):
     return module
 
 
+def import_statements(file):
+    """Return the import statements of a file, also those in functions."""
+    nodes = ast.walk(ast.parse(file.read_text()))
+    return [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
+STATEMENTS = {module: import_statements(file) for module, file in FILES.items()}
+
+
 def imports_of(module):
-    """Return the modules of the repository that a module imports, also in functions."""
+    """Return the modules of the repository that a module imports."""
     found = set()
-    for node in ast.walk(ast.parse(FILES[module].read_text())):
+    for node in STATEMENTS[module]:
         if isinstance(node, ast.ImportFrom) and node.level:
             target = absolute(module, node)
             found |= {defining_module(target, alias.name) for alias in node.names}
     return found - {module, ARRAY_TYPES}
+
+
+def libraries(module):
+    """Return the packages outside the repository that a module imports."""
+    found = set()
+    for node in STATEMENTS[module]:
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif not node.level:
+            found.add(node.module.split(".")[0])
+    return found
 
 
 GRAPH = {module: imports_of(module) for module in FILES}
