@@ -87,7 +87,9 @@ class BeliefObservation(
         self._rows = count_landmark_rows(self.scenario, max_landmarks)
         self._by_id = self.scenario.sensor.identities
         self._bounds = world_bounds(self.scenario)
-        self._estimator = choose_estimator(estimator, self.scenario, estimator_options)
+        self._estimator = choose_estimator(
+            estimator, self.scenario, estimator_options, rows=self._rows
+        )
         self.observation_space = with_belief(env.observation_space, self._rows)
         self._belief: BeliefOfMap | None = None
         self._storage: BatchStorage | None = None

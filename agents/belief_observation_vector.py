@@ -10,7 +10,9 @@ from gymnasium.vector.utils import batch_space
 
 from ..arrays import AnyArray, BoolArray
 from ..envs.vector.episodes import final_infos
+from ..estimator.filters.batch import BatchSlam
 from ..estimator.filters.batch_results import BatchBeliefs
+from .associating_filters import AssociatingFilters
 from .belief_arrays import update_filters
 from .belief_features import belief_features, world_bounds
 from .belief_observation import (
@@ -34,9 +36,10 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
     Parameters
     ----------
     env : VectorEnv
-        A `LandmarkWorldVectorEnv` with identities, as ``gymnasium.make_vec`` makes it.
+        A `LandmarkWorldVectorEnv`, as ``gymnasium.make_vec`` makes it.
     estimator : str, default "invariant"
-        The registered name of a filter that runs in batches.
+        The registered name of a filter that runs in batches. Where the world hides
+        identities, one that landmark management takes; filters run one by one then.
     estimator_options : mapping, optional
         Further options of the filter.
     max_landmarks : int, optional
@@ -45,8 +48,8 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
     Raises
     ------
     ValueError
-        If the filter cannot run in batches, or if the worlds hide identities or have
-        more landmarks than there are rows.
+        If the filter cannot run in batches, or if the worlds have more landmarks than
+        there are rows.
 
     Examples
     --------
@@ -68,20 +71,17 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
     ) -> None:
         super().__init__(env)
         self.scenario = scenario_of(env)
-        if not self.scenario.sensor.identities:
-            raise ValueError(
-                "sensor.identities must be true for vector environments: the "
-                "batched filters do not associate"
-            )
         if not hasattr(type(env.unwrapped), "start_estimates"):
             raise ValueError(
                 "env must be a LandmarkWorldVectorEnv, which has start_estimates, "
                 f"got {type(env.unwrapped).__name__}"
             )
         rows = count_landmark_rows(self.scenario, max_landmarks)
-        self._missing_rows = rows - self.scenario.landmarks.count
+        is_hidden = not self.scenario.sensor.identities
+        self._missing_rows = 0 if is_hidden else rows - self.scenario.landmarks.count
         self._bounds = world_bounds(self.scenario)
-        self._filters = choose_batch(
+        choose = AssociatingFilters if is_hidden else choose_batch
+        self._filters: BatchSlam | AssociatingFilters = choose(
             estimator, self.scenario, self.num_envs, rows, estimator_options
         )
         self._mode = env.metadata["autoreset_mode"]
@@ -156,7 +156,10 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
                 for key in ("landmarks", "mask")
             }
             observations = {**observations, **longer}
-        update_filters(self._filters, observations, worlds, moved=moved)
+        if isinstance(self._filters, AssociatingFilters):
+            self._filters.update(observations, worlds, moved=moved)
+        else:
+            update_filters(self._filters, observations, worlds, moved=moved)
 
     def _with_beliefs(self, observations: Observation) -> Observation:
         features = belief_features(self._filters.storage(), self._bounds)

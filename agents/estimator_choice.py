@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol, cast
+from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..arrays import AnyArray, BoolArray
 from ..envs.rendering import BeliefLike
 from ..estimator.filters.batch import BatchSlam
+from ..estimator.map_management.policy import LandmarkPolicy, as_policy
 from ..estimator.registry import (
     accepted_options,
     find_estimator,
@@ -58,6 +60,8 @@ def choose_estimator(
     estimator: EstimatorChoice,
     scenario: Scenario,
     options: Mapping[str, Any] | None = None,
+    *,
+    rows: int | None = None,
 ) -> FollowingEstimator:
     """Make an estimator with the noise settings of a world.
 
@@ -70,6 +74,9 @@ def choose_estimator(
         Source of the noise settings.
     options : mapping, optional
         Further options of the estimator's constructor.
+    rows : int, optional
+        In a world that hides identities, the most landmarks that landmark management
+        keeps in the map, unless its policy has a capacity.
 
     Raises
     ------
@@ -90,7 +97,7 @@ def choose_estimator(
         factory = partial(make_estimator, estimator)
         known = noise_options(find_estimator(estimator), scenario)
         if not scenario.sensor.identities:
-            known["management"] = True  # associates the readings
+            settings["management"] = _bounded(settings.get("management", True), rows)
     elif isinstance(estimator, type) or not _has_a_method(estimator):
         factory = estimator
         known = noise_options(factory, scenario)
@@ -103,6 +110,14 @@ def choose_estimator(
         return checked_estimator(cast("FollowingEstimator", estimator))
     stds = {"motion_std": scenario.motion.std, "measurement_std": scenario.sensor.std}
     return checked_estimator(factory(**stds, **{**known, **settings}))
+
+
+def _bounded(management: Any, rows: int | None) -> LandmarkPolicy | Literal[False]:
+    """Return a policy that keeps at most so many landmarks; False for none."""
+    if management is False or management is None:
+        return False
+    policy = as_policy(management)
+    return replace(policy, capacity=rows) if policy.capacity is None else policy
 
 
 def choose_batch(

@@ -412,6 +412,11 @@ CASES = [
         {"steps": 8, "start": {"std": [0.1, 0.1, 0.1], "drawn": "estimate"}},
         "first_estimates",
     ),
+    (
+        "hidden_identities",
+        {"steps": 9, "sensor": {"dropout": 0.0, "clutter": 2.0}},
+        "invariant",
+    ),
 ]
 
 
@@ -460,10 +465,10 @@ def test_a_filter_that_cannot_run_in_batches_is_refused():
         BeliefObservationVector(vector, EkfSlam)
 
 
-def test_hidden_identities_are_refused_where_worlds_run_side_by_side():
+def test_where_worlds_hide_identities_only_names_are_estimators():
     vector = gym.make_vec(ID, 2, scenario="hidden_identities")
-    with pytest.raises(ValueError, match=r"sensor\.identities must be true"):
-        BeliefObservationVector(vector, "ekf")
+    with pytest.raises(ValueError, match="estimator must be a registered name"):
+        BeliefObservationVector(vector, EkfSlam)
 
 
 def test_rows_of_a_vector_can_be_more_than_its_landmarks():
@@ -521,3 +526,20 @@ def test_where_identities_are_hidden_a_named_estimator_associates():
     for _ in range(30):
         observation, *_ = env.step(np.array([0.5, 0.1]))
     assert 0 < observation["belief_mask"].sum() < 60
+
+
+@pytest.mark.parametrize("options", [None, {"management": {"confirm": [1, 1]}}])
+def test_a_managed_map_never_outgrows_its_rows(options):
+    env = world("hidden_identities", sensor={"clutter": 3.0}, steps=60)
+    env = BeliefObservation(env, "ekf", estimator_options=options, max_landmarks=6)
+    observation = drive(env, 60)
+    assert observation["belief_mask"].all()
+    assert len(env.belief.landmark_ids) == 6
+
+
+def test_a_capacity_of_the_policy_is_kept():
+    options = {"management": {"confirm": [1, 1], "capacity": 4}}
+    env = world("hidden_identities", steps=20)
+    env = BeliefObservation(env, "ekf", estimator_options=options)
+    drive(env, 20)
+    assert len(env.belief.landmark_ids) == 4

@@ -220,3 +220,16 @@ def test_nonsense_is_refused(name, value):
     env = BeliefObservation(gym.make("slamgym/LandmarkWorld-v0"), "ekf")
     with pytest.raises(ValueError, match=f"{name} must be finite"):
         InformationReward(env, **{name: value})
+
+
+def test_the_gain_adds_up_where_the_filter_associates():
+    world = gym.make(ID, scenario="hidden_identities", steps=25)
+    env = InformationReward(BeliefObservation(world, "invariant"))
+    env.reset(seed=3)
+    prior = landmark_prior_std(load_scenario("hidden_identities"))
+    start = uncertainty(env.get_wrapper_attr("beliefs"), "D", prior)[0]
+    total = sum(env.step(np.array([0.8, 0.2]))[1] for _ in range(25))
+    beliefs = env.get_wrapper_attr("beliefs")
+    assert beliefs.mapped.sum() > 5
+    assert total == pytest.approx(start - uncertainty(beliefs, "D", prior)[0])
+    assert total > 1.0

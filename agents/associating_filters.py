@@ -1,0 +1,103 @@
+"""One filter per world that associates readings without identity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..arrays import AnyArray, Array, BoolArray
+from ..estimator.filters.batch_results import BatchBeliefs, BatchStorage
+from ..sim_configs import Scenario
+from .belief_arrays import belief_storage
+from .estimator_choice import checked_belief, choose_estimator
+
+
+class AssociatingFilters:
+    """Managed filters side by side, for vector worlds that hide identities.
+
+    Each filter runs by itself, since batches do not associate.
+
+    Parameters
+    ----------
+    estimator : str
+        Registered name or "module:Class".
+    scenario : Scenario
+        Source of the noise settings.
+    runs : int
+        B, the number of worlds.
+    rows : int
+        N, the most landmarks in a map.
+    options : mapping, optional
+        Further options of the filters.
+
+    Raises
+    ------
+    ValueError
+        If the name is unknown, or an option does not fit.
+    """
+
+    def __init__(
+        self,
+        estimator: str,
+        scenario: Scenario,
+        runs: int,
+        rows: int,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        if not isinstance(estimator, str):
+            raise ValueError(
+                "estimator must be a registered name for vector environments, "
+                f"got {estimator!r}"
+            )
+        self._filters = [
+            choose_estimator(estimator, scenario, options, rows=rows)
+            for _ in range(runs)
+        ]
+        self._steps = np.zeros(runs, dtype=np.int64)
+        capacity = 3 + 2 * rows
+        self._means = np.zeros((runs, capacity))
+        self._covariances = np.zeros((runs, capacity, capacity))
+        self._slots = np.full((runs, rows), -1, dtype=np.int64)
+
+    def reset(self, poses: Array, pose_std: Any, *, runs: BoolArray) -> None:
+        """Start new runs in some worlds, with poses (B, 3) known to (3,)."""
+        for run in np.flatnonzero(runs).tolist():
+            self._filters[run].reset(poses[run], pose_std)
+            self._steps[run] = 0
+
+    def update(
+        self, observations: Mapping[str, AnyArray], worlds: BoolArray, *, moved: bool
+    ) -> None:
+        """Update the filters of some worlds with an observation, batched along B.
+
+        Parameters
+        ----------
+        observations : mapping
+            Batched observations of a landmark world.
+        worlds : bool ndarray, shape (B,)
+            Worlds whose filters are updated.
+        moved : bool
+            Whether the worlds have moved. False for the scan from the start.
+        """
+        for run in np.flatnonzero(worlds).tolist():
+            slam = self._filters[run]
+            if moved:
+                slam.predict(observations["odometry"][run])
+                self._steps[run] += 1
+            seen = observations["mask"][run]
+            slam.update(observations["landmarks"][run][seen])
+            belief = checked_belief(slam, int(self._steps[run]))
+            stored = belief_storage(belief, self._slots.shape[1], by_id=False)
+            self._means[run] = stored.means[0]
+            self._covariances[run] = stored.covariances[0]
+            self._slots[run] = stored.slots[0]
+
+    def storage(self) -> BatchStorage:
+        """Return the arrays of the beliefs; they change with the next update."""
+        return BatchStorage.of(self._means, self._covariances, self._slots)
+
+    def beliefs(self) -> BatchBeliefs:
+        """Return the beliefs of all worlds side by side, as a snapshot."""
+        return self.storage().beliefs()
