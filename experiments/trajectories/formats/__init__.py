@@ -1,23 +1,14 @@
 """File formats of trajectories, one module each, loaded on demand.
 
-A shard of some episodes is one file or one folder. Every module has
-
-``ENDING``
-    The ending of the names of its shards.
-``LIBRARIES``
-    The packages besides numpy that write it; their versions determine the bytes.
-``check(scenario)``
-    Raises a ValueError for a scenario that the format cannot hold.
-``write(trajectories, path)``
-    Writes a shard. The same trajectories give the same bytes.
-``read(path)``
-    Yields the trajectories of a shard, one after the other.
+A shard of some episodes is one file or one folder. Every module has `write` and `read`,
+and those of ``ENDING``, ``LIBRARIES`` and `check` that differ from the defaults of
+`TrajectoryFormat`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol, cast
+from typing import NamedTuple
 
 from ....sim_configs import Scenario
 from ....sim_configs.scenario_errors import unknown_choice
@@ -34,21 +25,19 @@ FORMATS = {
 """Names of the formats and of their modules."""
 
 
-class TrajectoryFormat(Protocol):
-    """The interface of a module of this package."""
+class TrajectoryFormat(NamedTuple):
+    """What a module of this package defines."""
 
-    ENDING: str
-    LIBRARIES: tuple[str, ...]
-
-    def check(self, scenario: Scenario) -> None:
-        """Raise a ValueError for a scenario that the format cannot hold."""
-
-    def write(self, trajectories: Sequence[Trajectory], path: Path) -> None:
-        """Write a shard."""
-
-    def read(self, path: Path) -> Iterator[Trajectory]:
-        """Yield the trajectories of a shard."""
-        ...
+    write: Callable[[Sequence[Trajectory], Path], None]
+    """Writes a shard. The same trajectories give the same bytes."""
+    read: Callable[[Path], Iterator[Trajectory]]
+    """Yields the trajectories of a shard, one after the other."""
+    check: Callable[[Scenario], None] = lambda scenario: None
+    """Raises a ValueError for a scenario that the format cannot hold."""
+    ENDING: str = ""
+    """The ending of the names of its shards."""
+    LIBRARIES: tuple[str, ...] = ()
+    """The packages besides numpy that write it; their versions determine the bytes."""
 
 
 def trajectory_format(name: str) -> TrajectoryFormat:
@@ -79,4 +68,7 @@ def trajectory_format(name: str) -> TrajectoryFormat:
             f"the format '{name}' needs the package {error.name}: "
             "pip install 'slamgym[trajectories]'"
         ) from None
-    return cast(TrajectoryFormat, module)
+    defined = {
+        n: vars(module)[n] for n in TrajectoryFormat._fields if n in vars(module)
+    }
+    return TrajectoryFormat(**defined)

@@ -30,9 +30,6 @@ from ..trajectory import Trajectory, array_of
 from .dead_reckoning import dead_reckoning
 from .episode_files import numbers, read_metadata, write_lines, write_metadata
 
-ENDING = ""
-LIBRARIES: tuple[str, ...] = ()
-
 _LEAST_STD = 1e-6
 """Replaces zero noise, whose information would be infinite [m, rad]."""
 

@@ -34,10 +34,6 @@ LIBRARIES = ("minari", "pyarrow")
 _ROOT = "MINARI_DATASETS_PATH"
 
 
-def check(scenario: Scenario) -> None:
-    """Accept every scenario."""
-
-
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:
     """Write a shard; its folder's name is the id of the data set."""
     scenario = trajectories[0].scenario

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ....sim_configs import Scenario
 from ....sim_configs.scenario_files import scenario_text
 from ..trajectory import (
     ARRAYS,
@@ -21,13 +20,8 @@ from ..trajectory import (
 )
 
 ENDING = ".npz"
-LIBRARIES: tuple[str, ...] = ()
 
 _NO_DATE = (1980, 1, 1, 0, 0, 0)  # a constant: equal arrays give equal bytes
-
-
-def check(scenario: Scenario) -> None:
-    """Accept every scenario."""
 
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:

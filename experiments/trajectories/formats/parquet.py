@@ -15,18 +15,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ....arrays import AnyArray, Array
-from ....sim_configs import Scenario
 from ....sim_configs.scenario_files import scenario_text
 from ..trajectory import Trajectory, array_of, scenario_from_text
 
-ENDING = ""
 LIBRARIES = ("pyarrow",)
 
 _STEPS, _EPISODES = "steps.parquet", "episodes.parquet"
-
-
-def check(scenario: Scenario) -> None:
-    """Accept every scenario."""
 
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:

@@ -12,19 +12,11 @@ from typing import Any
 import numpy as np
 
 from ....envs.spaces import count_rows
-from ....sim_configs import Scenario
 from ...logs.events import NO_LANDMARK, OdometryRow, Scan
 from ...logs.recording import log_header
 from ...logs.slamlog import SlamLog, read_slamlog, write_slamlog
 from ..trajectory import Trajectory, array_of
 from .episode_files import read_metadata, write_metadata
-
-ENDING = ""
-LIBRARIES: tuple[str, ...] = ()
-
-
-def check(scenario: Scenario) -> None:
-    """Accept every scenario."""
 
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:

@@ -17,17 +17,9 @@ import numpy as np
 
 from ....arrays import Array
 from ....estimator.models.angles import wrap_angle
-from ....sim_configs import Scenario
 from ..trajectory import Trajectory
 from .dead_reckoning import dead_reckoning
 from .episode_files import numbers, read_metadata, write_lines, write_metadata
-
-ENDING = ""
-LIBRARIES: tuple[str, ...] = ()
-
-
-def check(scenario: Scenario) -> None:
-    """Accept every scenario."""
 
 
 def write(trajectories: Sequence[Trajectory], path: Path) -> None:
