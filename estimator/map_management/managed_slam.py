@@ -173,7 +173,7 @@ class ManagedSlam:
         given = argument_checks.identities(landmark_ids, len(readings))
         plan = ScanAssociation(self._policy, self._candidates, len(readings))
         view = self._editor.map_view(self._policy.reach(readings))
-        plan.translate(given, view.mapped, self._pruner.aliases)
+        plan.translate(given, view.mapped, self._pruner.merger.aliases)
         return plan
 
     def alternatives(
@@ -235,7 +235,7 @@ class ManagedSlam:
             Where one is not in the map, or they are the same.
         """
         argument_checks.two_landmarks(kept, gone, self._slots)
-        self._pruner.join(kept, gone)
+        self._pruner.merger.join(kept, gone)
         self._recent.note_edits((), [(kept, gone)])
 
     @property

@@ -23,6 +23,11 @@ class MapPruner:
         Edits the filter's map.
     noise : Noise
         Noise of the sensor.
+
+    Attributes
+    ----------
+    merger : LandmarkMerger
+        Merges landmarks of this run.
     """
 
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
@@ -33,12 +38,7 @@ class MapPruner:
     def forget(self) -> None:
         """Start a new run."""
         self._records = LandmarkRecords()
-        self._merger = LandmarkMerger(self._policy, self._editor, self._records)
-
-    @property
-    def aliases(self) -> dict[int, int]:
-        """Landmarks merged into others: gone to kept."""
-        return self._merger.aliases
+        self.merger = LandmarkMerger(self._policy, self._editor, self._records)
 
     def note_sightings(self, readings: Array, ids: Sequence[int]) -> None:
         """Record the landmarks that the rows of a scan (m, 2) have shown."""
@@ -51,7 +51,7 @@ class MapPruner:
         along = (range_std + per_metre * distance) ** -2.0
         across = (np.maximum(distance, 1e-12) * bearing_std) ** -2.0
         self._records.note_sightings(ids, bearing + view.mean[2], along, across)
-        self._merger.note_scan(view, ids)
+        self.merger.note_scan(view, ids)
 
     def expected(self, scan: Array) -> set[int]:
         """Return the landmarks that a scan (m, 2) should show; changes nothing."""
@@ -83,7 +83,7 @@ class MapPruner:
         ids = [i for i in row_ids if i is not None and i in seen]
         self.note_sightings(readings[rows], ids)
         removed = self.remove_missing(missed)
-        merged = self._merger.merge(seen)
+        merged = self.merger.merge(seen)
         return removed + self.keep_capacity(seen), merged
 
     def remove_missing(self, missed: set[int]) -> list[int]:
@@ -110,18 +110,14 @@ class MapPruner:
         if ids:
             self._editor.remove(ids)
             self._records.follow(self._editor.map_view().mapped)
-            self._merger.forget(ids)
+            self.merger.forget(ids)
         return ids
-
-    def join(self, kept: int, gone: int) -> None:
-        """Merge two landmarks; both identities then name the first."""
-        self._merger.join(kept, gone)
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all records, as arrays."""
-        return self._records.state_dict() | self._merger.state_dict()
+        return self._records.state_dict() | self.merger.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
         self._records.load_state_dict(state)
-        self._merger.load_state_dict(state)
+        self.merger.load_state_dict(state)
