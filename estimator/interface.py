@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from .belief import Belief, MapView
 from .update_report import ScanDecisions, UpdateReport
 
@@ -15,6 +16,7 @@ __all__ = [
     "MapView",
     "ScanDecisions",
     "SlamEstimator",
+    "SmoothedPath",
     "SupportsBeliefLimit",
     "SupportsDecisions",
     "SupportsJoin",
@@ -24,6 +26,7 @@ __all__ = [
     "SupportsMemoryEstimate",
     "SupportsMerging",
     "SupportsRemoval",
+    "SupportsSmoothing",
     "SupportsTruth",
     "UpdateReport",
     "optional_members",
@@ -79,6 +82,31 @@ class SupportsDecisions(Protocol):
     @property
     def decisions(self) -> Sequence[ScanDecisions]:
         """The decisions about every scan since the start, as they stand now."""
+
+
+class SmoothedPath(Protocol):
+    """Beliefs about the poses of a drive, given all of its readings."""
+
+    poses: Array
+    """At every scan, shape (N, 3) [m, m, rad]."""
+
+    @property
+    def pose_covariances(self) -> Array:
+        """Shape (N, 3, 3)."""
+        ...
+
+    def belief(self) -> Belief:
+        """Return the belief about the last pose and the map."""
+        ...
+
+
+@runtime_checkable
+class SupportsSmoothing(Protocol):
+    """An estimator that knows more of a pose once it has seen the whole drive."""
+
+    def smoothed(self) -> SmoothedPath:
+        """Return the beliefs about all poses, given the drive until now."""
+        ...
 
 
 @runtime_checkable
@@ -153,6 +181,7 @@ _MEMBERS: dict[type, tuple[str, ...]] = {
     SupportsTruth: ("observe_truth",),
     SupportsLocalView: ("local_view",),
     SupportsJoin: ("join",),
+    SupportsSmoothing: ("smoothed",),
     SupportsMemoryEstimate: ("memory_for",),
     SupportsBeliefLimit: ("belief_limit",),
 }

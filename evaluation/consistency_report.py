@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.error_frames import ErrorFrame
 from ..estimator.support import argument_checks
+from .chi_square import Band
 from .hypothesis_tests import (
     FamilyTest,
     HypothesisTest,
@@ -42,6 +43,8 @@ _GRID = 10
 _LAGS = 10
 _ERROR_RATE = 0.05
 _MOST_NAMES = 10
+_NOTHING = HypothesisTest(np.nan, Band(np.nan, np.nan), np.nan, _ERROR_RATE)
+"""The outcome of a test without data."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -144,8 +147,7 @@ class ConsistencyReport:
             f"{grid.rejected.sum()} rejected; band [{grid.interval.low:.3f}, "
             f"{grid.interval.high:.3f}]: {_outcome(grid.accepted)} "
             f"(rejects a consistent filter in at most {grid.error_rate:.0%}).",
-            _sentence("NIS over all scans, χ²", "ratio", self.nis),
-            _sentence("NIS whiteness, Ljung-Box", "Q", self.whiteness),
+            *self._innovation_sentences(),
             f"Equivalence, {frame}: the 90 % interval of the ratio is "
             f"[{near.interval.low:.3f}, {near.interval.high:.3f}]; inside "
             f"[{low:g}, {high:g}]: {near.verdict} (claims consistency wrongly in at "
@@ -153,6 +155,15 @@ class ConsistencyReport:
             f"Per-run ratios, {frame}: mean {self.mean_ratio:.3f}, median "
             f"{self.median_ratio:.3f}, {self.share_above_3:.1%} of the runs above 3.",
             f"Runs that find covariances too small by a factor in 90 %: {needed}.",
+        )
+
+    def _innovation_sentences(self) -> tuple[str, ...]:
+        """Return the sentences on the NIS, none without innovations."""
+        if self.nis is _NOTHING:
+            return ()
+        return (
+            _sentence("NIS over all scans, χ²", "ratio", self.nis),
+            _sentence("NIS whiteness, Ljung-Box", "Q", self.whiteness),
         )
 
 
@@ -173,7 +184,8 @@ def evaluate_consistency(
         Not divided by ``dof``; nan from the step at which a run failed, and at leading
         steps at which no run has a NEES.
     nis, nis_dof : array_like, shape (runs, steps)
-        NIS of each scan and its degrees of freedom, 0 if the scan corrected nothing.
+        NIS of each scan and its degrees of freedom, 0 if the scan corrected nothing; a
+        smoother has none.
     dof : int
         Degrees of freedom of one NEES.
     frame : {"additive", "invariant"}
@@ -193,6 +205,7 @@ def evaluate_consistency(
     averages = scores.mean(axis=1)
     steps = np.linspace(0, scores.shape[1] - 1, _GRID + 1).round()[1:]
     grid = np.unique(steps.astype(np.int64))
+    has_nis, lags = bool(freedom.any()), min(_LAGS, scans.shape[1] - 1)
     return ConsistencyReport(
         frame=frame,
         degrees_of_freedom=dof,
@@ -204,8 +217,8 @@ def evaluate_consistency(
         bootstrap=bootstrap_test(averages, dof, rng=rng),
         family=family_test(scores[:, grid], dof),
         family_steps=grid + first,
-        nis=nis_test(scans, freedom),
-        whiteness=whiteness_test(scans, freedom, lags=min(_LAGS, scans.shape[1] - 1)),
+        nis=nis_test(scans, freedom) if has_nis else _NOTHING,
+        whiteness=whiteness_test(scans, freedom, lags=lags) if has_nis else _NOTHING,
         equivalence=equivalence_test(averages, dof),
         mean_ratio=float(averages.mean() / dof),
         median_ratio=float(np.median(averages) / dof),

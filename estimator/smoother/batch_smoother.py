@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ..filters.invariant import InvariantEkfSlam
+from ..belief import Belief
 from ..models.bearing_range import locate_landmark
 from ..support import argument_checks
 from .drive import Drive
-from .optimiser import KINDS, Estimate, Noise, Optimiser
+from .optimiser import KINDS, Estimate, Noise, Optimiser, Solution
 from .smoothed_drive import SmoothedDrive
+from .start import start_of
 
+ITERATIONS = 5  # of an update of the filter that gives the second start
 SCALES = {"huber": 1.345, "cauchy": 2.3849}  # 95 % efficient without outliers
 
 
 def smooth(
     drive: Drive,
     *,
-    start: ArrayLike | None = None,
+    start: ArrayLike | Belief | None = None,
     landmarks: Mapping[int, ArrayLike] | None = None,
     robust: str | None = None,
     robust_scale: float | None = None,
@@ -38,10 +40,11 @@ def smooth(
     ----------
     drive : Drive
         Motions and scans.
-    start : array_like, shape (N, 3), optional
-        Poses to start from; where not given, those of an invariant filter.
+    start : Belief or array_like, shape (N, 3), optional
+        The belief of a filter at the end of the drive, or poses to start from; by
+        default an invariant filter over the drive.
     landmarks : mapping from id to (2,), optional
-        Landmarks to start from; else from the filter, or from their first reading.
+        Landmarks to start from; else those of the filter, or as first read.
     robust : {"huber", "cauchy"}, optional
         Kernel that gives readings far off less weight.
     robust_scale : float, optional
@@ -77,31 +80,54 @@ def smooth(
     """
     argument_checks.whole("iterations", iterations, 1)
     argument_checks.above("tolerance", tolerance, 0.0)
-    noise = _noise(drive, robust, robust_scale)
+    rules = drive.rules
+    kernel = robust_kernel(robust, robust_scale)
+    noise = Noise(np.array(rules), rules.bearing_std, *kernel)
     arrays, order = drive.arrays()
-    poses, known = _start(drive, start, landmarks or {}, order)
-    first = Estimate(poses, _landmarks_at(drive, poses, known, order))
-    minimum = Optimiser(arrays, noise).minimise(first, tolerance, iterations)
-    return SmoothedDrive(minimum, order.tolist(), drive.landmark_ids)
+    optimiser = Optimiser(arrays, noise)
+    starts = _starts(drive, start, _places(landmarks or {}, order), order)
+    found = _best(optimiser, starts, tolerance, iterations)
+    return SmoothedDrive(
+        optimiser.linearised(found), order.tolist(), drive.landmark_ids
+    )
 
 
-def _noise(drive: Drive, robust: str | None, scale: float | None) -> Noise:
+def robust_kernel(robust: str | None, scale: float | None) -> tuple[float, float]:
+    """Return kind and scale of a robust kernel, or refuse them."""
     if robust is not None:
         argument_checks.one_of("robust", robust, tuple(SCALES))
-    default = SCALES.get(robust or "", 1.0)
-    chosen = default if scale is None else scale
-    argument_checks.above("robust_scale", chosen, 0.0)
-    rules = drive.rules
-    return Noise(np.array(rules), rules.bearing_std, KINDS[robust], float(chosen))
+    chosen = SCALES.get(robust or "", 1.0) if scale is None else scale
+    return KINDS[robust], argument_checks.above("robust_scale", chosen, 0.0)
 
 
-def _start(
-    drive: Drive,
-    start: ArrayLike | None,
-    landmarks: Mapping[int, ArrayLike],
-    order: IntArray,
-) -> tuple[Array, dict[int, Array]]:
-    """Return poses (N, 3) to start from, and landmarks as far as they are known."""
+def _best(
+    optimiser: Optimiser,
+    starts: Sequence[Callable[[], Estimate]],
+    tolerance: float,
+    iterations: int,
+) -> Solution:
+    """Return the solution from the first start, or the best where that is implausible.
+
+    Raises the error of the first start where none leads to a solution.
+    """
+    failures, best = [], None
+    for start in starts:
+        try:
+            found = optimiser.minimise(start(), tolerance, iterations)
+        except np.linalg.LinAlgError as error:
+            failures.append(error)
+            continue
+        if best is None or found.cost < best.cost:
+            best = found
+        if best.cost <= optimiser.plausible_cost:
+            break
+    if best is None:
+        raise failures[0]
+    return best
+
+
+def _places(landmarks: Mapping[int, ArrayLike], order: IntArray) -> dict[int, Array]:
+    """Return landmarks that the user gave, each of which has a reading."""
     known = set(order.tolist())
     given = {
         i: argument_checks.finite_vector(f"landmarks[{i}]", place, 2)
@@ -110,39 +136,31 @@ def _start(
     for i in given:
         if i not in known:
             raise ValueError(f"landmark {i} has no reading in the drive")
-    if start is None:
-        poses, found = filtered(drive)
-        return poses, found | given
+    return given
+
+
+def _starts(
+    drive: Drive,
+    start: ArrayLike | Belief | None,
+    given: Mapping[int, Array],
+    order: IntArray,
+) -> list[Callable[[], Estimate]]:
+    """Return what computes poses and landmarks to start from, the best guess first."""
+
+    def estimate(poses: Array, found: Mapping[int, Array]) -> Estimate:
+        return Estimate(poses, _landmarks_at(drive, poses, {**found, **given}, order))
+
+    if start is None or isinstance(start, Belief):
+        return [
+            lambda: estimate(*start_of(drive, start)),
+            lambda: estimate(*start_of(drive, iterations=ITERATIONS)),
+        ]
     poses = argument_checks.as_floats("start", start).copy()
     if poses.shape != (drive.poses, 3) or not np.isfinite(poses).all():
         raise ValueError(
             f"start must be finite poses ({drive.poses}, 3), got shape {poses.shape}"
         )
-    return poses, given
-
-
-def filtered(drive: Drive) -> tuple[Array, dict[int, Array]]:
-    """Return the poses (N, 3) and landmarks of an invariant filter over a drive."""
-    rules, noise = drive.rules, drive.motion_noise
-    slam = InvariantEkfSlam(
-        np.sqrt(noise.variance),
-        (rules.bearing_std, rules.range_std),
-        initial_pose=drive.initial_pose,
-        initial_pose_std=drive.initial_pose_std,
-        range_std_per_metre=rules.range_std_per_metre,
-        range_noise_at="reading" if rules.noise_as_read else "expected",
-        noise_at_rest=noise.at_rest,
-        min_range=rules.min_range,
-    )
-    poses = np.empty((drive.poses, 3))
-    for k, motion in enumerate(drive.motions):
-        for distance, turn, dt in motion.steps:
-            slam.predict((distance, turn), dt)
-        readings, ids = drive.sightings(k)
-        slam.update(readings, ids)
-        poses[k] = slam.map.mean[:3]
-    places = slam.belief().landmarks
-    return poses, dict(zip(slam.landmark_ids, places, strict=True))
+    return [lambda: estimate(poses, {})]
 
 
 def _landmarks_at(

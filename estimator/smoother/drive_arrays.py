@@ -59,7 +59,9 @@ def noise_factors(covariances: Array) -> tuple[Array, Array]:
     std = np.sqrt(np.where(noisy, variances, 0.0))
     scale = np.sqrt(np.where(largest > 0, largest, 1.0))
     weights = 1 / np.where(noisy, std, scale)
-    return axes * std[:, None], weights[:, :, None] * axes.transpose(0, 2, 1)
+    factors, whiteners = axes * std[:, None], weights[:, :, None] * axes.mT
+    # One layout whatever the number of poses: for another, kernels compile anew.
+    return np.ascontiguousarray(factors), np.ascontiguousarray(whiteners)
 
 
 def landmark_order(ids: IntArray, firsts: IntArray) -> tuple[IntArray, IntArray]:

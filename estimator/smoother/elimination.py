@@ -35,7 +35,14 @@ from ..models.bearing_range import reading_slopes_jit
 from ..support.jit import jit, njit_internal
 from .cost import innovation, motion_residual, robust_weight
 from .drive_arrays import DriveArrays
-from .small_matrices import complement, inverse_root, multiply, times_vector
+from .small_matrices import (
+    complement,
+    inverse_root,
+    left_transposed,
+    multiply,
+    right_transposed,
+    transposed_times,
+)
 
 
 class Elimination(NamedTuple):
@@ -194,20 +201,20 @@ def _minimise(
     curvature: Array, slope: Array, noise: Array, room: Array, gain: Array
 ) -> None:
     """Minimise over the noise: write U, Λ and λ; leave T in room[0], Uᵀλ in room[4]."""
-    T, M, inverse, product, reduced = room
+    T, M, inverse, product, reduced = room[0], room[1], room[2], room[3], room[4]
     multiply(curvature, noise, product)
-    multiply(noise.T, product, M)
+    left_transposed(noise, product, M)
     for i in range(3):
         M[i, i] += 1.0
     inverse_root(M, inverse)
-    multiply(noise, inverse.T, gain)
-    times_vector(gain.T, slope, reduced[0])
-    multiply(gain.T, curvature, product)
-    multiply(inverse.T, product, M)
+    right_transposed(noise, inverse, gain)
+    transposed_times(gain, slope, reduced[0])
+    left_transposed(gain, curvature, product)
+    left_transposed(inverse, product, M)
     multiply(gain, product, T)
     complement(T)
     multiply(curvature, T, product)
-    times_vector(T.T, slope, reduced[1])
+    transposed_times(T, slope, reduced[1])
     for i in range(3):
         slope[i] = reduced[1, i]
         for j in range(i + 1):

@@ -19,7 +19,8 @@ from .substitution import substitute
 KINDS = {None: SQUARED, "huber": HUBER, "cauchy": CAUCHY}
 SLACK = 1e-12  # of the cost, in rounding
 REWEIGHTED = 30  # iterations; from then on the noise of the ranges is fixed
-RELOCATED = 5  # iterations from one search for better places of landmarks to the next
+SEARCHES = 5  # for better places of landmarks
+RELOCATED = 5  # iterations from one to the next
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
 
 
@@ -45,16 +46,23 @@ class Estimate(NamedTuple):
     """Shape (2n,), in the order of the elimination."""
 
 
-class Minimum(NamedTuple):
-    """The most likely poses and landmarks, and the system linearised there."""
+class Solution(NamedTuple):
+    """Poses and landmarks whose cost no small step lowers."""
 
     estimate: Estimate
+    cost: float
+    first_cost: float
+    """Of the start."""
+    iterations: int
+
+
+class Minimum(NamedTuple):
+    """A solution with the system linearised there."""
+
+    solution: Solution
     elimination: Elimination
     information: Array
     """Of the landmarks, shape (2n, 2n)."""
-    cost: float
-    first_cost: float
-    iterations: int
 
 
 class Optimiser:
@@ -76,7 +84,17 @@ class Optimiser:
         self._owners = np.repeat(np.arange(poses), np.diff(drive.firsts))
         self._by_landmark = np.argsort(drive.columns, kind="stable")
 
-    def minimise(self, start: Estimate, tolerance: float, most: int) -> Minimum:
+    @property
+    def plausible_cost(self) -> float:
+        """Largest cost that is no sign of a wrong solution.
+
+        Twice the cost of the right one is about χ², with two degrees of freedom for
+        each reading less two for each landmark.
+        """
+        freedom = 2 * len(self._drive.readings) - len(self._room.right)
+        return 0.6 * freedom + 6 * float(np.sqrt(freedom / 2)) + 1
+
+    def minimise(self, start: Estimate, tolerance: float, most: int) -> Solution:
         """Iterate until no pose or landmark moves more than the tolerance [m, rad].
 
         Raises
@@ -84,7 +102,7 @@ class Optimiser:
         numpy.linalg.LinAlgError
             Where that takes more than ``most`` iterations, or no step lowers the cost.
         """
-        estimate, damping = start, 0.0
+        estimate, damping, searches = start, 0.0, SEARCHES
         stds = self.range_stds(estimate)
         first_cost = cost = self.cost(estimate, stds)
         # A start that contradicts a motion without noise is no bound of the cost.
@@ -96,16 +114,24 @@ class Optimiser:
             is_bound = True
             estimate, damping, moved = self._descend(estimate, stds, cost, damping)
             is_found = moved <= tolerance and damping <= FIRST_DAMPING
-            if is_found or iteration % RELOCATED == 0:
-                relocated = self._relocate(estimate)
-                if is_found and not relocated:
-                    return self._at(estimate, first_cost, iteration)
+            if searches and (is_found or iteration % RELOCATED == 0):
+                searches -= 1
+                is_found &= self._relocate(estimate) == 0
+            if is_found:
+                cost = self.cost(estimate, self.range_stds(estimate))
+                return Solution(estimate, cost, first_cost, iteration)
         raise np.linalg.LinAlgError(
             f"smoothing did not converge in {most} iterations: the last one moved a "
             f"pose or landmark by {moved:.3g}, the cost fell from {first_cost:.4g} to "
             f"{self.cost(estimate, stds):.4g}; a better start, another noise or a "
             "robust kernel may help"
         )
+
+    def linearised(self, solution: Solution) -> Minimum:
+        """Return a solution with its system, which the next call overwrites."""
+        stds = self.range_stds(solution.estimate)
+        information = self.linearise(solution.estimate, stds)
+        return Minimum(solution, self._room, information)
 
     def range_stds(self, estimate: Estimate) -> Array:
         """Return σr of each reading, shape (M,), at the range it should have."""
@@ -158,12 +184,6 @@ class Optimiser:
         landmark_step = cho_solve(factor, self._room.right)
         poses = substitute(estimate.poses, self._drive, landmark_step, self._room)
         return Estimate(poses, estimate.landmarks + landmark_step)
-
-    def _at(self, estimate: Estimate, first_cost: float, iterations: int) -> Minimum:
-        """Return the minimum with the system linearised there, not damped."""
-        stds = self.range_stds(estimate)
-        information, cost = self.linearise(estimate, stds), self.cost(estimate, stds)
-        return Minimum(estimate, self._room, information, cost, first_cost, iterations)
 
 
 def _distance(one: Estimate, other: Estimate) -> float:

@@ -2,69 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
 from ..interface import Belief, MapView, SlamEstimator, UpdateReport, optional_members
-from ..map_management.map_view import (
-    mapped_ids,
-    marginal,
-    marginal_without_joining,
-    view_map,
-)
+from ..map_management.map_editor import edit_map
+from ..map_management.map_view import mapped_ids, marginal, view_map
+from ..support import argument_checks
 from .drive import Drive
+
+HISTORY = "recorded_events"
+
+
+class Event(NamedTuple):
+    """One event of a drive, after all those before it."""
+
+    before: Event | None
+    name: str
+    """Method of :class:`Drive` that takes it in."""
+    arguments: tuple[Any, ...]
 
 
 class RecordedSlam:
     """A filter, and beside it the drive that it followed.
 
-    The drive gets the readings that the filter used, of the landmarks that it decided
-    on: with landmark management, those are its associations.  Landmarks that it merged
-    are one in the drive, and those that it removed are not in it.
+    The drive gets the readings that the filter used.  Landmarks that the filter merged
+    are one in the drive, and those that it removed are not in it.  With landmark
+    management around this filter, these are the associations that management decided
+    on, also those of landmarks confirmed later.
 
     Parameters
     ----------
     slam : SlamEstimator
         The filter, at its start.
-    drive : Drive
-        Without motions and scans; it has the noise to smooth with.
+    **noise
+        The keywords of :class:`Drive`.
 
     Examples
     --------
-    >>> from slamgym.estimator import make_estimator
-    >>> from slamgym.estimator.smoother import smooth
+    >>> from slamgym.estimator import InvariantEkfSlam, smooth
     >>> noise = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
-    >>> slam = RecordedSlam(make_estimator("invariant", **noise), Drive(**noise))
+    >>> slam = RecordedSlam(InvariantEkfSlam(**noise), **noise)
     >>> _ = slam.update([(0.0, 5.0)], [7])
     >>> slam.predict((2.0, 0.0))
     >>> _ = slam.update([(0.0, 3.2)], [7])
-    >>> smooth(slam.drive, start=slam.poses).landmarks.round(3)
+    >>> smooth(slam.recorded()).landmarks.round(3)
     array([[5.067, 0.   ]])
     """
 
-    def __init__(self, slam: SlamEstimator, drive: Drive) -> None:
-        self._slam, self.drive = slam, drive
-        self._poses = {0: drive.initial_pose}
+    def __init__(self, slam: SlamEstimator, **noise: Any) -> None:
+        Drive(**noise)  # refuses what it cannot smooth
+        self._slam, self._noise = slam, noise
+        self._editor = edit_map(slam)
+        self._last: Event | None = None
         for name, member in optional_members(slam).items():
             setattr(self, name, member)
 
-    @property
-    def poses(self) -> Array:
-        """The filter's estimate of each pose of the drive, shape (N, 3)."""
-        return np.array([self._poses[pose] for pose in range(self.drive.poses)])
+    def recorded(self) -> Drive:
+        """Return the drive until now; where it ended is a pose of it."""
+        drive = Drive(**self._noise)
+        for event in self._events():
+            getattr(drive, event.name)(*event.arguments)
+        drive.end_motion()
+        return drive
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Refuse: a drive has one start."""
-        raise ValueError("a recorded drive cannot be reset: record another one")
+        """Start a new run and a new drive, at a pose (3,) known to (3,) [m, m, rad]."""
+        self._slam.reset(pose, pose_std)
+        self._noise |= {"initial_pose": pose, "initial_pose_std": pose_std}
+        self._last = None
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
         self._slam.predict(odometry, dt)
-        self.drive.predict(odometry, dt)
+        self._record("predict", argument_checks.pair("odometry", odometry), dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
@@ -77,20 +91,22 @@ class RecordedSlam:
             row: i for row, i in enumerate(decided) if i is not None and i not in unused
         }
         readings = np.asarray(measurements, dtype=np.float64).reshape(-1, 2)
-        self.drive.update(readings[list(used)], list(used.values()))
+        self._record("update", readings[list(used)], list(used.values()))
         for kept, gone in report.merged_ids:
-            self.drive.merge(kept, gone)
+            self._record("merge", kept, gone)
         if report.removed_ids:
-            self.drive.forget(report.removed_ids)
-        belief = marginal_without_joining(self._slam, ())
-        self._poses[self.drive.poses - 1] = belief.pose
+            self._record("forget", report.removed_ids)
         return report
 
-    def end(self) -> None:
-        """Make the place where the drive ended its last pose."""
-        self.drive.end_motion()
-        belief = marginal_without_joining(self._slam, ())
-        self._poses[self.drive.poses - 1] = belief.pose
+    def remove(self, landmark_ids: Sequence[int]) -> None:
+        """Marginalise landmarks, and drop their readings from the drive."""
+        self._editor.remove(landmark_ids)
+        self._record("forget", tuple(landmark_ids))
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Make one of two landmarks, in the filter and in the drive."""
+        self._editor.merge(kept, gone)
+        self._record("merge", kept, gone)
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
         """Return the filter's belief."""
@@ -108,12 +124,36 @@ class RecordedSlam:
         return mapped_ids(self._slam)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the filter's state; the drive is not part of it."""
-        return self._slam.state_dict()
+        """Return the filter's state, and the events until now as one object."""
+        history = np.empty((), dtype=object)
+        history[()] = self._last
+        return self._slam.state_dict() | {HISTORY: history}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Refuse: a drive cannot go back."""
-        raise ValueError("a recorded drive cannot go back to an earlier state")
+        """Continue from a saved state of this process, with its drive.
+
+        Raises
+        ------
+        ValueError
+            Where the state holds no drive, or the filter refuses it.
+        """
+        history = state.get(HISTORY)
+        if not isinstance(history, np.ndarray) or history.dtype != object:
+            raise ValueError(f"state must hold '{HISTORY}', got {sorted(state)}")
+        self._slam.load_state_dict(state)
+        self._last = history.item()
 
     def __repr__(self) -> str:
         return f"Recorded {self._slam!r}"
+
+    def _record(self, name: str, *arguments: Any) -> None:
+        self._last = Event(self._last, name, arguments)
+
+    def _events(self) -> Iterator[Event]:
+        """Yield the events in their order."""
+        events: list[Event] = []
+        event = self._last
+        while event is not None:
+            events.append(event)
+            event = event.before
+        yield from reversed(events)

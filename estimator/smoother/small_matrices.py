@@ -1,4 +1,7 @@
-"""Products and roots of matrices (3, 3), compiled: faster than those of numpy."""
+"""Products and roots of matrices (3, 3), compiled: faster than those of numpy.
+
+The arguments are C-contiguous, since a kernel is compiled anew for every other layout.
+"""
 
 import numpy as np
 
@@ -15,10 +18,26 @@ def multiply(a: Array, b: Array, out: Array) -> None:
 
 
 @njit_internal
-def times_vector(a: Array, b: Array, out: Array) -> None:
-    """Write the product of a matrix (3, 3) and a vector."""
+def left_transposed(a: Array, b: Array, out: Array) -> None:
+    """Write aᵀ b of two matrices (3, 3)."""
     for i in range(3):
-        out[i] = a[i, 0] * b[0] + a[i, 1] * b[1] + a[i, 2] * b[2]
+        for j in range(3):
+            out[i, j] = a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
+
+
+@njit_internal
+def right_transposed(a: Array, b: Array, out: Array) -> None:
+    """Write a bᵀ of two matrices (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
+
+
+@njit_internal
+def transposed_times(a: Array, b: Array, out: Array) -> None:
+    """Write aᵀ b of a matrix (3, 3) and a vector."""
+    for i in range(3):
+        out[i] = a[0, i] * b[0] + a[1, i] * b[1] + a[2, i] * b[2]
 
 
 @njit_internal

@@ -40,12 +40,13 @@ class SmoothedDrive:
     def __init__(
         self, minimum: Minimum, order: Sequence[int], landmark_ids: Sequence[int]
     ) -> None:
-        estimate, elimination = minimum.estimate, minimum.elimination
-        self.cost = minimum.cost
+        solution, elimination = minimum.solution, minimum.elimination
+        estimate = solution.estimate
+        self.cost = solution.cost
         """Half the sum of the squared, normalised residuals; of a robust kernel, ρ."""
-        self.first_cost = minimum.first_cost
+        self.first_cost = solution.first_cost
         """The cost at the start."""
-        self.iterations = minimum.iterations
+        self.iterations = solution.iterations
         """Steps of Levenberg-Marquardt."""
         self.landmark_ids = tuple(landmark_ids)
         """In the order of their first reading."""

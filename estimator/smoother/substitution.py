@@ -17,7 +17,7 @@ from ..models.rigid_motion import composed_jit
 from ..support.jit import jit, njit_internal
 from .drive_arrays import DriveArrays
 from .elimination import Elimination
-from .small_matrices import complement, multiply
+from .small_matrices import complement, multiply, right_transposed
 
 
 @jit
@@ -90,7 +90,7 @@ def conditionals(poses: Array, out: Elimination) -> tuple[Array, Array]:
     K, moved = np.empty((3, 3)), np.empty((3, 3))
     for k in range(count):
         U, phi = out.gains[k], transitions[k]
-        multiply(U, U.T, K)
+        right_transposed(U, U, K)
         multiply(K, out.curvatures[k], phi)
         complement(phi)
         rows = out.rows[k]
@@ -110,7 +110,7 @@ def conditionals(poses: Array, out: Elimination) -> tuple[Array, Array]:
                         + phi[i, 2] * before[2, c]
                     )
             multiply(phi, covariances[k - 1], moved)
-            multiply(moved, phi.T, covariances[k])
+            right_transposed(moved, phi, covariances[k])
         for i in range(3):
             for j in range(3):
                 covariances[k, i, j] += K[i, j]

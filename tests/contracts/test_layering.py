@@ -31,8 +31,9 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         association
         filters
         map_management
-        large_maps smoother
+        large_maps
         registry contract
+        smoother
         check_estimator
     """,
     "estimator.large_maps": """

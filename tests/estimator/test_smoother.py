@@ -6,9 +6,10 @@ from dense_smoother import DenseSmoother
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 
 from slamgym.estimator import make_estimator
+from slamgym.estimator.map_management import ManagedSlam
 from slamgym.estimator.models.angles import wrap_angle
-from slamgym.estimator.smoother import Drive, RecordedSlam, smooth
-from slamgym.estimator.smoother.batch_smoother import filtered
+from slamgym.estimator.smoother import Drive, SmoothingSlam, smooth
+from slamgym.estimator.smoother.start import start_of
 
 START_STD = (0.1, 0.2, 0.05)
 RANGE = 7.0  # of the sensor [m]
@@ -139,7 +140,7 @@ def test_gtsam_finds_the_same_poses_landmarks_and_marginals():
     import gtsam_batch
 
     made, moves, scans = recorded(seed=4, steps=60)
-    smoothed, (poses, places) = smooth(made), filtered(made)
+    smoothed, (poses, places) = smooth(made), start_of(made)
     settings = (MOTION_STD, MEASUREMENT_STD, START_STD)
     graph = gtsam_batch.graph_of(moves, scans, *settings)
     solution = gtsam_batch.solve(graph, gtsam_batch.values_of(poses, places))
@@ -351,44 +352,74 @@ def test_readings_below_the_minimum_range_are_skipped():
     assert made.landmark_ids == (1,)
 
 
-def test_a_recorded_filter_gives_its_associations_to_the_drive():
+@pytest.mark.parametrize("backdate", [False, True])
+def test_management_gives_its_associations_to_the_drive(backdate):
     noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    managed = make_estimator("invariant", management=True, **noise)
-    slam, plain = RecordedSlam(managed, Drive(**noise)), Drive(**noise)
+    policy = {"confirm": [3, 5], "backdate": backdate}
+    slam = ManagedSlam(SmoothingSlam, management=policy, **noise)
+    plain = Drive(**noise)
     for odometry, readings, _ in drive(5, 40, landmarks=SIX):
         slam.predict(odometry)
         slam.update(readings)
         plain.predict(odometry)
         plain.update(readings, range(6))
-    smoothed, expected = smooth(slam.drive, start=slam.poses), smooth(plain)
+    smoothed, expected = slam.smoothed(), smooth(plain)
     gaps = np.linalg.norm(smoothed.landmarks[:, None] - expected.landmarks, axis=2)
     assert sorted(gaps.argmin(axis=1)) == [0, 1, 2, 3, 4, 5]
-    assert (gaps.min(axis=1) < 0.3).all()  # the first two scans are not associated
-    assert 6 * 35 < slam.drive.readings <= 6 * 38
-    assert slam.drive.poses == 41
+    made = slam.filter.recorded()
+    assert made.poses == 41
+    assert (made.readings > 6 * 38) == backdate  # confirmed at the third sight
+    if backdate:
+        assert smoothed.poses == pytest.approx(expected.poses, abs=0.05)
 
 
 def test_merged_and_removed_landmarks_leave_the_drive():
-    made = Drive(MOTION_STD, MEASUREMENT_STD)
-    made.update([(0.1, 2.0), (0.4, 3.0)], [0, 1])
-    made.predict((0.5, 0.0))
-    made.update([(0.15, 1.6), (1.0, 2.0)], [2, 3])
-    made.merge(0, 2)
-    made.forget([3])
-    assert made.landmark_ids == (0, 1)
-    assert smooth(made).landmark_ids == (0, 1)
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    slam = SmoothingSlam(**noise)
+    slam.update([(0.1, 2.0), (0.4, 3.0)], [0, 1])
+    slam.predict((0.5, 0.0))
+    slam.update([(0.15, 1.6), (1.0, 2.0)], [2, 3])
+    slam.merge(0, 2)
+    slam.remove([3])
+    assert slam.landmark_ids == slam.smoothed().landmark_ids == (0, 1)
+
+
+def test_a_filter_that_goes_back_takes_its_drive_back():
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    slam = SmoothingSlam(**noise)
+    slam.update([(0.1, 2.0)], [0])
+    before, expected = slam.state_dict(), slam.smoothed()
+    slam.predict((0.5, 0.0))
+    slam.update([(0.15, 1.6), (1.0, 2.0)], [0, 3])
+    slam.load_state_dict(before)
+    assert repr(slam.smoothed()) == repr(expected)
+    with pytest.raises(ValueError, match="state must hold 'recorded_events'"):
+        slam.load_state_dict(make_estimator("invariant", **noise).state_dict())
+    slam.reset((1.0, 0, 0), (0, 0, 0))
+    slam.update([(0.1, 2.0)], [0])
+    assert slam.smoothed().poses.tolist() == [[1.0, 0.0, 0.0]]
 
 
 def test_recording_does_not_change_the_filter():
     noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    alone = make_estimator("invariant", **noise)
-    slam = RecordedSlam(make_estimator("invariant", **noise), Drive(**noise))
+    alone, slam = make_estimator("invariant", **noise), SmoothingSlam(**noise)
     for odometry, readings, _ in drive(6, 5):
         for each in (alone, slam):
             each.predict(odometry)
             each.update(readings, list(range(6)))
     assert slam.belief().mean.tolist() == alone.belief().mean.tolist()
-    assert slam.poses[-1].tolist() == alone.belief().pose.tolist()
+    assert slam.recorded().readings == 30
     assert slam.landmark_ids == alone.landmark_ids
-    with pytest.raises(ValueError, match="cannot be reset"):
-        slam.reset((0, 0, 0), (0, 0, 0))
+
+
+def test_the_smoother_follows_any_filter_and_refuses_what_it_cannot_take():
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    gated = SmoothingSlam(follow="ekf", gate_probability=0.99, **noise)
+    gated.update([(0.1, 2.0)], [0])
+    for reading in ((0.1, 2.0), (0.1, 9.0)):
+        gated.update([reading], [0])
+    assert gated.recorded().readings == 2
+    with pytest.raises(TypeError, match="gate_probabilty"):
+        SmoothingSlam(gate_probabilty=0.99, **noise)
+    with pytest.raises(ValueError, match="robust must be"):
+        SmoothingSlam(robust="tukey", **noise)

@@ -15,6 +15,8 @@ from ...runs.filter_settings import FilterSettings, settings_for_scenario
 
 _PACKAGE = Path(registry.__file__).resolve().parents[1]
 _BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")
+OFFLINE = {"smoother": "slamgym.estimator.smoother.smoothing_slam:SmoothingSlam"}
+"""Estimators of whole drives, which no step-by-step experiment knows by name."""
 _COMMA = re.compile(r",(?![^\[]*\])")  # outside brackets
 _SPEC = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>[^\]]*)\])?")
 
@@ -106,12 +108,13 @@ def _read(spec: str) -> EstimatorChoice:
         raise ValueError(
             f"options must be like [iterations=3,sequential=true], got '{spec}'"
         ) from None
-    return EstimatorChoice(spec, match["name"].strip(), table)
+    name = match["name"].strip()
+    return EstimatorChoice(spec, OFFLINE.get(name, name), table)
 
 
 def _labelled(label: str, what: Any) -> EstimatorChoice:
     if isinstance(what, str):
-        return EstimatorChoice(label, what)
+        return EstimatorChoice(label, OFFLINE.get(what, what))
     if isinstance(what, tuple) and len(what) == 2:
         name, options = what
         return EstimatorChoice(label, _name_of(label, name), options)
@@ -121,7 +124,7 @@ def _labelled(label: str, what: Any) -> EstimatorChoice:
 def _name_of(label: str, what: str | Callable[..., Any]) -> str:
     """Return the import path of a class, or register what cannot be imported."""
     if isinstance(what, str):
-        return what
+        return OFFLINE.get(what, what)
     module, name = getattr(what, "__module__", ""), getattr(what, "__qualname__", "")
     path = f"{module}:{name}"
     if module != "__main__" and name.isidentifier():

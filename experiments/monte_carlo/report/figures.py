@@ -46,20 +46,22 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> dict[str, Fi
     -------
     dict of str to Figure
         ``nees``, ``runs``, ``heading``, ``nis`` and ``rmse``, of the estimators with
-        successful runs; empty if there is none.
+        successful runs; empty if there is none. ``nis`` shows those with innovations,
+        which a smoother has not.
     """
     frame: ErrorFrame = summary["frame"]
     each = [scores_of(dataset, label, frame) for label in labels_of(dataset)]
     shown = [(scores, look_of(i)) for i, scores in enumerate(each) if scores.good.any()]
     if not shown:
         return {}
-    return {
+    figures = {
         "nees": nees_figure(shown, frame, summary),
         "runs": runs_figure(shown, frame),
         "heading": heading_figure(shown, summary["knowable_heading_std"]),
-        "nis": nis_figure(shown),
         "rmse": rmse_figure(shown),
     }
+    innovative = [pair for pair in shown if pair[0].nis_per_degree is not None]
+    return figures | ({"nis": nis_figure(innovative)} if innovative else {})
 
 
 def nees_figure(shown: Shown, frame: ErrorFrame, summary: dict[str, Any]) -> Figure:

@@ -1,0 +1,78 @@
+"""The smoother where a filter is expected: it follows a drive, then smooths it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from ..registry import accepted_options, find_estimator, make_estimator
+from .batch_smoother import robust_kernel, smooth
+from .recorded_slam import RecordedSlam
+from .smoothed_drive import SmoothedDrive
+
+
+class SmoothingSlam(RecordedSlam):
+    """A filter that keeps its drive, and smooths it at the end.
+
+    Its beliefs on the way are the filter's.  :meth:`smoothed` returns those about all
+    poses given the whole drive, which experiments take in their place.
+
+    Parameters
+    ----------
+    motion_std, measurement_std, initial_pose, initial_pose_std
+        As every filter takes them.
+    follow : str
+        The filter, by a name that :func:`~slamgym.estimator.make_estimator` takes.
+    robust, robust_scale
+        As in :func:`.batch_smoother.smooth`.
+    range_std_per_metre, range_noise_at, noise_at_rest, min_range
+        As in :class:`~slamgym.estimator.EkfSlam`; the filter gets those that it takes.
+    **options
+        Further options of the filter.
+
+    Raises
+    ------
+    ValueError
+        Where an argument is refused.
+    TypeError
+        Where the filter does not take an option.
+    """
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        follow: str = "invariant",
+        robust: str | None = None,
+        robust_scale: float | None = None,
+        initial_pose: ArrayLike = (0.0, 0.0, 0.0),
+        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        range_std_per_metre: float = 0.0,
+        range_noise_at: str = "expected",
+        noise_at_rest: bool = True,
+        min_range: float = 1e-3,
+        **options: Any,
+    ) -> None:
+        noise: dict[str, Any] = {
+            "motion_std": motion_std,
+            "measurement_std": measurement_std,
+            "initial_pose": initial_pose,
+            "initial_pose_std": initial_pose_std,
+        }
+        sensor = {
+            "range_std_per_metre": range_std_per_metre,
+            "range_noise_at": range_noise_at,
+            "noise_at_rest": noise_at_rest,
+            "min_range": min_range,
+        }
+        robust_kernel(robust, robust_scale)
+        taken = accepted_options(find_estimator(follow), sensor)
+        slam = make_estimator(follow, **noise, **taken, **options)
+        super().__init__(slam, **noise, **sensor)
+        self._kernel: dict[str, Any] = {"robust": robust, "robust_scale": robust_scale}
+
+    def smoothed(self) -> SmoothedDrive:
+        """Return the beliefs about all poses, given the drive until now."""
+        return smooth(self.recorded(), start=self.belief(), **self._kernel)
