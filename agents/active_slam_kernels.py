@@ -11,9 +11,10 @@ import numpy as np
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.kernels.in_view import View
+from ..estimator.kernels.log_det import half_log_det, largest_variance
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..estimator.support.jit import jit, njit_internal
-from .belief_kernels import FeatureArrays, largest_variance, write_belief_features
+from .belief_kernels import FeatureArrays, write_belief_features
 from .floor_kernels import (
     DISTANCE,
     FAR,
@@ -190,36 +191,13 @@ def map_uncertainty(
     sx, sy = rules.prior_std
     if rules.criterion == D:
         prior = missing * (math.log(sx) + math.log(sy))
-        return (prior + log_root_det(P, scratch.matrix)) / landmarks
+        return (prior + half_log_det(P, scratch.matrix)) / landmarks
     if rules.criterion == A:
         return float((missing * (sx * sx + sy * sy) + np.trace(P)) / landmarks)
     largest = max(sx * sx, sy * sy) if missing > 0 else 0.0
     if mapped > 0:
         largest = max(largest, np.linalg.eigvalsh(np.ascontiguousarray(P))[-1])
     return float(largest)
-
-
-@njit_internal
-def log_root_det(P: Array, L: Array) -> float:
-    """Compute ½ log det P by its Cholesky factor; -inf if not positive definite.
-
-    The diagonal of L holds reciprocals.
-    """
-    half_log_det = 0.0
-    for i in range(len(P)):
-        for j in range(i):
-            entry = P[i, j]
-            for k in range(j):
-                entry -= L[i, k] * L[j, k]
-            L[i, j] = entry * L[j, j]
-        pivot = P[i, i]
-        for k in range(i):
-            pivot -= L[i, k] * L[i, k]
-        if not pivot > 0.0:
-            return -math.inf
-        half_log_det += 0.5 * math.log(pivot)
-        L[i, i] = 1.0 / math.sqrt(pivot)
-    return half_log_det
 
 
 @njit_internal

@@ -6,6 +6,7 @@ Symbols are those of `belief_features`.
 import math
 
 from ..arrays import Array, BoolArray, IntArray
+from ..estimator.kernels.log_det import largest_variance
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..estimator.support.jit import jit, njit_internal
 
@@ -118,14 +119,6 @@ def relative_spread(
         xy - to_x * dx + to_y * dy - turn * dx * dy,
         yy - 2 * to_y * dx + turn * dx * dx,
     )
-
-
-@njit_internal
-def largest_variance(covariance: Array, x: int) -> float:
-    """Compute the larger eigenvalue of the block at columns x and x + 1."""
-    xx, yy = covariance[x, x], covariance[x + 1, x + 1]
-    across = math.hypot(0.5 * (xx - yy), covariance[x, x + 1])
-    return float(0.5 * (xx + yy) + across)
 
 
 @njit_internal

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from agents_beliefs import belief_table
+from agents_beliefs import belief_table, imagine_line
 from agents_peers import peer_calls
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import FlattenObservation
@@ -173,7 +173,9 @@ def main() -> int:
     console = Console(width=120)
     console.print(table)
     console.print(beliefs)
-    return missed + of_beliefs
+    line, of_plans = imagine_line()
+    console.print(line)
+    return missed + of_beliefs + of_plans
 
 
 def _against_bare(times: dict[str, list[float]], name: str, case: Case) -> list[str]:

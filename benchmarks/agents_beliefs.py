@@ -24,12 +24,15 @@ import numpy as np
 from interleaved import verdict
 from rich.table import Table
 
-from slamgym.agents import BeliefObservationVector
+from slamgym.agents import ActiveSlamEnv, BeliefObservationVector
+from slamgym.estimator import imagine
 from slamgym.estimator.filters import batch
 from slamgym.estimator.kernels.batch import drive_runs
 
 ID = "slamgym/LandmarkWorld-v0"
 GOAL = 3.0
+IMAGINE_GOAL = 4.0  # [ms]
+TWELVE = {"layout": "ring", "count": 12, "radius": 4.0}
 ROUNDS = 21
 STEPS = {20: 30, 64: 30, 1024: 4}  # worlds: steps of each in a round
 EPISODE = 10_000  # steps: none ends meanwhile
@@ -93,6 +96,25 @@ def belief_table() -> tuple[Table, int]:
         ]
         table.add_row(str(count), *times, f"{value:.2f}", f"<= {GOAL:g}", word)
     return table, missed
+
+
+def imagine_line() -> tuple[str, int]:
+    """Time 256 plans of 10 steps from a map of 12 landmarks; goal at most 4 ms."""
+    env = ActiveSlamEnv("active_medium", landmarks=TWELVE, crash_cost=0.0)
+    env.reset(seed=0)
+    for _ in range(7):  # once around, until all are mapped
+        env.step([0.0, 1.0])
+    plans = np.random.default_rng(0).uniform([0.0, -1.0], [1.0, 1.0], (256, 10, 2))
+    slam: Any = env.knowledge.estimator
+    sensor, best = env.scenario.sensor, np.inf
+    for _ in range(50):
+        began = time.thread_time()
+        imagine(slam, plans, sensor)
+        best = min(best, 1e3 * (time.thread_time() - began))
+    word = verdict(best, IMAGINE_GOAL, at_least=False)
+    mapped = len(slam.belief().landmark_ids)
+    what = f"imagine, 256 plans x 10 steps, {mapped} landmarks: {best:.2f} ms"
+    return f"{what}, goal <= {IMAGINE_GOAL:g}: {word}", int(word == "MISSED")
 
 
 def _round(

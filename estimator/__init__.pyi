@@ -6,6 +6,7 @@ from . import models as models
 from . import smoother as smoother
 from .check_estimator import EstimatorContractError as EstimatorContractError
 from .check_estimator import check_estimator as check_estimator
+from .filters import BatchBeliefs as BatchBeliefs
 from .filters import BatchSlam as BatchSlam
 from .filters import BatchTrace as BatchTrace
 from .filters import EkfSlam as EkfSlam
@@ -17,6 +18,7 @@ from .filters import ObservabilityConstrainedEkfSlam as ObservabilityConstrained
 from .filters import RobocentricEkfSlam as RobocentricEkfSlam
 from .filters import UnscentedSlam as UnscentedSlam
 from .filters import can_batch as can_batch
+from .filters import imagine as imagine
 from .interface import Belief as Belief
 from .interface import SlamEstimator as SlamEstimator
 from .interface import UpdateReport as UpdateReport

@@ -16,7 +16,7 @@ from ..kernels.scan_rows import Workspace
 from ..models.angles import wrap_angle
 from ..support import argument_checks
 from ..support.threads import share_out, usable_cores
-from .batch_arguments import chosen_runs, first_poses, step_data
+from .batch_arguments import checked_beliefs, chosen_runs, first_poses, step_data
 from .batch_results import BatchBeliefs, BatchStorage, BatchTrace
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap
@@ -80,9 +80,10 @@ class BatchSlam:
             raise ValueError(f"{type(estimator).__name__} cannot run in batches")
         self.runs = argument_checks.whole("runs", runs, 1)
         self.landmarks = argument_checks.whole("landmarks", landmarks, 0)
-        self._rules = estimator.rules
-        self._rule_values = estimator.rule_values.copy()
-        self._motion_values = estimator.motion_values
+        self.rules = estimator.rules
+        """What distinguishes this filter's updates from another's."""
+        self.rule_values = estimator.rule_values.copy()
+        self.motion_values = estimator.motion_values
         self._threads = argument_checks.whole("threads", threads or usable_cores(), 1)
         std = argument_checks.standard_deviations(
             "initial_pose_std", initial_pose_std, 3
@@ -182,10 +183,7 @@ class BatchSlam:
         self.failed_at[chosen] = NEVER
 
     def beliefs(self) -> BatchBeliefs:
-        """Return the beliefs of all runs side by side, as a snapshot.
-
-        A run that has stopped still has the belief it stopped with.
-        """
+        """Return a snapshot of all beliefs; a run that stopped has its last."""
         return self.storage().beliefs()
 
     def storage(self) -> BatchStorage:
@@ -194,6 +192,40 @@ class BatchSlam:
         They change with the next :meth:`run` or :meth:`reset`.
         """
         return BatchStorage.of(self._means, self._covariances, self._slots)
+
+    @property
+    def references(self) -> Array:
+        """Linearisation points, stored like the means, for filters that fix them."""
+        return BatchStorage.of(self._references, self._covariances, self._slots).means
+
+    def load(
+        self,
+        beliefs: BatchBeliefs,
+        *,
+        references: ArrayLike | None = None,
+        runs: ArrayLike | None = None,
+    ) -> None:
+        """Continue runs from beliefs; also those that had stopped.
+
+        Parameters
+        ----------
+        beliefs : BatchBeliefs
+            Of B runs, as :meth:`beliefs` returns them, or `BatchBeliefs.of` makes them.
+        references : array_like, shape (B, 3 + 2L), optional
+            Linearisation points of filters that fix them; the means by default.
+        runs : array_like of bool, shape (B,), optional
+            All by default.
+
+        Raises
+        ------
+        ValueError
+            Where a shape is wrong, or a belief cannot be; nothing is then loaded.
+        """
+        chosen = chosen_runs(runs, self.runs)
+        loaded = checked_beliefs(beliefs, references, chosen, self.landmarks)
+        for run in np.flatnonzero(chosen).tolist():
+            loaded.write(run, self._arrays())
+        self.failed_at[chosen] = NEVER
 
     def belief(self, run: int) -> Belief:
         """Return the belief of one run as a snapshot."""
@@ -204,26 +236,17 @@ class BatchSlam:
             self._means[run, :n],
             self._covariances[run, :n, :n],
             tuple(np.flatnonzero(slots >= 0)[order].tolist()),
-            FRAMES[self._rules.frame],
+            FRAMES[self.rules.frame],
         )
 
     @property
     def nbytes(self) -> int:
         """Memory that the beliefs of all runs take [bytes]."""
-        return sum(
-            array.nbytes
-            for array in (
-                self._means,
-                self._references,
-                self._covariances,
-                self._slots,
-                self._mapped,
-            )
-        )
+        return sum(array.nbytes for array in self._arrays())
 
     def __repr__(self) -> str:
-        mapped = self._mapped
-        landmarks = f"{mapped.min()} to {mapped.max()} of {self.landmarks} landmarks"
+        few, most = self._mapped.min(), self._mapped.max()
+        landmarks = f"{few} to {most} of {self.landmarks} landmarks"
         stopped = int((self.failed_at != NEVER).sum())
         return f"BatchSlam of {self.runs} runs, {landmarks} mapped, {stopped} stopped"
 
@@ -235,30 +258,29 @@ class BatchSlam:
         failed_at: IntArray,
         part: slice,
     ) -> None:
-        runs = RunArrays(
-            self._means, self._covariances, self._references, self._slots, self._mapped
-        )
         drive_runs(
-            _of(part, runs),
+            _of(part, self._arrays()),
             _of(part, data),
             dt,
             _of(part, trace),
             failed_at[part],
-            self._motion_values,
-            self._rule_values,
+            self.motion_values,
+            self.rule_values,
             _of(slice(None), self._room()),
+        )
+
+    def _arrays(self) -> RunArrays:
+        return RunArrays(
+            self._means, self._covariances, self._references, self._slots, self._mapped
         )
 
     def _room(self) -> Workspace:
         """Give each share a workspace of its own; kept where there is one thread."""
-        if self._threads > 1:
-            return self._new_room()
-        if self._kept_room is None:
-            self._kept_room = self._new_room()
-        return self._kept_room
-
-    def _new_room(self) -> Workspace:
-        return workspace_for(self._rules, self.landmarks, self._means.shape[1])
+        if self._threads == 1 and self._kept_room is not None:
+            return self._kept_room
+        room = workspace_for(self.rules, self.landmarks, self._means.shape[1])
+        self._kept_room = room
+        return room
 
 
 def can_batch(estimator: object) -> bool:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, BoolArray
-from ..kernels.batch import StepData
+from ..kernels.batch import RunArrays, StepData
 from ..support import argument_checks
+from .batch_results import BatchBeliefs
+
+_ROUNDING = 1e-9  # tolerance of a negative eigenvalue, as in `check_estimator`
 
 
 def step_data(
@@ -51,6 +56,80 @@ def chosen_runs(runs: ArrayLike | None, count: int) -> BoolArray:
             f"{chosen.shape}"
         )
     return chosen
+
+
+class LoadedBeliefs(NamedTuple):
+    """Beliefs that have been checked; arrays as in `BatchBeliefs`."""
+
+    means: Array
+    covariances: Array
+    references: Array
+    mapped: BoolArray
+
+    def write(self, run: int, arrays: RunArrays) -> None:
+        """Replace the belief of a run; its landmarks are stored in order of id."""
+        ids = np.flatnonzero(self.mapped[run])
+        at = [0, 1, 2, *(3 + 2 * i + axis for i in ids.tolist() for axis in (0, 1))]
+        size = len(at)
+        for array in arrays[:3]:
+            array[run] = 0.0
+        arrays.means[run, :size] = self.means[run, at]
+        arrays.references[run, :size] = self.references[run, at]
+        arrays.covariances[run, :size, :size] = self.covariances[run][np.ix_(at, at)]
+        arrays.slots[run] = -1
+        arrays.slots[run, ids] = np.arange(len(ids))
+        arrays.mapped[run] = len(ids)
+
+
+def checked_beliefs(
+    beliefs: BatchBeliefs,
+    references: ArrayLike | None,
+    runs: BoolArray,
+    landmarks: int,
+) -> LoadedBeliefs:
+    """Return beliefs of B runs over L landmarks, or refuse those of the chosen runs."""
+    count, size = len(runs), 3 + 2 * landmarks
+    means = argument_checks.as_floats("beliefs.means", beliefs.means)
+    covariances = argument_checks.as_floats("beliefs.covariances", beliefs.covariances)
+    points = means
+    if references is not None:
+        points = argument_checks.as_floats("references", references)
+    mapped = np.asarray(beliefs.mapped)
+    for name, array, shape in (
+        ("beliefs.means", means, (count, size)),
+        ("beliefs.covariances", covariances, (count, size, size)),
+        ("beliefs.mapped", mapped, (count, landmarks)),
+        ("references", points, (count, size)),
+    ):
+        if array.shape != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    if mapped.dtype != np.bool_:
+        raise ValueError(f"beliefs.mapped must be booleans, got {mapped.dtype}")
+    for run in np.flatnonzero(runs).tolist():
+        problem = _problem(means[run], covariances[run], points[run])
+        if problem:
+            raise ValueError(f"{problem} in run {run}")
+    return LoadedBeliefs(means, covariances, points, mapped)
+
+
+def _problem(mean: Array, covariance: Array, reference: Array) -> str | None:
+    """Return what is wrong with a belief, or None."""
+    for name, array in (
+        ("beliefs.means", mean),
+        ("beliefs.covariances", covariance),
+        ("references", reference),
+    ):
+        if not np.isfinite(array).all():
+            return f"{name} must be finite, but is not"
+    if not np.array_equal(covariance, covariance.T):
+        return "beliefs.covariances must be symmetric, but is not"
+    least = float(np.linalg.eigvalsh(covariance)[0])
+    if least < -_ROUNDING * max(1.0, float(np.trace(covariance))):
+        return (
+            "beliefs.covariances must be positive semidefinite, but has the "
+            f"eigenvalue {least:.3g}"
+        )
+    return None
 
 
 def first_poses(name: str, poses: ArrayLike, count: int) -> Array:

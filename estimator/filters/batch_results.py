@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
+from ..belief import Belief
 from ..models.angles import wrap_angle
 
 
@@ -32,6 +34,29 @@ class BatchBeliefs(NamedTuple):
     """Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped."""
     mapped: BoolArray
     """Which landmarks are in the map, shape (B, L)."""
+
+    @classmethod
+    def of(cls, beliefs: Sequence[Belief], landmarks: int) -> BatchBeliefs:
+        """Return beliefs of single filters with L landmarks, whose ids are 0 … L−1.
+
+        Raises
+        ------
+        ValueError
+            Where a belief has a landmark with another id.
+        """
+        count, size = len(beliefs), 3 + 2 * landmarks
+        means, covariances = np.zeros((count, size)), np.zeros((count, size, size))
+        mapped = np.zeros((count, landmarks), dtype=np.bool_)
+        for run, belief in enumerate(beliefs):
+            ids = belief.landmark_ids
+            if not all(0 <= i < landmarks for i in ids):
+                raise ValueError(
+                    f"landmark ids must be below landmarks = {landmarks}, got {ids}"
+                )
+            at = [0, 1, 2, *(3 + 2 * i + axis for i in ids for axis in (0, 1))]
+            means[run, at], mapped[run, list(ids)] = belief.mean, True
+            covariances[run][np.ix_(at, at)] = belief.covariance
+        return cls(means, covariances, mapped)
 
     @property
     def poses(self) -> Array:

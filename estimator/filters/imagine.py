@@ -1,0 +1,191 @@
+"""What would be known after a plan: open-loop beliefs of filters of the family."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...arrays import Array, IntArray
+from ..kernels.imagine import Imagined, imagine_plans
+from ..kernels.in_view import as_view
+from ..support import argument_checks
+from .batch import BatchSlam, can_batch
+from .ekf import EkfSlam
+from .scan_workspace import workspace_for
+
+_STDS = slice(5, 8)  # of `Rules`: the standard deviations of the measurement noise
+
+
+class SensorLimits(Protocol):
+    """What a sensor sees; ``Scenario.sensor`` has these attributes."""
+
+    @property
+    def min_range(self) -> float:
+        """Nearest visible landmark [m]."""
+
+    @property
+    def max_range(self) -> float:
+        """Farthest visible landmark [m]."""
+
+    @property
+    def field_of_view(self) -> float:
+        """Full angle of view, centred on the heading [rad]."""
+
+    @property
+    def occlusion(self) -> bool:
+        """Whether walls hide landmarks."""
+
+    @property
+    def dropout(self) -> float:
+        """Probability of losing a reading."""
+
+
+def imagine(
+    filters: EkfSlam | BatchSlam,
+    plans: ArrayLike,
+    sensor: SensorLimits,
+    *,
+    walls: ArrayLike = (),
+    density: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Imagined:
+    """Imagine the beliefs after plans that nobody has driven.
+
+    From its present belief, the filter predicts with the odometry of a plan and
+    updates with the readings that it expects: of the mapped landmarks that the sensor
+    would see from the believed pose. Their innovations are zero, so that the means
+    follow the plan and only covariances change. No filter changes.
+
+    A reading that can drop out counts with the expected share of its information: its
+    variance is divided by 1 - dropout.
+
+    Parameters
+    ----------
+    filters : EkfSlam or BatchSlam
+        One filter, or B filters side by side, of the kinds that run in batches: their
+        beliefs, rules and noise.
+    plans : array_like, shape (K, T, 2) or (B, K, T, 2)
+        Odometry (d, α) of T steps [m, rad]; the same plans for all filters, or K for
+        each.
+    sensor : SensorLimits
+        ``scenario.sensor``, or any object with its attributes.
+    walls : array_like, shape (W, 4)
+        Rows (x0, y0, x1, y1) [m]. They hide landmarks if ``sensor.occlusion`` is set.
+    density : (points, counts), optional
+        Points where unmapped landmarks may be, (C, 2) [m], and the expected number of
+        them at each point, (C,) or (B, C). A point counts once it is in view.
+
+    Returns
+    -------
+    Imagined
+        L is the number of landmarks of a batch, or that of a filter's map, in the
+        order of its belief. B is 1 for one filter. nan where an update fails.
+
+    Raises
+    ------
+    TypeError
+        If the filter is of another kind.
+    ValueError
+        If an array has a wrong shape or is not finite, or there is no plan or no step.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> slam = EkfSlam((0.1, 0.05, 0.05), (0.02, 0.1))
+    >>> _ = slam.update([(0.0, 2.0)], landmark_ids=[7])
+    >>> ahead, back = np.full((5, 2), (0.2, 0.0)), np.full((5, 2), (-0.2, 0.0))
+    >>> sensor = load_scenario("active_medium").sensor
+    >>> after = imagine(slam, [ahead, back], sensor)
+    >>> after.worst_variances.shape
+    (1, 2, 1)
+    >>> bool((after.worst_variances[0, 0] < slam.belief().covariance[3, 3]).all())
+    True
+    """
+    means, covariances, references, slots = _beliefs(filters)
+    count, landmarks = slots.shape
+    driven = _checked_plans(plans, count)
+    ends = argument_checks.as_floats("walls", walls).reshape(-1, 4)
+    dropout = float(sensor.dropout)
+    rules = filters.rule_values.copy()
+    rules[_STDS] /= max(1.0 - dropout, 1e-9) ** 0.5
+    view = as_view(
+        float(sensor.max_range),
+        float(sensor.field_of_view),
+        ends if sensor.occlusion else ends[:0],
+    )
+    min_range = float(sensor.min_range)
+    settings = tuple(view), min_range, dropout, filters.motion_values, rules
+    plans_each, steps = driven.shape[1:3]
+    results = Imagined(
+        np.full((count, plans_each, steps, 3), np.nan),
+        np.full((count, plans_each, steps, 3, 3), np.nan),
+        np.full((count, plans_each), np.nan),
+        np.full((count, plans_each, landmarks), np.nan),
+        np.full((count, plans_each), np.nan),
+    )
+    workspace = workspace_for(filters.rules, landmarks, means.shape[1])
+    imagine_plans(
+        (means, covariances, references, slots),
+        driven,
+        _checked_density(density, count),
+        settings,
+        tuple(workspace),
+        tuple(results),
+    )
+    return results
+
+
+def _beliefs(filters: EkfSlam | BatchSlam) -> tuple[Array, Array, Array, IntArray]:
+    """Return means, covariances, references and slots, live."""
+    if isinstance(filters, BatchSlam):
+        means, covariances, slots = filters.storage()
+        return means, covariances, filters.references, slots
+    if not can_batch(filters):
+        raise TypeError(
+            "filters must be a BatchSlam, or a filter that can run in batches, "
+            f"got {type(filters).__name__}"
+        )
+    gaussian = filters.map
+    slots = np.arange(len(gaussian.slots))[None]
+    means, covariances, references = (array[None] for array in gaussian.arrays)
+    return means, covariances, references, slots
+
+
+def _checked_plans(plans: ArrayLike, count: int) -> Array:
+    """Return plans (B, K, T, 2)."""
+    given = argument_checks.as_floats("plans", plans)
+    if given.ndim not in (3, 4) or given.shape[-1] != 2 or 0 in given.shape:
+        raise ValueError(
+            "plans must have shape (K, T, 2) or (B, K, T, 2) with at least one plan of "
+            f"one step, got {given.shape}"
+        )
+    if given.ndim == 4 and len(given) != count:
+        raise ValueError(
+            f"plans must be those of {count} filters along the first axis, "
+            f"got {given.shape}"
+        )
+    if not np.isfinite(given).all():
+        raise ValueError("plans must be finite")
+    return np.ascontiguousarray(np.broadcast_to(given, (count, *given.shape[-3:])))
+
+
+def _checked_density(
+    density: tuple[ArrayLike, ArrayLike] | None, count: int
+) -> tuple[Array, Array]:
+    """Return points (2, C) and expected counts (B, C)."""
+    if density is None:
+        return np.zeros((2, 0)), np.zeros((count, 0))
+    points, weights = (argument_checks.as_floats("density", part) for part in density)
+    shape = (len(points),) if points.ndim == 2 and points.shape[1] == 2 else None
+    if shape is None or weights.shape not in (shape, (count, *shape)):
+        raise ValueError(
+            f"density must be points (C, 2) and counts (C,) or ({count}, C), "
+            f"got {points.shape} and {weights.shape}"
+        )
+    if not (
+        np.isfinite(points).all() and (np.isfinite(weights) & (weights >= 0)).all()
+    ):
+        raise ValueError("density must be finite points and finite counts >= 0")
+    spread = np.broadcast_to(weights, (count, *shape))
+    return np.ascontiguousarray(points.T), np.ascontiguousarray(spread)

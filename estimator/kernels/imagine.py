@@ -1,0 +1,214 @@
+"""Beliefs after plans that nobody has driven, compiled.
+
+Every plan starts from a copy of a belief. Its steps are those of a real filter: the
+expected readings have innovations of zero, so that only the covariance changes.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...arrays import Array, IntArray
+from ..models.bearing_range import wrap_angle_jit
+from ..support.jit import jit, njit_internal
+from .in_view import View, is_hidden, is_in_view
+from .log_det import half_log_det, largest_variance
+from .predict import predict
+from .rules import as_rules
+from .scan_rows import LEDGER_HEIGHT, SLOT
+from .scan_update import DONE, update_belief
+
+
+class Settings(NamedTuple):
+    """The sensor and the noise of all plans."""
+
+    sight: View
+    min_range: float
+    """[m]"""
+    dropout: float
+    """Probability that a reading is lost."""
+    motion_values: Array
+    no_noise: Array
+    """Zeros, for a robot at rest."""
+    rule_values: Array
+    """With the measurement noise of expected readings."""
+
+
+class Room(NamedTuple):
+    """A copy of a belief, and room for its updates."""
+
+    mean: Array
+    covariance: Array
+    reference: Array
+    factor: Array
+    readings: Array
+    ledger: IntArray
+    workspace: tuple[Array, Array, Array]
+
+
+class Imagined(NamedTuple):
+    """The beliefs expected after K plans of T steps in B worlds."""
+
+    poses: Array
+    """(x, y, θ) after every step, shape (B, K, T, 3) [m, m, rad]."""
+    pose_covariances: Array
+    """Of the additive error, shape (B, K, T, 3, 3)."""
+    log_det: Array
+    """log det of the joint covariance of the mapped landmarks in the end, (B, K)."""
+    worst_variances: Array
+    """Larger eigenvalue of the covariance of each landmark in the end, (B, K, L) [m²];
+    inf where it is not mapped."""
+    new_landmarks: Array
+    """Expected number of landmarks seen for the first time, (B, K)."""
+
+
+@jit
+def imagine_plans(
+    beliefs: tuple[Array, Array, Array, IntArray],
+    plans: Array,
+    density: tuple[Array, Array],
+    settings: tuple[Any, ...],
+    workspace: tuple[Any, ...],
+    results: tuple[Any, ...],
+) -> None:
+    """Imagine all plans, see :func:`.filters.imagine.imagine`.
+
+    Parameters
+    ----------
+    beliefs
+        Means, covariances, references and slots, as a batch stores them.
+    plans : ndarray, shape (B, K, T, 2)
+    density
+        Points where a new landmark may be (2, C), and how many are expected (B, C).
+    settings
+        The entries of `Settings`.
+    results
+        The arrays of `Imagined`, which are filled; nan from a step on that fails.
+    """
+    means, covariances, references, slots = beliefs
+    view, min_range, dropout, motion_values, rule_values = settings
+    sensor = Settings(
+        View(*view), min_range, dropout, motion_values, np.zeros(3), rule_values
+    )
+    outcome = Imagined(*results)
+    capacity, landmarks = means.shape[1], slots.shape[1]
+    room = Room(
+        np.zeros(capacity),
+        np.zeros((capacity, capacity)),
+        np.zeros(capacity),
+        np.zeros((capacity, capacity)),
+        np.empty((landmarks, 2)),
+        np.zeros((LEDGER_HEIGHT, landmarks), np.int64),
+        (workspace[0], workspace[1], workspace[2]),
+    )
+    points, weights = density
+    missed = np.empty(len(weights[0]))
+    for b in range(len(means)):
+        size = 3 + 2 * np.sum(slots[b] >= 0)
+        for k in range(plans.shape[1]):
+            copy_belief(means[b], covariances[b], references[b], size, room)
+            missed[:] = 1.0
+            for t in range(plans.shape[2]):
+                d, turn = plans[b, k, t, 0], plans[b, k, t, 1]
+                if not imagine_step(room, size, d, turn, sensor):
+                    break
+                look_for_new(room.mean, points, weights[b], sensor, missed)
+                for i in range(3):
+                    outcome.poses[b, k, t, i] = room.mean[i]
+                    for j in range(3):
+                        variance = room.covariance[i, j]
+                        outcome.pose_covariances[b, k, t, i, j] = variance
+                if t == plans.shape[2] - 1:
+                    judge(b, k, room, size, slots[b], outcome)
+            found = 0.0
+            for c in range(len(missed)):
+                found += weights[b, c] * (1.0 - missed[c])
+            outcome.new_landmarks[b, k] = found
+
+
+@njit_internal
+def copy_belief(
+    mean: Array, covariance: Array, reference: Array, size: int, room: Room
+) -> None:
+    """Start a plan from a belief."""
+    for i in range(size):
+        room.mean[i], room.reference[i] = mean[i], reference[i]
+        for j in range(size):
+            room.covariance[i, j] = covariance[i, j]
+
+
+@njit_internal
+def imagine_step(
+    room: Room, size: int, distance: float, turn: float, settings: Settings
+) -> bool:
+    """Predict, and update with the expected readings; False if the update fails."""
+    noise = settings.motion_values
+    at_rest = distance == 0 and turn == 0 and noise[3] == 0
+    variance = settings.no_noise if at_rest else noise
+    linearisation = as_rules(settings.rule_values).linearisation
+    mean, covariance, reference = room.mean, room.covariance, room.reference
+    predict(mean, covariance, reference, size, distance, turn, variance, linearisation)
+    count = expect_readings(mean, size, settings, room.readings, room.ledger)
+    if count == 0:
+        return True
+    rows, before, prior = room.workspace
+    status, _, _ = update_belief(
+        *(mean, covariance, reference, size, room.readings, count, room.ledger),
+        *(rows, before, prior, settings.rule_values),
+    )
+    return bool(status == DONE)
+
+
+@njit_internal
+def expect_readings(
+    mean: Array, size: int, settings: Settings, readings: Array, ledger: IntArray
+) -> int:
+    """Write the noise-free readings of mapped landmarks in view; return how many."""
+    count, sight = 0, settings.sight
+    if settings.dropout >= 1.0:
+        return count
+    x, y, cos, sin = mean[0], mean[1], math.cos(mean[2]), math.sin(mean[2])
+    for slot in range((size - 3) // 2):
+        dx, dy = mean[3 + 2 * slot] - x, mean[4 + 2 * slot] - y
+        distance = math.sqrt(dx * dx + dy * dy)
+        if distance <= settings.min_range:
+            continue
+        if not is_in_view(dx * cos + dy * sin, distance, sight):
+            continue
+        if is_hidden(x, y, dx, dy, sight.walls):
+            continue
+        readings[count, 0] = wrap_angle_jit(math.atan2(dy, dx) - mean[2])
+        readings[count, 1], ledger[SLOT, count] = distance, slot
+        count += 1
+    return count
+
+
+@njit_internal
+def look_for_new(
+    mean: Array, points: Array, weights: Array, settings: Settings, missed: Array
+) -> None:
+    """Multiply the probability that a landmark at a point is missed, where in view."""
+    x, y, cos, sin = mean[0], mean[1], math.cos(mean[2]), math.sin(mean[2])
+    for c in range(len(missed)):
+        if weights[c] > 0.0 and missed[c] > 0.0:
+            dx, dy = points[0, c] - x, points[1, c] - y
+            ahead, distance = dx * cos + dy * sin, math.sqrt(dx * dx + dy * dy)
+            if is_in_view(ahead, distance, settings.sight) and not is_hidden(
+                x, y, dx, dy, settings.sight.walls
+            ):
+                missed[c] *= settings.dropout
+
+
+@njit_internal
+def judge(
+    b: int, k: int, room: Room, size: int, slots: IntArray, outcome: Imagined
+) -> None:
+    """Write what remains uncertain in the end of a plan."""
+    joint = room.covariance[3:size, 3:size]
+    outcome.log_det[b, k] = 2.0 * half_log_det(joint, room.factor)
+    for i in range(len(slots)):
+        outcome.worst_variances[b, k, i] = math.inf
+        if slots[i] >= 0:
+            worst = largest_variance(room.covariance, 3 + 2 * slots[i])
+            outcome.worst_variances[b, k, i] = worst
