@@ -124,7 +124,7 @@ def monte_carlo(
     place = out or default_folder("monte-carlo", world.name)
     told = world.with_changes(**assumed) if assumed else world
     with reporter.note_if_slow("preparing the filters …"):
-        _compile(estimators)
+        _compile(estimators, identities=world.sensor.identities)
     if merge:
         monte_carlo.merge_blocks(merge, place)
     with (
@@ -178,11 +178,13 @@ def _show(summary: dict[str, Any], place: Path, reporter: "Reporter") -> None:
     reporter.finish({**summary, "out": str(place)})
 
 
-def _compile(estimators: str) -> None:
-    """Run all estimators for two steps, which compiles their kernels."""
+def _compile(estimators: str, *, identities: bool) -> None:
+    """Run all estimators for some steps, which compiles their kernels."""
     from ...sim_configs import load_scenario
     from ..monte_carlo import monte_carlo
 
-    small = load_scenario("six_landmarks").with_changes(steps=2)
+    small = load_scenario("six_landmarks").with_changes(
+        steps=8, sensor={"identities": identities}
+    )
     with contextlib.suppress(Exception):  # the job itself fails too, and reports it
         monte_carlo(small, estimators, 1)

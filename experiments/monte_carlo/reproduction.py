@@ -31,6 +31,8 @@ def python_call(summary: dict[str, Any]) -> str:
         arguments.append(f"assumed={ASSUMED_FILE!r}")
     if summary["block_size"] is not None:
         arguments.append(f"block_size={summary['block_size']}")
+    if summary["resolution"]:
+        arguments.append(f"resolution={summary['resolution']}")
     if first:
         arguments.append(f"first_run={first}")
     note = (

@@ -197,12 +197,13 @@ def pose_nees(trace: RunTrace) -> Array:
     """
     if trace.true_poses is None:
         return np.full(len(trace.t), np.nan)
-    return nees.pose_nees(
-        np.asarray(trace.true_poses, dtype=np.float64),
-        np.asarray(trace.poses, dtype=np.float64),
-        np.asarray(trace.pose_covariances, dtype=np.float64),
-        frame=trace.frame,
-    )
+    with np.errstate(invalid="ignore"):  # nan where the truth is unknown
+        return nees.pose_nees(
+            np.asarray(trace.true_poses, dtype=np.float64),
+            np.asarray(trace.poses, dtype=np.float64),
+            np.asarray(trace.pose_covariances, dtype=np.float64),
+            frame=trace.frame,
+        )
 
 
 def map_accuracy(trace: RunTrace) -> PositionAccuracy | None:

@@ -414,7 +414,11 @@ CASES = [
     ),
     (
         "hidden_identities",
-        {"steps": 9, "sensor": {"dropout": 0.0, "clutter": 2.0}},
+        {
+            "steps": 9,
+            "sensor": {"clutter": 2.0},
+            "start": {"std": [0.1, 0.1, 0.1], "drawn": "estimate"},
+        },
         "invariant",
     ),
 ]

@@ -34,6 +34,7 @@ from slamgym.experiments.monte_carlo.measure.run_measures import (
 )
 from slamgym.experiments.monte_carlo.report.html_report import html_report
 from slamgym.experiments.monte_carlo.report.table import measures
+from slamgym.experiments.monte_carlo.reproduction import python_call
 from slamgym.experiments.monte_carlo.store.result_blocks import merge_blocks
 from slamgym.experiments.monte_carlo.store.results import load_results
 from slamgym.experiments.runs.filter_settings import settings_for, settings_for_scenario
@@ -194,7 +195,7 @@ def test_readings_without_identity_are_associated_and_scored(hidden):
     assert np.isfinite(hidden.landmark_rmse).all()
 
 
-def test_lost_runs_are_told_by_the_same_filter_with_known_identities(hidden):
+def test_bad_runs_are_told_by_the_same_filter_with_known_identities(hidden):
     known = load_scenario("hidden_identities").with_changes(
         steps=40, sensor={"identities": True, "clutter": 0.0, "max_clutter": 0}
     )
@@ -252,6 +253,7 @@ def test_landmarks_nearer_than_the_resolution_are_one_place():
     assert coarse.association_new_correct.item() == 1
     assert coarse.association_duplicate.item() == coarse.association_map_size - 1 > 2
     assert coarse.attrs["resolution"] == 100.0
+    assert "    resolution=100.0,\n" in python_call(summarise_monte_carlo(coarse))
 
 
 def test_an_estimator_that_associates_by_itself_is_scored_by_its_reports():

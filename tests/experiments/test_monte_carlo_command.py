@@ -66,6 +66,22 @@ def test_results_summary_and_report_are_written_and_told(here):
     assert "<svg" in page
 
 
+def test_a_world_without_identities_is_scored_by_places(here):
+    world = ("hidden_identities", "--steps", 12, "--runs", 2, "--resolution", 100)
+    estimator = 'ekf[management={association="joint"}]'
+    result = slamgym("monte-carlo", *world, "-e", estimator, "--out", "out")
+    assert result.exit_code == 0, result.stderr
+    rows = [line.split() for line in result.stdout.splitlines()]
+    assert ["bad", "runs", "of", "2", "0", "0"] in rows
+    assert rows[
+        next(k for k, row in enumerate(rows) if row[:2] == ["landmarks", "in"])
+    ][:5] == ["landmarks", "in", "the", "map", "1.00"]
+    summary = json.loads((here / "out" / "summary.json").read_text())
+    (entry,) = summary["estimators"].values()
+    assert entry["association"]["resolution"] == summary["resolution"] == 100.0
+    assert "the map has" in " ".join(summary["notes"])
+
+
 @pytest.mark.slow
 def test_a_filter_of_ones_own_is_found_and_its_crash_told(here):
     (here / "fragile.py").write_text(FRAGILE)

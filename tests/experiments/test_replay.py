@@ -546,3 +546,11 @@ def test_a_log_without_all_the_truth_tells_none():
     truth = np.zeros((2, 4))
     truth[1, 0] = 3.0
     replay(short_drive(ground_truth=truth), Student())
+
+
+def test_a_truth_that_is_known_at_some_steps_only_gives_no_warning_of_numpy():
+    truth = np.array([[0.5, 0, 0, 0], [1.5, 1, 0, 0]])
+    settings = settings_for(short_drive(), estimator="invariant", **NOISE)
+    done = replay(short_drive(ground_truth=truth), settings.make((0, 0, 0)))
+    assert done.trace.frame == "invariant"
+    assert np.isnan(pose_nees(done.trace)).any()

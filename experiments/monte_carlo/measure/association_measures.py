@@ -1,7 +1,7 @@
 """Measure how well a run associated readings without identity.
 
-A run is lost if its path error is more than `LOST` above that of the same filter with
-known identities on the same readings.
+A run is bad if it fails, or if its path error is more than `MARGIN` above that of the
+same filter with known identities on the same readings.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from ...runs.filter_settings import FilterSettings
 from ...runs.simulated_runs import SimulatedRuns
 from .filtered_runs import FilteredRuns, filter_runs
 
-LOST = 1.0
+MARGIN = 1.0
 """Path error above that with known identities [m]."""
 
 COUNTS = AssociationScores._fields

@@ -10,8 +10,8 @@ from ...runs.nan_statistics import finite, mean
 from ..measure.association_measures import (
     COUNTS,
     KNOWN_IDS_ATE,
-    LOST,
     MAPS,
+    MARGIN,
     PREFIX,
     SHARES,
 )
@@ -41,7 +41,7 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
     if KNOWN_IDS_ATE not in scores.results:
         return None
     hidden, known = scores.per_run("ate"), scores.per_run(KNOWN_IDS_ATE)
-    bad = int((~scores.good).sum() + (hidden > known + LOST).sum())
+    bad = int((~scores.good).sum() + (hidden > known + MARGIN).sum())
     parts = {
         which: {
             part: mean(scores.per_run(f"gospa_{which}_{part}"))
@@ -56,7 +56,7 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
         "bad_runs": {
             "count": bad,
             "share": bad / len(scores.good),
-            "margin": LOST,
+            "margin": MARGIN,
         },
         "median_ate": {"hidden": _median(hidden), "known": _median(known)},
     }

@@ -15,7 +15,7 @@ from ....sim_configs.atomic_file import replace_when_written
 from ..reproduction import ASSUMED_FILE, python_call
 from .figures import MOST_DOTS, grid_steps, report_figures
 from .inline_svg import inline_svg
-from .table import lost_run_text, measures, number, percent
+from .table import bad_run_text, measures, number, percent
 from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT, p_text
 
 _NOTHING = "–"
@@ -66,7 +66,7 @@ def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         "described": "; ".join(_described(*entry) for entry in entries.items()),
         "files": _files(summary),
         "measures": measures(summary),
-        "lost": _lost(summary),
+        "bad_run": _bad_run(summary),
         "figures": report_figures(dataset, summary),
         "good_runs": max(entry["good_runs"] for entry in entries.values()),
         "tested": grid_steps(summary),
@@ -110,9 +110,9 @@ def headline(summary: dict[str, Any]) -> str:
     return f"{summary['scenario']}: {said}"
 
 
-def _lost(summary: dict[str, Any]) -> str:
+def _bad_run(summary: dict[str, Any]) -> str:
     scores = [entry["association"] for entry in summary["estimators"].values()]
-    return "" if None in scores else f" {lost_run_text(scores[0])}"
+    return "" if None in scores else f" {bad_run_text(scores[0])}"
 
 
 def _files(summary: dict[str, Any]) -> dict[str, str]:

@@ -51,8 +51,9 @@ def summarise_monte_carlo(
         ``scenario`` (its name), ``scenario_toml``, ``assumed_toml`` (the scenario whose
         noise the estimators assume, None where the same), ``seed``, ``runs``,
         ``first_run`` (number of the first of them), ``steps``, ``block_size`` (None
-        where unknown), ``versions``, ``command``; ``frame``; ``knowable_heading_std``
-        [rad], the deviation of the heading at the start, below which it cannot fall;
+        where unknown), ``resolution`` (of places in scores of association) [m],
+        ``versions``, ``command``; ``frame``; ``knowable_heading_std`` [rad], the
+        deviation of the heading at the start, below which it cannot fall;
         ``estimators`` by label, see :func:`summarise_estimator`; and ``notes``, the
         warnings of :func:`.warnings.run_warnings`.
     """
@@ -75,6 +76,7 @@ def summarise_monte_carlo(
         "first_run": int(dataset["run"].values[0]),
         "steps": dataset.sizes["step"] - 1,
         "block_size": None if block_size is None else int(block_size),
+        "resolution": float(attrs.get("resolution", 0.0)),
         "versions": json.loads(attrs.get("versions", "{}")),
         "command": str(attrs.get("command", "")),
         "frame": frame,

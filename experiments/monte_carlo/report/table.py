@@ -109,7 +109,7 @@ def _association_measures(summary: dict[str, Any]) -> list[Measure]:
         Measure("precision", "1", at("precision", write=share)),
         Measure("recall", "1", at("recall", write=share)),
         Measure(
-            f"lost or failed runs of {runs}",
+            f"bad runs of {runs}",
             "0",
             lambda entry: str(entry["association"]["bad_runs"]["count"]),
         ),
@@ -175,14 +175,15 @@ def _caption(entries: dict[str, Entry]) -> str:
     scores = next((entry["association"] for entry in entries.values()), None)
     if scores is None:
         return text
-    return f"{text} {lost_run_text(scores)}"
+    return f"{text} {bad_run_text(scores)}"
 
 
-def lost_run_text(scores: dict[str, Any]) -> str:
-    """Write what a lost run is."""
+def bad_run_text(scores: dict[str, Any]) -> str:
+    """Write what a bad run is."""
     return (
-        f"A run is lost if its path error is more than {scores['bad_runs']['margin']:g}"
-        " m above that of the same filter with known identities."
+        "A run is bad if it failed, or if its path error is more than "
+        f"{scores['bad_runs']['margin']:g} m above that of the same filter with known "
+        "identities."
     )
 
 
