@@ -4,6 +4,7 @@ from . import large_maps as large_maps
 from . import map_management as map_management
 from . import models as models
 from . import smoother as smoother
+from .association.constellations import Constellations as Constellations
 from .check_estimator import EstimatorContractError as EstimatorContractError
 from .check_estimator import check_estimator as check_estimator
 from .filters import BatchBeliefs as BatchBeliefs

@@ -20,6 +20,7 @@ __all__ = [
     "SupportsBeliefLimit",
     "SupportsDecisions",
     "SupportsJoin",
+    "SupportsJointMerging",
     "SupportsLandmarkIds",
     "SupportsLocalView",
     "SupportsMapView",
@@ -158,6 +159,14 @@ class SupportsMerging(Protocol):
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being one, and remove the second."""
+
+
+@runtime_checkable
+class SupportsJointMerging(SupportsMerging, Protocol):
+    """An estimator that merges several pairs of landmarks by one measurement."""
+
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Condition on the landmarks (kept, gone) being one; remove the second ones."""
 
 
 @runtime_checkable

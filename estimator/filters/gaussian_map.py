@@ -130,13 +130,18 @@ class GaussianMap:
         self.relabel(i for i in self.slots if i not in gone)
 
     def merge(
-        self, kept: int, gone: int, *, frame: ErrorFrame, at_reference: bool
+        self,
+        kept: Sequence[int],
+        gone: Sequence[int],
+        *,
+        frame: ErrorFrame,
+        at_reference: bool,
     ) -> None:
-        """Condition on two landmarks being one, and remove the second.
+        """Condition on landmarks being one in pairs, and remove the second of each.
 
         Parameters
         ----------
-        kept, gone : int
+        kept, gone : sequence of int
             The landmarks.
         frame : {"additive", "invariant"}
             Error frame of the filter.
@@ -147,12 +152,12 @@ class GaussianMap:
         self.mean[:n], self.covariance[:n, :n] = coincide(
             self.mean[:n],
             self.covariance[:n, :n],
-            self.slots[kept],
-            self.slots[gone],
+            [self.slots[i] for i in kept],
+            [self.slots[i] for i in gone],
             frame=frame,
             reference=self.reference[:n] if at_reference else None,
         )
-        self.remove([gone])
+        self.remove(gone)
 
     def slots_of(self, ids: Iterable[int]) -> list[int]:
         """Return the places of landmarks, -1 for those not in the map."""

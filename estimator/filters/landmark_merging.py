@@ -1,16 +1,22 @@
-"""Merge two landmarks of a Gaussian map: their offset, and the condition that it is 0.
+"""Merge landmarks of a Gaussian map: their offset, and the condition that it is 0.
 
 Pure functions of mean (3 + 2n,) and covariance P (3 + 2n, 3 + 2n) in the order
 (x, y, θ, l1x, l1y, …); a landmark is named by its slot 0 … n − 1.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...arrays import Array, ComplexArray
+from ...arrays import Array, ComplexArray, IntArray
 from ..error_frames import ErrorFrame
 from ..models.rigid_motion import left_jacobian
+
+MOST_ITERATIONS = 50
+TURN_TOLERANCE = 1e-13
+"""Iterations of a turn end when it changes by less [rad]."""
 
 
 class ConditionedMap(NamedTuple):
@@ -69,32 +75,34 @@ def separation(mean: Array, covariance: Array, one: int, other: int) -> Separati
 def coincide(
     mean: Array,
     covariance: Array,
-    one: int,
-    other: int,
+    one: int | Sequence[int],
+    other: int | Sequence[int],
     *,
     frame: ErrorFrame = "additive",
     reference: Array | None = None,
 ) -> ConditionedMap:
-    """Condition a map on two of its landmarks being one.
+    """Condition a map on two of its landmarks being one, or on several such pairs.
 
     The condition is a measurement 0 = l_i − l_j without noise.  With D = l̂_i − l̂_j::
 
         H = [… −J D …  I … −I …],   S = H P Hᵀ = L Lᵀ,   A = L⁻¹ H P
-        δ = −Aᵀ L⁻¹ D,    P ← P − Aᵀ A
+        δ = −Aᵀ L⁻¹ M D,    P ← P − Aᵀ A
 
     The columns are those of θ, l_i and l_j.  The condition holds no information about a
     rotation of the whole map, and neither must H.  Its heading column is therefore
     −J D, with D taken at the points where the filter linearises.  The additive EKF has
-    no heading column, since the condition is linear in its error.  In the invariant
-    frame δ is composed with the state and P follows, as in
-    :class:`~slamgym.estimator.filters.invariant.InvariantEkfSlam`.
+    no heading column, since the condition is linear in its error, and M = 1.  In the
+    invariant frame δ is composed with the state and P follows, as in
+    :class:`~slamgym.estimator.filters.invariant.InvariantEkfSlam`.  There the condition
+    R(t) D + V(t) (ξ_i − ξ_j) = 0 holds for M = V(−t)⁻¹, where t is the turn in δ, which
+    is found by iteration.  Several pairs have their rows of D and H below each other.
 
     Parameters
     ----------
     mean, covariance : ndarray
         The map.
-    one, other : int
-        Slots i and j of the two landmarks.
+    one, other : int or sequence of int
+        Slots i and j of the two landmarks, or of each pair.
     frame : {"additive", "invariant"}
         Error frame of the filter.
     reference : ndarray, shape (3 + 2n,), optional
@@ -103,7 +111,7 @@ def coincide(
     Returns
     -------
     ConditionedMap
-        Both landmarks have the same mean and covariance in it; drop either.
+        Both landmarks of a pair have the same mean and covariance in it; drop either.
 
     Raises
     ------
@@ -119,24 +127,45 @@ def coincide(
     >>> mean[3:], P.diagonal()[3:]
     (array([5., 0., 5., 0.]), array([0.5, 0.5, 0.5, 0.5]))
     """
-    i, j = 3 + 2 * one, 3 + 2 * other
-    offset = mean[i : i + 2] - mean[j : j + 2]
-    rows = covariance[i : i + 2] - covariance[j : j + 2]
+    i, j = _columns(one), _columns(other)
+    offset = mean[i] - mean[j]
+    rows = covariance[i] - covariance[j]
     if frame == "invariant" or reference is not None:
         at = mean if reference is None else reference
-        dx, dy = at[i : i + 2] - at[j : j + 2]
-        rows = rows + np.outer((dy, -dx), covariance[2])
-        S = rows[:, i : i + 2] - rows[:, j : j + 2]
-        S = S + np.outer(rows[:, 2], (dy, -dx))
+        lever = (at[i] - at[j]).reshape(-1, 2)[:, ::-1] * (1.0, -1.0)
+        lever = lever.ravel()
+        rows = rows + np.outer(lever, covariance[2])
+        S = rows[:, i] - rows[:, j] + np.outer(rows[:, 2], lever)
     else:
-        S = rows[:, i : i + 2] - rows[:, j : j + 2]
+        S = rows[:, i] - rows[:, j]
     L = np.linalg.cholesky((S + S.T) / 2)
-    white = np.linalg.solve(L, np.column_stack([rows, -offset]))
-    gains, shift = white[:, :-1], white[:, :-1].T @ white[:, -1]
-    P = covariance - np.outer(gains[0], gains[0]) - np.outer(gains[1], gains[1])
+    gains = np.linalg.solve(L, rows)
+    P = covariance - gains.T @ gains
     if frame == "additive":
-        return ConditionedMap(mean + shift, P)
+        return ConditionedMap(mean - gains.T @ np.linalg.solve(L, offset), P)
+    shift = _turned_shift(L, gains, offset)
     return _composed(mean, P, shift)
+
+
+def _turned_shift(
+    L: NDArray[np.floating], gains: NDArray[np.floating], offset: Array
+) -> Array:
+    """Return δ, iterated until its turn is the one at which M was computed."""
+    points, turn = offset[::2] + 1j * offset[1::2], 0.0
+    for _ in range(MOST_ITERATIONS):
+        seen = points / left_jacobian(np.array(-turn))
+        flat = np.column_stack([seen.real, seen.imag]).ravel()
+        white = np.linalg.solve(L, flat)
+        before, turn = turn, float(-gains[:, 2] @ white)
+        if abs(turn - before) <= TURN_TOLERANCE:
+            break
+    return np.asarray(-gains.T @ white)
+
+
+def _columns(slots: int | Sequence[int]) -> IntArray:
+    """Return the columns of landmarks in the state."""
+    first = 3 + 2 * np.atleast_1d(np.asarray(slots, dtype=np.int64))
+    return np.asarray((first[:, None] + np.arange(2)).ravel())
 
 
 def _composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:

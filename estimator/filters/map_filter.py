@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -68,7 +68,19 @@ class MapFilter:
         numpy.linalg.LinAlgError
             Where their distance has no uncertainty; nothing is then merged.
         """
-        argument_checks.two_landmarks(kept, gone, self.map.slots)
+        self.merge_pairs([(kept, gone)])
+
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Merge several pairs (kept, gone) at once, as one measurement.
+
+        Raises
+        ------
+        ValueError
+            Where a landmark is not in the map, or in two pairs.
+        numpy.linalg.LinAlgError
+            Where a distance has no uncertainty; nothing is then merged.
+        """
+        kept, gone = argument_checks.landmark_pairs(pairs, self.map.slots)
         at_reference = self.rules.linearisation != AT_ESTIMATE
         self.map.merge(kept, gone, frame=self.frame, at_reference=at_reference)
 

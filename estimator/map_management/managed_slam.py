@@ -184,7 +184,7 @@ class ManagedSlam:
         Of those that cost more than ``ceiling`` only the likeliest is of interest.
         """
         argument_checks.refuse_not_finite(readings)
-        view = self._editor.map_view(self._policy.reach(readings))
+        view = self._pruner.view_for(readings)
         return associate(
             self._policy, self._candidates, readings, view, self._sensor, ceiling
         )
@@ -203,7 +203,7 @@ class ManagedSlam:
         self._candidates = plan.candidates
         seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
         seen -= {*report.rejected_ids, *report.skipped_ids}
-        removed, merged = self._pruner.prune(readings, plan.row_ids, seen, missed)
+        removed, merged = self._pruner.prune(readings, plan, seen, missed)
         self._recent.note_edits(removed, merged)
         made = self.decisions[-1]
         return report.replace(
@@ -235,7 +235,7 @@ class ManagedSlam:
             Where one is not in the map, or they are the same.
         """
         argument_checks.two_landmarks(kept, gone, self._slots)
-        self._pruner.merger.join(kept, gone)
+        self._pruner.merger.join([(kept, gone)])
         self._recent.note_edits((), [(kept, gone)])
 
     @property

@@ -7,6 +7,7 @@ the whole covariance.  Others may support some of these, each by itself:
 * ``landmark_ids`` lists the mapped landmarks in the order of the belief;
 * ``remove(landmark_ids)`` marginalises landmarks, all else keeps its last bit;
 * ``merge(kept, gone)`` conditions on two landmarks being one, and removes the second;
+* ``merge_pairs(pairs)`` does so with several pairs by one measurement;
 * ``local_view(within)`` returns the pose and at least those landmarks that are within
   so many metres of it, where a view of all of them takes long.
 
@@ -26,6 +27,7 @@ from ..filters.landmark_merging import coincide
 from ..interface import (
     MapView,
     SlamEstimator,
+    SupportsJointMerging,
     SupportsLocalView,
     SupportsMerging,
     SupportsRemoval,
@@ -46,8 +48,8 @@ class MapEditor(Protocol):
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks; all else keeps its last bit."""
 
-    def merge(self, kept: int, gone: int) -> None:
-        """Condition on two landmarks being one, and remove the second."""
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Condition on pairs of landmarks being one, and remove the second of each."""
 
 
 def edit_map(slam: SlamEstimator, *, merging: bool = True) -> MapEditor:
@@ -106,10 +108,10 @@ class CachedEditor:
         self.expire()
         self._editor.remove(ids)
 
-    def merge(self, kept: int, gone: int) -> None:
-        """Condition on two landmarks being one, and remove the second."""
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Condition on pairs of landmarks being one, and remove the second of each."""
         self.expire()
-        self._editor.merge(kept, gone)
+        self._editor.merge_pairs(pairs)
 
 
 class _MethodEditor:
@@ -125,8 +127,12 @@ class _MethodEditor:
     def remove(self, ids: Sequence[int]) -> None:
         self._slam.remove(ids)
 
-    def merge(self, kept: int, gone: int) -> None:
-        self._slam.merge(kept, gone)
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        if isinstance(self._slam, SupportsJointMerging):
+            self._slam.merge_pairs(pairs)
+            return
+        for kept, gone in pairs:
+            self._slam.merge(kept, gone)
 
 
 class _StateEditor:
@@ -141,17 +147,17 @@ class _StateEditor:
     def remove(self, ids: Sequence[int]) -> None:
         self._load_without(self._slam.state_dict(), ids)
 
-    def merge(self, kept: int, gone: int) -> None:
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         state = self._slam.state_dict()
         order = np.asarray(state["landmark_ids"]).tolist()
         state["mean"], state["covariance"] = coincide(
             np.asarray(state["mean"]),
             np.asarray(state["covariance"]),
-            order.index(kept),
-            order.index(gone),
+            [order.index(kept) for kept, _ in pairs],
+            [order.index(gone) for _, gone in pairs],
             frame=self._slam.belief().frame,
         )
-        self._load_without(state, [gone])
+        self._load_without(state, [gone for _, gone in pairs])
 
     def _load_without(self, state: dict[str, Any], ids: Sequence[int]) -> None:
         order = np.asarray(state["landmark_ids"]).tolist()

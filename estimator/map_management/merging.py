@@ -50,20 +50,21 @@ class LandmarkMerger:
         merged: list[tuple[int, int]] = []
         while (pair := self._duplicate(seen)) is not None:
             kept, gone = pair
-            self.join(kept, gone)
+            self.join([pair])
             seen = (seen - {gone}) | {kept}
             merged.append(pair)
         return merged
 
-    def join(self, kept: int, gone: int) -> None:
-        """Merge two landmarks; both identities then name the first."""
+    def join(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Merge pairs of landmarks; both identities then name the first."""
         self._records.follow(self._editor.map_view().mapped)
-        self._editor.merge(kept, gone)
-        self._records.join(kept, gone)
+        self._editor.merge_pairs(pairs)
+        for kept, gone in pairs:
+            self._records.join(kept, gone)
+            earlier = {i: kept for i, j in self.aliases.items() if j == gone}
+            self.aliases |= {gone: kept, **earlier}
+            self._apart = {_renamed(pair, gone, kept) for pair in self._apart}
         self._records.follow(self._editor.map_view().mapped)
-        earlier = {i: kept for i, j in self.aliases.items() if j == gone}
-        self.aliases |= {gone: kept, **earlier}
-        self._apart = {_renamed(pair, gone, kept) for pair in self._apart}
 
     def forget(self, ids: Iterable[int]) -> None:
         """Drop what is known about landmarks that have been removed."""

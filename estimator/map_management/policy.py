@@ -10,6 +10,7 @@ import numpy as np
 
 from ...arrays import Array
 from ..association.association_policy import AssociationPolicy
+from ..association.constellations import Constellations
 from ..support import argument_checks
 from .field_of_view import FieldOfView
 
@@ -49,6 +50,9 @@ class LandmarkPolicy(AssociationPolicy):
     """Smallest distance of two landmarks [m]; landmarks estimated closer are merged."""
     merge_gate: float = 9.21
     """Largest Dᵀ C⁻¹ D, of the offset D, at which two landmarks may be one."""
+    constellations: Constellations | None = None
+    """How landmarks around the robot are recognised as older ones after long drift;
+    None: never."""
     capacity: int | None = None
     """Largest number of landmarks; beyond it the least informative are removed."""
 
@@ -60,6 +64,11 @@ class LandmarkPolicy(AssociationPolicy):
                 argument_checks.whole(name, getattr(self, name), 1)
         if self.merge_within is not None:
             argument_checks.above("merge_within", self.merge_within, 0.0)
+        if not isinstance(self.constellations, Constellations | None):
+            raise ValueError(
+                "constellations must be Constellations, its fields as a mapping, True, "
+                f"or None, got {self.constellations!r}"
+            )
         if not isinstance(self.view, FieldOfView | None):
             raise ValueError(f"view must be a FieldOfView or None, got {self.view!r}")
         if self.remove_after is not None and self.view is None:
@@ -111,10 +120,18 @@ def as_policy(value: "LandmarkPolicy | Mapping[str, Any] | bool") -> LandmarkPol
     given = dict(value)
     if isinstance(given.get("view"), Mapping):
         given["view"] = _made(FieldOfView, "management.view", given["view"])
+    rules = given.get("constellations")
+    if isinstance(rules, Mapping) or rules is True:
+        fields_of_rules = {} if rules is True else rules
+        given["constellations"] = _made(
+            Constellations, "management.constellations", fields_of_rules
+        )
+    elif rules is False:
+        given["constellations"] = None
     return _made(LandmarkPolicy, "management", given)
 
 
-Made = TypeVar("Made", LandmarkPolicy, FieldOfView)
+Made = TypeVar("Made", LandmarkPolicy, FieldOfView, Constellations)
 
 
 def _made(kind: type[Made], name: str, given: Mapping[str, Any]) -> Made:

@@ -1,13 +1,16 @@
 """Prune a filter's map after each scan: remove landmarks, merge duplicates."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Array
+from ..association.candidates import ScanAssociation
 from ..association.nearest_neighbour import Noise
+from ..interface import MapView
 from .landmark_records import LandmarkRecords
+from .loop_closing import LoopCloser, Pairs
 from .map_editor import MapEditor
 from .merging import LandmarkMerger
 from .policy import LandmarkPolicy
@@ -39,6 +42,7 @@ class MapPruner:
         """Start a new run."""
         self._records = LandmarkRecords()
         self.merger = LandmarkMerger(self._policy, self._editor, self._records)
+        self._closer = LoopCloser(self._policy.constellations)
 
     def note_sightings(self, readings: Array, ids: Sequence[int]) -> None:
         """Record the landmarks that the rows of a scan (m, 2) have shown."""
@@ -59,12 +63,13 @@ class MapPruner:
         if policy.remove_after is None or policy.view is None or not view.ids:
             return set()
         mask = policy.view.expects(view.mean[:3].copy(), view.landmarks, scan)
+        mask &= ~self._closer.lost(view)
         return {view.ids[slot] for slot in np.flatnonzero(mask).tolist()}
 
     def prune(
         self,
         readings: Array,
-        row_ids: Sequence[int | None],
+        plan: ScanAssociation,
         seen: set[int],
         missed: set[int],
     ) -> tuple[list[int], list[tuple[int, int]]]:
@@ -74,16 +79,18 @@ class MapPruner:
         ----------
         readings : ndarray, shape (m, 2)
             The scan.
-        row_ids : sequence of int or None, length m
-            Landmark of each row.
+        plan : ScanAssociation
+            Landmarks of its rows, and those that it has confirmed.
         seen, missed : set of int
             Landmarks that the scan has shown, and those that it should have shown.
         """
+        row_ids = plan.row_ids
         rows = [row for row, i in enumerate(row_ids) if i in seen]
         ids = [i for i in row_ids if i is not None and i in seen]
         self.note_sightings(readings[rows], ids)
         removed = self.remove_missing(missed)
         merged = self.merger.merge(seen)
+        merged += self.close_loops(plan.confirmed, self._policy.reach(readings))
         return removed + self.keep_capacity(seen), merged
 
     def remove_missing(self, missed: set[int]) -> list[int]:
@@ -95,6 +102,31 @@ class MapPruner:
             return []
         self._records.note_misses(self._records.slots(missed))
         return self.remove(self._records.overdue(self._policy.remove_after))
+
+    def close_loops(self, added: Collection[int], within: float) -> Pairs:
+        """Merge landmarks around the robot with an older part of the map.
+
+        Parameters
+        ----------
+        added : collection of int
+            Landmarks, seen without identity, that the last scan has added.
+        within : float
+            Reach of the readings [m].
+        """
+        if not self._closer.is_waiting(added):
+            return []
+        pairs = self._closer.pairs(self._editor.map_view(within), added, within)
+        try:
+            if pairs:
+                self.merger.join(pairs)
+        except np.linalg.LinAlgError:  # nothing was merged; later scans try again
+            return []
+        return pairs
+
+    def view_for(self, readings: Array) -> MapView:
+        """Return a view of the landmarks that readings (m, 2) may belong to."""
+        reach = self._policy.reach(readings)
+        return self._closer.without_lost(self._editor.map_view(reach), reach)
 
     def keep_capacity(self, seen: set[int]) -> list[int]:
         """Remove the landmarks of least information, first among those not seen."""
@@ -115,9 +147,14 @@ class MapPruner:
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all records, as arrays."""
-        return self._records.state_dict() | self.merger.state_dict()
+        return {
+            **self._records.state_dict(),
+            **self.merger.state_dict(),
+            **self._closer.state_dict(),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
         self._records.load_state_dict(state)
         self.merger.load_state_dict(state)
+        self._closer.load_state_dict(state)

@@ -72,8 +72,8 @@ class RecentScan:
         """Remove and merge landmarks as after the scan."""
         if self.removed:
             editor.remove(self.removed)
-        for kept, gone in self.merged:
-            editor.merge(kept, gone)
+        for pairs in _groups(self.merged):
+            editor.merge_pairs(pairs)
 
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
@@ -242,6 +242,25 @@ def _decided(plan: ScanAssociation, report: UpdateReport) -> ScanDecisions:
     return ScanDecisions(
         row_ids, tuple(i for i in row_ids if i in new and i is not None)
     )
+
+
+def _groups(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
+    """Split pairs into groups in which each landmark occurs once.
+
+    Examples
+    --------
+    >>> _groups([(0, 4), (1, 5), (0, 6)])
+    [[(0, 4), (1, 5)], [(0, 6)]]
+    """
+    groups: list[list[tuple[int, int]]] = []
+    used: set[int] = set()
+    for pair in pairs:
+        if not groups or not used.isdisjoint(pair):
+            groups.append([])
+            used = set()
+        groups[-1].append(pair)
+        used.update(pair)
+    return groups
 
 
 def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | None:

@@ -105,8 +105,13 @@ class RecordedSlam:
 
     def merge(self, kept: int, gone: int) -> None:
         """Make one of two landmarks, in the filter and in the drive."""
-        self._editor.merge(kept, gone)
-        self._record("merge", kept, gone)
+        self.merge_pairs([(kept, gone)])
+
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Merge pairs (kept, gone) of landmarks, in the filter and in the drive."""
+        self._editor.merge_pairs(pairs)
+        for kept, gone in pairs:
+            self._record("merge", kept, gone)
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
         """Return the filter's belief."""

@@ -150,6 +150,17 @@ def two_landmarks(kept: int, gone: int, mapped: Mapping[int, int]) -> list[int]:
     return mapped_identities([kept, gone], mapped)
 
 
+def landmark_pairs(
+    pairs: Sequence[tuple[int, int]], mapped: Mapping[int, int]
+) -> tuple[list[int], list[int]]:
+    """Return the first and the second landmarks of pairs, all mapped and different."""
+    kept, gone = [i for i, _ in pairs], [j for _, j in pairs]
+    for i, j in pairs:
+        two_landmarks(i, j, mapped)
+    ids = mapped_identities([*kept, *gone], mapped)
+    return ids[: len(kept)], ids[len(kept) :]
+
+
 def refuse_not_finite(readings: Array) -> None:
     """Refuse readings without identity that are not finite, naming the first."""
     finite = np.isfinite(readings).all(axis=1)

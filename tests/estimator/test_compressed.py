@@ -244,7 +244,7 @@ def test_a_merge_is_that_of_the_full_filter(base, jumping):
             assert len(twice) > 1
             for i in twice:
                 slam.merge(i, i + count)
-                edit_map(full).merge(i, i + count)
+                edit_map(full).merge_pairs([(i, i + count)])
             assert_equal_beliefs(slam.belief(), full.belief())
     assert_equal_beliefs(slam.belief(), full.belief())
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 from scipy.linalg import expm
+from scipy.optimize import root
 
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
 from slamgym.estimator.error_frames import invariant_covariance, invariant_error
@@ -103,20 +104,34 @@ def lie_moved(mean, xi):
     return np.concatenate([moved[:2], [mean[2] + xi[2]], moved[2:]])
 
 
-def test_invariant_merge_is_the_update_in_invariant_coordinates():
+@pytest.mark.parametrize("pairs", [[(0, 1)], [(0, 2), (3, 1)]])
+def test_invariant_merge_is_the_update_in_invariant_coordinates(pairs):
     mean, P = random_map(3)
     mean[2] = 0.4
-    H = np.zeros((2, 11))
-    H[:, 3:5], H[:, 5:7] = np.eye(2), -np.eye(2)
+    one, other = zip(*pairs, strict=True)
+    i, j = (np.ravel([(3 + 2 * k, 4 + 2 * k) for k in slots]) for slots in (one, other))
+    H = np.eye(11)[i] - np.eye(11)[j]
     P_xi = invariant_covariance(mean, P)
-    K = P_xi @ H.T @ np.linalg.inv(H @ P_xi @ H.T)
-    expected = lie_moved(mean, -K @ (mean[3:5] - mean[5:7]))
-    merged = coincide(mean, P, 0, 1, frame="invariant")
-    np.testing.assert_allclose(merged.mean, expected, atol=1e-12)
+
+    def moved(multipliers):
+        return lie_moved(mean, P_xi @ H.T @ multipliers)
+
+    found = root(lambda x: H @ moved(x), np.zeros(len(H)), tol=1e-13)
+    merged = coincide(mean, P, one, other, frame="invariant")
+    np.testing.assert_allclose(merged.mean, moved(found.x), atol=1e-10)
     back = invariant_covariance(merged.mean, merged.covariance)
+    K = P_xi @ H.T @ np.linalg.inv(H @ P_xi @ H.T)
     np.testing.assert_allclose(back, P_xi - K @ H @ P_xi, atol=1e-12)
     np.testing.assert_array_equal(merged.covariance, merged.covariance.T)
-    assert abs(invariant_error(expected, mean)[2]) > 1e-3  # the heading has moved
+    assert abs(invariant_error(merged.mean, mean)[2]) > 1e-3  # the heading has moved
+
+
+def test_additive_merge_of_several_pairs_is_that_of_one_after_the_other():
+    mean, P = random_map(6)
+    together = coincide(mean, P, [0, 3], [2, 1])
+    apart = coincide(*coincide(mean, P, 0, 2), 3, 1)
+    np.testing.assert_allclose(together.mean, apart.mean, atol=1e-12)
+    np.testing.assert_allclose(together.covariance, apart.covariance, atol=1e-12)
 
 
 def test_merged_landmarks_have_one_place_and_one_covariance():
@@ -179,7 +194,7 @@ def volume(belief):
 def test_merging_keeps_the_information_of_both(name):
     slam = doubled(name)
     before = [volume(marginal(slam, [i])) for i in (0, 6)]
-    edit_map(slam).merge(0, 6)
+    edit_map(slam).merge_pairs([(0, 6)])
     assert slam.belief().landmark_ids == tuple(IDS)
     assert volume(marginal(slam, [0])) < min(before) - 0.1
     assert np.linalg.eigvalsh(slam.belief().covariance).min() > 0
@@ -197,7 +212,7 @@ def test_merging_tells_no_filter_that_knows_better_its_heading(name):
     truth = np.array([(0.5, 6.0), (0.5, 6.0), (-1.0, 3.0)])
     for _ in range(20):
         slam.update(truth + MEASUREMENT_STD * rng.standard_normal((3, 2)), [0, 1, 2])
-    edit_map(slam).merge(0, 1)
+    edit_map(slam).merge_pairs([(0, 1)])
     for _ in range(20):
         noise = MEASUREMENT_STD * rng.standard_normal((2, 2))
         slam.update(truth[1:] + noise, [0, 2])
@@ -221,7 +236,7 @@ def test_a_filter_of_ones_own_is_edited_through_its_state():
     boxed, open_one = Boxed(doubled("ekf")), doubled("ekf")
     for slam in (boxed, open_one):
         door = edit_map(slam)
-        door.merge(0, 6)
+        door.merge_pairs([(0, 6)])
         door.remove([3])
     assert boxed.belief().landmark_ids == open_one.belief().landmark_ids
     np.testing.assert_array_equal(boxed.belief().mean, open_one.belief().mean)

@@ -66,10 +66,11 @@ class CompressedMap:
         for i in ids:
             self._drop(i)
 
-    def merge(self, kept: int, gone: int) -> None:
-        """Condition on two local landmarks being the same, and drop the second."""
-        self.filter.merge(kept, gone)
-        self._drop(gone)
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Condition on local landmarks being the same; drop the second of each pair."""
+        self.filter.merge_pairs(pairs)
+        for _, gone in pairs:
+            self._drop(gone)
 
     def belief(self, ids: Sequence[int]) -> Belief:
         """Return the marginal of the pose and some landmarks."""

@@ -173,11 +173,27 @@ class CompressedEkfSlam:
         ValueError
             If one is not in the map or both are the same; nothing is then merged.
         """
-        ids = argument_checks.two_landmarks(kept, gone, self._map.slots)
-        local = self._map.local
+        self.merge_pairs([(kept, gone)])
+
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Merge several pairs (kept, gone) at once, as one measurement.
+
+        Parameters
+        ----------
+        pairs : sequence of (int, int)
+            Mapped landmarks, each in one pair.
+
+        Raises
+        ------
+        ValueError
+            If one is not in the map or in two pairs; nothing is then merged.
+        """
+        kept, gone = argument_checks.landmark_pairs(pairs, self._map.slots)
+        ids, local = [*kept, *gone], self._map.local
         if not all(i in local for i in ids):
-            self._map.change_local_map(ids, max(self._local_size or 0, len(local), 2))
-        self._map.merge(kept, gone)
+            size = max(self._local_size or 0, len(local), len(ids))
+            self._map.change_local_map(ids, size)
+        self._map.merge_pairs(pairs)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return a snapshot of the belief, for the whole map or a part of it.

@@ -1,6 +1,6 @@
 """The submap in use: an ordinary filter in a frame of its own."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 from ....arrays import Array
 from ...filters.ekf import EkfSlam
@@ -81,9 +81,9 @@ class ActiveSubmap:
         if alone := [i for i in here if i not in links]:
             self.filter.remove(alone)
 
-    def merge(self, kept: int, gone: int) -> None:
-        """Merge two landmarks if the submap holds both; otherwise rename the second."""
-        if kept in self and gone in self:
-            self.filter.merge(kept, gone)
-        elif gone in self:
-            self.filter.map.rename({gone: kept})
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Merge pairs of landmarks that the submap holds; otherwise rename."""
+        here = [(kept, gone) for kept, gone in pairs if gone in self]
+        if both := [pair for pair in here if pair[0] in self]:
+            self.filter.merge_pairs(both)
+        self.filter.map.rename({gone: kept for kept, gone in here if gone in self})

@@ -1,5 +1,7 @@
 """The graph of a run: closed submaps, the active submap, and their common landmarks."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ....arrays import Array, IntArray
@@ -126,12 +128,15 @@ class SubmapGraph:
         for i in ids:
             self.index.remove(i)
 
-    def merge(self, kept: int, gone: int) -> None:
-        """Condition on two mapped landmarks being the same, and remove the second."""
-        closed = self.closed.with_merged(self.index[kept], self.index[gone])
-        self.active.merge(kept, gone)
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Condition on pairs of landmarks being one, and remove the second ones."""
+        closed = self.closed
+        for kept, gone in pairs:
+            closed = closed.with_merged(self.index[kept], self.index[gone])
+        self.active.merge_pairs(pairs)
         self.closed = closed
-        self.index.remove(gone)
+        for _, gone in pairs:
+            self.index.remove(gone)
 
     @property
     def _active_slots(self) -> IntArray:

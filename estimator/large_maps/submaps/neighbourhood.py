@@ -187,18 +187,22 @@ class Neighbourhood:
         if held := [i for i in ids if i in slam.map.slots]:
             slam.remove(held)
 
-    def merge(self, kept: int, gone: int) -> None:
-        """Condition on two landmarks being the same, after the submaps have been."""
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Condition on pairs of landmarks being one, after the submaps have been.
+
+        Several pairs close a loop: the copy is replaced, since joining the submaps is
+        more accurate than a linear step.
+        """
         if self._copy is None:
             return
-        slam = self._copy.slam
-        held = {kept, gone}.intersection(slam.map.slots)
-        if len(held) == 2:
+        slam, ids = self._copy.slam, {i for pair in pairs for i in pair}
+        held = ids.intersection(slam.map.slots)
+        if len(held) == 2 == len(ids):
             with suppress(np.linalg.LinAlgError):
-                slam.merge(kept, gone)
+                slam.merge_pairs(pairs)
         elif held:
             self.renew()
-        self.remove([gone])
+        self.remove([gone for _, gone in pairs])
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state as arrays; empty without a copy."""

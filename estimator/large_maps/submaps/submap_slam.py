@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -204,15 +204,10 @@ class SubmapSlam(SubmapQueries):
         self._neighbourhood.remove(ids)
 
     def merge(self, kept: int, gone: int) -> None:
-        """Condition on two landmarks being the same, and remove the second.
+        """Condition on two mapped landmarks being the same, and remove the second.
 
         The landmark then connects all submaps that hold either.  Submaps that hold both
         are conditioned separately (:mod:`.merging`).
-
-        Parameters
-        ----------
-        kept, gone : int
-            Two mapped landmarks.
 
         Raises
         ------
@@ -222,10 +217,14 @@ class SubmapSlam(SubmapQueries):
         numpy.linalg.LinAlgError
             If the covariance of their distance is singular; nothing is then merged.
         """
-        argument_checks.two_landmarks(kept, gone, self._graph.index)
+        self.merge_pairs([(kept, gone)])
+
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Merge several pairs (kept, gone) of landmarks; errors as :meth:`merge`."""
+        argument_checks.landmark_pairs(pairs, self._graph.index)
         self._claim_folder()
-        self._graph.merge(kept, gone)
-        self._neighbourhood.merge(kept, gone)
+        self._graph.merge_pairs(pairs)
+        self._neighbourhood.merge_pairs(pairs)
 
     def join(self) -> None:
         """Join the closed submaps, and continue from the result.

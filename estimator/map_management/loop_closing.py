@@ -1,0 +1,239 @@
+"""Close loops after long drift: recognise landmarks around the robot as older ones.
+
+A landmark is lost if its position relative to the robot, with the error ::
+
+    e_l − e_p − J (l − p) e_θ,
+
+is less certain than the policy allows.  Readings are not associated with lost
+landmarks, so that around a robot that has lost its map a new one begins.  A landmark
+that enters the map where a lost one may be is *doubtful*: it may be a second copy.
+Once a constellation around the robot is recognised among the lost landmarks, both are
+merged by one measurement.  Where the loop has been closed otherwise, the older landmark
+is no longer lost, and a doubtful one is merged with it if their offset is accurate and
+passes the gate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Array, BoolArray, IntArray
+from ..association.constellations import Constellations, match_constellations
+from ..association.same_place import TwoPlaces
+from ..belief import MapView
+
+Pairs = list[tuple[int, int]]
+"""Landmarks that are the same: (kept, gone)."""
+
+LOCAL_REACH = 3.0
+"""Landmarks count as local within so many times the reach of the readings."""
+OFFSET_GATE = 25.0
+"""Largest χ² of the offset of two landmarks that may be the same; 2 degrees."""
+SAME_GATE = 9.21
+"""Largest χ² of the offset of two landmarks that are the same; 2 degrees, 99 %."""
+ACCURATE = 0.25
+"""An offset is accurate if its σ is less than this times that of lost landmarks."""
+NEAR_STDS = 10.0
+"""Readings may belong to landmarks that are so many σ farther away than they reach."""
+TURN_STDS = 4.0
+SLACK = 0.2
+"""The heading may be wrong by so many standard deviations and so much [rad]."""
+
+
+class LoopCloser:
+    """Recognises the landmarks around the robot in the map of one filter.
+
+    Parameters
+    ----------
+    rules : Constellations or None
+        None: no landmark is ever lost.
+    """
+
+    def __init__(self, rules: Constellations | None) -> None:
+        self._rules = rules
+        self._doubtful: set[int] = set()
+
+    def lost(self, view: MapView) -> BoolArray:
+        """Return which landmarks of a view are lost, shape (n,)."""
+        if self._rules is None or not view.ids:
+            return np.zeros(len(view.ids), dtype=np.bool_)
+        return _relative_std(view) > self._rules.lost_std
+
+    def without_lost(self, view: MapView, within: float) -> MapView:
+        """Return a view of the landmarks within a distance [m] that are not lost.
+
+        The view itself, if no landmark is lost.
+        """
+        is_lost = self.lost(view)
+        if self._rules is None or not is_lost.any():
+            return view
+        away = np.hypot(*(view.landmarks - view.mean[:2]).T)
+        is_near = away <= within + NEAR_STDS * self._rules.lost_std
+        return _part(view, np.flatnonzero(~is_lost & is_near))
+
+    def is_waiting(self, added: Collection[int]) -> bool:
+        """Return whether landmarks may have to be merged after some were added."""
+        return self._rules is not None and bool(added or self._doubtful)
+
+    def pairs(self, view: MapView, added: Collection[int], within: float) -> Pairs:
+        """Return landmarks to merge after a scan.
+
+        Parameters
+        ----------
+        view : MapView
+            The map around the robot.
+        added : collection of int
+            Landmarks that the scan has added to the map.
+        within : float
+            Reach of the readings [m].
+        """
+        if self._rules is None:
+            return []
+        is_lost = self.lost(view)
+        self._note_added(view, added, is_lost)
+        doubtful = [k for k, i in enumerate(view.ids) if i in self._doubtful]
+        if not doubtful:
+            return []
+        accurate = ACCURATE * self._rules.lost_std
+        found = _found_again(view, np.array(doubtful), is_lost, accurate)
+        if found or not added:
+            return found
+        return _recognised(view, is_lost, within, self._rules)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that is remembered, as arrays."""
+        return {"doubtful": np.array(sorted(self._doubtful), dtype=np.int64)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self._doubtful = set(np.asarray(state["doubtful"]).tolist())
+
+    def _note_added(
+        self, view: MapView, added: Collection[int], is_lost: BoolArray
+    ) -> None:
+        """Remember new landmarks that may be lost ones; forget those that are gone."""
+        self._doubtful &= set(view.mapped)
+        new = np.array([k for k, i in enumerate(view.ids) if i in set(added)], int)
+        lost = np.flatnonzero(is_lost)
+        if len(new) and len(lost):
+            squared, _ = _offsets(view, new, lost)
+            doubtful = new[(squared <= OFFSET_GATE).any(axis=1)]
+            self._doubtful |= {view.ids[k] for k in doubtful.tolist()}
+
+
+def _found_again(
+    view: MapView, doubtful: IntArray, is_lost: BoolArray, accurate: float
+) -> Pairs:
+    """Return doubtful landmarks and the older ones, no longer lost, that they are."""
+    is_older = ~is_lost
+    is_older[doubtful] = False
+    older = np.flatnonzero(is_older)
+    doubtful = doubtful[~is_lost[doubtful]]
+    if not len(older) or not len(doubtful):
+        return []
+    squared, std = _offsets(view, doubtful, older)
+    squared[older[None] > doubtful[:, None]] = np.inf
+    squared[std > accurate] = np.inf
+    best = squared.argmin(axis=1)
+    rows = np.arange(len(doubtful))
+    good = (squared[rows, best] <= SAME_GATE) & (squared.argmin(axis=0)[best] == rows)
+    return [
+        (view.ids[older[best[row]]], view.ids[doubtful[row]])
+        for row in np.flatnonzero(good).tolist()
+    ]
+
+
+def _recognised(
+    view: MapView,
+    is_lost: BoolArray,
+    within: float,
+    rules: Constellations,
+) -> Pairs:
+    """Return landmarks of a constellation that is recognised."""
+    away = np.hypot(*(view.landmarks - view.mean[:2]).T)
+    local = np.flatnonzero(~is_lost & (away <= LOCAL_REACH * within))
+    local = local[np.argsort(away[local], kind="stable")]
+    older = np.flatnonzero(is_lost)
+    if min(len(local), len(older)) < rules.least:
+        return []
+    feasible = _offsets(view, local, older)[0] <= OFFSET_GATE
+    used = feasible.any(axis=0)
+    older, feasible = older[used], feasible[:, used]
+    if len(older) < rules.least:
+        return []
+    turn = TURN_STDS * float(np.sqrt(view.covariance[2, 2])) + SLACK
+    places = TwoPlaces(
+        view.landmarks[local],
+        view.landmarks[older],
+        _invariant(view, np.concatenate([local, older])),
+        min(turn, np.pi),
+    )
+    match = match_constellations(places, feasible, rules)
+    if match is None:
+        return []
+    return [
+        (view.ids[older[p]], view.ids[local[i]])
+        for i, p in zip(match.local.tolist(), match.older.tolist(), strict=True)
+    ]
+
+
+def _relative_std(view: MapView) -> Array:
+    """Return the largest σ of each landmark relative to the robot, shape (n,) [m]."""
+    n, P = len(view.ids), view.covariance
+    columns = np.arange(3, 3 + 2 * n).reshape(n, 2)
+    lever = (view.landmarks - view.mean[:2])[:, ::-1] * (-1.0, 1.0)
+    C = P[columns[:, :, None], columns[:, None, :]] + P[:2, :2]
+    with_pose = P[columns, 0], P[columns, 1]
+    cross = np.stack(with_pose, axis=2)
+    C = C - cross - cross.transpose(0, 2, 1)
+    heading = P[columns, 2] - P[:2, 2]
+    both = heading[:, :, None] * lever[:, None, :]
+    C = C - both - both.transpose(0, 2, 1)
+    C = C + P[2, 2] * lever[:, :, None] * lever[:, None, :]
+    return _largest_std(C[:, 0, 0], C[:, 0, 1], C[:, 1, 1])
+
+
+def _offsets(view: MapView, some: IntArray, others: IntArray) -> tuple[Array, Array]:
+    """Return χ² and largest σ of the offsets of landmarks, shapes (m, n)."""
+    P = _invariant(view, np.concatenate([some, others]))
+    m, n = len(some), len(others)
+    blocks = P.reshape(m + n, 2, m + n, 2).transpose(0, 2, 1, 3)
+    own = blocks[np.arange(m + n), np.arange(m + n)]
+    cross = blocks[:m, m:]
+    C = own[:m, None] + own[None, m:] - cross - cross.transpose(0, 1, 3, 2)
+    d = view.landmarks[some][:, None] - view.landmarks[others][None]
+    xx, xy, yy = C[..., 0, 0], C[..., 0, 1], C[..., 1, 1]
+    x, y = d[..., 0], d[..., 1]
+    determinant = xx * yy - xy * xy
+    squared = np.full((m, n), np.inf)
+    product = yy * x * x - 2 * xy * x * y + xx * y * y
+    np.divide(product, determinant, out=squared, where=determinant > 0)
+    return squared, _largest_std(xx, xy, yy)
+
+
+def _largest_std(xx: Array, xy: Array, yy: Array) -> Array:
+    """Return the largest standard deviation of covariances (xx, xy, yy)."""
+    largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+    return np.sqrt(np.maximum(largest, 0.0))
+
+
+def _invariant(view: MapView, slots: IntArray) -> Array:
+    """Return the covariance of ξ_q = e_q − J (q − p) e_θ of landmarks."""
+    columns = (3 + 2 * slots[:, None] + np.arange(2)).ravel()
+    P = view.covariance
+    lever = (view.landmarks[slots] - view.mean[:2])[:, ::-1] * (-1.0, 1.0)
+    lever = lever.ravel()
+    cross = np.outer(lever, P[2, columns])
+    block = P[np.ix_(columns, columns)]
+    return np.asarray(block - cross - cross.T + P[2, 2] * np.outer(lever, lever))
+
+
+def _part(view: MapView, slots: IntArray) -> MapView:
+    """Return a view of some landmarks only."""
+    columns = np.concatenate([[0, 1, 2], (3 + 2 * slots[:, None] + [0, 1]).ravel()])
+    ids: Sequence[int] = [view.ids[slot] for slot in slots.tolist()]
+    P = view.covariance[np.ix_(columns, columns)]
+    return MapView(view.mean[columns], P, ids, view.mapped)

@@ -1,0 +1,255 @@
+"""Recognition of a place by its constellation, against searches over all matches."""
+
+from itertools import combinations, permutations
+
+import networkx as nx
+import numpy as np
+import pytest
+
+from slamgym.estimator.association import constellations, same_place
+from slamgym.estimator.association.constellations import (
+    Constellations,
+    match_constellations,
+)
+from slamgym.estimator.association.same_place import Match, TwoPlaces
+from slamgym.estimator.error_frames import invariant_error
+from slamgym.estimator.kernels.clique_search import compare_pairs, search_clique
+
+STD = 0.05
+GROUP = np.array([(0, 0), (4, 1), (1, 5), (6, 6), (9, 2), (3, 9), (8, 9)], dtype=float)
+
+
+def turned(points, angle):
+    cos, sin = np.cos(angle), np.sin(angle)
+    return points @ np.array([(cos, sin), (-sin, cos)])
+
+
+def shifted(points, x, y=0.0):
+    return points + np.array([x, y])
+
+
+def two_places(a, b, drift=3.0, largest_turn=np.pi):
+    """Independent errors of STD, and a common one of all local landmarks."""
+    m, size = len(a), len(a) + len(b)
+    covariance = STD**2 * np.eye(2 * size)
+    covariance[: 2 * m, : 2 * m] += drift**2 * np.kron(np.ones((m, m)), np.eye(2))
+    return TwoPlaces(a, b, covariance, largest_turn)
+
+
+def matched(a, b, rules=None, feasible=None, **changes):
+    may = np.full((len(a), len(b)), True) if feasible is None else feasible
+    match = match_constellations(
+        two_places(a, b, **changes), may, rules or Constellations(least=5)
+    )
+    return match and dict(zip(match.local.tolist(), match.older.tolist(), strict=True))
+
+
+def noisy(points, seed=0):
+    return points + STD * np.random.default_rng(seed).standard_normal(points.shape)
+
+
+# --- the search ---
+
+
+def random_graph(seed):
+    rng = np.random.default_rng(seed)
+    pairs = np.argwhere(rng.random((6, 7)) < 0.6)
+    agree = np.triu(rng.random((len(pairs), len(pairs))) < 0.5, 1)
+    agree &= (pairs[:, None] != pairs[None]).all(axis=2)
+    return pairs, agree | agree.T
+
+
+def test_the_clique_is_as_large_as_that_of_networkx():
+    for seed in range(40):
+        pairs, agree = random_graph(seed)
+        clique = np.zeros(7, dtype=np.int64)
+        size, visited = search_clique(pairs, agree, 0, 100_000, clique)
+        graph = nx.from_numpy_array(agree)
+        assert size == max(map(len, nx.find_cliques(graph)))
+        assert visited < 100_000
+        assert all(agree[s, t] for s, t in combinations(clique[:size], 2))
+
+
+def test_the_search_finds_no_clique_that_is_not_larger_than_wanted():
+    pairs, agree = random_graph(0)
+    clique = np.zeros(7, dtype=np.int64)
+    size, _ = search_clique(pairs, agree, 0, 100_000, clique)
+    assert search_clique(pairs, agree, size - 1, 100_000, clique)[0] == size
+    assert search_clique(pairs, agree, size, 100_000, clique)[0] == 0
+
+
+def test_the_search_stops_at_its_limit():
+    pairs, agree = random_graph(0)
+    clique = np.zeros(7, dtype=np.int64)
+    assert search_clique(pairs, agree, 0, 3, clique)[1] == 3
+
+
+def test_pairs_agree_where_distance_and_direction_do():
+    rng = np.random.default_rng(3)
+    a, b = rng.uniform(0, 6, (4, 2)), rng.uniform(0, 6, (5, 2))
+    pairs = np.argwhere(np.full((4, 5), True))
+    tables = constellations.tables(two_places(a, b))
+    agree = np.zeros((20, 20), dtype=np.bool_)
+    compare_pairs(pairs, *tables, 400.0, 1.0, agree)
+    for s, (i, p) in enumerate(pairs):
+        for t, (j, q) in enumerate(pairs):
+            one, other = a[j] - a[i], b[q] - b[p]
+            gap = np.linalg.norm(one) - np.linalg.norm(other)
+            turn = np.angle(complex(*other) * np.conj(complex(*one)))
+            close = gap**2 <= 400.0 * 4 * STD**2 and abs(turn) <= 1.0
+            assert agree[s, t] == (i != j and p != q and close)
+    assert 20 < agree.sum() < 200
+
+
+def largest_by_trying_all(a, b, gate):
+    """The largest number of landmarks whose distances agree, over all matches."""
+    d, e = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (a, b))
+    for size in range(len(a), 0, -1):
+        for some in combinations(range(len(a)), size):
+            for others in permutations(range(len(b)), size):
+                difference = d[np.ix_(some, some)] - e[np.ix_(others, others)]
+                if (difference**2 <= gate).all():
+                    return size
+    return 0
+
+
+def test_the_largest_constellation_is_that_of_a_search_over_all_matches():
+    sizes = set()
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        b = rng.uniform(0, 8, (6, 2))
+        some = rng.permutation(6)[: rng.integers(2, 5)]
+        a = np.concatenate(
+            [noisy(turned(b[some], 0.7), seed), rng.uniform(0, 8, (1, 2))]
+        )
+        places = two_places(a, b)
+        pairs = np.argwhere(np.full((len(a), 6), True))
+        agree = np.zeros((len(pairs), len(pairs)), dtype=np.bool_)
+        tables = constellations.tables(places)
+        gate = constellations.DISTANCE_GATE
+        compare_pairs(pairs, *tables, gate, np.pi, agree)
+        clique = constellations.largest_clique(pairs, agree, 0, 100_000)
+        assert len(clique) == largest_by_trying_all(a, b, gate * 4 * STD**2)
+        sizes.add(len(clique))
+    assert len(sizes) > 1
+
+
+# --- what is recognised ---
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, -2.0])
+def test_a_turned_and_shifted_place_is_recognised(angle):
+    others = np.array([(20.0, 3.0), (22.0, 8.0)])
+    older = np.concatenate([others, GROUP])
+    local = noisy(shifted(turned(GROUP[::-1], angle), 2.0, -1.0))
+    assert matched(local, older, drift=30.0) == {i: 8 - i for i in range(7)}
+
+
+def test_a_mirrored_place_is_not_recognised():
+    assert matched(noisy(GROUP), GROUP) is not None
+    assert matched(noisy(GROUP * (-1.0, 1.0)), GROUP, drift=30.0) is None
+
+
+def test_a_place_seen_twice_before_is_not_recognised():
+    twice = np.concatenate([GROUP, shifted(turned(GROUP, 0.5), 14.0)])
+    assert matched(noisy(GROUP), GROUP, drift=30.0) is not None
+    assert matched(noisy(GROUP), twice, drift=30.0) is None
+
+
+def test_more_landmarks_decide_between_places_that_look_alike():
+    around = np.array([(-3.0, 4.0), (-4.0, -2.0), (2.0, -4.0)])
+    here = np.concatenate([GROUP, around])
+    twice = np.concatenate([here, shifted(GROUP, 16.0)])
+    assert matched(noisy(here), twice, drift=30.0) == {i: i for i in range(10)}
+
+
+def test_a_symmetric_place_is_not_recognised():
+    hexagon = 5 * np.array([(np.cos(t), np.sin(t)) for t in np.arange(6) * np.pi / 3])
+    assert matched(noisy(hexagon), hexagon) is None
+    assert matched(noisy(hexagon), hexagon, largest_turn=0.3) is not None
+
+
+def test_a_displacement_beyond_the_drift_is_refused():
+    assert matched(noisy(shifted(GROUP, 7.0)), GROUP, drift=3.0) is not None
+    assert matched(noisy(shifted(GROUP, 20.0)), GROUP, drift=3.0) is None
+
+
+def test_landmarks_without_a_partner_in_the_middle_refuse_a_match():
+    rng = np.random.default_rng(1)
+    others = rng.uniform(1, 8, (7, 2))
+    assert matched(noisy(GROUP), np.concatenate([GROUP, others])) is None
+    far = np.concatenate([GROUP, shifted(others, 30.0)])
+    assert matched(noisy(GROUP), far) is not None
+
+
+def test_a_pair_that_is_not_feasible_is_not_matched():
+    feasible = np.full((7, 7), True)
+    feasible[2] = False
+    found = matched(noisy(GROUP), GROUP, feasible=feasible)
+    assert found == {i: i for i in range(7)}  # added once the others are matched
+
+
+def test_too_few_landmarks_are_no_constellation():
+    rules = Constellations(least=6, margin=1)
+    assert matched(noisy(GROUP[:6]), GROUP, rules) == {i: i for i in range(6)}
+    assert matched(noisy(GROUP[:5]), GROUP, rules) is None
+
+
+def test_a_search_beyond_its_limit_recognises_nothing():
+    rules = Constellations(least=5, search_nodes=20)
+    assert matched(noisy(GROUP), GROUP, rules) is None
+
+
+def test_the_order_of_the_landmarks_does_not_matter():
+    order = np.random.default_rng(0).permutation(7)
+    local = noisy(GROUP)
+    found = matched(local[order], GROUP)
+    assert found == dict(enumerate(order.tolist()))
+
+
+# --- the statistics ---
+
+
+def test_the_tests_have_the_chi_square_of_their_degrees_at_any_heading_error():
+    """Estimates are drawn from the invariant error, whose heading has σ = 0.5 rad."""
+    rng = np.random.default_rng(0)
+    k = len(GROUP)
+    root = 0.05 * rng.standard_normal((4 * k + 3, 4 * k + 3))
+    P = root @ root.T
+    drift = np.zeros((3, 4 * k + 3))
+    drift[0, 3 : 3 + 2 * k : 2] = drift[1, 4 : 4 + 2 * k : 2] = 2.0
+    P += drift.T @ drift
+    P[2, 2] += 0.25
+    truth = np.concatenate([[1.0, 2.0, 0.0], GROUP.ravel(), GROUP.ravel()])
+    chi = []
+    for _ in range(250):
+        xi = rng.multivariate_normal(np.zeros(4 * k + 3), P)
+        mean = estimate_with(truth, xi)
+        np.testing.assert_allclose(invariant_error(truth, mean), xi, atol=1e-9)
+        points = mean[3:].reshape(-1, 2)
+        places = TwoPlaces(points[:k], points[k:], P[3:, 3:], np.pi)
+        every = np.arange(k)
+        chi.append(same_place.misfit(places, Match(every, every)))
+    shape, displacement = np.mean(chi, axis=0)
+    assert shape == pytest.approx(2 * k - 3, rel=0.1)
+    assert displacement == pytest.approx(2, rel=0.2)
+
+
+def estimate_with(truth, xi):
+    """The estimate χ̂ of which the truth has the error ξ: χ̂ = exp(−ξ) χ."""
+    t = -xi[2]
+    V = (np.exp(1j * t) - 1) / (1j * t)
+    points = np.delete(truth, 2).reshape(-1, 2) @ (1, 1j)
+    moves = np.delete(xi, 2).reshape(-1, 2) @ (1, 1j)
+    moved = np.exp(1j * t) * points - V * moves
+    flat = np.column_stack([moved.real, moved.imag]).ravel()
+    return np.insert(flat, 2, truth[2] + t)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("least", 2), ("margin", 0), ("lost_std", 0.0), ("search_nodes", 0)],
+)
+def test_bad_rules_are_refused_by_name(field, value):
+    with pytest.raises(ValueError, match=f"constellations.{field}"):
+        Constellations(**{field: value})

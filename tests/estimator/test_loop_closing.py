@@ -1,0 +1,187 @@
+"""Loops closed after long drift by constellations, in managed filters."""
+
+import numpy as np
+import pytest
+
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.estimator import LandmarkPolicy, make_estimator
+from slamgym.estimator.association.constellations import Constellations
+from slamgym.estimator.map_management.policy import as_policy
+from slamgym.sim_configs import action_sequence, load_scenario
+
+POLICY = {"association": "joint", "backdate": True, "constellations": True}
+OPTIONS = {
+    "invariant": {},
+    "compressed": {"base": "invariant"},
+    "submaps": {"submap_size": 30},
+}
+
+
+@pytest.fixture(scope="module")
+def lap():
+    """Odometry, readings and true identities of a lap until the loop is closed."""
+    world = load_scenario("lost_loop")
+    env = LandmarkWorldEnv(world)
+    observation, info = env.reset(seed=40)
+    steps = []
+    for action in action_sequence(world)[:285]:
+        mask = observation["mask"]
+        ids = np.asarray(info["landmark_ids"])[: mask.sum()].tolist()
+        readings = observation["landmarks"][mask]
+        steps.append((observation["odometry"], readings, ids, info["pose"]))
+        observation, *_, info = env.step(action)
+    return steps
+
+
+def made(name="invariant", **changes):
+    world = load_scenario("lost_loop")
+    return make_estimator(
+        name,
+        motion_std=world.motion.std,
+        measurement_std=world.sensor.std,
+        management=POLICY | changes,
+        **OPTIONS[name],
+    )
+
+
+def run(slam, steps, owners):
+    """Feed steps; return the merged pairs, and note who each landmark is."""
+    merged = []
+    for odometry, readings, ids, _ in steps:
+        slam.predict(odometry)
+        report = slam.update(readings)
+        for true, i in zip(ids, report.row_ids, strict=True):
+            if i is not None:
+                owners.setdefault(i, true)
+        merged += report.merged_ids
+    return merged
+
+
+def duplicates(slam, owners):
+    true = [owners[i] for i in slam.landmark_ids]
+    return len(true) - len(set(true))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OPTIONS)
+def test_a_lost_loop_is_closed(lap, name):
+    owners = {}
+    slam = made(name)
+    merged = run(slam, lap, owners)
+    assert len(merged) >= 6
+    assert all(owners[kept] == owners[gone] for kept, gone in merged)
+    assert duplicates(slam, owners) == 0
+    end, truth = slam.belief([]).pose, lap[-1][3]
+    assert np.hypot(*(end - truth)[:2]) < 2.0
+
+
+# --- small maps ---
+
+PLACE = np.array([(2, 2), (3, -2), (5, 1), (6, -1), (8, 2), (9, -3), (4, 4.0)])
+
+
+def readings_of(landmarks, pose=(0.0, 0.0, 0.0)):
+    d = landmarks - np.array(pose[:2])
+    bearings = np.arctan2(d[:, 1], d[:, 0]) - pose[2]
+    return np.column_stack([bearings, np.hypot(d[:, 0], d[:, 1])])
+
+
+def lost_and_seen_again(scans=3, given=None, **changes):
+    """Map a place, lose the way by noise alone, and see the place again."""
+    slam = make_estimator(
+        "invariant",
+        motion_std=(0.01, 0.01, 0.005),
+        measurement_std=(0.01, 0.03),
+        management={"constellations": True, "confirm": (2, 3)} | changes,
+    )
+    for _ in range(3):
+        slam.update(readings_of(PLACE))
+    slam.predict((0.0, 0.0), dt=30_000.0)  # σ = 1.7 m and 0.9 rad
+    where = (0.8, -0.9, 0.3)
+    merged = []
+    for _ in range(scans):
+        merged += slam.update(readings_of(PLACE, where), given).merged_ids
+    return slam, merged, where
+
+
+def test_a_constellation_is_merged_with_the_older_one():
+    slam, merged, where = lost_and_seen_again()
+    assert sorted(merged) == [(i, i + 7) for i in range(7)]
+    assert slam.landmark_ids == tuple(range(7))
+    np.testing.assert_allclose(slam.belief().pose, where, atol=0.05)
+    np.testing.assert_allclose(slam.belief().landmarks, PLACE, atol=0.05)
+
+
+@pytest.mark.parametrize("association", ["nearest", "joint", "hypotheses"])
+def test_a_saved_state_continues_bit_for_bit_through_the_merge(association):
+    options = {"association": association, "backdate": association != "nearest"}
+    slam, merged, where = lost_and_seen_again(scans=1, **options)
+    copy, _, _ = lost_and_seen_again(scans=0, **options)
+    assert merged == []
+    copy.load_state_dict(slam.state_dict())
+    for _ in range(2):
+        scan = readings_of(PLACE, where)
+        merged = slam.update(scan).merged_ids
+        assert copy.update(scan).merged_ids == merged
+        np.testing.assert_array_equal(slam.belief().mean, copy.belief().mean)
+    assert slam.landmark_ids == tuple(range(7))
+
+
+def test_doubtful_landmarks_are_part_of_the_saved_state():
+    slam, _, where = lost_and_seen_again(constellations={"least": 8})
+    copy, _, _ = lost_and_seen_again(scans=0, constellations={"least": 8})
+    copy.load_state_dict(slam.state_dict())
+    two = readings_of(PLACE[:2], where)
+    merged = [one.update(two, [0, 1]).merged_ids for one in (slam, copy)]
+    assert merged[0] == merged[1] != ()
+
+
+def test_readings_of_lost_landmarks_are_not_associated_with_them():
+    slam, merged, _ = lost_and_seen_again(constellations={"least": 8})
+    assert merged == []
+    assert len(slam.landmark_ids) == 14
+
+
+def test_lost_landmarks_are_not_missing():
+    view = {"max_range": 20.0}
+    changes = {"view": view, "remove_after": 2, "constellations": {"least": 8}}
+    slam, _, _ = lost_and_seen_again(scans=4, **changes)
+    assert len(slam.landmark_ids) == 14
+
+
+def test_landmarks_that_come_with_an_identity_are_not_merged():
+    slam, merged, _ = lost_and_seen_again(given=range(20, 27))
+    assert merged == []
+    assert len(slam.landmark_ids) == 14
+
+
+def test_a_doubtful_landmark_is_merged_once_the_older_one_is_found_again():
+    few = {"least": 8}
+    slam, merged, where = lost_and_seen_again(constellations=few)
+    assert merged == []
+    report = slam.update(readings_of(PLACE[:2], where), [0, 1])  # identities are given
+    assert set(report.merged_ids) == {(i, i + 7) for i in range(7)}
+
+
+def test_a_merge_that_fails_leaves_all_as_after_the_scan(monkeypatch):
+    slam, _, where = lost_and_seen_again(scans=1)
+
+    def refuse(pairs):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(slam.filter, "merge_pairs", refuse)
+    report = slam.update(readings_of(PLACE, where))
+    assert report.confirmed_ids == tuple(range(7, 14))
+    assert report.merged_ids == ()
+    assert len(slam.landmark_ids) == 14
+
+
+def test_constellations_are_given_by_their_fields_true_or_none():
+    assert as_policy({"constellations": True}).constellations == Constellations()
+    assert as_policy({"constellations": False}).constellations is None
+    rules = as_policy({"constellations": {"least": 8}}).constellations
+    assert rules == Constellations(least=8)
+    with pytest.raises(ValueError, match="constellations has no 'leest'"):
+        as_policy({"constellations": {"leest": 8}})
+    with pytest.raises(ValueError, match="constellations must be"):
+        LandmarkPolicy(constellations=6)  # type: ignore[arg-type]
