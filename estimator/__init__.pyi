@@ -21,6 +21,7 @@ from .filters import UnscentedSlam as UnscentedSlam
 from .filters import can_batch as can_batch
 from .filters import imagine as imagine
 from .interface import Belief as Belief
+from .interface import ScanDecisions as ScanDecisions
 from .interface import SlamEstimator as SlamEstimator
 from .interface import UpdateReport as UpdateReport
 from .large_maps import CompressedEkfSlam as CompressedEkfSlam

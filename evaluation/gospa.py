@@ -14,6 +14,8 @@ References
    2017.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

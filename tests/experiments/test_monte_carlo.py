@@ -241,6 +241,10 @@ def test_a_report_shows_association_only_where_identities_are_hidden(hidden, who
     assert not {"precision", "recall"} & {
         measure.name for measure in measures(summarise_monte_carlo(whole))
     }
+
+
+@pytest.mark.slow
+def test_the_page_shows_association_and_says_what_a_bad_run_is(hidden):
     page = html_report(hidden, summarise_monte_carlo(hidden))
     assert "precision" in page
     assert "above that of the same filter with known identities" in page

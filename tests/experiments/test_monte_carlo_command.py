@@ -66,6 +66,7 @@ def test_results_summary_and_report_are_written_and_told(here):
     assert "<svg" in page
 
 
+@pytest.mark.slow
 def test_a_world_without_identities_is_scored_by_places(here):
     world = ("hidden_identities", "--steps", 12, "--runs", 2, "--resolution", 100)
     estimator = 'ekf[management={association="joint"}]'
