@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from ...arrays import Array
-from ...estimator.models.angles import wrap_angle
+from ...estimator.error_frames import additive_error
 from ..runs.trace import RunTrace
 from .style import ALARM, BLUE, GREY, INK, TEAL, dress, new_figure, write_title
 
@@ -31,7 +31,7 @@ def errors_figure(trace: RunTrace) -> Figure:
     figure = new_figure(8.4, 1.0 + 1.9 * rows)
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     if truth is not None and known:
-        errors = pose_errors(trace.poses, truth)
+        errors = -additive_error(truth, trace.poses)
         std = np.sqrt(
             np.maximum(np.diagonal(trace.pose_covariances, axis1=1, axis2=2), 0)
         )
@@ -47,29 +47,6 @@ def errors_figure(trace: RunTrace) -> Figure:
     axes[-1].set_xlabel(f"time [{trace.time_unit}]")
     figure.align_ylabels(axes)
     return figure
-
-
-def pose_errors(poses: Array, true_poses: Array) -> Array:
-    """Subtract true from estimated poses, headings wrapped into [-π, π).
-
-    Parameters
-    ----------
-    poses, true_poses : ndarray, shape (k, 3)
-        Rows (x, y, θ) [m, m, rad].
-
-    Returns
-    -------
-    ndarray, shape (k, 3)
-        Errors, nan where the truth is.
-
-    Examples
-    --------
-    >>> pose_errors(np.array([[1.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -3.0]]))[0, 2]
-    np.float64(-0.28318530717958623)
-    """
-    errors = np.array(poses - true_poses)
-    errors[:, 2] = wrap_angle(errors[:, 2])
-    return errors
 
 
 def nis_band(
