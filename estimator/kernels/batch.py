@@ -1,4 +1,4 @@
-"""The loop over runs and steps, compiled; the arithmetic is that of one filter."""
+"""Loop over runs and steps, compiled, with the kernels of a single filter."""
 
 from typing import NamedTuple
 
@@ -23,8 +23,8 @@ class RunArrays(NamedTuple):
     means: Array  # (B, capacity)
     covariances: Array  # (B, capacity, capacity)
     references: Array  # (B, capacity)
-    slots: IntArray  # (B, L) place of each landmark in the map, -1 where not mapped
-    mapped: IntArray  # (B,) how many landmarks are
+    slots: IntArray  # (B, L) place of each landmark in the map, -1 if not mapped
+    mapped: IntArray  # (B,) number of mapped landmarks
 
 
 class StepData(NamedTuple):
@@ -48,9 +48,9 @@ def drive_runs(
 ) -> None:
     """Take each run through all its steps, in place.
 
-    The arrays come as plain tuples, the entries of :class:`RunArrays`,
-    :class:`StepData` and :class:`.scan_rows.Workspace`: numba takes microseconds to
-    recognise a NamedTuple.
+    The arguments are plain tuples of the entries of :class:`RunArrays`,
+    :class:`StepData` and :class:`.scan_rows.Workspace`, because numba takes
+    microseconds to recognise a NamedTuple.
 
     Parameters
     ----------
@@ -61,9 +61,9 @@ def drive_runs(
         degrees of freedom (B, T).
     failed_at : ndarray, shape (B,)
         On entry NEVER for the runs that take part.  On return the step at which a run
-        stopped, NEVER where it did not.
+        failed, NEVER if it did not.
     motion_values : ndarray, shape (4,)
-        The variances (σx², σy², σα²), and 1 where a robot at rest has motion noise too.
+        The variances (σx², σy², σα²), and 1 if a robot at rest has motion noise too.
     rule_values
         As :func:`.rules.as_rules` reads them.
     """
@@ -134,9 +134,9 @@ def gather(
     ids: IntArray,
     ledger: IntArray,
 ) -> int:
-    """Collect the readings of one step, and their landmarks' places in the map.
+    """Collect the readings of one step and the places of their landmarks in the map.
 
-    Returns how many there are, or -1 where one is not usable.
+    Returns the number of readings, or -1 if one is not usable.
     """
     m = 0
     for i in range(len(visible)):
@@ -154,7 +154,7 @@ def gather(
 def note_new(
     m: int, ids: IntArray, ledger: IntArray, slots: IntArray, mapped: int
 ) -> int:
-    """Give the added landmarks their places in the map; return how many there are."""
+    """Give the added landmarks their places in the map; return their number."""
     added = 0
     for k in range(m):
         if ledger[OUTCOME, k] == ADDED:
