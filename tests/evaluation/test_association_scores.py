@@ -60,6 +60,11 @@ def test_a_place_counts_as_missed_from_its_confirmation_on():
     assert counts(decisions, [[A], [A], [A]]) == {"new_correct": 1, "missed": 1}
 
 
+def test_clutter_that_is_left_out_is_no_miss_even_with_a_ghost_in_the_map():
+    decisions = [given(0, added=(0,)), given(None)]
+    assert counts(decisions, [[CLUTTER], [CLUTTER]]) == {"ghost": 1}
+
+
 def test_a_landmark_that_was_removed_may_come_back():
     gone = given(0, added=(0,), removed=(0,))
     decisions = [gone, given(None), given(1, added=(1,))]

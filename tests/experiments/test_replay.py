@@ -84,6 +84,8 @@ def test_the_summary_scores_readings_without_identity(method):
     assert summary["map_size"] == summary["new_correct"] == size > 10
     assert summary["correct"] == done.readings.associated > 300
     assert summary["wrong"] == summary["ghost"] == summary["duplicate"] == 0
+    assert summary["true_map_size"] < len(log.landmarks)  # some are seen too rarely
+    assert summary["gospa"]["raw"]["missed_count"] == summary["true_map_size"] - size
     truth = dict(zip(log.landmark_ids.tolist(), log.landmarks.tolist(), strict=True))
     expected = [truth[ids[i]] for i in done.belief.landmark_ids]
     assert done.trace.true_landmarks.tolist() == expected
