@@ -74,7 +74,7 @@ def test_a_cutoff_that_is_no_length_is_refused(cutoff):
 
 @pytest.mark.slow
 def test_stone_soup_finds_the_same():
-    pytest.importorskip("stonesoup", reason="needs stonesoup, see extra benchmark")
+    pytest.importorskip("stonesoup", reason="needs stonesoup, see extra interop")
     from stonesoup.metricgenerator.ospametric import GOSPAMetric
     from stonesoup.types.state import State
 
