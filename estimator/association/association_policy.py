@@ -8,7 +8,7 @@ from typing import Any
 
 from ..support import argument_checks
 
-ASSOCIATIONS = ("nearest", "joint", "compatibility", "hypotheses")
+ASSOCIATIONS = ("auto", "nearest", "joint", "compatibility", "hypotheses")
 
 MOST_SCANS = 63  # that fit one mask of a tentative landmark
 
@@ -23,17 +23,15 @@ class AssociationPolicy:
         Where a value is out of range.
     """
 
-    association: str = "nearest"
+    association: str = "auto"
     """How readings without identity are assigned to landmarks: "nearest", each reading
     to its likeliest landmark; "joint", the likeliest assignment of the whole scan;
     "compatibility", the most pairs that are jointly compatible (JCBB); "hypotheses",
-    several joint assignments, followed until the readings decide between them."""
+    several joint assignments, followed until the readings decide between them; "auto",
+    hypotheses, but joint in filters for large maps and those that observe the truth."""
     density: float | None = None
     """Readings per scan from no landmark of the map, clutter and new landmarks
     [1 / (rad m)]; None: estimate it from the scans so far."""
-    detection: float = 0.9
-    """Probability that a landmark of the map is read where a joint assignment pairs it
-    with a reading."""
     hypotheses: int = 10
     """Most hypotheses at a time."""
     branches: int = 3
@@ -41,10 +39,10 @@ class AssociationPolicy:
     search_nodes: int = 2000
     """Limit of the search for joint assignments; beyond it the best found so far is
     taken."""
-    pair_gate: float = 20.0
+    pair_gate: float = 15.0
     """A joint assignment pairs a reading and a landmark up to this νᵀ S⁻¹ ν, given the
     other pairs."""
-    backdate: bool = False
+    backdate: bool = True
     """Whether the sightings before the confirming one count: the filter then repeats
     the scans since the first sighting, with the new landmark in them."""
     match_gate: float = 9.21
@@ -62,9 +60,6 @@ class AssociationPolicy:
         argument_checks.one_of("association", self.association, ASSOCIATIONS)
         if self.density is not None:
             argument_checks.above("density", self.density, 0.0)
-        argument_checks.above("detection", self.detection, 0.0)
-        if self.detection >= 1.0:
-            raise ValueError(f"detection must be below 1, got {self.detection!r}")
         for name in ("hypotheses", "branches", "search_nodes"):
             argument_checks.whole(name, getattr(self, name), 1)
         argument_checks.above("pair_gate", self.pair_gate, 0.0)

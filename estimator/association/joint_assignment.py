@@ -3,12 +3,11 @@
 An assignment gives each reading one landmark or none, and each landmark at most one
 reading.  Its cost is −2 ln of its likelihood, up to a constant of the scan::
 
-    cost = νᵀ S⁻¹ ν + ln det S + λ u,    λ = −2 ln ρ − 2 ln 2π + 2 ln(D / (1 − D))
+    cost = νᵀ S⁻¹ ν + ln det S + λ u,    λ = −2 ln ρ − 2 ln 2π
 
 ν and S = H P Hᵀ + Q belong to the paired readings together, u counts the readings left
-out, ρ is the density of readings that come from no landmark of the map, clutter and
-landmarks that are not mapped yet [1 / (rad m)], and D is the probability that a
-landmark in view is read.
+out, and ρ is the density of readings that come from no landmark of the map: clutter and
+landmarks that are not mapped yet [1 / (rad m)].
 
 A depth-first branch and bound decides one reading after the other.  A pair conditions
 the expected readings of all landmarks.  By the chain rule of the Gaussian, the cost of
@@ -39,7 +38,8 @@ class Solutions(NamedTuple):
     marks: IntArray
     """Landmark 0 … J − 1 of each reading or `UNPAIRED`, shape (M, m)."""
     distances: Array
-    """Least νᵀ S⁻¹ ν of each unpaired reading, given the pairs, shape (M, m)."""
+    """Least νᵀ S⁻¹ ν of each unpaired reading to a landmark without a reading, given
+    the pairs, shape (M, m)."""
     is_complete: bool
     """False where the search stopped at its limit of nodes."""
 

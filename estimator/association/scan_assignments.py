@@ -83,7 +83,7 @@ def assign_scan(
         joint=joint,
         variances=_variances(readings, noise),
         feasible=fit.squared[:, explained] <= policy.pair_gate,
-        missing=0.0 if pairs_first else missing_cost(density, policy.detection),
+        missing=0.0 if pairs_first else missing_cost(density),
         gate=policy.pair_gate,
         limits=_limits(policy, len(readings)),
         pairs_first=pairs_first,
@@ -129,27 +129,15 @@ def _limits(policy: AssociationPolicy, rows: int) -> Array:
     return limits
 
 
-def missing_cost(density: float, detection: float) -> float:
-    """Return λ, the cost of a reading without a landmark.
-
-    ::
-
-        λ = −2 ln ρ − 2 ln 2π + 2 ln(D / (1 − D))
-
-    Parameters
-    ----------
-    density : float
-        ρ, readings per scan that belong to no landmark of the map [1 / (rad m)].
-    detection : float
-        D, the probability that a landmark in view is read.
+def missing_cost(density: float) -> float:
+    """Return λ = −2 ln ρ − 2 ln 2π, the cost of a reading without a landmark.
 
     Examples
     --------
-    >>> round(missing_cost(0.02, 0.5), 2)
+    >>> round(missing_cost(0.02), 2)
     4.15
     """
-    odds = detection / (1 - detection)
-    return float(2 * np.log(odds / (2 * np.pi * density)))
+    return float(-2 * np.log(density) - 2 * np.log(2 * np.pi))
 
 
 def _slots(

@@ -133,7 +133,9 @@ def condition(
 
 @jit
 def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
-    """Find the least νᵀ S⁻¹ ν of each unpaired reading, given the pairs.
+    """Find the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
+
+    A scan shows a landmark once: a reading beside one that is taken is of another.
 
     Parameters
     ----------
@@ -145,12 +147,15 @@ def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
     rows, landmarks = problem[3].shape
     shifts = np.zeros((2, landmarks, 2))
     joints = np.empty((2, 2 * landmarks, 2 * landmarks))
+    taken = np.zeros(landmarks, np.bool_)
     for s in range(len(marks)):
         here = 0
+        taken[:] = False
         shifts[0] = 0.0
         joints[0] = joint
         for i in range(rows):
             if marks[s, i] != UNPAIRED:
+                taken[marks[s, i]] = True
                 condition(
                     innovations[i],
                     variances[i],
@@ -165,6 +170,8 @@ def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
         for i in range(rows):
             if marks[s, i] == UNPAIRED:
                 for j in range(landmarks):
+                    if taken[j]:
+                        continue
                     x, _ = fit(
                         innovations[i], variances[i], shifts[here], joints[here], j, 1.0
                     )

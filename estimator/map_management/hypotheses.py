@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -25,7 +25,7 @@ Option = tuple[float, int, ScanAssociation]
 SPREAD = 16.0
 """Hypotheses e^8 times less probable than the best one are discarded."""
 
-SAME = 0.3
+SAME = 0.5
 """Hypotheses of the same landmarks whose means differ by less than so many σ in every
 coordinate are the same."""
 
@@ -36,6 +36,10 @@ def manage(
 ) -> Callable[..., ManagedSlam | HypothesisSlam]:
     """Return what makes a filter managed by a policy, from the keywords of filters."""
     policy = as_policy(management)
+    if policy.association == "auto":
+        made = estimator.func if isinstance(estimator, partial) else estimator
+        one = hasattr(made, "local_view") or hasattr(made, "observe_truth")
+        policy = replace(policy, association="joint" if one else "hypotheses")
     kind = HypothesisSlam if policy.association == "hypotheses" else ManagedSlam
     return partial(kind, estimator, management=policy)
 
@@ -285,5 +289,12 @@ class HypothesisSlam:
     def _keep(self, hypotheses: list[Hypothesis]) -> None:
         """Go on with these, and reuse the filters of the others."""
         kept = {id(h.slam) for h in hypotheses}
-        self._spare += [h.slam for h in self.hypotheses if id(h.slam) not in kept]
+        for hypothesis in self.hypotheses:
+            if id(hypothesis.slam) not in kept:
+                hypothesis.slam.reset(np.zeros(3), np.zeros(3))  # frees its scans
+                self._spare.append(hypothesis.slam)
         self.hypotheses = hypotheses
+
+    def __repr__(self) -> str:
+        count = len(self.hypotheses)
+        return repr(self.best) + (f", best of {count} hypotheses" if count > 1 else "")

@@ -80,12 +80,16 @@ def smooth(
     """
     argument_checks.whole("iterations", iterations, 1)
     argument_checks.above("tolerance", tolerance, 0.0)
-    noise = Noise(drive.rules, *robust_kernel(robust, robust_scale))
+    rules = drive.rules
+    kernel = robust_kernel(robust, robust_scale)
+    noise = Noise(np.array(rules), rules.bearing_std, *kernel)
     arrays, order = drive.arrays()
     optimiser = Optimiser(arrays, noise)
     starts = _starts(drive, start, _places(landmarks or {}, order), order)
     found = _best(optimiser, starts, tolerance, iterations)
-    return SmoothedDrive(optimiser.linearised(found), order.tolist(), drive)
+    return SmoothedDrive(
+        optimiser.linearised(found), order.tolist(), drive.landmark_ids
+    )
 
 
 def robust_kernel(robust: str | None, scale: float | None) -> tuple[float, float]:
