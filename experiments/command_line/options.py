@@ -71,6 +71,14 @@ ControllerName = Annotated[
         "path they mean, random wanders.",
     ),
 ]
+TruthFile = Annotated[
+    Path | None,
+    option(
+        "FILE",
+        "A graph file of the true poses of an iSAM or g2o text, by their ids.",
+        "none",
+    ),
+]
 OutFolder = Annotated[
     Path | None,
     option(

@@ -72,6 +72,7 @@ def replay(
         int | None,
         options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
     ] = None,
+    truth: options.TruthFile = None,
     out: options.OutFolder = None,
     every_step: options.EveryStep = None,
     as_json: options.AsJson = False,
@@ -87,12 +88,14 @@ def replay(
     slamgym replay data.txt --landmark-init independent --out homework
     slamgym replay sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
     slamgym replay results/loop-ekf/log.csv --estimator invariant
+    slamgym replay graph.txt --truth true.g2o --motion-std .1,.1,.05 \
+        --measurement-std .02,.1
     """
     from ..logs.anonymous import without_identities
     from ..runs.filter_settings import settings_for
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
-    from .run_files import filter_and_write, read_any_log, show_run
+    from .run_files import filter_and_write, note_choices, read_any_log, show_run
 
     named = {
         "landmark_init": landmark_init,
@@ -101,7 +104,9 @@ def replay(
         "noise_at_rest": noise_at_rest,
     }
     given = {name: value for name, value in named.items() if value is not None}
-    drive = read_any_log(log, robot)
+    reporter = Reporter(as_json=as_json)
+    drive = read_any_log(log, robot, truth=truth)
+    note_choices(drive, reporter)
     if hide_identities:
         drive = without_identities(drive)
     settings = settings_for(
@@ -110,7 +115,6 @@ def replay(
         **standard_deviations(motion_std, measurement_std, initial_pose_std),
         options=given | assignments("--option", option),
     )
-    reporter = Reporter(as_json=as_json)
     place = out or default_folder(drive.name, estimator)
     with output_folder(place) as folder:
         summary = filter_and_write(

@@ -44,6 +44,10 @@ class Reporter:
         if not self._as_json:
             self._results.print(Text(text), soft_wrap=True)
 
+    def note(self, text: str) -> None:
+        """Print a remark on standard error."""
+        self._notes.print(f"note: {text}", markup=False)
+
     def finish(self, summary: dict[str, Any]) -> None:
         """Print the JSON object."""
         if self._as_json:
@@ -99,7 +103,7 @@ class Reporter:
         """Print the warnings of the block as plain lines on standard error."""
 
         def show(message: Warning | str, *_: object, **__: object) -> None:
-            self._notes.print(f"note: {message}", markup=False)
+            self.note(str(message))
 
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)

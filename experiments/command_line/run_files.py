@@ -25,21 +25,29 @@ from .warm_up import warm_up
 _FEW_STEPS = 60  # of a run whose every step is drawn by default
 
 
-def read_any_log(path: Path, robot: int | None = None) -> SlamLog:
-    """Read a log of any known format.
+def read_any_log(
+    path: Path, robot: int | None = None, *, truth: Path | None = None
+) -> SlamLog:
+    """Read a log of any known format, with its truth if that is in another file.
 
     Raises
     ------
     BadInputError
-        If it cannot be opened.
+        If a file cannot be opened.
     LogError
-        If it is malformed.
+        If one is malformed.
     """
     try:
-        return read_log(path, robot=robot)
+        return read_log(path, robot=robot, truth=truth)
     except OSError as error:
-        reason = error.strerror or error
-        raise BadInputError(f"cannot read the log {path}: {reason}") from error
+        reason, file = error.strerror or error, error.filename or path
+        raise BadInputError(f"cannot read the log {file}: {reason}") from error
+
+
+def note_choices(log: SlamLog, reporter: Reporter) -> None:
+    """Note what the importer of a log left out."""
+    if "left_out" in log.header:
+        reporter.note(f"left out of the log: {log.header['left_out']}")
 
 
 def filter_and_write(

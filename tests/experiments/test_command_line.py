@@ -142,6 +142,27 @@ def test_a_log_can_be_replayed_without_its_identities(log, without_pictures):
     assert ",,-0.01,4.1,,7" in (log.parent / "hidden/log.csv").read_text()
 
 
+GRAPH = """EDGE2 0 1 1 0 0 50 0 0 50 0 100
+LANDMARK 1 7 3 4 10 0 10
+EDGE2 1 2 1 0 0 50 0 0 50 0 100
+LANDMARK 2 7 2 4 10 0 10
+EDGE2 0 2 2 0 0 50 0 0 50 0 100
+"""
+GRAPH_NOISE = ("--motion-std", ".02,.02,.01", "--measurement-std", ".02,.1")
+
+
+def test_a_graph_is_replayed_against_the_truth_of_another_file(here, without_pictures):
+    (here / "graph.txt").write_text(GRAPH)
+    (here / "true.g2o").write_text("".join(f"VERTEX2 {k} {k} 0.5 0\n" for k in "012"))
+    result = slamgym("replay", "graph.txt", *GRAPH_NOISE, "--truth", "true.g2o")
+    assert "note: left out of the log: 1 loop closures between poses\n" in result.stderr
+    summary = json.loads((here / "results/graph-ekf/summary.json").read_text())
+    assert summary["ate"]["raw"] == pytest.approx(0, abs=1e-9)
+    assert summary["pose"] == pytest.approx([2, 0.5, 0], abs=1e-9)
+    message = refused("replay", "graph.txt", *GRAPH_NOISE, "--truth", "nowhere.g2o")
+    assert message == "cannot read the log nowhere.g2o: No such file or directory"
+
+
 def test_the_scenario_of_a_run_is_saved_with_its_changes(finished_run):
     folder, _ = finished_run
     expected = load_scenario("six_landmarks").with_changes(steps=2)

@@ -307,6 +307,11 @@ def test_g2o_words_mean_the_same(file):
     ("line", "message"),
     [
         (
+            "EDGE2 1 5 1 0 0 1 0 0 1 0 1",
+            "expected odometry from pose 3, got from pose 1",
+        ),
+        ("EDGE2 3 3 1 0 0", "expected odometry to a new pose, got to pose 3"),
+        (
             "ODOMETRY 1 5 1 0 0 1 0 0 1 0 1",
             "expected odometry from pose 3, got from pose 1",
         ),
@@ -327,6 +332,78 @@ def test_g2o_words_mean_the_same(file):
 def test_wrong_isam_line_is_named(file, line, message):
     with pytest.raises(LogError, match=f"line 6: {message}"):
         read_log(file(ISAM + line + "\n"))
+
+
+@pytest.mark.parametrize("edge", ["EDGE2", "EDGE_SE2"])
+def test_loop_closures_between_poses_are_left_out_and_counted(file, edge):
+    closed = ISAM.replace("ODOMETRY", edge) + f"{edge} 3 0 9 9 9\n{edge} 0 1 8 8 8\n"
+    log = read_log(file(closed))
+    assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
+    assert log.header["left_out"] == "2 loop closures between poses"
+
+
+def test_a_graph_of_poses_alone_with_loop_closures_is_refused(file):
+    edges = "EDGE2 0 1 1 0 0\nEDGE2 1 2 1 0 0\nEDGE2 2 0 -2 0 0\n"
+    with pytest.raises(LogError, match="line 3: expected readings of landmarks, as a"):
+        read_log(file(edges))
+
+
+@pytest.mark.parametrize("vertex", ["VERTEX2", "VERTEX_SE2"])
+def test_true_poses_of_a_graph_are_taken_by_id(file, vertex):
+    rows = ["3 5 6 0.5", "0 1 2 0.25", "1 3 4 -0.5"]
+    text = "".join(f"{vertex} {row}\n" for row in rows) + "VERTEX_XY 2 7 8\n"
+    log = read_log(file(ISAM), truth=file(text, "true.g2o"))
+    expected = [(0, 1, 2, 0.25), (1, 3, 4, -0.5), (2, 5, 6, 0.5)]
+    np.testing.assert_array_equal(log.ground_truth, expected)
+    np.testing.assert_array_equal(log.start, (1, 2, 0.25))
+    assert (log.landmark_ids.tolist(), log.landmarks.tolist()) == ([2], [[7, 8]])
+    assert log.header["truth"] == "graph true.g2o"
+
+
+def test_true_poses_follow_from_exact_edges(file):
+    exact = (
+        f"EDGE2 0 1 2 0 {math.pi / 2}\nLANDMARK 1 2 1 2\nEDGE2 1 3 -3 1 0\n"
+        "LANDMARK 3 2 4 1\nLANDMARK 3 4 0 5\n"
+    )
+    log = read_log(file(ISAM), truth=file(exact, "true.txt"))
+    expected = [(0, 0, 0, 0), (1, 2, 0, np.pi / 2), (2, 1, -3, np.pi / 2)]
+    np.testing.assert_allclose(log.ground_truth, expected, atol=1e-15)
+    assert log.landmark_ids.tolist() == [2, 4]
+    np.testing.assert_allclose(log.landmarks, [(0, 1), (-4, -3)], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("01", "true.txt: expected the true poses of the 3 poses of the log, got 2"),
+        ("0123", "true.txt: expected the true poses of the 3 poses of the log, got 4"),
+        ("012", "true.txt: expected the poses of the log, found no pose 3"),
+    ],
+)
+def test_truth_of_other_poses_is_refused(file, rows, message):
+    truth = file("".join(f"VERTEX2 {row} 0 0 0\n" for row in rows), "true.txt")
+    with pytest.raises(LogError, match=message):
+        read_log(file(ISAM), truth=truth)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 1 2", "expected ODOMETRY or EDGE_SE2 or EDGE2 or"),
+        ("VERTEX2 3 1 0", "expected VERTEX2 i x y θ"),
+        ("VERTEX_XY 3 1", "expected VERTEX_XY i x y"),
+        ("VERTEX2 0 1 2 3", "expected each vertex once, got VERTEX2 0 again"),
+    ],
+)
+def test_wrong_line_of_the_truth_is_named(file, text, message):
+    truth = file(f"VERTEX2 0 0 0 0\n{text}\n", "true.txt")
+    with pytest.raises(LogError, match=f"true.txt, line 2: {message}"):
+        read_log(file(ISAM), truth=truth)
+
+
+def test_truth_is_refused_for_a_log_that_is_no_graph(file):
+    with pytest.raises(ValueError, match="truth must be None"):
+        read_log(file(FREIBURG), truth=file(ISAM, "true.txt"))
 
 
 def test_isam_text_without_odometry_is_refused(file):

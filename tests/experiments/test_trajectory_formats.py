@@ -317,6 +317,16 @@ def test_our_own_importer_reads_the_graph(tmp_path):
             assert scans[step].measurements == pytest.approx(rows, abs=1e-12)
 
 
+def test_our_own_importer_reads_the_truth_of_the_graph(tmp_path):
+    drive = turning(0)
+    fmt("g2o").write([drive], tmp_path / "shard")
+    graph = tmp_path / "shard" / "seed_00000000.g2o"
+    log = read_log(graph, truth=graph.with_stem(f"{graph.stem}_truth"))
+    np.testing.assert_array_equal(log.ground_truth[:, 1:], drive.poses)
+    np.testing.assert_array_equal(log.landmarks, drive.landmarks)
+    np.testing.assert_array_equal(log.start, drive.poses[0])
+
+
 def edges(path, tag):
     for line in path.read_text().splitlines():
         if line.startswith(f"{tag} "):

@@ -14,7 +14,8 @@ from ..lines import LogLine, read_lines, shown
 from ..slamlog import SlamLog, read_slamlog
 from .course import read_course
 from .freiburg import read_freiburg
-from .isam import ISAM_TAGS, read_isam
+from .graph import GRAPH_TAGS
+from .isam import read_isam
 from .utias import read_utias
 
 EXPECTED = (
@@ -25,7 +26,6 @@ READERS = {
     "slamlog": read_slamlog,
     "course": read_course,
     "freiburg": read_freiburg,
-    "isam": read_isam,
 }
 
 
@@ -34,6 +34,7 @@ def read_log(
     *,
     landmarks: ArrayLike | None = None,
     robot: int | None = None,
+    truth: str | PathLike[str] | None = None,
 ) -> SlamLog:
     """Read a log of any known format, which is detected from the content.
 
@@ -48,6 +49,9 @@ def read_log(
         log.
     robot : int, optional
         Which robot of a UTIAS folder; the lowest by default.
+    truth : path, optional
+        A graph file of the true poses of an iSAM or g2o text, by their ids: ``VERTEX2``
+        or ``VERTEX_SE2`` lines, or exact edges.
 
     Returns
     -------
@@ -57,19 +61,26 @@ def read_log(
     Raises
     ------
     LogError
-        If the content is no log of a known format, or malformed.
+        If the content is no log of a known format, or malformed, or if the truth is not
+        of the log's poses.
     OSError
         If a file cannot be opened.
     ValueError
-        If ``robot`` is given for a format of one robot.
+        If ``robot`` is given for a format of one robot, or ``truth`` for a log that is
+        no graph.
     """
     source = Path(path)
-    if source.is_dir():
-        log = read_utias(source, robot=robot)
-    elif robot is not None:
+    kind = "utias" if source.is_dir() else _format_of(read_lines(path)[0])
+    if robot is not None and kind != "utias":
         raise ValueError(f"robot must be None for a log in one file, got {robot}")
+    if truth is not None and kind != "isam":
+        raise ValueError(f"truth must be None for a log that is no graph, got {truth}")
+    if kind == "utias":
+        log = read_utias(source, robot=robot)
+    elif kind == "isam":
+        log = read_isam(path, truth=truth)
     else:
-        log = READERS[_format_of(read_lines(path)[0])](path)
+        log = READERS[kind](path)
     if landmarks is None:
         return log
     positions = float_array("landmarks", landmarks, columns=2)
@@ -88,7 +99,7 @@ def _format_of(line: LogLine) -> str:
         return "slamlog"
     if (tag, len(fields)) == ("ODOMETRY", 3) or tag == "SENSOR":
         return "freiburg"
-    if tag in ISAM_TAGS:
+    if tag in GRAPH_TAGS:
         return "isam"
     try:
         np.array([tag, *fields], dtype=np.float64)

@@ -1,6 +1,6 @@
-"""Read pose-landmark graphs as text, in the formats of iSAM and g2o.
+"""Read pose-landmark graphs as text, in the formats of iSAM, TORO and g2o.
 
-Lines ``ODOMETRY i j dx dy dθ …`` (pose j in the frame of pose i) and
+Lines ``ODOMETRY i j dx dy dθ …`` or ``EDGE2`` (pose j in the frame of pose i) and
 ``LANDMARK i j x y …`` (landmark j in the frame of pose i), or ``EDGE_SE2`` and
 ``EDGE_SE2_XY``. The information matrices at the ends of the lines, and the estimates in
 ``VERTEX`` and ``FIX`` lines, are ignored.
@@ -11,87 +11,81 @@ from os import PathLike
 from pathlib import Path
 
 from ..events import EventRecorder, OdometryRow, Reading, Scan, wrap_bearing
-from ..lines import LogLine, read_lines, shown
+from ..lines import LogLine, read_lines
 from ..slamlog import SlamLog
-
-ODOMETRY_TAGS = ("ODOMETRY", "EDGE_SE2")
-LANDMARK_TAGS = ("LANDMARK", "EDGE_SE2_XY")
-ESTIMATE_TAGS = ("VERTEX_SE2", "VERTEX_XY", "FIX")
-ISAM_TAGS = ODOMETRY_TAGS + LANDMARK_TAGS + ESTIMATE_TAGS
+from .graph import Graph, chain_of, id_at, reals_at, sort_lines
+from .graph_truth import with_truth
 
 
-def read_isam(path: str | PathLike[str]) -> SlamLog:
+def read_isam(
+    path: str | PathLike[str], *, truth: str | PathLike[str] | None = None
+) -> SlamLog:
     """Read a graph whose odometry lines form one chain of poses.
 
-    Poses and landmarks share one sequence of ids in the file: landmarks keep theirs,
+    Poses and landmarks share one sequence of ids in many files: landmarks keep theirs,
     while poses are renumbered, so that pose k has t = k. An increment (dx, dy, dθ)
     becomes two turn-last rows, (0, φ) with dt = 0 and (d, dθ - φ) with dt = 1, where
     d (cos φ, sin φ) = (dx, dy) and φ in [-π/2, π/2]; d < 0 means driving backwards.
+
+    Loop closures, edges between two poses that were both visited before, are left out
+    and counted in the header (``left_out``): a filter has no use for them.
 
     Parameters
     ----------
     path : path
         The file.
+    truth : path, optional
+        A graph of the true poses, see :func:`.graph_truth.with_truth`.
 
     Returns
     -------
     SlamLog
-        Motion turn-last, one unit of time per pose, starting at the origin, no truth.
+        Motion turn-last, one unit of time per pose. It starts at the first true pose,
+        without a truth at the origin.
 
     Raises
     ------
     LogError
-        If a line is of no known kind, or the odometry is no chain (as with the loop
-        closures of a pose graph), or a landmark is seen from a pose outside the chain.
+        If a line is of no known kind, or the odometry is no chain, or a landmark is
+        seen from a pose outside the chain, or a graph with loop closures has no
+        landmarks, or the truth is of other poses.
     OSError
-        If the file cannot be opened.
+        If a file cannot be opened.
     """
-    lines = read_lines(path)
-    odometry: list[LogLine] = []
-    seen_from: dict[int, list[LogLine]] = {}
-    for line in lines:
-        tag, *fields = line.text.split()
-        if tag in ODOMETRY_TAGS:
-            line.check_count(fields, (5, 11), f"{tag} i j dx dy dθ [6 of information]")
-            odometry.append(line)
-        elif tag in LANDMARK_TAGS:
-            line.check_count(fields, (4, 7), f"{tag} i j x y [3 of information]")
-            seen_from.setdefault(_id(line, 1), []).append(line)
-        elif tag not in ESTIMATE_TAGS:
-            raise line.error(" or ".join(ISAM_TAGS), shown(line.text))
-    if not odometry:
-        raise lines[-1].error("odometry", "the end of the file")
-    return SlamLog(
-        name=Path(path).stem,
-        header={"source": "iSAM or g2o text", "truth": "none"},
-        events=_walk(odometry, seen_from),
+    graph = sort_lines(read_lines(path))
+    chain, steps, closures = chain_of(graph)
+    header = {"source": "iSAM or g2o text", "truth": "none"}
+    if closures:
+        header["left_out"] = f"{closures} loop closures between poses"
+        if not graph.readings:
+            raise graph.lines[-1].error(
+                "readings of landmarks, as a filter has no use for loop closures "
+                "between poses",
+                "the end of the file",
+            )
+    log = SlamLog(
+        name=Path(path).stem, header=header, events=_events(graph, chain, steps)
     )
+    return log if truth is None else with_truth(log, steps, truth)
 
 
-def _walk(
-    odometry: list[LogLine], seen_from: dict[int, list[LogLine]]
+def _events(
+    graph: Graph, chain: list[LogLine], steps: dict[int, int]
 ) -> tuple[OdometryRow | Scan, ...]:
     """Follow the chain of poses, and record the readings of each pose."""
+    for pose in graph.readings.keys() - steps.keys():
+        raise graph.readings[pose][0].error("a pose of the odometry", f"pose {pose}")
     recorder = EventRecorder()
-    pose = _id(odometry[0], 1)
-    visited = {pose}
-    _take_readings(recorder, seen_from.get(pose, []), 0)
-    for step, line in enumerate(odometry, 1):
-        if _id(line, 1) != pose:
-            raise line.error(f"odometry from pose {pose}", f"from pose {_id(line, 1)}")
-        pose = _id(line, 2)
-        if pose in visited:
-            raise line.error("odometry to a new pose", f"to pose {pose} again")
-        visited.add(pose)
-        _take_increment(recorder, line, step)
-        _take_readings(recorder, seen_from.get(pose, []), step)
-    for pose in seen_from.keys() - visited:
-        raise seen_from[pose][0].error("a pose of the odometry", f"pose {pose}")
+    for pose, step in steps.items():
+        if step:
+            _take_increment(recorder, chain[step - 1], step)
+        for line in graph.readings.get(pose, []):
+            _take_reading(recorder, line, step)
     return recorder.finish()
 
 
 def _take_increment(recorder: EventRecorder, line: LogLine, step: int) -> None:
-    dx, dy, turn = map(line.to_real, line.text.split()[3:6])
+    dx, dy, turn = reals_at(line, 3, 6)
     sign = -1.0 if dx < 0 else 1.0
     direction = math.atan2(sign * dy, abs(dx))
     distance = sign * math.hypot(dx, dy)
@@ -100,14 +94,9 @@ def _take_increment(recorder: EventRecorder, line: LogLine, step: int) -> None:
     )
 
 
-def _take_readings(recorder: EventRecorder, lines: list[LogLine], step: int) -> None:
-    for line in lines:
-        x, y = map(line.to_real, line.text.split()[3:5])
-        bearing = wrap_bearing(math.atan2(y, x))
-        recorder.add_reading(
-            line, Reading(float(step), _id(line, 2), bearing, math.hypot(x, y))
-        )
-
-
-def _id(line: LogLine, place: int) -> int:
-    return line.to_id(line.text.split()[place])
+def _take_reading(recorder: EventRecorder, line: LogLine, step: int) -> None:
+    x, y = reals_at(line, 3, 5)
+    bearing = wrap_bearing(math.atan2(y, x))
+    recorder.add_reading(
+        line, Reading(float(step), id_at(line, 2), bearing, math.hypot(x, y))
+    )
