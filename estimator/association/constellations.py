@@ -30,10 +30,12 @@ from ..kernels.clique_search import compare_pairs, search_clique
 from ..support import argument_checks
 from .same_place import Match, TwoPlaces, extended, is_same_place, moved_gaps
 
-LARGEST_GRAPH = 1200
+LARGEST_GRAPH = 800
 """Most pairs of landmarks that are compared."""
 DISTANCE_GATE = 10.83
 """Squared difference of two distances over its variance; χ² of 1 degree, 99.9 %."""
+RIVAL_SHARE = 0.75
+"""A second place with a larger share of the landmarks is a rival."""
 RIVAL_GAP = 3.0
 """A rival's pairs are so many times farther apart than the worst pair of the match."""
 
@@ -51,12 +53,12 @@ class Constellations:
     least: int = 6
     """Smallest number of landmarks that make a constellation."""
     margin: int = 3
-    """A second place that fits with fewer than so many landmarks less is a rival; the
-    constellation is then ambiguous and not used."""
+    """A second place that fits with fewer than so many landmarks less, or with more
+    than three quarters of them, is a rival: the constellation is not used."""
     lost_std: float = 1.0
     """A landmark whose position relative to the robot is less certain than this is not
     associated with single readings [m]."""
-    search_nodes: int = 100_000
+    search_nodes: int = 20_000
     """Limit of the search; beyond it no constellation is recognised."""
 
     def __post_init__(self) -> None:
@@ -159,7 +161,8 @@ def _has_rival(
     gaps = moved_gaps(places, match)
     worst = gaps[match.local, match.older].max()
     others = gaps[pairs[:, 0], pairs[:, 1]] > RIVAL_GAP * worst
-    floor = max(len(match.local) - rules.margin, 2)
+    k = len(match.local)
+    floor = max(min(k - rules.margin, int(RIVAL_SHARE * k)), 2)
     clique = np.zeros(len(places.local) + 1, dtype=np.int64)
     rest = agree[np.ix_(others, others)]
     nodes = rules.search_nodes

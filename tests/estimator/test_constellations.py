@@ -169,6 +169,13 @@ def test_a_symmetric_place_is_not_recognised():
     assert matched(noisy(hexagon), hexagon, largest_turn=0.3) is not None
 
 
+def test_a_regular_grid_is_not_recognised():
+    grid = 3.0 * np.argwhere(np.full((5, 6), True))
+    assert matched(noisy(grid), grid) is None
+    near = np.linalg.norm(grid[:, None] - grid, axis=2) < 1.5
+    assert matched(noisy(grid), grid, feasible=near) == {i: i for i in range(30)}
+
+
 def test_a_displacement_beyond_the_drift_is_refused():
     assert matched(noisy(shifted(GROUP, 7.0)), GROUP, drift=3.0) is not None
     assert matched(noisy(shifted(GROUP, 20.0)), GROUP, drift=3.0) is None
