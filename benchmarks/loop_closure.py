@@ -34,6 +34,7 @@ METHODS: dict[str, dict[str, Any]] = {
     },
 }
 CONFIRM = (3, 8)
+OPTIONS = {"compressed": {"base": "invariant"}, "submaps": {"submap_size": 30}}
 
 
 class Outcome(NamedTuple):
@@ -71,6 +72,7 @@ def make(world: Scenario, estimator: str, **options: Any) -> SlamEstimator:
         range_std_per_metre=world.sensor.range_std_per_metre,
         initial_pose=world.start.pose,
         initial_pose_std=world.start.std,
+        **OPTIONS.get(estimator, {}),
         **options,
     )
 
