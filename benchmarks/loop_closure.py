@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
@@ -34,7 +34,10 @@ METHODS: dict[str, dict[str, Any]] = {
     },
 }
 CONFIRM = (3, 8)
-OPTIONS = {"compressed": {"base": "invariant"}, "submaps": {"submap_size": 30}}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "compressed": {"base": "invariant"},
+    "submaps": {"submap_size": 30},
+}
 
 
 class Outcome(NamedTuple):
@@ -101,17 +104,25 @@ def known(slam: SlamEstimator, scans: list[Scan]) -> Iterator[tuple[Any, int]]:
 
 
 def hidden(slam: SlamEstimator, scans: list[Scan]) -> Iterator[tuple[Any, int]]:
-    """Feed a drive to a filter, without identities."""
-    owners: dict[int, int] = {}
+    """Feed a drive to a filter, without identities.
+
+    A landmark is the true one that most of its readings are of.
+    """
+    owners = defaultdict[int, Counter[int]](Counter)
     for k, scan in enumerate(scans):
         if k:
             slam.predict(scan.odometry)
         report = slam.update(scan.readings)
         for true, i in zip(scan.ids.tolist(), report.row_ids, strict=True):
             if i is not None:
-                owners.setdefault(i, true)
-        pairs = [(owners.get(a), owners.get(b)) for a, b in report.merged_ids]
+                owners[i][true] += 1
+        pairs = [[majority(owners[i]) for i in pair] for pair in report.merged_ids]
         yield slam.belief([]).pose[:2], sum(a != b for a, b in pairs)  # type: ignore[call-arg]
+
+
+def majority(readings: Counter[int]) -> int | None:
+    """Return the true landmark of most readings, None without any."""
+    return readings.most_common(1)[0][0] if readings else None
 
 
 def score(
