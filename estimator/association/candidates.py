@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..belief import MapView
@@ -34,6 +35,25 @@ class Sensor(NamedTuple):
     noise: Noise
     min_range: float
     """Readings closer than this have no usable bearing [m]."""
+
+    @classmethod
+    def checked(cls, measurement_std: ArrayLike, options: Mapping[str, Any]) -> Sensor:
+        """Read a sensor from the arguments of a filter.
+
+        Raises
+        ------
+        ValueError
+            If the bearing noise depends on the range.
+        """
+        if options.get("bearing_std_metres"):
+            raise ValueError(
+                "bearing_std_metres must be 0 with management, "
+                f"got {options['bearing_std_metres']!r}"
+            )
+        bearing_std, range_std = np.asarray(measurement_std, dtype=np.float64).tolist()
+        per_metre = float(options.get("range_std_per_metre", 0.0))
+        min_range = options.get("min_range", 1e-3)
+        return cls((bearing_std, range_std, per_metre), min_range)
 
 
 class UnexplainedDensity(NamedTuple):

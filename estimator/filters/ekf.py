@@ -55,8 +55,11 @@ class EkfSlam(MapFilter):
         reproduce results obtained so.
     range_std_per_metre : float
         Part of σr that grows with the range: σr(r) = σr + k r.
+    bearing_std_metres : float
+        Part of σβ that shrinks with the range: σβ(r) = σβ + b / r. A sensor that
+        reads positions with the noise σ has σβ = 0, σr = b = σ.
     range_noise_at : {"expected", "reading"}
-        Which range that is: the one that the belief expects, or the one read, which
+        Which range r is: the one that the belief expects, or the one read, which
         many filters take although it trusts readings more just when they are short.
         For a new landmark it is always the one read.
     gate_probability : float or None
@@ -109,6 +112,7 @@ class EkfSlam(MapFilter):
         landmark_init: str = "full",
         range_std_per_metre: float = 0.0,
         range_noise_at: str = "expected",
+        bearing_std_metres: float = 0.0,
         gate_probability: float | None = None,
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
@@ -122,6 +126,7 @@ class EkfSlam(MapFilter):
                 frame=self._frame,
                 landmark_init=landmark_init,
                 range_std_per_metre=range_std_per_metre,
+                bearing_std_metres=bearing_std_metres,
                 range_noise_at=range_noise_at,
                 gate_probability=gate_probability,
                 min_range=min_range,

@@ -19,6 +19,7 @@ def checked_rules(
     frame: int,
     landmark_init: str,
     range_std_per_metre: float,
+    bearing_std_metres: float = 0.0,
     range_noise_at: str,
     gate_probability: float | None,
     min_range: float,
@@ -39,13 +40,17 @@ def checked_rules(
         min_range=argument_checks.above("min_range", min_range, 0.0),
         gate=_gate(gate_probability),
         noise_as_read=range_noise_at == "reading",
+        bearing_std_metres=argument_checks.at_least(
+            "bearing_std_metres", bearing_std_metres, 0.0
+        ),
     )
 
 
 def reading_variances(rules: Rules, ranges: Array) -> Array:
     """Return (σβ², σr²) of readings at these ranges [m], shape (m, 2)."""
     range_std = rules.range_std + rules.range_std_per_metre * ranges
-    bearing_std = np.full(len(ranges), rules.bearing_std)
+    away = np.maximum(ranges, rules.min_range)
+    bearing_std = rules.bearing_std + rules.bearing_std_metres / away
     return np.column_stack([bearing_std, range_std]) ** 2
 
 

@@ -15,7 +15,7 @@ from .batch import BatchSlam, can_batch
 from .ekf import EkfSlam
 from .scan_workspace import workspace_for
 
-_STDS = slice(5, 8)  # of `Rules`: the standard deviations of the measurement noise
+_STDS = slice(5, 9)  # of `Rules`: the standard deviations of the measurement noise
 
 
 class SensorLimits(Protocol):

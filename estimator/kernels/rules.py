@@ -29,16 +29,17 @@ class Rules(NamedTuple):
     bearing_std: float = 0.0  # [rad]
     range_std: float = 0.0  # [m]
     range_std_per_metre: float = 0.0
+    bearing_std_metres: float = 0.0  # [m]
     min_range: float = 1e-3  # [m]
     gate: float = np.inf  # largest NIS of one reading
-    noise_as_read: bool = False  # take σr at the range as read, not as expected
+    noise_as_read: bool = False  # take noise at the range as read, not as expected
 
 
 @njit_inlined
 def as_rules(values: Array) -> Rules:
     """Read rules from the array ``numpy.array(rules)``.
 
-    Python passes one array faster than a tuple of eleven numbers.
+    Python passes one array faster than a tuple of twelve numbers.
     """
     return Rules(
         int(values[0]),
@@ -51,5 +52,6 @@ def as_rules(values: Array) -> Rules:
         values[7],
         values[8],
         values[9],
-        values[10] > 0,
+        values[10],
+        values[11] > 0,
     )

@@ -15,7 +15,7 @@ from .scan_rows import (
     Workspace,
     prior_system_jit,
 )
-from .screen import range_variance, screen, usable
+from .screen import bearing_variance, range_variance, screen, usable
 
 # Status of an update, where it is not the reading that failed.
 DONE, NOT_USABLE = -1, -2
@@ -100,7 +100,7 @@ def update_belief(
                 size,
                 readings[k, 0],
                 readings[k, 1],
-                rules.bearing_std**2,
+                bearing_variance(rules, readings[k, 1]),
                 range_variance(rules, readings[k, 1]),
                 rules.linearisation,
                 rules.correlated,

@@ -64,7 +64,7 @@ def screen(
         system[row, READING], system[row + 1, READING] = bearing, distance
         # The range as read makes σr small just where its error is negative.
         at = distance if rules.noise_as_read else expected
-        system[row, VARIANCE] = rules.bearing_std**2
+        system[row, VARIANCE] = bearing_variance(rules, at)
         system[row + 1, VARIANCE] = range_variance(rules, at)
         ledger[NEAR, k] = is_too_near(mean, belief.covariance, column)
         if rules.gate < np.inf:
@@ -76,6 +76,12 @@ def screen(
                 continue
         used += 1
     return used
+
+
+@njit_internal
+def bearing_variance(rules: Rules, distance: float) -> float:
+    """Return σβ² of a reading at that range [m], which is at least the minimum."""
+    return (rules.bearing_std + rules.bearing_std_metres / distance) ** 2
 
 
 @njit_internal

@@ -84,15 +84,13 @@ class ManagedSlam:
             initial_pose_std=initial_pose_std,
             **options,
         )
-        bearing_std, range_std = np.asarray(measurement_std, dtype=np.float64).tolist()
-        noise = bearing_std, range_std, float(options.get("range_std_per_metre", 0.0))
-        self._sensor = Sensor(noise, options.get("min_range", 1e-3))
+        self._sensor = Sensor.checked(measurement_std, options)
         self._motion_noise = MotionNoise.checked(
             motion_std, options.get("noise_at_rest", True)
         )
         merging = self._policy.merge_within is not None
         self._editor = CachedEditor(edit_map(self._filter, merging=merging))
-        self._pruner = MapPruner(self._policy, self._editor, noise)
+        self._pruner = MapPruner(self._policy, self._editor, self._sensor.noise)
         self._candidates = Candidates()
         window = self._policy.confirm[1] if self._policy.backdate else 0
         self._recent = RecentScans(self._filter, self._editor, window)

@@ -79,6 +79,13 @@ TruthFile = Annotated[
         "none",
     ),
 ]
+NoiseFromFile = Annotated[
+    bool,
+    option(
+        "--noise-from-file",
+        "Take the noise from the information matrices of an iSAM or g2o text.",
+    ),
+]
 OutFolder = Annotated[
     Path | None,
     option(

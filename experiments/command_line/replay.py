@@ -73,6 +73,7 @@ def replay(
         options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
     ] = None,
     truth: options.TruthFile = None,
+    noise_from_file: options.NoiseFromFile = False,
     out: options.OutFolder = None,
     every_step: options.EveryStep = None,
     as_json: options.AsJson = False,
@@ -88,8 +89,7 @@ def replay(
     slamgym replay data.txt --landmark-init independent --out homework
     slamgym replay sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
     slamgym replay results/loop-ekf/log.csv --estimator invariant
-    slamgym replay graph.txt --truth true.g2o --motion-std .1,.1,.05 \
-        --measurement-std .02,.1
+    slamgym replay graph.txt --truth true.g2o --noise-from-file
     """
     from ..logs.anonymous import without_identities
     from ..runs.filter_settings import settings_for
@@ -105,7 +105,7 @@ def replay(
     }
     given = {name: value for name, value in named.items() if value is not None}
     reporter = Reporter(as_json=as_json)
-    drive = read_any_log(log, robot, truth=truth)
+    drive = read_any_log(log, robot, truth=truth, noise_from_file=noise_from_file)
     note_choices(drive, reporter)
     if hide_identities:
         drive = without_identities(drive)

@@ -26,7 +26,11 @@ _FEW_STEPS = 60  # of a run whose every step is drawn by default
 
 
 def read_any_log(
-    path: Path, robot: int | None = None, *, truth: Path | None = None
+    path: Path,
+    robot: int | None = None,
+    *,
+    truth: Path | None = None,
+    noise_from_file: bool = False,
 ) -> SlamLog:
     """Read a log of any known format, with its truth if that is in another file.
 
@@ -38,16 +42,18 @@ def read_any_log(
         If one is malformed.
     """
     try:
-        return read_log(path, robot=robot, truth=truth)
+        return read_log(path, robot=robot, truth=truth, noise_from_file=noise_from_file)
     except OSError as error:
         reason, file = error.strerror or error, error.filename or path
         raise BadInputError(f"cannot read the log {file}: {reason}") from error
 
 
 def note_choices(log: SlamLog, reporter: Reporter) -> None:
-    """Note what the importer of a log left out."""
+    """Note what the importer of a log left out, and which noise it took."""
     if "left_out" in log.header:
         reporter.note(f"left out of the log: {log.header['left_out']}")
+    if "noise" in log.header:
+        reporter.note(f"noise {log.header['noise']}")
 
 
 def filter_and_write(

@@ -96,9 +96,10 @@ def settings_for(
     """Set up an estimator for a log: by the arguments, else by the log's header.
 
     A log's header may hold ``motion_std``, ``measurement_std``, ``start_sigma``,
-    ``range_std_per_metre`` and ``noise_at_rest``; logs of the simulator do, and for the
-    course log the published values are used. By default, a log starts at a known pose,
-    and its robot has no noise while it reports to be at rest.
+    ``range_std_per_metre``, ``bearing_std_metres`` and ``noise_at_rest``; logs of the
+    simulator do, and for the course log the published values are used. A given
+    ``measurement_std`` replaces ``bearing_std_metres`` too. By default, a log starts at
+    a known pose, and its robot has no noise while it reports to be at rest.
 
     Parameters
     ----------
@@ -123,6 +124,8 @@ def settings_for(
     """
     factory = registry.find_estimator(estimator)
     header = dict(log.header)
+    if measurement_std is not None:
+        header.pop("bearing_std_metres", None)
     if header.get("source") == _COURSE_SOURCE:
         header = {**_COURSE_NOISE, **header}
     return FilterSettings(
@@ -187,7 +190,16 @@ def _header_options(
     if "range_std_per_metre" in header:
         key = "range_std_per_metre"
         options[key] = _number(name, key, header[key])
-    return registry.accepted_options(factory, options)
+    if "bearing_std_metres" in header:
+        key = "bearing_std_metres"
+        options[key] = _number(name, key, header[key])
+    accepted = registry.accepted_options(factory, options)
+    if options.get("bearing_std_metres") and "bearing_std_metres" not in accepted:
+        raise ValueError(
+            f"the noise of {name} needs bearing_std_metres, which the estimator does "
+            "not have: give it another --measurement-std"
+        )
+    return accepted
 
 
 def _needed_options(log: SlamLog, header: Mapping[str, str]) -> dict[str, Any]:

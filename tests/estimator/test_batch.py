@@ -18,6 +18,7 @@ NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 CASES = {
     "ekf": ("ekf", {}),
     "gated": ("ekf", {"gate_probability": 0.9, "range_std_per_metre": 0.02}),
+    "positions": ("ekf", {"bearing_std_metres": 0.1, "range_noise_at": "reading"}),
     "independent": ("ekf", {"landmark_init": "independent", "noise_at_rest": False}),
     "invariant": ("invariant", {}),
     "invariant iterated": ("invariant", {"iterations": 3}),

@@ -168,6 +168,32 @@ def test_range_noise_is_that_of_the_expected_range_or_of_the_one_read():
     assert variances["reading"] == pytest.approx((MEASUREMENT_STD[1] + 0.5) ** 2)
 
 
+def test_bearing_noise_shrinks_with_the_range_by_a_part_in_metres():
+    slam = make(bearing_std_metres=0.3)
+    slam.update([(0.0, 10.0)], [0])
+    variance = slam.belief().covariance[4, 4]
+    assert variance == pytest.approx((10 * MEASUREMENT_STD[0] + 0.3) ** 2)
+
+
+def test_noise_of_positions_has_the_same_size_in_all_directions():
+    slam = EkfSlam((0.1, 0.1, 0.1), (0.0, 0.3), bearing_std_metres=0.3)
+    slam.update([(0.7, 10.0), (-2.0, 0.5)], [0, 1])
+    expected = 0.09 * np.eye(4)
+    np.testing.assert_allclose(slam.belief().covariance[3:, 3:], expected, atol=1e-12)
+
+
+def test_bearing_noise_is_that_of_the_expected_range_or_of_the_one_read():
+    variances = {}
+    for at in ("expected", "reading"):
+        slam = make(bearing_std_metres=0.3, range_noise_at=at)
+        slam.update([(0.0, 10.0)], [0])
+        prior = slam.belief().covariance[4, 4] / 10.0**2
+        S = slam.update([(0.0, 5.0)], [0]).innovation_covariance
+        variances[at] = S[0, 0] - prior
+    assert variances["expected"] == pytest.approx((MEASUREMENT_STD[0] + 0.03) ** 2)
+    assert variances["reading"] == pytest.approx((MEASUREMENT_STD[0] + 0.06) ** 2)
+
+
 def test_gate_rejects_an_outlier_and_reports_it():
     plain, gated = run(20), run(20, gate_probability=0.999)
     *_, (odometry, readings, _) = drive(0, 21)
@@ -331,6 +357,7 @@ def test_bad_input_is_refused_by_name_and_changes_nothing(call, message):
         ({"noise_at_rest": "no"}, "noise_at_rest must be True or False"),
         ({"gate_probability": "high"}, "gate_probability must lie between 0 and 1"),
         ({"range_std_per_metre": "x"}, "range_std_per_metre must be a finite number"),
+        ({"bearing_std_metres": -1.0}, "bearing_std_metres must be a finite number"),
         ({"min_range": 0.0}, "min_range must be a finite number > 0"),
         ({"range_std_per_metre": -1.0}, "range_std_per_metre must be a finite"),
     ],

@@ -390,6 +390,21 @@ def test_range_noise_reaches_every_filter(case, at):
 
 
 @pytest.mark.parametrize("case", FAMILY)
+@pytest.mark.parametrize("at", ["expected", "reading"])
+def test_bearing_noise_in_metres_reaches_every_filter(case, at):
+    variances = []
+    for metres in (0.0, 3.0):
+        slam = make(case, bearing_std_metres=metres, range_noise_at=at)
+        tell_truth(slam, np.zeros(3))
+        slam.update(np.array([(0.3, 6.0), (1.0, 9.0)]), [0, 1])
+        slam.predict((0.0, 0.0))
+        scan = np.array([(0.3, 3.0), (1.0, 4.5)])
+        S = slam.update(scan, [0, 1]).innovation_covariance
+        variances.append(S[0, 0])
+    assert variances[1] > variances[0] + (0.9 if at == "reading" else 0.2)
+
+
+@pytest.mark.parametrize("case", FAMILY)
 def test_a_landmark_at_the_robot_is_reported_as_near(case):
     slam = make(case)
     true_map = {0: (0.9, 0.0), 1: (2.0, 3.0)}

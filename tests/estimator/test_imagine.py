@@ -148,9 +148,12 @@ def test_dropout_counts_readings_with_their_share_of_information():
         "ekf",
         motion_std=NOISE["motion_std"],
         measurement_std=np.array(NOISE["measurement_std"]) * 2**0.5,
+        range_std_per_metre=0.02 * 2**0.5,
+        bearing_std_metres=0.05 * 2**0.5,
     )
-    half.load_state_dict(driven("ekf").state_dict())
-    lossy = imagine(driven("ekf"), PLANS, sensor(dropout=0.5))
+    slam = driven("ekf", range_std_per_metre=0.02, bearing_std_metres=0.05)
+    half.load_state_dict(slam.state_dict())
+    lossy = imagine(slam, PLANS, sensor(dropout=0.5))
     expected = imagine(half, PLANS, sensor())
     np.testing.assert_allclose(lossy.log_det, expected.log_det, atol=1e-9)
     blind = imagine(driven("ekf"), PLANS, sensor(dropout=1.0))

@@ -189,6 +189,11 @@ def test_identities_need_confirmation_where_they_are_not_trusted():
     assert slam.update(scan[1:], [9]).confirmed_ids == (9,)
 
 
+def test_bearing_noise_that_depends_on_the_range_is_refused():
+    with pytest.raises(ValueError, match="bearing_std_metres must be 0 with manag"):
+        make(bearing_std_metres=0.1)
+
+
 def test_a_reading_that_could_be_of_two_landmarks_is_left_out():
     slam = make(management={"ambiguity": 2.0})
     slam.update(polar([(5, 0.1), (5, -0.1)]), [3, 4])

@@ -144,6 +144,7 @@ def test_gate_and_range_settings_are_those_of_the_ekf():
     settings = {
         "gate_probability": 0.9,
         "range_std_per_metre": 0.02,
+        "bearing_std_metres": 0.01,
         "min_range": 4.0,
         "noise_at_rest": False,
     }

@@ -159,6 +159,12 @@ def test_a_graph_is_replayed_against_the_truth_of_another_file(here, without_pic
     summary = json.loads((here / "results/graph-ekf/summary.json").read_text())
     assert summary["ate"]["raw"] == pytest.approx(0, abs=1e-9)
     assert summary["pose"] == pytest.approx([2, 0.5, 0], abs=1e-9)
+    result = slamgym("replay", "graph.txt", "--noise-from-file")
+    assert "note: noise from the file, by its information matrices\n" in result.stderr
+    settings = json.loads((here / "results/graph-ekf/summary.json").read_text())
+    assert settings["settings"]["motion_std"] == pytest.approx((0.02, 0.02, 0.01))
+    assert settings["settings"]["measurement_std"] == pytest.approx((0, 0.1))
+    assert settings["settings"]["options"]["bearing_std_metres"] == pytest.approx(0.1)
     message = refused("replay", "graph.txt", *GRAPH_NOISE, "--truth", "nowhere.g2o")
     assert message == "cannot read the log nowhere.g2o: No such file or directory"
 

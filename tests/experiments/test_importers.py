@@ -56,6 +56,11 @@ def utias(tmp_path):
     return tmp_path
 
 
+def rotated(angle):
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([(cos, -sin), (sin, cos)])
+
+
 def odometry_rows(log):
     return [event for event in log.events if isinstance(event, OdometryRow)]
 
@@ -404,6 +409,90 @@ def test_wrong_line_of_the_truth_is_named(file, text, message):
 def test_truth_is_refused_for_a_log_that_is_no_graph(file):
     with pytest.raises(ValueError, match="truth must be None"):
         read_log(file(FREIBURG), truth=file(ISAM, "true.txt"))
+
+
+NOISE_OF_INFORMATION = [
+    # iSAM: the square root of the information, in the frame of the first pose
+    ("ODOMETRY 0 1 1 0 0.5 50 0 0 20 0 100\nLANDMARK 1 2 3 4 10 0 10\n"),
+    ("EDGE2 0 1 1 0 0.5 50 0 0 20 0 100\nLANDMARK 1 2 3 4 10 0 10\n"),
+    # TORO: information in another order, for a turn of the drive by 90°
+    (
+        "VERTEX2 0 0 0 0\nEDGE2 0 1 0 1 0.5 400 0 2500 10000 0 0\n"
+        "LANDMARK 1 2 3 4 10 0 10\n"
+    ),
+    # g2o: information in the frame of the second pose
+    (
+        f"EDGE_SE2 0 1 1 0 {math.pi / 2} 400 0 0 2500 0 10000\n"
+        "EDGE_SE2_XY 1 2 3 4 100 0 100\n"
+    ),
+]
+
+
+@pytest.mark.parametrize("text", NOISE_OF_INFORMATION)
+def test_noise_is_that_of_the_information_matrices(file, text):
+    header = read_log(file(text), noise_from_file=True).header
+    motion = [float(number) for number in header["motion_std"].split(",")]
+    assert motion == pytest.approx((0.02, 0.05, 0.01))
+    sensor = [float(number) for number in header["measurement_std"].split(",")]
+    assert sensor == pytest.approx((0.1 / 5, 0.1))
+    assert header["noise"] == "from the file, by its information matrices"
+
+
+def test_noise_of_correlated_errors_is_that_along_and_across(file):
+    turned = rotated(math.atan2(4, 3))
+    covariance = turned @ np.diag([0.3**2, 0.1**2]) @ turned.T
+    xx, xy, _, yy = np.linalg.inv(covariance).ravel()
+    sighted = f"EDGE_SE2_XY 1 2 3 4 {xx} {xy} {yy}\n"
+    edge = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
+    header = read_log(file(edge + sighted), noise_from_file=True).header
+    sensor = [float(number) for number in header["measurement_std"].split(",")]
+    assert sensor == pytest.approx((0.1 / 5, 0.3))
+
+
+def test_square_roots_of_information_are_upper_triangular(file):
+    # R = [2 3; 0 4], so that (Rᵀ R)⁻¹ = [25/64 -3/32; -3/32 1/16]
+    text = "EDGE2 0 1 1 0 0 1 0 0 1 0 1\nLANDMARK 1 2 5 0 2 3 4\n"
+    header = read_log(file(text), noise_from_file=True).header
+    sensor = [float(number) for number in header["measurement_std"].split(",")]
+    assert sensor == pytest.approx((1 / 4 / 5, 5 / 8))
+
+
+def test_noise_of_positions_becomes_bearing_noise_in_metres(file):
+    far = ISAM.replace("LANDMARK 3 4 -1 0", "LANDMARK 3 4 -9 0")
+    header = read_log(file(far), noise_from_file=True).header
+    sensor = [float(number) for number in header["measurement_std"].split(",")]
+    assert sensor == pytest.approx((0, 1 / 1.5))
+    assert float(header["bearing_std_metres"]) == pytest.approx(1 / 1.5)
+
+
+def test_noise_of_differing_information_is_the_median(file):
+    edges = [
+        f"ODOMETRY {k} {k + 1} 1 0 0 {w} 0 0 {w} 0 100\n"
+        for k, w in enumerate((50, 10, 20))
+    ]
+    header = read_log(file("".join(edges)), noise_from_file=True).header
+    assert header["motion_std"] == "0.05,0.05,0.01"
+    assert "measurement_std" not in header
+    assert header["noise"].startswith("from the file, by the medians of its differing")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("ODOMETRY 3 5 1 0 0", "expected information at the end of the line, got none"),
+        ("EDGE_SE2 3 5 1 0 0 1 2 0 1 0 1", "expected positive definite information"),
+        ("ODOMETRY 3 5 1 0 0 1 0 0 1 0 0", "expected positive definite information"),
+        ("LANDMARK 3 7 0 0 1 0 1", "expected a landmark away from its pose"),
+    ],
+)
+def test_noise_that_a_line_does_not_specify_is_refused(file, line, message):
+    with pytest.raises(LogError, match=f"line 6: {message}"):
+        read_log(file(f"{ISAM}{line}\n"), noise_from_file=True)
+
+
+def test_noise_from_the_file_is_refused_for_a_log_that_is_no_graph(file):
+    with pytest.raises(ValueError, match="noise_from_file needs a graph"):
+        read_log(file(FREIBURG), noise_from_file=True)
 
 
 def test_isam_text_without_odometry_is_refused(file):

@@ -392,6 +392,20 @@ def test_settings_come_from_the_caller_then_the_log():
     assert settings.options == {"range_std_per_metre": 0.05}
 
 
+def test_noise_of_positions_in_the_header_is_taken_unless_the_user_gives_a_noise():
+    header = {
+        "motion_std": "0.1,0.2,0.3",
+        "measurement_std": "0,0.1",
+        "bearing_std_metres": "0.1",
+        "noise_at_rest": "true",
+    }
+    log = SlamLog("log", header)
+    assert settings_for(log).options == {"bearing_std_metres": 0.1}
+    assert settings_for(log, measurement_std=(0.01, 0.1)).options == {}
+    with pytest.raises(ValueError, match="the noise of log needs bearing_std_metres"):
+        settings_for(log, estimator=f"{__name__}:Simple")
+
+
 def test_a_robot_that_reports_rest_is_taken_to_stand_still_unless_the_log_objects():
     settings = settings_for(SlamLog("log"), **NOISE)
     assert settings.options == {"noise_at_rest": False}

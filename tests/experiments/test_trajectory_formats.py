@@ -327,6 +327,20 @@ def test_our_own_importer_reads_the_truth_of_the_graph(tmp_path):
     np.testing.assert_array_equal(log.start, drive.poses[0])
 
 
+def test_our_own_importer_reads_the_noise_of_the_graph(tmp_path):
+    drive = turning(0)
+    fmt("g2o").write([drive], tmp_path / "shard")
+    graph = tmp_path / "shard" / "seed_00000000.g2o"
+    header = read_log(graph, noise_from_file=True).header
+    for key, expected in {
+        "motion_std": drive.scenario.motion.std,
+        "measurement_std": drive.scenario.sensor.std,
+    }.items():
+        std = [float(number) for number in header[key].split(",")]
+        assert std == pytest.approx(expected)
+    assert header["noise"] == "from the file, by its information matrices"
+
+
 def edges(path, tag):
     for line in path.read_text().splitlines():
         if line.startswith(f"{tag} "):

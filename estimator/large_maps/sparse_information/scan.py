@@ -50,6 +50,7 @@ class ScanRules:
         unknown = set(settings) - {
             "range_std_per_metre",
             "range_noise_at",
+            "bearing_std_metres",
             "gate_probability",
             "noise_at_rest",
             "min_range",
@@ -59,7 +60,8 @@ class ScanRules:
         self.rules = EkfSlam(motion_std, measurement_std, **settings).rules
         at_rest = settings.get("noise_at_rest", True)
         self.motion_noise = MotionNoise.checked(motion_std, at_rest)
-        if min(self.rules.bearing_std, self.rules.range_std) <= 0:
+        bearing_std = self.rules.bearing_std + self.rules.bearing_std_metres
+        if min(bearing_std, self.rules.range_std) <= 0:
             raise ValueError(
                 "measurement_std must be 2 finite numbers > 0, because an exact "
                 f"measurement has infinite information, got {measurement_std!r}"

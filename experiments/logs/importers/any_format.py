@@ -35,6 +35,7 @@ def read_log(
     landmarks: ArrayLike | None = None,
     robot: int | None = None,
     truth: str | PathLike[str] | None = None,
+    noise_from_file: bool = False,
 ) -> SlamLog:
     """Read a log of any known format, which is detected from the content.
 
@@ -52,6 +53,9 @@ def read_log(
     truth : path, optional
         A graph file of the true poses of an iSAM or g2o text, by their ids: ``VERTEX2``
         or ``VERTEX_SE2`` lines, or exact edges.
+    noise_from_file : bool, default False
+        Whether the header of an iSAM or g2o text gets the noise that the information
+        matrices specify: ``motion_std``, ``measurement_std``, ``bearing_std_metres``.
 
     Returns
     -------
@@ -66,8 +70,8 @@ def read_log(
     OSError
         If a file cannot be opened.
     ValueError
-        If ``robot`` is given for a format of one robot, or ``truth`` for a log that is
-        no graph.
+        If ``robot`` is given for a format of one robot, or ``truth`` or
+        ``noise_from_file`` for a log that is no graph.
     """
     source = Path(path)
     kind = "utias" if source.is_dir() else _format_of(read_lines(path)[0])
@@ -75,10 +79,12 @@ def read_log(
         raise ValueError(f"robot must be None for a log in one file, got {robot}")
     if truth is not None and kind != "isam":
         raise ValueError(f"truth must be None for a log that is no graph, got {truth}")
+    if noise_from_file and kind != "isam":
+        raise ValueError("noise_from_file needs a graph, iSAM or g2o text")
     if kind == "utias":
         log = read_utias(source, robot=robot)
     elif kind == "isam":
-        log = read_isam(path, truth=truth)
+        log = read_isam(path, truth=truth, noise_from_file=noise_from_file)
     else:
         log = READERS[kind](path)
     if landmarks is None:

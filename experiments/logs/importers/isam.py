@@ -2,8 +2,8 @@
 
 Lines ``ODOMETRY i j dx dy dθ …`` or ``EDGE2`` (pose j in the frame of pose i) and
 ``LANDMARK i j x y …`` (landmark j in the frame of pose i), or ``EDGE_SE2`` and
-``EDGE_SE2_XY``. The information matrices at the ends of the lines, and the estimates in
-``VERTEX`` and ``FIX`` lines, are ignored.
+``EDGE_SE2_XY``. The information matrices at the ends of the lines are ignored unless
+asked for, and so are the estimates in ``VERTEX`` and ``FIX`` lines.
 """
 
 import math
@@ -14,11 +14,15 @@ from ..events import EventRecorder, OdometryRow, Reading, Scan, wrap_bearing
 from ..lines import LogLine, read_lines
 from ..slamlog import SlamLog
 from .graph import Graph, chain_of, id_at, reals_at, sort_lines
+from .graph_noise import noise_header
 from .graph_truth import with_truth
 
 
 def read_isam(
-    path: str | PathLike[str], *, truth: str | PathLike[str] | None = None
+    path: str | PathLike[str],
+    *,
+    truth: str | PathLike[str] | None = None,
+    noise_from_file: bool = False,
 ) -> SlamLog:
     """Read a graph whose odometry lines form one chain of poses.
 
@@ -36,6 +40,9 @@ def read_isam(
         The file.
     truth : path, optional
         A graph of the true poses, see :func:`.graph_truth.with_truth`.
+    noise_from_file : bool
+        Whether the header gets the noise that the information matrices specify, see
+        :func:`.graph_noise.noise_header`.
 
     Returns
     -------
@@ -48,7 +55,8 @@ def read_isam(
     LogError
         If a line is of no known kind, or the odometry is no chain, or a landmark is
         seen from a pose outside the chain, or a graph with loop closures has no
-        landmarks, or the truth is of other poses.
+        landmarks, or the truth is of other poses, or the noise is asked for and a line
+        does not specify it.
     OSError
         If a file cannot be opened.
     """
@@ -63,6 +71,8 @@ def read_isam(
                 "between poses",
                 "the end of the file",
             )
+    if noise_from_file:
+        header |= noise_header(graph, chain)
     log = SlamLog(
         name=Path(path).stem, header=header, events=_events(graph, chain, steps)
     )
