@@ -8,6 +8,10 @@ from .chi_square import family_band as family_band
 from .consistency_report import ConsistencyReport as ConsistencyReport
 from .consistency_report import assert_consistent as assert_consistent
 from .consistency_report import evaluate_consistency as evaluate_consistency
+from .error_bound import Efficiency as Efficiency
+from .error_bound import PosteriorBound as PosteriorBound
+from .error_bound import efficiency as efficiency
+from .error_bound import posterior_bound as posterior_bound
 from .gospa import Gospa as Gospa
 from .gospa import gospa as gospa
 from .hypothesis_tests import FamilyTest as FamilyTest

@@ -41,7 +41,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         compressed sparse_information submaps
     """,
     "evaluation": """
-        chi_square nees trajectory_error association_scores gospa
+        chi_square nees trajectory_error error_bound association_scores gospa
         whiteness
         hypothesis_tests
         time_average_tests

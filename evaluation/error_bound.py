@@ -1,0 +1,281 @@
+"""How small the errors of any filter can be: the posterior Cramér-Rao bound.
+
+The bound of Tichavský, Muravchik and Nehorai [1]_ is the recursion of a Kalman filter
+that is linearised at the truth.  It is taken in the invariant error frame, where the
+Jacobian of the motion is the identity and those of the readings depend on relative
+positions only: in the additive frame, such a filter claims to observe its heading.
+With p the position, l each landmark, J = [0 −1; 1 0] and G = ∂(β, r)/∂(l − p)::
+
+    motion     ξ_p += R(θ) ε_xy − J p' ε_α,    ξ_θ += ε_α,    ξ_l −= J l ε_α
+    reading    G (ξ_l − ξ_p) + noise
+    first one  ξ_l = ξ_p + G⁻¹ noise
+
+References
+----------
+.. [1] P. Tichavský, C. Muravchik, A. Nehorai, Posterior Cramér-Rao bounds for
+   discrete-time nonlinear filtering, IEEE Trans. Signal Processing 46(5), 1998.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import t as student
+
+from ..arrays import Array, BoolArray
+from ..estimator.models.bearing_range import reading_slopes_jit
+from ..estimator.support import argument_checks
+from ..estimator.support.jit import jit, njit_internal
+
+
+class PosteriorBound(NamedTuple):
+    """Least mean squared errors of B runs, given their true paths; invariant frame."""
+
+    position: Array
+    """Of the position after each scan, shape (B, T) [m²]."""
+    heading: Array
+    """Of the heading after each scan, shape (B, T) [rad²]."""
+    raw_position: Array
+    """Of the position in the additive frame, to first order, shape (B, T) [m²]."""
+    map: Array
+    """At the end: of a landmark about the centre of the map, shape (B,) [m²]."""
+    covariances: Array
+    """Of (x, y, θ, l0x, …) at the end, shape (B, 3 + 2L, 3 + 2L); 0 where not read."""
+
+
+class Efficiency(NamedTuple):
+    """Bound divided by mean squared error, 1 for an estimate that cannot be better."""
+
+    value: float
+    interval: tuple[float, float]
+    """95 %, by the scatter of the runs."""
+
+
+def posterior_bound(
+    true_poses: ArrayLike,
+    landmarks: ArrayLike,
+    visible: ArrayLike,
+    dt: ArrayLike,
+    *,
+    motion_std: ArrayLike,
+    measurement_std: ArrayLike,
+    start_std: ArrayLike,
+    range_std_per_metre: float = 0.0,
+) -> PosteriorBound:
+    """Return the bound of many runs, each along its own true path.
+
+    Parameters
+    ----------
+    true_poses : array_like, shape (B, T, 3)
+        At each scan [m, m, rad].
+    landmarks : array_like, shape (B, L, 2)
+        True positions [m].
+    visible : array_like of bool, shape (B, T, L)
+        Which landmarks each scan reads.
+    dt : array_like, shape (T,) or (B, T)
+        Duration that the motion noise before each scan counts.
+    motion_std, start_std : array_like, shape (3,)
+        Of the motion noise in the robot's frame per step, and of the first pose.
+    measurement_std : array_like, shape (2,)
+        (σβ, σr) [rad, m].
+    range_std_per_metre : float
+        Part of σr that grows with the range.
+
+    Raises
+    ------
+    ValueError
+        Where shapes do not fit or a deviation is refused.
+    """
+    poses = argument_checks.as_floats("true_poses", true_poses)
+    places = argument_checks.as_floats("landmarks", landmarks)
+    seen = np.ascontiguousarray(visible, dtype=np.bool_)
+    count, steps, points = seen.shape if seen.ndim == 3 else (0, 0, 0)
+    for name, array, shape in (
+        ("true_poses", poses, (count, steps, 3)),
+        ("landmarks", places, (count, points, 2)),
+    ):
+        if array.shape != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    check = argument_checks.standard_deviations
+    sensor = check("measurement_std", measurement_std, 2)
+    noise = np.array([*sensor, float(range_std_per_metre)])
+    motion = check("motion_std", motion_std, 3) ** 2
+    start = check("start_std", start_std, 3)
+    durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps)).copy()
+    position, heading, raw = (np.empty((count, steps)) for _ in range(3))
+    covariances = np.zeros((count, 3 + 2 * points, 3 + 2 * points))
+    covariances[:, :3, :3] = _invariant_start(poses[:, :1], start)
+    known = np.zeros((count, points), dtype=np.bool_)
+    for b in range(count):
+        _follow(
+            poses[b],
+            places[b],
+            seen[b],
+            durations[b],
+            motion,
+            noise,
+            known[b],
+            covariances[b],
+            (position[b], heading[b], raw[b]),
+        )
+    pairs = zip(covariances, known, strict=True)
+    spread = np.array([_about_centre(*pair) for pair in pairs])
+    return PosteriorBound(position, heading, raw, spread, covariances)
+
+
+def efficiency(bound: Array, squared_error: Array) -> Efficiency:
+    """Divide the bound of M runs by the mean squared error.
+
+    Parameters
+    ----------
+    bound, squared_error : ndarray, shape (M,) or (M, K)
+        Of each run, averaged over its steps where there are several.
+
+    Examples
+    --------
+    >>> found = efficiency(np.ones(4), np.array([0.5, 1.5, 1.0, 1.0]))
+    >>> found.value, [round(end, 2) for end in found.interval]
+    (1.0, [0.35, 1.65])
+    """
+    least, found = (
+        np.asarray(array).reshape(len(array), -1).mean(axis=1)
+        for array in (bound, squared_error)
+    )
+    if not len(found) or not found.mean() > 0:
+        return Efficiency(np.nan, (np.nan, np.nan))
+    value = float(least.mean() / found.mean())
+    if len(found) < 2:
+        return Efficiency(value, (np.nan, np.nan))
+    residual = (least - value * found) / found.mean()
+    reach = float(student.ppf(0.975, len(found) - 1) * residual.std(ddof=1))
+    reach /= np.sqrt(len(found))
+    return Efficiency(value, (value - reach, value + reach))
+
+
+def invariant_squares(error: Array) -> tuple[Array, float]:
+    """Return the squares of an invariant error (3 + 2n,) that the bound is about.
+
+    Returns
+    -------
+    squares : ndarray, shape (2,)
+        Of position and heading [m², rad²].
+    map
+        Mean over the landmarks about the centre of the map [m²]; nan without any.
+    """
+    points = error[3:].reshape(-1, 2)
+    squares = np.array([error[0] ** 2 + error[1] ** 2, error[2] ** 2])
+    if not len(points):
+        return squares, float("nan")
+    return squares, float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())
+
+
+def _invariant_start(first: Array, std: Array) -> Array:
+    """Return D P Dᵀ of the first poses, shape (B, 3, 3)."""
+    lever = np.zeros((len(first), 3, 3))
+    lever[:] = np.eye(3)
+    lever[:, 0, 2], lever[:, 1, 2] = first[:, 0, 1], -first[:, 0, 0]
+    return np.asarray(lever * std**2 @ lever.mT)
+
+
+def _about_centre(covariance: Array, known: BoolArray) -> float:
+    """Return the mean variance of the known landmarks about their centre."""
+    at = 3 + 2 * np.flatnonzero(known)
+    if not len(at):
+        return float("nan")
+    total = 0.0
+    for axis in (0, 1):
+        block = covariance[np.ix_(at + axis, at + axis)]
+        total += block.trace() / len(at) - block.mean()
+    return float(total)
+
+
+@jit
+def _follow(
+    poses: Array,
+    landmarks: Array,
+    visible: BoolArray,
+    dt: Array,
+    motion: Array,
+    noise: Array,
+    known: BoolArray,
+    P: Array,
+    out: tuple[Array, Array, Array],
+) -> None:
+    """Take the bound P of one run through all its scans, in place."""
+    size = len(P)
+    entry, row = np.zeros((size, 3)), np.empty(size)
+    for t in range(len(poses)):
+        if t > 0 and dt[t] > 0:
+            _move(poses, landmarks, known, t, motion * dt[t], entry, P)
+        x, y = poses[t, 0], poses[t, 1]
+        for i in range(len(landmarks)):
+            if not visible[t, i]:
+                continue
+            dx, dy = landmarks[i, 0] - x, landmarks[i, 1] - y
+            bx, by, rx, ry = reading_slopes_jit(dx, dy)
+            distance = np.sqrt(dx * dx + dy * dy)
+            across = noise[0] ** 2
+            along = (noise[1] + noise[2] * distance) ** 2
+            c = 3 + 2 * i
+            if known[i]:
+                _read(P, row, c, bx, by, across)
+                _read(P, row, c, rx, ry, along)
+            else:
+                known[i] = True
+                _add(P, c, rx, ry, across * distance * distance, along)
+        out[0][t], out[1][t] = P[0, 0] + P[1, 1], P[2, 2]
+        lever = 2 * (x * P[1, 2] - y * P[0, 2]) + (x * x + y * y) * P[2, 2]
+        out[2][t] = out[0][t] + lever
+
+
+@njit_internal
+def _move(
+    poses: Array,
+    landmarks: Array,
+    known: BoolArray,
+    t: int,
+    variance: Array,
+    entry: Array,
+    P: Array,
+) -> None:
+    """Add the noise of the motion to scan t."""
+    cos, sin = np.cos(poses[t - 1, 2]), np.sin(poses[t - 1, 2])
+    entry[0, 0], entry[1, 0] = cos, sin
+    entry[0, 1], entry[1, 1] = -sin, cos
+    entry[0, 2], entry[1, 2], entry[2, 2] = poses[t, 1], -poses[t, 0], 1.0
+    for i in range(len(landmarks)):
+        entry[3 + 2 * i, 2] = landmarks[i, 1] if known[i] else 0.0
+        entry[4 + 2 * i, 2] = -landmarks[i, 0] if known[i] else 0.0
+    for i in range(2):
+        for j in range(2):
+            for k in range(2):
+                P[i, j] += entry[i, k] * entry[j, k] * variance[k]
+    for i in range(len(P)):
+        turned = entry[i, 2] * variance[2]
+        for j in range(len(P)):
+            P[i, j] += turned * entry[j, 2]
+
+
+@njit_internal
+def _read(P: Array, row: Array, c: int, gx: float, gy: float, variance: float) -> None:
+    """Take in one number, (gx, gy) (ξ_l − ξ_p) plus noise, of the landmark at c."""
+    for j in range(len(P)):
+        row[j] = gx * (P[c, j] - P[0, j]) + gy * (P[c + 1, j] - P[1, j])
+    total = gx * (row[c] - row[0]) + gy * (row[c + 1] - row[1]) + variance
+    for i in range(len(P)):
+        share = row[i] / total
+        for j in range(len(P)):
+            P[i, j] -= share * row[j]
+
+
+@njit_internal
+def _add(P: Array, c: int, rx: float, ry: float, across: float, along: float) -> None:
+    """Add the landmark at c, read in the direction (rx, ry), ξ_l = ξ_p + noise."""
+    for j in range(len(P)):
+        P[c, j], P[c + 1, j] = P[0, j], P[1, j]
+        P[j, c], P[j, c + 1] = P[0, j], P[1, j]
+    P[c, c] = P[0, 0] + rx * rx * along + ry * ry * across
+    P[c + 1, c + 1] = P[1, 1] + ry * ry * along + rx * rx * across
+    P[c, c + 1] = P[c + 1, c] = P[0, 1] + rx * ry * (along - across)

@@ -1,0 +1,161 @@
+"""The bound on the errors of any filter: against Kalman's covariance, and filters."""
+
+import numpy as np
+import pytest
+
+from slamgym.estimator import make_estimator
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.evaluation.error_bound import (
+    efficiency,
+    invariant_squares,
+    posterior_bound,
+)
+
+NOISE = {
+    "motion_std": (0.1, 0.05, 0.03),
+    "measurement_std": (0.02, 0.1),
+    "range_std_per_metre": 0.01,
+}
+START_STD = (0.1, 0.2, 0.05)
+PLACES = np.array([[3.0, 2.0], [-1.0, 4.0], [2.0, -5.0], [6.0, 1.0]])
+
+
+def exact_drive(steps=25):
+    """Return poses (T, 3) and visibility (T, L) of a drive without noise."""
+    poses = [np.array([1.0, -0.5, 0.4])]
+    for _ in range(steps):
+        poses.append(predict_pose(poses[-1], np.array([0.3, 0.2])).pose)
+    visible = np.random.default_rng(2).random((steps + 1, len(PLACES))) < 0.6
+    return np.array(poses), visible
+
+
+def test_the_bound_is_the_invariant_filter_where_it_linearises_at_the_truth():
+    poses, visible = exact_drive()
+    dt = np.ones(len(poses))
+    bound = posterior_bound(
+        poses[None], PLACES[None], visible[None], dt, start_std=START_STD, **NOISE
+    )
+    slam = make_estimator(
+        "invariant", initial_pose=poses[0], initial_pose_std=START_STD, **NOISE
+    )
+    for t, pose in enumerate(poses):
+        if t:
+            slam.predict((0.3, 0.2))
+        seen = np.flatnonzero(visible[t])
+        slam.update(predict_measurement(pose, PLACES[seen]).measurement, seen)
+        claimed = slam.belief().error_covariance("invariant")
+        assert bound.position[0, t] == pytest.approx(claimed[:2, :2].trace())
+        assert bound.heading[0, t] == pytest.approx(claimed[2, 2])
+        additive = slam.belief().pose_covariance[:2, :2].trace()
+        assert bound.raw_position[0, t] == pytest.approx(additive)
+    ids = slam.belief().landmark_ids
+    columns = [0, 1, 2, *(3 + 2 * i + axis for i in ids for axis in (0, 1))]
+    found = bound.covariances[0][np.ix_(columns, columns)]
+    assert found == pytest.approx(claimed, rel=1e-9, abs=1e-12)
+
+
+def test_the_bound_of_a_linear_drive_is_the_covariance_of_kalman():
+    steps, place = 12, np.array([[30.0, 0.0]])
+    poses = np.zeros((steps, 3))
+    poses[:, 0] = 0.5 * np.arange(steps)
+    bound = posterior_bound(
+        poses[None],
+        place[None],
+        np.ones((1, steps, 1), dtype=bool),
+        np.ones(steps),
+        motion_std=(0.3, 0, 0),
+        measurement_std=(0.1, 0.2),
+        start_std=(0.4, 0, 0),
+    )
+    P = np.array([[0.16, 0.16], [0.16, 0.16 + 0.04]])
+    H = np.array([-1.0, 1.0])
+    for k in range(steps):
+        if k:
+            P = P + np.diag([0.09, 0.0])
+            K = P @ H / (H @ P @ H + 0.04)
+            P = P - np.outer(K, H @ P)
+        assert bound.position[0, k] == pytest.approx(P[0, 0], rel=1e-12)
+    both = bound.covariances[0][np.ix_([0, 3], [0, 3])]
+    assert both == pytest.approx(P, rel=1e-12)
+    assert not bound.heading.any()
+
+
+def test_a_robot_that_stands_cannot_learn_its_heading():
+    poses = np.tile([2.0, 1.0, 0.3], (1, 50, 1))
+    bound = posterior_bound(
+        poses,
+        PLACES[None],
+        np.ones((1, 50, 4), dtype=bool),
+        np.zeros(50),
+        start_std=(0, 0, 0.3),
+        **NOISE,
+    )
+    assert bound.heading[0] == pytest.approx(0.09, rel=1e-12)
+
+
+def test_runs_are_bounded_each_by_itself():
+    poses, visible = exact_drive()
+    dt = np.ones(len(poses))
+    pair = [np.stack([a, b]) for a, b in ((poses, poses + 1), (PLACES, PLACES))]
+    both = posterior_bound(
+        *pair, np.stack([visible, ~visible]), dt, start_std=START_STD, **NOISE
+    )
+    alone = posterior_bound(
+        *(array[1:] for array in pair), ~visible[None], dt, start_std=START_STD, **NOISE
+    )
+    assert both.position[1].tolist() == alone.position[0].tolist()
+    assert both.map[1] == alone.map[0]
+
+
+def test_no_landmark_leaves_dead_reckoning():
+    poses, visible = exact_drive()
+    bound = posterior_bound(
+        poses[None],
+        PLACES[None],
+        np.zeros_like(visible)[None],
+        np.ones(len(poses)),
+        start_std=START_STD,
+        **NOISE,
+    )
+    turned = 0.05**2 + 0.03**2 * np.arange(len(poses))
+    assert bound.heading[0] == pytest.approx(turned)
+    assert np.isnan(bound.map[0])
+
+
+def test_squares_are_those_of_the_invariant_error():
+    squares, about_centre = invariant_squares(np.array([1, 2, 3, 4, 0, 6, 0, 5, 3.0]))
+    assert squares.tolist() == [5, 9]
+    assert about_centre == pytest.approx((1 + 1 + 1 + 1 + 0 + 4) / 3)
+    assert np.isnan(invariant_squares(np.zeros(3))[1])
+
+
+def test_the_interval_of_the_efficiency_covers_the_true_ratio():
+    rng, inside = np.random.default_rng(0), 0
+    for _ in range(400):
+        bound = rng.gamma(20, 1 / 20, 60)
+        errors = 1.25 * bound * rng.chisquare(4, 60) / 4
+        low, high = efficiency(bound, errors).interval
+        inside += low < 1 / 1.25 < high
+    assert 0.91 < inside / 400 < 0.98
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"landmarks": np.zeros((1, 3, 2))}, r"landmarks must have shape \(1, 4, 2\)"),
+        ({"motion_std": (0.1, -1, 0)}, "motion_std must be 3 finite numbers >= 0"),
+    ],
+)
+def test_wrong_arguments_are_named(change, message):
+    poses, visible = exact_drive()
+    arguments = {
+        "true_poses": poses[None],
+        "landmarks": PLACES[None],
+        "visible": visible[None],
+        "dt": np.ones(len(poses)),
+        "start_std": START_STD,
+        **NOISE,
+    }
+    with pytest.raises(ValueError, match=message):
+        posterior_bound(**arguments | change)
