@@ -139,18 +139,20 @@ def efficiency(bound: Array, squared_error: Array) -> Efficiency:
     >>> found.value, [round(end, 2) for end in found.interval]
     (1.0, [0.35, 1.65])
     """
+    if not len(squared_error):
+        return Efficiency(np.nan, (np.nan, np.nan))
     least, found = (
         np.asarray(array).reshape(len(array), -1).mean(axis=1)
         for array in (bound, squared_error)
     )
-    if not len(found) or not found.mean() > 0:
+    if not found.mean() > 0:
         return Efficiency(np.nan, (np.nan, np.nan))
     value = float(least.mean() / found.mean())
     if len(found) < 2:
         return Efficiency(value, (np.nan, np.nan))
     residual = (least - value * found) / found.mean()
     reach = float(student.ppf(0.975, len(found) - 1) * residual.std(ddof=1))
-    reach /= np.sqrt(len(found))
+    reach = reach / len(found) ** 0.5
     return Efficiency(value, (value - reach, value + reach))
 
 

@@ -14,11 +14,13 @@ from joblib import delayed
 
 from ...estimator import registry
 from ...estimator.interface import SupportsSmoothing, SupportsTruth
+from ...evaluation.error_bound import PosteriorBound
 from ...sim_configs import Scenario, load_scenario
 from ..runs.blas_threads import one_blas_thread
 from ..runs.filter_settings import FilterSettings
 from ..runs.simulated_runs import SimulatedRuns, simulate_runs
 from .measure.association_measures import KNOWN_IDS_ATE, known_ids_errors
+from .measure.bounds import bound_runs
 from .measure.estimator_choices import OFFLINE, EstimatorChoice, estimator_choices
 from .measure.filtered_runs import filter_runs
 from .measure.run_measures import Block, measure_runs
@@ -52,11 +54,14 @@ class _Work:
             if ":" not in name and name not in registry.list_estimators():
                 registry.register_estimator(name, factory)
         runs = simulate_runs(self.scenario, span.size, self.seed + span.first)
-        return [self._measure(settings, runs) for settings in self.settings]
+        bound = bound_runs(self.scenario, runs)
+        return [self._measure(settings, runs, bound) for settings in self.settings]
 
-    def _measure(self, settings: FilterSettings, runs: SimulatedRuns) -> Block:
+    def _measure(
+        self, settings: FilterSettings, runs: SimulatedRuns, bound: PosteriorBound
+    ) -> Block:
         filtered = filter_runs(settings, runs, threads=self.threads)
-        block = measure_runs(runs, filtered, resolution=self.resolution)
+        block = measure_runs(runs, filtered, bound, resolution=self.resolution)
         if runs.true_ids is not None:
             block[KNOWN_IDS_ATE] = known_ids_errors(settings, runs, self.threads)
         return block

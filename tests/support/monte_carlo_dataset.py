@@ -14,8 +14,10 @@ import xarray as xr
 
 from slamgym import __version__
 from slamgym.estimator import make_batch
+from slamgym.estimator.error_frames import invariant_error
 from slamgym.estimator.models.angles import wrap_angle
 from slamgym.evaluation import nees as c
+from slamgym.evaluation.error_bound import posterior_bound
 from slamgym.evaluation.trajectory_error import position_accuracy
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
@@ -79,7 +81,23 @@ def scores_of(world, drives, name, options):
         **options,
     )
     trace = batch.run(drives.odometry, drives.measurements, drives.visible, drives.dt)
-    return over_time(drives, trace) | at_the_end(drives, trace, batch)
+    bound = posterior_bound(
+        drives.true_poses,
+        drives.landmarks,
+        drives.visible,
+        drives.dt,
+        motion_std=world.motion.std,
+        measurement_std=world.sensor.std,
+        start_std=world.start.std,
+        range_std_per_metre=world.sensor.range_std_per_metre,
+    )
+    bounds = {
+        "position_bound": (STEP, bound.position),
+        "position_bound_raw": (STEP, bound.raw_position),
+        "heading_bound": (STEP, bound.heading),
+        "map_bound": (RUN, bound.map),
+    }
+    return over_time(drives, trace) | at_the_end(drives, trace, batch) | bounds
 
 
 def over_time(drives, trace):
@@ -95,6 +113,8 @@ def over_time(drives, trace):
         found["heading_nees"] = c.heading_nees(*poses)
     found["nis"], found["nis_dof"] = trace.nis, trace.degrees_of_freedom
     found["position_error"] = np.hypot(errors[..., 0], errors[..., 1])
+    invariant = invariant_error(drives.true_poses, trace.poses)
+    found["position_error_invariant"] = np.hypot(invariant[..., 0], invariant[..., 1])
     found["heading_error"] = wrap_angle(errors[..., 2])
     found["heading_std"] = np.sqrt(variance[..., 2])
     found["position_std"] = np.sqrt(variance[..., :2].sum(axis=2))
@@ -119,6 +139,8 @@ def run_end(drives, trace, belief, run):
     path = position_accuracy(trace.poses[run, :, :2], drives.true_poses[run, :, :2])
     world = position_accuracy(belief.landmarks, true[seen])
     blocks = [belief.covariance[i : i + 2, i : i + 2] for i in range(3, len(states), 2)]
+    places = invariant_error(states, belief.mean)[3:].reshape(-1, 2)
+    centred = np.linalg.norm(places - places.mean(axis=0), axis=1)
     areas = [9 * np.pi * np.sqrt(np.linalg.det(block)) for block in blocks]
     row = {
         "state_dof": len(states),
@@ -126,6 +148,7 @@ def run_end(drives, trace, belief, run):
         "relative_map_dof": len(states) - 3,
         "landmark_rmse": world.raw_rmse,
         "landmark_rmse_aligned": world.aligned_rmse,
+        "map_error_centred": np.sqrt(np.mean(centred**2)),
         "ate": path.raw_rmse,
         "ate_aligned": path.aligned_rmse,
         "pose_area": 9 * np.pi * np.sqrt(np.linalg.det(belief.covariance[:2, :2])),

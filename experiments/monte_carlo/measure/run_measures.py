@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....arrays import Array
-from ....estimator.error_frames import ERROR_FRAMES
+from ....estimator.error_frames import ERROR_FRAMES, invariant_error
 from ....estimator.interface import Belief
 from ....estimator.models.angles import wrap_angle
 from ....evaluation import nees
+from ....evaluation.error_bound import PosteriorBound, invariant_squares
 from ....evaluation.trajectory_error import ellipse_areas, position_accuracy
 from ....sim_configs import Scenario
 from ...runs.simulated_runs import SimulatedRuns
@@ -65,6 +66,12 @@ VARIABLES: dict[str, Variable] = {
     "landmark_nees_additive": Variable(LANDMARK, "f8", "final NEES, 2 degrees"),
     "landmark_error": Variable(LANDMARK, "f8", "final distance to the truth [m]"),
     "landmark_mahalanobis": Variable(LANDMARK, "f8", "the same in deviations"),
+    "position_error_invariant": Variable(STEP, "f8", "the same, invariant frame [m]"),
+    "position_bound": Variable(STEP, "f8", "least mean square of that [m²]"),
+    "position_bound_raw": Variable(STEP, "f8", "that of the raw position [m²]"),
+    "heading_bound": Variable(STEP, "f8", "least mean square of the heading [rad²]"),
+    "map_error_centred": Variable(RUN, "f8", "final RMS about the map's centre [m]"),
+    "map_bound": Variable(RUN, "f8", "least mean square of that [m²]"),
     "failed": Variable(RUN, "?", "whether the run ended before its time"),
     "failed_at": Variable(RUN, "i8", "at which step, -1 if it did not"),
     "message": Variable(RUN, "U", "why"),
@@ -83,7 +90,11 @@ def variables_of(scenario: Scenario) -> dict[str, Variable]:
 
 
 def measure_runs(
-    runs: SimulatedRuns, filtered: FilteredRuns, *, resolution: float = 0.0
+    runs: SimulatedRuns,
+    filtered: FilteredRuns,
+    bound: PosteriorBound,
+    *,
+    resolution: float = 0.0,
 ) -> Block:
     """Measure a filter's runs against the truth.
 
@@ -93,6 +104,8 @@ def measure_runs(
         B runs of T steps among L landmarks.
     filtered : FilteredRuns
         The beliefs of a filter in these runs.
+    bound : PosteriorBound
+        Of the errors of any filter in these runs.
     resolution : float
         True landmarks nearer to each other count as one place [m], where identities are
         hidden.
@@ -115,6 +128,8 @@ def measure_runs(
             measured |= map_measures
         for name, value in measured.items():
             block[name][run] = value
+    block["position_bound"], block["heading_bound"] = bound.position, bound.heading
+    block["position_bound_raw"], block["map_bound"] = bound.raw_position, bound.map
     block["readings"] = runs.visible.sum(axis=(1, 2))
     _write_failures(block, failures)
     return block
@@ -171,6 +186,9 @@ def _measure_path(truth: Array, filtered: FilteredRuns, run: int) -> dict[str, V
         "nis": filtered.trace.nis[run],
         "nis_dof": filtered.trace.degrees_of_freedom[run],
         "position_error": np.hypot(errors[:, 0], errors[:, 1]),
+        "position_error_invariant": np.linalg.norm(
+            invariant_error(truth, poses)[:, :2], axis=1
+        ),
         "heading_error": wrap_angle(errors[:, 2]),
         "heading_std": np.sqrt(variances[:, 2]),
         "position_std": np.sqrt(variances[:, 0] + variances[:, 1]),
@@ -215,9 +233,11 @@ def _measure_map(
     for frame in ERROR_FRAMES:
         values = nees.landmark_nees(*states, frame=frame)
         measured[f"landmark_nees_{frame}"] = _by_id(values, ids, len(true_landmarks))
+    _, centred = invariant_squares(invariant_error(*states[:2]))
     accuracy = position_accuracy(belief.landmarks, true_landmarks[ids])
     return measured | {
         "relative_map_nees": float(nees.relative_map_nees(*states)),
+        "map_error_centred": float(np.sqrt(centred)),
         "landmark_rmse": accuracy.raw_rmse,
         "landmark_rmse_aligned": accuracy.aligned_rmse,
         "landmark_area": float(ellipse_areas(belief.landmark_covariances).mean()),

@@ -164,6 +164,10 @@ def rmse_figure(shown: Shown) -> Figure:
     for scores, look in shown:
         rms = _root_mean_square(scores.over_time("position_error"))
         axes.plot(*thinned(scores.steps, rms), **look.line(plain(scores.label)))
+    if "position_bound_raw" in shown[0][0].results:
+        bound = shown[0][0].over_time("position_bound_raw").mean(axis=0)
+        least = thinned(shown[0][0].steps, np.sqrt(bound))
+        axes.plot(*least, color=GREY, ls=":", lw=1.5, label="bound of any filter")
     dress(axes)
     axes.margins(x=0.01)
     axes.set_ylim(bottom=0)

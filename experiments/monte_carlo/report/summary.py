@@ -13,6 +13,7 @@ from ...runs.nan_statistics import finite, mean, quotient, root_mean_square
 from ..measure.association_measures import KNOWN_IDS_ATE
 from .association import association_summary
 from .decision_entries import decisions_table
+from .efficiency import efficiency_summary
 from .scores import (
     POINT_FREEDOM,
     POSE_FREEDOM,
@@ -117,7 +118,8 @@ def summarise_estimator(
         ``heading_std_end``, ``{claimed, true}`` [rad]; ``rmse`` of position [m] and
         heading [rad]; ``ate`` and ``landmark_rmse``, ``{raw, aligned}`` [m];
         ``landmark_mahalanobis``, root mean square; ``area`` of the 3σ ellipses at the
-        end [m²]; ``association``, see :func:`.association.association_summary`;
+        end [m²]; ``efficiency``, see :func:`.efficiency.efficiency_summary`;
+        ``association``, see :func:`.association.association_summary`;
         ``unused_readings``, the share of readings of known identity that corrected
         nothing and added no landmark, None where identities are hidden.
     """
@@ -156,6 +158,7 @@ def summarise_estimator(
             "pose": mean(scores.per_run("pose_area")),
             "landmark": mean(scores.per_run("landmark_area")),
         },
+        "efficiency": efficiency_summary(scores),
         "association": association_summary(scores),
         "unused_readings": _unused_readings(scores),
     }

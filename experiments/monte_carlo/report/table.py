@@ -67,6 +67,10 @@ def measures(summary: dict[str, Any]) -> list[Measure]:
             at("heading_std_end", "true", write=in_degrees),
         ),
         Measure("… RMSE over all steps", "", at("rmse", "heading", write=in_degrees)),
+        *(
+            Measure(f"efficiency of the {name}", "≤ 1", _efficiency(key))
+            for name, key in (("position", "pose"), ("heading",) * 2, ("map",) * 2)
+        ),
         Measure("path (ATE), raw [m]", "", at("ate", "raw")),
         Measure("… aligned [m]", "", at("ate", "aligned")),
         Measure("landmark RMSE, raw [m]", "", at("landmark_rmse", "raw")),
@@ -76,6 +80,20 @@ def measures(summary: dict[str, Any]) -> list[Measure]:
             f"failed runs of {runs}", "0", lambda entry: str(len(entry["failed_runs"]))
         ),
     ]
+
+
+def _efficiency(key: str) -> Callable[[Entry], str]:
+    """Return what writes bound by mean squared error, with its 95 % interval."""
+
+    def write(entry: Entry) -> str:
+        found = (entry.get("efficiency") or {}).get(key)
+        if found is None:
+            return _NOTHING
+        reach = found["interval"][1]
+        spread = "" if reach is None else f" ± {reach - found['value']:.2f}"
+        return f"{found['value']:.2f}{spread}"
+
+    return write
 
 
 def _association_measures(summary: dict[str, Any]) -> list[Measure]:

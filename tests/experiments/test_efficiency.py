@@ -1,0 +1,84 @@
+"""The bound in a Monte Carlo: variables, summary, table and figure."""
+
+import numpy as np
+import pytest
+
+from slamgym.evaluation.error_bound import posterior_bound
+from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
+from slamgym.experiments.monte_carlo.report.html_report import html_report
+from slamgym.experiments.monte_carlo.report.table import measures
+from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.sim_configs import load_scenario
+
+RUNS = 30
+WORLD = load_scenario("six_landmarks")
+
+
+@pytest.fixture(scope="module")
+def results():
+    return monte_carlo(WORLD, "ekf,invariant,smoother", RUNS, seed=7)
+
+
+@pytest.fixture(scope="module")
+def summary(results):
+    return summarise_monte_carlo(results)
+
+
+def test_bounds_are_those_along_the_true_paths(results):
+    runs = simulate_runs(WORLD, RUNS, 7)
+    bound = posterior_bound(
+        runs.true_poses,
+        runs.landmarks,
+        runs.visible,
+        runs.dt,
+        motion_std=WORLD.motion.std,
+        measurement_std=WORLD.sensor.std,
+        start_std=WORLD.start.std,
+    )
+    for name in ("ekf", "smoother"):
+        found = results.sel(estimator=name)
+        assert found.position_bound.values.tolist() == bound.position.tolist()
+        assert found.map_bound.values.tolist() == bound.map.tolist()
+
+
+def test_efficiency_is_the_bound_by_the_mean_squared_error(results, summary):
+    found = results.sel(estimator="invariant").isel(step=slice(1, None))
+    ratio = found.position_bound.mean() / (found.position_error_invariant**2).mean()
+    entry = summary["estimators"]["invariant"]["efficiency"]["pose"]
+    assert entry["value"] == pytest.approx(float(ratio))
+    assert entry["interval"][0] < entry["value"] < entry["interval"][1]
+
+
+def test_no_filter_is_significantly_better_than_the_bound(summary):
+    for name in ("ekf", "invariant"):
+        for found in summary["estimators"][name]["efficiency"].values():
+            assert found["interval"][0] < 1
+
+
+def test_a_smoother_is_bounded_in_its_map_only(summary):
+    found = summary["estimators"]["smoother"]["efficiency"]
+    assert found["pose"] is None
+    assert found["heading"] is None
+    assert 0.5 < found["map"]["value"] < 1.5
+
+
+def test_table_and_report_show_the_efficiency(results, summary):
+    rows = {measure.name: measure.of for measure in measures(summary)}
+    cell = rows["efficiency of the position"]
+    value = summary["estimators"]["ekf"]["efficiency"]["pose"]["value"]
+    assert cell(summary["estimators"]["ekf"]).startswith(f"{value:.2f} ± ")
+    assert cell(summary["estimators"]["smoother"]) == "–"
+    assert "bound of any filter" in html_report(results, summary)
+
+
+def test_results_without_bounds_have_no_efficiency(results):
+    older = results.drop_vars("position_bound")
+    entry = summarise_monte_carlo(older)["estimators"]["ekf"]
+    assert entry["efficiency"] is None
+
+
+def test_hidden_identities_do_not_change_the_bound():
+    world = load_scenario("hidden_identities").with_changes(steps=30)
+    hidden = monte_carlo(world, "invariant", 2, seed=3)
+    assert np.isfinite(hidden.position_bound).all()
+    assert (hidden.position_bound[0, :, -1] > 0).all()
