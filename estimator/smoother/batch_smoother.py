@@ -80,16 +80,12 @@ def smooth(
     """
     argument_checks.whole("iterations", iterations, 1)
     argument_checks.above("tolerance", tolerance, 0.0)
-    rules = drive.rules
-    kernel = robust_kernel(robust, robust_scale)
-    noise = Noise(np.array(rules), rules.bearing_std, *kernel)
+    noise = Noise(drive.rules, *robust_kernel(robust, robust_scale))
     arrays, order = drive.arrays()
     optimiser = Optimiser(arrays, noise)
     starts = _starts(drive, start, _places(landmarks or {}, order), order)
     found = _best(optimiser, starts, tolerance, iterations)
-    return SmoothedDrive(
-        optimiser.linearised(found), order.tolist(), drive.landmark_ids
-    )
+    return SmoothedDrive(optimiser.linearised(found), order.tolist(), drive)
 
 
 def robust_kernel(robust: str | None, scale: float | None) -> tuple[float, float]:

@@ -116,8 +116,11 @@ class Drive:
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The landmarks that are read, in the order of their first reading."""
-        ids = (int(i) for scans in self._sightings for scan in scans for i in scan.ids)
-        return tuple(dict.fromkeys(ids))
+        scans = [scan.ids for scans in self._sightings for scan in scans]
+        if not scans:
+            return ()
+        found, first = np.unique(np.concatenate(scans), return_index=True)
+        return tuple(found[np.argsort(first)].tolist())
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from ...arrays import Array
+from ..kernels.rules import Rules
 from ..models.angles import wrap_angle
 from ..support.memory_limit import refuse_beyond_memory
 from .cost import CAUCHY, HUBER, SQUARED, range_stds, total_cost
@@ -19,6 +20,7 @@ from .substitution import substitute
 KINDS = {None: SQUARED, "huber": HUBER, "cauchy": CAUCHY}
 SLACK = 1e-12  # of the cost, in rounding
 REWEIGHTED = 30  # iterations; from then on the noise of the ranges is fixed
+SHRINKING = 0.5  # steps that shrink by this factor converge linearly
 SEARCHES = 5  # for better places of landmarks
 RELOCATED = 5  # iterations from one to the next
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
@@ -27,10 +29,8 @@ FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
 class Noise(NamedTuple):
     """The noise of the sensor, and how much an outlier counts."""
 
-    rule_values: Array
-    """The rules of a filter, see :class:`..kernels.rules.Rules`."""
-    bearing_std: float
-    """σβ [rad]."""
+    rules: Rules
+    """Of a filter, which hold the noise."""
     kind: float
     """Of the robust kernel, one of `KINDS`."""
     scale: float
@@ -65,6 +65,24 @@ class Minimum(NamedTuple):
     """Of the landmarks, shape (2n, 2n)."""
 
 
+class _State:
+    """An estimate on its way to the solution."""
+
+    def __init__(self, estimate: Estimate, stds: Array) -> None:
+        self.estimate, self.stds = estimate, stds
+        self.cost, self.moved, self.error = np.inf, np.inf, np.inf
+        self.damping, self.searches = 0.0, SEARCHES
+
+    def move(self, estimate: Estimate, cost: float) -> None:
+        """Take an accepted step; later ones are expected to shrink as this one did."""
+        moved = _distance(self.estimate, estimate)
+        rate = moved / self.moved if 0 < self.moved < np.inf else 1.0
+        self.error = moved * (rate / (1 - rate) if rate < SHRINKING else 1.0)
+        self.estimate, self.cost, self.moved = estimate, cost, moved
+        lower = self.damping / 10
+        self.damping = lower if lower >= FIRST_DAMPING else 0.0
+
+
 class Optimiser:
     """Minimise the cost of a drive.
 
@@ -73,7 +91,7 @@ class Optimiser:
     """
 
     def __init__(self, drive: DriveArrays, noise: Noise) -> None:
-        self._drive, self._noise = drive, noise
+        self._drive = drive
         poses, landmarks = len(drive.increments), int(drive.widths[0]) // 2
         refuse_beyond_memory(
             f"smoothing {poses} poses among {landmarks} landmarks",
@@ -81,6 +99,10 @@ class Optimiser:
             "smooth a part of the drive, or a drive with fewer landmarks",
         )
         self._room = new_elimination(poses, landmarks)
+        rules = noise.rules
+        self._rule_values = np.array(rules)
+        self._sensor = rules.bearing_std, noise.kind, noise.scale
+        self._varies = rules.range_std_per_metre > 0 and not rules.noise_as_read
         self._owners = np.repeat(np.arange(poses), np.diff(drive.firsts))
         self._by_landmark = np.argsort(drive.columns, kind="stable")
 
@@ -95,35 +117,33 @@ class Optimiser:
         return 0.6 * freedom + 6 * float(np.sqrt(freedom / 2)) + 1
 
     def minimise(self, start: Estimate, tolerance: float, most: int) -> Solution:
-        """Iterate until no pose or landmark moves more than the tolerance [m, rad].
+        """Iterate until no pose or landmark will move more than the tolerance [m, rad].
 
         Raises
         ------
         numpy.linalg.LinAlgError
             Where that takes more than ``most`` iterations, or no step lowers the cost.
         """
-        estimate, damping, searches = start, 0.0, SEARCHES
-        stds = self.range_stds(estimate)
-        first_cost = cost = self.cost(estimate, stds)
+        state = _State(start, self.range_stds(start))
+        state.cost = first_cost = self.cost(start, state.stds)
         # A start that contradicts a motion without noise is no bound of the cost.
-        is_bound = bool(self._drive.factors[1:].any(axis=1).all())
+        if not self._drive.factors[1:].any(axis=1).all():
+            state.cost = np.inf
         for iteration in range(1, most + 1):
-            if iteration <= REWEIGHTED:
-                stds = self.range_stds(estimate)
-            cost = self.cost(estimate, stds) if is_bound else np.inf
-            is_bound = True
-            estimate, damping, moved = self._descend(estimate, stds, cost, damping)
-            is_found = moved <= tolerance and damping <= FIRST_DAMPING
-            if searches and (is_found or iteration % RELOCATED == 0):
-                searches -= 1
-                is_found &= self._relocate(estimate) == 0
+            self._descend(state)
+            is_found = state.error <= tolerance and state.damping <= FIRST_DAMPING
+            if state.searches and (is_found or iteration % RELOCATED == 0):
+                state.searches -= 1
+                is_found &= self._relocate(state) == 0
             if is_found:
-                cost = self.cost(estimate, self.range_stds(estimate))
-                return Solution(estimate, cost, first_cost, iteration)
+                cost = self.cost(state.estimate, self.range_stds(state.estimate))
+                return Solution(state.estimate, cost, first_cost, iteration)
+            if self._varies and iteration < REWEIGHTED:
+                self._reweight(state)
         raise np.linalg.LinAlgError(
             f"smoothing did not converge in {most} iterations: the last one moved a "
-            f"pose or landmark by {moved:.3g}, the cost fell from {first_cost:.4g} to "
-            f"{self.cost(estimate, stds):.4g}; a better start, another noise or a "
+            f"pose or landmark by {state.moved:.3g}, the cost fell from "
+            f"{first_cost:.4g} to {state.cost:.4g}; a better start, another noise or a "
             "robust kernel may help"
         )
 
@@ -135,18 +155,16 @@ class Optimiser:
 
     def range_stds(self, estimate: Estimate) -> Array:
         """Return σr of each reading, shape (M,), at the range it should have."""
-        return range_stds(*estimate, self._drive, self._noise.rule_values)
+        return range_stds(*estimate, self._drive, self._rule_values)
 
     def cost(self, estimate: Estimate, stds: Array) -> float:
         """Return the cost, with σr of every reading given."""
-        _, bearing_std, kind, scale = self._noise
-        return total_cost(*estimate, self._drive, stds, bearing_std, kind, scale)
+        return total_cost(*estimate, self._drive, stds, *self._sensor)
 
     def linearise(self, estimate: Estimate, stds: Array, damping: float = 0.0) -> Array:
         """Eliminate the poses; return the information of the landmarks, (2n, 2n)."""
         room, drive = self._room, self._drive
-        sensor = self._noise[1:]
-        eliminate(*estimate, drive, stds, sensor, damping, room)
+        eliminate(*estimate, drive, stds, self._sensor, damping, room)
         rows = room.rows.reshape(-1, len(room.right))
         information = -(rows.T @ rows)
         n = len(room.blocks)
@@ -154,29 +172,36 @@ class Optimiser:
         information.reshape(n, 2, n, 2)[at, :, at, :] += room.blocks
         return information
 
-    def _descend(
-        self, estimate: Estimate, stds: Array, cost: float, damping: float
-    ) -> tuple[Estimate, float, float]:
-        """Take one step that does not raise the cost; return it, damping and length."""
-        while damping <= MOST_DAMPING:
-            moved = self._step(estimate, stds, damping)
-            longest = _distance(estimate, moved)
-            if self.cost(moved, stds) <= cost * (1 + SLACK) + SLACK:
-                lower = damping / 10
-                return moved, lower if lower >= FIRST_DAMPING else 0.0, longest
-            damping = max(FIRST_DAMPING, 10 * damping)
+    def _descend(self, state: _State) -> None:
+        """Take one step that does not raise the cost."""
+        while state.damping <= MOST_DAMPING:
+            moved = self._step(state.estimate, state.stds, state.damping)
+            cost = self.cost(moved, state.stds)
+            if cost <= state.cost * (1 + SLACK) + SLACK:
+                return state.move(moved, cost)
+            state.damping = max(FIRST_DAMPING, 10 * state.damping)
         raise np.linalg.LinAlgError(
-            f"smoothing diverged: no step lowers the cost of {cost:.4g}"
+            f"smoothing diverged: no step lowers the cost of {state.cost:.4g}"
         )
 
-    def _relocate(self, estimate: Estimate) -> int:
+    def _relocate(self, state: _State) -> int:
         """Move landmarks out of local minima, in place; return how many."""
-        noise, drive = self._noise, self._drive
-        robust = noise.kind, noise.scale
-        rules = noise.rule_values
-        return relocate(
-            *estimate, drive, self._by_landmark, self._owners, rules, robust
+        moved = relocate(
+            *state.estimate,
+            self._drive,
+            self._by_landmark,
+            self._owners,
+            self._rule_values,
+            self._sensor[1:],
         )
+        if moved:
+            self._reweight(state)
+        return moved
+
+    def _reweight(self, state: _State) -> None:
+        """Take the noise of ranges at the present estimate."""
+        state.stds = self.range_stds(state.estimate)
+        state.cost = self.cost(state.estimate, state.stds)
 
     def _step(self, estimate: Estimate, stds: Array, damping: float) -> Estimate:
         information = self.linearise(estimate, stds, damping)

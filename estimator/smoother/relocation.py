@@ -35,6 +35,7 @@ def relocate(
     """Move each landmark to where one of its readings puts it, if that costs far less.
 
     The poses are fixed, and σr is that at the range read, so that places compare.
+    Landmarks whose readings cost no more than they should are passed over.
 
     Parameters
     ----------
@@ -60,7 +61,9 @@ def relocate(
         own = by_landmark[first:last]
         place[0], place[1] = landmarks[c], landmarks[c + 1]
         least = _cost_at(place, own, poses, drive, owners, rules, robust) - GAIN
-        bound = least
+        bound, first = least, last
+        if least < len(own) + 3 * np.sqrt(len(own)):  # the mean, and 3 σ more
+            continue
         for i in range(0, len(own), max(len(own) // CANDIDATES, 1)):
             j = own[i]
             pose, z = poses[owners[j]], drive.readings[j]
@@ -72,7 +75,6 @@ def relocate(
                 least = cost
                 landmarks[c], landmarks[c + 1] = place[0], place[1]
         moved += least < bound
-        first = last
     return moved
 
 

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 from ..belief import Belief
 from ..models.angles import wrap_angle
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
+from .drive import Drive
 from .optimiser import Minimum, factorised
+from .path import path_between
 from .substitution import conditionals
 
 
@@ -33,13 +35,11 @@ class SmoothedDrive:
         Of the cost.
     order : sequence of int
         The landmarks in the order of the elimination.
-    landmark_ids : sequence of int
-        The same landmarks in the order of beliefs.
+    drive : Drive
+        What was smoothed.
     """
 
-    def __init__(
-        self, minimum: Minimum, order: Sequence[int], landmark_ids: Sequence[int]
-    ) -> None:
+    def __init__(self, minimum: Minimum, order: Sequence[int], drive: Drive) -> None:
         solution, elimination = minimum.solution, minimum.elimination
         estimate = solution.estimate
         self.cost = solution.cost
@@ -48,11 +48,14 @@ class SmoothedDrive:
         """The cost at the start."""
         self.iterations = solution.iterations
         """Steps of Levenberg-Marquardt."""
-        self.landmark_ids = tuple(landmark_ids)
+        self.landmark_ids = drive.landmark_ids
         """In the order of their first reading."""
         self.poses = estimate.poses.copy()
         """(x, y, θ), shape (N, 3) [m, m, rad], heading in [-π, π)."""
         self.poses[:, 2] = wrap_angle(self.poses[:, 2])
+        self._motions, self._noise = tuple(drive.motions), drive.motion_noise
+        self.readings = drive.readings
+        """Number of readings of landmarks."""
         self._slots = {i: slot for slot, i in enumerate(order)}
         self._all = estimate.landmarks
         self.landmarks = self._all[self._columns(self.landmark_ids)].reshape(-1, 2)
@@ -62,6 +65,29 @@ class SmoothedDrive:
         self._factor = factorised(minimum.information)
         identity = np.eye(len(self._all))
         self._landmark_covariance = cho_solve(self._factor, identity)
+
+    @property
+    def readings_until(self) -> IntArray:
+        """How many readings of odometry lead to each pose, shape (N,)."""
+        counts = [len(motion.steps) for motion in self._motions]
+        return np.cumsum(counts, dtype=np.int64)
+
+    @property
+    def cost_per_degree(self) -> float:
+        """Twice the cost by its degrees of freedom, nan if there are none.
+
+        It is about 1 if the noise is as assumed, and the kernel not robust.
+        """
+        freedom = 2 * self.readings - 2 * len(self.landmarks)
+        return 2 * self.cost / freedom if freedom else float("nan")
+
+    @property
+    def path(self) -> Array:
+        """The pose at the start and after each reading of odometry, shape (1 + P, 3).
+
+        See :func:`.path.path_between`; where several readings lead to a scan.
+        """
+        return path_between(self.poses, self._motions, self._noise)
 
     @property
     def pose_covariances(self) -> Array:

@@ -5,7 +5,8 @@ it imports what is heavy when it runs, so that help answers at once.
 """
 # ruff: noqa: I001 (the order of the imports is the order of the commands in the help)
 
-from . import run, replay, monte_carlo, generate, noise_study, render_video, listings
+from . import run, replay, smooth, monte_carlo, generate, noise_study
+from . import render_video, listings
 from .program import main
 
 __all__ = [
@@ -17,4 +18,5 @@ __all__ = [
     "render_video",
     "replay",
     "run",
+    "smooth",
 ]

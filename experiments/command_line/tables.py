@@ -120,3 +120,37 @@ def _number(value: float | None, digits: int) -> str:
 def significant(value: float | None) -> str:
     """Write three significant digits; a dash where unknown."""
     return "-" if value is None else f"{value:.3g}"
+
+
+def smoothing_table(summary: dict[str, Any]) -> Table:
+    """Lay out filter and smoother of a log side by side."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("", summary["follows"], "smoother"):
+        table.add_column(Text(heading), justify="left" if not heading else "right")
+    for name, key in (("path error", "ate"), ("map error", "landmark_rmse")):
+        pair = [summary[key][side] for side in ("filter", "smoother")]
+        if None in pair:
+            continue
+        for kind in ("raw", "aligned"):
+            cells = [significant(errors[kind]) for errors in pair]
+            table.add_row(f"{name}, {kind} [m RMS]", *cells)
+    pair = [summary["nees"][side] for side in ("filter", "smoother")]
+    if None not in pair:
+        cells = [significant(numbers["per_degree"]) for numbers in pair]
+        table.add_row("pose NEES per degree, 1 expected", *cells)
+    return table
+
+
+def smoothing_figures(summary: dict[str, Any]) -> Table:
+    """Lay out what was smoothed, and how well the readings fit."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    cost = summary["cost"]
+    first, last = significant(cost["first"]), significant(cost["last"])
+    ratio = significant(cost["per_degree"])
+    sizes = "{readings} of {landmarks} landmarks, from {poses} poses"
+    table.add_row("readings", sizes.format(**summary))
+    table.add_row("cost", f"{first}, then {last} after {summary['iterations']} steps")
+    table.add_row("misfit", f"{ratio} per degree of freedom; 1 is expected")
+    return table

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from joblib import delayed
 
 from ...estimator import registry
-from ...estimator.interface import SupportsSmoothing, SupportsTruth
+from ...estimator.interface import SupportsTruth
 from ...evaluation.error_bound import PosteriorBound
 from ...sim_configs import Scenario, load_scenario
 from ..runs.blas_threads import one_blas_thread
@@ -21,7 +21,7 @@ from ..runs.filter_settings import FilterSettings
 from ..runs.simulated_runs import SimulatedRuns, simulate_runs
 from .measure.association_measures import KNOWN_IDS_ATE, known_ids_errors
 from .measure.bounds import bound_runs
-from .measure.estimator_choices import OFFLINE, EstimatorChoice, estimator_choices
+from .measure.estimator_choices import EstimatorChoice, estimator_choices
 from .measure.filtered_runs import filter_runs
 from .measure.run_measures import Block, measure_runs
 from .store.job_folder import RESULTS
@@ -220,10 +220,6 @@ def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:
         raise ValueError(
             f"estimator '{choice.name}' linearises at the true landmarks: it needs "
             "sensor.identities = true"
-        )
-    if choice.name in OFFLINE.values() and not isinstance(slam, SupportsSmoothing):
-        raise ValueError(
-            "smoother does not follow hypotheses: choose another association"
         )
     return settings
 

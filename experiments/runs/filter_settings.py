@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,6 +17,9 @@ from ..logs.lines import LogError
 from ..logs.recording import log_header
 from ..logs.slamlog import SlamLog
 
+SMOOTHER = "slamgym.estimator.smoother.smoothing_slam:SmoothingSlam"
+"""Import path of the smoother; its option ``follow`` names the filter that it follows,
+and whose options it takes too."""
 SIGMAS = ("σx", "σy", "σα", "σβ", "σr")
 """The five noises: three of the motion in the robot's frame, two of the sensor."""
 
@@ -24,6 +28,11 @@ _COURSE_NOISE = {  # as the homework publishes it
     "motion_std": "0.25,0.1,0.1",
     "measurement_std": "0.01,0.08",
     "start_sigma": "0.02,0.02,0.1",
+}
+
+_ASSUMED_NOISE = {
+    "motion_std": (0.1, 0.1, 0.03),
+    "measurement_std": (0.026, 0.3),
 }
 
 
@@ -141,6 +150,26 @@ def settings_for(
             **(options or {}),
         },
     )
+
+
+def noise_or_assumed(
+    log: SlamLog, stds: Mapping[str, Sequence[float]]
+) -> dict[str, Sequence[float]]:
+    """Add an assumed noise to what is given, where the log specifies none.
+
+    Warns with the values: those of a car with a laser scanner, per √s, which are larger
+    than those of most robots.
+    """
+    known = {**log.header, **stds}
+    if log.header.get("source") == _COURSE_SOURCE:
+        return dict(stds)
+    missing = {key: std for key, std in _ASSUMED_NOISE.items() if key not in known}
+    for key, std in missing.items():
+        values = ",".join(map(str, std))
+        warnings.warn(
+            f"{log.name} does not specify its {key}: {values} is assumed", stacklevel=2
+        )
+    return {**missing, **stds}
 
 
 def settings_for_scenario(

@@ -70,8 +70,8 @@ def summarise(
         "landmarks": landmark_table(trace),
         "nis": nis_summary(trace),
         "nees": nees_summary(trace),
-        "ate": _rmse(path_accuracy(log, trace.t, trace.poses)),
-        "landmark_rmse": _rmse(map_accuracy(trace)),
+        "ate": rmse_table(path_accuracy(log, trace.t, trace.poses)),
+        "landmark_rmse": rmse_table(map_accuracy(trace)),
         "association": association_summary(replay, resolution),
         "warnings": run_warnings(replay),
     }
@@ -233,7 +233,8 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _rmse(accuracy: PositionAccuracy | None) -> dict[str, float | None] | None:
+def rmse_table(accuracy: PositionAccuracy | None) -> dict[str, float | None] | None:
+    """Return root mean squares ``{raw, aligned}`` [m]; None if the truth is unknown."""
     if accuracy is None:
         return None
     return {

@@ -18,6 +18,7 @@ from slamgym.sim_configs import list_presets, load_scenario
 COMMANDS = (
     "run",
     "replay",
+    "smooth",
     "generate",
     "monte-carlo",
     "noise-study",

@@ -88,7 +88,12 @@ def test_worlds_that_hide_identities_are_smoothed_with_the_associations_decided(
     assert (smoothed.ate < 1.2 * filtered.ate).all()
 
 
-def test_several_hypotheses_are_refused():
+def test_of_several_hypotheses_the_most_probable_one_is_smoothed():
+    world = load_scenario("hidden_identities").with_changes(steps=40)
     options = {"management": {"association": "hypotheses"}}
-    with pytest.raises(ValueError, match="smoother does not follow hypotheses"):
-        monte_carlo("hidden_identities", {"smooth": ("smoother", options)}, 2)
+    pair = {"filter": ("invariant", options), "smoother": ("smoother", options)}
+    results = monte_carlo(world, pair, 1, seed=3)
+    assert not results.failed.any()
+    filtered, smoothed = (results.sel(estimator=name, run=0) for name in pair)
+    assert smoothed.state_dof == filtered.state_dof
+    assert smoothed.position_std.mean() < filtered.position_std.mean()

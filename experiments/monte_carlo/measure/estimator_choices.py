@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 from ....estimator import registry
 from ....estimator.registry import find_estimator, list_estimators, register_estimator
 from ....sim_configs import Scenario
-from ...runs.filter_settings import FilterSettings, settings_for_scenario
+from ...runs.filter_settings import SMOOTHER, FilterSettings, settings_for_scenario
 
 _PACKAGE = Path(registry.__file__).resolve().parents[1]
 _BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")
-OFFLINE = {"smoother": "slamgym.estimator.smoother.smoothing_slam:SmoothingSlam"}
+OFFLINE = {"smoother": SMOOTHER}
 """Estimators of whole drives, which no step-by-step experiment knows by name."""
 _COMMA = re.compile(r",(?![^\[]*\])")  # outside brackets
 _SPEC = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>[^\]]*)\])?")

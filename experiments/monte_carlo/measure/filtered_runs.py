@@ -13,9 +13,9 @@ from ....estimator.interface import (
     Belief,
     SlamEstimator,
     SmoothedPath,
-    SupportsSmoothing,
     SupportsTruth,
 )
+from ....estimator.smoother.within import smoother_in
 from ...runs.association import DecisionRecorder, RunDecisions
 from ...runs.filter_settings import FilterSettings
 from ...runs.memory_check import refuse_large_maps
@@ -136,8 +136,8 @@ def _one_by_one(
             belief = _step(slam, runs, run, step, trace, recorder)
             if not _finite(trace, (run, step)):
                 return Failure(step, _NOT_FINITE)
-        if isinstance(slam, SupportsSmoothing):
-            belief = _take_smoothed(slam.smoothed(), trace, run)
+        if (smoother := smoother_in(slam)) is not None:
+            belief = _take_smoothed(smoother.smoothed(), trace, run)
     except (Exception, SystemExit) as error:
         return Failure(step, f"{type(error).__name__}: {error}")
     if not _is_finite_map(belief):

@@ -1,0 +1,12 @@
+"""Find what smooths in an estimator that may be managed."""
+
+from __future__ import annotations
+
+from ..interface import SlamEstimator, SupportsSmoothing
+from ..map_management.hypotheses import HypothesisSlam
+
+
+def smoother_in(slam: SlamEstimator) -> SupportsSmoothing | None:
+    """Return what smooths, of several hypotheses the most probable one; else None."""
+    inner = slam.best if isinstance(slam, HypothesisSlam) else slam
+    return inner if isinstance(inner, SupportsSmoothing) else None

@@ -1,0 +1,82 @@
+"""``slamgym smooth``: all poses and landmarks of a log at once, with a picture."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from . import options
+from .option_values import assignments, standard_deviations
+from .program import command
+
+_NOTE = "compiling the smoother, once after each installation …"
+
+
+@command
+def smooth(
+    log: Annotated[
+        Path,
+        typer.Argument(metavar="LOG", help="A log of any format that replay reads."),
+    ],
+    *,
+    estimator: options.EstimatorName = "invariant",
+    motion_std: options.MotionStd = None,
+    measurement_std: options.MeasurementStd = None,
+    initial_pose_std: options.InitialPoseStd = None,
+    robust: Annotated[
+        str | None,
+        options.option(
+            "huber|cauchy",
+            "Give readings that are far off less weight.",
+            "all weigh the same",
+        ),
+    ] = None,
+    option: options.EstimatorOptions = None,
+    robot: Annotated[
+        int | None,
+        options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
+    ] = None,
+    out: options.OutFolder = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Smooth a log: all its poses and landmarks at once.
+
+    Filters a log, then finds the most likely poses and landmarks given all of its
+    readings, with their covariances. The filter associates readings without identity,
+    and what its gate rejects is left out. Compares both with the truth. Where neither
+    the log nor an option specifies a noise, the command assumes one and says so.
+
+    Examples
+    --------
+    slamgym smooth data.txt
+    slamgym smooth sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
+    slamgym smooth log.csv --option gate_probability=0.999 --robust huber
+    """
+    from ..figures import save_figure, smoothed_figure
+    from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
+    from ..runs.log_smoothing import smooth_log, summarise_smoothing
+    from .output_folder import default_folder, output_folder, write_summary
+    from .reporter import Reporter
+    from .run_files import read_any_log
+    from .tables import smoothing_figures, smoothing_table, written
+
+    given = assignments("--option", option) | {"follow": estimator}
+    if robust is not None:
+        given["robust"] = robust
+    drive = read_any_log(log, robot)
+    reporter = Reporter(as_json=as_json)
+    stated = standard_deviations(motion_std, measurement_std, initial_pose_std)
+    with reporter.warnings():
+        stds = noise_or_assumed(drive, stated)
+    settings = settings_for(drive, estimator=SMOOTHER, **stds, options=given)
+    place = out or default_folder(drive.name, "smoother")
+    with output_folder(place) as folder:
+        with reporter.progress("filtering") as tick, reporter.note_if_slow(_NOTE):
+            smoothed = smooth_log(drive, settings, progress=tick)
+        save_figure(smoothed_figure(smoothed), folder / "map.png")
+        summary = write_summary(folder, summarise_smoothing(smoothed, settings))
+    title = f"[bold]{summary['log']}[/] smoothed, following [bold]{estimator}[/]\n"
+    files = written(str(place), summary["files"])
+    figures = smoothing_figures(summary)
+    reporter.show(title, smoothing_table(summary), "", figures, "", files)
+    reporter.finish({**summary, "out": str(place)})

@@ -1,0 +1,170 @@
+"""Smooth a log: filter it, then estimate all its poses and landmarks at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ... import __version__
+from ...arrays import Array, IntArray
+from ...estimator.smoother import SmoothedDrive
+from ...estimator.smoother.within import smoother_in
+from ...evaluation import nees
+from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
+from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
+from ..logs.slamlog import SlamLog
+from ..logs.steps import predictions, steps_of
+from .blas_threads import one_blas_thread
+from .filter_settings import FilterSettings
+from .log_replay import Progress, Replay, replay
+from .nan_statistics import finite
+from .summary import map_accuracy, nees_summary, rmse_table, settings_table
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedLog:
+    """A log, filtered and smoothed."""
+
+    filtered: Replay
+    """The filter's run, whose associations the smoother has."""
+    drive: SmoothedDrive
+    """All poses at scans and all landmarks, given the whole log."""
+    poses: Array
+    """The pose after every step of the log, shape (K + 1, 3) [m, m, rad]."""
+    scan_steps: IntArray
+    """Step of each pose of the drive, shape (N,)."""
+
+    @property
+    def log(self) -> SlamLog:
+        """The log."""
+        return self.filtered.log
+
+
+def smooth_log(
+    log: SlamLog, settings: FilterSettings, *, progress: Progress | None = None
+) -> SmoothedLog:
+    """Filter a log, and smooth it with the associations of the filter.
+
+    Parameters
+    ----------
+    log : SlamLog
+        The log.
+    settings : FilterSettings
+        Of `SMOOTHER`; by ``management`` it associates readings without identity.
+    progress : callable, optional
+        Called with (steps done, steps) of the filter.
+
+    Raises
+    ------
+    ValueError
+        If the log has no scan, or the filter refuses a reading.
+    numpy.linalg.LinAlgError
+        If the smoother does not converge.
+    """
+    slam = settings.make(log.start)
+    if smoother_in(slam) is None:
+        raise ValueError(f"estimator '{settings.estimator}' does not smooth")
+    followed = str(settings.options.get("follow", "invariant"))
+    filtered = replay(log, slam, name=followed, progress=progress)
+    if not filtered.scans:
+        raise ValueError(
+            f"{log.name} holds no scan: without readings of landmarks there is nothing "
+            "to smooth"
+        )
+    smoother = smoother_in(slam)  # of the hypothesis that is the best one now
+    with one_blas_thread():
+        drive = None if smoother is None else smoother.smoothed()
+    if not isinstance(drive, SmoothedDrive):
+        raise ValueError(f"estimator '{settings.estimator}' is not slamgym's smoother")
+    readings = _readings_until(log)
+    scan_steps = np.searchsorted(readings, drive.readings_until).astype(np.int64)
+    return SmoothedLog(filtered, drive, drive.path[readings], scan_steps)
+
+
+def summarise_smoothing(
+    smoothed: SmoothedLog, settings: FilterSettings | None = None
+) -> dict[str, Any]:
+    """Summarise a smoothed log.
+
+    Returns
+    -------
+    dict
+        ``log``, ``follows``, the name of the filter, ``settings``, ``slamgym``;
+        ``steps`` and ``scans`` of the log; ``poses``, ``readings`` and ``landmarks``
+        that were smoothed; ``cost``, half the sum of squares, at the ``first`` and the
+        last estimate and ``per_degree``, of which 1 is expected without a robust
+        kernel; ``iterations``; ``ate``, ``landmark_rmse`` and ``nees`` (of the pose),
+        each of ``filter`` and ``smoother``, None where the truth is unknown.
+    """
+    log, trace, drive = smoothed.log, smoothed.filtered.trace, smoothed.drive
+    return {
+        "slamgym": __version__,
+        "log": log.name,
+        "follows": trace.estimator,
+        "settings": None if settings is None else settings_table(settings),
+        "steps": trace.last_step,
+        "scans": smoothed.filtered.scans,
+        "poses": len(drive.poses),
+        "readings": drive.readings,
+        "landmarks": len(drive.landmarks),
+        "cost": {
+            "first": finite(drive.first_cost),
+            "last": finite(drive.cost),
+            "per_degree": finite(drive.cost_per_degree),
+        },
+        "iterations": drive.iterations,
+        "ate": {
+            "filter": rmse_table(path_accuracy(log, trace.t, trace.poses)),
+            "smoother": rmse_table(path_accuracy(log, trace.t, smoothed.poses)),
+        },
+        "landmark_rmse": {
+            "filter": rmse_table(map_accuracy(trace)),
+            "smoother": rmse_table(_map_accuracy(smoothed)),
+        },
+        "nees": {"filter": nees_summary(trace), "smoother": _nees(smoothed)},
+    }
+
+
+def _readings_until(log: SlamLog) -> IntArray:
+    """Return how many readings of odometry there are until each step, (K + 1,)."""
+    counts = [
+        sum(len(predictions(row, log.motion)) for row in step.motions)
+        for step in steps_of(log)
+    ]
+    return np.cumsum(counts, dtype=np.int64)
+
+
+def _map_accuracy(smoothed: SmoothedLog) -> PositionAccuracy | None:
+    drive = smoothed.drive
+    truth = true_landmarks_of(smoothed.log, drive.landmark_ids, drive.landmarks)
+    if truth is None:
+        return None
+    known = np.isfinite(truth).all(axis=1)
+    return position_accuracy(drive.landmarks[known], truth[known])
+
+
+def _nees(smoothed: SmoothedLog) -> dict[str, Any] | None:
+    """Summarise the NEES of the poses at the scans, in the invariant frame."""
+    times = smoothed.filtered.trace.t[smoothed.scan_steps]
+    truth = true_poses_of(smoothed.log, times)
+    if truth is None:
+        return None
+    drive, known = smoothed.drive, np.isfinite(truth).all(axis=1)
+    if not known.any():
+        return None
+    values = nees.pose_nees(
+        truth[known],
+        drive.poses[known],
+        drive.pose_covariances[known],
+        frame="invariant",
+    )
+    values = values[np.isfinite(values)]
+    return {
+        "mean": finite(values.mean()),
+        "degrees_of_freedom": 3,
+        "per_degree": finite(values.mean() / 3),
+        "steps": len(values),
+        "frame": "invariant",
+    }

@@ -1,0 +1,172 @@
+"""Smoothing a log, from Python and from the command line."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+from drives import MEASUREMENT_STD, MOTION_STD, drive
+from typer.testing import CliRunner
+
+from slamgym.estimator.smoother import Drive, smooth
+from slamgym.experiments.command_line.app import main
+from slamgym.experiments.logs.events import OdometryRow, Scan
+from slamgym.experiments.logs.slamlog import SlamLog, write_slamlog
+from slamgym.experiments.runs.filter_settings import SMOOTHER, settings_for
+from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
+
+SIX = np.array([[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12.0]])
+NOISE = {
+    "motion_std": ",".join(map(str, MOTION_STD)),
+    "measurement_std": ",".join(map(str, MEASUREMENT_STD)),
+}
+
+
+def a_log(*, motion="turn-last", with_ids=True, scans=True):
+    """Return the log of a drive: two odometry rows for each scan, and the truth."""
+    events, truth = [], [(0.0, 0.0, 0.0, 0.0)]
+    for step, ((d, alpha), readings, pose) in enumerate(drive(8, 30), start=1):
+        events += [
+            OdometryRow(step - 0.5, d / 2, alpha / 2, 0.5),
+            OdometryRow(float(step), d / 2, alpha / 2, 0.5),
+        ]
+        truth.append((float(step), *pose))
+        if scans:
+            ids = np.arange(6) if with_ids else None
+            events.append(Scan(float(step), readings, ids))
+    return SlamLog(
+        "little",
+        NOISE,
+        motion=motion,
+        landmark_ids=np.arange(6),
+        landmarks=SIX,
+        ground_truth=np.array(truth),
+        events=tuple(events),
+    )
+
+
+def smoothed(log, **options):
+    return smooth_log(log, settings_for(log, estimator=SMOOTHER, options=options))
+
+
+@pytest.fixture(scope="module")
+def example():
+    return smoothed(a_log())
+
+
+def test_the_smoother_is_closer_to_the_truth_than_the_filter(example):
+    summary = summarise_smoothing(example)
+    for key in ("ate", "landmark_rmse"):
+        errors = summary[key]
+        assert errors["smoother"]["aligned"] < errors["filter"]["aligned"]
+    assert 0.7 < summary["cost"]["per_degree"] < 1.3
+    assert 0.2 < summary["nees"]["smoother"]["per_degree"] < 3
+    assert summary["poses"] == 31
+    assert summary["readings"] == 30 * 6
+
+
+def test_every_step_of_the_log_has_a_pose(example):
+    trace = example.filtered.trace
+    assert len(example.poses) == len(trace.t) == 61
+    assert example.poses[example.scan_steps].tolist() == example.drive.poses.tolist()
+    assert trace.t[example.scan_steps].tolist() == list(range(31))
+
+
+def test_the_path_between_scans_is_that_of_a_drive_with_a_pose_at_every_reading(
+    example,
+):
+    fine = Drive(MOTION_STD, MEASUREMENT_STD)
+    for event in a_log().events:
+        if isinstance(event, OdometryRow):
+            fine.predict((event.d, event.alpha), event.dt)
+            fine.end_motion()
+        else:
+            fine.update(event.measurements, event.landmark_ids)
+    found = smooth(fine)
+    assert example.drive.path == pytest.approx(found.path, abs=1e-3)
+    assert found.path.tolist() == found.poses.tolist()
+
+
+def test_midpoint_odometry_is_smoothed_as_two_readings():
+    log = a_log(motion="midpoint")
+    found, by_hand = smoothed(log), Drive(MOTION_STD, MEASUREMENT_STD)
+    for event in log.events:
+        if isinstance(event, OdometryRow):
+            by_hand.predict((0.0, event.alpha / 2), 0.0)
+            by_hand.predict((event.d, event.alpha / 2), event.dt)
+        else:
+            by_hand.update(event.measurements, event.landmark_ids)
+    assert found.drive.poses == pytest.approx(smooth(by_hand).poses, abs=1e-7)
+    assert len(found.drive.path) == 121
+    assert len(found.poses) == 61
+
+
+def test_readings_without_identity_are_smoothed_as_management_associates_them():
+    found = smoothed(a_log(with_ids=False))
+    summary = summarise_smoothing(found)
+    assert summary["landmarks"] == 6
+    assert summary["ate"]["smoother"]["aligned"] < 0.1
+
+
+def test_a_log_without_scans_is_refused():
+    with pytest.raises(ValueError, match="little holds no scan"):
+        smoothed(a_log(scans=False))
+
+
+def test_a_filter_that_does_not_smooth_is_refused():
+    log = a_log()
+    with pytest.raises(ValueError, match="estimator 'ekf' does not smooth"):
+        smooth_log(log, settings_for(log, estimator="ekf"))
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_slamlog(a_log(), tmp_path / "little.csv")
+    write_slamlog(a_log(scans=False), tmp_path / "blind.csv")
+    return tmp_path
+
+
+def slamgym(*arguments):
+    return CliRunner().invoke(main, list(arguments))
+
+
+def test_the_command_writes_a_picture_and_the_numbers(here):
+    result = slamgym("smooth", "little.csv", "--robust", "huber", "--json")
+    assert result.exit_code == 0, result.stderr
+    summary = json.loads(result.stdout)
+    assert summary["files"] == ["map.png", "summary.json"]
+    assert (here / summary["out"] / "map.png").stat().st_size > 10_000
+    assert summary["settings"]["options"]["robust"] == "huber"
+    shown = slamgym("smooth", "little.csv", "--estimator", "ekf").stdout
+    assert "path error, aligned" in shown
+    assert "1 is expected" in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["blind.csv"], "little holds no scan"),
+        (["little.csv", "--estimator", "ekff"], "did you mean 'ekf'?"),
+        (["little.csv", "--robust", "tukey"], "robust must be 'huber' or 'cauchy'"),
+        (["nowhere.csv"], "cannot read the log nowhere.csv"),
+    ],
+)
+def test_what_cannot_be_smoothed_is_refused_in_one_line(here, arguments, message):
+    before = sorted(os.walk(here))
+    result = slamgym("smooth", *arguments)
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert message in result.stderr
+    assert sorted(os.walk(here)) == before
+
+
+def test_a_log_without_noise_is_smoothed_with_an_assumed_one_and_says_so(here):
+    text = (here / "little.csv").read_text()
+    lines = [line for line in text.splitlines() if "_std" not in line]
+    (here / "unsure.csv").write_text("\n".join(lines) + "\n")
+    result = slamgym("smooth", "unsure.csv", "--measurement-std", ".02,.08", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert "does not specify its motion_std: 0.1,0.1,0.03 is assumed" in result.stderr
+    assert "measurement_std" not in result.stderr
+    assert json.loads(result.stdout)["settings"]["motion_std"] == [0.1, 0.1, 0.03]
