@@ -36,6 +36,7 @@ def smooth(
         int | None,
         options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
     ] = None,
+    truth: options.TruthFile = None,
     out: options.OutFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
@@ -57,14 +58,15 @@ def smooth(
     from ..runs.log_smoothing import smooth_log, summarise_smoothing
     from .output_folder import default_folder, output_folder, write_summary
     from .reporter import Reporter
-    from .run_files import read_any_log
+    from .run_files import note_choices, read_any_log
     from .tables import smoothing_figures, smoothing_table, written
 
     given = assignments("--option", option) | {"follow": estimator}
     if robust is not None:
         given["robust"] = robust
-    drive = read_any_log(log, robot)
     reporter = Reporter(as_json=as_json)
+    drive = read_any_log(log, robot, truth=truth)
+    note_choices(drive, reporter)
     stated = standard_deviations(motion_std, measurement_std, initial_pose_std)
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)

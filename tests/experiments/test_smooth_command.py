@@ -170,3 +170,17 @@ def test_a_log_without_noise_is_smoothed_with_an_assumed_one_and_says_so(here):
     assert "does not specify its motion_std: 0.1,0.1,0.03 is assumed" in result.stderr
     assert "measurement_std" not in result.stderr
     assert json.loads(result.stdout)["settings"]["motion_std"] == [0.1, 0.1, 0.03]
+
+
+def test_a_graph_is_smoothed_against_the_truth_of_another_file(here):
+    edges = [f"EDGE2 {k} {k + 1} 1 0 0\nLANDMARK {k} 9 {4 - k} 4\n" for k in range(3)]
+    (here / "graph.txt").write_text("".join([*edges, "EDGE2 3 0 -3 0 0\n"]))
+    vertices = [f"VERTEX2 {k} {k + 1} 0.5 0\n" for k in range(4)]
+    (here / "true.g2o").write_text("".join([*vertices, "VERTEX_XY 9 5 4.5\n"]))
+    noise = ("--motion-std", ".1,.1,.1", "--measurement-std", ".1,.1")
+    result = slamgym("smooth", "graph.txt", *noise, "--truth", "true.g2o", "--json")
+    assert "note: left out of the log: 1 loop closures between poses" in result.stderr
+    summary = json.loads(result.stdout)
+    for who in ("filter", "smoother"):
+        assert summary["ate"][who]["raw"] == pytest.approx(0, abs=1e-6)
+        assert summary["landmark_rmse"][who]["raw"] == pytest.approx(0, abs=1e-6)
