@@ -29,7 +29,8 @@ class SmoothingSlam(RecordedSlam):
     range_std_per_metre, range_noise_at, noise_at_rest, min_range
         As in :class:`~slamgym.estimator.EkfSlam`; the filter gets those that it takes.
     **options
-        Further options of the filter.
+        Further options of the filter, but for ``bearing_std_metres``: the smoother
+        takes a constant bearing noise.
 
     Raises
     ------
@@ -67,6 +68,11 @@ class SmoothingSlam(RecordedSlam):
             "noise_at_rest": noise_at_rest,
             "min_range": min_range,
         }
+        if options.get("bearing_std_metres"):
+            raise ValueError(
+                "bearing_std_metres must be 0 to smooth, "
+                f"got {options['bearing_std_metres']!r}"
+            )
         robust_kernel(robust, robust_scale)
         taken = accepted_options(find_estimator(follow), sensor)
         slam = make_estimator(follow, **noise, **taken, **options)
