@@ -4,8 +4,8 @@
 
 For each world and method: the median error of the path with known and with hidden
 identities, the lost runs (more than 1 m worse than with known identities), readings
-given to a wrong landmark, landmarks mapped twice, the size of the map, and the time of
-a step as a multiple of that of nearest neighbours.
+given to a wrong landmark, landmarks mapped twice, the size of the map, precision and
+recall, and the time of a step as a multiple of that of nearest neighbours.
 """
 
 from __future__ import annotations
@@ -17,15 +17,26 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.estimator import SlamEstimator, make_estimator
+from slamgym.estimator import (
+    LandmarkPolicy,
+    ScanDecisions,
+    SlamEstimator,
+    make_estimator,
+)
+from slamgym.estimator.association.scan_assignments import assign_scan
+from slamgym.estimator.belief import MapView
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.evaluation import AssociationScores, score_association
 from slamgym.sim_configs import Scenario, action_sequence, load_scenario
 
 METHODS: dict[str, dict[str, Any]] = {
-    "nearest": {"association": "nearest"},
-    "joint": {"association": "joint", "backdate": True},
-    "hypotheses": {"association": "hypotheses", "backdate": True},
+    "nearest": {"association": "nearest", "backdate": False},
+    "compatibility": {"association": "compatibility"},
+    "joint": {"association": "joint"},
+    "hypotheses": {"association": "hypotheses"},
 }
 LOST = 1.0  # [m]
+NOISE = (0.02, 0.1, 0.0)  # [rad, m, m/m]
 
 
 class Scan(NamedTuple):
@@ -41,10 +52,8 @@ class Outcome(NamedTuple):
     """What came of one run."""
 
     error: float
-    wrong: int
-    duplicates: int
-    landmarks: int
     seconds: float
+    scores: AssociationScores
 
 
 def worlds() -> dict[str, Scenario]:
@@ -92,11 +101,9 @@ def make(world: Scenario, **options: Any) -> SlamEstimator:
     )
 
 
-def follow(slam: SlamEstimator, scans: list[Scan], *, is_known: bool) -> Outcome:
+def follow(slam: Any, scans: list[Scan], *, is_known: bool = False) -> Outcome:
     """Feed a drive to a filter and score it."""
-    squared, owners = [], dict[int, int]()
-    wrong = duplicates = 0
-    seconds = 0.0
+    squared, seconds = [], 0.0
     for k, scan in enumerate(scans):
         begin = time.process_time()
         if k:
@@ -105,17 +112,53 @@ def follow(slam: SlamEstimator, scans: list[Scan], *, is_known: bool) -> Outcome
             real = scan.ids >= 0
             slam.update(scan.readings[real], scan.ids[real].tolist())
         else:
-            row_ids = slam.update(scan.readings).row_ids
-            for true, i in zip(scan.ids.tolist(), row_ids, strict=True):
-                if i is not None and i not in owners:
-                    duplicates += true >= 0 and true in owners.values()
-                    owners[i] = true
-                wrong += i is not None and owners[i] != true
+            slam.update(scan.readings)
         seconds += time.process_time() - begin
-        squared.append(float(np.sum((slam.belief().pose - scan.pose)[:2] ** 2)))
-    size = len(slam.belief().landmark_ids)
-    error = float(np.sqrt(np.mean(squared)))
-    return Outcome(error, wrong, duplicates, size, seconds / len(scans))
+        squared.append(float(np.sum((slam.map_view().mean[:2] - scan.pose[:2]) ** 2)))
+    decisions = [ScanDecisions(tuple(scan.ids.tolist())) for scan in scans]
+    scores = score_association(
+        decisions if is_known else slam.decisions, [scan.ids for scan in scans]
+    )
+    return Outcome(float(np.sqrt(np.mean(squared))), seconds / len(scans), scores)
+
+
+def crowded_scan() -> float:
+    """Return the time of a joint assignment of 12 readings to 60 landmarks [ms]."""
+    rng = np.random.default_rng(1)
+    landmarks, truth = rng.uniform(-8, 8, (60, 2)), np.array([0.3, -0.2, 0.1])
+    root = rng.normal(scale=0.02, size=(123, 123))
+    mean = np.append(np.zeros(3), landmarks)
+    view = MapView(mean, root @ root.T, tuple(range(60)))
+    readings = predict_measurement(truth, landmarks[:12]).measurement
+    times = []
+    for _ in range(50):
+        begin = time.perf_counter()
+        assign_scan(LandmarkPolicy(association="joint"), view, readings, NOISE, 0.01)
+        times.append(time.perf_counter() - begin)
+    return 1e3 * float(np.median(times))
+
+
+def row_of(runs: list[Outcome], known: list[float], base: float) -> list[str]:
+    """Return the entries of the table for one world and method."""
+    errors = np.array([run.error for run in runs])
+    seconds = float(np.mean([run.seconds for run in runs]))
+    lost = int((errors > np.array(known) + LOST).sum())
+    scores = {
+        name: float(np.mean([run.scores.as_dict()[name] for run in runs]))
+        for name in ("wrong", "duplicate", "map_size", "precision", "recall")
+    }
+    return [
+        f"{np.median(known):.3f}",
+        f"{np.median(errors):.3f}",
+        f"{lost} of {len(runs)}",
+        f"{scores['wrong']:.1f}",
+        f"{scores['duplicate']:.2f}",
+        f"{scores['map_size']:.1f}",
+        f"{scores['precision']:.3f}",
+        f"{scores['recall']:.3f}",
+        f"{1e3 * seconds:.2f}",
+        f"{seconds / base:.1f}",
+    ]
 
 
 def main() -> None:
@@ -123,28 +166,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=5000)
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     options = parser.parse_args()
-    for policy in METHODS.values():  # compile
+    for method in options.methods:  # compile
         world = worlds()["corridor"]
-        follow(make(world, management=policy), drive(world, 0)[:30], is_known=False)
+        follow(make(world, management=METHODS[method]), drive(world, 0)[:30])
+    print(f"12 readings against 60 landmarks, joint: {crowded_scan():.2f} ms\n")
     print(
-        "world | method | known [m] | hidden [m] | lost | wrong | double | map | cost"
+        "| world | method | known ids [m] | error [m] | lost | wrong | duplicate "
+        "| map | precision | recall | ms a step | of nearest |"
     )
+    print("|---" * 12 + "|")
     for name, world in worlds().items():
         scans = [drive(world, options.seed + i) for i in range(options.runs)]
         known = [follow(make(world), s, is_known=True).error for s in scans]
         base = 0.0
-        for method, policy in METHODS.items():
-            runs = [
-                follow(make(world, management=policy), s, is_known=False) for s in scans
-            ]
-            error, wrong, double, size, seconds = np.array(runs).T
-            base = base or float(seconds.mean())
-            lost = int((error > np.array(known) + LOST).sum())
-            row = [name, method, f"{np.median(known):.3f}", f"{np.median(error):.3f}"]
-            row += [f"{lost} of {len(runs)}", f"{wrong.mean():.1f}"]
-            row += [f"{double.mean():.2f}", f"{size.mean():.1f}"]
-            print(" | ".join([*row, f"{seconds.mean() / base:.1f}"]), flush=True)
+        for method in options.methods:
+            policy = METHODS[method]
+            runs = [follow(make(world, management=policy), s) for s in scans]
+            base = base or float(np.mean([run.seconds for run in runs]))
+            row = " | ".join([name, method, *row_of(runs, known, base)])
+            print(f"| {row} |", flush=True)
 
 
 if __name__ == "__main__":
