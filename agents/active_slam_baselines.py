@@ -3,8 +3,10 @@
 =============  =====================================================================
 ``random``     actions uniform within the robot's limits
 ``coverage``   lanes up and down the floor, then across, independent of the belief
-``greedy``     the motion with the largest expected information, out of a few
+``frontier``   the nearest unseen cell; when all are mapped, as ``revisit``
 ``revisit``    the nearest goal; when uncertain, the best known landmark
+``greedy``     the motion with the largest expected gain, see `belief_space_planner`
+``mpc``        the same of tours from goal to goal
 =============  =====================================================================
 
 They use `AgentKnowledge` only, not the truth. They drive straight to their goals, so
@@ -12,6 +14,7 @@ they need a floor without inner walls.
 """
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -23,9 +26,9 @@ from ..sim_configs import Robot, Scenario
 from ..sim_configs.scenario_errors import unknown_choice
 from .agent_knowledge import AgentKnowledge, as_points
 from .belief_features import largest_variances, world_bounds
-from .greedy_information import GreedyInformation
+from .belief_space_planner import GREEDY, MPC, BeliefSpacePlanner
 
-BASELINES = ("random", "coverage", "greedy", "revisit")
+BASELINES = ("random", "coverage", "frontier", "revisit", "greedy", "mpc")
 
 _CLEARANCE = 1.0  # distance kept from the walls [m]
 _ALIGNED = 0.4  # heading error below which a robot drives while it turns [rad]
@@ -127,6 +130,25 @@ class Revisit:
         return np.asarray(belief.landmarks[best])
 
 
+class Frontier:
+    """Drives to the nearest unseen cell; when all is mapped, does as `Revisit`."""
+
+    def __init__(self) -> None:
+        self._revisit = Revisit()
+
+    def act(self, knowledge: AgentKnowledge) -> Array:
+        """Drive to the next goal; see `Baseline.act`."""
+        unseen = as_points(knowledge.grid.cells[~knowledge.explored])
+        missing = len(knowledge.known) - len(knowledge.belief.landmark_ids)
+        otherwise = self._revisit.act(knowledge)
+        if not missing or not len(unseen):
+            return otherwise
+        pose, scenario = knowledge.belief.pose, knowledge.scenario
+        nearest = unseen[np.argmin(np.hypot(*(unseen - pose[:2]).T))]
+        goal = _kept_inside(nearest, scenario)
+        return steer(pose, goal, scenario.robot, scenario.dt)
+
+
 _PATIENCE = 25  # largest number of steps of a return, then steps of exploration
 
 
@@ -135,8 +157,8 @@ def make_baseline(name: str, scenario: Scenario, rng: np.random.Generator) -> Ba
 
     Parameters
     ----------
-    name : {"random", "coverage", "greedy", "revisit"}
-        See the module's docstring.
+    name : str
+        One of `BASELINES`, see the module's docstring.
     scenario : Scenario
         The scenario of the task.
     rng : numpy.random.Generator
@@ -147,18 +169,19 @@ def make_baseline(name: str, scenario: Scenario, rng: np.random.Generator) -> Ba
     ValueError
         If there is no such baseline, or the floor has inner walls.
     """
+    makers: dict[str, Callable[[], Baseline]] = {
+        "random": lambda: RandomActions(rng),
+        "coverage": lambda: Coverage(scenario),
+        "frontier": Frontier,
+        "revisit": Revisit,
+        "greedy": lambda: BeliefSpacePlanner(GREEDY),
+        "mpc": lambda: BeliefSpacePlanner(MPC),
+    }
+    if name not in makers:
+        raise ValueError(unknown_choice("name", name, BASELINES))
     if name != "random":
         _check_open_floor(scenario)
-    match name:
-        case "random":
-            return RandomActions(rng)
-        case "coverage":
-            return Coverage(scenario)
-        case "greedy":
-            return GreedyInformation()
-        case "revisit":
-            return Revisit()
-    raise ValueError(unknown_choice("name", name, BASELINES))
+    return makers[name]()
 
 
 def coverage_lanes(scenario: Scenario) -> Array:

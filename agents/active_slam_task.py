@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, fields
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,10 @@ class RewardWeights:
             raise ValueError(
                 f"accuracy must be a finite number > 0 [m], got {self.accuracy!r}"
             )
+        for name in ("success_reward", "crash_cost", "effort_cost", "step_cost"):
+            weight = getattr(self, name)
+            if not (isinstance(weight, Real) and 0 <= float(weight) < np.inf):
+                raise ValueError(f"{name} must be a finite number >= 0, got {weight!r}")
 
 
 class ActiveSlamTask:

@@ -39,8 +39,8 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         Truncates episodes earlier than the scenario's own number of steps.
     autoreset_mode : AutoresetMode or str, default "NextStep"
         Any of Gymnasium's three. "Disabled" needs ``options={"reset_mask": …}``.
-    render_mode : None
-        Vector environments of active SLAM are not rendered.
+    render_mode : {"human", "rgb_array"}, optional
+        As in `LandmarkWorldVectorEnv`; the frames also show the beliefs.
 
     Examples
     --------
@@ -62,19 +62,15 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        if render_mode is not None:
-            raise ValueError(
-                f"render_mode must be None for vector environments, got {render_mode!r}"
-            )
         weights, changes = split_settings(settings)
         super().__init__(
             num_envs,
             scenario,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
+            render_mode=render_mode,
             **changes,
         )
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.task = ActiveSlamTask(self.scenario, weights, num_envs)
         self.single_observation_space = self.task.observation_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -106,6 +102,8 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
 
     def _filter(self, worlds: BoolArray, *, moved: bool) -> None:
         update_filters(self._filters, super()._observations(), worlds, moved=moved)
+        if self.render_mode is not None:
+            self.show_beliefs(list(map(self._filters.belief, range(self.num_envs))))
 
     def _observations(self) -> Observation:
         observations = self.task.observations()

@@ -14,6 +14,7 @@ m of n episodes is given as m ± 1.96 s/√n.
 import argparse
 import runpy
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,23 +36,33 @@ LEVELS = ("active_easy", "active_medium", "active_hard")
 TRAINING = Path(__file__).parents[1] / "examples" / "09_train_active_slam.py"
 
 
-def score(scenario: str, seeds: range, policy: str | None) -> dict[str, list[Episode]]:
-    """Let everybody play the maps of one difficulty."""
+def score(
+    scenario: str, seeds: range, names: Sequence[str], policy: str | None
+) -> dict[str, list[Episode]]:
+    """Let baselines and a policy play the maps of one difficulty."""
     env = ActiveSlamEnv(scenario)
     players: dict[str, Policy] = {}
-    for name in BASELINES:
+    for name in names:
         baseline = make_baseline(name, env.scenario, np.random.default_rng(0))
         players[name] = baseline_policy(baseline)
     if policy is not None:
         load_policy = runpy.run_path(str(TRAINING))["load_policy"]
         players["ppo"] = load_policy(Path(policy))
-    return {name: run_episodes(env, player, seeds) for name, player in players.items()}
+    played = {}
+    for name, player in players.items():
+        began = time.thread_time()
+        played[name] = run_episodes(env, player, seeds)
+        steps = sum(episode.steps for episode in played[name])
+        spent = 1e3 * (time.thread_time() - began) / steps
+        print(f"{name}: {spent:.1f} ms a step, action and world", flush=True)
+    return played
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--maps", type=int, default=100)
     parser.add_argument("--level", choices=LEVELS, action="append")
+    parser.add_argument("--baseline", choices=BASELINES, action="append")
     parser.add_argument(
         "--policy", metavar="SCENARIO=FILE", action="append", default=[]
     )
@@ -64,10 +75,13 @@ def main() -> None:
     policies = dict(each.split("=", 1) for each in given.policy)
     for scenario in given.level or LEVELS:
         began = time.perf_counter()
-        played = score(scenario, seeds, policies.get(scenario))
+        names = given.baseline or BASELINES
+        played = score(scenario, seeds, names, policies.get(scenario))
         took = time.perf_counter() - began
         print(f"{scenario}, {given.maps} maps ({took:.0f} s)\n{score_table(played)}")
-        print(f"{difference_lines(played, 'ppo')}\n" if "ppo" in played else "")
+        for name in ("mpc", "ppo"):
+            if name in played:
+                print(f"{difference_lines(played, name)}\n")
 
 
 if __name__ == "__main__":

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
@@ -100,6 +102,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
     """  # noqa: E501 (tables)
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": _FPS}  # noqa: RUF012
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -124,6 +127,17 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
         self._motion_noise = NoiseRows(_refuse_to_step)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The specification it was made from, with the length of its episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None and spec.max_episode_steps is None:
+            spec = replace(spec, max_episode_steps=self.scenario.steps)
+        self._spec = spec
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

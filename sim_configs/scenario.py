@@ -11,7 +11,12 @@ from .controls import ControlSequence, command_cycle
 from .field_types import Name, Part, Positive, Text, Wall, broken_rule, expect
 from .layouts import LandmarkLayout
 from .randomisation import RANGES, Randomise
-from .scenario_errors import ScenarioError, error_lines
+from .scenario_errors import (
+    ScenarioError,
+    UnknownKeywordError,
+    closest,
+    error_lines,
+)
 from .scenario_parts import Motion, Robot, Sensor, Start
 
 _Steps = Annotated[
@@ -117,7 +122,8 @@ class Scenario(Part):
         Raises
         ------
         ScenarioError
-            If a key is unknown or the result is not a valid scenario.
+            If a key is unknown (also a `TypeError`) or the result is not a valid
+            scenario.
 
         Examples
         --------
@@ -128,6 +134,12 @@ class Scenario(Part):
         """
         if not changes:
             return self
+        fields = type(self).model_fields
+        for key in changes.keys() - fields:
+            raise UnknownKeywordError(
+                f"unexpected keyword argument '{key}': unknown key '{key}' in the "
+                f"scenario{closest(key, fields)}"
+            )
         return self.from_table(_merge(self.model_dump(), changes))
 
     def drawn_at(self, shares: Mapping[str, float], directions: Array) -> Self:

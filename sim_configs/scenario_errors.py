@@ -17,6 +17,14 @@ class ScenarioError(ValueError):
     """Raised for an invalid scenario; the message has one line per mistake."""
 
 
+class UnknownKeywordError(ScenarioError, TypeError):
+    """Raised for a keyword that is no field of a scenario.
+
+    It is a `TypeError` too, as for any function that gets a keyword it does not have:
+    libraries that try keywords of other environments rely on it.
+    """
+
+
 def closest(word: str, words: Iterable[str]) -> str:
     """Return the suggestion that ends an error message, empty if no word is similar.
 

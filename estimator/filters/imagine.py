@@ -122,7 +122,7 @@ def imagine(
         np.full((count, plans_each, steps, 3, 3), np.nan),
         np.full((count, plans_each), np.nan),
         np.full((count, plans_each, landmarks), np.nan),
-        np.full((count, plans_each), np.nan),
+        np.full((count, plans_each, steps), np.nan),
     )
     workspace = workspace_for(filters.rules, landmarks, means.shape[1])
     imagine_plans(

@@ -60,7 +60,8 @@ class Imagined(NamedTuple):
     """Larger eigenvalue of the covariance of each landmark in the end, (B, K, L) [m²];
     inf where it is not mapped."""
     new_landmarks: Array
-    """Expected number of landmarks seen for the first time, (B, K)."""
+    """Expected number of landmarks seen for the first time until each step,
+    (B, K, T)."""
 
 
 @jit
@@ -108,12 +109,13 @@ def imagine_plans(
         size = 3 + 2 * np.sum(slots[b] >= 0)
         for k in range(plans.shape[1]):
             copy_belief(means[b], covariances[b], references[b], size, room)
-            missed[:] = 1.0
+            missed[:], found = 1.0, 0.0
             for t in range(plans.shape[2]):
                 d, turn = plans[b, k, t, 0], plans[b, k, t, 1]
                 if not imagine_step(room, size, d, turn, sensor):
                     break
-                look_for_new(room.mean, points, weights[b], sensor, missed)
+                found += look_for_new(room.mean, points, weights[b], sensor, missed)
+                outcome.new_landmarks[b, k, t] = found
                 for i in range(3):
                     outcome.poses[b, k, t, i] = room.mean[i]
                     for j in range(3):
@@ -121,10 +123,6 @@ def imagine_plans(
                         outcome.pose_covariances[b, k, t, i, j] = variance
                 if t == plans.shape[2] - 1:
                     judge(b, k, room, size, slots[b], outcome)
-            found = 0.0
-            for c in range(len(missed)):
-                found += weights[b, c] * (1.0 - missed[c])
-            outcome.new_landmarks[b, k] = found
 
 
 @njit_internal
@@ -187,17 +185,24 @@ def expect_readings(
 @njit_internal
 def look_for_new(
     mean: Array, points: Array, weights: Array, settings: Settings, missed: Array
-) -> None:
-    """Multiply the probability that a landmark at a point is missed, where in view."""
+) -> float:
+    """Return how many landmarks are expected that have been missed until now.
+
+    ``missed`` has the probability of that for a landmark at each point; it falls where
+    a point is in view.
+    """
+    found, sight = 0.0, settings.sight
     x, y, cos, sin = mean[0], mean[1], math.cos(mean[2]), math.sin(mean[2])
     for c in range(len(missed)):
         if weights[c] > 0.0 and missed[c] > 0.0:
             dx, dy = points[0, c] - x, points[1, c] - y
             ahead, distance = dx * cos + dy * sin, math.sqrt(dx * dx + dy * dy)
-            if is_in_view(ahead, distance, settings.sight) and not is_hidden(
-                x, y, dx, dy, settings.sight.walls
+            if is_in_view(ahead, distance, sight) and not is_hidden(
+                x, y, dx, dy, sight.walls
             ):
+                found += weights[c] * missed[c] * (1.0 - settings.dropout)
                 missed[c] *= settings.dropout
+    return found
 
 
 @njit_internal

@@ -44,6 +44,7 @@ from slamgym.sim_configs import drawn_scenario, load_scenario
 ID = "slamgym/ActiveSlam-v0"
 LEVELS = ["active_easy", "active_medium", "active_hard"]
 LIMITS = np.array([1.0, 1.0])
+PLANNERS = ("coverage", "frontier", "revisit", "greedy", "mpc")
 RING = {"layout": "ring", "count": 5, "radius": 3.0}
 
 
@@ -215,6 +216,10 @@ def test_settings_survive_a_spec_written_as_json():
             r"scenario must have sensor\.identities = true",
         ),
         ({"accuracy": 0.0}, "accuracy must be a finite number > 0"),
+        ({"crash_cost": -5}, "crash_cost must be a finite number >= 0, got -5"),
+        ({"success_reward": math.nan}, "success_reward must be a finite number >= 0"),
+        ({"step_cost": math.inf}, "step_cost must be a finite number >= 0, got inf"),
+        ({"effort_cost": "x"}, "effort_cost must be a finite number >= 0, got 'x'"),
         ({"criterion": "B"}, "criterion must be one of D, A, E, got 'B'"),
         ({"stesp": 3}, "unknown key 'stesp' in the scenario; did you mean 'steps'"),
         ({"estimator": "efk"}, "unknown estimator 'efk'; did you mean 'ekf'"),
@@ -509,9 +514,74 @@ def test_gymnasiums_time_limit_holds_in_many_worlds_too():
     assert cut == [[False, False], [False, False], [True, True]]
 
 
-def test_many_worlds_are_not_drawn():
-    with pytest.raises(ValueError, match="render_mode must be None"):
-        ActiveSlamVectorEnv(2, render_mode="rgb_array")
+def test_frames_of_many_worlds_show_their_beliefs():
+    vector = ActiveSlamVectorEnv(2, "active_easy", render_mode="rgb_array")
+    vector.reset(seed=0)
+    vector.step(np.array([[0.5, 0.0], [0.0, 0.3]]))
+    shown = vector.render()
+    vector.show_beliefs([None, None])
+    for frame, bare in zip(shown, vector.render(), strict=True):
+        assert (frame != bare).any()
+    vector.close()
+
+
+def test_the_seeds_of_many_worlds_are_told():
+    vector = ActiveSlamVectorEnv(3, "active_easy")
+    vector.reset(seed=5)
+    assert vector.np_random_seed == (5, 6, 7)
+
+
+@pytest.mark.slow
+def test_stable_baselines_gets_images_of_many_worlds():
+    pytest.importorskip("stable_baselines3", reason="needs Stable-Baselines3")
+    from slamgym.envs.vector import to_stable_baselines
+
+    settings = {"render_mode": "rgb_array", "autoreset_mode": "SameStep"}
+    worlds = to_stable_baselines(ActiveSlamVectorEnv(2, "active_easy", **settings))
+    worlds.reset()
+    assert [image.shape for image in worlds.get_images()] == [(600, 600, 3)] * 2
+    worlds.close()
+
+
+@pytest.mark.slow
+def test_episodes_are_filmed(tmp_path):
+    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
+    env = gym.make(ID, scenario="active_easy", steps=3, render_mode="rgb_array")
+    env = gym.wrappers.RecordVideo(env, str(tmp_path / "videos"))
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step([0.1, 0.1])
+    env.close()
+    assert list(tmp_path.glob("videos/*.mp4"))
+
+
+@pytest.mark.parametrize("name", [ID, "slamgym/LandmarkWorld-v0"])
+def test_the_specification_has_the_length_of_the_episodes(name):
+    env = gym.make(name, steps=7)
+    assert env.spec.max_episode_steps == 7
+    assert gym.make(name, max_episode_steps=3).spec.max_episode_steps == 3
+    aware = gym.wrappers.TimeAwareObservation(env)
+    assert aware.reset(seed=0)[0] in aware.observation_space
+
+
+@pytest.mark.parametrize("name", [ID, "slamgym/LandmarkWorld-v0"])
+def test_an_unknown_keyword_is_a_type_error_as_for_any_function(name):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
+        gym.make(name, frameskip=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [ID, "slamgym/LandmarkWorld-v0"])
+@pytest.mark.filterwarnings("ignore")
+def test_torchrl_makes_and_collects(name):
+    envs = pytest.importorskip("torchrl.envs", reason="needs TorchRL")
+    collectors = pytest.importorskip("torchrl.collectors")
+    envs.check_env_specs(envs.GymEnv(name))
+    collect = getattr(collectors, "Collector", None) or collectors.SyncDataCollector
+    sizes = {"frames_per_batch": 20, "total_frames": 40}
+    collected = collect(lambda: envs.GymEnv(name), None, **sizes)
+    assert [batch.numel() for batch in collected] == [20, 20]
+    collected.shutdown()
 
 
 # the floor
@@ -629,7 +699,7 @@ def scores():
 @pytest.mark.slow
 def test_whoever_looks_does_better_than_chance(scores):
     chance = mean_of(scores["random"], "total").value
-    for name in ("coverage", "greedy", "revisit"):
+    for name in PLANNERS:
         assert mean_of(scores[name], "total").value > chance + 4
         assert mean_of(scores[name], "known").value > 0.75
     assert mean_of(scores["coverage"], "success").value == 1
@@ -637,7 +707,7 @@ def test_whoever_looks_does_better_than_chance(scores):
 
 @pytest.mark.slow
 def test_those_who_plan_do_not_touch_a_wall(scores):
-    for name in ("coverage", "greedy", "revisit"):
+    for name in PLANNERS:
         assert not any(episode.crashed for episode in scores[name])
 
 
@@ -663,9 +733,10 @@ def test_lanes_show_the_whole_floor(level):
     assert seen.mean() > 0.97
 
 
-def test_thinking_ahead_leaves_the_estimator_as_it_was():
+@pytest.mark.parametrize("name", ["greedy", "mpc"])
+def test_thinking_ahead_leaves_the_estimator_as_it_was(name):
     env = ActiveSlamEnv("active_medium")
-    baseline = make_baseline("greedy", env.scenario, np.random.default_rng(0))
+    baseline = make_baseline(name, env.scenario, np.random.default_rng(0))
     env.reset(seed=0)
     for _ in range(10):
         before = env.knowledge.estimator.state_dict()

@@ -167,11 +167,12 @@ def test_new_landmarks_are_expected_where_a_plan_looks_first():
     points, counts = [(8.0, 0.0), (-3.0, 0.0), (20.0, 0.0)], [0.5, 0.2, 9.0]
     sight = sensor(field_of_view=1.0)
     found = imagine(slam, [ahead, turning], sight, density=(points, counts))
-    np.testing.assert_allclose(found.new_landmarks, [[0.5, 0.2]])
+    np.testing.assert_allclose(found.new_landmarks[0, :, -1], [0.5, 0.2])
+    assert found.new_landmarks[0, 1].tolist() == [0.0, 0.0, 0.2, 0.2]
     sight.dropout = 0.1
     lossy = imagine(slam, [ahead, turning], sight, density=(points, counts))
-    np.testing.assert_allclose(lossy.new_landmarks[0, 0], 0.5 * (1 - 0.1**2))
-    assert imagine(slam, [ahead], sight).new_landmarks == 0.0
+    np.testing.assert_allclose(lossy.new_landmarks[0, 0, -1], 0.5 * (1 - 0.1**2))
+    assert not imagine(slam, [ahead], sight).new_landmarks.any()
 
 
 def test_a_robot_at_rest_has_noise_as_in_the_filter():

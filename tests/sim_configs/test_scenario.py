@@ -46,10 +46,12 @@ def mistake_of(**changes):
     [
         ({"sensor": {"max_rage": 3.0}},
          "unknown key 'max_rage' in sensor; did you mean 'max_range'?"),
-        ({"stesp": 3}, "unknown key 'stesp' in the scenario; did you mean 'steps'?"),
+        ({"stesp": 3}, "unexpected keyword argument 'stesp': "
+         "unknown key 'stesp' in the scenario; did you mean 'steps'?"),
         ({"landmarks": {"layout": "ring", "raduis": 3.0, "count": 3}},
          "unknown key 'raduis' in landmarks; did you mean 'radius'?"),
-        ({"zzz": 3}, "unknown key 'zzz' in the scenario"),
+        ({"zzz": 3}, "unexpected keyword argument 'zzz': "
+         "unknown key 'zzz' in the scenario"),
     ],
 )  # fmt: skip
 def test_an_unknown_key_is_refused_with_a_suggestion(changes, message):

@@ -1,0 +1,292 @@
+"""Planning in belief space: imagine many plans, and take the first step of the best.
+
+The value of a plan, in the units of the task's reward, is what it is expected to gain:
+
+* the decrease of ½ log det of the map's covariance, per landmark;
+* for every landmark expected to be found, the same of its own uncertainty, which is
+  that of the pose it is seen from, and of the reading;
+* a bonus for every landmark that becomes known.
+
+A missing landmark is equally likely in any unseen cell, and less so in cells seen.
+
+A horizon of a few steps does not reach what is far away. Attractors [1]_ therefore
+stand for it: a plan also gains by ending near a goal that it leaves for later.
+
+References
+----------
+.. [1] C. Leung, S. Huang, G. Dissanayake, Active SLAM using model predictive control
+   and attractor based exploration, IROS 2006.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..arrays import Array, BoolArray, IndexArray
+from ..envs.angles import wrap_angle
+from ..estimator.filters.imagine import imagine
+from ..estimator.kernels.imagine import Imagined
+from .agent_knowledge import AgentKnowledge, as_points
+from .belief_features import largest_variances
+
+_CLEARANCE = 0.5  # of arcs, distance kept from walls beyond the robot's radius [m]
+_MARGIN = 1.0  # of goals, distance kept from the walls [m]
+_ALIGNED = 0.5  # heading error below which a robot drives while it turns [rad]
+_TURNS = (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)  # of the largest turn rate
+
+
+class PlannerSettings(NamedTuple):
+    """What a planner considers, and how it values plans."""
+
+    horizon: int
+    """Steps of a plan."""
+    straight: tuple[int, ...]
+    """Steps that a robot drives straight on after a turn."""
+    goals: int
+    """Unseen cells to drive to, at most; 0 leaves arcs alone."""
+    known_bonus: float
+    """For every landmark that becomes known."""
+    discount: float
+    """Of landmarks found a step later."""
+    overlooked: float
+    """Probability that a landmark in a cell in view is not seen."""
+    persistence: float
+    """For the rest of the tour chosen before, so that the robot does not dither."""
+    attraction: float
+    """Per metre nearer to a goal that is left for later."""
+
+
+MPC = PlannerSettings(
+    horizon=20,
+    straight=(20,),
+    goals=12,
+    known_bonus=1.5,
+    discount=0.9,
+    overlooked=0.3,
+    persistence=0.1,
+    attraction=0.06,
+)
+GREEDY = MPC._replace(straight=(2, 5, 10), goals=0)
+"""Looks as far ahead, along motions that turn and then drive straight on."""
+
+
+class BeliefSpacePlanner:
+    """Takes the first step of the plan with the largest expected gain.
+
+    The plans turn and then drive straight on, and with goals also drive to one goal
+    and then to another: unseen cells, mapped landmarks not yet known, and the
+    landmark known best.
+
+    Parameters
+    ----------
+    settings : PlannerSettings
+        `GREEDY` or `MPC`.
+    """
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        self._settings = settings
+        self._tour: Array | None = None
+        self._chance: Array = np.empty(0)
+
+    def act(self, knowledge: AgentKnowledge) -> Array:
+        """Choose (v, ω) [m/s, rad/s]; see `Baseline.act`."""
+        settings = self._settings
+        self._look(knowledge)
+        plans, tours = _arcs(knowledge, settings), np.empty((0, 2, 2))
+        arcs = len(plans)
+        if settings.goals:
+            tours = _tours(knowledge, self._chance, settings.goals)
+        if self._tour is not None:
+            tours = np.concatenate([tours, _rest(knowledge, self._tour)[None]])
+        driven = _driven(knowledge, tours, settings.horizon)
+        plans = np.concatenate([plans, driven])
+        values = plan_values(knowledge, plans, self._chance, settings)
+        values[-1] += settings.persistence * (self._tour is not None)
+        best = int(np.argmax(values))
+        self._tour = tours[best - arcs] if best >= arcs else None
+        return np.asarray(plans[best, 0] / knowledge.scenario.dt)
+
+    def _look(self, knowledge: AgentKnowledge) -> None:
+        """Lower the chance of a missing landmark in the cells in view."""
+        explored, overlooked = knowledge.explored, self._settings.overlooked
+        if knowledge.step == 0 or len(self._chance) != len(explored):
+            self._tour, self._chance = None, np.where(explored, overlooked, 1.0)
+            return
+        seen = knowledge.grid.visible_from(knowledge.belief.pose[None])[0]
+        self._chance[seen] *= overlooked
+
+
+def _rest(knowledge: AgentKnowledge, tour: Array) -> Array:
+    """Return what is left of a tour: its second goal where the first is reached."""
+    longest = knowledge.scenario.robot.max_speed * knowledge.scenario.dt
+    near = np.hypot(*(tour[0] - knowledge.belief.pose[:2])) < 0.5 * longest
+    return np.asarray(tour[[1, 1]] if near else tour)
+
+
+def plan_values(
+    knowledge: AgentKnowledge, plans: Array, chance: Array, settings: PlannerSettings
+) -> Array:
+    """Return the expected gain of plans (K, T, 2), (K,); -inf where one hits a wall.
+
+    Parameters
+    ----------
+    chance : ndarray, shape (C,)
+        How likely a missing landmark is in a cell, up to a factor.
+    """
+    scenario, size = knowledge.scenario, len(knowledge.known)
+    slam: Any = knowledge.estimator
+    missing = size - len(knowledge.belief.landmark_ids)
+    points = as_points(knowledge.grid.cells)
+    counts = missing * chance / chance.sum()
+    kept = counts > 0.02 * counts.max() if missing else counts > 0
+    density = points[kept], counts[kept]
+    now = np.linalg.slogdet(knowledge.belief.covariance[3:, 3:])[1]
+    steps = plans.shape[1]
+    values = np.zeros(len(plans))
+    for horizon in (steps // 2, steps):
+        after = imagine(
+            slam,
+            plans[:, :horizon],
+            scenario.sensor,
+            walls=scenario.walls,
+            density=density if horizon == steps else None,
+        )
+        known = after.worst_variances[0] <= knowledge.accuracy**2
+        values += 0.25 * (now - after.log_det[0]) / size
+        values += 0.5 * settings.known_bonus * known.sum(axis=1)
+    found = np.diff(after.new_landmarks[0], axis=1, prepend=0.0)
+    values += (_worth(knowledge, after, settings) * found) @ (
+        settings.discount ** np.arange(steps)
+    )
+    values -= settings.attraction * _distance_to_rest(knowledge, after, known)
+    values[~_is_free(knowledge, after.poses[0])] = -math.inf
+    return values
+
+
+def _worth(
+    knowledge: AgentKnowledge, after: Imagined, settings: PlannerSettings
+) -> Array:
+    """Return the value of a landmark found at each step of plans, (K, T).
+
+    Its uncertainty is that of the pose it is seen from, and of the reading.
+    """
+    sensor, P = knowledge.scenario.sensor, after.pose_covariances[0]
+    distance = 0.6 * min(sensor.max_range, knowledge.grid.diagonal)
+    variance = largest_variances(P[..., :2, :2]) + sensor.std[1] ** 2
+    std = np.sqrt(variance + distance**2 * (P[..., 2, 2] + sensor.std[0] ** 2))
+    size = len(knowledge.known)
+    gain = sum(np.log(prior / std) for prior in knowledge.prior_std) / size
+    certain = 1.0 / (1.0 + (std / knowledge.accuracy) ** 8)
+    return np.asarray(gain + settings.known_bonus * certain)
+
+
+def _distance_to_rest(
+    knowledge: AgentKnowledge, after: Imagined, known: BoolArray
+) -> Array:
+    """Return the distance from the end of plans to the nearest goal left, (K,) [m]."""
+    ends = after.poses[0, :, -1, :2]
+    landmarks = knowledge.belief.landmarks
+    away = np.hypot(*(landmarks - ends[:, None]).transpose(2, 0, 1))
+    away[known] = math.inf
+    if len(knowledge.belief.landmark_ids) < len(knowledge.known):
+        unseen = as_points(knowledge.grid.cells[~knowledge.explored])
+        seen = knowledge.grid.visible_from(after.poses[0].reshape(-1, 3))
+        shape = *after.poses.shape[1:3], seen.shape[1]
+        found: BoolArray = np.logical_or.reduce(seen.reshape(shape), axis=1)
+        left = ~found[:, ~knowledge.explored]
+        cells = np.hypot(*(unseen - ends[:, None]).transpose(2, 0, 1))
+        away = np.concatenate([away, np.where(left, cells, math.inf)], axis=1)
+    nearest = away.min(axis=1, initial=math.inf)
+    return np.where(np.isfinite(nearest), nearest, 0.0)
+
+
+def _is_free(knowledge: AgentKnowledge, poses: Array) -> BoolArray:
+    """Return which plans keep clear of walls, or turn on the spot."""
+    clearance = knowledge.scenario.robot.radius + _CLEARANCE
+    gap = knowledge.grid.clearance(poses[..., :2])
+    here = knowledge.grid.clearance(knowledge.belief.pose[None, :2])[0]
+    return np.asarray((gap >= min(clearance, here - 1e-9)).all(axis=1))
+
+
+def _arcs(knowledge: AgentKnowledge, settings: PlannerSettings) -> Array:
+    """Return plans that turn, drive straight on, and turn on the spot, (K, T, 2)."""
+    robot, dt = knowledge.scenario.robot, knowledge.scenario.dt
+    longest, turning = robot.max_speed * dt, robot.max_turn_rate * dt
+    plans = []
+    for drive, steps in ((1.0, 1), (1.0, 4), (0.0, 3), (0.0, settings.horizon)):
+        for straight in settings.straight if steps < settings.horizon else (0,):
+            for turn in _TURNS:
+                plan = np.tile((0.0, turning), (settings.horizon, 1))
+                plan[: steps + straight] = longest, 0.0
+                plan[:steps] = drive * longest, turn * turning
+                plans.append(plan)
+    return np.array(plans)
+
+
+def _tours(knowledge: AgentKnowledge, chance: Array, cells: int) -> Array:
+    """Return pairs of goals to drive to one after the other, (K, 2, 2) [m]."""
+    belief, grid = knowledge.belief, knowledge.grid
+    position = belief.pose[:2]
+    ids = list(belief.landmark_ids)
+    unknown = belief.landmarks[~knowledge.known[ids]]
+    first, second = [unknown], [position[None]]
+    if ids:
+        blocks = belief.covariance[3:, 3:].diagonal().reshape(-1, 2).sum(axis=1)
+        best = belief.landmarks[[int(np.argmin(blocks))]]
+        first.append(best)
+        second.append(best)
+    if len(unknown):
+        second.append(unknown[[int(_distances(unknown, position).argmin())]])
+    if len(ids) < len(knowledge.known):
+        unseen = as_points(grid.cells[chance >= chance.max()])
+        spread = unseen[_spread_out(unseen, position, cells)]
+        first.append(spread)
+        second.append(spread[:1])
+    starts, ends = np.concatenate(first), np.concatenate(second)
+    pairs = np.empty((len(starts), len(ends), 2, 2))
+    pairs[:, :, 0], pairs[:, :, 1] = starts[:, None], ends
+    left, bottom, right, top = grid.bounds
+    low, high = (left + _MARGIN, bottom + _MARGIN), (right - _MARGIN, top - _MARGIN)
+    return np.clip(pairs.reshape(-1, 2, 2), low, high)
+
+
+def _spread_out(points: Array, position: Array, most: int) -> IndexArray:
+    """Return the nearest of points, then those farthest from all chosen before."""
+    if not len(points):
+        return np.empty(0, dtype=np.intp)
+    chosen = [int(_distances(points, position).argmin())]
+    gap = _distances(points, points[chosen[0]])
+    while len(chosen) < min(most, len(points)):
+        chosen.append(int(gap.argmax()))
+        gap = np.minimum(gap, _distances(points, points[chosen[-1]]))
+    return np.array(chosen)
+
+
+def _driven(knowledge: AgentKnowledge, tours: Array, steps: int) -> Array:
+    """Return plans that drive to the goals of tours (K, 2, 2), (K, T, 2).
+
+    A robot at its last goal turns on the spot and looks around.
+    """
+    robot, dt = knowledge.scenario.robot, knowledge.scenario.dt
+    longest, turning = robot.max_speed * dt, robot.max_turn_rate * dt
+    x, y, heading = np.tile(knowledge.belief.pose, (len(tours), 1)).T
+    leg, plans = np.zeros(len(tours), dtype=np.intp), np.empty((len(tours), steps, 2))
+    each = np.arange(len(tours))
+    for t in range(steps):
+        goal = tours[each, np.minimum(leg, 1)]
+        dx, dy = goal[:, 0] - x, goal[:, 1] - y
+        distance = np.hypot(dx, dy)
+        arrived = distance < 0.5 * longest
+        error = wrap_angle(np.arctan2(dy, dx) - heading)
+        turn = np.clip(np.where(arrived, turning, error), -turning, turning)
+        ahead = (np.abs(error) < _ALIGNED) & ~arrived
+        drive = np.where(ahead, np.minimum(distance, longest), 0.0)
+        plans[:, t] = np.column_stack([drive, turn])
+        x, y = x + drive * np.cos(heading), y + drive * np.sin(heading)
+        heading, leg = heading + turn, leg + arrived
+    return plans
+
+
+def _distances(points: Array, position: Array) -> Array:
+    return np.asarray(np.hypot(*(points - position).T))
