@@ -52,7 +52,8 @@ class UpdateReport:
     )
     """L, shape (2m, 2m), lower triangular, L Lᵀ = S; or a function that returns it."""
     confirmed_ids: tuple[int, ...] = ()
-    """Landmarks among ``added_ids`` that were tentative before."""
+    """Landmarks that were tentative before: among ``added_ids``, or among those
+    associated where the filter has applied their earlier sightings."""
     removed_ids: tuple[int, ...] = ()
     """Landmarks marginalised: missed too often, or beyond the map's capacity."""
     merged_ids: tuple[tuple[int, int], ...] = ()

@@ -102,7 +102,8 @@ class DecisionRecorder:
         """Note an update with readings of true landmarks, shape (m,), if known."""
         self._true_ids.append(true_ids)
         if not isinstance(self._slam, SupportsDecisions):
-            added = tuple(i for i in report.row_ids if i in report.added_ids)
+            new = {*report.added_ids, *report.confirmed_ids}
+            added = tuple(i for i in report.row_ids if i in new)
             self._reported.append(ScanDecisions(report.row_ids, added))
 
     def result(self) -> RunDecisions | None:
