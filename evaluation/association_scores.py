@@ -15,6 +15,7 @@ Readings before the confirming one count where the filter applied them in the en
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -115,18 +116,10 @@ def score_association(
     scans = _checked(decisions, true_ids)
     seen = [[_place(places, i) for i in row.tolist()] for row in scans]
     owners = _owners(zip(decisions, seen, strict=True))
-    counts = dict.fromkeys(AssociationScores._fields, 0)
+    counts = Counter(dict.fromkeys(AssociationScores._fields, 0))
     in_map: dict[int, int] = {}
     for made, scan in zip(decisions, seen, strict=True):
-        new: set[int] = set()
-        for landmark, place in zip(made.row_ids, scan, strict=True):
-            is_new = landmark in made.added and landmark not in new
-            outcome = _outcome(landmark, place, in_map, owners, is_new=is_new)
-            if outcome is not None:
-                counts[outcome] += 1
-            if is_new and landmark is not None:
-                new.add(landmark)
-                in_map[landmark] = place
+        counts.update(_outcomes(made, scan, in_map, owners))
         for gone in (*made.removed, *(gone for _, gone in made.merged)):
             in_map.pop(gone, None)
     counts["map_size"] = len(in_map)
@@ -224,24 +217,32 @@ def known_places(seen: Sequence[Sequence[int]], confirm: tuple[int, int]) -> set
     }
 
 
-def _outcome(
-    landmark: int | None,
-    place: int,
-    in_map: Mapping[int, int],
+def _outcomes(
+    made: ScanDecisions,
+    scan: Sequence[int],
+    in_map: dict[int, int],
     owners: Mapping[int, int],
-    *,
-    is_new: bool,
-) -> str | None:
-    """Return which count one decision adds to; None for a harmless one."""
-    is_clutter = place == CLUTTER
-    if landmark is None:
-        return "missed" if not is_clutter and place in in_map.values() else None
-    if is_new:
-        is_known = place in in_map.values()
-        return "ghost" if is_clutter else "duplicate" if is_known else "new_correct"
-    if is_clutter:
-        return "clutter_used"
-    return "correct" if owners.get(landmark) == place else "wrong"
+) -> Iterator[str]:
+    """Yield which counts the decisions about a scan add to; put new ones in the map."""
+    new = set(made.added)
+    for landmark, place in zip(made.row_ids, scan, strict=True):
+        if landmark is None:
+            if place != CLUTTER and place in in_map.values():
+                yield "missed"
+        elif landmark in new:
+            yield _kind_of_new(place, in_map)
+            new.remove(landmark)
+            in_map[landmark] = place
+        elif place == CLUTTER:
+            yield "clutter_used"
+        else:
+            yield "correct" if owners.get(landmark) == place else "wrong"
+
+
+def _kind_of_new(place: int, in_map: Mapping[int, int]) -> str:
+    if place == CLUTTER:
+        return "ghost"
+    return "duplicate" if place in in_map.values() else "new_correct"
 
 
 def _owners(

@@ -183,9 +183,8 @@ def _checked_density(
             f"density must be points (C, 2) and counts (C,) or ({count}, C), "
             f"got {points.shape} and {weights.shape}"
         )
-    if not (
-        np.isfinite(points).all() and (np.isfinite(weights) & (weights >= 0)).all()
-    ):
+    usable = [np.isfinite(points), np.isfinite(weights), weights >= 0]
+    if not all(entries.all() for entries in usable):
         raise ValueError("density must be finite points and finite counts >= 0")
     spread = np.broadcast_to(weights, (count, *shape))
     return np.ascontiguousarray(points.T), np.ascontiguousarray(spread)

@@ -118,16 +118,13 @@ def as_policy(value: "LandmarkPolicy | Mapping[str, Any] | bool") -> LandmarkPol
             f"got {value!r}"
         )
     given = dict(value)
+    if isinstance(given.get("constellations"), bool):
+        given["constellations"] = {} if given["constellations"] else None
     if isinstance(given.get("view"), Mapping):
         given["view"] = _made(FieldOfView, "management.view", given["view"])
-    rules = given.get("constellations")
-    if isinstance(rules, Mapping) or rules is True:
-        fields_of_rules = {} if rules is True else rules
-        given["constellations"] = _made(
-            Constellations, "management.constellations", fields_of_rules
-        )
-    elif rules is False:
-        given["constellations"] = None
+    if isinstance(rules := given.get("constellations"), Mapping):
+        name = "management.constellations"
+        given["constellations"] = _made(Constellations, name, rules)
     return _made(LandmarkPolicy, "management", given)
 
 

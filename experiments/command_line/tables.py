@@ -127,17 +127,16 @@ def smoothing_table(summary: dict[str, Any]) -> Table:
     table = Table(box=None, pad_edge=False)
     for heading in ("", summary["follows"], "smoother"):
         table.add_column(Text(heading), justify="left" if not heading else "right")
-    for name, key in (("path error", "ate"), ("map error", "landmark_rmse")):
+    for name, key, kind in (
+        ("path error, raw [m RMS]", "ate", "raw"),
+        ("path error, aligned [m RMS]", "ate", "aligned"),
+        ("map error, raw [m RMS]", "landmark_rmse", "raw"),
+        ("map error, aligned [m RMS]", "landmark_rmse", "aligned"),
+        ("pose NEES per degree, 1 expected", "nees", "per_degree"),
+    ):
         pair = [summary[key][side] for side in ("filter", "smoother")]
-        if None in pair:
-            continue
-        for kind in ("raw", "aligned"):
-            cells = [significant(errors[kind]) for errors in pair]
-            table.add_row(f"{name}, {kind} [m RMS]", *cells)
-    pair = [summary["nees"][side] for side in ("filter", "smoother")]
-    if None not in pair:
-        cells = [significant(numbers["per_degree"]) for numbers in pair]
-        table.add_row("pose NEES per degree, 1 expected", *cells)
+        if None not in pair:
+            table.add_row(name, *(significant(numbers[kind]) for numbers in pair))
     return table
 
 

@@ -54,21 +54,17 @@ def noise_header(graph: Graph, chain: Sequence[LogLine]) -> dict[str, str]:
     is_toro = any(line.text.startswith("VERTEX2 ") for line in graph.vertices)
     motion = np.array([_motion_std(line, is_toro=is_toro) for line in chain])
     header = {"motion_std": numbers(*np.median(motion, axis=0))}
-    differ = not _alike(motion)
+    are_alike = _alike(motion)
     lines = [line for at_pose in graph.readings.values() for line in at_pose]
-    sighted = np.array([_reading_std(line) for line in lines]).reshape(-1, 3)
-    if len(sighted):
-        bearing, across, along = sighted.T
-        is_of_positions = _spread(across) < _spread(bearing)
-        sideways = np.median(across if is_of_positions else bearing)
-        if is_of_positions:
-            header["bearing_std_metres"] = numbers(sideways)
-        bearing_std = 0.0 if is_of_positions else sideways
+    if lines:
+        bearing, across, along = np.array([_reading_std(line) for line in lines]).T
+        sideways, bearing_std = bearing, float(np.median(bearing))
+        if _spread(across) < _spread(bearing):
+            sideways, bearing_std = across, 0.0
+            header["bearing_std_metres"] = numbers(np.median(across))
         header["measurement_std"] = numbers(bearing_std, np.median(along))
-        differ |= not _alike(
-            np.column_stack([across if is_of_positions else bearing, along])
-        )
-    what = "the medians of its differing" if differ else "its"
+        are_alike &= _alike(np.column_stack([sideways, along]))
+    what = "its" if are_alike else "the medians of its differing"
     return {**header, "noise": f"from the file, by {what} information matrices"}
 
 

@@ -93,7 +93,10 @@ def _suspicions(entry: Mapping[str, Any]) -> Iterator[str]:
             f"NIS is {nis:.3g} per degree of freedom: the filter assumes {amount} "
             "noise, or associates wrongly."
         )
-    scores = entry.get("association") or {}
+    yield from _split_map(entry.get("association") or {})
+
+
+def _split_map(scores: Mapping[str, float | None]) -> Iterator[str]:
     size, true_size = scores.get("map_size"), scores.get("true_map_size")
     if size and true_size and size > LARGE_MAP * true_size:
         yield (
