@@ -31,7 +31,7 @@ def _decision_order(feasible: BoolArray, innovations: Array) -> IntArray:
 
     Ties are broken by the readings themselves: the order of the scan has no effect.
     """
-    _, options = _candidates(feasible)
+    options = feasible.sum(axis=1)
     order = np.arange(len(options))
     for i in range(1, len(options)):
         k = i

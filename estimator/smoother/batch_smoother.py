@@ -123,7 +123,7 @@ def _best(
 
 
 def _places(landmarks: Mapping[int, ArrayLike], order: IntArray) -> dict[int, Array]:
-    """Return landmarks that the user gave, each of which has a reading."""
+    """Return the landmarks given by the user; each has a reading."""
     known = set(order.tolist())
     given = {
         i: argument_checks.finite_vector(f"landmarks[{i}]", place, 2)

@@ -4,7 +4,7 @@ from typing import Any
 
 from rich.table import Table
 
-from .tables import significant
+from .tables import named_rows, significant
 
 
 def association_table(scores: dict[str, Any]) -> Table:
@@ -18,13 +18,7 @@ def association_table(scores: dict[str, Any]) -> Table:
     title = "Association"
     if scores["resolution"]:
         title += f", landmarks nearer than {scores['resolution']:g} m counted as one"
-    table = Table(title=title, title_justify="left", box=None, show_header=False)
-    table.pad_edge = False
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column()
-    for name, text in _rows(scores):
-        table.add_row(name, text)
-    return table
+    return named_rows(_rows(scores), title)
 
 
 def _rows(scores: dict[str, Any]) -> list[tuple[str, str]]:

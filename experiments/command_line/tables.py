@@ -33,10 +33,17 @@ def landmark_table(summary: dict[str, Any]) -> Table:
 
 def key_figures(summary: dict[str, Any]) -> Table:
     """Lay out the few numbers that describe the quality of a run."""
-    table = Table(box=None, show_header=False, pad_edge=False)
+    return named_rows(_figures(summary))
+
+
+def named_rows(rows: Sequence[tuple[str, str]], title: str | None = None) -> Table:
+    """Lay out rows of a name and a text."""
+    table = Table(
+        title=title, title_justify="left", box=None, show_header=False, pad_edge=False
+    )
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
-    for name, text in _figures(summary):
+    for name, text in rows:
         table.add_row(name, text)
     return table
 
@@ -142,14 +149,14 @@ def smoothing_table(summary: dict[str, Any]) -> Table:
 
 def smoothing_figures(summary: dict[str, Any]) -> Table:
     """Lay out what was smoothed, and how well the readings fit."""
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column()
     cost = summary["cost"]
     first, last = significant(cost["first"]), significant(cost["last"])
     ratio = significant(cost["per_degree"])
     sizes = "{readings} of {landmarks} landmarks, from {poses} poses"
-    table.add_row("readings", sizes.format(**summary))
-    table.add_row("cost", f"{first}, then {last} after {summary['iterations']} steps")
-    table.add_row("misfit", f"{ratio} per degree of freedom; 1 is expected")
-    return table
+    return named_rows(
+        [
+            ("readings", sizes.format(**summary)),
+            ("cost", f"{first}, then {last} after {summary['iterations']} steps"),
+            ("misfit", f"{ratio} per degree of freedom; 1 is expected"),
+        ]
+    )

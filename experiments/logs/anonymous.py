@@ -1,4 +1,4 @@
-"""Logs whose readings do not say of which landmark they are."""
+"""Logs whose readings have no identity."""
 
 from dataclasses import replace
 

@@ -109,7 +109,7 @@ class DecisionRecorder:
     def result(self) -> RunDecisions | None:
         """Return the decisions as they stand now.
 
-        None where the estimator tells none, or a true landmark is unknown.
+        None if the estimator reports none, or a true landmark is unknown.
         """
         made: Sequence[ScanDecisions] = self._reported
         if isinstance(self._slam, SupportsDecisions):

@@ -48,7 +48,7 @@ class Replay:
     last_seen: Mapping[int, int] = field(default_factory=dict)
     """The step of the last reading of each landmark."""
     decisions: RunDecisions | None = None
-    """What it decided about readings without identity, if the log tells their truth."""
+    """Its decisions about readings without identity, if the log has true ids."""
 
 
 def replay(

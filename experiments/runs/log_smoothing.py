@@ -94,9 +94,9 @@ def summarise_smoothing(
         ``log``, ``follows``, the name of the filter, ``settings``, ``slamgym``;
         ``steps`` and ``scans`` of the log; ``poses``, ``readings`` and ``landmarks``
         that were smoothed; ``cost``, half the sum of squares, at the ``first`` and the
-        last estimate and ``per_degree``, of which 1 is expected without a robust
-        kernel; ``iterations``; ``ate``, ``landmark_rmse`` and ``nees`` (of the pose),
-        each of ``filter`` and ``smoother``, None where the truth is unknown.
+        last estimate and ``per_degree`` (1 is expected without a robust kernel);
+        ``iterations``; ``ate``, ``landmark_rmse`` and ``nees`` (of the pose), each
+        of ``filter`` and ``smoother``, None where the truth is unknown.
     """
     log, trace, drive = smoothed.log, smoothed.filtered.trace, smoothed.drive
     return {

@@ -47,7 +47,7 @@ MEANINGS: dict[str, str] = {
 def measure_association(
     runs: SimulatedRuns, filtered: FilteredRuns, run: int, resolution: float
 ) -> Mapping[str, NDArray[np.generic] | float]:
-    """Measure one run; empty where its filter tells no decisions, or failed.
+    """Measure one run; empty if its filter reports no decisions, or failed.
 
     Parameters
     ----------

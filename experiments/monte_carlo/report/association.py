@@ -32,7 +32,7 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
         Means over the runs that did not fail of ``correct``, ``wrong``,
         ``new_correct``, ``duplicate``, ``ghost``, ``missed``, ``clutter_used``,
         ``map_size``, ``true_map_size``, ``precision`` and ``recall``; None where
-        the estimator tells no decisions.  ``gospa``: ``raw`` and ``aligned`` means of
+        the estimator reports none.  ``gospa``: ``raw`` and ``aligned`` means of
         the metric and its parts, and the ``cutoff`` [m].  ``resolution`` [m].
         ``bad_runs``: ``count`` and ``share`` of all runs, failed or more than
         ``margin`` [m] worse than with known identities.  ``median_ate``: ``hidden``
