@@ -13,7 +13,7 @@ from ..arrays import Array, BoolArray, IntArray
 from ..estimator.kernels.in_view import View
 from ..estimator.kernels.log_det import half_log_det, largest_variance
 from ..estimator.models.bearing_range import wrap_angle_jit
-from ..estimator.support.jit import jit, njit_internal
+from ..jit import jit, njit_internal
 from .belief_kernels import FeatureArrays, write_belief_features
 from .floor_kernels import (
     DISTANCE,

@@ -8,7 +8,7 @@ import math
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.kernels.log_det import largest_variance
 from ..estimator.models.bearing_range import wrap_angle_jit
-from ..estimator.support.jit import jit, njit_internal
+from ..jit import jit, njit_internal
 
 Rectangle = tuple[float, float, float, float]
 

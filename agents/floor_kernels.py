@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Array, BoolArray
 from ..estimator.kernels.in_view import View, is_hidden, is_in_view
-from ..estimator.support.jit import jit, njit_internal
+from ..jit import jit, njit_internal
 from .belief_kernels import Rectangle
 
 Pose = tuple[float, float, float, float]

@@ -27,7 +27,7 @@ from scipy.stats import t as student
 from ..arrays import Array, BoolArray
 from ..estimator.models.bearing_range import reading_slopes_jit
 from ..estimator.support import argument_checks
-from ..estimator.support.jit import jit, njit_internal
+from ..jit import jit, njit_internal
 
 
 class PosteriorBound(NamedTuple):

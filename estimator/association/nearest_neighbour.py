@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, IntArray
+from ...jit import jit
 from ..models.bearing_range import wrap_angle_jit
-from ..support.jit import jit
 
 Noise = tuple[float, float, float]
 """(σβ, σr, k) of a sensor [rad, m, m/m]: a reading of range r has σr + k r."""

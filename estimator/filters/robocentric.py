@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
+from ...jit import jit, njit_internal
 from ..belief import Belief, MapView
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
-from ..support.jit import jit, njit_internal
 from ..update_report import UpdateReport
 from .ekf import EkfSlam
 

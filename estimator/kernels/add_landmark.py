@@ -1,7 +1,7 @@
 """Landmark initialisation from one reading, compiled."""
 
+from ...jit import njit_internal
 from ..models.bearing_range import located_jit
-from ..support.jit import njit_internal
 from .belief_arrays import BeliefArrays
 from .rules import AT_ESTIMATE, AT_REFERENCE, PROJECTED
 

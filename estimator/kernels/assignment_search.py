@@ -8,7 +8,7 @@ far stand at ``level[d]`` of ``shifts`` and ``joints``.
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ..support.jit import jit, njit_internal
+from ...jit import jit, njit_internal
 from .joint_readings import PAIR_BONUS, UNPAIRED, Problem, condition, fit
 
 

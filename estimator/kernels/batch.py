@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ..support.jit import jit, njit_internal
+from ...jit import jit, njit_internal
 from .predict import predict
 from .rules import as_rules
 from .scan_rows import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT

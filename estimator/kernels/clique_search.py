@@ -6,8 +6,8 @@
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
+from ...jit import jit, njit_internal
 from ..models.bearing_range import wrap_angle_jit
-from ..support.jit import jit, njit_internal
 
 
 @jit

@@ -1,7 +1,7 @@
 """One correction of a belief, compiled: linearise, condition, compose; iterated."""
 
 from ...arrays import Array, IntArray
-from ..support.jit import njit_inlined, njit_internal
+from ...jit import njit_inlined, njit_internal
 from .belief_arrays import BeliefArrays
 from .covariance_update import absorb, block_of, mirror, times
 from .linearise import linearise

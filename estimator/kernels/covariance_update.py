@@ -9,7 +9,7 @@ longer.
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ..support.jit import fma, njit_internal
+from ...jit import fma, njit_internal
 from .scan_rows import CORRECTION, FIRST, INNOVATION, JACOBIAN, ROOT, VARIANCE, WHITE
 
 # Share of a variance below which the remainder counts as rounding.

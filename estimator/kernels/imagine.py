@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import Array, IntArray
+from ...jit import jit, njit_internal
 from ..models.bearing_range import wrap_angle_jit
-from ..support.jit import jit, njit_internal
 from .in_view import View, is_hidden, is_in_view
 from .log_det import half_log_det, largest_variance
 from .predict import predict

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array
-from ..support.jit import njit_internal
+from ...jit import njit_internal
 
 _MOUNTED = 1e-6  # a point this near to the line of a wall is mounted on it [m]
 _EDGE = 1e-12  # relative; a point on the edge of the view is in view

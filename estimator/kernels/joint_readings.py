@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
+from ...jit import jit, njit_internal
 from ..models.bearing_range import expected_reading_jit, reading_slopes_jit
 from ..models.bearing_range import wrap_angle_jit as wrap
-from ..support.jit import jit, njit_internal
 
 UNPAIRED = -1
 

@@ -5,12 +5,12 @@ differ from zero: (x, y, θ, c, c+1).  A row of H is stored as these five entrie
 """
 
 from ...arrays import Array
+from ...jit import njit_internal
 from ..models.bearing_range import (
     expected_reading_jit,
     reading_slopes_jit,
     wrap_angle_jit,
 )
-from ..support.jit import njit_internal
 from .rules import AT_REFERENCE, AT_TRUTH, PROJECTED
 from .scan_rows import INNOVATION, JACOBIAN, READING
 

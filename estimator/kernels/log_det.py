@@ -3,7 +3,7 @@
 import math
 
 from ...arrays import Array
-from ..support.jit import njit_internal
+from ...jit import njit_internal
 
 
 @njit_internal

@@ -1,8 +1,8 @@
 """Prediction by one odometry reading, compiled; symbols as in the motion model."""
 
 from ...arrays import Array
+from ...jit import jit, njit_internal
 from ..models.unicycle_motion import drive_jit
-from ..support.jit import jit, njit_internal
 from .rules import AT_ESTIMATE
 
 

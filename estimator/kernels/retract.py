@@ -1,8 +1,8 @@
 """Corrections in the invariant error frame, compiled: of the mean and of P."""
 
 from ...arrays import Array
+from ...jit import fma, njit_internal
 from ..models.rigid_motion import turn_coefficients_jit
-from ..support.jit import fma, njit_internal
 from .scan_rows import CORRECTION, HEADING, TRANSPORT
 
 

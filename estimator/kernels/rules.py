@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array
-from ..support.jit import njit_inlined
+from ...jit import njit_inlined
 
 # Where Jacobians are taken.
 AT_ESTIMATE = 0

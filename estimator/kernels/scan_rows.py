@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ..support.jit import njit_internal
+from ...jit import njit_internal
 from .belief_arrays import aligned_zeros
 
 # The first rows are vectors over the whole state.

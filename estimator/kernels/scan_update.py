@@ -1,7 +1,7 @@
 """Update of one belief by one scan, compiled: screen, correct, map new landmarks."""
 
 from ...arrays import Array, IntArray
-from ..support.jit import jit
+from ...jit import jit
 from .add_landmark import add_landmark
 from .belief_arrays import BeliefArrays
 from .correct import copy_covariance, correct

@@ -3,8 +3,8 @@
 import numpy as np
 
 from ...arrays import Array, IntArray
+from ...jit import njit_internal
 from ..support.argument_checks import LARGEST
-from ..support.jit import njit_internal
 from .belief_arrays import BeliefArrays
 from .linearise import linearise
 from .rules import Rules

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array
-from ..support.jit import njit_inlined, njit_internal
+from ...jit import njit_inlined, njit_internal
 from .angles import wrap_angle
 
 wrap_angle_jit = njit_internal(wrap_angle)

@@ -19,7 +19,7 @@ References
 import numpy as np
 
 from ...arrays import Array, ComplexArray
-from ..support.jit import njit_inlined
+from ...jit import njit_inlined
 
 
 def rotation(angle: float) -> Array:

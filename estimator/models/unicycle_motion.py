@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import Array
-from ..support.jit import njit_inlined
+from ...jit import njit_inlined
 
 Real = Any  # a number, or an array of any shape
 

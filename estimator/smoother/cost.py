@@ -17,11 +17,11 @@ from math import log1p, sqrt
 import numpy as np
 
 from ...arrays import Array
+from ...jit import jit, njit_internal
 from ..kernels.rules import as_rules
 from ..kernels.screen import range_variance
 from ..models.bearing_range import expected_reading_jit, wrap_angle_jit
 from ..models.rigid_motion import composed_jit
-from ..support.jit import jit, njit_internal
 from .drive_arrays import DriveArrays
 
 SQUARED, HUBER, CAUCHY = 0.0, 1.0, 2.0

@@ -31,8 +31,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array
+from ...jit import jit, njit_internal
 from ..models.bearing_range import reading_slopes_jit
-from ..support.jit import jit, njit_internal
 from .cost import innovation, motion_residual, robust_weight
 from .drive_arrays import DriveArrays
 from .small_matrices import (

@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from ...arrays import Array, IntArray
+from ...jit import jit, njit_internal
 from ..kernels.rules import Rules, as_rules
 from ..kernels.screen import range_variance
 from ..models.bearing_range import expected_reading_jit, located_jit, wrap_angle_jit
-from ..support.jit import jit, njit_internal
 from .cost import robust_loss
 from .drive_arrays import DriveArrays
 

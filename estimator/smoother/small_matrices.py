@@ -6,7 +6,7 @@ The arguments are C-contiguous, since a kernel is compiled anew for every other 
 import numpy as np
 
 from ...arrays import Array
-from ..support.jit import njit_internal
+from ...jit import njit_internal
 
 
 @njit_internal

@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from ...arrays import Array
+from ...jit import jit, njit_internal
 from ..models.bearing_range import wrap_angle_jit
 from ..models.rigid_motion import composed_jit
-from ..support.jit import jit, njit_internal
 from .drive_arrays import DriveArrays
 from .elimination import Elimination
 from .small_matrices import complement, multiply, right_transposed

@@ -131,7 +131,7 @@ def test_the_tests_of_the_filter_pass_in_plain_python():
 
 
 def test_an_edited_kernel_is_compiled_again(tmp_path):
-    from slamgym.estimator.support.jit import discard_stale_cache
+    from slamgym.jit import discard_stale_cache
 
     source, cache = tmp_path / "kernels.py", tmp_path / "__pycache__"
     source.write_text("x = 1")

@@ -12,7 +12,7 @@ PACKAGES = (
     "agents",
     "experiments",
 )
-ARRAY_TYPES = "arrays"  # names for annotations, which every room may import
+GROUND = {"arrays", "jit"}  # beside the rooms; every room may import them
 
 
 def module_name(file):
@@ -87,7 +87,7 @@ def imports_of(module):
         if isinstance(node, ast.ImportFrom) and node.level:
             target = absolute(module, node)
             found |= {defining_module(target, alias.name) for alias in node.names}
-    return found - {module, ARRAY_TYPES}
+    return found - {module} - GROUND
 
 
 def libraries(module):

@@ -1,7 +1,7 @@
 """Copy rows and columns between the arrays of a map and a local map, compiled."""
 
 from ....arrays import Array, IntArray
-from ...support.jit import jit
+from ....jit import jit
 
 
 @jit

@@ -14,8 +14,8 @@ from typing import Any, TypeVar, cast
 from numba import config, njit, types
 from numba.extending import intrinsic
 
-SOURCES = Path(__file__).parents[1]
-"""The folder `estimator`: kernels call functions from any file in it."""
+SOURCES = Path(__file__).parent / "estimator"
+"""Kernels of any folder call functions from any file in it."""
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
@@ -67,7 +67,7 @@ def _compile(function: Kernel, *, callable_from_python: bool) -> Kernel:
 
 @cache
 def discard_stale_cache(sources: Path, cached: Path) -> None:
-    """Delete cached kernels that are older than any source file; once per folder.
+    """Delete cached kernels older than any source file or this one; once per folder.
 
     Numba compares a cached kernel with its own file only.  After an edit in the file of
     a function that the kernel calls, numba would run the old code.
@@ -77,7 +77,8 @@ def discard_stale_cache(sources: Path, cached: Path) -> None:
     sources, cached : Path
         Folder of the sources, and the folder of numba's cache.
     """
-    newest = max((f.stat().st_mtime for f in sources.rglob("*.py")), default=0.0)
+    files = [Path(__file__), *sources.rglob("*.py")]
+    newest = max(file.stat().st_mtime for file in files)
     for file in cached.glob("*.nb[ic]"):
         with suppress(OSError):  # a cache that belongs to another user
             if file.stat().st_mtime < newest:
