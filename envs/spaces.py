@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from ..sim_configs import Scenario
 from ..sim_configs.layouts import possible_positions
-from .sensors.noise_streams import MANY_STD
+from .sensors.heavy_tails import MANY_STD, largest_noise
 
 
 def action_space(scenario: Scenario) -> spaces.Box:
@@ -47,11 +47,14 @@ def count_rows(scenario: Scenario) -> int:
 
 
 def _largest_odometry(scenario: Scenario) -> tuple[float, float]:
-    robot, motion = scenario.robot, scenario.motion
-    errs = MANY_STD * (motion.noise_in == "odometry")
+    robot, motion, faults = scenario.robot, scenario.motion, scenario.present_faults
+    errs = largest_noise(faults.motion_dof) * (motion.noise_in == "odometry")
+    gain = max(1.0, 1.0 + faults.odometry_scale)
     return (
-        robot.max_speed * scenario.dt + errs * motion.std[0],
-        robot.max_turn_rate * scenario.dt + errs * motion.std[2],
+        gain * robot.max_speed * scenario.dt + errs * motion.std[0],
+        robot.max_turn_rate * scenario.dt
+        + abs(faults.odometry_turn)
+        + errs * motion.std[2],
     )
 
 
@@ -60,7 +63,10 @@ def _longest_reading(scenario: Scenario) -> float:
     reach = sensor.max_range
     if math.isinf(reach):
         reach = _farthest_landmark(scenario)
-    return reach + MANY_STD * (sensor.std[1] + sensor.range_std_per_metre * reach)
+    faults = scenario.present_faults
+    largest = largest_noise(faults.sensor_dof)
+    noise = largest * (sensor.std[1] + sensor.range_std_per_metre * reach)
+    return reach + noise + max(0.0, faults.range_bias)
 
 
 def _farthest_landmark(scenario: Scenario) -> float:
@@ -69,6 +75,7 @@ def _farthest_landmark(scenario: Scenario) -> float:
     away = possible_positions(scenario.landmarks) - start.pose[:2]
     step = scenario.robot.max_speed * scenario.dt
     if motion.noise_in == "motion":
-        step += MANY_STD * math.hypot(*motion.std[:2])
+        largest = largest_noise(scenario.present_faults.motion_dof)
+        step += largest * math.hypot(*motion.std[:2])
     drawn = MANY_STD * math.hypot(*start.std[:2])
     return float(np.hypot(*away.T).max()) + drawn + scenario.steps * step

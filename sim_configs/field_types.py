@@ -73,6 +73,7 @@ Flag = Annotated[StrictBool, expect("true or false")]
 
 Positive = Annotated[_Number, Field(gt=0), expect("a finite number > 0")]
 NotNegative = Annotated[_NotNegative, expect("a finite number >= 0")]
+Finite = Annotated[_Number, expect("a finite number")]
 PositiveOrInfinite = Annotated[
     float, Field(strict=True, allow_inf_nan=True, gt=0), expect("a number > 0, or inf")
 ]

@@ -17,8 +17,9 @@ from .scenario_errors import (
     closest,
     error_lines,
 )
-from .scenario_parts import Motion, Robot, Sensor, Start
+from .scenario_parts import Faults, Motion, Robot, Sensor, Start
 
+_NO_FAULTS = Faults()
 _Steps = Annotated[
     int, Field(strict=True, ge=2), expect("an integer >= 2")
 ]  # Gymnasium's checker refuses an episode that ends at its first step
@@ -56,6 +57,15 @@ class Scenario(Part):
     randomise: Randomise | None = Field(
         default=None, description="ranges from which every episode draws its own world"
     )
+
+    faults: Faults | None = Field(
+        default=None, description="faults of the world that no filter knows"
+    )
+
+    @property
+    def present_faults(self) -> Faults:
+        """The faults of the world, all zero where the scenario has none."""
+        return self.faults or _NO_FAULTS
 
     @model_validator(mode="after")
     def _check_walls(self) -> Self:

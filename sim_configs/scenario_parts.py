@@ -1,4 +1,4 @@
-"""Tables of a scenario: start, robot, motion noise and sensor."""
+"""Tables of a scenario: start, robot, motion noise, sensor and faults."""
 
 import math
 from typing import Annotated, Any, Literal, Self
@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from .field_types import (
     CountOrZero,
+    Finite,
     Flag,
     MeasurementStd,
     MotionStd,
@@ -21,6 +22,9 @@ from .field_types import (
     expect,
 )
 
+_Degrees = Annotated[
+    float, Field(strict=True, allow_inf_nan=True, gt=2), expect("a number > 2, or inf")
+]
 _Angle = Annotated[Positive, Field(le=2 * math.pi), expect("a number in (0, 2π] [rad]")]
 
 
@@ -143,3 +147,39 @@ class Sensor(Part):
                 f"(better mean + 4 √mean), got {self.max_clutter}"
             )
         return self
+
+
+class Faults(Part):
+    """What is wrong with the world, and is told to no filter.
+
+    A scenario without this table has no faults. No other setting changes, so filters
+    assume the nominal noise. An odometry fault needs motion: a robot that is commanded
+    to rest reads none.
+    """
+
+    odometry_scale: Annotated[
+        float,
+        Field(strict=True, allow_inf_nan=False, gt=-1),
+        expect("a finite number > -1"),
+    ] = Field(
+        default=0.0, description="s: odometry reads (1 + s) d for a distance d [1]"
+    )
+    odometry_turn: Finite = Field(
+        default=0.0, description="added to every turn of the odometry [rad per step]"
+    )
+    bearing_bias: Finite = Field(
+        default=0.0, description="added to every bearing [rad]"
+    )
+    range_bias: Finite = Field(default=0.0, description="added to every range [m]")
+    motion_dof: _Degrees = Field(
+        default=math.inf,
+        description="degrees of freedom of the motion noise, Student's t with scale "
+        "motion.std; inf (the default) for normal noise",
+        json_schema_extra=_leave_out_default,
+    )
+    sensor_dof: _Degrees = Field(
+        default=math.inf,
+        description="degrees of freedom of the sensor noise, Student's t with scale "
+        "sensor.std; inf (the default) for normal noise",
+        json_schema_extra=_leave_out_default,
+    )

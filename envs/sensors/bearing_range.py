@@ -18,8 +18,9 @@ import numpy as np
 from ...arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ...sim_configs import Scenario
 from ..angles import wrap_bearings
+from .heavy_tails import largest_noise
 from .line_of_sight import LineOfSight
-from .noise_streams import MANY_STD, SensorNoise
+from .noise_streams import SensorNoise
 
 _PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
 _UNSEEN = np.array(0.0)
@@ -56,7 +57,11 @@ class BearingRangeSensor:
         self._growth = sensor.range_std_per_metre  # of σr, per metre of range
         self._max_range = _limit(sensor.max_range, above=math.inf)
         self._half_view = _limit(sensor.field_of_view / 2, above=math.pi)
-        self._may_wrap = sensor.field_of_view / 2 + MANY_STD * bearing_std >= math.pi
+        faults = scenario.present_faults
+        self._bias = _bias(faults.bearing_bias, faults.range_bias)
+        largest = largest_noise(faults.sensor_dof) * bearing_std
+        largest += abs(faults.bearing_bias)
+        self._may_wrap = sensor.field_of_view / 2 + largest >= math.pi
         hides = sensor.occlusion and scenario.walls
         self._sight = LineOfSight(scenario.walls) if hides else None
 
@@ -71,7 +76,7 @@ class BearingRangeSensor:
 
         ::
 
-            δ = (l - p) (cos θ - i sin θ),   z = (arg δ, |δ|) + ε
+            δ = (l - p) (cos θ - i sin θ),   z = (arg δ, |δ|) + ε + bias
 
         Parameters
         ----------
@@ -103,6 +108,9 @@ class BearingRangeSensor:
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
         readings += self._scaled(error, readings[1])
+        if self._bias is not None:
+            bearings += self._bias[0]
+            readings[1] += self._bias[1]
         if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
             wrap_bearings(bearings)
         if np.count_nonzero(mask) < mask.size:
@@ -123,6 +131,11 @@ class BearingRangeSensor:
         if not self._growth:
             return error
         return np.stack([error[0], error[1] * (self._std + self._growth * ranges)])
+
+
+def _bias(bearing: float, distance: float) -> Array | None:
+    """Return the biases (bearing, range), shape (2,), or None if there is none."""
+    return np.array([bearing, distance]) if bearing or distance else None
 
 
 def _limit(value: float, above: float) -> Array | None:

@@ -13,11 +13,9 @@ import numpy as np
 
 from ...arrays import Array
 from ...sim_configs import Scenario
+from .heavy_tails import heavy_tails
 
 Row = TypeVar("Row")
-
-MANY_STD = 10.0
-"""Bound of normal noise in standard deviations; the probability beyond is 1e-23."""
 
 _FIRST_BLOCK = 16  # steps; short, so that a reset is quick
 _LONGEST_BLOCK = 128  # steps; later blocks grow to this
@@ -104,7 +102,9 @@ def sensor_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[SensorN
 def _draw_motion_noise(
     streams: Streams, scenario: Scenario, steps: int
 ) -> list[list[float]]:
-    noise = streams.motion.standard_normal((steps, 3)) * scenario.motion.std
+    unit = streams.motion.standard_normal((steps, 3))
+    degrees = scenario.present_faults.motion_dof
+    noise = heavy_tails(unit, degrees) * scenario.motion.std
     rows: list[list[float]] = noise.tolist()
     return rows
 
@@ -155,6 +155,8 @@ class SensorNoiseModel:
 
     def __init__(self, scenario: Scenario) -> None:
         self._sensor = sensor = scenario.sensor
+        faults = scenario.present_faults
+        self._degrees, self._bias = faults.sensor_dof, faults.range_bias
         bearing_std, self._std = sensor.std
         self._growth = sensor.range_std_per_metre
         range_std = 1.0 if self._growth else self._std
@@ -164,8 +166,8 @@ class SensorNoiseModel:
 
     def apply(self, draws: UnitDraws) -> SensorNoise:
         """Scale the draws of some steps or worlds."""
-        sensor, unit = self._sensor, draws.measurement
-        nearest = _nearest_readable(unit[1], self._std, self._growth)
+        sensor, unit = self._sensor, heavy_tails(draws.measurement, self._degrees)
+        nearest = _nearest_readable(unit[1], self._std, self._growth, self._bias)
         np.maximum(nearest, self._nearest, out=nearest)
         if draws.dropout is not None:
             nearest[draws.dropout < sensor.dropout] = np.inf
@@ -221,13 +223,13 @@ def _sensor_noise_by_step(
     return cast("Iterable[SensorNoise]", zip(*rows, strict=True))
 
 
-def _nearest_readable(unit: Array, std: float, per_metre: float) -> Array:
-    """Return the range r above which r + (σ + k r) ε > 0, with unit noise ε."""
+def _nearest_readable(unit: Array, std: float, per_metre: float, bias: float) -> Array:
+    """Return the range r above which r + (σ + k r) ε + bias > 0, with unit noise ε."""
     if per_metre == 0.0:
-        return -std * unit
+        return -std * unit - bias
     slope = 1.0 + per_metre * unit
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(slope > 0.0, -std * unit / slope, np.inf)
+        return np.where(slope > 0.0, (-std * unit - bias) / slope, np.inf)
 
 
 def _poisson_cdf(mean: float, largest: int) -> Array:

@@ -7,7 +7,9 @@ u = (d, α)        command: distance driven, then heading turned [m, rad]
 
 With ``noise_in = "motion"`` the robot slips and the odometry reports the command. With
 ``"odometry"`` the robot follows the command and the encoders have the noise. With
-``noise_at_rest`` off, a step with the command (0, 0) has no noise.
+``noise_at_rest`` off, a step with the command (0, 0) has no noise. The faults of the
+scenario change what the encoders report of a step that moves: s scales its distance, b
+is added to its turn.
 """
 
 from collections.abc import Sequence
@@ -45,6 +47,8 @@ class OdometrySensor:
     def __init__(self, scenario: Scenario) -> None:
         self._slips = scenario.motion.noise_in == "motion"
         self._noise_at_rest = scenario.motion.noise_at_rest
+        faults = scenario.present_faults
+        self._gain, self._turn = 1.0 + faults.odometry_scale, faults.odometry_turn
 
     def split_noise(
         self, command: Command, noise: Sequence[float]
@@ -87,10 +91,14 @@ class OdometrySensor:
         Returns
         -------
         ndarray, shape (2,)
-            Odometry (share d + εd, α + εα) [m, rad]. Walls do not affect the turn.
+            Odometry ((1 + s) share d + εd, α + b + εα) [m, rad]. Walls do not affect
+            the turn.
         """
         distance, turn = command
-        return np.array([share * distance + error[0], turn + error[1]])
+        bias = self._turn if command != (0.0, 0.0) else 0.0
+        return np.array(
+            [self._gain * (share * distance) + error[0], turn + bias + error[1]]
+        )
 
 
 class VectorOdometrySensor:
@@ -108,6 +116,8 @@ class VectorOdometrySensor:
         self._slips = scenario.motion.noise_in == "motion"
         self._noise_at_rest = scenario.motion.noise_at_rest
         self._no_slip = np.zeros((count, 3))
+        faults = scenario.present_faults
+        self._gain, self._turn = 1.0 + faults.odometry_scale, faults.odometry_turn
 
     def split_noise(self, commands: Array, noise: Array) -> tuple[Array, Array]:
         """Split noise, (B, 3), into slip, (B, 3), and odometry error, (B, 2) or ().
@@ -125,7 +135,11 @@ class VectorOdometrySensor:
 
         Overwrites the commands.
         """
+        if self._turn:
+            commands[commands.any(axis=1), 1] += self._turn
         if share is not None:
             commands[:, 0] *= share
+        if self._gain != 1.0:
+            commands[:, 0] *= self._gain
         odometry: Array = commands + error
         return odometry

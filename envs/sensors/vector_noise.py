@@ -10,6 +10,7 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IndexArray
 from ...sim_configs import Scenario
+from .heavy_tails import heavy_tails
 from .noise_streams import (
     SensorNoise,
     SensorNoiseModel,
@@ -40,6 +41,7 @@ class VectorNoise:
         steps = max(_FEWEST_STEPS, _BLOCK_NUMBERS // sum(widths))
         self._steps = min(steps, scenario.steps + 1)
         self._model = SensorNoiseModel(scenario)
+        self._motion_dof = scenario.present_faults.motion_dof
         self._motion_std = np.tile(
             scenario.motion.std, (count, 1)
         )  # tiled: numpy runs one loop
@@ -72,7 +74,8 @@ class VectorNoise:
 
     def motion(self) -> Array:
         """Return (εx, εy, εα) of this step, shape (B, 3) [m, m, rad]."""
-        noise: Array = self._motion.rows(self._place) * self._motion_std
+        unit = heavy_tails(self._motion.rows(self._place), self._motion_dof)
+        noise: Array = unit * self._motion_std
         return noise
 
     def sensor(self, worlds: IndexArray | slice | None) -> SensorNoise:

@@ -70,7 +70,7 @@ STRANGERS = {
 EVALUATION_KNOWS = {"models", "support", "error_frames", "interface", "belief"}
 MAY_IMPORT = {  # besides the standard library and lazy_loader
     "sim_configs": {"numpy", "pydantic", "pydantic_core"},
-    "envs": {"numpy", "gymnasium", "pymunk"},
+    "envs": {"numpy", "scipy", "gymnasium", "pymunk"},
     "estimator": {"numpy", "scipy", "numba", "psutil"},
     "evaluation": {"numpy", "scipy"},
     "agents": {"numpy", "gymnasium"},

@@ -32,6 +32,14 @@ ROAMING = load_scenario("six_landmarks").with_changes(
 HALF_BLIND = {"occlusion": True, "max_range": 8.0, "field_of_view": 3.0, "dropout": 0.2}
 HIDDEN = {"clutter": 1.0, "max_clutter": 5, "identities": False}
 ENCODERS = {"noise_in": "odometry", "noise_at_rest": False, "std": [0.05, 0.0, 0.04]}
+FAULTS = {
+    "odometry_scale": 0.1,
+    "odometry_turn": 0.05,
+    "bearing_bias": 0.3,
+    "range_bias": -0.2,
+    "motion_dof": 3.0,
+    "sensor_dof": 4.5,
+}
 VARIANTS = {
     "walls": {"walls": WALLS},
     "walls that hide": {"walls": WALLS, "sensor": HALF_BLIND},
@@ -41,6 +49,8 @@ VARIANTS = {
     "coarse": {"sensor": {"std": [1.0, 1.0], "min_range": 0.0}},
     "one landmark": {"landmarks": {"layout": "points", "points": [[1.0, 2.0]]}},
     "silent at rest": {"motion": {"noise_at_rest": False}},
+    "faults": {"faults": FAULTS, "motion": {"noise_at_rest": False}, "walls": WALLS},
+    "faulty encoders": {"faults": FAULTS, "motion": ENCODERS},
     "encoders": {"motion": ENCODERS, "start": {"drawn": "estimate", "std": [1, 1, 1]}},
 }
 SCENARIOS = {name: load_scenario(name) for name in list_presets()} | {

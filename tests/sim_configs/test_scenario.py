@@ -121,6 +121,20 @@ def test_a_bad_value_gets_one_line_that_names_its_field(changes, field):
     assert "\n" not in message
 
 
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ({"motion_dof": 2}, "faults.motion_dof must be a number > 2, or inf, got 2"),
+        ({"sensor_dof": "4"}, "faults.sensor_dof must be a number > 2, or inf"),
+        ({"odometry_scale": -1}, "faults.odometry_scale must be a finite number > -1"),
+        ({"range_bias": np.inf}, "faults.range_bias must be a finite number, got inf"),
+        ({"turn_bias": 0.1}, "unknown key 'turn_bias' in faults; did you mean"),
+    ],
+)
+def test_an_impossible_fault_is_refused(fault, message):
+    assert mistake_of(faults=fault).startswith(message)
+
+
 @pytest.mark.parametrize("kind", ["landmarks", "controls"])
 def test_an_unknown_kind_is_refused_with_a_suggestion(kind):
     tag, typo = {"landmarks": ("layout", "rnig"), "controls": ("sequence", "spirral")}[

@@ -1,0 +1,106 @@
+"""Faults of the world, held against the same world without them."""
+
+import numpy as np
+import pytest
+from gymnasium.utils import seeding
+from scipy.stats import norm, t
+
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.envs.sensors.heavy_tails import heavy_tails, largest_noise
+from slamgym.envs.vector import WorldBatch
+from slamgym.sim_configs import action_sequence, load_scenario
+
+BASE = load_scenario("six_landmarks")
+ENCODERS = {"noise_in": "odometry", "std": [0.05, 0.0, 0.04]}
+
+
+def episode(scenario, seed=3):
+    """Odometry, readings and true poses of one drive, over its steps."""
+    env = LandmarkWorldEnv(scenario)
+    moments = [env.reset(seed=seed)]
+    moments += [env.step(a)[::4] for a in action_sequence(scenario)]
+    return (
+        np.array([observation["odometry"] for observation, _ in moments]),
+        np.array([observation["landmarks"] for observation, _ in moments]),
+        np.array([info["pose"] for _, info in moments]),
+    )
+
+
+def gap(faults, scenario=BASE):
+    """Faulty minus faultless drive of the same seed."""
+    faulty = episode(scenario.with_changes(faults=faults))
+    return [a - b for a, b in zip(faulty, episode(scenario), strict=True)]
+
+
+def test_a_scenario_without_the_table_equals_one_with_an_empty_table():
+    assert all((difference == 0).all() for difference in gap({}))
+
+
+@pytest.mark.parametrize("motion", [{}, ENCODERS])
+def test_odometry_faults_change_nothing_but_the_odometry_of_steps_that_move(motion):
+    scenario = BASE.with_changes(motion=motion)
+    faults = {"odometry_scale": 0.1, "odometry_turn": 0.02}
+    odometry, readings, poses = gap(faults, scenario)
+    driven = action_sequence(scenario)[:, 0] * scenario.dt
+    assert odometry[1:, 0] == pytest.approx(0.1 * driven)
+    assert odometry[1:, 1] == pytest.approx(0.02)
+    assert (odometry[0] == 0).all()
+    assert not readings.any()
+    assert not poses.any()
+
+
+def test_a_robot_at_rest_reads_no_fault():
+    resting = BASE.with_changes(faults={"odometry_scale": 0.1, "odometry_turn": 0.02})
+    env = LandmarkWorldEnv(resting)
+    env.reset(seed=0)
+    assert env.step([0.0, 0.0])[0]["odometry"].tolist() == [0.0, 0.0]
+
+
+def test_a_biased_sensor_adds_to_every_reading_and_moves_no_robot():
+    odometry, readings, poses = gap({"bearing_bias": 0.1, "range_bias": -0.2})
+    wrapped = (readings[..., 0] + np.pi) % (2 * np.pi) - np.pi
+    assert wrapped == pytest.approx(0.1)
+    assert readings[..., 1] == pytest.approx(-0.2)
+    assert not odometry.any()
+    assert not poses.any()
+
+
+def test_a_negative_bias_never_gives_a_range_below_zero():
+    near = BASE.with_changes(
+        sensor={"min_range": 0.0}, landmarks={"layout": "points", "points": [[3, 0.1]]}
+    )
+    worlds = WorldBatch(near.with_changes(faults={"range_bias": -0.3}), 50)
+    worlds.reset([seeding.np_random(seed)[0] for seed in range(50)])
+    worlds.step(np.tile([1.0, 0.0], (50, 1)))
+    assert 0 < worlds.mask.sum() < 50
+    assert (worlds.measurements[worlds.mask][:, 1] > 0).all()
+
+
+@pytest.mark.parametrize("dof", [2.5, 3.0, 30.0])
+def test_heavy_tails_have_the_quantiles_of_students_t(dof):
+    shares = np.array([1e-12, 0.01, 0.3, 0.5, 0.9, 0.999])
+    tails = heavy_tails(norm.ppf(shares), dof)
+    assert tails == pytest.approx(t.ppf(shares, dof), rel=1e-6, abs=1e-12)
+    assert heavy_tails(-norm.ppf(shares), dof).tolist() == (-tails).tolist()
+
+
+def test_heavy_tails_reach_motion_and_sensor_separately():
+    odometry, readings, poses = gap({"motion_dof": 3})
+    assert poses.any()
+    assert not odometry.any()
+    assert readings.any()  # from other poses
+    odometry, readings, poses = gap({"sensor_dof": 3})
+    assert readings.any()
+    assert not poses.any()
+
+
+def test_faulty_observations_stay_within_the_observation_space():
+    faults = {"range_bias": 3.0, "odometry_turn": 0.3, "odometry_scale": 0.5}
+    scenario = BASE.with_changes(
+        faults=faults | {"sensor_dof": 2.1, "motion_dof": 2.1}, sensor={"max_range": 9}
+    )
+    env = LandmarkWorldEnv(scenario)
+    env.reset(seed=0)
+    for _ in range(29):
+        assert env.observation_space.contains(env.step([1.0, 1.0])[0])
+    assert np.isfinite(largest_noise(2.1))
