@@ -130,21 +130,6 @@ def test_the_tests_of_the_filter_pass_in_plain_python():
     assert done.returncode == 0, done.stdout
 
 
-def test_an_edited_kernel_is_compiled_again(tmp_path):
-    from slamgym.jit import discard_stale_cache
-
-    source, cache = tmp_path / "kernels.py", tmp_path / "__pycache__"
-    source.write_text("x = 1")
-    cache.mkdir()
-    for name in ("old.nbi", "old.nbc", "module.pyc"):
-        (cache / name).write_text("")
-    os.utime(source, (2e9, 2e9))
-    (cache / "new.nbi").write_text("")
-    os.utime(cache / "new.nbi", (3e9, 3e9))
-    discard_stale_cache(tmp_path, cache)
-    assert sorted(f.name for f in cache.iterdir()) == ["module.pyc", "new.nbi"]
-
-
 @pytest.mark.slow
 def test_kernels_compiled_and_kernels_loaded_give_the_same_bits(tmp_path):
     code = """

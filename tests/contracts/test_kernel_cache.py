@@ -1,0 +1,335 @@
+"""Compiled kernels on disk: never stale, shared, and not needed."""
+
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+import time
+from importlib import import_module
+from pathlib import Path
+from pkgutil import walk_packages
+
+import numpy as np
+import pytest
+
+import slamgym
+from slamgym import kernel_cache
+from slamgym.code_fingerprint import (
+    UnknownValueError,
+    code_fingerprint,
+)
+from slamgym.jit import fma, jit
+
+CALLER = """
+    from callee import twice
+    from slamgym.jit import jit
+
+    @jit
+    def answer(x):
+        return twice(x) + 1
+"""
+CALLEE = """
+    import constants
+    from slamgym.jit import njit_internal
+
+    @njit_internal
+    def twice(x):
+        return constants.FACTOR * x
+"""
+ASK = """
+    from caller import answer
+    print(answer(3.0), sum(answer.stats.cache_hits.values()))
+"""
+UNWRITABLE = {"HOME": "/dev/null", "XDG_CACHE_HOME": "", "NUMBA_CACHE_DIR": ""}
+
+
+def write(folder, **modules):
+    """Write modules, all with one date of the past, and no byte code of them."""
+    folder.mkdir(exist_ok=True)
+    for name, text in modules.items():
+        (folder / f"{name}.py").write_text(textwrap.dedent(text))
+    for file in folder.glob("*.py"):
+        os.utime(file, (1e9, 1e9))
+
+
+def python(folder, code=ASK, prefix=(), **environment):
+    environment = {"PYTHONDONTWRITEBYTECODE": "1", **environment}
+    return subprocess.run(
+        [*prefix, sys.executable, "-c", textwrap.dedent(code)],
+        env={**os.environ, **environment},
+        cwd=folder,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+
+
+def answer(folder, code=ASK, **environment):
+    value, hits = python(folder, code, **environment).stdout.split()
+    return float(value), int(hits)
+
+
+@pytest.fixture
+def kernels(tmp_path, monkeypatch):
+    """Return a folder with two kernels and a constant, and a cache of their own."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    write(tmp_path / "k", caller=CALLER, callee=CALLEE, constants="FACTOR = 2")
+    return tmp_path / "k"
+
+
+@pytest.mark.slow
+def test_an_edit_in_a_callee_is_seen_though_all_dates_are_alike(kernels):
+    assert answer(kernels) == (7, 0)
+    assert answer(kernels) == (7, 1)
+    write(kernels, callee=CALLEE.replace("* x", "* x * x"))
+    assert answer(kernels) == (19, 0)
+    write(kernels, constants="FACTOR = 3")
+    assert answer(kernels) == (28, 0)
+    write(kernels, callee=CALLEE, constants="FACTOR = 2")
+    assert answer(kernels) == (7, 1)  # the first code is still there
+
+
+@pytest.mark.slow
+def test_an_edit_while_a_process_runs_does_not_reach_the_cache(kernels):
+    code = """
+        from pathlib import Path
+        from caller import answer
+        callee = Path("callee.py")
+        callee.write_text(callee.read_text().replace("* x", "* x * x"))
+        print(answer(3.0), 0)
+    """
+    assert answer(kernels, code) == (7, 0)
+    assert answer(kernels) == (19, 0)
+
+
+@pytest.mark.slow
+def test_equal_kernels_in_two_checkouts_are_compiled_once(kernels, tmp_path):
+    assert answer(kernels) == (7, 0)
+    write(tmp_path / "other", caller=CALLER, callee=CALLEE, constants="FACTOR = 2")
+    os.utime(tmp_path / "other" / "callee.py")
+    assert answer(tmp_path / "other") == (7, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", [UNWRITABLE, {"NUMBA_CACHE_DIR": "/dev/null/x"}])
+def test_where_nothing_can_be_written_one_warning_names_another_folder(kernels, where):
+    done = python(kernels, ASK, **where)
+    assert done.stdout.split() == ["7.0", "0"]
+    assert done.stderr.count("Warning") == 1
+    assert "/dev/null" in done.stderr
+    assert str(next(kernels.parent.glob("slamgym-*"))) in done.stderr
+    again = python(kernels, ASK, **where)  # finds them there, and has no complaint
+    assert (again.stdout.split(), again.stderr) == (["7.0", "1"], "")
+
+
+@pytest.mark.slow
+def test_a_folder_of_somebody_else_is_not_used(kernels):
+    private = kernels.parent / kernel_cache._private_path().name
+    private.mkdir(mode=0o777)
+    private.chmod(0o777)
+    done = python(kernels, ASK, **UNWRITABLE)
+    assert done.stdout.split() == ["7.0", "0"]
+    assert done.stderr.count("Warning") == 1
+    assert "every process compiles anew" in done.stderr
+    assert list(private.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_read_only_install_without_a_home_can_be_imported(kernels, tmp_path):
+    prefix = []
+    if os.getuid() == 0:  # who may write anywhere, unless it gives up that right
+        if not shutil.which("setpriv"):
+            pytest.skip("needs setpriv, or a user who is not root")
+        prefix = ["setpriv", "--bounding-set=-dac_override,-fowner"]
+    home = tmp_path / "home"
+    home.mkdir()
+    packages = tmp_path / "site-packages"
+    shutil.copytree(Path(slamgym.__file__).parent, packages / "slamgym")
+    folders = [home, packages, *(f for f in packages.rglob("*") if f.is_dir())]
+    for folder in folders:
+        folder.chmod(0o555)
+    path = os.pathsep.join([str(packages), os.environ["PYTHONPATH"]])
+    try:
+        done = python(
+            kernels,
+            "import slamgym; print(slamgym.__file__)" + textwrap.dedent(ASK),
+            prefix,
+            **{**UNWRITABLE, "HOME": str(home), "PYTHONPATH": path},
+        )
+    finally:
+        for folder in folders:
+            folder.chmod(0o755)
+    assert done.stdout.split() == [str(packages / "slamgym/__init__.py"), "7.0", "0"]
+    assert done.stderr.count("Warning") == 1
+    assert str(home) in done.stderr
+
+
+@pytest.mark.slow
+def test_processes_that_compile_for_other_types_at_once_keep_all_of_it(kernels):
+    calls = ["3.0", "3", "3 + 0j", "np.float32(3)"]
+    code = """
+        import numpy as np, os, sys, time
+        from caller import answer
+        while time.time() < {start}:
+            pass
+        print(answer({call}))
+    """
+    start = time.time() + 3
+    children = [
+        subprocess.Popen(
+            [sys.executable, "-c", textwrap.dedent(code.format(start=start, call=x))],
+            cwd=kernels,
+        )
+        for x in calls
+    ]
+    assert [child.wait() for child in children] == [0] * 4
+    hits = f"""
+        import numpy as np
+        from caller import answer
+        values = {{complex(answer(x)) for x in ({", ".join(calls)})}}
+        print(*map(abs, values), sum(answer.stats.cache_hits.values()))
+    """
+    assert answer(kernels, hits) == (7, 4)
+
+
+@pytest.mark.slow
+def test_a_damaged_file_is_compiled_again(kernels, tmp_path):
+    assert answer(kernels) == (7, 0)
+    files = list((tmp_path / "cache/slamgym").glob("*.nbc"))
+    for file, size in zip(files, (0, 1000), strict=True):
+        file.write_bytes(file.read_bytes()[:size])
+    assert answer(kernels) == (7, 0)
+    assert answer(kernels) == (7, 1)
+
+
+def test_the_folder_stays_small_and_keeps_what_was_used_last(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_cache, "MAX_BYTES", 300)
+    now = time.time()
+    for day in range(6):
+        (tmp_path / f"{day}.nbc").write_bytes(b"x" * 100)
+        os.utime(tmp_path / f"{day}.nbc", (now - day * 1e5, now - day * 1e5))
+    for name, age in (("fresh", 0), ("left", 1e7)):
+        (tmp_path / f"{name}.tmp").write_bytes(b"")
+        os.utime(tmp_path / f"{name}.tmp", (now - age, now - age))
+    kernel_cache._sweep_once(tmp_path)
+    left = sorted(file.name for file in tmp_path.iterdir())
+    assert left == ["0.nbc", "1.nbc", "2.nbc", "fresh.tmp"]
+
+
+SOURCE = """
+from typing import NamedTuple
+from slamgym import jit as tools
+from slamgym.jit import jit, njit_internal, njit_inlined
+import numpy as np
+
+TABLE = np.array([1.0, 2.0])
+
+class Rule(NamedTuple):
+    gate: float
+    rest: float
+
+@njit_inlined
+def inlined(x):
+    return tools.fma(x, 2.0, 1.0)
+
+@njit_internal
+def called(x):
+    return inlined(x) + TABLE[0]
+
+@jit
+def kernel(x, scale=2.0):
+    if x < 0:
+        return kernel(-x)
+    return Rule(called(x), scale).gate + np.sqrt(x)
+"""
+
+
+def fingerprint(source):
+    names = {"__name__": "of_a_test"}
+    exec(source, names)
+    return code_fingerprint(names["kernel"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("[1.0, 2.0]", "[1.0, 3.0]"),  # a constant of a callee
+        ("2.0, 1.0)", "2.0, -1.0)"),  # a number in what is copied into a callee
+        ("+ TABLE", "- TABLE"),
+        ("scale=2.0", "scale=3.0"),
+        ("np.sqrt", "np.cbrt"),
+        ("tools.fma", "tools._multiply_add"),
+        ("    gate: float\n    rest: float", "    rest: float\n    gate: float"),
+        ("@njit_internal\ndef called", "@jit\ndef called"),
+        ("x < 0", "x <= 0"),
+    ],
+)
+def test_every_edit_of_what_a_kernel_uses_changes_its_fingerprint(old, new):
+    assert old in SOURCE
+    assert fingerprint(SOURCE.replace(old, new)) != fingerprint(SOURCE)
+
+
+def test_comments_and_places_do_not_change_a_fingerprint():
+    moved = "\n\n# a comment\nUNUSED = 3\n" + SOURCE
+    assert fingerprint(moved) == fingerprint(SOURCE)
+
+
+def test_options_of_the_compiler_change_a_fingerprint(monkeypatch):
+    before = fingerprint(SOURCE)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "elsewhere")
+    assert fingerprint(SOURCE) == before
+    monkeypatch.setenv("NUMBA_BOUNDSCHECK", "1")
+    assert fingerprint(SOURCE) != before
+
+
+def test_a_kernel_with_a_value_of_an_unknown_kind_is_not_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
+    unknown = object()
+
+    @jit
+    def kernel(x):
+        return x if x > 0 else fma(x, 1.0, 1.0)
+
+    @jit
+    def odd(x):
+        return x if unknown is None else x + 1
+
+    with pytest.raises(UnknownValueError, match="no fingerprint"):
+        code_fingerprint(odd)
+    assert kernel(1.0) == 1
+    assert [file.suffix for file in tmp_path.iterdir()] == [".nbc"]
+
+
+def kernels_of_the_package():
+    for module in walk_packages(slamgym.__path__, "slamgym."):
+        if module.name.startswith(
+            tuple(f"slamgym.{p}." for p in ("estimator", "evaluation", "agents"))
+        ):
+            for value in vars(import_module(module.name)).values():
+                if getattr(getattr(value, "py_func", None), "__module__", "") == (
+                    module.name
+                ):
+                    yield value
+
+
+@pytest.mark.slow
+def test_every_kernel_has_its_own_fingerprint_and_the_same_in_every_process():
+    here = {code_fingerprint(kernel) for kernel in kernels_of_the_package()}
+    assert len(here) == len(list(kernels_of_the_package())) > 100
+    code = """
+        from test_kernel_cache import code_fingerprint, kernels_of_the_package
+        print(*map(code_fingerprint, kernels_of_the_package()))
+    """
+    there = python(Path(__file__).parent, code, PYTHONHASHSEED="7").stdout.split()
+    assert set(there) == here
+
+
+def test_fingerprints_are_quick():
+    kernels = list(kernels_of_the_package())
+    np.testing.assert_array_less(0, len(kernels))
+    began = time.process_time()
+    for kernel in kernels:
+        code_fingerprint(kernel)
+    assert time.process_time() - began < 1  # 0.1 s
