@@ -305,7 +305,9 @@ def test_a_kernel_with_a_value_of_an_unknown_kind_is_not_kept(tmp_path, monkeypa
 def kernels_of_the_package():
     for module in walk_packages(slamgym.__path__, "slamgym."):
         if module.name.startswith(
-            tuple(f"slamgym.{p}." for p in ("estimator", "evaluation", "agents"))
+            tuple(
+                f"slamgym.{p}." for p in ("envs", "estimator", "evaluation", "agents")
+            )
         ):
             for value in vars(import_module(module.name)).values():
                 if getattr(getattr(value, "py_func", None), "__module__", "") == (
