@@ -3,6 +3,7 @@ from . import filters as filters
 from . import large_maps as large_maps
 from . import map_management as map_management
 from . import models as models
+from . import peers as peers
 from . import smoother as smoother
 from .association.constellations import Constellations as Constellations
 from .check_estimator import EstimatorContractError as EstimatorContractError
@@ -30,6 +31,8 @@ from .large_maps import SubmapSlam as SubmapSlam
 from .map_management import FieldOfView as FieldOfView
 from .map_management import LandmarkPolicy as LandmarkPolicy
 from .map_management import ManagedSlam as ManagedSlam
+from .peers.catalogue import Peer as Peer
+from .peers.catalogue import list_peers as list_peers
 from .registry import list_estimators as list_estimators
 from .registry import make_batch as make_batch
 from .registry import make_estimator as make_estimator

@@ -20,6 +20,7 @@ from .filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from .filters.robocentric import RobocentricEkfSlam
 from .filters.unscented import UnscentedSlam
 from .interface import SlamEstimator
+from .peers.catalogue import PEERS
 
 if TYPE_CHECKING:
     from .map_management.policy import LandmarkPolicy
@@ -54,8 +55,17 @@ def register_estimator(name: str, factory: EstimatorFactory) -> None:
 
 
 def list_estimators() -> tuple[str, ...]:
-    """Return the registered names, in the order of registration."""
-    return tuple(_factories)
+    """Return the registered names, in the order of registration.
+
+    Those of other libraries, which :func:`~slamgym.estimator.list_peers` returns, are
+    not among them.
+    """
+    return tuple(name for name in _factories if name not in PEERS)
+
+
+def is_registered(name: str) -> bool:
+    """Return whether a name is registered, of slamgym, of a peer or of a user."""
+    return name in _factories
 
 
 def find_estimator(name: str) -> EstimatorFactory:
@@ -64,9 +74,12 @@ def find_estimator(name: str) -> EstimatorFactory:
     Raises
     ------
     ValueError
-        Where there is none, with the nearest name.
+        Where there is none, with the nearest name, or where its library is not
+        installed, with how to install it.
     """
     factory = _factories.get(name, name)
+    if name in PEERS and isinstance(factory, str):
+        PEERS[name].refuse_missing()
     if not isinstance(factory, str):
         return factory
     if ":" in factory:
@@ -92,7 +105,8 @@ def make_estimator(
     Parameters
     ----------
     name : str
-        One of :func:`list_estimators`, or "module:Class".
+        One of :func:`list_estimators` or of
+        :func:`~slamgym.estimator.list_peers`, or "module:Class".
     motion_std : array_like, shape (3,)
         (σx, σy, σα) of the motion noise in the robot frame [m, m, rad] per step.
     measurement_std : array_like, shape (2,)
@@ -223,3 +237,4 @@ _factories |= {
     ),
     "submaps": f"{_LARGE}.submaps.submap_slam:SubmapSlam",
 }
+_factories |= {name: peer.path for name, peer in PEERS.items()}

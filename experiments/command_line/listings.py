@@ -32,15 +32,32 @@ def scenarios(as_json: options.AsJson = False) -> None:
 def estimators(as_json: options.AsJson = False) -> None:
     """List the filters there are.
 
-    List the filters that come with slamgym.
+    List the filters that come with slamgym, and those of other libraries, which
+    pip install 'slamgym[peers]' installs.
     """
+    from ...estimator.peers.catalogue import list_peers
     from ...estimator.registry import find_estimator, list_estimators
 
     rows = [
-        {"name": name, "description": _first_line(find_estimator(name))}
+        _entry(name, "slamgym", _first_line(find_estimator(name)), installed=True)
         for name in list_estimators()
     ]
+    rows += [
+        _entry(peer.name, peer.library, peer.description, installed=peer.installed)
+        for peer in list_peers()
+    ]
     _show("estimators", rows, as_json=as_json)
+
+
+def _entry(
+    name: str, library: str, description: str, *, installed: bool
+) -> dict[str, Any]:
+    return {
+        "name": name,
+        "library": library,
+        "installed": installed,
+        "description": description,
+    }
 
 
 def _show(what: str, rows: list[dict[str, Any]], *, as_json: bool) -> None:
@@ -51,14 +68,18 @@ def _show(what: str, rows: list[dict[str, Any]], *, as_json: bool) -> None:
     reporter = Reporter(as_json=as_json)
     table = Table(box=None, pad_edge=False)
     for key in rows[0]:
-        numeric = isinstance(rows[0][key], int)
+        numeric = type(rows[0][key]) is int
         table.add_column(
             key, justify="right" if numeric else "left", no_wrap=key == "name"
         )
     for row in rows:
-        table.add_row(*(str(value) for value in row.values()))
+        table.add_row(*(_cell(value) for value in row.values()))
     reporter.show(table)
     reporter.finish({what: rows})
+
+
+def _cell(value: object) -> str:
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
 def _first_line(factory: object) -> str:

@@ -51,7 +51,7 @@ class _Work:
     def do(self, span: Span) -> list[Block]:
         """Simulate, filter and measure runs; return one block per estimator."""
         for name, factory in self.factories.items():
-            if ":" not in name and name not in registry.list_estimators():
+            if ":" not in name and not registry.is_registered(name):
                 registry.register_estimator(name, factory)
         runs = simulate_runs(self.scenario, span.size, self.seed + span.first)
         bound = bound_runs(self.scenario, runs)

@@ -1,0 +1,220 @@
+"""A graph of GTSAM that grows by a pose and a scan at every step.
+
+In GTSAM's coordinates of a pose, which are those of the robot's own frame::
+
+    t = t̂ + R(θ̂) v,    θ = θ̂ + ω
+
+where (t̂, θ̂) is where the library linearised: in iSAM2 not yet its estimate.  The
+odometry factor x_k⁻¹ x_{k+1} = (d, 0, α) has its noise in the frame of the new
+heading: its covariance is R(α)ᵀ diag(σx², σy²) R(α) and σα².
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...arrays import Array
+from ..models.bearing_range import locate_landmark
+from ..support import argument_checks
+from .peer_slam import Innovation, PeerSlam, Readings
+from .whole_state import expected_readings, motion_covariance, moved_state, wrapped
+
+X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
+
+LEAST_VARIANCE = 1e-12
+"""Of motion noise [m², m², rad²]: GTSAM takes no certain motion."""
+PoseAndPlaces = tuple[Any, list[Array]]
+MOVE, READING, SOLVE = 0.0, 1.0, 2.0
+"""Kinds of the events of a drive."""
+
+
+class GtsamSlam(PeerSlam):
+    """A smoother of GTSAM, its graph solved after every scan.
+
+    Its factors are GTSAM's own: ``PriorFactorPose2``, ``BetweenFactorPose2`` and
+    ``BearingRangeFactor2D``.  The belief is the joint marginal of the last pose and all
+    landmarks, as the library linearised it.
+
+    Parameters
+    ----------
+    motion_std, measurement_std, **settings
+        As in :class:`.peer_slam.PeerSlam`.
+    innovations : bool
+        Whether reports have innovations and NIS.  They take the joint marginal before
+        each scan, which costs more than the solution.
+    """
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        innovations: bool = True,
+        **settings: Any,
+    ) -> None:
+        self._innovations = argument_checks.flag("innovations", innovations)
+        super().__init__(motion_std, measurement_std, **settings)
+
+    def _start(self, pose: Array, std: Array) -> None:
+        self._begin()
+        self._graph, self._guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._events: list[tuple[float, ...]] = []
+        self._moves: list[tuple[Array, Array]] = []
+        self._k = self._solved_k = 0
+        self._estimate = self._solved = pose
+        self._covariance: Array | None = np.diag(std**2)
+        self._first = np.stack([pose, std])
+        own = _rotation(pose[2])
+        noise = gtsam.noiseModel.Gaussian.Covariance((own.T * std**2) @ own)
+        self._graph.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(*pose), noise))
+        self._guess.insert(X(0), gtsam.Pose2(*pose))
+
+    def _move(self, odometry: Array, variance: Array) -> None:
+        self._events.append((MOVE, *odometry, *variance))
+        self._moves.append((odometry, variance))
+        turned = _rotation(odometry[1])
+        covariance = (turned.T * np.maximum(variance, LEAST_VARIANCE)) @ turned
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        between = gtsam.Pose2(odometry[0], 0.0, odometry[1])
+        before, now = X(self._k), X(self._k + 1)
+        self._graph.add(gtsam.BetweenFactorPose2(before, now, between, noise))
+        self._k += 1
+        self._estimate = moved_state(self._estimate, odometry)[0]
+        self._guess.insert(now, gtsam.Pose2(*self._estimate[:3]))
+
+    def _take_in(self, known: Readings, new: Readings) -> Innovation | None:
+        if not len(known.slots) + len(new.slots):
+            return None
+        innovation = None
+        if self._innovations and len(known.slots):
+            innovation = self._innovation(known)
+        found = locate_landmark(self._estimate[:3], new.measurements).position
+        self._estimate = np.concatenate([self._estimate, found.ravel()])
+        for slot, place in zip(new.slots, found, strict=True):
+            self._guess.insert(L(slot), place)
+        for readings in (known, new):
+            self._add_readings(readings)
+        self._solve()
+        return innovation
+
+    def _add_readings(self, readings: Readings) -> None:
+        for (bearing, distance), slot, variance in zip(*readings, strict=True):
+            self._events.append((READING, bearing, distance, *variance, slot))
+            noise = gtsam.noiseModel.Diagonal.Variances(variance)
+            self._graph.add(
+                gtsam.BearingRangeFactor2D(
+                    X(self._k), L(slot), gtsam.Rot2(bearing), distance, noise
+                )
+            )
+
+    def _solve(self) -> None:
+        """Give the library what is new, and read its estimate."""
+        self._events.append((SOLVE, 0.0, 0.0, 0.0, 0.0, 0.0))
+        n = len(self._estimate[3:]) // 2
+        self._optimise(self._graph, self._guess, n)
+        self._graph, self._guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        pose, places = self._found(X(self._k), [L(slot) for slot in range(n)])
+        self._estimate = np.array([pose.x(), pose.y(), pose.theta(), *np.ravel(places)])
+        self._solved, self._solved_k = self._estimate, self._k
+        self._moves, self._covariance = [], None
+
+    def _innovation(self, readings: Readings) -> Innovation:
+        """Return ν and S at the last marginal, moved as an EKF moves it."""
+        mean, P = self._solved, self._solved_covariance()
+        for odometry, variance in self._moves:
+            moved, G = moved_state(mean, odometry)
+            P = G @ P @ G.T + motion_covariance(mean, variance)
+            mean = moved
+        expected, H = expected_readings(mean, readings.slots)
+        nu = wrapped((readings.measurements - expected).ravel()).reshape(-1, 2)
+        return Innovation(nu, H @ P @ H.T + np.diag(readings.variances.ravel()))
+
+    def _mean(self) -> Array:
+        return self._estimate
+
+    def _moments(self) -> tuple[Array, Array]:
+        if self._moves:
+            self._solve()
+        return self._estimate, self._solved_covariance()
+
+    def _solved_covariance(self) -> Array:
+        """Return the joint marginal at the last solution, of the additive error."""
+        if self._covariance is None:
+            n = len(self._solved)
+            keys = [X(self._solved_k), *(L(slot) for slot in range((n - 3) // 2))]
+            covariance, values = self._joint(keys)
+            turn = np.eye(n)
+            turn[:3, :3] = _rotation(values.atPose2(keys[0]).theta())
+            self._covariance = turn @ covariance @ turn.T
+        return self._covariance
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the drive until now, from which a smoother solves anew."""
+        return {
+            "class": type(self).__name__,
+            "first_pose": self._first.copy(),
+            "events": np.array(self._events, dtype=np.float64).reshape(-1, 6),
+            "landmark_ids": np.array(self.landmark_ids, dtype=np.int64),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state: repeat its drive."""
+        entries = ("first_pose", "events", "landmark_ids")
+        argument_checks.refuse_other_state(
+            state, entries, **{"class": type(self).__name__}
+        )
+        ids = np.asarray(state["landmark_ids"]).tolist()
+        self._slots = {i: slot for slot, i in enumerate(ids)}
+        self._start(*np.array(state["first_pose"], dtype=np.float64))
+        rows: list[Array] = []
+        for event in np.array(state["events"], dtype=np.float64):
+            if event[0] == MOVE:
+                self._move(event[1:3], event[3:])
+            elif event[0] == READING:
+                rows.append(event)
+            else:
+                self._repeat(np.array(rows).reshape(-1, 6))
+                rows = []
+
+    def _repeat(self, rows: Array) -> None:
+        """Repeat a solution with the readings of a scan, or without any."""
+        if not len(rows):
+            self._solve()
+            return
+        slots = rows[:, 5].astype(np.int64)
+        is_new = slots >= len(self._estimate[3:]) // 2
+        known, new = (
+            Readings(rows[which, 1:3], slots[which], rows[which, 3:5])
+            for which in (~is_new, is_new)
+        )
+        self._take_in(known, new)
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Make an empty solver."""
+
+    @abstractmethod
+    def _optimise(
+        self, graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values, landmarks: int
+    ) -> None:
+        """Add factors and first guesses to the solver, and solve."""
+
+    @abstractmethod
+    def _found(self, pose: int, landmarks: list[int]) -> PoseAndPlaces:
+        """Return the estimates of a pose and of landmarks, by their keys."""
+
+    @abstractmethod
+    def _joint(self, keys: list[int]) -> tuple[Array, Any]:
+        """Return the joint marginal of keys in GTSAM's coordinates, and about what."""
+
+
+def _rotation(angle: float) -> Array:
+    """Return the rotation of a pose by an angle, (3, 3), the heading left as it is."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
