@@ -47,11 +47,20 @@ EstimatorName = Annotated[
         'A filter (see: slamgym estimators), or "module:Class" of your own.',
     ),
 ]
+EstimatorNames = Annotated[
+    str,
+    option(
+        "--estimator -e NAMES",
+        'Filters with commas between, such as "ekf,invariant[iterations=3]" or '
+        '"module:Class" of your own. run.html shows all of them; the other files and '
+        "numbers are the first one's.",
+    ),
+]
 EstimatorOptions = Annotated[
     list[str] | None,
     option(
         "--option KEY=VALUE",
-        f"An option of the filter, such as gate_probability=0.999. {REPEATED}",
+        f"An option of the filters, such as gate_probability=0.999. {REPEATED}",
     ),
 ]
 ScenarioChanges = Annotated[

@@ -1,7 +1,8 @@
 """``slamgym replay``: filter a log, compare with the truth, draw."""
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,7 +22,7 @@ def replay(
         ),
     ],
     *,
-    estimator: options.EstimatorName = "ekf",
+    estimator: options.EstimatorNames = "ekf",
     motion_std: options.MotionStd = None,
     measurement_std: options.MeasurementStd = None,
     initial_pose_std: options.InitialPoseStd = None,
@@ -81,18 +82,20 @@ def replay(
     """Filter a log, compare with the truth, draw.
 
     Filter a log, and compare with the truth as far as it is known: prints every
-    landmark with its Euclidean and Mahalanobis distance to its true place.
+    landmark with its Euclidean and Mahalanobis distance to its true place. Writes
+    run.html, a page that plays the run, pictures and the numbers.
 
     Examples
     --------
     slamgym replay data.txt
     slamgym replay data.txt --landmark-init independent --out homework
     slamgym replay sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
-    slamgym replay results/loop-ekf/log.csv --estimator invariant
+    slamgym replay results/loop-ekf/log.csv --estimator ekf,invariant
     slamgym replay graph.txt --truth true.g2o --noise-from-file
     """
     from ..logs.anonymous import without_identities
     from ..runs.filter_settings import settings_for
+    from .chosen_filters import chosen_filters
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
     from .run_files import filter_and_write, note_choices, read_any_log, show_run
@@ -109,15 +112,17 @@ def replay(
     note_choices(drive, reporter)
     if hide_identities:
         drive = without_identities(drive)
-    settings = settings_for(
-        drive,
-        estimator=estimator,
-        **standard_deviations(motion_std, measurement_std, initial_pose_std),
-        options=given | assignments("--option", option),
+    stds: dict[str, Any] = standard_deviations(
+        motion_std, measurement_std, initial_pose_std
     )
-    place = out or default_folder(drive.name, estimator)
+    filters = chosen_filters(
+        estimator,
+        given | assignments("--option", option),
+        partial(settings_for, drive, **stds),
+    )
+    place = out or default_folder(drive.name, *filters)
     with output_folder(place) as folder:
         summary = filter_and_write(
-            drive, settings, folder, every_step, reporter, resolution=resolution
+            drive, filters, folder, every_step, reporter, resolution=resolution
         )
     show_run(summary, place, reporter)

@@ -1,5 +1,7 @@
 """``slamgym run``: drive through a scenario, filter what the robot reads, draw."""
 
+from functools import partial
+
 from . import options
 from .option_values import assignments
 from .program import command
@@ -9,7 +11,7 @@ from .program import command
 def run(
     scenario: options.ScenarioName,
     *,
-    estimator: options.EstimatorName = "ekf",
+    estimator: options.EstimatorNames = "ekf",
     option: options.EstimatorOptions = None,
     seed: options.Seed = 0,
     steps: options.Steps = None,
@@ -22,36 +24,46 @@ def run(
 ) -> None:
     """Drive through a scenario, filter, draw.
 
-    Drive a robot through a scenario and follow it with a filter, which knows the
-    scenario's noise. Writes pictures of map, errors and covariance, the log, the
-    scenario and the numbers.
+    Drive a robot through a scenario and follow it with filters, which know the
+    scenario's noise. Writes run.html, a page that plays the run, pictures of map,
+    errors and covariance, the log, the scenario and the numbers.
 
     Examples
     --------
     slamgym run six_landmarks
     slamgym run loop --seed 3 --out loop_3
+    slamgym run loop --estimator ekf,invariant
     slamgym run dense --set sensor.max_range=4 --steps 100 --json
     slamgym run hidden_identities -e invariant --resolution 0.5
     slamgym run mine.toml --controller random --estimator mine:MyFilter
     """
     from ...sim_configs import save_scenario
     from ..runs.filter_settings import settings_for_scenario
+    from .chosen_filters import chosen_filters
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
     from .run_files import filter_and_write, show_run
     from .scenario_options import chosen_scenario, recorded
 
     world = chosen_scenario(scenario, steps, set_)
-    settings = settings_for_scenario(
-        world, estimator=estimator, options=assignments("--option", option)
+    filters = chosen_filters(
+        estimator,
+        assignments("--option", option),
+        partial(settings_for_scenario, world),
     )
     reporter = Reporter(as_json=as_json)
-    place = out or default_folder(world.name, estimator)
+    place = out or default_folder(world.name, *filters)
     with output_folder(place) as folder:
         with reporter.progress("driving") as tick:
             log = recorded(world, controller, seed, tick)
         save_scenario(world, folder / "scenario.toml")
         summary = filter_and_write(
-            log, settings, folder, every_step, reporter, resolution=resolution
+            log,
+            filters,
+            folder,
+            every_step,
+            reporter,
+            resolution=resolution,
+            walls=world.walls,
         )
     show_run(summary, place, reporter)

@@ -1,6 +1,6 @@
-"""A log filtered by one estimator: the files of the run, and what is printed of it."""
+"""A log filtered by estimators: the files of the run, and what is printed of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +12,15 @@ from ..logs.importers import read_log
 from ..logs.slamlog import SlamLog, write_slamlog
 from ..logs.steps import steps_of
 from ..runs.filter_settings import FilterSettings
-from ..runs.log_replay import replay
+from ..runs.log_replay import Replay, replay
 from ..runs.summary import summarise
 from ..runs.trace import RunTrace
+from ..viewers import RunFrames, ViewedRun, write_run_page
 from .association_table import association_table
 from .errors import BadInputError
 from .output_folder import write_summary
 from .reporter import Reporter
-from .tables import key_figures, landmark_table, written
+from .tables import comparison_table, key_figures, landmark_table, written
 from .warm_up import warm_up
 
 _FEW_STEPS = 60  # of a run whose every step is drawn by default
@@ -58,21 +59,25 @@ def note_choices(log: SlamLog, reporter: Reporter) -> None:
 
 def filter_and_write(
     log: SlamLog,
-    settings: FilterSettings,
+    filters: Mapping[str, FilterSettings],
     folder: Path,
     every_step: bool | None,
     reporter: Reporter,
     *,
     resolution: float = 0.0,
+    walls: Iterable[Sequence[float]] = (),
 ) -> dict[str, Any]:
-    """Filter a log, and write figures, log.csv (slamlog 1) and summary.json.
+    """Filter a log, and write figures, run.html, log.csv and summary.json.
+
+    The page run.html shows all filters side by side; the other files are those of the
+    first one.
 
     Parameters
     ----------
     log : SlamLog
         The log.
-    settings : FilterSettings
-        Of the filter.
+    filters : mapping from label to FilterSettings
+        The filters, at least one.
     folder : Path
         The folder to write to.
     every_step : bool or None
@@ -81,27 +86,54 @@ def filter_and_write(
         Shows the progress.
     resolution : float
         True landmarks nearer to each other count as one in scores of association [m].
+    walls : iterable of (x0, y0, x1, y1)
+        Walls to draw on the page [m].
 
     Returns
     -------
     dict
-        The summary that was written.
+        The summary that was written; ``others`` holds those of the further filters.
     """
-    warm_up(settings, reporter)
     if every_step is None:
         every_step = sum(1 for _ in steps_of(log)) <= _FEW_STEPS + 1
+    runs, frames = [], []
+    for label, settings in filters.items():
+        frames.append(RunFrames(log))
+        run = _filtered(log, label, settings, every_step, reporter, frames[-1])
+        runs.append(run)
+    first = runs[0]
+    with reporter.progress("drawing") as tick:
+        write_figures(folder, first.trace, every_step=every_step, progress=tick)
+    viewed = [
+        ViewedRun(run.trace, kept) for run, kept in zip(runs, frames, strict=True)
+    ]
+    write_run_page(folder / "run.html", log, viewed, walls=walls)
+    write_slamlog(first.log, folder / "log.csv")
+    summaries = [
+        summarise(run, settings, resolution=resolution)
+        for run, settings in zip(runs, filters.values(), strict=True)
+    ]
+    return write_summary(folder, {**summaries[0], "others": summaries[1:]})
+
+
+def _filtered(
+    log: SlamLog,
+    label: str,
+    settings: FilterSettings,
+    every_step: bool,
+    reporter: Reporter,
+    frames: RunFrames,
+) -> Replay:
+    warm_up(settings, reporter)
     with reporter.progress("filtering") as tick:
-        run = replay(
+        return replay(
             log,
             settings.make(log.start),
-            name=settings.estimator,
+            name=label,
             keep_history=every_step,
             progress=tick,
+            watch=frames.watch,
         )
-    with reporter.progress("drawing") as tick:
-        write_figures(folder, run.trace, every_step=every_step, progress=tick)
-    write_slamlog(run.log, folder / "log.csv")
-    return write_summary(folder, summarise(run, settings, resolution=resolution))
 
 
 def write_figures(
@@ -147,11 +179,19 @@ def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
         "",
         key_figures(summary),
         "",
+        *_comparison(summary),
         *_association(summary),
         *_warnings(summary),
         written(str(place), summary["files"]),
     )
     reporter.finish({**summary, "out": str(place)})
+
+
+def _comparison(summary: dict[str, Any]) -> tuple[Table | str, ...]:
+    if not summary["others"]:
+        return ()
+    runs = (summary, *summary["others"])
+    return comparison_table({run["estimator"]: run for run in runs}), ""
 
 
 def _association(summary: dict[str, Any]) -> tuple[Table | str, ...]:

@@ -1,7 +1,7 @@
 """The numbers of a run as tables for the terminal."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.table import Table
@@ -129,11 +129,18 @@ def significant(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-def smoothing_table(summary: dict[str, Any]) -> Table:
-    """Lay out filter and smoother of a log side by side."""
+def comparison_table(columns: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Lay out errors and consistency of several estimates side by side.
+
+    Parameters
+    ----------
+    columns : mapping
+        By the heading, ``ate``, ``landmark_rmse`` and ``nees`` as in a run's summary.
+    """
     table = Table(box=None, pad_edge=False)
-    for heading in ("", summary["follows"], "smoother"):
-        table.add_column(Text(heading), justify="left" if not heading else "right")
+    table.add_column("")
+    for heading in columns:
+        table.add_column(Text(heading), justify="right")
     for name, key, kind in (
         ("path error, raw [m RMS]", "ate", "raw"),
         ("path error, aligned [m RMS]", "ate", "aligned"),
@@ -141,10 +148,23 @@ def smoothing_table(summary: dict[str, Any]) -> Table:
         ("map error, aligned [m RMS]", "landmark_rmse", "aligned"),
         ("pose NEES per degree, 1 expected", "nees", "per_degree"),
     ):
-        pair = [summary[key][side] for side in ("filter", "smoother")]
-        if None not in pair:
-            table.add_row(name, *(significant(numbers[kind]) for numbers in pair))
+        found = [column[key] for column in columns.values()]
+        if None not in found:
+            cells = (significant(numbers[kind]) for numbers in found)
+            table.add_row(Text(name), *cells)
     return table
+
+
+def smoothing_table(summary: dict[str, Any]) -> Table:
+    """Lay out filter and smoother of a log side by side."""
+    names = {"filter": summary["follows"], "smoother": "smoother"}
+    keys = ("ate", "landmark_rmse", "nees")
+    return comparison_table(
+        {
+            heading: {key: summary[key][side] for key in keys}
+            for side, heading in names.items()
+        }
+    )
 
 
 def smoothing_figures(summary: dict[str, Any]) -> Table:

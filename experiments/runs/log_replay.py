@@ -7,7 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...arrays import Array
-from ...estimator.interface import Belief, SlamEstimator, SupportsJoin, SupportsTruth
+from ...estimator.interface import (
+    Belief,
+    SlamEstimator,
+    SupportsJoin,
+    SupportsTruth,
+    UpdateReport,
+)
 from ...estimator.map_management.hypotheses import HypothesisSlam
 from ...estimator.map_management.managed_slam import ManagedSlam
 from ...estimator.map_management.map_view import marginal_without_joining
@@ -24,6 +30,7 @@ from .run_recorder import MapChanges, ReadingCounts, RunRecorder
 from .trace import RunTrace
 
 Progress = Callable[[int, int], object]
+Watcher = Callable[[int, SlamEstimator, UpdateReport | None], object]
 
 _MOST_MAPS = 500  # kept of a run by default
 _MOST_JOINED = 50  # the same where each must be joined from submaps
@@ -58,6 +65,7 @@ def replay(
     name: str | None = None,
     keep_history: bool = False,
     progress: Progress | None = None,
+    watch: Watcher | None = None,
 ) -> Replay:
     """Feed a log to an estimator: for each step its motion, then its scan.
 
@@ -79,6 +87,9 @@ def replay(
         only of some hundred steps spread over the run.
     progress : callable, optional
         Called with (steps done, steps) after every step.
+    watch : callable, optional
+        Called with (step, estimator, report) after every step; the report is None if
+        the step has no scan. It must not change the estimator.
 
     Returns
     -------
@@ -117,7 +128,9 @@ def replay(
         for number, step in enumerate(steps):
             with _naming_time(log, step):
                 show_truth(number)
-                _take(step, log, estimator, recorder, decisions)
+                report = _take(step, log, estimator, recorder, decisions)
+            if watch is not None:
+                watch(number, estimator, report)
             if progress is not None:
                 progress(number + 1, len(steps))
     made = decisions.result() if hides_identities(log) else None
@@ -167,7 +180,7 @@ def _take(
     estimator: SlamEstimator,
     recorder: RunRecorder,
     decisions: DecisionRecorder,
-) -> None:
+) -> UpdateReport | None:
     for row in step.motions:
         for odometry, dt in predictions(row, log.motion):
             estimator.predict(odometry, dt)
@@ -177,6 +190,7 @@ def _take(
         report = estimator.update(step.scan.measurements, _ids(step.scan))
         decisions.add(report, true_ids_of(step.scan))
     recorder.add(predicted, report)
+    return report
 
 
 @contextlib.contextmanager

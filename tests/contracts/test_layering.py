@@ -51,6 +51,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         logs
         runs
         figures
+        viewers
         monte_carlo
         noise_study
         trajectories

@@ -104,7 +104,7 @@ def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
     for name in names:
         with Image.open(folder / name) as picture:
             assert min(picture.size) > 300
-    texts = ["log.csv", "scenario.toml", "summary.json"]
+    texts = ["log.csv", "run.html", "scenario.toml", "summary.json"]
     found = [p.relative_to(folder).as_posix() for p in folder.rglob("*.*")]
     assert sorted(found) == sorted(names + texts) == summary["files"]
 
@@ -260,6 +260,28 @@ def test_a_random_controller_wanders_the_same_way_for_the_same_seed(without_pict
     options = ("run", "loop", "--steps", 5, "--controller", "random")
     assert answered(*options)["pose"] == answered(*options)["pose"]
     assert answered(*options)["pose"] != answered(*options, "--seed", 1)["pose"]
+
+
+def test_several_filters_share_a_page_and_a_table(log, without_pictures):
+    names = "ekf,invariant[gate_probability=0.9]"
+    text = printed("replay", log, "-e", names, "--out", "both")
+    assert "map error, raw [m RMS]" in text
+    summary = json.loads((log.parent / "both/summary.json").read_text())
+    assert summary["estimator"] == "ekf"
+    (other,) = summary["others"]
+    assert other["estimator"] == "invariant[gate_probability=0.9]"
+    assert other["settings"]["options"]["gate_probability"] == 0.9
+    page = (log.parent / "both/run.html").read_text()
+    assert "<title>little: ekf, invariant[gate_probability=0.9]" in page
+    alone = answered("replay", log, "-e", "ekf")
+    assert alone["out"].endswith("little-ekf")
+    assert alone["pose"] == summary["pose"]
+    assert alone["others"] == []
+
+
+@pytest.mark.parametrize("names", ["ekf,ekf", ",", "ekf[x"])
+def test_malformed_lists_of_filters_are_refused(log, names):
+    assert refused("replay", log, "-e", names).startswith("estimators must")
 
 
 def test_an_older_output_is_replaced_as_a_whole(log, without_pictures):

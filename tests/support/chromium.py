@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome")
-_FLAGS = (
+QUIET_FLAGS = (
     "--headless",
     "--no-sandbox",
     "--disable-gpu",
@@ -20,9 +20,8 @@ _FLAGS = (
     "--disable-sync",
     "--hide-scrollbars",
     "--host-resolver-rules=MAP * ~NOTFOUND",  # nor does the browser ask anybody
-    "--enable-logging=stderr",
-    "--v=0",
 )
+_FLAGS = (*QUIET_FLAGS, "--enable-logging=stderr", "--v=0")
 
 
 def find_chromium():

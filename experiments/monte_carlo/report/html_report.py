@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import xarray as xr
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from ....evaluation.consistency_report import FEW_AVERAGES
 from ....sim_configs.atomic_file import replace_when_written
+from ...figures.web_style import page_environment
 from ..reproduction import ASSUMED_FILE, python_call
 from .figures import MOST_DOTS, grid_steps, report_figures
 from .inline_svg import inline_svg
@@ -51,14 +51,7 @@ def write_html_report(
 
 def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     """Return the report's HTML; see :func:`write_html_report`."""
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        finalize=escape,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-        undefined=StrictUndefined,
-    )
+    environment = page_environment(Path(__file__).parent, finalize=escape)
     entries = summary["estimators"]
     page = {
         "headline": headline(summary),

@@ -1,0 +1,45 @@
+"""Filters by the names that the user gives, with options in brackets."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ..monte_carlo.measure.estimator_choices import estimator_choices
+from ..runs.filter_settings import FilterSettings
+
+
+def chosen_filters(
+    estimators: str,
+    options: Mapping[str, Any],
+    settings: Callable[..., FilterSettings],
+) -> dict[str, FilterSettings]:
+    """Set up one or more filters, by the labels that the user gave.
+
+    Parameters
+    ----------
+    estimators : str
+        Names with commas between, such as "ekf,invariant[iterations=3]".
+    options : mapping
+        Options of all of them; those in brackets go before.
+    settings : callable
+        Called with ``estimator`` and ``options``.
+
+    Raises
+    ------
+    ValueError
+        If there is none, one is unknown or malformed, or one stands there twice.
+
+    Examples
+    --------
+    >>> from functools import partial
+    >>> from slamgym.experiments.runs import settings_for_scenario
+    >>> from slamgym.sim_configs import load_scenario
+    >>> set_up = partial(settings_for_scenario, load_scenario("loop"))
+    >>> list(chosen_filters("ekf,invariant[iterations=3]", {}, set_up))
+    ['ekf', 'invariant[iterations=3]']
+    """
+    return {
+        choice.label: settings(
+            estimator=choice.name, options={**options, **choice.options}
+        )
+        for choice in estimator_choices(estimators)
+    }
