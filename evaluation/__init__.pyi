@@ -8,6 +8,9 @@ from .chi_square import family_band as family_band
 from .consistency_report import ConsistencyReport as ConsistencyReport
 from .consistency_report import assert_consistent as assert_consistent
 from .consistency_report import evaluate_consistency as evaluate_consistency
+from .diagnosis import CAUSES as CAUSES
+from .diagnosis import Diagnosis as Diagnosis
+from .diagnosis import diagnose as diagnose
 from .error_bound import Efficiency as Efficiency
 from .error_bound import PosteriorBound as PosteriorBound
 from .error_bound import efficiency as efficiency
@@ -28,6 +31,7 @@ from .nees import pose_nees as pose_nees
 from .nees import position_nees as position_nees
 from .nees import relative_map_nees as relative_map_nees
 from .nees import state_nees as state_nees
+from .noise_sums import noise_sums as noise_sums
 from .time_average_tests import EQUIVALENCE_MARGIN as EQUIVALENCE_MARGIN
 from .time_average_tests import EquivalenceTest as EquivalenceTest
 from .time_average_tests import bootstrap_test as bootstrap_test

@@ -166,10 +166,15 @@ def _show(summary: dict[str, Any], place: Path, reporter: "Reporter") -> None:
     """Print the table, a sentence for each estimator, the notes, and the files."""
     from rich.text import Text
 
+    from ..monte_carlo.report.diagnosis import diagnosis_lines
     from ..monte_carlo.report.table import monte_carlo_table
     from .tables import written
 
-    sentences = [entry["sentence"] for entry in summary["estimators"].values()]
+    sentences = [
+        sentence
+        for label, entry in summary["estimators"].items()
+        for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
+    ]
     reporter.show(monte_carlo_table(summary), "")
     for lines in (sentences, summary["notes"]):
         if lines:

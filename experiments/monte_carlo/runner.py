@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from joblib import delayed
 
+from ...arrays import Array
 from ...estimator import registry
 from ...estimator.interface import SupportsTruth
 from ...evaluation.error_bound import PosteriorBound
@@ -20,7 +21,7 @@ from ..runs.blas_threads import one_blas_thread
 from ..runs.filter_settings import FilterSettings
 from ..runs.simulated_runs import SimulatedRuns, simulate_runs
 from .measure.association_measures import KNOWN_IDS_ATE, known_ids_errors
-from .measure.bounds import bound_runs
+from .measure.bounds import bound_runs, noise_of_runs
 from .measure.estimator_choices import EstimatorChoice, estimator_choices
 from .measure.filtered_runs import filter_runs
 from .measure.run_measures import Block, measure_runs
@@ -42,6 +43,7 @@ class _Work:
     """All that a worker needs to compute a block."""
 
     scenario: Scenario
+    assumed: Scenario
     settings: tuple[FilterSettings, ...]
     factories: Mapping[str, registry.EstimatorFactory]
     seed: int
@@ -55,13 +57,20 @@ class _Work:
                 registry.register_estimator(name, factory)
         runs = simulate_runs(self.scenario, span.size, self.seed + span.first)
         bound = bound_runs(self.scenario, runs)
-        return [self._measure(settings, runs, bound) for settings in self.settings]
+        noise = noise_of_runs(self.scenario, self.assumed, runs)
+        return [
+            self._measure(settings, runs, bound, noise) for settings in self.settings
+        ]
 
     def _measure(
-        self, settings: FilterSettings, runs: SimulatedRuns, bound: PosteriorBound
+        self,
+        settings: FilterSettings,
+        runs: SimulatedRuns,
+        bound: PosteriorBound,
+        noise: Array,
     ) -> Block:
         filtered = filter_runs(settings, runs, threads=self.threads)
-        block = measure_runs(runs, filtered, bound, resolution=self.resolution)
+        block = measure_runs(runs, filtered, bound, noise, resolution=self.resolution)
         if runs.true_ids is not None:
             block[KNOWN_IDS_ATE] = known_ids_errors(settings, runs, self.threads)
         return block
@@ -158,6 +167,7 @@ def monte_carlo(
     workers = engage_workers(jobs, backend)
     work = _Work(
         world,
+        assumed_world,
         tuple(_checked(choice, assumed_world) for choice in choices),
         {choice.name: registry.find_estimator(choice.name) for choice in choices},
         job.seed,

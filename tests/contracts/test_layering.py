@@ -42,9 +42,10 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
     """,
     "evaluation": """
         chi_square nees trajectory_error error_bound association_scores gospa
-        whiteness
-        hypothesis_tests
+        whiteness noise_sums
+        hypothesis_tests noise_findings
         time_average_tests
+        diagnosis
         consistency_report
     """,
     "experiments": """

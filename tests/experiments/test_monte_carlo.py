@@ -25,7 +25,7 @@ from slamgym.evaluation import AssociationScores, Gospa
 from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
-from slamgym.experiments.monte_carlo.measure.bounds import bound_runs
+from slamgym.experiments.monte_carlo.measure.bounds import bound_runs, noise_of_runs
 from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
 from slamgym.experiments.monte_carlo.measure.filtered_runs import filter_runs
 from slamgym.experiments.monte_carlo.measure.run_measures import (
@@ -168,7 +168,8 @@ def test_deviations_and_areas_are_those_of_the_claimed_covariances():
     filtered = filter_runs(settings_for_scenario(WORLD), runs)
     variances = np.array([4.0, 9.0, 25.0]) * np.array([1.0, 100.0])[:, None]
     filtered.trace.pose_covariances[:] = variances[:, None, :, None] * np.eye(3)
-    block = measure_runs(runs, filtered, bound_runs(WORLD, runs))
+    noise = noise_of_runs(WORLD, WORLD, runs)
+    block = measure_runs(runs, filtered, bound_runs(WORLD, runs), noise)
     for run, scale in enumerate((1.0, 10.0)):
         np.testing.assert_allclose(block["position_std"][run], scale * np.sqrt(13.0))
         np.testing.assert_allclose(block["heading_std"][run], scale * 5.0)

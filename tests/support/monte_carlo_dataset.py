@@ -18,6 +18,7 @@ from slamgym.estimator.error_frames import invariant_error
 from slamgym.estimator.models.angles import wrap_angle
 from slamgym.evaluation import nees as c
 from slamgym.evaluation.error_bound import posterior_bound
+from slamgym.evaluation.noise_sums import noise_sums
 from slamgym.evaluation.trajectory_error import position_accuracy
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
@@ -25,6 +26,7 @@ from slamgym.sim_configs.scenario_files import save_scenario
 
 RUN, STEP = ("estimator", "run"), ("estimator", "run", "step")
 LANDMARK = ("estimator", "run", "landmark")
+NOISE = ("estimator", "run", "noise", "moment")
 FILTERS = {
     "ekf": {"name": "ekf", "options": {}},
     "invariant": {"name": "invariant", "options": {}},
@@ -91,11 +93,23 @@ def scores_of(world, drives, name, options):
         start_std=world.start.std,
         range_std_per_metre=world.sensor.range_std_per_metre,
     )
+    sums = noise_sums(
+        drives.true_poses,
+        drives.landmarks,
+        drives.odometry,
+        drives.measurements,
+        drives.visible,
+        motion_std=world.motion.std,
+        measurement_std=world.sensor.std,
+        range_std_per_metre=world.sensor.range_std_per_metre,
+        noise_in=world.motion.noise_in,
+    )
     bounds = {
         "position_bound": (STEP, bound.position),
         "position_bound_raw": (STEP, bound.raw_position),
         "heading_bound": (STEP, bound.heading),
         "map_bound": (RUN, bound.map),
+        "noise_sums": (NOISE, sums),
     }
     return over_time(drives, trace) | at_the_end(drives, trace, batch) | bounds
 

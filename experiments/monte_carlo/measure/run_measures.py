@@ -15,6 +15,7 @@ from ....estimator.interface import Belief
 from ....estimator.models.angles import wrap_angle
 from ....evaluation import nees
 from ....evaluation.error_bound import PosteriorBound, invariant_squares
+from ....evaluation.noise_sums import CHANNELS, MOMENTS
 from ....evaluation.trajectory_error import ellipse_areas, position_accuracy
 from ....sim_configs import Scenario
 from ...runs.simulated_runs import SimulatedRuns
@@ -26,6 +27,8 @@ Block = dict[str, NDArray[np.generic]]
 Value = NDArray[np.generic] | float
 
 STEP, RUN, LANDMARK = ("run", "step"), ("run",), ("run", "landmark")
+NOISE = "run", "noise", "moment"
+NOISE_SIZES = {"noise": len(CHANNELS), "moment": len(MOMENTS)}
 
 
 class Variable(NamedTuple):
@@ -72,6 +75,7 @@ VARIABLES: dict[str, Variable] = {
     "heading_bound": Variable(STEP, "f8", "least mean square of the heading [rad²]"),
     "map_error_centred": Variable(RUN, "f8", "final RMS about the map's centre [m]"),
     "map_bound": Variable(RUN, "f8", "least mean square of that [m²]"),
+    "noise_sums": Variable(NOISE, "f8", "sums over the noise in assumed deviations"),
     "failed": Variable(RUN, "?", "whether the run ended before its time"),
     "failed_at": Variable(RUN, "i8", "at which step, -1 if it did not"),
     "message": Variable(RUN, "U", "why"),
@@ -93,6 +97,7 @@ def measure_runs(
     runs: SimulatedRuns,
     filtered: FilteredRuns,
     bound: PosteriorBound,
+    noise: Array,
     *,
     resolution: float = 0.0,
 ) -> Block:
@@ -106,6 +111,8 @@ def measure_runs(
         The beliefs of a filter in these runs.
     bound : PosteriorBound
         Of the errors of any filter in these runs.
+    noise : ndarray, shape (B, 5, 7)
+        Sums of the noise, see :func:`~slamgym.evaluation.noise_sums`.
     resolution : float
         True landmarks nearer to each other count as one place [m], where identities are
         hidden.
@@ -130,6 +137,7 @@ def measure_runs(
             block[name][run] = value
     block["position_bound"], block["heading_bound"] = bound.position, bound.heading
     block["position_bound_raw"], block["map_bound"] = bound.raw_position, bound.map
+    block["noise_sums"] = noise
     block["readings"] = runs.visible.sum(axis=(1, 2))
     _write_failures(block, failures)
     return block
@@ -166,7 +174,7 @@ def _write_failures(block: Block, failures: Mapping[int, Failure]) -> None:
 
 def _empty_block(runs: SimulatedRuns) -> Block:
     shape = (*runs.visible.shape[:2], runs.landmarks.shape[1])
-    sizes = dict(zip(("run", "step", "landmark"), shape, strict=True))
+    sizes = dict(zip(("run", "step", "landmark"), shape, strict=True)) | NOISE_SIZES
     variables = VARIABLES if runs.true_ids is None else HIDDEN_VARIABLES
     blanks = {"f8": np.nan, "i8": 0, "?": False, "U": ""}
     return {

@@ -13,6 +13,7 @@ from ...runs.nan_statistics import finite, mean, quotient, root_mean_square
 from ..measure.association_measures import KNOWN_IDS_ATE
 from .association import association_summary
 from .decision_entries import decisions_table
+from .diagnosis import diagnosis_summary
 from .efficiency import efficiency_summary
 from .scores import (
     POINT_FREEDOM,
@@ -119,6 +120,7 @@ def summarise_estimator(
         heading [rad]; ``ate`` and ``landmark_rmse``, ``{raw, aligned}`` [m];
         ``landmark_mahalanobis``, root mean square; ``area`` of the 3σ ellipses at the
         end [m²]; ``efficiency``, see :func:`.efficiency.efficiency_summary`;
+        ``diagnosis``, see :func:`.diagnosis.diagnosis_summary`;
         ``association``, see :func:`.association.association_summary`;
         ``unused_readings``, the share of readings of known identity that corrected
         nothing and added no landmark, None where identities are hidden.
@@ -159,6 +161,7 @@ def summarise_estimator(
             "landmark": mean(scores.per_run("landmark_area")),
         },
         "efficiency": efficiency_summary(scores),
+        "diagnosis": diagnosis_summary(scores, frame),
         "association": association_summary(scores),
         "unused_readings": _unused_readings(scores),
     }

@@ -11,7 +11,7 @@ from typing import Any
 from ....sim_configs.atomic_file import replace_when_written
 from ...runs.folder_lock import WRITER, locked_folder, naming_folder
 
-FORMAT = "slamgym monte carlo 2"
+FORMAT = "slamgym monte carlo 3"
 JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
 _PARTIAL = re.compile(
     r"\.(job\.[0-9a-f]{8}\.json|results\.[0-9a-f]{8}\.nc"

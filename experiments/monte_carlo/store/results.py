@@ -12,8 +12,9 @@ import numpy as np
 import xarray as xr
 
 from .... import __version__
+from ....evaluation.noise_sums import CHANNELS, MOMENTS
 from ....sim_configs.atomic_file import replace_when_written
-from ..measure.run_measures import VARIABLES, Block, Variable
+from ..measure.run_measures import NOISE_SIZES, VARIABLES, Block, Variable
 from .job_folder import RESULTS
 from .result_blocks import Job, Span
 
@@ -178,6 +179,7 @@ def _sizes(job: Job, runs: Span) -> dict[str, int]:
         "run": runs.size,
         "step": job.scenario.steps + 1,
         "landmark": job.scenario.landmarks.count,
+        **NOISE_SIZES,
     }
 
 
@@ -185,4 +187,6 @@ def _coordinates(job: Job, runs: Span) -> dict[str, np.ndarray[Any, Any]]:
     return {dim: np.arange(size) for dim, size in _sizes(job, runs).items()} | {
         "estimator": np.array([choice.label for choice in job.estimators]),
         "run": np.arange(runs.first, runs.stop),
+        "noise": np.array(CHANNELS),
+        "moment": np.array(MOMENTS),
     }

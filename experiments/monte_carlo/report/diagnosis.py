@@ -1,0 +1,90 @@
+"""Why an estimator is not consistent, as an entry of the summary and a sentence."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ....arrays import Array
+from ....estimator.error_frames import ErrorFrame
+from ....evaluation.diagnosis import CANNOT_TELL, Diagnosis, diagnose
+from ...runs.nan_statistics import finite
+from ..measure.association_measures import KNOWN_IDS_ATE, PREFIX
+from .scores import EstimatorScores
+
+_MISTAKES = ("wrong", "duplicate", "ghost", "clutter_used")
+
+
+def diagnosis_summary(
+    scores: EstimatorScores, frame: ErrorFrame
+) -> dict[str, Any] | None:
+    """Name the cause for which an estimator is not consistent.
+
+    Returns
+    -------
+    dict or None
+        ``cause``, one of :data:`slamgym.evaluation.CAUSES`, its ``p``, a ``sentence``,
+        and ``others``, further causes; see :func:`slamgym.evaluation.diagnose`. None
+        for results without noise, which an older version wrote.
+    """
+    if "noise_sums" not in scores.results:
+        return None
+    found = _diagnosed(scores, frame)
+    return {
+        "cause": found.cause,
+        "p": finite(found.p_value),
+        "sentence": found.sentence,
+        "others": list(found.others),
+    }
+
+
+def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
+    """Write the diagnosis of an entry of the summary as a line, if there is one.
+
+    Examples
+    --------
+    >>> diagnosis_lines("ekf", {"diagnosis": {"sentence": "honest: all is well."}})
+    ('ekf: cause: honest: all is well.',)
+    """
+    found = entry.get("diagnosis")
+    return () if found is None else (f"{label}: cause: {found['sentence']}",)
+
+
+def _diagnosed(scores: EstimatorScores, frame: ErrorFrame) -> Diagnosis:
+    """Diagnose the runs that succeeded; all runs' noise counts, as it is the world's.
+
+    Runs that failed leave nothing to say of a filter whose other runs are honest.
+    """
+    nees = scores.over_time(f"pose_nees_{frame}")[:, scores.first - 1 :]
+    heading = scores.over_time("heading_nees")[:, scores.first - 1 :]
+    found = diagnose(
+        scores.per_run("noise_sums"),
+        nees,
+        heading,
+        nis_ratio=scores.nis_per_degree,
+        heading_knowledge=_heading_knowledge(scores),
+        mistakes=_mistakes(scores),
+    )
+    if found.cause != "honest" or not scores.failures:
+        return found
+    failed, runs = len(scores.failures), len(scores.good)
+    return Diagnosis(
+        CANNOT_TELL,
+        found.p_value,
+        f"cannot tell: {failed} of {runs} runs failed; the others are honest.",
+    )
+
+
+def _heading_knowledge(scores: EstimatorScores) -> Array | None:
+    """Divide the variance of the last heading by the least possible one."""
+    bound = scores.per_run("heading_bound")[:, -1]
+    if scores.nis_per_degree is None or not (bound > 0).all():
+        return None
+    return np.asarray(scores.per_run("heading_std")[:, -1] ** 2 / bound)
+
+
+def _mistakes(scores: EstimatorScores) -> Array | None:
+    if KNOWN_IDS_ATE not in scores.results:
+        return None
+    counts = [scores.per_run(f"{PREFIX}{name}") for name in _MISTAKES]
+    return np.asarray(np.nan_to_num(np.sum(counts, axis=0)))

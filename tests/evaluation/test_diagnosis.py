@@ -1,0 +1,252 @@
+"""The noise of a world by its truth, and the cause that it points to."""
+
+import numpy as np
+import pytest
+from scipy.stats import kurtosistest
+
+from slamgym.evaluation import CAUSES, diagnose, noise_sums
+from slamgym.evaluation.noise_findings import _kurtosis_score, noise_findings
+from slamgym.evaluation.noise_sums import CHANNELS, MOMENTS
+
+RUNS, STEPS = 60, 40
+MOTION_STD, SENSOR_STD = (0.2, 0.1, 0.05), (0.02, 0.1)
+PER_METRE = 0.03
+
+
+def drive(rng, *, runs=3, steps=6, landmarks=4, noise_in="motion"):
+    """A drive with known noise, step by step; the slow twin of the sums."""
+    poses, points = np.zeros((runs, steps, 3)), rng.uniform(-5, 5, (runs, landmarks, 2))
+    poses[:, 0] = rng.uniform(-4, 4, (runs, 3))
+    command = rng.uniform((0.2, -1.0), (2.0, 1.0), (runs, steps, 2))
+    motion = rng.normal(size=(runs, steps, 3)) * MOTION_STD
+    odometry, visible = command.copy(), rng.random((runs, steps, landmarks)) < 0.7
+    if noise_in == "odometry":
+        motion[..., 1] = 0.0
+        odometry -= motion[..., ::2]
+    sensor = rng.normal(size=(runs, steps, landmarks, 2))
+    readings = np.zeros(sensor.shape)
+    for b in range(runs):
+        for t in range(steps):
+            if t:
+                x, y, theta = poses[b, t - 1]
+                slip = motion[b, t] if noise_in == "motion" else np.zeros(3)
+                ahead, left = command[b, t, 0] + slip[0], slip[1]
+                poses[b, t] = (
+                    x + ahead * np.cos(theta) - left * np.sin(theta),
+                    y + ahead * np.sin(theta) + left * np.cos(theta),
+                    theta + command[b, t, 1] + slip[2],
+                )
+            for i in range(landmarks):
+                dx, dy = points[b, i] - poses[b, t, :2]
+                far = np.hypot(dx, dy)
+                sensor[b, t, i] *= SENSOR_STD[0], SENSOR_STD[1] + PER_METRE * far
+                readings[b, t, i] = np.arctan2(dy, dx) - poses[b, t, 2], far
+    readings += sensor
+    return poses, points, odometry, readings, visible, motion, sensor, command
+
+
+def summed(poses, points, odometry, readings, visible, **options):
+    return noise_sums(
+        poses, points, odometry, readings, visible, motion_std=MOTION_STD,
+        measurement_std=SENSOR_STD, range_std_per_metre=PER_METRE, **options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("noise_in", ["motion", "odometry"])
+def test_sums_are_those_of_the_noise_that_made_the_drive(noise_in):
+    *data, motion, sensor, command = drive(np.random.default_rng(1), noise_in=noise_in)
+    sums = summed(*data, noise_in=noise_in)
+    poses, points, _, _, visible = data
+    far = np.linalg.norm(points[:, None] - poses[:, :, None, :2], axis=-1)
+    for b in range(len(poses)):
+        w = list((motion[b, 1:] / MOTION_STD).T)
+        seen = sensor[b, visible[b]] / SENSOR_STD[0]
+        range_std = SENSOR_STD[1] + PER_METRE * far[b][visible[b]]
+        w += [seen[:, 0], sensor[b, visible[b]][:, 1] / range_std]
+        for channel, values in zip(sums[b], w, strict=True):
+            powers = [(values**k).sum() for k in range(5)]
+            assert channel[:5] == pytest.approx(powers, abs=1e-9)
+        g = command[b, 1:, 0] / MOTION_STD[0]
+        assert sums[b, 0, 5:] == pytest.approx([(g * w[0]).sum(), (g * g).sum()])
+
+
+def test_steps_that_do_not_count_are_left_out_of_the_motion_alone():
+    data = drive(np.random.default_rng(2))[:5]
+    counted = np.zeros((3, 6), dtype=bool)
+    counted[:, 3] = True
+    sums = summed(*data, noisy_steps=counted)
+    assert (sums[:, :3, 0] == 1).all()
+    assert sums[:, 3:, 0].tolist() == summed(*data)[:, 3:, 0].tolist()
+
+
+def test_a_noise_that_is_not_assumed_and_not_there_is_no_channel():
+    data = drive(np.random.default_rng(3), noise_in="odometry")[:5]
+    options = {"measurement_std": SENSOR_STD, "motion_std": (0.2, 0.0, 0.05)}
+    assert not noise_sums(*data, **options)[:, 1].any()
+    slipping = drive(np.random.default_rng(3))[:5]
+    assert noise_sums(*slipping, **options)[:, 1, 2].min() > 1e6
+
+
+def test_the_kurtosis_has_the_score_of_scipy():
+    for seed, size in ((0, 40), (1, 300), (2, 5000)):
+        x = np.random.default_rng(seed).standard_t(8, size)
+        centred = x - x.mean()
+        kurtosis = (centred**4).mean() / (centred**2).mean() ** 2
+        assert _kurtosis_score(kurtosis, size) == pytest.approx(
+            kurtosistest(x).statistic
+        )
+
+
+def sums_of(w, lever=20.0):
+    """Sums of standardised noise, shape (runs, 5, numbers), all of one lever."""
+    powers = [(w**k).sum(axis=2) for k in range(5)]
+    count = np.full(w.shape[:2], w.shape[2])
+    return np.stack([*powers, lever * powers[1], lever**2 * count], axis=2)
+
+
+def honest(seed, runs=RUNS):
+    rng = np.random.default_rng(seed)
+    return {
+        "noise": sums_of(rng.standard_normal((runs, 5, STEPS))),
+        "nees": rng.chisquare(3, (runs, STEPS)),
+        "heading_nees": rng.chisquare(1, (runs, STEPS)),
+    }
+
+
+def with_noise(channel, change, seed=5):
+    rng = np.random.default_rng(seed)
+    w = rng.standard_normal((RUNS, 5, STEPS))
+    at = CHANNELS.index(channel)
+    w[:, at] = change(rng, w[:, at])
+    return honest(seed) | {"noise": sums_of(w)}
+
+
+@pytest.mark.parametrize(
+    ("channel", "change", "cause"),
+    [
+        ("along", lambda _, w: 1.15 * w, "motion noise too small"),
+        ("sideways", lambda _, w: 0.85 * w, "motion noise too large"),
+        ("turn", lambda _, w: 1.15 * w, "motion noise too small"),
+        ("bearing", lambda _, w: 1.15 * w, "bearing noise too small"),
+        ("bearing", lambda _, w: 0.85 * w, "bearing noise too large"),
+        ("range", lambda _, w: 1.15 * w, "range noise too small"),
+        ("range", lambda _, w: 0.85 * w, "range noise too large"),
+        ("along", lambda _, w: w - 0.2, "odometry scale"),
+        ("turn", lambda _, w: w + 0.2, "odometry turn"),
+        ("bearing", lambda _, w: w + 0.2, "bearing bias"),
+        ("range", lambda _, w: w - 0.2, "range bias"),
+        ("turn", lambda rng, w: rng.standard_t(5, w.shape), "heavy tails"),
+        ("range", lambda rng, w: rng.standard_t(5, w.shape) / 1.29, "heavy tails"),
+    ],
+)
+def test_each_fault_of_the_noise_is_named(channel, change, cause):
+    found = diagnose(**with_noise(channel, change))
+    assert found.cause == cause
+    assert found.p_value < 0.025
+    assert found.sentence.startswith(f"{cause}: ")
+    assert found.cause in CAUSES
+
+
+def test_the_larger_of_two_faults_is_named_first():
+    rng = np.random.default_rng(8)
+    w = rng.standard_normal((RUNS, 5, STEPS))
+    w[:, 3] *= 1.1
+    w[:, 4] *= 1.4
+    found = diagnose(**honest(8) | {"noise": sums_of(w)})
+    assert found.cause == "range noise too small"
+    assert found.others == ("bearing noise too small",)
+
+
+def test_a_certain_but_tiny_fault_is_no_cause():
+    rng = np.random.default_rng(9)
+    w = 1.01 * rng.standard_normal((RUNS, 5, 1500))
+    found = diagnose(**honest(9) | {"noise": sums_of(w)})
+    assert found.cause == "honest"
+    assert min(f.p_value for f in noise_findings(sums_of(w))) < 1e-6
+
+
+def test_honest_runs_are_called_something_else_in_at_most_five_percent():
+    causes = [diagnose(**honest(seed)).cause for seed in range(100, 140)]
+    assert causes.count("honest") >= 36  # of 40; fewer in .3 % of cases at 5 %
+
+
+def test_errors_without_a_fault_of_the_noise_are_linearisation():
+    scores = honest(11)
+    wrong = scores | {"nees": 1.8 * scores["nees"]}
+    assert diagnose(**wrong).cause == "linearisation"
+    assert diagnose(**wrong, nis_ratio=1.02).cause == "linearisation"
+
+
+def test_spurious_knowledge_of_the_heading_makes_small_errors_suffice():
+    scores = honest(12)
+    nearly = scores | {"heading_nees": 1.15 * scores["heading_nees"]}
+    assert diagnose(**nearly, heading_knowledge=np.ones(RUNS)).cause == "honest"
+    knowing = diagnose(**nearly, heading_knowledge=np.full(RUNS, 0.6))
+    assert knowing.cause == "linearisation"
+    assert "0.6 of the least possible variance" in knowing.sentence
+
+
+def test_a_filter_that_ignores_the_noise_it_is_given_is_not_explained():
+    scores = honest(13)
+    wrong = scores | {"nees": 1.8 * scores["nees"]}
+    assert diagnose(**wrong, nis_ratio=1.7).cause == "cannot tell"
+    cautious = scores | {"nees": 0.5 * scores["nees"]}
+    assert diagnose(**cautious).cause == "cannot tell"
+
+
+def test_runs_with_wrong_associations_that_err_more_point_to_the_association():
+    scores, mistakes = honest(14), np.zeros(RUNS)
+    nees = scores["nees"].copy()
+    nees[:20] *= 4.0
+    mistakes[:20] = 3
+    wrong = scores | {"nees": nees}
+    assert diagnose(**wrong, mistakes=mistakes).cause == "association"
+    assert diagnose(**wrong, mistakes=mistakes[::-1]).cause == "cannot tell"
+    assert diagnose(**wrong, mistakes=np.zeros(RUNS)).cause == "linearisation"
+
+
+def test_a_heading_known_for_certain_has_no_part_in_the_answer():
+    certain = honest(15) | {"heading_nees": np.full((RUNS, STEPS), np.nan)}
+    assert diagnose(**certain).cause == "honest"
+
+
+def test_few_runs_decide_nothing():
+    found = diagnose(**honest(0, runs=19))
+    assert found.cause == "cannot tell"
+    assert "19 runs" in found.sentence
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("noise", np.zeros((RUNS, 5, 6)), r"noise must be shape \(60, 5, 7\)"),
+        ("noise", np.full((RUNS, 5, 7), np.nan), "noise must be finite"),
+        ("nees", np.ones(RUNS), r"nees must be shape \(runs, steps\)"),
+        ("nees", np.full((RUNS, STEPS), np.nan), "nees must be finite"),
+        ("heading_nees", np.ones((RUNS, 2)), "heading_nees must be shape"),
+    ],
+)
+def test_bad_input_is_refused_by_name(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        diagnose(**honest(0) | {name: value})
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        (0, r"true_poses must be shape \(B, T, 3\)"),
+        (2, "odometry must be shape"),
+        (3, "measurements must be shape"),
+        (4, "visible must be"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(place, message):
+    data = list(drive(np.random.default_rng(0))[:5])
+    data[place] = data[place][:, :, :2] if place == 0 else data[place][:, :4]
+    with pytest.raises(ValueError, match=message):
+        summed(*data)
+
+
+def test_the_sums_have_the_documented_shape():
+    sums = summed(*drive(np.random.default_rng(4))[:5])
+    assert sums.shape == (3, len(CHANNELS), len(MOMENTS))
