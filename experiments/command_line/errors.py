@@ -2,38 +2,65 @@
 
 import contextlib
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from typer.core import TyperGroup
 
-FAILURE, BAD_INPUT, INTERRUPTED = 1, 2, 130
+FAILURE, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 
 
 class BadInputError(ValueError):
     """The user's input cannot be used; the message gives the reason in one line."""
 
 
+class TerminationError(KeyboardInterrupt):
+    """A scheduler or ``kill`` sent SIGTERM; what handles Ctrl-C handles it, too."""
+
+
 class InterruptedRunError(Exception):
-    """The user pressed Ctrl-C; the message may name the work that remains."""
+    """Ctrl-C or SIGTERM, its cause; the message may name the work that remains."""
 
 
 @contextlib.contextmanager
 def interruptible(message: str) -> Iterator[None]:
-    """Report Ctrl-C in the block with a message about what remains."""
+    """Report Ctrl-C and SIGTERM in the block with a message about what remains."""
     try:
         yield
-    except KeyboardInterrupt:
-        raise InterruptedRunError(message) from None
+    except KeyboardInterrupt as error:
+        raise InterruptedRunError(message) from error
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Raise `TerminationError` in the block at the first SIGTERM, unless ignored."""
+    usual = signal.getsignal(signal.SIGTERM)
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if usual is not signal.SIG_DFL or not in_main_thread:
+        yield
+        return
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, usual)
+
+
+def _terminate(_number: int, _frame: object) -> NoReturn:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one spoils no clean-up
+    raise TerminationError
 
 
 class OneLineErrors(TyperGroup):
     """A group of commands that reports an error in one line.
 
-    Bad input ends with exit code 2, a failure with 1, Ctrl-C with 130. The traceback
-    is shown when the environment variable ``SLAMGYM_TRACEBACK`` is set.
+    Bad input ends with exit code 2, a failure with 1, Ctrl-C with 130, SIGTERM with
+    143. The traceback is shown when the environment variable ``SLAMGYM_TRACEBACK`` is
+    set.
     """
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
@@ -43,7 +70,8 @@ class OneLineErrors(TyperGroup):
         if not stands_alone:
             return super().main(*args, **kwargs)
         try:
-            result = super().main(*args, **kwargs)
+            with terminable():
+                result = super().main(*args, **kwargs)
         except Exception as error:
             if "SLAMGYM_TRACEBACK" in os.environ:
                 raise
@@ -88,7 +116,8 @@ def exit_code_of(error: Exception) -> int:
     (2, 1)
     """
     if isinstance(error, InterruptedRunError):
-        return INTERRUPTED
+        terminated = isinstance(error.__cause__, TerminationError)
+        return TERMINATED if terminated else INTERRUPTED
     if isinstance(error, np.linalg.LinAlgError):
         return FAILURE
     is_asked_wrongly = hasattr(error, "format_message")

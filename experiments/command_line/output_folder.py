@@ -1,17 +1,20 @@
 """The folder that a command writes: it appears complete or not at all."""
 
 import contextlib
+import glob
 import json
 import re
 import secrets
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ..runs.folder_lock import naming_folder
+from ..runs.folder_lock import WRITER, locked_folder, naming_folder
 from .errors import BadInputError
 
+_HOUR = 3600.0
 SUMMARY = "summary.json"
 """Every output folder holds it; its ``files`` lists what slamgym wrote there."""
 
@@ -45,12 +48,48 @@ def output_folder(path: Path) -> Iterator[Path]:
     with _parents(path):
         partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
         with naming_folder(path):
+            sweep(path)
             partial.mkdir()
         try:
-            yield partial
+            with _in_use(partial):
+                yield partial
             _swap(partial, path)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _in_use(folder: Path) -> Iterator[None]:
+    """Lock a folder during the block, where the file system has locks."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError, NotImplementedError):
+            stack.enter_context(locked_folder(folder))
+        yield
+
+
+def sweep(path: Path) -> None:
+    """Remove what killed commands left beside a folder that they were writing.
+
+    A living process holds a lock in its unfinished folder.  One without a lock is left
+    alone for an hour, and an older output if it is the only one.
+    """
+    leftover = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}\.(partial|old)")
+    for folder in path.parent.glob(f".{glob.escape(path.name)}.*"):
+        kind = leftover.fullmatch(folder.name)
+        needed = kind is None or (kind[1] == "old" and not path.exists())
+        if not needed and _is_abandoned(folder):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_abandoned(folder: Path) -> bool:
+    """Return whether no process writes to a folder any more."""
+    try:
+        if (folder / WRITER).exists():
+            with locked_folder(folder):
+                return True
+        return time.time() - folder.stat().st_ctime > _HOUR
+    except (OSError, NotImplementedError, ValueError):  # ValueError: it is in use
+        return False
 
 
 def default_folder(*names: str) -> Path:
@@ -65,9 +104,10 @@ def default_folder(*names: str) -> Path:
 
 
 def files_in(folder: Path) -> list[str]:
-    """List the files below a folder by their paths relative to it, sorted."""
+    """List the files below a folder but its lock, by their relative paths, sorted."""
     files = (entry for entry in folder.rglob("*") if not entry.is_dir())
-    return sorted(file.relative_to(folder).as_posix() for file in files)
+    names = {file.relative_to(folder).as_posix() for file in files}
+    return sorted(names - {WRITER})
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:

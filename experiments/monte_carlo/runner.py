@@ -5,7 +5,9 @@ nothing else, such as the number of runs, estimators or workers. Runs are simula
 filtered and measured in blocks; a worker computes one block at a time.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -176,7 +178,8 @@ def monte_carlo(
     )
     path = None if out is None else Path(out)
     with one_blas_thread(), BlockFolder(job, path, fresh=fresh) as folder:
-        _complete(folder, asked, work, workers, progress or _no_progress)
+        with _saying_what_is_kept(path):
+            _complete(folder, asked, work, workers, progress or _no_progress)
         if path is None:
             return dataset_of(job, folder.blocks(asked), asked, command)
         target = path / RESULTS
@@ -199,15 +202,32 @@ def _complete(
     missing = folder.missing(asked)
     done = asked.size - sum(span.size for span in missing)
     progress(done, asked.size)
-    for span, blocks in _computed(work, missing, workers):
-        folder.add(span, blocks)
-        done += span.size
-        progress(done, asked.size)
+    with closing(_computed(work, missing, workers)) as computed:  # ends the workers
+        for span, blocks in computed:
+            folder.add(span, blocks)
+            done += span.size
+            progress(done, asked.size)
+
+
+@contextmanager
+def _saying_what_is_kept(path: Path | None) -> Iterator[None]:
+    """Report the loss of a worker process with what the same job needs not do again."""
+    try:
+        yield
+    except BrokenProcessPool as error:
+        kept = (
+            "nothing is kept without a folder for the results"
+            if path is None
+            else f"the finished runs are in {path}, and the same command continues"
+        )
+        raise OSError(
+            f"a worker process was killed, perhaps for want of memory; {kept}"
+        ) from error
 
 
 def _computed(
     work: _Work, spans: list[Span], workers: Workers | None
-) -> Iterator[tuple[Span, list[Block]]]:
+) -> Generator[tuple[Span, list[Block]], None, None]:
     """Yield the blocks as they come, in any order."""
     if workers is None:
         yield from ((span, work.do(span)) for span in spans)

@@ -1,10 +1,17 @@
 """Engage the workers of a Monte Carlo: processes, threads, or a cluster."""
 
+import os
+import signal
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
+import psutil
 from joblib import Parallel, effective_n_jobs, parallel_config
+from joblib.parallel import BACKENDS as KNOWN_BACKENDS
+from joblib.parallel import get_active_backend
 
 from ...sim_configs.scenario_errors import unknown_choice
 
@@ -12,6 +19,8 @@ Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's de
 Workers = Callable[[Iterable[Call]], Iterable[Any]]
 
 BACKENDS = ("loky", "threading", "dask", "ray")
+_PATIENCE = 0.5
+"""How long a worker lives on without the process that engaged it [s]."""
 _LARGEST = 2**63  # of the integers in a file of results
 
 
@@ -54,10 +63,29 @@ def _joblib_workers(jobs: int | None, backend: str | None) -> Workers:
     if jobs is not None or backend is not None:
         chosen["n_jobs"] = jobs or -1
     with parallel_config(**chosen):
+        begin: dict[str, Any] = {}
+        if isinstance(get_active_backend()[0], KNOWN_BACKENDS["loky"]):
+            begin = {"initializer": _end_with, "initargs": (os.getpid(),)}
         workers: Workers = Parallel(
-            return_as="generator_unordered", pre_dispatch="2*n_jobs"
+            return_as="generator_unordered", pre_dispatch="2*n_jobs", **begin
         )
         return workers
+
+
+def _end_with(engaging: int) -> None:
+    """Let this worker end when the process that engaged it is gone, and not before.
+
+    A scheduler may send SIGTERM to all processes of a job.  The one that engaged the
+    workers then ends them.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    threading.Thread(target=_watch, args=(engaging,), daemon=True).start()
+
+
+def _watch(engaging: int) -> None:
+    while os.getppid() == engaging and psutil.pid_exists(engaging):
+        time.sleep(_PATIENCE)
+    os._exit(1)
 
 
 def _ray_workers(jobs: int | None) -> Workers:

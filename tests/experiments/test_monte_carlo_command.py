@@ -3,10 +3,8 @@
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -144,28 +142,6 @@ def test_a_folder_of_another_scenario_is_refused(here):
     told = refused("monte-carlo", "six_landmarks", "--runs", 2, "--out", "out")
     assert "holds results of scenario" in told
     assert (here / "out" / "results.nc").read_bytes() == before
-
-
-@pytest.mark.slow
-def test_an_interrupted_job_says_that_it_goes_on(here):
-    command = [
-        sys.executable,
-        "-c",
-        # Of a parent in the background a child inherits that interrupts are ignored.
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from slamgym.experiments.command_line.app import main; main()",
-    ]
-    job = ["monte-carlo", "loop", "--runs", "1000", "--block-size", "4", "--out", "out"]
-    child = subprocess.Popen(command + job, stderr=subprocess.PIPE, text=True)
-    blocks = here / "out" / "blocks"
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and not list(blocks.glob("runs-*.npz")):
-        time.sleep(0.05)
-    child.send_signal(signal.SIGINT)
-    _, stderr = child.communicate(timeout=60)
-    assert child.returncode == 130
-    assert "the finished runs are in out, and the same command continues" in stderr
-    assert list(blocks.glob("runs-*.npz"))
 
 
 @pytest.mark.slow

@@ -1,0 +1,188 @@
+"""What commands do when they, or their workers, are told to end."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+from slamgym.experiments.command_line.errors import (
+    TerminationError,
+    interruptible,
+    terminable,
+)
+from slamgym.experiments.command_line.output_folder import output_folder, sweep
+from slamgym.experiments.runs.folder_lock import WRITER, locked_folder
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals are those of POSIX")
+
+PROGRAM = [
+    sys.executable,
+    "-c",
+    # Of a parent in the background a child inherits that interrupts are ignored.
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    "from slamgym.experiments.command_line.app import main; main()",
+]
+JOB = "monte-carlo six_landmarks -e ekf --runs 90000 --block-size 8 --jobs 2 --out out"
+GOES_ON = "the finished runs are in out, and the same command continues"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def begin(*arguments):
+    return subprocess.Popen(
+        [*PROGRAM, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_until(happened):
+    deadline = time.monotonic() + 120
+    while not happened():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def many_runs(here):
+    """Return a Monte Carlo on two workers that has results, and its processes."""
+    child = begin(*JOB.split())
+    wait_until(lambda: len(list(here.glob("out/blocks/runs-*.npz"))) > 1)
+    return child, psutil.Process(child.pid).children(recursive=True)
+
+
+def workers_among(processes):
+    names = {process: " ".join(process.cmdline()) for process in processes}
+    return [p for p, name in names.items() if "popen_loky" in name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+)
+def test_an_ended_job_says_that_it_goes_on_and_leaves_no_process(here, number, code):
+    child, processes = many_runs(here)
+    assert len(workers_among(processes)) == 2
+    child.send_signal(number)
+    _, stderr = child.communicate(timeout=60)
+    assert child.returncode == code
+    assert stderr.endswith(f"slamgym: interrupted; {GOES_ON}\n")
+    _, alive = psutil.wait_procs(processes, timeout=10)
+    assert alive == []
+
+
+@pytest.mark.slow
+def test_workers_end_when_the_process_that_engaged_them_is_killed(here):
+    child, processes = many_runs(here)
+    child.kill()
+    child.communicate()
+    _, alive = psutil.wait_procs(processes, timeout=20)
+    assert alive == []
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_reported_with_how_to_go_on(here):
+    child, processes = many_runs(here)
+    first, second = workers_among(processes)
+    first.terminate()  # in vain: the job ends its workers
+    time.sleep(1)
+    assert child.poll() is None
+    second.kill()
+    _, stderr = child.communicate(timeout=60)
+    assert child.returncode == 1
+    assert "slamgym: a worker process was killed, perhaps for" in stderr
+    assert stderr.endswith(f"{GOES_ON}\n")
+
+
+@pytest.mark.slow
+def test_a_run_that_is_ended_leaves_nothing_and_a_killed_one_is_swept(here):
+    def unfinished():
+        return list(here.glob(".out.*.partial"))
+
+    for number, code in ((signal.SIGKILL, -9), (signal.SIGTERM, 143)):
+        child = begin(*["run", "loop", "--steps", "200000", "--out", "out"])
+        left = set(unfinished())
+        wait_until(
+            lambda left=left: any(
+                (f / WRITER).exists() for f in unfinished() if f not in left
+            )
+        )
+        child.send_signal(number)
+        _, stderr = child.communicate(timeout=60)
+        assert child.returncode == code
+        assert len(unfinished()) == (number == signal.SIGKILL)
+    assert stderr == "slamgym: interrupted; nothing was written\n"
+    assert list(here.iterdir()) == []
+
+
+def test_what_a_living_process_writes_is_not_swept(tmp_path):
+    names = {
+        "lives": ".out.00000001.partial",
+        "dead": ".out.00000002.partial",
+        "young": ".out.00000003.partial",
+        "foreign": ".out.mine.partial",
+        "of_another": ".outer.00000004.partial",
+        "only_output": ".out.00000005.old",
+    }
+    folders = {name: tmp_path / file for name, file in names.items()}
+    for folder in folders.values():
+        (folder / "deep").mkdir(parents=True)
+    (folders["dead"] / WRITER).write_text("process 1")
+    with locked_folder(folders["lives"]):
+        sweep(tmp_path / "out")
+    assert {name for name, folder in folders.items() if folder.exists()} == {
+        "lives",
+        "young",
+        "foreign",
+        "of_another",
+        "only_output",
+    }
+
+
+def test_old_folders_without_a_lock_are_swept(tmp_path, monkeypatch):
+    (tmp_path / ".out.00000001.partial").mkdir()
+    (tmp_path / ".out.00000002.old").mkdir()
+    (tmp_path / "out").mkdir()
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 3700)
+    sweep(tmp_path / "out")
+    assert [file.name for file in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_lock_of_a_folder_does_not_appear_in_it(tmp_path):
+    with output_folder(tmp_path / "out") as folder:
+        assert (folder / WRITER).exists()
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_only_the_first_sigterm_raises_and_the_usual_handler_comes_back():
+    usual = signal.getsignal(signal.SIGTERM)
+
+    def end_twice():
+        with terminable():
+            try:
+                signal.raise_signal(signal.SIGTERM)
+            finally:
+                signal.raise_signal(signal.SIGTERM)
+
+    for _ in range(2):
+        with pytest.raises(TerminationError):
+            end_twice()
+        assert signal.getsignal(signal.SIGTERM) is usual
+
+
+def test_an_ignored_sigterm_stays_ignored():
+    usual = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        with terminable(), interruptible("never"):
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, usual)
