@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from ..arrays import Array
-from .controls import ControlSequence, command_cycle
+from .controls import CircleSequence, ControlSequence, command_cycle
 from .field_types import Name, Part, Positive, Text, Wall, broken_rule, expect
 from .layouts import LandmarkLayout
 from .randomisation import RANGES, Randomise
@@ -41,8 +41,8 @@ class Scenario(Part):
 
     name: Name = Field(description="short name, for titles and files")
     description: Text = Field(default="", description="purpose of the scenario")
-    dt: Positive = Field(description="duration of one step [s]")
-    steps: _Steps = Field(description="steps of an episode")
+    dt: Positive = Field(default=0.2, description="duration of one step [s]")
+    steps: _Steps = Field(default=500, description="steps of an episode")
     start: Start = Field(default=Start(), description="start pose of the robot")
     robot: Robot = Field(default=Robot(), description="body and limits of the robot")
     motion: Motion = Field(description="noise of the motion")
@@ -52,7 +52,9 @@ class Scenario(Part):
         default=(), description="(x0, y0, x1, y1) of each [m]"
     )
     controls: ControlSequence = Field(
-        description="open-loop commands of the robot; repeated when short"
+        default=CircleSequence(radius=4.0, speed=0.5),
+        description="open-loop commands of the robot; repeated when short; by default "
+        "a circle of 4 m at 0.5 m/s",
     )
     randomise: Randomise | None = Field(
         default=None, description="ranges from which every episode draws its own world"

@@ -77,7 +77,7 @@ class RobocentricEkfSlam(EkfSlam):
         super().load_state_dict(state)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
-        """Return the belief in the world's frame, as :meth:`EkfSlam.belief`."""
+        """Return the belief in the world's frame, as `EkfSlam.belief`."""
         n, ids = self.map.size, self.landmark_ids
         mean, jacobian = _in_world(self.map.mean[:n])
         moved = jacobian @ self.map.covariance[:n, :n] @ jacobian.T

@@ -76,7 +76,7 @@ class HypothesisSlam:
     Parameters
     ----------
     estimator, motion_std, measurement_std, initial_pose, initial_pose_std, management
-        As in :class:`ManagedSlam`.
+        As in `ManagedSlam`.
     **options
         Those of the filter.
 
@@ -168,7 +168,7 @@ class HypothesisSlam:
     ) -> UpdateReport:
         """Associate one scan in every hypothesis, and correct the beliefs with it.
 
-        Parameters and errors as in :meth:`ManagedSlam.update`.  A hypothesis whose
+        Parameters and errors as in `ManagedSlam.update`.  A hypothesis whose
         filter fails is discarded, as long as another one succeeds.
 
         Returns

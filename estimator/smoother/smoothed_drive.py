@@ -27,7 +27,7 @@ class SmoothedDrive:
         P_jk = Π_j Φ_{j+1}ᵀ … Φ_kᵀ + Ψ_j P_l Ψ_kᵀ    for j < k
 
     with the Schur complement S of the landmarks and Π, Φ, Ψ of
-    :func:`.substitution.conditionals`.
+    `substitution.conditionals`.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class SmoothedDrive:
     def path(self) -> Array:
         """The pose at the start and after each reading of odometry, shape (1 + P, 3).
 
-        See :func:`.path.path_between`; where several readings lead to a scan.
+        See `path.path_between`; where several readings lead to a scan.
         """
         return path_between(self.poses, self._motions, self._noise)
 

@@ -25,7 +25,7 @@ class SmoothingSlam(RecordedSlam):
     follow : str
         The filter, by a name that :func:`~slamgym.estimator.make_estimator` takes.
     robust, robust_scale
-        As in :func:`.batch_smoother.smooth`.
+        As in `batch_smoother.smooth`.
     range_std_per_metre, range_noise_at, noise_at_rest, min_range
         As in :class:`~slamgym.estimator.EkfSlam`; the filter gets those that it takes.
     **options

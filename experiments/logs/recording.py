@@ -32,7 +32,7 @@ def record_episode(
     scenario : Scenario, mapping, str or Path
         The world, as in :func:`slamgym.sim_configs.load_scenario`.
     controller : Controller
-        Drives the robot, see :mod:`slamgym.envs.controllers`.
+        Drives the robot, see `envs.controllers`.
     seed : int
         Fixes everything random in the world.
     progress : callable, optional

@@ -30,7 +30,7 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
     Parameters
     ----------
     effects : sequence of NoiseEffect
-        Of :func:`~slamgym.experiments.noise_study.many_runs.noise_effects`.
+        Of `noise_effects`.
     """
     places = list(dict.fromkeys(e.changed for e in effects if e.changed in _TITLES))
     labels = list(dict.fromkeys(effect.estimator for effect in effects))

@@ -103,7 +103,7 @@ def study_scenario(
     record : callable
         Drives one episode of a scenario, always with the same seed, so that the noise
         differs by the factor alone; see
-        :func:`~slamgym.experiments.logs.recording.record_episode`.
+        `record_episode`.
     estimator : str
         Name of the filter; it assumes the noise of the world.
     options : mapping, optional

@@ -20,6 +20,8 @@ from ..logs.slamlog import SlamLog
 SMOOTHER = "slamgym.estimator.smoother.smoothing_slam:SmoothingSlam"
 """Import path of the smoother; its option ``follow`` names the filter that it follows,
 and whose options it takes too."""
+OFFLINE = {"smoother": SMOOTHER}
+"""Estimators of whole drives, which no step-by-step experiment knows by name."""
 SIGMAS = ("σx", "σy", "σα", "σβ", "σr")
 """The five noises: three of the motion in the robot's frame, two of the sensor."""
 
@@ -131,6 +133,7 @@ def settings_for(
     LogError
         If a value in the header is malformed.
     """
+    estimator = OFFLINE.get(estimator, estimator)
     factory = registry.find_estimator(estimator)
     header = dict(log.header)
     if measurement_std is not None:

@@ -48,11 +48,11 @@ def summarise(
         ``landmarks``, see :func:`landmark_table`; ``pose``, ``pose_covariance``;
         ``steps``, ``scans``, ``readings`` by what became of them; ``map_changes``, the
         landmarks confirmed, removed and merged, and the most in the map; ``nis``, see
-        :func:`nis_summary`; ``nees``, see :func:`nees_summary`; ``ate``, the root mean
+        `nis_summary`; ``nees``, see `nees_summary`; ``ate``, the root mean
         square distance of the path from the truth at the times of the truth, and
         ``landmark_rmse``, that of the map, both ``{raw, aligned}`` [m];
-        ``association``, see :func:`association_summary`; ``warnings``, see
-        :func:`.run_warnings.run_warnings`; ``log``, ``estimator``, ``settings``, and
+        ``association``, see `association_summary`; ``warnings``, see
+        `.run_warnings.run_warnings`; ``log``, ``estimator``, ``settings``, and
         ``slamgym``, the version.
     """
     log, trace = replay.log, replay.trace

@@ -382,6 +382,35 @@ def test_only_parts_of_one_job_are_merged(tmp_path):
         monte_carlo("six_landmarks", "ekf", 20, first_run=5)
 
 
+def test_a_filter_of_a_notebook_runs_and_is_known_by_its_methods(tmp_path, monkeypatch):
+    monkeypatch.delattr(sys.modules["__main__"], "__file__")
+
+    def written(factor):  # classes without a file, as in a notebook
+        cell = {"EkfSlam": EkfSlam, "__name__": "__main__"}
+        exec(
+            "class Cautious(EkfSlam):\n"
+            "    def predict(self, odometry, dt=1.0):\n"
+            f"        super().predict(odometry, {factor} * dt)\n",
+            cell,
+        )
+        return {"cautious": cell["Cautious"]}
+
+    for _ in range(2):
+        monte_carlo("six_landmarks", written(2), 2, out=tmp_path / "out").close()
+    with pytest.raises(ValueError, match="holds results of code"):
+        monte_carlo("six_landmarks", written(3), 2, out=tmp_path / "out")
+
+
+def test_a_label_does_not_replace_the_class_it_is_given_to():
+    class Mine(EkfSlam):
+        pass
+
+    noise = {"motion_std": (0, 0, 0), "measurement_std": (0.1, 0.1)}
+    (choice,) = estimator_choices({"invariant": Mine})
+    assert isinstance(make_estimator(choice.name, **noise), Mine)
+    assert not isinstance(make_estimator("invariant", **noise), Mine)
+
+
 def test_a_filter_that_has_changed_is_not_mixed_with_what_it_was(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     source = tmp_path / "changing_filter.py"

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from slamgym.sim_configs import (
     Scenario,
     ScenarioError,
+    action_sequence,
     list_presets,
     load_scenario,
     place_landmarks,
@@ -148,9 +149,22 @@ def test_an_unknown_kind_is_refused_with_a_suggestion(kind):
 def test_every_missing_field_gets_a_line_of_its_own():
     lines = mistake({"name": "x", "dt": 1.0}).splitlines()
     assert lines == [
-        f"{field} must be given"
-        for field in ("steps", "motion", "sensor", "landmarks", "controls")
+        f"{field} must be given" for field in ("motion", "sensor", "landmarks")
     ]
+
+
+def test_a_file_of_ten_lines_describes_a_drive(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(
+        'name = "small"\n[motion]\nstd = [0.02, 0.0, 0.02]\n[sensor]\n'
+        'std = [0.02, 0.1]\n[landmarks]\nlayout = "grid"\nrows = 2\ncolumns = 3\n'
+        "spacing = 2.0\n"
+    )
+    scenario = load_scenario(path)
+    actions = action_sequence(scenario)
+    assert scenario.landmarks.count == 6
+    assert len(actions) == scenario.steps
+    assert np.all(np.abs(actions) <= (scenario.robot.max_speed, 1.0))
 
 
 def test_a_missing_field_of_a_layout_is_named():

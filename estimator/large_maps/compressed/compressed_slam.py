@@ -102,7 +102,7 @@ class CompressedEkfSlam:
         self.reset(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run with an empty map, as :meth:`EkfSlam.reset`."""
+        """Start a new run with an empty map, as `EkfSlam.reset`."""
         self._map.reset(pose, pose_std)
         self._extra = 0  # landmarks of the local map beyond those of a scan
         self._age = 0  # scans in this phase
@@ -251,7 +251,7 @@ class CompressedEkfSlam:
         return name | self._map.state_dict([self._extra, self._age, self._rests])
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, as :meth:`EkfSlam.load_state_dict`."""
+        """Continue from a saved state, as `EkfSlam.load_state_dict`."""
         name, base = type(self).__name__, type(self._map.filter).__name__
         saved = checked_state(state, name, base, self._map.is_invariant)
         self._extra, self._age, rests = self._map.load(saved)

@@ -115,7 +115,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         self.reset(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run with an empty map, as :meth:`EkfSlam.reset`."""
+        """Start a new run with an empty map, as `EkfSlam.reset`."""
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         self._belief = SparseBelief.empty(first, std)
@@ -276,7 +276,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         return as_arrays(self._belief, type(self).__name__, self._scan_rules.base)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, as :meth:`EkfSlam.load_state_dict`."""
+        """Continue from a saved state, as `EkfSlam.load_state_dict`."""
         name, base = type(self).__name__, self._scan_rules.base
         self._belief = checked_state(state, name, base)
 

@@ -41,8 +41,8 @@ class SubmapSlam(SubmapQueries):
 
     ``belief()`` joins the submaps.  Landmarks in several submaps are the same unknown,
     which closes loops, and the frames are the sparse least-squares solution,
-    linearised at one point (:mod:`.joining`).  One linear update then fuses the active
-    submap (:mod:`.fusion`).  The cost of a step depends on the active submap only, not
+    linearised at one point (`joining`).  One linear update then fuses the active
+    submap (`fusion`).  The cost of a step depends on the active submap only, not
     on the size of the map.
 
     Parameters
@@ -119,7 +119,7 @@ class SubmapSlam(SubmapQueries):
         self.reset(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run with an empty map, as :meth:`EkfSlam.reset`."""
+        """Start a new run with an empty map, as `EkfSlam.reset`."""
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         if self._folder is not None:
@@ -207,7 +207,7 @@ class SubmapSlam(SubmapQueries):
         """Condition on two mapped landmarks being the same, and remove the second.
 
         The landmark then connects all submaps that hold either.  Submaps that hold both
-        are conditioned separately (:mod:`.merging`).
+        are conditioned separately (`merging`).
 
         Raises
         ------
@@ -240,7 +240,7 @@ class SubmapSlam(SubmapQueries):
 
         From the first call on, the filter follows the robot in a copy of a part of the
         joined map.  It replaces the copy when a submap is closed or the robot leaves
-        the part.  The submaps and :meth:`belief` do not change.
+        the part.  The submaps and `belief` do not change.
 
         Parameters
         ----------
@@ -256,7 +256,7 @@ class SubmapSlam(SubmapQueries):
         Raises
         ------
         ValueError, numpy.linalg.LinAlgError
-            As :meth:`belief`; the state is then unchanged.
+            As `belief`; the state is then unchanged.
         """
         return self._neighbourhood.view(within)._replace(whole=self.landmark_ids)
 
@@ -269,7 +269,7 @@ class SubmapSlam(SubmapQueries):
         return as_arrays(type(self).__name__, self._graph, neighbourhood)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, as :meth:`EkfSlam.load_state_dict`.
+        """Continue from a saved state, as `EkfSlam.load_state_dict`.
 
         Raises
         ------

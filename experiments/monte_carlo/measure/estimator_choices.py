@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import marshal
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -11,12 +12,12 @@ from typing import Any, NamedTuple
 from ....estimator import registry
 from ....estimator.registry import find_estimator, list_estimators, register_estimator
 from ....sim_configs import Scenario
-from ...runs.filter_settings import SMOOTHER, FilterSettings, settings_for_scenario
+from ...runs.filter_settings import OFFLINE, FilterSettings, settings_for_scenario
 
 _PACKAGE = Path(registry.__file__).resolve().parents[1]
 _BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")
-OFFLINE = {"smoother": SMOOTHER}
-"""Estimators of whole drives, which no step-by-step experiment knows by name."""
+OWN_NAMES = frozenset(list_estimators())
+"""Names that stay those of slamgym's own estimators."""
 _COMMA = re.compile(r",(?![^\[]*\])")  # outside brackets
 _SPEC = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>[^\]]*)\])?")
 
@@ -32,19 +33,36 @@ class EstimatorChoice(NamedTuple):
 
     def code(self) -> str:
         """Return a digest of the user's own source; empty for slamgym's estimators."""
+        estimator = find_estimator(self.name)
         try:
-            source = inspect.getsourcefile(find_estimator(self.name))
+            source = inspect.getsourcefile(estimator)
         except TypeError:
             return ""
+        except OSError:  # written in a notebook or an interpreter: no file
+            return _digest(_code_of_methods(estimator))
         if source is None or Path(source).resolve().is_relative_to(_PACKAGE):
             return ""
-        return hashlib.sha256(Path(source).read_bytes()).hexdigest()[:12]
+        return _digest(Path(source).read_bytes())
 
     def settings(self, scenario: Scenario) -> FilterSettings:
         """Return its settings for the noise of a world."""
         return settings_for_scenario(
             scenario, estimator=self.name, options=self.options
         )
+
+
+def _digest(code: bytes) -> str:
+    return hashlib.sha256(code).hexdigest()[:12]
+
+
+def _code_of_methods(estimator: object) -> bytes:
+    """Return the compiled code of a class's own methods."""
+    members = sorted(vars(estimator).items())
+    return b"".join(
+        marshal.dumps(member.__code__)
+        for _, member in members
+        if inspect.isfunction(member)
+    )
 
 
 def estimator_choices(
@@ -129,6 +147,6 @@ def _name_of(label: str, what: str | Callable[..., Any]) -> str:
     path = f"{module}:{name}"
     if module != "__main__" and name.isidentifier():
         return path
-    if label not in list_estimators():
-        register_estimator(label, what)
-    return label
+    name = label if label not in OWN_NAMES else f"{label} of yours"
+    register_estimator(name, what)
+    return name

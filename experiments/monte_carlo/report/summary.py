@@ -56,8 +56,8 @@ def summarise_monte_carlo(
         where unknown), ``resolution`` (of places in scores of association) [m],
         ``versions``, ``command``; ``frame``; ``knowable_heading_std`` [rad], the
         deviation of the heading at the start, below which it cannot fall;
-        ``estimators`` by label, see :func:`summarise_estimator`; and ``notes``, the
-        warnings of :func:`.warnings.run_warnings`.
+        ``estimators`` by label, see `summarise_estimator`; and ``notes``, the
+        warnings of `.warnings.run_warnings`.
     """
     attrs = dataset.attrs
     assumed = attrs.get("assumed", attrs["scenario"])

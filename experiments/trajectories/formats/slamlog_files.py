@@ -34,7 +34,7 @@ def read(path: Path) -> Iterator[Trajectory]:
 def to_slamlog(trajectory: Trajectory) -> SlamLog:
     """Return the log of a trajectory, for replay.
 
-    Time counts steps, as in :func:`~slamgym.experiments.logs.recording.record_episode`,
+    Time counts steps, as in `record_episode`,
     whose log of the same seed is equal.
 
     Raises

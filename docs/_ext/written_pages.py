@@ -1,0 +1,213 @@
+"""Sphinx extension: pages that are made from the package itself, before every build.
+
+It writes into ``docs/generated``: a page per environment, the gallery of presets, the
+table of a scenario's fields, and the lists of public names.
+"""
+
+import inspect
+import re
+from pathlib import Path
+from types import ModuleType
+
+import preset_pictures
+import scenario_fields
+from sphinx.application import Sphinx
+from sphinx.util.display import status_iterator
+
+import slamgym
+from slamgym import agents, envs, estimator, evaluation, experiments, sim_configs
+
+ROOT = Path(__file__).parents[2]
+ENVIRONMENTS = {
+    "LandmarkWorld": (envs.LandmarkWorldEnv, "loop"),
+    "ActiveSlam": (agents.ActiveSlamEnv, "active_medium"),
+}
+PACKAGES: tuple[ModuleType, ...] = (
+    estimator,
+    evaluation,
+    sim_configs,
+    envs,
+    envs.controllers,
+    agents,
+    experiments.logs,
+    experiments.runs,
+    experiments.monte_carlo,
+    experiments.noise_study,
+    experiments.trajectories,
+    experiments.figures,
+    estimator.association,
+    estimator.filters,
+    estimator.large_maps,
+    estimator.map_management,
+    estimator.models,
+    estimator.smoother,
+    envs.robot,
+    envs.sensors,
+    envs.rendering,
+    envs.vector,
+)
+"""A name stands under the first package that has it."""
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register with Sphinx."""
+    app.connect("builder-inited", write_pages, priority=100)
+    app.connect("source-read", point_into_the_site)
+    return {"parallel_read_safe": True}
+
+
+def write_pages(app: Sphinx) -> None:
+    """Write all pages below ``docs/generated``."""
+    folder = Path(app.srcdir) / "generated"
+    (folder / "api").mkdir(parents=True, exist_ok=True)
+    for name, (environment, preset) in ENVIRONMENTS.items():
+        _write(folder / f"{name}.md", environment_page(name, environment, preset))
+    _write(folder / "fields.md", scenario_fields.page())
+    _write(folder / "presets.md", preset_pictures.page(folder))
+    listed = public_names()
+    for package in status_iterator(listed, "listing public names … "):
+        _write(folder / "api" / f"{package}.rst", names_page(package, listed[package]))
+    _write(folder / "api" / "index.rst", api_index(list(listed)))
+    for name in ("CONVENTIONS", "CHANGELOG", "CONTRIBUTING"):
+        text = (ROOT / f"{name}.md").read_text()
+        _write(folder / f"{name.lower()}.md", text)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file if its text is new, so that Sphinx reads only what changed."""
+    if not path.exists() or path.read_text() != text:
+        path.write_text(text)
+
+
+def environment_page(name: str, environment: type, preset: str) -> str:
+    """Return the Markdown page of an environment, made from its docstring."""
+    title, _, rest = inspect.getdoc(environment).partition("\n\n")
+    body, _, example = rest.partition("\nExamples\n--------\n")
+    body = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"`\1`", body)
+    body = re.sub(r"``", "`", body)
+    return f"""# {name}
+
+{title}
+
+```{{image}} {preset}.gif
+:alt: An episode of {name} in the preset {preset}
+:width: 480px
+```
+
+```python
+import gymnasium
+import slamgym
+
+env = gymnasium.make("slamgym/{name}-v0", scenario="{preset}")
+```
+
+{body}
+
+## Example
+
+```pycon
+{example.strip()}
+```
+"""
+
+
+def public_names() -> dict[str, list[str]]:
+    """Return the public names of each package; every object under one package only."""
+    taken: set[int] = set()
+    listed: dict[str, list[str]] = {}
+    for package in PACKAGES:
+        found = []
+        for name in getattr(package, "__all__", ()):
+            thing = getattr(package, name)
+            if inspect.ismodule(thing) or id(thing) in taken:
+                continue
+            taken.add(id(thing))
+            found.append(name)
+        if found:
+            listed[package.__name__] = found
+    return listed
+
+
+def names_page(package: str, names: list[str]) -> str:
+    """Return the page of a package: its docstring and a table of its names."""
+    rule = "=" * len(package)
+    about = (inspect.getdoc(inspect.importlib.import_module(package)) or "").split(
+        "\n\n"
+    )[0]
+    environments = {cls.__name__: page for page, (cls, _) in ENVIRONMENTS.items()}
+    rows = "\n".join(f"   {name}" for name in names if name not in environments)
+    pages = "\n".join(
+        f"* :doc:`{name} <../{environments[name]}>`"
+        for name in names
+        if name in environments
+    )
+    return f"""{package}
+{rule}
+
+{about}
+
+.. currentmodule:: {package}
+
+{pages}
+
+.. autosummary::
+   :toctree: names
+   :nosignatures:
+
+{rows}
+"""
+
+
+def api_index(packages: list[str]) -> str:
+    """Return the page that lists the packages, and the names at the top."""
+    top = "\n".join(
+        f"* ``slamgym.{name}``"
+        for name in slamgym.__all__
+        if not inspect.ismodule(getattr(slamgym, name))
+    )
+    rows = "\n".join(f"   {package}" for package in packages)
+    return f"""Public names
+============
+
+The names used most can be imported from ``slamgym`` itself:
+
+{top}
+
+.. toctree::
+   :maxdepth: 1
+
+{rows}
+"""
+
+
+_OUTSIDE = re.compile(r"\[([^\]]+)\]\((?:\.\./)+([^)#\s]*)(#[^)]*)?\)")
+
+
+def point_into_the_site(app: Sphinx, document: str, source: list[str]) -> None:
+    """Turn links to files beside ``docs`` into links to pages of the site, or text."""
+    depth = document.count("/")
+    pages = {
+        f"{name}.md": "../" * depth + f"generated/{name.lower()}.md"
+        for name in ("CONVENTIONS", "CHANGELOG", "CONTRIBUTING")
+    }
+
+    def replacement(match: re.Match[str]) -> str:
+        text, target, anchor = match.group(1), match.group(2), match.group(3) or ""
+        if target in pages:
+            return f"[{text}]({pages[target]}{anchor})"
+        return text
+
+    source[0] = _OUTSIDE.sub(replacement, source[0])
+    if document.startswith("generated/"):
+        source[0] = _root_links(source[0], depth)
+
+
+def _root_links(text: str, depth: int) -> str:
+    """Mend links of a page that stands at the root of the repository."""
+    up = "../" * depth
+    text = re.sub(r"\]\(docs/", f"]({up}", text)
+    names = "|".join(("CONVENTIONS", "CHANGELOG", "CONTRIBUTING"))
+    text = re.sub(
+        rf"\]\(({names})\.md", lambda found: f"]({found.group(1).lower()}.md", text
+    )
+    return re.sub(r"\[([^\]]+)\]\((?!https?:|\.\./|#|[a-z]+\.md)[^)]*\)", r"\1", text)
