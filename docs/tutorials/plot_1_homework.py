@@ -30,7 +30,7 @@ print(log.name, "with", len(log.events), "rows of odometry and scans")
 # %%
 # The map
 # -------
-# The textbook filter of the homework is ``ekf``. `settings_for` takes the noise from the log's header.
+# The textbook filter of the homework is ``ekf``. ``settings_for`` takes the noise from the log's header.
 
 from slamgym.experiments.figures import covariance_figure, map_figure, truth_figure
 
@@ -65,7 +65,7 @@ correlations = covariance_figure(run.trace)
 # %%
 # What does each noise do?
 # ------------------------
-# `study_log` filters the log eleven times: with the settings of the log, and with each of the five standard deviations
+# ``study_log`` filters the log eleven times: with the settings of the log, and with each of the five standard deviations
 # times 10 and divided by 10. NIS and NEES are given per degree of freedom, so 1 is expected. With too large a σ the
 # ellipses are wider than needed, and both are below 1; with too small a σ the truth lies outside, and they are above 1.
 

@@ -9,8 +9,8 @@ tests it with 100 drives beside two filters of the package.
 # %%
 # Write and check a filter
 # ------------------------
-# A filter is any class with the six methods of `SlamEstimator`. The shortest way is to change one that exists.
-# `check_estimator` drives it through a small world and names the first promise that it breaks.
+# A filter is any class with the six methods of ``SlamEstimator``. The shortest way is to change one that exists.
+# ``check_estimator`` drives it through a small world and names the first promise that it breaks.
 
 from slamgym import EkfSlam, check_estimator
 

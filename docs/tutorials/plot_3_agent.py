@@ -24,7 +24,7 @@ for key, value in observation.items():
 # %%
 # A reward for information
 # ------------------------
-# `InformationReward` pays for every step by which the uncertainty of the map decreases.
+# ``InformationReward`` pays for every step by which the uncertainty of the map decreases.
 
 env = InformationReward(believing, criterion="D")
 robot = believing.scenario.robot

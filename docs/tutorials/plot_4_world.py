@@ -42,7 +42,7 @@ except ValueError as error:
 # %%
 # Change it and look at it
 # ------------------------
-# `with_changes` replaces fields. On the command line, ``--set sensor.max_range=5`` does the same.
+# ``with_changes`` replaces fields. On the command line, ``--set sensor.max_range=5`` does the same.
 
 import gymnasium
 import matplotlib.pyplot as plt

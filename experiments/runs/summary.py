@@ -52,7 +52,7 @@ def summarise(
         square distance of the path from the truth at the times of the truth, and
         ``landmark_rmse``, that of the map, both ``{raw, aligned}`` [m];
         ``association``, see `association_summary`; ``warnings``, see
-        `.run_warnings.run_warnings`; ``log``, ``estimator``, ``settings``, and
+        `run_warnings`; ``log``, ``estimator``, ``settings``, and
         ``slamgym``, the version.
     """
     log, trace = replay.log, replay.trace

@@ -60,7 +60,7 @@ def generate_trajectories(
     seed : int, optional
         Seed of episode 0; episode i has the world of seed + i.
     format : str, optional
-        Format of the files, see `.formats`.
+        Format of the files, see `formats`.
     episodes_per_shard : int, optional
         The default is 100, or fewer if they would take more than 256 MB of memory.
     progress : callable, optional

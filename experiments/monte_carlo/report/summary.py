@@ -57,7 +57,7 @@ def summarise_monte_carlo(
         ``versions``, ``command``; ``frame``; ``knowable_heading_std`` [rad], the
         deviation of the heading at the start, below which it cannot fall;
         ``estimators`` by label, see `summarise_estimator`; and ``notes``, the
-        warnings of `.warnings.run_warnings`.
+        warnings of `run_warnings`.
     """
     attrs = dataset.attrs
     assumed = attrs.get("assumed", attrs["scenario"])
