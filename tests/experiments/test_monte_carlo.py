@@ -20,7 +20,7 @@ import pytest
 import xarray as xr
 
 from slamgym.envs.controllers import make_controller
-from slamgym.estimator import Belief, EkfSlam, make_estimator
+from slamgym.estimator import Belief, EkfSlam, make_estimator, registry
 from slamgym.evaluation import AssociationScores, Gospa
 from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.logs.recording import record_episode
@@ -382,6 +382,12 @@ def test_only_parts_of_one_job_are_merged(tmp_path):
         monte_carlo("six_landmarks", "ekf", 20, first_run=5)
 
 
+@pytest.fixture
+def own_registry(monkeypatch):
+    monkeypatch.setattr(registry, "_factories", dict(registry._factories))
+
+
+@pytest.mark.usefixtures("own_registry")
 def test_a_filter_of_a_notebook_runs_and_is_known_by_its_methods(tmp_path, monkeypatch):
     monkeypatch.delattr(sys.modules["__main__"], "__file__")
 
@@ -401,6 +407,7 @@ def test_a_filter_of_a_notebook_runs_and_is_known_by_its_methods(tmp_path, monke
         monte_carlo("six_landmarks", written(3), 2, out=tmp_path / "out")
 
 
+@pytest.mark.usefixtures("own_registry")
 def test_a_label_does_not_replace_the_class_it_is_given_to():
     class Mine(EkfSlam):
         pass
