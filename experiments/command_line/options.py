@@ -103,6 +103,15 @@ OutFolder = Annotated[
         "results/<name>-<estimator>",
     ),
 ]
+RerunFile = Annotated[
+    Path | None,
+    option(
+        "FILE",
+        "Write the content of run.html as a recording for the viewer rerun, too (.rrd; "
+        "needs slamgym[viewer]).",
+        "none",
+    ),
+]
 EveryStep = Annotated[
     bool | None,
     option(

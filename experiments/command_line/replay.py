@@ -77,6 +77,7 @@ def replay(
     noise_from_file: options.NoiseFromFile = False,
     out: options.OutFolder = None,
     every_step: options.EveryStep = None,
+    rerun: options.RerunFile = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Filter a log, compare with the truth, draw.
@@ -98,7 +99,13 @@ def replay(
     from .chosen_filters import chosen_filters
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
-    from .run_files import filter_and_write, note_choices, read_any_log, show_run
+    from .run_files import (
+        check_rerun,
+        filter_and_write,
+        note_choices,
+        read_any_log,
+        show_run,
+    )
 
     named = {
         "landmark_init": landmark_init,
@@ -108,6 +115,7 @@ def replay(
     }
     given = {name: value for name, value in named.items() if value is not None}
     reporter = Reporter(as_json=as_json)
+    check_rerun(rerun)
     drive = read_any_log(log, robot, truth=truth, noise_from_file=noise_from_file)
     note_choices(drive, reporter)
     if hide_identities:
@@ -123,6 +131,12 @@ def replay(
     place = out or default_folder(drive.name, *filters)
     with output_folder(place) as folder:
         summary = filter_and_write(
-            drive, filters, folder, every_step, reporter, resolution=resolution
+            drive,
+            filters,
+            folder,
+            every_step,
+            reporter,
+            resolution=resolution,
+            rerun=rerun,
         )
     show_run(summary, place, reporter)

@@ -19,6 +19,7 @@ def run(
     set_: options.ScenarioChanges = None,
     out: options.OutFolder = None,
     every_step: options.EveryStep = None,
+    rerun: options.RerunFile = None,
     resolution: options.Resolution = 0.0,
     as_json: options.AsJson = False,
 ) -> None:
@@ -42,7 +43,7 @@ def run(
     from .chosen_filters import chosen_filters
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
-    from .run_files import filter_and_write, show_run
+    from .run_files import check_rerun, filter_and_write, show_run
     from .scenario_options import chosen_scenario, recorded
 
     world = chosen_scenario(scenario, steps, set_)
@@ -52,6 +53,7 @@ def run(
         partial(settings_for_scenario, world),
     )
     reporter = Reporter(as_json=as_json)
+    check_rerun(rerun)
     place = out or default_folder(world.name, *filters)
     with output_folder(place) as folder:
         with reporter.progress("driving") as tick:
@@ -65,5 +67,6 @@ def run(
             reporter,
             resolution=resolution,
             walls=world.walls,
+            rerun=rerun,
         )
     show_run(summary, place, reporter)

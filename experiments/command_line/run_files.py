@@ -1,6 +1,6 @@
 """A log filtered by estimators: the files of the run, and what is printed of it."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import Replay, replay
 from ..runs.summary import summarise
 from ..runs.trace import RunTrace
-from ..viewers import RunFrames, ViewedRun, write_run_page
+from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
+from ..viewers.rerun_recording import import_rerun
 from .association_table import association_table
 from .errors import BadInputError
 from .output_folder import write_summary
@@ -57,6 +58,25 @@ def note_choices(log: SlamLog, reporter: Reporter) -> None:
         reporter.note(f"noise {log.header['noise']}")
 
 
+def check_rerun(path: Path | None) -> None:
+    """Check before the work that a recording for rerun can be written.
+
+    Raises
+    ------
+    BadInputError
+        If the path does not end in .rrd, or its folder does not exist.
+    ImportError
+        If rerun-sdk is not installed.
+    """
+    if path is None:
+        return
+    if path.suffix != ".rrd":
+        raise BadInputError(f"--rerun must end in .rrd, got {path}")
+    if not path.absolute().parent.is_dir():
+        raise BadInputError(f"--rerun: the folder of {path} does not exist")
+    import_rerun()
+
+
 def filter_and_write(
     log: SlamLog,
     filters: Mapping[str, FilterSettings],
@@ -65,7 +85,8 @@ def filter_and_write(
     reporter: Reporter,
     *,
     resolution: float = 0.0,
-    walls: Iterable[Sequence[float]] = (),
+    walls: Sequence[Sequence[float]] = (),
+    rerun: Path | None = None,
 ) -> dict[str, Any]:
     """Filter a log, and write figures, run.html, log.csv and summary.json.
 
@@ -86,8 +107,10 @@ def filter_and_write(
         Shows the progress.
     resolution : float
         True landmarks nearer to each other count as one in scores of association [m].
-    walls : iterable of (x0, y0, x1, y1)
+    walls : sequence of (x0, y0, x1, y1)
         Walls to draw on the page [m].
+    rerun : Path, optional
+        Where to write a recording for rerun.
 
     Returns
     -------
@@ -108,6 +131,8 @@ def filter_and_write(
         ViewedRun(run.trace, kept) for run, kept in zip(runs, frames, strict=True)
     ]
     write_run_page(folder / "run.html", log, viewed, walls=walls)
+    if rerun is not None:
+        write_rerun(rerun, log, viewed, walls=walls)
     write_slamlog(first.log, folder / "log.csv")
     summaries = [
         summarise(run, settings, resolution=resolution)

@@ -1,4 +1,4 @@
-"""Viewers of whole runs, step by step: a web page that stands alone.
+"""Viewers of whole runs, step by step: a web page, and a recording for rerun.
 
 A `RunFrames` watches a replay; the viewers show what it has kept beside the trace.
 """

@@ -5,7 +5,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -22,20 +22,12 @@ from ..runs.summary import pose_nees
 from ..runs.trace import RunTrace
 from . import run_frames
 from .packed_arrays import PackedArrays, deviation_codes, position_codes
-from .run_frames import OUTCOMES, MapFrame, RunFrames
+from .run_frames import OUTCOMES, RunFrames
+from .viewed_run import ViewedRun, map_at, shown_steps
 
 _PARTS = Path(__file__).parent / "run_page_parts"
 _SCRIPTS = ("data.js", "map.js", "chart.js", "player.js")
 _SHARE = 0.95  # probability of the bands of NEES and NIS
-
-
-class ViewedRun(NamedTuple):
-    """One filter's run over the log of the page."""
-
-    trace: RunTrace
-    """Its beliefs; its name labels the filter."""
-    frames: RunFrames
-    """What it watched of the same replay."""
 
 
 def write_run_page(
@@ -105,11 +97,6 @@ def _page(log: SlamLog, runs: Sequence[ViewedRun], walls: list[list[float]]) -> 
     )
 
 
-def shown_steps(frames: Sequence[RunFrames]) -> list[int]:
-    """Return the steps that all filters have kept, in ascending order."""
-    return sorted(set.intersection(*(set(kept.maps) for kept in frames)))
-
-
 def _pack_world(
     packed: PackedArrays, log: SlamLog, trace: RunTrace, steps: Sequence[int]
 ) -> None:
@@ -143,7 +130,7 @@ def _pack_filter(
     packed: PackedArrays, prefix: str, run: ViewedRun, steps: Sequence[int]
 ) -> None:
     """Pack the beliefs of one filter."""
-    trace, maps = run.trace, [_map_at(run, step) for step in steps]
+    trace, maps = run.trace, [map_at(run, step) for step in steps]
     _pack_poses(packed, prefix, trace, steps)
     packed.put_frames(f"{prefix}id", [frame.ids for frame in maps], "int32")
     for axis, name in enumerate("xy"):
@@ -197,17 +184,6 @@ def _pack_correlations(
     packed.put_frames(f"{prefix}pairs.id", ids, "int32")
     values = [np.round(255 * found.values) for found in kept.values()]
     packed.put_frames(f"{prefix}pairs.value", values, "uint8")
-
-
-def _map_at(run: ViewedRun, step: int) -> MapFrame:
-    """Return the map of a step; of a filter that joins its map, the last joined one."""
-    frame = run.frames.maps[step]
-    if not run.frames.joins:
-        return frame
-    ids, means, covariances = run.trace.map_at(step)
-    return frame._replace(
-        ids=ids.astype(np.int64), means=means, covariances=covariances
-    )
 
 
 def _std(covariances: Array) -> Array:

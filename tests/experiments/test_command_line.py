@@ -279,6 +279,16 @@ def test_several_filters_share_a_page_and_a_table(log, without_pictures):
     assert alone["others"] == []
 
 
+def test_a_recording_for_rerun_is_checked_before_the_work(log, monkeypatch):
+    message = refused("replay", log, "--rerun", "out.bin")
+    assert message == "--rerun must end in .rrd, got out.bin"
+    message = refused("replay", log, "--rerun", "nowhere/out.rrd")
+    assert "the folder of nowhere/out.rrd does not exist" in message
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    message = refused("replay", log, "--rerun", "out.rrd", code=1)
+    assert "pip install 'slamgym[viewer]'" in message
+
+
 @pytest.mark.parametrize("names", ["ekf,ekf", ",", "ekf[x"])
 def test_malformed_lists_of_filters_are_refused(log, names):
     assert refused("replay", log, "-e", names).startswith("estimators must")

@@ -92,7 +92,7 @@ class Chart {
     const [from, to] = [run.t[0], run.t[run.length - 1]];
     for (const t of roundTicks(from, to, width / 90)) {
       const x = MARGIN.left + ((width - MARGIN.left - MARGIN.right) * (t - from)) / Math.max(to - from, 1e-9);
-      if (x < width - 40) context.fillText(String(+t.toPrecision(6)), x, height - 7);
+      if (x < width - 62) context.fillText(String(+t.toPrecision(6)), x, height - 7);
     }
     context.textAlign = "right";
     context.fillText(run.facts.unit, width - MARGIN.right, height - 7);

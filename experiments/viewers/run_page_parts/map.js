@@ -96,16 +96,15 @@ class Camera {
   constructor(run) {
     this.box = this.boxAround(run);
     this.reset();
-    this.closeUp = 2.6 * Math.max(2, ...this.ranges(run));
+    this.closeUp = 2.6 * Math.max(2, this.longestRange(run));
   }
 
-  ranges(run) {
+  longestRange(run) {
     const codes = run.arrays["reading.range"].values;
-    let most = 0;
-    for (const code of codes) if (code > most) most = code;
-    return [metres(most)];
+    return metres(codes.reduce((most, code) => Math.max(most, code), 0));
   }
 
+  /** Box around paths and maps, and around what is true within the sensor's reach of it. */
   boxAround(run) {
     const box = { left: Infinity, right: -Infinity, low: Infinity, high: -Infinity };
     const add = (x, y) => {
@@ -115,15 +114,19 @@ class Camera {
       box.low = Math.min(box.low, y);
       box.high = Math.max(box.high, y);
     };
-    run.walls.forEach(([x0, y0, x1, y1]) => (add(x0, y0), add(x1, y1)));
-    run.landmarks.forEach(({ x, y }) => add(x, y));
     run.truth.x.forEach((x, i) => add(x, run.truth.y[i]));
     for (const filter of run.filters) {
       filter.poses.x.forEach((x, i) => add(x, filter.poses.y[i]));
       filter.map(run.length - 1).forEach(({ x, y }) => add(x, y));
     }
-    if (box.left > box.right) return { left: -1, right: 1, low: -1, high: 1 };
-    return box;
+    const reach = this.longestRange(run);
+    const { left, right, low, high } = box;
+    const addNear = (x, y) => {
+      if (x > left - reach && x < right + reach && y > low - reach && y < high + reach) add(x, y);
+    };
+    run.walls.forEach(([x0, y0, x1, y1]) => (addNear(x0, y0), addNear(x1, y1)));
+    run.landmarks.forEach(({ x, y }) => addNear(x, y));
+    return box.left > box.right ? { left: -1, right: 1, low: -1, high: 1 } : box;
   }
 
   reset() {

@@ -165,7 +165,7 @@ class Player {
 
   writeChosen(related) {
     if (this.chosen === null) {
-      get("chosen").textContent = "";
+      get("chosen").textContent = "Click a landmark or the robot to see its correlations.";
       return;
     }
     const said = this.views.map((view, i) => {
