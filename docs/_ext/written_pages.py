@@ -35,6 +35,7 @@ PACKAGES: tuple[ModuleType, ...] = (
     experiments.noise_study,
     experiments.trajectories,
     experiments.figures,
+    experiments.viewers,
     estimator.association,
     estimator.filters,
     estimator.large_maps,
