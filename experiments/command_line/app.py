@@ -5,11 +5,12 @@ it imports what is heavy when it runs, so that help answers at once.
 """
 # ruff: noqa: I001 (the order of the imports is the order of the commands in the help)
 
-from . import run, replay, smooth, monte_carlo, generate, noise_study
+from . import run, replay, smooth, fit_noise, monte_carlo, generate, noise_study
 from . import render_video, listings
 from .program import main
 
 __all__ = [
+    "fit_noise",
     "generate",
     "listings",
     "main",

@@ -140,6 +140,22 @@ InitialPoseStd = Annotated[
         "A,B,C", "σx,σy,σθ of the first pose [m, m, rad].", "from the log, else 0,0,0"
     ),
 ]
+RangeStdPerMetre = Annotated[
+    float | None,
+    option(
+        "K",
+        "Part of σr that grows with the range: σr + K r.",
+        "from the log, else 0",
+    ),
+]
+NoiseAtRest = Annotated[
+    bool | None,
+    option(
+        "--noise-at-rest/--no-noise-at-rest",
+        "Whether the pose becomes uncertain while the odometry reports no motion.",
+        "from the log, else not",
+    ),
+]
 Resolution = Annotated[
     float,
     option(

@@ -43,22 +43,8 @@ def replay(
             "none rejected",
         ),
     ] = None,
-    range_std_per_metre: Annotated[
-        float | None,
-        options.option(
-            "K",
-            "Part of σr that grows with the range: σr + K r.",
-            "from the log, else 0",
-        ),
-    ] = None,
-    noise_at_rest: Annotated[
-        bool | None,
-        options.option(
-            "--noise-at-rest/--no-noise-at-rest",
-            "Whether the pose becomes uncertain while the odometry reports no motion.",
-            "from the log, else not",
-        ),
-    ] = None,
+    range_std_per_metre: options.RangeStdPerMetre = None,
+    noise_at_rest: options.NoiseAtRest = None,
     option: options.EstimatorOptions = None,
     hide_identities: Annotated[
         bool,

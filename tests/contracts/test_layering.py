@@ -54,7 +54,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         figures
         viewers
         monte_carlo
-        noise_study
+        noise_study noise_fitting
         trajectories
         command_line
     """,

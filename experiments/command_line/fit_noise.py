@@ -1,0 +1,133 @@
+"""``slamgym fit-noise``: the noise of a log, by maximum likelihood."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from . import options
+from .option_values import assignments, standard_deviations
+from .program import command
+
+if TYPE_CHECKING:
+    from ..logs.slamlog import SlamLog
+    from ..noise_fitting import NoiseFit
+    from ..runs.filter_settings import FilterSettings
+    from .reporter import Reporter
+
+_NOTE = "compiling the likelihood, once after each installation …"
+
+
+@command
+def fit_noise(
+    log: Annotated[
+        Path,
+        typer.Argument(metavar="LOG", help="A log of any format that replay reads."),
+    ],
+    *,
+    estimator: options.EstimatorName = "invariant",
+    motion_std: options.MotionStd = None,
+    measurement_std: options.MeasurementStd = None,
+    initial_pose_std: options.InitialPoseStd = None,
+    option: options.EstimatorOptions = None,
+    range_std_per_metre: options.RangeStdPerMetre = None,
+    noise_at_rest: options.NoiseAtRest = None,
+    hide_identities: Annotated[
+        bool,
+        options.option(
+            "--hide-identities",
+            "Let the filter associate the readings of a log that identifies them.",
+        ),
+    ] = False,
+    robot: Annotated[
+        int | None,
+        options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
+    ] = None,
+    truth: options.TruthFile = None,
+    noise_from_file: options.NoiseFromFile = False,
+    write: Annotated[
+        bool,
+        options.option(
+            "--write", "Put the suggested noise into the header of LOG, a slamlog 1."
+        ),
+    ] = False,
+    out: options.OutFolder = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Fit the noise of a log by maximum likelihood.
+
+    Finds the noise under which the readings of a log are most likely, by the
+    innovations of a filter, with 95 % intervals; no truth is needed. Where the
+    innovations are not white, it suggests by how much to inflate the noise of the
+    sensor. Prints the options to paste, and compares filters with the noise before and
+    after. The noise given, or that of the log, is where the search begins, and what a
+    filter associates readings without identity with.
+
+    Examples
+    --------
+    slamgym fit-noise log.csv
+    slamgym fit-noise log.csv --write
+    slamgym fit-noise MRCLAM_Dataset6 --robot 3 --estimator ekf
+    """
+    from ..logs.anonymous import without_identities
+    from ..noise_fitting.header import refuse_other_formats, write_noise
+    from ..runs.filter_settings import noise_or_assumed, settings_for
+    from .output_folder import default_folder, output_folder
+    from .reporter import Reporter
+    from .run_files import note_choices, read_any_log
+
+    reporter = Reporter(as_json=as_json)
+    drive = read_any_log(log, robot, truth=truth, noise_from_file=noise_from_file)
+    if write:
+        refuse_other_formats(log)
+    note_choices(drive, reporter)
+    if hide_identities:
+        drive = without_identities(drive)
+    stated = standard_deviations(motion_std, measurement_std, initial_pose_std)
+    with reporter.warnings():
+        stds = noise_or_assumed(drive, stated)
+    named = {"range_std_per_metre": range_std_per_metre, "noise_at_rest": noise_at_rest}
+    given = {name: value for name, value in named.items() if value is not None}
+    settings = settings_for(
+        drive,
+        estimator=estimator,
+        **stds,
+        options=given | assignments("--option", option),
+    )
+    place = out or default_folder(drive.name, "noise")
+    with output_folder(place) as folder:
+        result, summary = _fit_and_write(drive, settings, folder, reporter)
+    if write:
+        write_noise(log, result.suggested.settings)
+    _show(summary, place, reporter)
+    if write:
+        reporter.show(f"Wrote the suggested noise into the header of {log}")
+    reporter.finish({**summary, "out": str(place), "written": write})
+
+
+def _fit_and_write(
+    drive: "SlamLog", settings: "FilterSettings", folder: Path, reporter: "Reporter"
+) -> tuple["NoiseFit", dict[str, Any]]:
+    """Fit the noise, replay, and write innovations.png and summary.json."""
+    from ..figures import save_figure
+    from ..noise_fitting import fit_noise as fit
+    from ..noise_fitting import noise_fit_figure, summarise_fit
+    from .output_folder import write_summary
+
+    with reporter.progress("fitting") as tick, reporter.note_if_slow(_NOTE):
+        result = fit(drive, settings, progress=tick)
+    with reporter.progress("replaying") as tick:
+        summary = summarise_fit(result, progress=tick)
+    save_figure(noise_fit_figure(result), folder / "innovations.png")
+    return result, write_summary(folder, summary)
+
+
+def _show(summary: dict[str, Any], place: Path, reporter: "Reporter") -> None:
+    from .noise_fit_tables import advice, comparison_table, noise_table
+    from .tables import written
+
+    title = f"Noise of [bold]{summary['log']}[/], by [bold]{summary['estimator']}[/]\n"
+    reporter.show(title, noise_table(summary), "", comparison_table(summary), "")
+    reporter.show(advice(summary), "")
+    reporter.show_verbatim(summary["options"])
+    reporter.show("", written(str(place), summary["files"]))

@@ -1,0 +1,299 @@
+"""Fitting the noise of a log, from Python and from the command line."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from slamgym.envs.controllers import OpenLoop
+from slamgym.experiments.command_line.app import main
+from slamgym.experiments.logs import (
+    OdometryRow,
+    Scan,
+    SlamLog,
+    read_slamlog,
+    record_episode,
+    write_slamlog,
+)
+from slamgym.experiments.noise_fitting import (
+    fit_noise,
+    noise_fit_figure,
+    summarise_fit,
+    write_noise,
+)
+from slamgym.experiments.noise_fitting.scoring import curvature, maximise
+from slamgym.experiments.runs import settings_for
+from slamgym.sim_configs import action_sequence, load_scenario
+
+MOTION, SENSOR = (0.05, 0.03, 0.02), (0.02, 0.08)
+
+
+def a_log(seed=3, *, steps=150, world="six_landmarks", **changes):
+    noise = {
+        "motion": {"std": MOTION},
+        "sensor": {"std": SENSOR, **changes.pop("sensor", {})},
+    }
+    scenario = load_scenario(world).with_changes(steps=steps, **noise, **changes)
+    driver = OpenLoop(action_sequence(scenario), scenario.robot)
+    return record_episode(scenario, driver, seed)
+
+
+def fitted(log, *, start=(0.2, 0.2, 0.2, 0.1, 0.3), **settings):
+    return fit_noise(
+        log,
+        settings_for(
+            log,
+            estimator="invariant",
+            motion_std=start[:3],
+            measurement_std=start[3:],
+            **settings,
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def example():
+    return fitted(a_log())
+
+
+def test_a_log_gives_its_noise_back_within_the_intervals(example):
+    truth = (*MOTION, *SENSOR)
+    assert [noise.name for noise in example.noise][:5] == ["σx", "σy", "σα", "σβ", "σr"]
+    for noise, true in zip(example.noise, truth, strict=False):
+        assert noise.low < true < noise.high
+        assert abs(np.log(noise.value / true)) < 0.3
+    assert example.noise[5].verdict == "zero"
+    assert example.noise[5].value == 0
+
+
+def test_the_fit_does_not_depend_on_where_it_starts(example):
+    other = fitted(a_log(), start=(0.01, 0.004, 0.3, 0.002, 0.9))
+    for a, b in zip(example.noise[:5], other.noise[:5], strict=True):
+        assert abs(np.log(a.value / b.value)) < 0.01
+        assert abs(np.log(a.high / b.high)) < 0.02
+
+
+def test_white_innovations_suggest_no_inflation(example):
+    assert example.suggested.settings == example.fitted.settings
+    assert 0.8 < example.calibration < 1.3
+
+
+@pytest.mark.slow
+def test_range_noise_that_grows_with_range_is_found():
+    log = a_log(sensor={"range_std_per_metre": 0.03}, steps=300)
+    growing = fitted(log).noise[5]
+    assert growing.verdict == "fitted"
+    assert growing.low < 0.03 < growing.high
+
+
+def test_readings_with_correlated_errors_suggest_inflation():
+    """A range error of each landmark that stays for many scans, beside a white one."""
+    log, rng = a_log(steps=300), np.random.default_rng(1)
+    errors, events = np.zeros(6), []
+    for event in log.events:
+        kept = event
+        if isinstance(event, Scan):
+            errors = 0.9 * errors + 0.1 * rng.standard_normal(6)
+            added = np.column_stack([np.zeros(6), errors])[event.landmark_ids]
+            kept = replace(event, measurements=event.measurements + added)
+        events.append(kept)
+    fit = fitted(replace(log, events=tuple(events)))
+    assert fit.fitted.whiteness[1].p_value < 1e-6
+    assert fit.fitted.whiteness[1].first > 0.2
+    assert fit.fitted.whiteness[1].inflation > 1.2
+    assert fit.suggested.settings.measurement_std[1] == pytest.approx(
+        fit.fitted.settings.measurement_std[1] * fit.fitted.whiteness[1].inflation,
+        rel=1e-3,
+    )
+
+
+def test_outliers_do_not_decide():
+    log = a_log()
+    events = list(log.events)
+    for k in (41, 91, 141):
+        scan = next(e for e in events[k:] if isinstance(e, Scan))
+        wrong = scan.measurements.copy()
+        wrong[0] += (1.0, 4.0)
+        events[events.index(scan)] = replace(scan, measurements=wrong)
+    fit = fitted(replace(log, events=tuple(events)))
+    assert fit.fitted.rejected == 3
+    assert fit.noise[4].low < SENSOR[1] < fit.noise[4].high
+
+
+def test_a_noise_on_which_nothing_depends_keeps_its_value():
+    """A robot that turns on the spot does not slip along or across."""
+    rng = np.random.default_rng(4)
+    places, heading, events = np.array([[3.0, 1.0], [-2.0, 4.0]]), 0.0, []
+    for t in range(200):
+        if t:
+            events.append(OdometryRow(float(t), 0.0, 0.1, 1.0))
+            heading += 0.1 + 0.02 * rng.standard_normal()
+        bearing = np.arctan2(places[:, 1], places[:, 0]) - heading
+        readings = np.column_stack([bearing, np.hypot(*places.T)])
+        readings += (0.02, 0.05) * rng.standard_normal((2, 2))
+        events.append(Scan(float(t), readings, [0, 1]))
+    fit = fitted(SlamLog("turning", events=tuple(events)))
+    along, _, turning, bearing, _, _ = fit.noise
+    assert along.verdict in {"zero", "unknown"}
+    assert turning.verdict == bearing.verdict == "fitted"
+    assert turning.low < 0.02 < turning.high
+
+
+def test_at_rest_without_noise_at_rest_the_motion_noise_is_unknown():
+    log = a_log(steps=60)
+    standing = [
+        replace(e, d=0.0, alpha=0.0) if isinstance(e, OdometryRow) else e
+        for e in log.events
+    ]
+    standing[1] = replace(standing[1], d=1e-9)
+    scan = log.events[0]
+    rng = np.random.default_rng(0)
+    for k, event in enumerate(standing):
+        if isinstance(event, Scan):
+            noise = SENSOR * rng.standard_normal(scan.measurements.shape)
+            standing[k] = replace(
+                event,
+                measurements=scan.measurements + noise,
+                landmark_ids=scan.landmark_ids,
+            )
+    header = {**log.header, "noise_at_rest": "false"}
+    fit = fitted(replace(log, events=tuple(standing), header=header))
+    by_name = {noise.name: noise for noise in fit.noise}
+    assert by_name["σβ"].verdict == by_name["σr"].verdict == "fitted"
+    for name, before in (("σx", 0.2), ("σy", 0.2), ("σα", 0.2)):
+        assert by_name[name].verdict in {"unknown", "zero"}
+        if by_name[name].verdict == "unknown":
+            assert by_name[name].value == before
+
+
+def test_scoring_finds_the_spread_of_normal_numbers_and_its_interval():
+    x = np.random.default_rng(2).normal(0, 3.0, 4000)
+
+    def likelihoods(sigmas):
+        return -0.5 * (x / sigmas) ** 2 - np.log(sigmas)
+
+    best = maximise(likelihoods, np.array([[0.1], [50.0]]))
+    assert best.converged
+    assert best.parameters[0] == pytest.approx(np.sqrt(np.mean(x**2)), rel=1e-3)
+    bent = curvature(likelihoods, np.log(best.parameters), np.array([0.05]))
+    assert bent[0, 0] == pytest.approx(2 * len(x), rel=0.01)
+
+
+def test_the_whiteness_is_that_of_the_readings_used(example):
+    assert all(white.p_value > 1e-3 for white in example.fitted.whiteness)
+
+
+def test_the_summary_is_that_of_replays(example):
+    summary = summarise_fit(example)
+    runs = summary["runs"]
+    assert list(runs) == ["before", "fitted", "suggested"]
+    assert 0.9 < runs["fitted"]["nis"]["per_degree"] < 1.1
+    assert runs["fitted"]["log_likelihood"] > runs["before"]["log_likelihood"]
+    assert runs["fitted"]["ate"]["raw"] > 0
+    json.dumps(summary, allow_nan=False)
+
+
+def test_the_figure_has_a_column_for_each_noise(example):
+    axes = noise_fit_figure(example).axes
+    assert len(axes) == 4
+    assert axes[0].get_title(loc="left") == "bearing, before"
+
+
+@pytest.mark.slow
+def test_readings_without_identity_are_associated_first():
+    log = a_log(sensor={"identities": False}, steps=80)
+    fit = fitted(log, start=(*MOTION, *SENSOR))
+    by_name = {noise.name: noise for noise in fit.noise}
+    for name, true in (("σβ", SENSOR[0]), ("σr", SENSOR[1])):
+        assert abs(np.log(by_name[name].value / true)) < 0.25
+
+
+@pytest.mark.parametrize(
+    ("events", "message"),
+    [
+        ((OdometryRow(1.0, 1.0, 0.1, 1.0),), "holds no scan"),
+        ((Scan(0.0, [(0.1, 2.0)], [1]), Scan(1.0, [(0.1, 2.0)], [1])), "no motion"),
+        (
+            (Scan(0.0, [(0.1, 2.0)], [1]), OdometryRow(1.0, 1.0, 0.1, 1.0)),
+            "no landmark twice",
+        ),
+        (
+            (
+                Scan(0.0, [(0.1, 2.0)], [1]),
+                OdometryRow(1.0, 1.0, 0.1, 1.0),
+                Scan(1.0, [(0.1, np.nan)], [1]),
+            ),
+            "readings must be finite",
+        ),
+    ],
+)
+def test_a_log_that_says_nothing_is_refused_in_one_line(events, message):
+    with pytest.raises(ValueError, match=message):
+        fitted(SlamLog("bad", events=events))
+
+
+def test_a_filter_off_the_kernels_is_refused():
+    log = a_log(steps=5)
+    with pytest.raises(ValueError, match="runs in batches"):
+        fit_noise(log, settings_for(log, estimator="unscented"))
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, ["fit-noise", *map(str, arguments)])
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_noise_into_the_header_and_nothing_else(tmp_path):
+    path, out = tmp_path / "log.csv", tmp_path / "out"
+    log = a_log(steps=80)
+    write_slamlog(log, path)
+    before = path.read_text()
+    result = run(path, "--write", "--json", "--out", out)
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.stdout)
+    assert sorted(file.name for file in out.iterdir()) == [
+        "innovations.png",
+        "summary.json",
+    ]
+    after = path.read_text()
+    changed = set(before.splitlines()) ^ set(after.splitlines())
+    keys = {line.split(":")[0].removeprefix("# ") for line in changed}
+    assert keys == {"motion_std", "measurement_std", "range_std_per_metre"}
+    noise = settings_for(read_slamlog(path)).motion_std
+    assert list(noise) == summary["runs"]["suggested"]["settings"]["motion_std"]
+    assert "--motion-std" in summary["options"]
+
+
+def test_writing_keeps_line_ends_and_byte_order_mark(tmp_path):
+    path = tmp_path / "log.csv"
+    text = "\ufeff# format: slamlog 1\r\n# motion_std: 1,1,1\r\nodometry,1,1,0,1\r\n"
+    path.write_bytes(text.encode())
+    log = read_slamlog(path)
+    write_noise(
+        path,
+        settings_for(log, motion_std=(0.1, 0.2, 0.3), measurement_std=(0.01, 0.02)),
+    )
+    lines = path.read_bytes().decode().split("\r\n")
+    assert lines == [
+        "\ufeff# format: slamlog 1",
+        "# measurement_std: 0.01,0.02",
+        "# motion_std: 0.1,0.2,0.3",
+        "odometry,1,1,0,1",
+        "",
+    ]
+
+
+def test_bad_input_of_the_command_is_one_line_and_writes_nothing(tmp_path):
+    path, out = tmp_path / "log.csv", tmp_path / "out"
+    write_slamlog(SlamLog("empty", events=(OdometryRow(1.0, 1.0, 0.1, 1.0),)), path)
+    result = run(path, "--out", out, "--write")
+    assert result.exit_code == 2
+    assert result.stderr.splitlines()[-1].startswith("slamgym: empty holds no scan")
+    assert not out.exists()
+    text = tmp_path / "data.txt"
+    text.write_text("VERTEX2 0 0 0 0\n")
+    refused = run(text, "--write", "--out", out)
+    assert refused.exit_code == 2
+    assert not out.exists()
