@@ -27,7 +27,7 @@ from .whole_state import expected_readings, motion_covariance, moved_state, wrap
 
 X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
 
-LEAST_VARIANCE = 1e-12
+LEAST_VARIANCE = 1e-10
 """Of motion noise [m², m², rad²]: GTSAM takes no certain motion."""
 PoseAndPlaces = tuple[Any, list[Array]]
 MOVE, READING, SOLVE = 0.0, 1.0, 2.0

@@ -1,4 +1,8 @@
-"""GTSAM's smoothers: incremental, with a fixed lag, and in a batch."""
+"""GTSAM's smoothers: incremental, with a fixed lag, and in a batch.
+
+They factorise by QR: where a motion noise is almost zero, Cholesky finds the system
+indeterminate.
+"""
 
 from __future__ import annotations
 
@@ -103,14 +107,17 @@ class GtsamFixedLagSlam(GtsamSlam):
 class GtsamBatchSlam(GtsamSlam):
     """GTSAM's Levenberg-Marquardt over the whole drive after every scan.
 
-    It starts at the last solution, and has the library's own parameters.  The time of a
-    step grows with the drive.
+    It starts at the last solution, and has the library's own parameters.  The marginals
+    are those of a new iSAM2 linearised there, because ``gtsam.Marginals`` has no QR.
+    The time of a step grows with the drive.
 
     Parameters are those of :class:`GtsamSlam`.
     """
 
     def _begin(self) -> None:
         self._drive, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._parameters = gtsam.LevenbergMarquardtParams()
+        self._parameters.setLinearSolverType("MULTIFRONTAL_QR")
 
     def _optimise(
         self, graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values, landmarks: int
@@ -118,7 +125,7 @@ class GtsamBatchSlam(GtsamSlam):
         self._drive.push_back(graph)
         self._values.insert(guess)
         self._values = gtsam.LevenbergMarquardtOptimizer(
-            self._drive, self._values
+            self._drive, self._values, self._parameters
         ).optimize()
 
     def _found(self, pose: int, landmarks: list[int]) -> PoseAndPlaces:
@@ -126,8 +133,9 @@ class GtsamBatchSlam(GtsamSlam):
         return values.atPose2(pose), [values.atPoint2(key) for key in landmarks]
 
     def _joint(self, keys: list[int]) -> tuple[Array, Any]:
-        marginals = gtsam.Marginals(self._drive, self._values)
-        return marginals.jointMarginalCovariance(keys).fullMatrix(), self._values
+        isam = gtsam.ISAM2(_isam2_parameters(0.1, 1))
+        isam.update(self._drive, self._values)
+        return _joint_marginal(isam, keys)
 
 
 def _isam2_parameters(threshold: float, skip: int) -> gtsam.ISAM2Params:
@@ -136,6 +144,7 @@ def _isam2_parameters(threshold: float, skip: int) -> gtsam.ISAM2Params:
         argument_checks.at_least("relinearize_threshold", threshold, 0)
     )
     parameters.relinearizeSkip = argument_checks.whole("relinearize_skip", skip, 1)
+    parameters.setFactorization("QR")
     return parameters
 
 

@@ -19,6 +19,7 @@ from slamgym.estimator.models.unicycle_motion import predict_pose
 from slamgym.estimator.registry import find_estimator
 from slamgym.estimator.smoother import RecordedSlam
 from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.sim_configs import load_scenario
 
 PEERS = {peer.name: peer for peer in list_peers()}
 NOISE = {"motion_std": (0.1, 0.05, 0.03), "measurement_std": (0.02, 0.1)}
@@ -220,6 +221,16 @@ def test_a_monte_carlo_compares_a_peer_with_our_filter():
     errors = results.ate.values
     assert_allclose(errors[0], errors[1], rtol=0.2)
     assert list_estimators() == before
+
+
+def test_a_robot_without_noise_sideways_is_no_indeterminate_system():
+    peer("gtsam_isam2")
+    world = load_scenario(load_scenario("loop").model_dump() | {"steps": 40})
+    names = "invariant,gtsam_isam2,gtsam_fixed_lag,gtsam_batch"
+    results = monte_carlo(world, names, runs=1)
+    assert not results.failed.any(), results.message.values
+    areas = results.pose_area.values[:, 0]
+    assert_allclose(areas[1:], areas[0], rtol=0.1)
 
 
 @pytest.mark.slow

@@ -1,0 +1,206 @@
+"""Estimators of several libraries side by side, on the same drives: one table.
+
+    python benchmarks/field.py --runs 100
+    python benchmarks/field.py --checks     # what check_estimator finds, no table
+
+For each world and estimator: the laboratory's verdict in the invariant frame; NEES of
+the pose per degree of freedom in the invariant and in the additive frame, and NIS per
+degree; efficiency against the bound of any filter, of the position, the heading and the
+final map; path error and final map error [m], not aligned; CPU time of a step [µs]: of
+predict and update, and with the belief, mean and covariance of pose and whole map.
+Failed runs count in no other column.  Needs the extra ``peers``; estimators of missing
+libraries are left out and named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping
+from statistics import mean
+from time import thread_time
+from typing import Any
+
+import numpy as np
+
+from slamgym.estimator import list_peers
+from slamgym.estimator.check_estimator import CHECKS
+from slamgym.estimator.interface import SlamEstimator
+from slamgym.estimator.registry import accepted_options, find_estimator
+from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
+from slamgym.experiments.monte_carlo.measure.estimator_choices import (
+    EstimatorChoice,
+    estimator_choices,
+)
+from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.sim_configs import Scenario, load_scenario
+
+WORLDS = {"six_landmarks": 29, "loop": 260, "coarse_loop": 260}
+"""Steps of the worlds: of the two loops somewhat more than the first lap."""
+LONGEST = {"gtsam_batch": 100}
+"""Steps above which an estimator is left out: its time of a step grows with them."""
+OURS = ("ekf", "unscented", "invariant", "invariant[iterations=3]")
+VARIANTS = ("gtsam_isam2[relinearize_threshold=0.001]", "gtsam_fixed_lag[lag=50]")
+COLUMNS = (
+    "estimator",
+    "verdict",
+    "failed",
+    "NEES invariant",
+    "NEES additive",
+    "NIS",
+    "position",
+    "heading",
+    "map",
+    "ATE",
+    "map RMSE",
+    "µs",
+    "with belief",
+)
+
+
+def estimators() -> tuple[str, ...]:
+    """Return ours and those of the installed libraries; name the others."""
+    peers = list_peers()
+    for peer in peers:
+        if not peer.installed:
+            print(f"left out: {peer.name}, {peer.library} missing", file=sys.stderr)
+    installed = {peer.name for peer in peers if peer.installed}
+    variants = [name for name in VARIANTS if name.partition("[")[0] in installed]
+    return (*OURS, *sorted([*installed, *variants]))
+
+
+def world_of(name: str) -> Scenario:
+    """Return a world, shortened."""
+    scenario = load_scenario(name)
+    return load_scenario(scenario.model_dump() | {"steps": WORLDS[name]})
+
+
+def rows_of(
+    world: Scenario, names: tuple[str, ...], runs: int, seed: int
+) -> Iterator[list[str]]:
+    """Yield the row of each estimator in a world."""
+    times = step_times(world, names, seed)
+    for name in names:
+        results = monte_carlo(world, name, runs, seed)
+        entry = summarise_monte_carlo(results)["estimators"][name]
+        both = (f"{1e6 * value:.0f}" for value in times[name])
+        yield [f"`{name}`", *cells(entry), *both]
+
+
+def cells(entry: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what a summary says of an estimator."""
+    yield entry["verdict"]
+    yield str(len(entry["failed_runs"]))
+    yield number(entry["pose_nees"]["invariant"]["mean"])
+    yield number(entry["pose_nees"]["additive"]["mean"])
+    yield number(entry["nis"])
+    for key in ("pose", "heading", "map"):
+        found = (entry["efficiency"] or {}).get(key) or {}
+        yield number(found.get("value"))
+    yield number(entry["ate"]["raw"])
+    yield number(entry["landmark_rmse"]["raw"])
+
+
+def number(value: float | None) -> str:
+    """Write three digits, or a dash for what is not known."""
+    return "–" if value is None else f"{value:.3g}"
+
+
+def step_times(
+    world: Scenario, names: tuple[str, ...], seed: int
+) -> dict[str, tuple[float, float]]:
+    """Return the mean CPU time of a step [s], without and with the belief.
+
+    All estimators take each step of one drive in turn, so that whatever else the
+    machine does hits all alike.  A first drive of ten steps loads and compiles.
+    """
+    choices = estimator_choices(names)
+    drive(world, choices, seed, steps=10, with_belief=True)
+    plain = drive(world, choices, seed, steps=world.steps, with_belief=False)
+    full = drive(world, choices, seed, steps=world.steps, with_belief=True)
+    return {name: (mean(plain[name]), mean(full[name])) for name in names}
+
+
+def drive(
+    world: Scenario,
+    choices: tuple[EstimatorChoice, ...],
+    seed: int,
+    *,
+    steps: int,
+    with_belief: bool,
+) -> dict[str, list[float]]:
+    """Return the CPU times of the steps of one drive [s], by estimator."""
+    runs = simulate_runs(world, 1, seed)
+    slams = {c.label: made(c, world, runs.initial_poses[0]) for c in choices}
+    times: dict[str, list[float]] = {label: [] for label in slams}
+    for step in range(steps + 1):
+        seen = np.flatnonzero(runs.visible[0, step])
+        readings, ids = runs.measurements[0, step, seen], seen.tolist()
+        for label, slam in slams.items():
+            began = thread_time()
+            if step:
+                slam.predict(runs.odometry[0, step])
+            slam.update(readings, ids)
+            if with_belief:
+                slam.belief()
+            times[label].append(thread_time() - began)
+    return times
+
+
+def made(choice: EstimatorChoice, world: Scenario, pose: Any) -> SlamEstimator:
+    """Make an estimator; a graph without innovations, which take its marginals."""
+    silent = accepted_options(find_estimator(choice.name), {"innovations": False})
+    wanted = silent if choice.name.startswith("gtsam") else {}
+    options = {**wanted, **choice.options}
+    return choice._replace(options=options).settings(world).make(pose)
+
+
+def print_world(name: str, runs: int, seed: int) -> None:
+    """Print the table of one world."""
+    world = world_of(name)
+    names = tuple(
+        each for each in estimators() if LONGEST.get(each, world.steps) >= world.steps
+    )
+    print(f"**{name}, {world.steps} steps, {runs} runs, seed {seed}**\n")
+    print(f"| {' | '.join(COLUMNS)} |")
+    print("|---|---|" + "---:|" * (len(COLUMNS) - 2))
+    for row in rows_of(world, names, runs, seed):
+        print(f"| {' | '.join(row)} |", flush=True)
+    print()
+
+
+def print_checks() -> None:
+    """Print what each check of `check_estimator` finds, one estimator a row."""
+    print("| estimator | passed | findings |\n|---|---:|---|")
+    for peer in list_peers():
+        if peer.installed:
+            findings = list(found_by_checks(peer.name))
+            passed = f"{len(CHECKS) - len(findings)} of {len(CHECKS)}"
+            print(f"| `{peer.name}` | {passed} | {'; '.join(findings) or 'none'} |")
+
+
+def found_by_checks(name: str) -> Iterator[str]:
+    """Yield the message of each check that fails."""
+    for check in CHECKS:
+        try:
+            check(find_estimator(name))
+        except Exception as error:
+            yield f"{check.__name__}: {error}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=900_000)
+    parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=WORLDS)
+    parser.add_argument("--checks", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.checks:
+        print_checks()
+        return
+    for name in arguments.worlds:
+        print_world(name, arguments.runs, arguments.seed)
+
+
+if __name__ == "__main__":
+    main()
