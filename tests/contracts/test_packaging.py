@@ -4,10 +4,13 @@ import os
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 TOP = {file.name for file in (ROOT / "src" / "slamgym").iterdir() if file.is_file()}
@@ -103,3 +106,18 @@ def test_the_installed_command_answers(machine, tmp_path):
         machine / "slamgym", "--help", cwd=tmp_path
     )
     assert "loop" in call(machine / "slamgym", "scenarios", cwd=tmp_path)
+
+
+def test_the_versions_of_the_checks_satisfy_every_minimum():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    checked = ("test", "agents", "trajectories", "interop", "peers")
+    wanted = [*project["dependencies"], *(line for x in checked for line in extras[x])]
+    lines = (ROOT / ".ci" / "constraints.txt").read_text().splitlines()
+    pinned = {}
+    for pin in map(Requirement, (line for line in lines if not line.startswith("#"))):
+        (version,) = pin.specifier
+        pinned.setdefault(canonicalize_name(pin.name), set()).add(version.version)
+    for need in map(Requirement, wanted):
+        versions = pinned[canonicalize_name(need.name)]
+        assert all(map(need.specifier.contains, versions)), need
