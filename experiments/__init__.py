@@ -6,6 +6,7 @@
 * :mod:`~slamgym.experiments.monte_carlo` tests the consistency of filters in many runs.
 * :mod:`~slamgym.experiments.noise_study` scales each noise, in one run or in many.
 * :mod:`~slamgym.experiments.trajectories` generates data sets of trajectories.
+* :mod:`~slamgym.experiments.viewers` writes a run as a web page, or for rerun.
 
 The command line ``slamgym`` is ``command_line``.
 """

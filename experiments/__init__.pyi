@@ -5,3 +5,4 @@ from . import noise_fitting as noise_fitting
 from . import noise_study as noise_study
 from . import runs as runs
 from . import trajectories as trajectories
+from . import viewers as viewers

@@ -108,7 +108,7 @@ class RunFrames:
     def watch(
         self, step: int, slam: SlamEstimator, report: UpdateReport | None
     ) -> None:
-        """Keep a step, if it is due; see :func:`.log_replay.replay`."""
+        """Keep a step, if it is due; pass this as ``watch`` of ``replay``."""
         if not self._maps.is_due(step):
             return
         self.joins = isinstance(slam, SupportsJoin)
