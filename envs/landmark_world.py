@@ -14,7 +14,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, ComplexArray, ImageArray
-from ..sim_configs import Scenario, load_scenario, place_landmarks
+from ..sim_configs import Scenario, load_scenario
 from ..sim_configs.scenario import refuse_ranges
 from .actions import clipped_action
 from .rendering.episode_renderer import EpisodeRenderer
@@ -25,10 +25,10 @@ from .sensors.noise_streams import (
     NoiseRows,
     motion_noise_rows,
     sensor_noise_rows,
-    spawn_streams,
 )
 from .sensors.odometry import OdometrySensor
 from .spaces import action_space, observation_space
+from .streams.episodes import draw_landmarks, draw_starts, episode_keys
 
 Observation = dict[str, Any]
 
@@ -159,11 +159,14 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         if options:
             raise ValueError(f"options must be empty, got {options!r}")
         super().reset(seed=seed)
-        streams = spawn_streams(self.np_random)
-        self._place_landmarks(streams.map)
-        self._draw_start(streams.start)
-        self._motion_noise = motion_noise_rows(streams, self.scenario)
-        self._sensor_noise = sensor_noise_rows(streams, self.scenario)
+        key = episode_keys([self.np_random])
+        if self.scenario.landmarks.is_redrawn or len(self._landmarks) == 0:
+            self._landmarks = draw_landmarks(self.scenario, key)[0]
+        poses, estimates = draw_starts(self.scenario, key)
+        self._body.place(poses[0].tolist())
+        self._start_estimate: Array = estimates[0]
+        self._motion_noise = motion_noise_rows(key, self.scenario)
+        self._sensor_noise = sensor_noise_rows(key, self.scenario)
         self._steps_left = self.scenario.steps
         if self._renderer is not None:
             self._renderer.begin(self.landmarks)
@@ -236,21 +239,6 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         if len(self._landmarks) == 0:
             raise ResetNeeded("call reset first: there is no world yet")
 
-    def _place_landmarks(self, rng: np.random.Generator) -> None:
-        layout = self.scenario.landmarks
-        changes = layout.is_redrawn
-        if changes or len(self._landmarks) == 0:
-            landmarks = np.ascontiguousarray(place_landmarks(layout, rng))
-            self._landmarks = landmarks.view(np.complex128)[:, 0]
-
-    def _draw_start(self, rng: np.random.Generator) -> None:
-        start = self.scenario.start
-        centre = np.array(start.pose)
-        drawn = centre + start.std * rng.standard_normal(3)
-        draws_truth = start.drawn == "truth"
-        self._body.place((drawn if draws_truth else centre).tolist())
-        self._start_estimate = centre if draws_truth else drawn
-
     def _observe(
         self, odometry: Array, collision: bool
     ) -> tuple[Observation, dict[str, Any]]:
@@ -269,5 +257,5 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
 
 
-def _refuse_to_step(steps: int) -> list[list[float]]:
+def _refuse_to_step(steps: object) -> list[list[float]]:
     raise ResetNeeded("call reset before step")

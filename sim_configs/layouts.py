@@ -18,7 +18,7 @@ from .field_types import (
 )
 from .scenario_errors import ScenarioError
 
-_TRIES_PER_LANDMARK = 2000
+TRIES_PER_LANDMARK = 2000
 
 
 class _Layout(Part):
@@ -187,19 +187,23 @@ class RandomLayout(_Layout):
         low, high = self.bounds[:2], self.bounds[2:]
         placed = np.empty((self.count, 2))
         for index in range(self.count):
-            for _ in range(_TRIES_PER_LANDMARK):
+            for _ in range(TRIES_PER_LANDMARK):
                 point = rng.uniform(low, high)
-                gaps = placed[:index] - point
-                if (np.hypot(gaps[:, 0], gaps[:, 1]) >= self.min_distance).all():
+                squares = (placed[:index] - point) ** 2
+                if (squares.sum(axis=1) >= self.min_distance**2).all():
                     break
             else:
-                raise ScenarioError(
-                    "landmarks.min_distance must leave room for "
-                    f"{self.count} landmarks in {self.bounds}, got {self.min_distance} "
-                    f"({index} placed, then {_TRIES_PER_LANDMARK} tries failed)"
-                )
+                raise self.no_room(index)
             placed[index] = point
         return placed
+
+    def no_room(self, placed: int) -> ScenarioError:
+        """Return the error for a layout that has room for some landmarks only."""
+        return ScenarioError(
+            "landmarks.min_distance must leave room for "
+            f"{self.count} landmarks in {self.bounds}, got {self.min_distance} "
+            f"({placed} placed, then {TRIES_PER_LANDMARK} tries failed)"
+        )
 
 
 LandmarkLayout = Annotated[

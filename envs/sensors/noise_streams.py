@@ -1,7 +1,8 @@
-"""Noise of one world: one random stream per source, drawn in blocks of steps.
+"""Noise of the sensor and the motion: one random stream per source.
 
-Every stream is drawn step after step in a fixed layout. So the settings of one source
-do not affect the noise of another, and the length of a block has no effect.
+Every step of every stream has its own random numbers in a fixed layout. So the settings
+of one source do not affect the noise of another, the length of a block has no effect,
+and a world has the same noise alone and among others.
 """
 
 import math
@@ -11,8 +12,10 @@ from typing import Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from ...arrays import Array
+from ...arrays import Array, IntArray, WordArray
 from ...sim_configs import Scenario
+from ..streams.draws import draw_normals, draw_uniforms
+from ..streams.episodes import CLUTTER, DROPOUT, MEASUREMENT, MOTION, ORDER
 from .heavy_tails import heavy_tails
 
 Row = TypeVar("Row")
@@ -38,75 +41,75 @@ order : shape (…, N + C), or None with identities
 """
 
 
-class Streams(NamedTuple):
-    """The independent generators of one episode, in the order of spawning."""
-
-    start: np.random.Generator
-    map: np.random.Generator
-    motion: np.random.Generator
-    measurement: np.random.Generator
-    dropout: np.random.Generator
-    clutter: np.random.Generator
-    order: np.random.Generator
-
-
-def spawn_streams(rng: np.random.Generator) -> Streams:
-    """Spawn the streams of one episode; the state of `rng` does not change.
-
-    Examples
-    --------
-    >>> streams = spawn_streams(np.random.default_rng(0))
-    >>> bool(streams.start.random() == streams.map.random())
-    False
-    """
-    return Streams(*rng.spawn(len(Streams._fields)))
-
-
 class NoiseRows(Generic[Row]):
     """An endless iterator over rows of noise, one per step, drawn in growing blocks.
 
     Parameters
     ----------
     draw : callable
-        Takes a number of steps and draws the rows of that many next steps.
+        Takes an array of step numbers and draws the rows of these steps.
+    first : int
+        The first step.
 
     Examples
     --------
-    >>> rows = NoiseRows(np.random.default_rng(0).standard_normal)
-    >>> float(next(rows)) == np.random.default_rng(0).standard_normal()
-    True
+    >>> rows = NoiseRows(lambda steps: steps / 10, first=1)
+    >>> float(next(rows)), float(next(rows))
+    (0.1, 0.2)
     """
 
-    def __init__(self, draw: Callable[[int], Iterable[Row]]) -> None:
+    def __init__(
+        self, draw: Callable[[IntArray], Iterable[Row]], first: int = 0
+    ) -> None:
         self._draw = draw
+        self._next = first
         self._block = _FIRST_BLOCK
         self._to_come: list[Row] = []  # the next one last
 
     def __next__(self) -> Row:
         if not self._to_come:
-            self._to_come = list(self._draw(self._block))[::-1]
-            self._block = min(2 * self._block, _LONGEST_BLOCK)
+            end = self._next + self._block
+            self._to_come = list(self._draw(np.arange(self._next, end)))[::-1]
+            self._next, self._block = end, min(2 * self._block, _LONGEST_BLOCK)
         return self._to_come.pop()
 
 
-def motion_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[list[float]]:
-    """Return the rows (εx, εy, εα) [m, m, rad] of an episode, as floats."""
-    return NoiseRows(partial(_draw_motion_noise, streams, scenario))
+def motion_noise_rows(key: WordArray, scenario: Scenario) -> NoiseRows[list[float]]:
+    """Return the rows (εx, εy, εα) [m, m, rad] of an episode, as floats.
+
+    The first one is that of step 1.
+
+    Parameters
+    ----------
+    key : uint64 ndarray, shape (1, 2)
+        Of the episode.
+    """
+    return NoiseRows(partial(_motion_noise_by_step, key, scenario), first=1)
 
 
-def sensor_noise_rows(streams: Streams, scenario: Scenario) -> NoiseRows[SensorNoise]:
-    """Return the rows of `SensorNoise`; the first one is that of the start."""
-    return NoiseRows(partial(_sensor_noise_by_step, streams, scenario))
+def sensor_noise_rows(key: WordArray, scenario: Scenario) -> NoiseRows[SensorNoise]:
+    """Return the rows of `SensorNoise`; the first one is that of the start, step 0."""
+    return NoiseRows(partial(_sensor_noise_by_step, key, scenario))
 
 
-def _draw_motion_noise(
-    streams: Streams, scenario: Scenario, steps: int
+def _motion_noise_by_step(
+    key: WordArray, scenario: Scenario, steps: IntArray
 ) -> list[list[float]]:
-    unit = streams.motion.standard_normal((steps, 3))
-    degrees = scenario.present_faults.motion_dof
-    noise = heavy_tails(unit, degrees) * scenario.motion.std
+    keys = np.repeat(key, len(steps), axis=0)
+    unit = draw_unit_motion(keys, steps, scenario.present_faults.motion_dof)
+    noise = unit * scenario.motion.std
     rows: list[list[float]] = noise.tolist()
     return rows
+
+
+def draw_unit_motion(keys: WordArray, steps: IntArray, degrees: float) -> Array:
+    """Draw the motion noise of K steps or K worlds before scaling, shape (K, 3).
+
+    Standard normal, or Student's t with these degrees of freedom, see `heavy_tails`.
+    """
+    unit = np.empty((len(steps), 3))
+    draw_normals(keys, steps, MOTION, unit[None])
+    return heavy_tails(unit, degrees)
 
 
 class UnitDraws(NamedTuple):
@@ -193,34 +196,57 @@ class SensorNoiseModel:
         return np.where(present, np.stack([bearings, ranges]), 0.0)
 
 
-def draw_sensor_noise(streams: Streams, scenario: Scenario, steps: int) -> SensorNoise:
-    """Draw the sensor noise of the next steps.
+class UnitDrawer:
+    """Draws the random numbers for the sensor of a scenario.
 
-    Returns
-    -------
-    SensorNoise
-        Its four arrays, with the steps as their first axis.
+    Parameters
+    ----------
+    scenario : Scenario
+        Source of the number of landmarks and the sensor's settings.
     """
-    normal, *widths = unit_widths(scenario)
-    sources = streams.dropout, streams.clutter, streams.order
-    unit = streams.measurement.standard_normal((steps, 2, normal // 2))
-    uniform = [
-        source.random((steps, width)) if width else None
-        for source, width in zip(sources, widths, strict=True)
-    ]
-    draws = UnitDraws(unit.transpose(1, 0, 2), *uniform)
-    error, nearest, clutter, order = SensorNoiseModel(scenario).apply(draws)
-    if clutter is not None:
-        clutter = clutter.transpose(1, 0, 2)
-    return error.transpose(1, 0, 2), nearest, clutter, order
+
+    def __init__(self, scenario: Scenario) -> None:
+        normal, *self._widths = unit_widths(scenario)
+        self._landmarks = normal // 2
+
+    def draw(self, keys: WordArray, steps: IntArray) -> UnitDraws:
+        """Draw K rows, row k from the step ``steps[k]`` of the key ``keys[k]``.
+
+        Parameters
+        ----------
+        keys : uint64 ndarray, shape (K, 2)
+        steps : int64 ndarray, shape (K,)
+        """
+        unit = np.empty((2, len(steps), self._landmarks))
+        draw_normals(keys, steps, MEASUREMENT, unit)
+        uniform: list[Array | None] = [None, None, None]
+        for index, width in enumerate(self._widths):
+            if width:
+                uniform[index] = drawn = np.empty((len(steps), width))
+                draw_uniforms(keys, steps, (DROPOUT, CLUTTER, ORDER)[index], drawn)
+        return UnitDraws(unit, *uniform)
+
+
+def draw_sensor_noise(
+    keys: WordArray, steps: IntArray, scenario: Scenario
+) -> SensorNoise:
+    """Draw the sensor noise of K steps or K worlds; see `UnitDrawer.draw`."""
+    return SensorNoiseModel(scenario).apply(UnitDrawer(scenario).draw(keys, steps))
 
 
 def _sensor_noise_by_step(
-    streams: Streams, scenario: Scenario, steps: int
+    key: WordArray, scenario: Scenario, steps: IntArray
 ) -> Iterable[SensorNoise]:
-    fields = draw_sensor_noise(streams, scenario, steps)
-    rows = ([None] * steps if field is None else field for field in fields)
+    keys = np.repeat(key, len(steps), axis=0)
+    error, nearest, clutter, order = draw_sensor_noise(keys, steps, scenario)
+    fields = _by_step(error), nearest, _by_step(clutter), order
+    rows = ([None] * len(steps) if field is None else field for field in fields)
     return cast("Iterable[SensorNoise]", zip(*rows, strict=True))
+
+
+def _by_step(pairs: Array | None) -> Array | None:
+    """Move the axis of steps to the front."""
+    return None if pairs is None else np.ascontiguousarray(pairs.transpose(1, 0, 2))
 
 
 def _nearest_readable(unit: Array, std: float, per_metre: float, bias: float) -> Array:

@@ -10,15 +10,15 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
 from ...arrays import AnyArray, Array, BoolArray, IndexArray, IntArray
-from ...sim_configs import Scenario, place_landmarks
+from ...sim_configs import Scenario
 from ...sim_configs.scenario import refuse_ranges
 from ..actions import clipped_actions
 from ..robot.vector_bodies import UnicycleBodies
 from ..sensors.bearing_range import BearingRangeSensor, hide_identities
-from ..sensors.noise_streams import Streams, spawn_streams
 from ..sensors.odometry import VectorOdometrySensor
 from ..sensors.vector_noise import VectorNoise
 from ..spaces import count_rows
+from ..streams.episodes import draw_landmarks, draw_starts, episode_keys
 
 Scan = tuple[Array, BoolArray, IntArray | None]
 
@@ -124,7 +124,7 @@ class WorldBatch:
         ----------
         generators : sequence of numpy.random.Generator, length B
             Generator i corresponds to ``np_random`` of a single world. Only those of
-            the chosen worlds spawn.
+            the chosen worlds draw: the key of the episode.
         worlds : bool ndarray, shape (B,), optional
             Worlds to reset (None: all). The first call must reset all.
 
@@ -140,10 +140,11 @@ class WorldBatch:
             raise ValueError(
                 f"generators must be {self.count}, one per world, got {len(generators)}"
             )
-        streams = [spawn_streams(generators[world]) for world in chosen.tolist()]
-        poses, estimates = self._draw_starts([each.start for each in streams])
-        self._place_landmarks(chosen, streams)
-        self._noise.begin(chosen.tolist(), streams)
+        keys = episode_keys([generators[world] for world in chosen.tolist()])
+        if self.scenario.landmarks.is_redrawn or not self.begun:
+            self._landmarks[chosen] = draw_landmarks(self.scenario, keys)
+        poses, estimates = draw_starts(self.scenario, keys)
+        self._noise.begin(chosen, keys)
         self._start_estimates = _replaced(self._start_estimates, chosen, estimates)
         self._bodies.place(chosen, poses)
         self.poses = self._bodies.poses()
@@ -197,23 +198,6 @@ class WorldBatch:
         if not self.begun and not chosen.all():
             raise ResetNeeded("reset all worlds first: some have never begun")
         return np.flatnonzero(chosen)
-
-    def _draw_starts(self, rngs: list[np.random.Generator]) -> tuple[Array, Array]:
-        """Return true and estimated start poses, each of shape (b, 3)."""
-        start = self.scenario.start
-        centre = np.tile(start.pose, (len(rngs), 1))
-        unit = np.array([rng.standard_normal(3) for rng in rngs]).reshape(-1, 3)
-        drawn = centre + start.std * unit
-        return (drawn, centre) if start.drawn == "truth" else (centre, drawn)
-
-    def _place_landmarks(self, chosen: IndexArray, streams: list[Streams]) -> None:
-        layout = self.scenario.landmarks
-        if layout.is_redrawn:
-            placed = [place_landmarks(layout, each.map) for each in streams]
-            self._landmarks[chosen] = np.array(placed).view(np.complex128)[..., 0]
-        elif not self.begun:
-            placed_once = np.ascontiguousarray(place_landmarks(layout, streams[0].map))
-            self._landmarks[:] = placed_once.view(np.complex128)[:, 0]
 
     def _drive(self, commands: Array, moving: BoolArray | None) -> None:
         slip, error = self._odometer.split_noise(commands, self._noise.motion())

@@ -7,10 +7,13 @@ Python: ``NUMBA_DISABLE_JIT=1`` turns compilation off, for a debugger.
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
+import numpy as np
 from numba import config, njit, types
 from numba.extending import intrinsic
 
 from .kernel_cache import KernelCache
+
+_PLAIN = bool(getattr(config, "DISABLE_JIT", 0))
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
@@ -70,6 +73,51 @@ def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:
 # where.  One kernel would then give different bits alone and inside another kernel.
 fma = cast(
     "Callable[[float, float, float], float]",
-    _multiply_add if getattr(config, "DISABLE_JIT", 0) else intrinsic(_emitted_fma),
+    _multiply_add if _PLAIN else intrinsic(_emitted_fma),
 )
 """a b + c, rounded once."""
+
+
+def _multiply_words(a: np.uint64, b: np.uint64) -> tuple[np.uint64, np.uint64]:
+    """Return the high and the low half of a b, of 128 bits, in plain Python."""
+    product = int(a) * int(b)
+    return np.uint64(product >> 64), np.uint64(product & _ALL_BITS)
+
+
+def _add_words(a: np.uint64, b: np.uint64) -> np.uint64:
+    """Return a + b modulo 2⁶⁴ in plain Python, where numpy warns of overflow."""
+    return np.uint64((int(a) + int(b)) & _ALL_BITS)
+
+
+def _emitted_product(_typing: Any, _a: Any, _b: Any) -> tuple[Any, Any]:
+    halves = cast("Any", types).UniTuple(types.uint64, 2)
+
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        word = arguments[0].type
+        wide = type(word)(2 * word.width)
+        product = builder.mul(*(builder.zext(each, wide) for each in arguments))
+        high = builder.trunc(builder.lshr(product, wide(word.width)), word)
+        low = builder.trunc(product, word)
+        return context.make_tuple(builder, halves, (high, low))
+
+    return halves(types.uint64, types.uint64), generate
+
+
+def _emitted_sum(_typing: Any, _a: Any, _b: Any) -> tuple[Any, Any]:
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.add(*arguments)
+
+    return types.uint64(types.uint64, types.uint64), generate
+
+
+_ALL_BITS = 2**64 - 1
+multiply_words = cast(
+    "Callable[[np.uint64, np.uint64], tuple[np.uint64, np.uint64]]",
+    _multiply_words if _PLAIN else intrinsic(_emitted_product),
+)
+"""The high and the low half of the product of two words of 64 bits."""
+add_words = cast(
+    "Callable[[np.uint64, np.uint64], np.uint64]",
+    _add_words if _PLAIN else intrinsic(_emitted_sum),
+)
+"""a + b modulo 2⁶⁴."""

@@ -15,7 +15,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
     """,
     "envs": """
         angles actions
-        robot
+        robot streams
         sensors controllers
         spaces rendering
         landmark_world

@@ -13,8 +13,8 @@ from slamgym.envs.sensors.line_of_sight import LineOfSight
 from slamgym.envs.sensors.noise_streams import (
     draw_sensor_noise,
     sensor_noise_rows,
-    spawn_streams,
 )
+from slamgym.envs.streams.episodes import episode_keys
 from slamgym.sim_configs import load_scenario
 
 BASE = load_scenario("six_landmarks").with_changes(
@@ -39,9 +39,17 @@ def points(rng, count=COUNT, size=9.0):
     return x + 1j * y
 
 
+def key_of(seed):
+    return episode_keys([np.random.default_rng(seed)])
+
+
+def noise_of_steps(scenario, count):
+    keys = np.repeat(key_of(0), count, axis=0)
+    return draw_sensor_noise(keys, np.arange(count), scenario)
+
+
 def noise_of(scenario, seed=0):
-    streams = spawn_streams(np.random.default_rng(seed))
-    return next(sensor_noise_rows(streams, scenario))
+    return next(sensor_noise_rows(key_of(seed), scenario))
 
 
 def silent(scenario):
@@ -159,7 +167,7 @@ def test_a_reading_without_a_positive_range_is_not_reported(per_metre):
         std=(0.01, 2.0), range_std_per_metre=per_metre, min_range=0.0
     )
     rng, dropped = np.random.default_rng(0), 0
-    rows = sensor_noise_rows(spawn_streams(rng), scenario)
+    rows = sensor_noise_rows(key_of(0), scenario)
     for _ in range(300):
         noise, landmarks = next(rows), points(rng)
         readings, mask = scan(scenario, landmarks, POSE, noise)
@@ -216,8 +224,7 @@ def test_a_full_view_sees_all_around():
 
 def test_a_reading_drops_out_with_the_given_probability():
     scenario = scenario_with(dropout=0.3, min_range=0.0, std=(0.01, 0.0))
-    streams = spawn_streams(np.random.default_rng(0))
-    _, nearest, *_ = draw_sensor_noise(streams, scenario, 5000)
+    _, nearest, *_ = noise_of_steps(scenario, 5000)
     dropped = np.isinf(nearest)
     assert dropped.mean() == pytest.approx(0.3, abs=0.005)
     assert np.abs(np.corrcoef(dropped.T) - np.eye(COUNT)).max() < 0.08
@@ -289,7 +296,7 @@ HIDDEN = scenario_with(
 
 
 def hidden_scans(count, scenario=HIDDEN):
-    rows = sensor_noise_rows(spawn_streams(np.random.default_rng(5)), scenario)
+    rows = sensor_noise_rows(key_of(5), scenario)
     landmarks = points(np.random.default_rng(6))
     for _ in range(count):
         noise = next(rows)
@@ -327,9 +334,7 @@ def test_every_order_of_the_rows_is_equally_likely():
 
 
 def test_clutter_is_uniform_over_what_the_sensor_sees_and_poisson_in_number():
-    streams = spawn_streams(np.random.default_rng(0))
-    clutter = draw_sensor_noise(streams, HIDDEN, 20000)[2]
-    bearings, ranges = clutter[:, 0], clutter[:, 1]
+    bearings, ranges = noise_of_steps(HIDDEN, 20000)[2]
     present = ranges > 0
     counts = present.sum(axis=1)
     assert counts.mean() == pytest.approx(2.0, abs=0.03)
@@ -357,7 +362,7 @@ def test_the_length_of_a_block_changes_nothing(monkeypatch):
     def rows(steps):
         monkeypatch.setattr("slamgym.envs.sensors.noise_streams._FIRST_BLOCK", steps)
         scenario = HIDDEN.with_changes(sensor={"dropout": 0.2})
-        noise = sensor_noise_rows(spawn_streams(np.random.default_rng(0)), scenario)
+        noise = sensor_noise_rows(key_of(0), scenario)
         return [next(noise) for _ in range(40)]
 
     for row, other in zip(rows(7), rows(64), strict=True):
@@ -366,9 +371,9 @@ def test_the_length_of_a_block_changes_nothing(monkeypatch):
 
 
 def test_noise_has_the_given_standard_deviations():
-    error = draw_sensor_noise(spawn_streams(np.random.default_rng(0)), BASE, 3000)[0]
-    np.testing.assert_allclose(error.std(axis=(0, 2)), BASE.sensor.std, rtol=0.01)
-    assert abs(np.corrcoef(error[:, 0].ravel(), error[:, 1].ravel())[0, 1]) < 0.01
+    error = noise_of_steps(BASE, 3000)[0]
+    np.testing.assert_allclose(error.std(axis=(1, 2)), BASE.sensor.std, rtol=0.01)
+    assert abs(np.corrcoef(error[0].ravel(), error[1].ravel())[0, 1]) < 0.01
 
 
 # --- worlds side by side ---
@@ -409,6 +414,6 @@ def test_many_worlds_at_once_are_each_alone_to_the_last_bit():
 
 
 def test_neighbouring_steps_have_different_noise():
-    rows = sensor_noise_rows(spawn_streams(np.random.default_rng(0)), BASE)
+    rows = sensor_noise_rows(key_of(0), BASE)
     for before, after in pairwise(next(rows) for _ in range(200)):
         assert (before[0] != after[0]).all()

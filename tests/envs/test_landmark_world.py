@@ -8,13 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
-from gymnasium.utils import seeding
+from numpy_streams import first_key, normals, philox
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.sim_configs import ScenarioError, action_sequence, load_scenario
-
-# the order in which the streams are spawned: a change here changes every seeded episode
-STREAMS = ("start", "map", "motion", "measurement", "dropout", "clutter", "order")
+from slamgym.sim_configs import (
+    ScenarioError,
+    action_sequence,
+    load_scenario,
+    place_landmarks,
+)
 
 WALLS = [[5.0, -2.0, 5.0, 2.0], [-4.0, 4.0, 9.0, 4.5]]
 RANDOM_MAP = {
@@ -50,10 +52,10 @@ def episode(env, count=100, seed=7):
     return moments
 
 
-def stream(seed, name):
-    """The generator of one noise source, made without the environment."""
-    rng, _ = seeding.np_random(seed)
-    return rng.spawn(len(STREAMS))[STREAMS.index(name)]
+def noise_of(seed, name, count, steps=(0,)):
+    """The numbers of one noise source, made without the environment, row by step."""
+    key = first_key(seed)
+    return np.array([normals(key, name, count, step) for step in steps])
 
 
 def assert_same(moments, others):
@@ -94,7 +96,7 @@ def true_readings(env, moments):
 def test_the_path_is_the_turn_last_model_with_the_motion_stream_to_the_last_bit():
     env = make()
     moments = episode(env, count=500, seed=3)
-    noise = stream(3, "motion").standard_normal((500, 3)) * env.scenario.motion.std
+    noise = noise_of(3, "motion", 3, range(1, 501)) * env.scenario.motion.std
     x, y, theta = moments[0][1]["pose"].tolist()
     for (v, w), (ex, ey, ea), (_, info) in zip(
         actions(500).tolist(), noise.tolist(), moments[1:], strict=True
@@ -121,7 +123,7 @@ def test_every_moment_is_measured_from_its_own_pose_also_the_first():
 def test_sensor_noise_is_the_measurement_stream_step_by_step():
     env = make(sensor={"min_range": 0.0, "std": [0.02, 0.001]})
     moments = episode(env, seed=5)
-    noise = stream(5, "measurement").standard_normal((len(moments), 2, 30))
+    noise = noise_of(5, "measurement", 60, range(len(moments))).reshape(-1, 2, 30)
     directions, ranges = true_readings(env, moments)
     seen = masks(moments)
     bearings = directions * np.exp(0.02j * noise[:, 0])
@@ -146,7 +148,7 @@ def test_an_obeying_robot_reports_the_command_plus_noise():
     moments = episode(env, seed=3)
     exact = episode(make(motion={"std": [0.0, 0.0, 0.0]}), seed=3)
     np.testing.assert_array_equal(poses(moments), poses(exact))
-    noise = stream(3, "motion").standard_normal((100, 3)) * motion["std"]
+    noise = noise_of(3, "motion", 3, range(1, 101)) * motion["std"]
     expected = actions(100) * 0.5 + noise[:, [0, 2]]
     np.testing.assert_array_equal(odometry(moments), expected)
 
@@ -293,7 +295,7 @@ def test_ten_times_the_motion_noise_leaves_the_sensor_noise_unchanged():
 def test_the_start_stream_draws_the_truth_around_the_estimate():
     env = make(start={"pose": [1, 2, 3], "std": [0.1, 0.2, 0.3], "drawn": "truth"})
     _, info = env.reset(seed=4)
-    drawn = [1, 2, 3] + stream(4, "start").standard_normal(3) * [0.1, 0.2, 0.3]
+    drawn = [1, 2, 3] + noise_of(4, "start", 3)[0] * [0.1, 0.2, 0.3]
     np.testing.assert_array_equal(info["pose"], drawn)
     assert env.start_estimate.tolist() == [1, 2, 3]
 
@@ -301,9 +303,33 @@ def test_the_start_stream_draws_the_truth_around_the_estimate():
 def test_the_start_stream_draws_the_estimate_around_the_truth():
     env = make(start={"pose": [1, 2, 3], "std": [0.1, 0.2, 0.3], "drawn": "estimate"})
     _, info = env.reset(seed=4)
-    drawn = [1, 2, 3] + stream(4, "start").standard_normal(3) * [0.1, 0.2, 0.3]
+    drawn = [1, 2, 3] + noise_of(4, "start", 3)[0] * [0.1, 0.2, 0.3]
     np.testing.assert_array_equal(env.start_estimate, drawn)
     assert info["pose"].tolist() == [1, 2, 3]
+
+
+def test_a_random_map_is_thrown_from_the_map_stream():
+    env = make(landmarks={**RANDOM_MAP, "min_distance": 2.0})
+    env.reset(seed=6)
+    rng = np.random.Generator(philox(first_key(6), "map"))
+    thrown = place_landmarks(env.scenario.landmarks, rng)
+    np.testing.assert_array_equal(env.landmarks, thrown)
+
+
+def test_a_random_map_without_room_is_refused():
+    env = make(landmarks={**RANDOM_MAP, "count": 90, "min_distance": 3.0})
+    with pytest.raises(ScenarioError, match=r"min_distance must leave room for 90 .*"):
+        env.reset(seed=0)
+
+
+def test_restoring_the_generator_reproduces_the_next_episodes():
+    env = make()
+    env.reset(seed=2)
+    before = env.np_random.bit_generator.state
+    episodes = [episode(env, count=5, seed=None) for _ in range(2)]
+    env.np_random.bit_generator.state = before
+    for moments in episodes:
+        assert_same(moments, episode(env, count=5, seed=None))
 
 
 def test_a_random_map_is_new_in_every_episode_unless_it_has_a_seed():

@@ -1,0 +1,126 @@
+"""Random numbers by position, held against numpy and the standard library."""
+
+import numpy as np
+import pytest
+from numpy_streams import NAMES, normals, philox, uniforms
+from scipy import stats
+
+from slamgym.envs.streams import episodes
+from slamgym.envs.streams.draws import draw_normals, draw_uniforms
+from slamgym.envs.streams.episodes import draw_landmarks, draw_starts, episode_keys
+from slamgym.sim_configs import load_scenario, place_landmarks
+
+CROWDED = load_scenario("active_medium").with_changes(
+    landmarks={"count": 20, "min_distance": 2.5}
+)
+
+
+def keys_of(count, seed=0):
+    return episode_keys([np.random.default_rng([seed, k]) for k in range(count)])
+
+
+def normal_rows(keys, steps, width, *, stream=0, parts=1):
+    out = np.empty((parts, len(keys), width))
+    draw_normals(keys, np.asarray(steps), stream, out)
+    return out
+
+
+def uniform_rows(keys, steps, width, *, stream=0):
+    out = np.empty((len(keys), width))
+    draw_uniforms(keys, np.asarray(steps), stream, out)
+    return out
+
+
+@pytest.mark.parametrize("width", [1, 3, 4, 13])
+def test_uniform_numbers_are_those_of_numpys_philox(width):
+    keys, steps = keys_of(3), [0, 7, 2**40]
+    for stream, name in enumerate(NAMES):
+        rows = uniform_rows(keys, steps, width, stream=stream)
+        for row, key, step in zip(rows, keys, steps, strict=True):
+            np.testing.assert_array_equal(row, uniforms(key, name, width, step))
+
+
+@pytest.mark.parametrize(("parts", "width"), [(1, 3), (2, 6), (2, 5)])
+def test_normal_numbers_are_the_quantiles_of_numpys_words(parts, width):
+    keys, steps = keys_of(40), np.arange(40)
+    rows = normal_rows(keys, steps, width, stream=3, parts=parts)
+    assert (np.abs(rows) > 1.5).any()  # the tails have their own formula
+    for k in range(40):
+        expected = normals(keys[k], "measurement", parts * width, k)
+        np.testing.assert_array_equal(rows[:, k].ravel(), expected)
+
+
+def test_the_streams_are_numbered_as_named():
+    assert [getattr(episodes, name.upper()) for name in NAMES] == list(range(7))
+
+
+def test_a_row_is_the_same_alone_and_among_others():
+    keys, steps = keys_of(64), np.arange(64) % 5
+    together = normal_rows(keys, steps, 9)[0]
+    for k in (0, 5, 63):
+        alone = normal_rows(keys[k : k + 1], steps[k : k + 1], 9)[0, 0]
+        np.testing.assert_array_equal(alone, together[k])
+
+
+def test_normal_numbers_have_the_moments_and_the_distribution_of_the_normal():
+    count = 400_000
+    drawn = normal_rows(keys_of(1000), np.zeros(1000, int), count // 1000).ravel()
+    for order, expected, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96)):
+        gap = (drawn**order).mean() - expected
+        assert abs(gap) < 4 * np.sqrt(variance / count)
+    assert stats.kstest(drawn, "norm").pvalue > 1e-4
+    assert np.abs(drawn).max() < 8.3
+
+
+def test_the_far_tail_is_reached_and_exact():
+    drawn = normal_rows(keys_of(1), [0], 4_000_000).ravel()
+    assert (np.abs(drawn) > 4.0).sum() == pytest.approx(4e6 * 6.33e-5, abs=65)
+
+
+@pytest.mark.parametrize("axis", ["worlds", "steps", "streams", "columns"])
+def test_neighbouring_numbers_are_independent(axis):
+    count = 20_000
+    keys, steps = np.repeat(keys_of(1), count, axis=0), np.arange(count)
+    if axis == "worlds":
+        rows = normal_rows(keys_of(count), np.zeros(count, int), 1).ravel()
+        pairs = rows[:-1], rows[1:]
+    elif axis == "steps":
+        rows = normal_rows(keys, steps, 1).ravel()
+        pairs = rows[:-1], rows[1:]
+    elif axis == "streams":
+        pairs = (
+            normal_rows(keys, steps, 1, stream=2).ravel(),
+            normal_rows(keys, steps, 1, stream=3).ravel(),
+        )
+    else:
+        rows = normal_rows(keys, steps, 2)[0]
+        pairs = rows[:, 0], rows[:, 1]
+    for power in (1, 2):
+        correlation = np.corrcoef(pairs[0] ** power, pairs[1] ** power)[0, 1]
+        assert abs(correlation) < 4 / np.sqrt(count)
+
+
+def test_every_generator_gives_its_own_key_and_the_next_one_after_it():
+    generators = [np.random.default_rng(seed) for seed in range(50)]
+    keys = np.concatenate([episode_keys(generators) for _ in range(3)])
+    assert len(np.unique(keys)) == keys.size
+    again = episode_keys([np.random.default_rng(7)])
+    np.testing.assert_array_equal(again[0], keys[7])
+
+
+def test_darts_are_those_of_the_layout_with_numpys_philox():
+    keys = keys_of(30)
+    drawn = draw_landmarks(CROWDED, keys)
+    for key, landmarks in zip(keys, drawn, strict=True):
+        rng = np.random.Generator(philox(key, "map"))
+        placed = place_landmarks(CROWDED.landmarks, rng)
+        np.testing.assert_array_equal(landmarks, placed[:, 0] + 1j * placed[:, 1])
+
+
+def test_starts_are_drawn_around_the_pose_with_its_standard_deviations():
+    start = {"pose": [1.0, -2.0, 3.0], "std": [0.1, 0.2, 0.3], "drawn": "truth"}
+    drawn, centre = draw_starts(CROWDED.with_changes(start=start), keys_of(5000))
+    assert (centre == start["pose"]).all()
+    unit = (drawn - centre) / start["std"]
+    assert np.abs(unit.mean(axis=0)).max() < 4 / np.sqrt(5000)
+    assert np.abs(unit.std(axis=0) - 1).max() < 4 / np.sqrt(2 * 5000)
