@@ -21,11 +21,7 @@ from .rendering.episode_renderer import EpisodeRenderer
 from .rendering.render_state import RENDER_MODES, BeliefLike
 from .robot.unicycle_body import UnicycleBody
 from .sensors.bearing_range import BearingRangeSensor, hide_identities
-from .sensors.noise_streams import (
-    NoiseRows,
-    motion_noise_rows,
-    sensor_noise_rows,
-)
+from .sensors.noise_streams import NoiseRows, WorldNoise
 from .sensors.odometry import OdometrySensor
 from .spaces import action_space, observation_space
 from .streams.episodes import draw_landmarks, draw_starts, episode_keys
@@ -126,6 +122,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         self._sensor = BearingRangeSensor(self.scenario)
         self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
+        self._noise = WorldNoise(self.scenario)
         self._motion_noise = NoiseRows(_refuse_to_step)
 
     @property
@@ -165,8 +162,8 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         poses, estimates = draw_starts(self.scenario, key)
         self._body.place(poses[0].tolist())
         self._start_estimate: Array = estimates[0]
-        self._motion_noise = motion_noise_rows(key, self.scenario)
-        self._sensor_noise = sensor_noise_rows(key, self.scenario)
+        self._motion_noise = self._noise.motion_rows(key)
+        self._sensor_noise = self._noise.sensor_rows(key)
         self._steps_left = self.scenario.steps
         if self._renderer is not None:
             self._renderer.begin(self.landmarks)

@@ -10,8 +10,9 @@ Run it::
 
     python examples/08_belief_in_the_loop.py
 
-It prints what each of the two earns and how well it knows the map, and writes
-``results/08_belief_in_the_loop.png``: how sure of their place they are on their way.
+It prints what each of the two earns and how well it knows the map and its place, and
+writes ``results/08_belief_in_the_loop.png``: how sure of their place they are on their
+way.
 Then 64 worlds run side by side, each with its filter.
 """
 
@@ -105,7 +106,8 @@ def main() -> None:
     for name, each in drives.items():
         print(
             f"{name:22} earns {each.earned:5.2f} nats per landmark, "
-            f"knows them to {100 * each.known:3.0f} cm"
+            f"knows them to {100 * each.known:3.0f} cm, "
+            f"its place at worst to {100 * max(each.position_std):3.0f} cm"
         )
     print(f"64 worlds observe landmarks of shape {many_worlds()}")
     PICTURE.parent.mkdir(exist_ok=True)

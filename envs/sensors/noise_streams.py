@@ -74,44 +74,6 @@ class NoiseRows(Generic[Row]):
         return self._to_come.pop()
 
 
-def motion_noise_rows(key: WordArray, scenario: Scenario) -> NoiseRows[list[float]]:
-    """Return the rows (εx, εy, εα) [m, m, rad] of an episode, as floats.
-
-    The first one is that of step 1.
-
-    Parameters
-    ----------
-    key : uint64 ndarray, shape (1, 2)
-        Of the episode.
-    """
-    return NoiseRows(partial(_motion_noise_by_step, key, scenario), first=1)
-
-
-def sensor_noise_rows(key: WordArray, scenario: Scenario) -> NoiseRows[SensorNoise]:
-    """Return the rows of `SensorNoise`; the first one is that of the start, step 0."""
-    return NoiseRows(partial(_sensor_noise_by_step, key, scenario))
-
-
-def _motion_noise_by_step(
-    key: WordArray, scenario: Scenario, steps: IntArray
-) -> list[list[float]]:
-    keys = np.repeat(key, len(steps), axis=0)
-    unit = draw_unit_motion(keys, steps, scenario.present_faults.motion_dof)
-    noise = unit * scenario.motion.std
-    rows: list[list[float]] = noise.tolist()
-    return rows
-
-
-def draw_unit_motion(keys: WordArray, steps: IntArray, degrees: float) -> Array:
-    """Draw the motion noise of K steps or K worlds before scaling, shape (K, 3).
-
-    Standard normal, or Student's t with these degrees of freedom, see `heavy_tails`.
-    """
-    unit = np.empty((len(steps), 3))
-    draw_normals(keys, steps, MOTION, unit[None])
-    return heavy_tails(unit, degrees)
-
-
 class UnitDraws(NamedTuple):
     """Random numbers for the sensor before any scaling, for K steps or K worlds.
 
@@ -196,52 +158,81 @@ class SensorNoiseModel:
         return np.where(present, np.stack([bearings, ranges]), 0.0)
 
 
-class UnitDrawer:
-    """Draws the random numbers for the sensor of a scenario.
+class WorldNoise:
+    """Draws the noise of the worlds of a scenario.
+
+    Row k of what it draws is the noise of the step ``steps[k]`` of the episode with the
+    key ``keys[k]``: of K steps of one world, or of one step of K worlds.
 
     Parameters
     ----------
     scenario : Scenario
-        Source of the number of landmarks and the sensor's settings.
+        Source of the noise's settings and the number of landmarks.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        normal, *self._widths = unit_widths(scenario)
+        normal, *widths = unit_widths(scenario)
         self._landmarks = normal // 2
+        self._uniform = list(zip((DROPOUT, CLUTTER, ORDER), widths, strict=True))
+        self._model = SensorNoiseModel(scenario)
+        self._motion_dof = scenario.present_faults.motion_dof
+        self._motion_std = np.array(scenario.motion.std)
 
-    def draw(self, keys: WordArray, steps: IntArray) -> UnitDraws:
-        """Draw K rows, row k from the step ``steps[k]`` of the key ``keys[k]``.
+    def motion(self, keys: WordArray, steps: IntArray) -> Array:
+        """Draw the motion noise (εx, εy, εα), shape (K, 3) [m, m, rad].
 
         Parameters
         ----------
         keys : uint64 ndarray, shape (K, 2)
         steps : int64 ndarray, shape (K,)
         """
+        unit = np.empty((len(steps), 3))
+        draw_normals(keys, steps, MOTION, unit[None])
+        noise: Array = heavy_tails(unit, self._motion_dof) * self._motion_std
+        return noise
+
+    def sensor(self, keys: WordArray, steps: IntArray) -> SensorNoise:
+        """Draw the sensor noise; see `motion`."""
         unit = np.empty((2, len(steps), self._landmarks))
         draw_normals(keys, steps, MEASUREMENT, unit)
-        uniform: list[Array | None] = [None, None, None]
-        for index, width in enumerate(self._widths):
-            if width:
-                uniform[index] = drawn = np.empty((len(steps), width))
-                draw_uniforms(keys, steps, (DROPOUT, CLUTTER, ORDER)[index], drawn)
-        return UnitDraws(unit, *uniform)
+        uniform: list[Array | None] = []
+        for stream, width in self._uniform:
+            drawn = np.empty((len(steps), width)) if width else None
+            if drawn is not None:
+                draw_uniforms(keys, steps, stream, drawn)
+            uniform.append(drawn)
+        return self._model.apply(UnitDraws(unit, *uniform))
+
+    def motion_rows(self, key: WordArray) -> NoiseRows[list[float]]:
+        """Return the motion noise of an episode from step 1 on, as lists of floats.
+
+        Parameters
+        ----------
+        key : uint64 ndarray, shape (1, 2)
+            Of the episode.
+        """
+        return NoiseRows(partial(self._motion_by_step, key), first=1)
+
+    def sensor_rows(self, key: WordArray) -> NoiseRows[SensorNoise]:
+        """Return the sensor noise of an episode from the start, step 0, on."""
+        return NoiseRows(partial(self._sensor_by_step, key))
+
+    def _motion_by_step(self, key: WordArray, steps: IntArray) -> list[list[float]]:
+        rows: list[list[float]] = self.motion(_repeated(key, steps), steps).tolist()
+        return rows
+
+    def _sensor_by_step(self, key: WordArray, steps: IntArray) -> Iterable[SensorNoise]:
+        noise = self.sensor(_repeated(key, steps), steps)
+        error, nearest, clutter, order = noise
+        fields = _by_step(error), nearest, _by_step(clutter), order
+        rows = ([None] * len(steps) if field is None else field for field in fields)
+        return cast("Iterable[SensorNoise]", zip(*rows, strict=True))
 
 
-def draw_sensor_noise(
-    keys: WordArray, steps: IntArray, scenario: Scenario
-) -> SensorNoise:
-    """Draw the sensor noise of K steps or K worlds; see `UnitDrawer.draw`."""
-    return SensorNoiseModel(scenario).apply(UnitDrawer(scenario).draw(keys, steps))
-
-
-def _sensor_noise_by_step(
-    key: WordArray, scenario: Scenario, steps: IntArray
-) -> Iterable[SensorNoise]:
-    keys = np.repeat(key, len(steps), axis=0)
-    error, nearest, clutter, order = draw_sensor_noise(keys, steps, scenario)
-    fields = _by_step(error), nearest, _by_step(clutter), order
-    rows = ([None] * len(steps) if field is None else field for field in fields)
-    return cast("Iterable[SensorNoise]", zip(*rows, strict=True))
+def _repeated(key: WordArray, steps: IntArray) -> WordArray:
+    keys = np.empty((len(steps), 2), dtype=np.uint64)
+    keys[:] = key
+    return keys
 
 
 def _by_step(pairs: Array | None) -> Array | None:

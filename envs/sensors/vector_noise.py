@@ -4,12 +4,7 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IndexArray, WordArray
 from ...sim_configs import Scenario
-from .noise_streams import (
-    SensorNoise,
-    SensorNoiseModel,
-    UnitDrawer,
-    draw_unit_motion,
-)
+from .noise_streams import SensorNoise, WorldNoise
 
 
 class VectorNoise:
@@ -24,11 +19,7 @@ class VectorNoise:
     """
 
     def __init__(self, scenario: Scenario, count: int) -> None:
-        std = scenario.motion.std
-        self._motion_std = np.tile(std, (count, 1))  # tiled: numpy runs one loop
-        self._drawer = UnitDrawer(scenario)
-        self._model = SensorNoiseModel(scenario)
-        self._motion_dof = scenario.present_faults.motion_dof
+        self._noise = WorldNoise(scenario)
         self._keys = np.zeros((count, 2), dtype=np.uint64)
         self._steps = np.zeros(count, dtype=np.int64)
 
@@ -46,13 +37,11 @@ class VectorNoise:
 
     def motion(self) -> Array:
         """Return (εx, εy, εα) of this step, shape (B, 3) [m, m, rad]."""
-        unit = draw_unit_motion(self._keys, self._steps, self._motion_dof)
-        noise: Array = unit * self._motion_std
-        return noise
+        return self._noise.motion(self._keys, self._steps)
 
     def sensor(self, worlds: IndexArray | slice | None) -> SensorNoise:
         """Return the sensor noise of this step in some worlds (None: all)."""
         keys, steps = self._keys, self._steps
         if worlds is not None:
             keys, steps = keys[worlds], steps[worlds]
-        return self._model.apply(self._drawer.draw(keys, steps))
+        return self._noise.sensor(keys, steps)

@@ -37,8 +37,9 @@ def draw_starts(scenario: Scenario, keys: WordArray) -> tuple[Array, Array]:
     start = scenario.start
     unit = np.empty((1, len(keys), 3))
     draw_normals(keys, _first_steps(len(keys)), START, unit)
-    drawn = start.pose + np.array(start.std) * unit[0]
-    centre = np.tile(start.pose, (len(keys), 1))
+    drawn = start.pose + unit[0] * start.std
+    centre = np.empty(drawn.shape)
+    centre[:] = start.pose
     return (drawn, centre) if start.drawn == "truth" else (centre, drawn)
 
 

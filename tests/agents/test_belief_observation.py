@@ -511,7 +511,7 @@ def test_a_belief_in_rows_keeps_every_number():
 
 
 @pytest.mark.slow
-def test_the_example_shows_that_going_home_keeps_the_map_better(
+def test_the_example_shows_that_going_home_bounds_the_uncertainty_of_the_place(
     tmp_path, monkeypatch, capsys
 ):
     example = next(Path(__file__).parents[2].glob("examples/*belief_in_the_loop.py"))

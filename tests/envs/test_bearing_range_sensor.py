@@ -11,8 +11,7 @@ from slamgym.envs.sensors.bearing_range import (
 )
 from slamgym.envs.sensors.line_of_sight import LineOfSight
 from slamgym.envs.sensors.noise_streams import (
-    draw_sensor_noise,
-    sensor_noise_rows,
+    WorldNoise,
 )
 from slamgym.envs.streams.episodes import episode_keys
 from slamgym.sim_configs import load_scenario
@@ -45,11 +44,11 @@ def key_of(seed):
 
 def noise_of_steps(scenario, count):
     keys = np.repeat(key_of(0), count, axis=0)
-    return draw_sensor_noise(keys, np.arange(count), scenario)
+    return WorldNoise(scenario).sensor(keys, np.arange(count))
 
 
 def noise_of(scenario, seed=0):
-    return next(sensor_noise_rows(key_of(seed), scenario))
+    return next(WorldNoise(scenario).sensor_rows(key_of(seed)))
 
 
 def silent(scenario):
@@ -167,7 +166,7 @@ def test_a_reading_without_a_positive_range_is_not_reported(per_metre):
         std=(0.01, 2.0), range_std_per_metre=per_metre, min_range=0.0
     )
     rng, dropped = np.random.default_rng(0), 0
-    rows = sensor_noise_rows(key_of(0), scenario)
+    rows = WorldNoise(scenario).sensor_rows(key_of(0))
     for _ in range(300):
         noise, landmarks = next(rows), points(rng)
         readings, mask = scan(scenario, landmarks, POSE, noise)
@@ -296,7 +295,7 @@ HIDDEN = scenario_with(
 
 
 def hidden_scans(count, scenario=HIDDEN):
-    rows = sensor_noise_rows(key_of(5), scenario)
+    rows = WorldNoise(scenario).sensor_rows(key_of(5))
     landmarks = points(np.random.default_rng(6))
     for _ in range(count):
         noise = next(rows)
@@ -362,7 +361,7 @@ def test_the_length_of_a_block_changes_nothing(monkeypatch):
     def rows(steps):
         monkeypatch.setattr("slamgym.envs.sensors.noise_streams._FIRST_BLOCK", steps)
         scenario = HIDDEN.with_changes(sensor={"dropout": 0.2})
-        noise = sensor_noise_rows(key_of(0), scenario)
+        noise = WorldNoise(scenario).sensor_rows(key_of(0))
         return [next(noise) for _ in range(40)]
 
     for row, other in zip(rows(7), rows(64), strict=True):
@@ -414,6 +413,6 @@ def test_many_worlds_at_once_are_each_alone_to_the_last_bit():
 
 
 def test_neighbouring_steps_have_different_noise():
-    rows = sensor_noise_rows(key_of(0), BASE)
+    rows = WorldNoise(BASE).sensor_rows(key_of(0))
     for before, after in pairwise(next(rows) for _ in range(200)):
         assert (before[0] != after[0]).all()

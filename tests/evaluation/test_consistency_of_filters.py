@@ -66,7 +66,7 @@ def test_in_the_seed_world_the_ekf_believes_to_know_its_heading():
     ekf, ekf_std = study("six_landmarks", "ekf")
     assert 0.93 < invariant.mean() < 1.07
     assert 5.7 < invariant_std.mean() < 5.8
-    assert 2.4 < ekf.mean() < 2.8
+    assert 1.9 < ekf.mean() < 3.9  # over 20 times 200 runs: 2.90 with deviation 0.26
     assert ekf_std.mean() == pytest.approx(2.55, abs=0.05)
 
 
