@@ -24,7 +24,7 @@ from .sensors.bearing_range import BearingRangeSensor, hide_identities
 from .sensors.noise_streams import NoiseRows, WorldNoise
 from .sensors.odometry import OdometrySensor
 from .spaces import action_space, observation_space
-from .streams.episodes import draw_landmarks, draw_starts, episode_keys
+from .streams.episodes import EpisodeStarts, episode_keys
 
 Observation = dict[str, Any]
 
@@ -122,6 +122,7 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         self._sensor = BearingRangeSensor(self.scenario)
         self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
+        self._starts = EpisodeStarts(self.scenario)
         self._noise = WorldNoise(self.scenario)
         self._motion_noise = NoiseRows(_refuse_to_step)
 
@@ -157,9 +158,9 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
             raise ValueError(f"options must be empty, got {options!r}")
         super().reset(seed=seed)
         key = episode_keys([self.np_random])
-        if self.scenario.landmarks.is_redrawn or len(self._landmarks) == 0:
-            self._landmarks = draw_landmarks(self.scenario, key)[0]
-        poses, estimates = draw_starts(self.scenario, key)
+        if self._starts.redraws_landmarks or len(self._landmarks) == 0:
+            self._landmarks = self._starts.landmarks(key)[0]
+        poses, estimates = self._starts.poses(key)
         self._body.place(poses[0].tolist())
         self._start_estimate: Array = estimates[0]
         self._motion_noise = self._noise.motion_rows(key)

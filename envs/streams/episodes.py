@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...arrays import Array, ComplexArray, IntArray, WordArray
+from ...arrays import Array, ComplexArray, WordArray
 from ...sim_configs import Scenario, place_landmarks
 from ...sim_configs.layouts import TRIES_PER_LANDMARK, RandomLayout
 from .draws import draw_normals, throw_darts
@@ -32,38 +32,51 @@ def episode_keys(generators: Sequence[np.random.Generator]) -> WordArray:
     return np.array(words, dtype=np.uint64).reshape(-1, 2)
 
 
-def draw_starts(scenario: Scenario, keys: WordArray) -> tuple[Array, Array]:
-    """Return true and estimated start poses, each of shape (K, 3) [m, m, rad]."""
-    start = scenario.start
-    unit = np.empty((1, len(keys), 3))
-    draw_normals(keys, _first_steps(len(keys)), START, unit)
-    drawn = start.pose + unit[0] * start.std
-    centre = np.empty(drawn.shape)
-    centre[:] = start.pose
-    return (drawn, centre) if start.drawn == "truth" else (centre, drawn)
+class EpisodeStarts:
+    """Draws the start poses and the landmarks of the episodes of a scenario.
 
-
-def draw_landmarks(scenario: Scenario, keys: WordArray) -> ComplexArray:
-    """Return the landmarks x + iy, shape (K, N) [m], new ones for every key.
-
-    They equal those of `place_landmarks` with numpy's ``Philox`` at the same position.
-
-    Raises
-    ------
-    ScenarioError
-        If the layout has no room for its landmarks.
+    Parameters
+    ----------
+    scenario : Scenario
+        Source of the start and the layout.
     """
-    layout = scenario.landmarks
-    out = np.empty((len(keys), layout.count, 2))
-    if isinstance(layout, RandomLayout) and layout.is_redrawn:
-        rules = layout.bounds, layout.min_distance, TRIES_PER_LANDMARK
-        left_out = throw_darts(keys, MAP, *rules, out)
-        if left_out >= 0:
-            raise layout.no_room(left_out)
-    else:
-        out[:] = place_landmarks(layout, np.random.default_rng(0))  # draws nothing
-    return out.view(np.complex128)[..., 0]
 
+    def __init__(self, scenario: Scenario) -> None:
+        start, self._layout = scenario.start, scenario.landmarks
+        self._pose, self._std = np.array(start.pose), np.array(start.std)
+        self._draws_truth = start.drawn == "truth"
+        self.redraws_landmarks = self._layout.is_redrawn
+        """Whether every episode has new landmarks."""
 
-def _first_steps(count: int) -> IntArray:
-    return np.zeros(count, dtype=np.int64)
+    def poses(self, keys: WordArray) -> tuple[Array, Array]:
+        """Return true and estimated start poses, each of shape (K, 3) [m, m, rad]."""
+        drawn = np.empty((len(keys), 3))
+        steps = np.zeros(len(keys), dtype=np.int64)
+        draw_normals(keys, steps, START, drawn[None])
+        drawn *= self._std
+        drawn += self._pose
+        centre = np.empty(drawn.shape)
+        centre[:] = self._pose
+        return (drawn, centre) if self._draws_truth else (centre, drawn)
+
+    def landmarks(self, keys: WordArray) -> ComplexArray:
+        """Return the landmarks x + iy, shape (K, N) [m], drawn anew if random.
+
+        They equal those of `place_landmarks` with numpy's ``Philox`` at the same
+        position.
+
+        Raises
+        ------
+        ScenarioError
+            If the layout has no room for its landmarks.
+        """
+        layout = self._layout
+        out = np.empty((len(keys), layout.count, 2))
+        if isinstance(layout, RandomLayout) and self.redraws_landmarks:
+            rules = layout.bounds, layout.min_distance, TRIES_PER_LANDMARK
+            left_out = throw_darts(keys, MAP, *rules, out)
+            if left_out >= 0:
+                raise layout.no_room(left_out)
+        else:
+            out[:] = place_landmarks(layout, np.random.default_rng(0))  # draws nothing
+        return out.view(np.complex128)[..., 0]

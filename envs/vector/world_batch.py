@@ -18,7 +18,7 @@ from ..sensors.bearing_range import BearingRangeSensor, hide_identities
 from ..sensors.odometry import VectorOdometrySensor
 from ..sensors.vector_noise import VectorNoise
 from ..spaces import count_rows
-from ..streams.episodes import draw_landmarks, draw_starts, episode_keys
+from ..streams.episodes import EpisodeStarts, episode_keys
 
 Scan = tuple[Array, BoolArray, IntArray | None]
 
@@ -78,6 +78,7 @@ class WorldBatch:
         refuse_ranges(scenario)
         self.scenario = scenario
         self.count = count
+        self._starts = EpisodeStarts(scenario)
         self._noise = VectorNoise(scenario, count)
         self._sensor = BearingRangeSensor(scenario)
         self._odometer = VectorOdometrySensor(scenario, count)
@@ -141,9 +142,9 @@ class WorldBatch:
                 f"generators must be {self.count}, one per world, got {len(generators)}"
             )
         keys = episode_keys([generators[world] for world in chosen.tolist()])
-        if self.scenario.landmarks.is_redrawn or not self.begun:
-            self._landmarks[chosen] = draw_landmarks(self.scenario, keys)
-        poses, estimates = draw_starts(self.scenario, keys)
+        if self._starts.redraws_landmarks or not self.begun:
+            self._landmarks[chosen] = self._starts.landmarks(keys)
+        poses, estimates = self._starts.poses(keys)
         self._noise.begin(chosen, keys)
         self._start_estimates = _replaced(self._start_estimates, chosen, estimates)
         self._bodies.place(chosen, poses)

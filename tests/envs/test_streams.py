@@ -7,7 +7,7 @@ from scipy import stats
 
 from slamgym.envs.streams import episodes
 from slamgym.envs.streams.draws import draw_normals, draw_uniforms
-from slamgym.envs.streams.episodes import draw_landmarks, draw_starts, episode_keys
+from slamgym.envs.streams.episodes import EpisodeStarts, episode_keys
 from slamgym.sim_configs import load_scenario, place_landmarks
 
 CROWDED = load_scenario("active_medium").with_changes(
@@ -110,7 +110,7 @@ def test_every_generator_gives_its_own_key_and_the_next_one_after_it():
 
 def test_darts_are_those_of_the_layout_with_numpys_philox():
     keys = keys_of(30)
-    drawn = draw_landmarks(CROWDED, keys)
+    drawn = EpisodeStarts(CROWDED).landmarks(keys)
     for key, landmarks in zip(keys, drawn, strict=True):
         rng = np.random.Generator(philox(key, "map"))
         placed = place_landmarks(CROWDED.landmarks, rng)
@@ -119,7 +119,8 @@ def test_darts_are_those_of_the_layout_with_numpys_philox():
 
 def test_starts_are_drawn_around_the_pose_with_its_standard_deviations():
     start = {"pose": [1.0, -2.0, 3.0], "std": [0.1, 0.2, 0.3], "drawn": "truth"}
-    drawn, centre = draw_starts(CROWDED.with_changes(start=start), keys_of(5000))
+    starts = EpisodeStarts(CROWDED.with_changes(start=start))
+    drawn, centre = starts.poses(keys_of(5000))
     assert (centre == start["pose"]).all()
     unit = (drawn - centre) / start["std"]
     assert np.abs(unit.mean(axis=0)).max() < 4 / np.sqrt(5000)
