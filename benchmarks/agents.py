@@ -104,6 +104,23 @@ def world_cases() -> dict[str, Case]:
     }
 
 
+def reset_cases() -> dict[str, Case]:
+    """Short episodes with their resets, and resets alone: 8 and 30 µs."""
+    cases = {}
+    for count in (64, 1024):
+        short = gymnasium.make_vec(ID, count)
+        cases[f"six_landmarks with resets, {count}"] = steps_of(short, at_most=1.8)
+        drawn = gymnasium.make_vec(ID, count, scenario="active_medium")
+        drawn.reset(seed=0)
+        name = f"reset, random layout, {count}"
+        cases[name] = Case(drawn.reset, count, at_most=7.3)
+    for scenario in ("six_landmarks", "active_medium"):
+        env = LandmarkWorldEnv(scenario)
+        env.reset(seed=0)
+        cases[f"reset, {scenario}, single"] = Case(env.reset, 1, at_most=27.0)
+    return cases
+
+
 def flat_cases() -> dict[str, Case]:
     gymnasiums = "flat by Gymnasium's wrapper, 64"
     ours = steps_of(FlattenBatch(native(64)), faster_than=(gymnasiums, 1.0))
@@ -151,7 +168,13 @@ def main() -> int:
         for name, call in peers.items()
         if call is not None
     }
-    cases |= world_cases() | active_cases() | flat_cases() | stable_baselines_cases()
+    cases |= (
+        world_cases()
+        | reset_cases()
+        | active_cases()
+        | flat_cases()
+        | stable_baselines_cases()
+    )
     calls = {name: case.call for name, case in cases.items()}
     per_call = time_interleaved(calls, rounds=21)
     times = {
