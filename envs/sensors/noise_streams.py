@@ -20,8 +20,9 @@ from .heavy_tails import heavy_tails
 
 Row = TypeVar("Row")
 
-_FIRST_BLOCK = 16  # steps; short, so that a reset is quick
-_LONGEST_BLOCK = 128  # steps; later blocks grow to this
+_FIRST_BLOCK = 8  # steps; short, so that a reset is quick
+_GROWTH = 4  # of a block over the last one
+_LONGEST_BLOCK = 128  # steps
 
 SensorNoise = tuple[Array, Array, Array | None, Array | None]
 """Random effects on the sensor in one step: (error, nearest, clutter, order).
@@ -70,7 +71,7 @@ class NoiseRows(Generic[Row]):
         if not self._to_come:
             end = self._next + self._block
             self._to_come = list(self._draw(np.arange(self._next, end)))[::-1]
-            self._next, self._block = end, min(2 * self._block, _LONGEST_BLOCK)
+            self._next, self._block = end, min(_GROWTH * self._block, _LONGEST_BLOCK)
         return self._to_come.pop()
 
 

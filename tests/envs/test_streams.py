@@ -1,5 +1,9 @@
 """Random numbers by position, held against numpy and the standard library."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from numpy_streams import NAMES, normals, philox, uniforms
@@ -125,3 +129,26 @@ def test_starts_are_drawn_around_the_pose_with_its_standard_deviations():
     unit = (drawn - centre) / start["std"]
     assert np.abs(unit.mean(axis=0)).max() < 4 / np.sqrt(5000)
     assert np.abs(unit.std(axis=0) - 1).max() < 4 / np.sqrt(2 * 5000)
+
+
+@pytest.mark.slow
+def test_plain_python_draws_the_same_without_a_warning():
+    code = """
+from slamgym.envs import LandmarkWorldEnv
+env = LandmarkWorldEnv("active_easy", start={"std": [0.1, 0.1, 0.1]})
+env.reset(seed=3)
+observation, *_ = env.step((0.5, 0.1))
+for array in (env.pose, env.landmarks, observation["landmarks"]):
+    print(array.tobytes().hex())
+"""
+    compiled, plain = (
+        subprocess.run(
+            [sys.executable, "-W", "error", "-c", code],
+            env={**os.environ, **environment},
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        for environment in ({}, {"NUMBA_DISABLE_JIT": "1"})
+    )
+    assert compiled == plain
