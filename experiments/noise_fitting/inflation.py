@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from ...arrays import Array, IntArray
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
@@ -51,7 +52,9 @@ def whiteness(events: DriveEvents, record: DriveRecord) -> tuple[Whiteness, Whit
 
 def _of_axis(events: DriveEvents, record: DriveRecord, axis: int) -> Whiteness:
     scans = _judged(scan_series(events, record, axis))
-    landmarks = _judged(landmark_series(events, record, axis))
+    used = max(int(np.count_nonzero(record.used[0])), 1)
+    together = max(float(record.used[0].sum()) / used, 1.0)
+    landmarks = _judged(landmark_series(events, record, axis), together)
     p_values = [white.p_value for white in (scans, landmarks)]
     known = [p for p in p_values if np.isfinite(p)]
     return Whiteness(
@@ -84,12 +87,18 @@ def landmark_series(events: DriveEvents, record: DriveRecord, axis: int) -> Arra
     return series
 
 
-def _judged(series: Array) -> Whiteness:
+def _judged(series: Array, together: float = 1.0) -> Whiteness:
+    """Judge a series, of readings of which so many share the error of one pose.
+
+    Correlations of landmarks that are seen together are no independent evidence: at
+    worst, so many of them count as one.
+    """
     steps = series.shape[1]
     if steps < 2 * LAGS or np.isfinite(series).sum() < 4 * LAGS:
         return Whiteness(np.nan, np.nan, 1.0)
     correlations, _ = autocorrelation(series, lags=min(LONGEST, steps // 2))
-    p_value = ljung_box(series, lags=LAGS).p_value
+    statistic = ljung_box(series, lags=LAGS).statistic / together
+    p_value = float(chi2.sf(statistic, LAGS))
     factor = 1.0
     if p_value < SIGNIFICANT:
         factor = max(1.0, float(np.sqrt(1 + 2 * _positive_sum(correlations))))
