@@ -1,0 +1,123 @@
+"""How often `diagnose` names the right cause: a table of worlds and answers.
+
+    python benchmarks/causes.py --repetitions 20
+
+Every world is one line: an honest one, or one with a fault that its filter does not
+know, of such a size that NEES is off by about 1.3. Each answer is about the 100 runs of
+one Monte Carlo; the seeds are not those with which the rules were made.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import xarray as xr
+
+from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo.report.diagnosis import diagnosis_summary
+from slamgym.experiments.monte_carlo.report.scores import scores_of
+from slamgym.sim_configs import Scenario, load_scenario
+
+HONEST = "honest"
+
+
+class World(NamedTuple):
+    """A world, what its filter assumes, and the right answer."""
+
+    cause: str
+    scenario: str
+    faults: Mapping[str, float] = {}
+    assumed: Mapping[str, float] = {}
+    """Factors on the deviations that the filter assumes: motion, bearing, range."""
+    estimator: str = "invariant"
+    changes: Mapping[str, Any] = {}
+
+    def scenarios(self) -> tuple[Scenario, Scenario]:
+        """Return the world, and the one that the filter assumes."""
+        nominal = load_scenario(self.scenario).with_changes(**self.changes)
+        motion, bearing, distance = (
+            self.assumed.get(key, 1.0) for key in ("motion", "bearing", "range")
+        )
+        bearing_std, range_std = nominal.sensor.std
+        assumed = nominal.with_changes(
+            motion={"std": [motion * std for std in nominal.motion.std]},
+            sensor={"std": [bearing * bearing_std, distance * range_std]},
+        )
+        return nominal.with_changes(faults=dict(self.faults)), assumed
+
+
+SHORT = {"steps": 250}
+UNSURE = {"start": {"std": [0.02, 0.02, 0.05]}}
+WORLDS = (
+    World(HONEST, "six_landmarks"),
+    World(HONEST, "anchored"),
+    World(HONEST, "anchored", estimator="ekf"),
+    World(HONEST, "dropout", changes={"steps": 100}),
+    World(HONEST, "corridor", changes={"steps": 100}),
+    World(HONEST, "loop", changes=SHORT),
+    World("motion noise too small", "loop", assumed={"motion": 0.75}, changes=SHORT),
+    World("motion noise too large", "loop", assumed={"motion": 1.35}, changes=SHORT),
+    World("bearing noise too small", "anchored", assumed={"bearing": 0.8}),
+    World("bearing noise too large", "anchored", assumed={"bearing": 1.3}),
+    World("range noise too small", "anchored", assumed={"range": 0.75}),
+    World("range noise too large", "anchored", assumed={"range": 1.5}),
+    World("odometry scale", "anchored", {"odometry_scale": 0.15}),
+    World("odometry turn", "loop", {"odometry_turn": 0.014}, changes=SHORT),
+    World("bearing bias", "anchored", {"bearing_bias": 0.003}),
+    World("range bias", "anchored", {"range_bias": 0.03}),
+    World("heavy tails", "anchored", {"motion_dof": 3.5}),
+    World("heavy tails", "anchored", {"sensor_dof": 8}),
+    World("linearisation", "six_landmarks", estimator="ekf", changes=UNSURE),
+    World("linearisation", "unknown_heading", estimator="ekf"),
+)
+
+
+def answers(
+    world: World, runs: int, repetitions: int, seed: int
+) -> tuple[Counter[str], float]:
+    """Count the causes named in repeated Monte Carlos of a world; average NEES / 3."""
+    scenario, assumed = world.scenarios()
+    counts: Counter[str] = Counter()
+    ratios = []
+    for repetition in range(repetitions):
+        first = seed + runs * repetition
+        with monte_carlo(
+            scenario, world.estimator, runs, first, assumed=assumed
+        ) as results:
+            counts[cause_of(results)] += 1
+            ratios.append(float(results.pose_nees_invariant[:, :, 1:].mean() / 3))
+    return counts, sum(ratios) / len(ratios)
+
+
+def cause_of(results: xr.Dataset) -> str:
+    """Name the cause for the only estimator of a Monte Carlo."""
+    label = str(results["estimator"].values[0])
+    found = diagnosis_summary(scores_of(results, label, "invariant"), "invariant")
+    assert found is not None
+    return str(found["cause"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--repetitions", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=2_000_000)
+    arguments = parser.parse_args()
+    print("| cause | world | filter | NEES / 3 | right | other answers |")
+    print("|---|---|---|---|---|---|")
+    for world in WORLDS:
+        counts, ratio = answers(
+            world, arguments.runs, arguments.repetitions, arguments.seed
+        )
+        right = counts.pop(world.cause, 0)
+        others = ", ".join(f"{cause} {n}" for cause, n in counts.most_common())
+        share = f"{right} of {arguments.repetitions}"
+        row = (world.cause, world.scenario, f"`{world.estimator}`", f"{ratio:.2f}")
+        print(f"| {' | '.join((*row, share, others or '–'))} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
