@@ -104,7 +104,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--repetitions", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=2_000_000)
+    parser.add_argument("--seed", type=int, default=3_000_000)
     arguments = parser.parse_args()
     print("| cause | world | filter | NEES / 3 | right | other answers |")
     print("|---|---|---|---|---|---|")
