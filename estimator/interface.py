@@ -27,10 +27,12 @@ __all__ = [
     "SupportsMemoryEstimate",
     "SupportsMerging",
     "SupportsRemoval",
+    "SupportsRestore",
     "SupportsSmoothing",
     "SupportsTruth",
     "UpdateReport",
     "optional_members",
+    "restore",
 ]
 
 
@@ -179,6 +181,14 @@ class SupportsMemoryEstimate(Protocol):
 
 
 @runtime_checkable
+class SupportsRestore(Protocol):
+    """An estimator that continues from its own states without checking them."""
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that this process has saved."""
+
+
+@runtime_checkable
 class SupportsBeliefLimit(Protocol):
     """An estimator that refuses a dense belief of too many landmarks."""
 
@@ -204,3 +214,11 @@ def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
         if isinstance(estimator, ability)
         for name in names
     }
+
+
+def restore(estimator: SlamEstimator, state: Mapping[str, Any]) -> None:
+    """Continue from a state that this process has saved, without checks if possible."""
+    if isinstance(estimator, SupportsRestore):
+        estimator.restore(state)
+    else:
+        estimator.load_state_dict(state)

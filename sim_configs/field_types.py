@@ -3,10 +3,12 @@
 Number types refuse strings, booleans and NaN; they accept integers for floats.
 """
 
+import math
 from reprlib import repr as short_repr
 from typing import Annotated, Any
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -19,6 +21,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from ..magnitudes import LARGEST, SMALLEST
 from .scenario_errors import closest
 
 
@@ -63,6 +66,32 @@ def expect(expectation: str) -> WrapValidator:
     return WrapValidator(validate)
 
 
+def _within_bounds(value: Any) -> Any:
+    """Refuse finite numbers whose products with others could overflow."""
+    numbers = value if isinstance(value, tuple) else (value,)
+    largest = max(map(abs, numbers))
+    if largest > LARGEST and largest != math.inf:
+        raise _out_of_bounds("not exceed", LARGEST, value)
+    return value
+
+
+def _divisible(value: float) -> float:
+    """Refuse positive numbers whose quotients could overflow."""
+    if value < SMALLEST:
+        raise _out_of_bounds("be at least", SMALLEST, value)
+    return value
+
+
+def _out_of_bounds(rule: str, bound: float, value: object) -> PydanticCustomError:
+    return PydanticCustomError(
+        "expected",
+        "must {rule} {bound}, got {got}",
+        {"rule": rule, "bound": f"{bound:g}", "got": short_repr(value)},
+    )
+
+
+BOUNDED, DIVISIBLE = AfterValidator(_within_bounds), AfterValidator(_divisible)
+
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0)]
 _Integer = Annotated[int, Field(strict=True)]
@@ -71,41 +100,59 @@ Text = Annotated[StrictStr, expect("a string")]
 Name = Annotated[StrictStr, Field(min_length=1), expect("a string that is not empty")]
 Flag = Annotated[StrictBool, expect("true or false")]
 
-Positive = Annotated[_Number, Field(gt=0), expect("a finite number > 0")]
-NotNegative = Annotated[_NotNegative, expect("a finite number >= 0")]
-Finite = Annotated[_Number, expect("a finite number")]
+Positive = Annotated[
+    _Number, Field(gt=0), expect("a finite number > 0"), BOUNDED, DIVISIBLE
+]
+NotNegative = Annotated[_NotNegative, expect("a finite number >= 0"), BOUNDED]
+Finite = Annotated[_Number, expect("a finite number"), BOUNDED]
 PositiveOrInfinite = Annotated[
-    float, Field(strict=True, allow_inf_nan=True, gt=0), expect("a number > 0, or inf")
+    float,
+    Field(strict=True, allow_inf_nan=True, gt=0),
+    expect("a number > 0, or inf"),
+    BOUNDED,
+    DIVISIBLE,
 ]
 Probability = Annotated[_NotNegative, Field(le=1), expect("a number from 0 to 1")]
-Count = Annotated[_Integer, Field(ge=1), expect("an integer >= 1")]
-CountOrZero = Annotated[_Integer, Field(ge=0), expect("an integer >= 0")]
+Count = Annotated[_Integer, Field(ge=1), expect("an integer >= 1"), BOUNDED]
+CountOrZero = Annotated[_Integer, Field(ge=0), expect("an integer >= 0"), BOUNDED]
 
-Point = Annotated[tuple[_Number, _Number], expect("2 finite numbers (x, y) [m]")]
+Seed = Annotated[_Integer, Field(ge=0), expect("an integer >= 0")]
+
+Point = Annotated[
+    tuple[_Number, _Number], expect("2 finite numbers (x, y) [m]"), BOUNDED
+]
 Pose = Annotated[
-    tuple[_Number, _Number, _Number], expect("3 finite numbers (x, y, θ) [m, m, rad]")
+    tuple[_Number, _Number, _Number],
+    expect("3 finite numbers (x, y, θ) [m, m, rad]"),
+    BOUNDED,
 ]
 Bounds = Annotated[
     tuple[_Number, _Number, _Number, _Number],
     expect("4 finite numbers (xmin, ymin, xmax, ymax) [m]"),
+    BOUNDED,
 ]
 Wall = Annotated[
     tuple[_Number, _Number, _Number, _Number],
     expect("4 finite numbers (x0, y0, x1, y1) [m]"),
+    BOUNDED,
 ]
 PoseStd = Annotated[
     tuple[_NotNegative, _NotNegative, _NotNegative],
     expect("3 finite numbers >= 0 (σx, σy, σθ) [m, m, rad]"),
+    BOUNDED,
 ]
 MotionStd = Annotated[
     tuple[_NotNegative, _NotNegative, _NotNegative],
     expect("3 finite numbers >= 0 (σx, σy, σα) [m, m, rad]"),
+    BOUNDED,
 ]
 MeasurementStd = Annotated[
     tuple[_NotNegative, _NotNegative],
     expect("2 finite numbers >= 0 (σβ, σr) [rad, m]"),
+    BOUNDED,
 ]
 Command = Annotated[
     tuple[_Number, _Number, Annotated[_Integer, Field(ge=1)]],
     expect("(d [m], α [rad], times): 2 finite numbers and an integer >= 1"),
+    BOUNDED,
 ]

@@ -9,11 +9,11 @@ from ..arrays import Array
 from .field_types import (
     Bounds,
     Count,
-    CountOrZero,
     NotNegative,
     Part,
     Point,
     Positive,
+    Seed,
     broken_rule,
 )
 from .scenario_errors import ScenarioError
@@ -161,7 +161,7 @@ class RandomLayout(_Layout):
     min_distance: NotNegative = Field(
         default=0.0, description="least distance between two landmarks [m]"
     )
-    seed: CountOrZero | None = Field(
+    seed: Seed | None = Field(
         default=None,
         description="seed of the layout; without it every episode draws a new one",
     )

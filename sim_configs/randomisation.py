@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from ..arrays import Array
-from .field_types import NotNegative, Part, Positive, broken_rule, expect
+from .field_types import BOUNDED, NotNegative, Part, Positive, broken_rule, expect
 from .layouts import LandmarkLayout, place_landmarks
 from .scenario_parts import Motion, Sensor, Start
 
@@ -19,7 +19,9 @@ _Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Factors = Annotated[
     tuple[Positive, Positive], expect("2 finite factors > 0, low and high")
 ]
-Ends = Annotated[tuple[_Finite, _Finite], expect("2 finite numbers, low and high")]
+Ends = Annotated[
+    tuple[_Finite, _Finite], expect("2 finite numbers, low and high"), BOUNDED
+]
 
 _FACTORS = ("motion_std", "measurement_std", "start_std", "map_scale")
 

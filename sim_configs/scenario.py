@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from ..arrays import Array
+from ..magnitudes import LARGEST, LARGEST_EPISODE, LARGEST_MAP
 from .controls import CircleSequence, ControlSequence, command_cycle
 from .field_types import Name, Part, Positive, Text, Wall, broken_rule, expect
 from .layouts import LandmarkLayout
@@ -21,7 +22,9 @@ from .scenario_parts import Faults, Motion, Robot, Sensor, Start
 
 _NO_FAULTS = Faults()
 _Steps = Annotated[
-    int, Field(strict=True, ge=2), expect("an integer >= 2")
+    int,
+    Field(strict=True, ge=2, le=LARGEST_EPISODE),
+    expect(f"an integer >= 2, at most {LARGEST_EPISODE}"),
 ]  # Gymnasium's checker refuses an episode that ends at its first step
 
 
@@ -75,6 +78,23 @@ class Scenario(Part):
             if (x0, y0) == (x1, y1):
                 raise broken_rule(
                     f"walls[{index}] must have a length > 0, got {self.walls[index]}"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_sizes(self) -> Self:
+        for name, count in (
+            ("landmarks", self.landmarks.count),
+            ("sensor.max_clutter", self.sensor.max_clutter),
+        ):
+            if count > LARGEST_MAP:
+                raise broken_rule(f"{name} must be at most {LARGEST_MAP}, got {count}")
+        for name in ("max_speed", "max_turn_rate"):
+            limit = getattr(self.robot, name)
+            if limit * self.dt > LARGEST:
+                raise broken_rule(
+                    f"robot.{name} must not exceed {LARGEST:g} / dt, so that no step "
+                    f"is longer, got {limit} with dt = {self.dt}"
                 )
         return self
 

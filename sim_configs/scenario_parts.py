@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from .field_types import (
+    BOUNDED,
     CountOrZero,
     Finite,
     Flag,
@@ -23,7 +24,10 @@ from .field_types import (
 )
 
 _Degrees = Annotated[
-    float, Field(strict=True, allow_inf_nan=True, gt=2), expect("a number > 2, or inf")
+    float,
+    Field(strict=True, allow_inf_nan=True, gt=2),
+    expect("a number > 2, or inf"),
+    BOUNDED,
 ]
 _Angle = Annotated[Positive, Field(le=2 * math.pi), expect("a number in (0, 2π] [rad]")]
 
@@ -161,6 +165,7 @@ class Faults(Part):
         float,
         Field(strict=True, allow_inf_nan=False, gt=-1),
         expect("a finite number > -1"),
+        BOUNDED,
     ] = Field(
         default=0.0, description="s: odometry reads (1 + s) d for a distance d [1]"
     )

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..belief import MapView
+from ..support import saved_states
 from .association_policy import AssociationPolicy
 from .nearest_neighbour import AMBIGUOUS, NEW, Noise
 from .scan_assignments import assign_nearest, assign_scan
@@ -115,19 +116,23 @@ class Candidates:
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any]) -> Candidates:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore what :meth:`state_dict` returned; refuse what does not fit."""
         waiting: dict[int, list[int]] = {}
-        for landmark_id, scan in np.asarray(state["waiting"]).tolist():
-            waiting.setdefault(landmark_id, []).append(scan)
-        tentative = TentativeLandmarks(
-            np.array(state["places"], dtype=np.float64),
-            np.array(state["covariances"], dtype=np.float64),
-            np.array(state["seen"], dtype=np.uint64),
-            np.array(state["labels"], dtype=np.int64),
+        pairs = saved_states.whole_numbers(
+            "tentative.waiting", state["waiting"], (-1, 2)
         )
-        density = UnexplainedDensity(*np.asarray(state["density"]).tolist())
-        next_id, scan = int(state["next_id"]), int(state["scan"])
-        return cls(tentative, waiting, next_id, scan, density)
+        for landmark_id, scan in pairs.tolist():
+            waiting.setdefault(landmark_id, []).append(scan)
+        density = saved_states.array("tentative.density", state["density"], (3,))
+        if density.min() <= 0:
+            raise ValueError(f"state['tentative.density'] must be > 0, got {density}")
+        return cls(
+            TentativeLandmarks.from_state_dict(state),
+            waiting,
+            saved_states.whole_number("tentative.next_id", state["next_id"]),
+            saved_states.whole_number("tentative.scan", state["scan"]),
+            UnexplainedDensity(*density.tolist()),
+        )
 
 
 class ScanAssociation:

@@ -12,7 +12,8 @@ They do not depend on the belief of the filter or its frame.  A tentative landma
 is never confirmed leaves the belief unchanged.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from ...arrays import Array, BoolArray, IntArray
 from ..models.angles import wrap_angle
 from ..models.rigid_motion import rotation
+from ..support import saved_states
 from .nearest_neighbour import Distances, Noise, innovation_distances
 
 Masks = NDArray[np.uint64]
@@ -57,6 +59,30 @@ class TentativeLandmarks(NamedTuple):
             np.empty(0, np.uint64),
             np.empty(0, np.int64),
         )
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any]) -> "TentativeLandmarks":
+        """Return those whose arrays a state holds; refuse what does not fit."""
+        places = saved_states.array("tentative.places", state["places"], (-1, 2))
+        count = len(places)
+        covariances = saved_states.array(
+            "tentative.covariances", state["covariances"], (count, 2, 2)
+        )
+        symmetric = (covariances + covariances.transpose(0, 2, 1)) / 2
+        if not saved_states.is_semidefinite(symmetric):
+            raise ValueError(
+                "state['tentative.covariances'] must be positive semidefinite"
+            )
+        seen = np.asarray(state["seen"])
+        if seen.shape != (count,) or seen.dtype != np.uint64:
+            raise ValueError(
+                f"state['tentative.seen'] must be {count} unsigned integers, got "
+                f"{seen.dtype} with shape {seen.shape}"
+            )
+        labels = saved_states.whole_numbers(
+            "tentative.labels", state["labels"], (count,)
+        )
+        return cls(places, covariances, seen.copy(), labels)
 
     @property
     def sightings(self) -> IntArray:

@@ -37,11 +37,15 @@ def step_data(
     ):
         if array.shape != expected:
             raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
-    durations = np.ascontiguousarray(
-        np.broadcast_to(np.asarray(dt, dtype=np.float64), (steps,))
-    )
+    durations = argument_checks.as_floats("dt", dt)
+    if durations.shape not in ((), (1,), (steps,)):
+        raise ValueError(
+            f"dt must be one number or {steps}, got shape {durations.shape}"
+        )
+    durations = np.ascontiguousarray(np.broadcast_to(durations, (steps,)))
     if not (np.isfinite(durations) & (durations >= 0)).all():
         raise ValueError(f"dt must be finite numbers >= 0, got {dt!r}")
+    argument_checks.refuse_beyond("dt", durations, dt)
     return StepData(u, z, seen), durations
 
 
@@ -140,4 +144,5 @@ def first_poses(name: str, poses: ArrayLike, count: int) -> Array:
             f"{name} must be finite with shape (3,) or ({count}, 3), "
             f"got shape {first.shape}"
         )
+    argument_checks.refuse_beyond(name, first, poses)
     return np.broadcast_to(first, (count, 3))

@@ -37,7 +37,7 @@ def checked_rules(
         range_std_per_metre=argument_checks.at_least(
             "range_std_per_metre", range_std_per_metre, 0.0
         ),
-        min_range=argument_checks.above("min_range", min_range, 0.0),
+        min_range=argument_checks.positive("min_range", min_range),
         gate=_gate(gate_probability),
         noise_as_read=range_noise_at == "reading",
         bearing_std_metres=argument_checks.at_least(

@@ -12,7 +12,7 @@ from ...arrays import Array
 from ..belief import Belief, MapView
 from ..error_frames import ErrorFrame
 from ..kernels.belief_arrays import BeliefArrays, aligned_zeros
-from ..support import argument_checks
+from ..support import saved_states
 from ..support.memory_limit import landmarks_that_fit
 from .landmark_merging import coincide
 
@@ -198,18 +198,32 @@ class GaussianMap:
         ValueError
             Where the entries do not fit together; the map is then as before.
         """
-        saved = np.asarray(state["landmark_ids"])
-        ids = argument_checks.identities(saved, saved.size)
+        self.restore(checked_map(state))
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned, without checks."""
+        ids: list[int] = state["landmark_ids"].tolist()
         size = 3 + 2 * len(ids)
-        mean = argument_checks.finite_vector("state['mean']", state["mean"], size)
-        reference = argument_checks.finite_vector(
-            "state['reference']", state["reference"], size
-        )
-        covariance = _checked_covariance(state["covariance"], size)
         self.allocate(max(FIRST_ALLOCATION, len(ids)))
         self.relabel(ids)
-        self.mean[:size], self.reference[:size] = mean, reference
-        self.covariance[:size, :size] = covariance
+        self.mean[:size], self.reference[:size] = state["mean"], state["reference"]
+        self.covariance[:size, :size] = state["covariance"]
+
+
+def checked_map(
+    state: Mapping[str, Any], *, semidefinite: bool = True
+) -> dict[str, Any]:
+    """Return copies of the arrays of a saved map, or refuse what does not fit."""
+    ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
+    size = 3 + 2 * len(ids)
+    return {
+        "mean": saved_states.array("mean", state["mean"], (size,)),
+        "covariance": saved_states.covariance(
+            "covariance", state["covariance"], size, semidefinite=semidefinite
+        ),
+        "reference": saved_states.array("reference", state["reference"], (size,)),
+        "landmark_ids": np.array(ids, dtype=np.int64),
+    }
 
 
 def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
@@ -233,18 +247,6 @@ def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
     for axis in range(array.ndim):
         array = np.delete(array, columns, axis=axis)
     return array
-
-
-def _checked_covariance(saved: Any, size: int) -> Array:
-    covariance = argument_checks.as_floats("state['covariance']", saved)
-    if covariance.shape != (size, size) or not np.isfinite(covariance).all():
-        raise ValueError(
-            f"state['covariance'] must be finite with shape ({size}, {size}), "
-            f"got shape {covariance.shape}"
-        )
-    if not np.array_equal(covariance, covariance.T):
-        raise ValueError("state['covariance'] must be symmetric")
-    return covariance
 
 
 def _refill(array: Array, content: Array) -> None:

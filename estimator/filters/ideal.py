@@ -13,7 +13,7 @@ from ..interface import UpdateReport
 from ..kernels.rules import AT_ESTIMATE, AT_TRUTH
 from ..models.rigid_motion import rotation
 from ..models.unicycle_motion import drive
-from ..support import argument_checks
+from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from .ekf import EkfSlam
 
@@ -47,8 +47,16 @@ class IdealEkfSlam(EkfSlam):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state; the truth of each step must be told again."""
+        at_truth = saved_states.flag("at_truth", dict(state).get("at_truth", False))
         super().load_state_dict(state)
-        where = AT_TRUTH if state.get("at_truth", False) else AT_ESTIMATE
+        self._linearise_at(AT_TRUTH if at_truth else AT_ESTIMATE)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that this process has saved, without checks."""
+        super().restore(state)
+        self._linearise_at(AT_TRUTH if state["at_truth"] else AT_ESTIMATE)
+
+    def _linearise_at(self, where: int) -> None:
         self._adopt(self.rules._replace(linearisation=where))
 
     @staticmethod

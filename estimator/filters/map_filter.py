@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..belief import Belief, MapView, describe_filter
 from ..error_frames import ErrorFrame
 from ..kernels.rules import ADDITIVE, AT_ESTIMATE, INVARIANT, Rules
-from ..support import argument_checks
+from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.memory_limit import covariance_bytes
 from .gaussian_map import GaussianMap
@@ -126,10 +126,12 @@ class MapFilter:
             together; the belief is then as before.
         """
         entries = ("covariance", "landmark_ids", "mean", "reference")
-        argument_checks.refuse_other_state(
-            state, entries, estimator=type(self).__name__
-        )
+        saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
         self.map.load_state_dict(state)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that this process has saved, without checks."""
+        self.map.restore(state)
 
     def memory_for(self, landmarks: int) -> int:
         """Return what a map of so many landmarks takes at least [bytes]."""

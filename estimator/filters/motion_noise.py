@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from typing import NamedTuple
 
 from numpy.typing import ArrayLike
@@ -32,12 +31,11 @@ class MotionNoise(NamedTuple):
         Raises
         ------
         ValueError
-            Where dt is not finite or negative.
+            Where dt is no number, negative, or too large.
         """
-        if dt == 1.0 and self.at_rest:
+        if type(dt) is float and dt == 1.0 and self.at_rest:
             return self.variance
-        if not (isfinite(dt) and dt >= 0):
-            raise ValueError(f"dt must be a finite number >= 0, got {dt!r}")
+        dt = argument_checks.duration(dt)
         if not (self.at_rest or distance or turn):
             return self.variance * 0.0
         return self.variance * dt

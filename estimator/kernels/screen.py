@@ -4,7 +4,7 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import njit_internal
-from ..support.argument_checks import LARGEST
+from ...magnitudes import LARGEST
 from .belief_arrays import BeliefArrays
 from .linearise import linearise
 from .rules import Rules

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array
 from ..association.candidates import ScanAssociation
 from ..interface import Belief, MapView, ScanDecisions, SlamEstimator, UpdateReport
-from ..support import argument_checks
+from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.nested_state import with_prefix, without_prefix
 from .managed_slam import ManagedSlam
@@ -225,9 +225,10 @@ class HypothesisSlam:
             before.
         """
         name = type(self).__name__
-        argument_checks.refuse_other_state(state, ["costs"], estimator=name)
-        costs = np.asarray(state["costs"]).tolist()
-        argument_checks.at_least("the number of hypotheses", len(costs), 1)
+        saved_states.refuse_other_state(state, ["costs"], estimator=name)
+        costs = saved_states.array("costs", state["costs"], (-1,)).tolist()
+        if not costs or min(costs) < 0:
+            raise ValueError(f"state['costs'] must be numbers >= 0, got {costs}")
         loaded = [Hypothesis(cost, self._fresh()) for cost in costs]
         try:
             for k, hypothesis in enumerate(loaded):
@@ -259,8 +260,7 @@ class HypothesisSlam:
             slam = self.hypotheses[k].slam
             if k in used:
                 slam = self._fresh()
-                slam.load_state_dict(self.hypotheses[k].slam.state_dict())
-                slam.decisions.extend(self.hypotheses[k].slam.decisions)
+                slam.copy_from(self.hypotheses[k].slam)
             used.add(k)
             slams.append(slam)
         return slams
@@ -273,7 +273,7 @@ class HypothesisSlam:
             try:
                 reports.append(slam.take(readings, plan))
                 kept.append(Hypothesis(cost, slam))
-            except np.linalg.LinAlgError as error:
+            except (np.linalg.LinAlgError, MemoryError) as error:
                 errors.append(error)
         if not kept:
             raise errors[0]

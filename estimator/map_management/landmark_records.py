@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
+from ..support import saved_states
 
 
 class LandmarkRecords:
@@ -109,9 +110,17 @@ class LandmarkRecords:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        self.ids = tuple(np.asarray(state["ids"]).tolist())
-        self._slots = {i: k for k, i in enumerate(self.ids)}
-        self.sightings = np.array(state["sightings"], dtype=np.int64)
-        self.misses = np.array(state["misses"], dtype=np.int64)
-        self.information = np.array(state["information"], dtype=np.float64)
+        """Restore what :meth:`state_dict` returned; refuse what does not fit."""
+        ids = saved_states.landmark_ids("landmarks.ids", state["ids"])
+        count = len(ids)
+        sightings, misses = (
+            saved_states.whole_numbers(f"landmarks.{key}", state[key], (count,), 0)
+            for key in ("sightings", "misses")
+        )
+        information = saved_states.array(
+            "landmarks.information", state["information"], (count, 3)
+        )
+        self.ids = tuple(ids)
+        self._slots = {i: k for k, i in enumerate(ids)}
+        self.sightings, self.misses = sightings, misses
+        self.information = information

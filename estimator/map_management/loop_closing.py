@@ -24,6 +24,7 @@ from ...arrays import Array, BoolArray, IntArray
 from ..association.constellations import Constellations, match_constellations
 from ..association.same_place import TwoPlaces
 from ..belief import MapView
+from ..support import saved_states
 
 Pairs = list[tuple[int, int]]
 """Landmarks that are the same: (kept, gone)."""
@@ -109,7 +110,8 @@ class LoopCloser:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self._doubtful = set(np.asarray(state["doubtful"]).tolist())
+        doubtful = saved_states.landmark_ids("landmarks.doubtful", state["doubtful"])
+        self._doubtful = set(doubtful)
 
     def _note_added(
         self, view: MapView, added: Collection[int], is_lost: BoolArray

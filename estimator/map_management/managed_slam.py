@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,16 @@ from numpy.typing import ArrayLike
 from ...arrays import Array
 from ..association.candidates import Candidates, ScanAssociation, Sensor, associate
 from ..filters.motion_noise import MotionNoise
-from ..interface import Belief, MapView, SlamEstimator, UpdateReport, optional_members
+from ..interface import (
+    Belief,
+    MapView,
+    SlamEstimator,
+    UpdateReport,
+    optional_members,
+    restore,
+)
 from ..models.rigid_motion import rotation
-from ..support import argument_checks
+from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.nested_state import with_prefix, without_prefix
 from ..update_report import ScanDecisions
@@ -28,8 +36,8 @@ from .recent_scans import RecentScans
 class ManagedSlam:
     """A filter of any kind that associates, confirms, removes and merges landmarks.
 
-    Around the filter's own ``update`` a :class:`LandmarkPolicy` decides which landmark
-    each reading is of, which new ones to believe, and which to merge or to give up.
+    A :class:`LandmarkPolicy` decides which landmark each reading is of, which new ones
+    to believe, and which to merge or to give up.
 
     Parameters
     ----------
@@ -51,9 +59,9 @@ class ManagedSlam:
 
     Notes
     -----
-    Tentative landmarks stay outside the filter's state: clutter then neither moves the
-    pose nor costs anything, and a landmark that is never confirmed does not change the
-    belief.  Readings before the confirming one correct nothing unless backdated.
+    Tentative landmarks stay outside the filter's state: one that is never confirmed
+    does not change the belief.  Readings before the confirming one correct nothing
+    unless backdated.
 
     Examples
     --------
@@ -129,10 +137,10 @@ class ManagedSlam:
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
-        self._filter.predict(odometry, dt)
-        self._editor.expire()
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._motion_noise.over(distance, turn, dt)
+        self._filter.predict((distance, turn), dt)
+        self._editor.expire()
         moved = self._candidates.tentative.moved(distance, turn, variance)
         self._candidates = replace(self._candidates, tentative=moved)
         self._recent.note_motion(distance, turn, dt)
@@ -156,10 +164,9 @@ class ManagedSlam:
 
         Raises
         ------
-        ValueError
-            Where the arguments are malformed; all is then as before.
-        numpy.linalg.LinAlgError
-            Where the filter's covariance is degenerate; all is then as before.
+        ValueError, numpy.linalg.LinAlgError
+            Where the arguments are malformed, or the filter's covariance is degenerate;
+            all is then as before.
         """
         readings = argument_checks.scan(measurements)
         if landmark_ids is None:
@@ -214,24 +221,12 @@ class ManagedSlam:
         )
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
-        """Marginalise landmarks by hand, shape (n,); all else stays as it was.
-
-        Raises
-        ------
-        ValueError
-            Where one is not in the map.
-        """
+        """Marginalise mapped landmarks by hand, shape (n,); all else stays."""
         ids = argument_checks.mapped_identities(landmark_ids, self._slots)
         self._recent.note_edits(self._pruner.remove(ids), ())
 
     def merge(self, kept: int, gone: int) -> None:
-        """Merge two landmarks by hand; both identities then name the first.
-
-        Raises
-        ------
-        ValueError
-            Where one is not in the map, or they are the same.
-        """
+        """Merge two mapped landmarks by hand; both identities then name the first."""
         argument_checks.two_landmarks(kept, gone, self._slots)
         self._pruner.merger.join([(kept, gone)])
         self._recent.note_edits((), [(kept, gone)])
@@ -262,25 +257,31 @@ class ManagedSlam:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit under the same settings.
 
-        Raises
-        ------
-        ValueError
-            Where the state lacks an entry, or is of another estimator; all is then as
-            before.
+        An error leaves all as before.
         """
         entries = [k for k in self._remembered() if k.count(".") < 2]
-        argument_checks.refuse_other_state(
-            state, entries, estimator=type(self).__name__
-        )
+        saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
+        self._continue(state, self._filter.load_state_dict)
+
+    def copy_from(self, other: ManagedSlam) -> None:
+        """Continue as another filter of the same settings, decisions included."""
+        self._continue(other.state_dict(), partial(restore, self._filter))
+        self.decisions.extend(other.decisions)
+
+    def _continue(
+        self, state: Mapping[str, Any], load: Callable[[Mapping[str, Any]], None]
+    ) -> None:
+        """Continue from a state; an error leaves all as before."""
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
-        before = self._pruner.state_dict(), self._recent.state_dict()
+        before = self._pruner.state_dict(), self._recent.state_dict(), self.decisions
         try:
             self._pruner.load_state_dict(without_prefix(state, "landmarks"))
             self._recent.load_state_dict(without_prefix(state, "recent"))
-            self._filter.load_state_dict(without_prefix(state, "filter"))
+            load(without_prefix(state, "filter"))
         except Exception:
             self._pruner.load_state_dict(before[0])
             self._recent.load_state_dict(before[1])
+            self._recent.decisions = before[2]
             raise
         self._editor.expire()
         self._candidates = candidates

@@ -8,6 +8,7 @@ import numpy as np
 from ...arrays import Array, IntArray
 from ..filters.landmark_merging import separation
 from ..interface import MapView
+from ..support import saved_states
 from .landmark_records import LandmarkRecords
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
@@ -50,7 +51,10 @@ class LandmarkMerger:
         merged: list[tuple[int, int]] = []
         while (pair := self._duplicate(seen)) is not None:
             kept, gone = pair
-            self.join([pair])
+            try:
+                self.join([pair])
+            except np.linalg.LinAlgError:  # nothing was merged; later scans try again
+                break
             seen = (seen - {gone}) | {kept}
             merged.append(pair)
         return merged
@@ -80,8 +84,11 @@ class LandmarkMerger:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self._apart = {(i, j) for i, j in np.asarray(state["apart"]).tolist()}
-        self.aliases = dict(np.asarray(state["aliases"]).tolist())
+        apart, aliases = (
+            saved_states.whole_numbers(f"landmarks.{key}", state[key], (-1, 2)).tolist()
+            for key in ("apart", "aliases")
+        )
+        self._apart, self.aliases = {(i, j) for i, j in apart}, dict(aliases)
 
     def _duplicate(self, seen: set[int]) -> tuple[int, int] | None:
         """Find two landmarks that are one; keep the first of them in the map."""

@@ -154,7 +154,6 @@ class MapPruner:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        self._records.load_state_dict(state)
-        self.merger.load_state_dict(state)
-        self._closer.load_state_dict(state)
+        """Restore what :meth:`state_dict` returned; refuse what does not fit."""
+        for part in (self._records, self.merger, self._closer):
+            part.load_state_dict(state)

@@ -8,102 +8,25 @@ since then, with the new landmark in them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Array
-from ..association.candidates import LABEL_BITS, NO_LABEL, ScanAssociation
+from ..association.candidates import NO_LABEL, ScanAssociation
 from ..interface import (
     ScanDecisions,
     SlamEstimator,
     SupportsLocalView,
     SupportsTruth,
     UpdateReport,
+    restore,
 )
-from ..support import argument_checks
+from ..support import saved_states
 from ..support.nested_state import with_prefix, without_prefix
 from .map_editor import CachedEditor
-
-ENTRIES = ["number", "motions", "readings", "row_ids", "labels", "removed", "merged"]
-"""What the saved state of a scan holds, beside the state of the filter."""
-
-NO_LANDMARK = np.iinfo(np.int64).min
-
-Motion = tuple[float, float, float]
-"""(d, α) [m, rad] and dt."""
-
-
-@dataclass(frozen=True)
-class RecentScan:
-    """One scan, the motion before it, and what was done with it."""
-
-    number: int
-    motions: tuple[Motion, ...]
-    readings: Array
-    """Rows (β, r), shape (m, 2)."""
-    row_ids: tuple[int | None, ...]
-    """Landmark of each row, None where the filter does not use it."""
-    labels: tuple[int, ...]
-    """Label of the tentative landmark of each row, or `NO_LABEL`."""
-    before: Mapping[str, Any] | None = None
-    """State of the filter before the scan, where a tentative landmark begins in it."""
-    removed: tuple[int, ...] = ()
-    """Landmarks removed after it."""
-    merged: tuple[tuple[int, int], ...] = ()
-    """Landmarks merged after it: (kept, gone)."""
-
-    @property
-    def begins(self) -> bool:
-        """Whether a tentative landmark is seen here for the first time."""
-        return any(
-            label != NO_LABEL and label >> LABEL_BITS == self.number
-            for label in self.labels
-        )
-
-    def feed(self, slam: SlamEstimator) -> UpdateReport:
-        """Update a filter with the rows that it uses."""
-        rows = [row for row, i in enumerate(self.row_ids) if i is not None]
-        ids = [i for i in self.row_ids if i is not None]
-        return slam.update(self.readings[rows], ids)
-
-    def edit(self, editor: CachedEditor) -> None:
-        """Remove and merge landmarks as after the scan."""
-        if self.removed:
-            editor.remove(self.removed)
-        for pairs in _groups(self.merged):
-            editor.merge_pairs(pairs)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return all as arrays."""
-        row_ids = [NO_LANDMARK if i is None else i for i in self.row_ids]
-        return {
-            "number": np.array(self.number),
-            "motions": _motion_array(self.motions),
-            "readings": self.readings.copy(),
-            "row_ids": np.array(row_ids, dtype=np.int64),
-            "labels": np.array(self.labels, dtype=np.int64),
-            "removed": np.array(self.removed, dtype=np.int64),
-            "merged": np.array(self.merged, dtype=np.int64).reshape(-1, 2),
-            **with_prefix("before", self.before or {}),
-        }
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any]) -> RecentScan:
-        """Restore what :meth:`state_dict` returned."""
-        argument_checks.refuse_other_state(state, ENTRIES)
-        row_ids = np.asarray(state["row_ids"]).tolist()
-        return cls(
-            int(state["number"]),
-            _motions(state["motions"]),
-            np.array(state["readings"], dtype=np.float64).reshape(-1, 2),
-            tuple(None if i == NO_LANDMARK else i for i in row_ids),
-            tuple(np.asarray(state["labels"]).tolist()),
-            without_prefix(state, "before") or None,
-            tuple(np.asarray(state["removed"]).tolist()),
-            tuple((i, j) for i, j in np.asarray(state["merged"]).tolist()),
-        )
+from .recent_scan import Motion, RecentScan, motion_array, motions_of
 
 
 class RecentScans:
@@ -199,7 +122,7 @@ class RecentScans:
         try:
             before = scans[first].before
             assert before is not None  # a tentative landmark begins here
-            self._slam.load_state_dict(before)
+            restore(self._slam, before)
             report = scans[first].feed(self._slam)
             for k in range(first + 1, len(scans)):
                 scans[k - 1].edit(self._editor)
@@ -209,14 +132,15 @@ class RecentScans:
                     scans[k] = replace(scans[k], before=self._slam.state_dict())
                 report = scans[k].feed(self._slam)
         except Exception:
-            self._slam.load_state_dict(now)
+            restore(self._slam, now)
+            self._editor.expire()
             raise
         return report
 
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
         state: dict[str, Any] = {
-            "motions": _motion_array(self._motions),
+            "motions": motion_array(self._motions),
             "count": np.array(len(self._scans)),
         }
         for k, scan in enumerate(self._scans):
@@ -225,10 +149,15 @@ class RecentScans:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        motions = _motions(state["motions"])
+        motions = motions_of(state["motions"])
+        count = saved_states.whole_number("recent.count", state["count"])
+        if count > self._window + 1:
+            raise ValueError(
+                f"state['recent.count'] must be at most {self._window + 1}, got {count}"
+            )
         self._scans = [
             RecentScan.from_state_dict(without_prefix(state, str(k)))
-            for k in range(int(state["count"]))
+            for k in range(count)
         ]
         self._motions = motions
         self.decisions = []
@@ -242,25 +171,6 @@ def _decided(plan: ScanAssociation, report: UpdateReport) -> ScanDecisions:
     return ScanDecisions(
         row_ids, tuple(i for i in row_ids if i in new and i is not None)
     )
-
-
-def _groups(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
-    """Split pairs into groups in which each landmark occurs once.
-
-    Examples
-    --------
-    >>> _groups([(0, 4), (1, 5), (0, 6)])
-    [[(0, 4), (1, 5)], [(0, 6)]]
-    """
-    groups: list[list[tuple[int, int]]] = []
-    used: set[int] = set()
-    for pair in pairs:
-        if not groups or not used.isdisjoint(pair):
-            groups.append([])
-            used = set()
-        groups[-1].append(pair)
-        used.update(pair)
-    return groups
 
 
 def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | None:
@@ -289,12 +199,3 @@ def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | Non
         ids = tuple(names.get(label, i) for i, label in pairs)
         scans[k] = replace(scans[k], row_ids=ids)
     return shown[0]
-
-
-def _motion_array(motions: Sequence[Motion]) -> Array:
-    return np.array(motions, dtype=np.float64).reshape(-1, 3)
-
-
-def _motions(array: Any) -> tuple[Motion, ...]:
-    rows = np.asarray(array, dtype=np.float64).tolist()
-    return tuple((distance, turn, dt) for distance, turn, dt in rows)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..interface import Belief, MapView, SlamEstimator, UpdateReport, optional_members
 from ..map_management.map_editor import edit_map
 from ..map_management.map_view import mapped_ids, marginal, view_map
-from ..support import argument_checks
+from ..support import argument_checks, saved_states
 from .drive import Drive
 
 HISTORY = "recorded_events"
@@ -72,13 +72,15 @@ class RecordedSlam:
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run and a new drive, at a pose (3,) known to (3,) [m, m, rad]."""
         self._slam.reset(pose, pose_std)
-        self._noise |= {"initial_pose": pose, "initial_pose_std": pose_std}
+        first, std = np.array(pose, dtype=float), np.array(pose_std, dtype=float)
+        self._noise |= {"initial_pose": first, "initial_pose_std": std}
         self._last = None
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
-        self._slam.predict(odometry, dt)
-        self._record("predict", argument_checks.pair("odometry", odometry), dt)
+        motion = argument_checks.pair("odometry", odometry)
+        self._slam.predict(motion, dt)
+        self._record("predict", motion, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
@@ -142,9 +144,12 @@ class RecordedSlam:
         ValueError
             Where the state holds no drive, or the filter refuses it.
         """
-        history = state.get(HISTORY)
-        if not isinstance(history, np.ndarray) or history.dtype != object:
-            raise ValueError(f"state must hold '{HISTORY}', got {sorted(state)}")
+        saved_states.refuse_other_state(state, [HISTORY])
+        history = state[HISTORY]
+        if not _is_history(history):
+            raise ValueError(
+                f"state['{HISTORY}'] must be the events of a drive, got {history!r}"
+            )
         self._slam.load_state_dict(state)
         self._last = history.item()
 
@@ -162,3 +167,9 @@ class RecordedSlam:
             events.append(event)
             event = event.before
         yield from reversed(events)
+
+
+def _is_history(saved: Any) -> bool:
+    """Return whether a saved value is the last event of a drive, or none."""
+    is_one = isinstance(saved, np.ndarray) and saved.dtype == object and not saved.shape
+    return is_one and isinstance(saved.item(), Event | None)

@@ -6,19 +6,18 @@ Those of every step take well-formed arguments through without a copy.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import AnyArray, Array
+from ...magnitudes import LARGEST, SMALLEST
 from .memory_limit import covariance_bytes
 
 LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 
-# Largest reading or odometry [m, rad]; their squares, and products, stay finite.
-LARGEST = 1e12
 # The lowest identity that 64 bits hold, and how many from there on are no landmarks.
 LOWEST_ID, RESERVED_IDS = -(2**63), 2**20
 
@@ -26,19 +25,32 @@ _FLOAT64 = np.dtype(np.float64)
 
 
 def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
-    """Return ``value`` as float64 (size,), or refuse it."""
+    """Return ``value`` as float64 (size,) of usable magnitude, or refuse it."""
     vector = as_floats(name, value)
     if vector.shape != (size,) or not np.isfinite(vector).all():
         raise ValueError(f"{name} must be {size} finite numbers, got {value!r}")
+    refuse_beyond(name, vector, value)
     return vector
 
 
 def standard_deviations(name: str, value: ArrayLike, size: int) -> Array:
-    """Return ``value`` as float64 (size,), finite and not negative, or refuse it."""
+    """Return ``value`` as float64 (size,), from 0 to the largest, or refuse it."""
     std = as_floats(name, value)
     if std.shape != (size,) or not (np.isfinite(std) & (std >= 0)).all():
         raise ValueError(f"{name} must be {size} finite numbers >= 0, got {value!r}")
+    refuse_beyond(name, std, value)
     return std
+
+
+def duration(dt: float) -> float:
+    """Return the duration of a prediction [steps], or refuse it."""
+    return at_least("dt", dt, 0.0)
+
+
+def refuse_beyond(name: str, array: Array, value: object) -> None:
+    """Refuse finite numbers beyond the largest that filters accept."""
+    if (np.abs(array) > LARGEST).any():
+        raise ValueError(f"{name} must not exceed {LARGEST:g}, got {value!r}")
 
 
 def as_floats(name: str, value: ArrayLike) -> Array:
@@ -185,18 +197,6 @@ def refuse_unusable(readings: Array, ids: Sequence[int]) -> None:
             )
 
 
-def refuse_other_state(
-    state: Mapping[str, Any], entries: Iterable[str], **classes: str
-) -> None:
-    """Refuse a saved state that lacks an entry, or is of other classes than these."""
-    for key in (*classes, *entries):
-        if key not in state:
-            raise ValueError(f"state must hold {key!r}, got {sorted(state)}")
-    for key, name in classes.items():
-        if str(state[key]) != name:
-            raise ValueError(f"state is of {state[key]}, not of {name}")
-
-
 def refuse_large_belief(landmarks: int, limit: int, instead: str) -> None:
     """Refuse a dense covariance of more landmarks than the limit, with its size."""
     if landmarks > limit:
@@ -231,17 +231,35 @@ def _not_a_pair(name: str, value: ArrayLike) -> ValueError:
 
 
 def at_least(name: str, value: float, least: float) -> float:
-    """Return a finite number >= ``least``, or refuse it."""
+    """Return a number from ``least`` to the largest, or refuse it."""
     if not (_is_finite(value) and value >= least):
         raise ValueError(f"{name} must be a finite number >= {least:g}, got {value!r}")
+    if value > LARGEST:
+        raise ValueError(f"{name} must not exceed {LARGEST:g}, got {value!r}")
     return float(value)
 
 
 def above(name: str, value: float, least: float) -> float:
-    """Return a finite number > ``least``, or refuse it."""
+    """Return a number above ``least``, up to the largest, or refuse it."""
     if not (_is_finite(value) and value > least):
         raise ValueError(f"{name} must be a finite number > {least:g}, got {value!r}")
+    if value > LARGEST:
+        raise ValueError(f"{name} must not exceed {LARGEST:g}, got {value!r}")
     return float(value)
+
+
+def positive(name: str, value: float) -> float:
+    """Return a number > 0 that other numbers can be divided by, or refuse it."""
+    if above(name, value, 0.0) < SMALLEST:
+        raise ValueError(f"{name} must be at least {SMALLEST:g}, got {value!r}")
+    return float(value)
+
+
+def distance(name: str, value: float) -> float:
+    """Return a distance >= 0 [m], also infinity, or refuse it."""
+    if isinstance(value, float) and value == inf:
+        return value
+    return at_least(name, value, 0.0)
 
 
 def whole(name: str, value: int, least: int) -> int:
@@ -276,4 +294,6 @@ def _refuse_masked_and_complex(name: str, value: AnyArray) -> None:
 
 
 def _is_finite(value: float) -> bool:
-    return isinstance(value, int | float | np.number) and isfinite(value)
+    if isinstance(value, int):
+        return True  # of any size
+    return isinstance(value, float | np.number) and isfinite(value)

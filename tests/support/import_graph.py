@@ -12,7 +12,7 @@ PACKAGES = (
     "agents",
     "experiments",
 )
-GROUND = {"arrays", "jit"}  # beside the rooms; every room may import them
+GROUND = {"arrays", "jit", "magnitudes"}  # beside the rooms; every room may import them
 
 
 def module_name(file):

@@ -180,7 +180,7 @@ class CompressedMap:
 
     def load(self, saved: SavedState) -> list[int]:
         """Replace the state by a saved one; return the numbers of the caller."""
-        self.filter.load_state_dict(saved.local)
+        self.filter.restore(saved.local)
         self.deferred, self.slots, self.local = saved.far, saved.slots, saved.near
         self._points, self._references, self._strip, self._origin = saved.arrays
         self._virtual, *numbers = saved.numbers[:4]

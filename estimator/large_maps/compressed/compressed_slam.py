@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ....magnitudes import LARGEST
 from ...belief import describe_filter
 from ...filters.ekf import EkfSlam
 from ...filters.first_estimates import FirstEstimatesEkfSlam
@@ -15,7 +17,7 @@ from ...filters.invariant import InvariantEkfSlam
 from ...filters.iterated import IteratedEkfSlam
 from ...filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from ...interface import Belief, MapView, UpdateReport
-from ...support import argument_checks
+from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
 from . import active_set
@@ -31,6 +33,8 @@ BASES: dict[str, type[EkfSlam]] = {
     "observability_constrained": ObservabilityConstrainedEkfSlam,
     "iterated": IteratedEkfSlam,
 }
+CHECKED_LANDMARKS = 200
+"""Landmarks of a saved state whose joint covariance is checked."""
 
 
 class CompressedEkfSlam:
@@ -94,8 +98,10 @@ class CompressedEkfSlam:
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
         **settings: Any,
     ) -> None:
-        make = BASES[argument_checks.one_of("base", base, tuple(BASES))]
-        self._map = CompressedMap(make(motion_std, measurement_std, **settings))
+        base_filter = BASES[argument_checks.one_of("base", base, tuple(BASES))]
+        noise = np.array(motion_std), np.array(measurement_std)
+        self._make = partial(base_filter, *noise, **settings)
+        self._map = CompressedMap(self._make())
         self._local_size = local_size
         if local_size is not None:
             argument_checks.whole("local_size", local_size, 1)
@@ -133,7 +139,7 @@ class CompressedEkfSlam:
         readings = argument_checks.scan(measurements)
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_reserved(ids)
-        if (np.abs(readings) <= argument_checks.LARGEST).all():  # otherwise refused
+        if (np.abs(readings) <= LARGEST).all():  # otherwise refused
             self._choose_local_map([i for i in ids if i in self._map.slots])
         report = self._map.filter.update(readings, ids)
         self._map.add(report.added_ids)
@@ -251,10 +257,17 @@ class CompressedEkfSlam:
         return name | self._map.state_dict([self._extra, self._age, self._rests])
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, as `EkfSlam.load_state_dict`."""
+        """Continue from a saved state, as `EkfSlam.load_state_dict`.
+
+        Of a large map the covariance of the first 200 landmarks is checked.
+        """
         name, base = type(self).__name__, type(self._map.filter).__name__
         saved = checked_state(state, name, base, self._map.is_invariant)
-        self._extra, self._age, rests = self._map.load(saved)
+        loaded = CompressedMap(self._make())
+        extra, age, rests = loaded.load(saved)
+        some = loaded.belief(list(loaded.slots)[:CHECKED_LANDMARKS])
+        saved_states.refuse_indefinite("the covariance of state", some.covariance)
+        self._map, self._extra, self._age = loaded, extra, age
         self._rests = bool(rests)
 
     def _choose_local_map(self, required: Sequence[int]) -> None:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....arrays import Array, IntArray
+from ...support import saved_states
 from ...support.memory_limit import refuse_beyond_memory
 from .row_exchange import read_columns, write_columns
 
@@ -172,35 +173,28 @@ class DeferredCovariance:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from what :meth:`state_dict` returned, bit for bit."""
-        flat = np.asarray(state["covariance"], dtype=np.float64)
-        root = np.asarray(state["pending_root"], dtype=np.float64)
-        signs = np.asarray(state["pending_signs"], dtype=np.float64)
-        shapes = np.asarray(state["pending_shapes"], dtype=np.int64).tolist()
+        """Continue from what :meth:`state_dict` returned, or refuse it unchanged."""
+        flat = saved_states.array("far_covariance", state["covariance"], (-1,))
         count = round(np.sqrt(2 * flat.size / BLOCK**2 + 0.25) - 0.5)
-        if flat.shape != (BLOCK**2 * count * (count + 1) // 2,):
+        if flat.size != BLOCK**2 * count * (count + 1) // 2:
             raise ValueError(
                 "the stored covariance must be whole blocks of rows, got shape "
                 f"{flat.shape}"
             )
-        if root.shape != (BLOCK * count, len(signs)):
+        pending = _saved_downdates(state, BLOCK * count)
+        progress = saved_states.array("far_progress", state["progress"], (3,)).tolist()
+        under_way, done, credit = progress
+        if not (
+            under_way in (0, 1) and done in range(count + 1) and credit >= 0
+        ) or under_way > len(pending):
             raise ValueError(
-                f"the pending downdates must have shape {(BLOCK * count, len(signs))}, "
-                f"got {root.shape}"
+                f"state['far_progress'] must be 0 or 1, at most {count} blocks and a "
+                f"credit >= 0, got {progress}"
             )
-        blocks: list[Array] = []
-        first = 0
-        while first < flat.size:
-            last = first + BLOCK * BLOCK * (len(blocks) + 1)
-            blocks.append(flat[first:last].reshape(BLOCK, -1).copy())
-            first = last
-        pending, first = [], 0
-        for width, rank in shapes:
-            own = slice(first, first + rank)
-            pending.append(Downdate(root[:width, own].copy(), signs[own].copy()))
-            first += rank
-        under_way, done, credit = np.asarray(state["progress"]).tolist()
-        self._blocks, self._pending = blocks, pending
+        ends = BLOCK**2 * np.cumsum(np.arange(1, count + 1))
+        parts = np.split(flat, ends)[:count]
+        self._blocks = [part.reshape(BLOCK, -1).copy() for part in parts]
+        self._pending = pending
         self._under_way, self._done, self._credit = bool(under_way), int(done), credit
 
     def _enumerate(self) -> list[tuple[int, Array]]:
@@ -243,6 +237,29 @@ class DeferredCovariance:
             trans_a=True,
             overwrite_c=True,
         )
+
+
+def _saved_downdates(state: Mapping[str, Any], width: int) -> list[Downdate]:
+    """Return the pending downdates of a state, or refuse them."""
+    signs = saved_states.array("far_pending_signs", state["pending_signs"], (-1,))
+    root = saved_states.array(
+        "far_pending_root", state["pending_root"], (width, len(signs))
+    )
+    shapes = saved_states.whole_numbers(
+        "far_pending_shapes", state["pending_shapes"], (-1, 2), 0
+    )
+    if shapes[:, 1].sum() != len(signs) or (shapes[:, 0] > width).any():
+        raise ValueError(
+            f"state['far_pending_shapes'] must add up to a rank of {len(signs)} in "
+            f"{width} rows, got {shapes.tolist()}"
+        )
+    if not np.isin(signs, (-1, 1)).all():
+        raise ValueError("state['far_pending_signs'] must be 1 or -1")
+    ends = np.cumsum(shapes[:, 1]).tolist()
+    return [
+        Downdate(root[:rows, end - rank : end].copy(), signs[end - rank : end].copy())
+        for (rows, rank), end in zip(shapes.tolist(), ends, strict=True)
+    ]
 
 
 def stored_bytes(landmarks: int) -> int:

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.sparse import bsr_array
 
 from ....arrays import Array, BoolArray, IntArray
+from ...support import saved_states
 
 _ARRAY_OBJECTS = 220
 """Memory of two empty array objects [bytes]."""
@@ -143,9 +144,10 @@ class InformationMatrix:
             If the arrays do not fit together; the matrix is then unchanged.
         """
         counts, links = (
-            np.asarray(state[key]).astype(np.int64) for key in ("counts", "links")
+            saved_states.whole_numbers(f"matrix_{key}", state[key], (-1,), 0)
+            for key in ("counts", "links")
         )
-        blocks = np.asarray(state["blocks"], dtype=np.float64)
+        blocks = saved_states.array("matrix_blocks", state["blocks"], (-1, 2, 2))
         _check_rows(counts, links, blocks)
         ends = np.cumsum(counts)[:-1]
         self._links = [part.copy() for part in np.split(links, ends)][: len(counts)]
@@ -164,5 +166,12 @@ def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:
             f"state['matrix_links'] must lie in [0, {len(counts)}), got "
             f"{links.min()} to {links.max()}"
         )
-    if not np.isfinite(blocks).all():
-        raise ValueError("state['matrix_blocks'] must be finite")
+    rows = np.repeat(np.arange(len(counts)), counts)
+    order, mirrored = np.lexsort((links, rows)), np.lexsort((rows, links))
+    same = np.array_equal(rows[order], links[mirrored]) and np.array_equal(
+        links[order], rows[mirrored]
+    )
+    if not same or not np.allclose(
+        blocks[order], blocks[mirrored].transpose(0, 2, 1), rtol=1e-9, atol=0
+    ):
+        raise ValueError("state['matrix_blocks'] must be a symmetric matrix")

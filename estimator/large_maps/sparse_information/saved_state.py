@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ....arrays import IntArray
-from ...support import argument_checks
+from ...support import argument_checks, saved_states
 from ..sparse_cholesky.landmark_elimination import RestFactor
 from ..sparse_cholesky.schur_complement import Factor, SchurComplement, SubsetFactor
 from .conditional_pose import ConditionalPose
@@ -68,14 +68,13 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
     """
     entries = [f"{prefix}_{key}" for prefix, keys in _PARTS.items() for key in keys]
     entries += [*_OTHERS, *_MAP, *_LOCAL_MAP]
-    argument_checks.refuse_other_state(state, entries, estimator=name, base=base)
+    saved_states.refuse_other_state(state, entries, estimator=name, base=base)
     map_ = SparseMap()
     map_.information.load_state_dict(_part(state, "matrix"))
     count = len(map_.information)
     slots, free = _slots(state, count)
     map_.points, map_.first, map_.residual = (
-        argument_checks.finite_vector(f"state[{key!r}]", state[key], 2 * count).copy()
-        for key in _MAP
+        saved_states.array(key, state[key], (2 * count,)) for key in _MAP
     )
     pose = ConditionalPose(**_part(state, "pose"))
     of_local = _part(state, "local")
@@ -87,25 +86,35 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
     _check_shapes(local, pose)
     _check_slots(local, count)
     _load_dissection(state, map_, local.slots)
-    origin = argument_checks.finite_vector("state['origin']", state["origin"], 2).copy()
-    return SparseBelief(
-        slots,
-        free,
-        map_,
-        local,
-        pose,
-        origin,
-        float(state["reach"]),
-        bool(state["widened"]),
-    )
+    origin = saved_states.array("origin", state["origin"], (2,))
+    reach = argument_checks.as_floats("state['reach']", state["reach"])
+    if reach.shape != () or not reach > 0:
+        raise ValueError(f"state['reach'] must be a number > 0, got {state['reach']!r}")
+    widened = saved_states.flag("widened", state["widened"])
+    belief = SparseBelief(slots, free, map_, local, pose, origin, float(reach), widened)
+    _check_definite(belief)
+    return belief
+
+
+def _check_definite(belief: SparseBelief) -> None:
+    """Raise a ValueError where pose or map have no positive definite covariance."""
+    saved_states.refuse_indefinite("state['pose_covariance']", belief.pose.covariance)
+    try:
+        pose = belief.marginal([]).covariance
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "state['matrix_blocks'] must be a positive definite information matrix"
+        ) from None
+    saved_states.refuse_indefinite("the covariance of the pose of state", pose)
 
 
 def _slots(state: Mapping[str, Any], count: int) -> tuple[dict[int, int], list[int]]:
-    ids, slots, free = (
-        np.asarray(state[key]).ravel().tolist()
-        for key in ("landmark_ids", "slots", "free")
+    ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
+    slots, free = (
+        saved_states.whole_numbers(key, state[key], (-1,), 0).tolist()
+        for key in ("slots", "free")
     )
-    if sorted(slots + free) != list(range(count)) or len(set(ids)) != len(slots):
+    if sorted(slots + free) != list(range(count)) or len(ids) != len(slots):
         raise ValueError(
             f"state['slots'] and state['free'] must share out the {count} rows of the "
             f"matrix among {len(ids)} landmarks, got {len(slots)} and {len(free)}"
@@ -129,15 +138,14 @@ def _load_dissection(
 ) -> None:
     """Load the elimination order; insert landmarks that it does not contain."""
     matrix, count = map_.information, len(map_.information)
-    nodes = np.asarray(state["nodes"])
-    if nodes.shape != (count,) or (nodes < 0).any() or (nodes >= 2**50).any():
+    nodes = saved_states.whole_numbers("nodes", state["nodes"], (count,), 0)
+    if (nodes >= 2**50).any():
         raise ValueError(
-            f"state['nodes'] must be {count} whole numbers in [0, 2⁵⁰), got "
-            f"shape {nodes.shape}"
+            f"state['nodes'] must be whole numbers in [0, 2⁵⁰), got {nodes.max()}"
         )
     dissection = map_.elimination.dissection
-    dissection.nodes = nodes.astype(np.int64)
-    dissection.dissected = int(state["parted"])
+    dissection.nodes = nodes
+    dissection.dissected = saved_states.whole_number("parted", state["parted"])
     others = np.setdiff1d(np.flatnonzero(dissection.nodes == 0), local)
     others = others[matrix.is_filled(others)]
     if len(others):

@@ -7,7 +7,13 @@ import numpy as np
 
 from ....arrays import Array
 
-ITERATIONS, HALVINGS, MEMORY = 100, 8, 5
+ITERATIONS, HALVINGS, MEMORY = 200, 8, 5
+PATIENCE = 30
+"""Iterations after which an extrapolated step only has to lower the cost.
+
+Where large errors remain at the solution, as after improbable readings, plain steps
+approach it slowly, and their decrement rises and falls on the way.
+"""
 
 
 class Iterate(NamedTuple):
@@ -43,12 +49,13 @@ def minimise(
     """
     now = evaluate(values)
     past: list[Iterate] = []
-    for _ in range(ITERATIONS):
+    for iteration in range(ITERATIONS):
         if now.decrement <= converged:
             return True
         past = [*past[-MEMORY:], now] if now.decrement < 1 else []
         trial = evaluate(now.values + accelerated(past)) if len(past) > 1 else None
-        if trial and trial.cost <= now.largest_cost and trial.decrement < now.decrement:
+        largest = np.inf if iteration >= PATIENCE else now.decrement
+        if trial and trial.cost <= now.largest_cost and trial.decrement < largest:
             now = trial
         else:
             now = _descend(evaluate, now)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from ....arrays import Array, IntArray
 from ...filters.invariant import InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport
-from ...support import argument_checks
+from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from .store import LostSubmapError
 
@@ -217,11 +217,12 @@ class Neighbourhood:
         """Return a neighbourhood that continues from a saved state."""
         if not state:
             return Neighbourhood(self._make, self._joined_region)
-        argument_checks.refuse_other_state(state, ["extent"])
+        saved_states.refuse_other_state(state, ["extent"])
         numbers = argument_checks.as_floats("state['extent']", state["extent"])
-        if numbers.shape != (6 + RECENT_SCANS,) or np.isnan(numbers).any():
+        if numbers.shape != (6 + RECENT_SCANS,) or not _is_extent(numbers):
             raise ValueError(
-                f"state['extent'] must be {6 + RECENT_SCANS} numbers, got {numbers}"
+                f"state['extent'] must be a finite position and {4 + RECENT_SCANS} "
+                f"numbers >= 0, the third of them 0 or 1, got {numbers}"
             )
         x, y, reach, slack, is_all, farthest, *reaches = numbers.tolist()
         region = Region(np.array([x, y]), reach, slack, bool(is_all), farthest)
@@ -241,6 +242,15 @@ class Neighbourhood:
             "reference": belief.mean,
             "landmark_ids": np.array(belief.landmark_ids, dtype=np.int64),
         }
-        slam.load_state_dict(state)
+        slam.restore(state)
         self._copy = _Copy(slam, region)
         return self._copy
+
+
+def _is_extent(numbers: Array) -> bool:
+    """Return whether numbers may be a region and the distances after it."""
+    return bool(
+        np.isfinite(numbers[:2]).all()
+        and (numbers[2:] >= 0).all()
+        and numbers[4] in (0, 1)
+    )

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....arrays import IntArray
-from ...support import argument_checks
+from ...support import saved_states
 from .active_submap import ActiveSubmap
 from .chain import Chain
 from .closed_submaps import ClosedSubmaps
@@ -90,9 +90,9 @@ def checked_state(
     entries = ["landmark_ids", "slots", "slot_count", "renamed", "submap_count", "run"]
     entries += ["local_estimator", *(f"chain_{key}" for key in SHAPES)]
     base = type(active.filter).__name__
-    argument_checks.refuse_other_state(state, entries, estimator=name, base=base)
+    saved_states.refuse_other_state(state, entries, estimator=name, base=base)
     index = _index(state)
-    count = int(state["submap_count"])
+    count = saved_states.whole_number("submap_count", state["submap_count"])
     chain = _chain(state, count)
     store = _store(state, count, folder)
     pairs = _numbers(state, "renamed", index.count).reshape(-1, 2)
@@ -121,10 +121,9 @@ def _numbers(state: Mapping[str, Any], key: str, limit: int) -> IntArray:
 
 def _index(state: Mapping[str, Any]) -> LandmarkIndex:
     """Return the landmarks of the map with their slots."""
-    saved = np.asarray(state["landmark_ids"])
-    ids = argument_checks.identities(saved, saved.size)
+    ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
     refuse_link_names(ids)
-    count = int(state["slot_count"])
+    count = saved_states.whole_number("slot_count", state["slot_count"])
     slots = _numbers(state, "slots", count).ravel()
     if len(slots) != len(ids) or (np.diff(slots) <= 0).any():
         raise ValueError(
@@ -149,18 +148,16 @@ def _check_names(
 def _chain(state: Mapping[str, Any], count: int) -> Chain:
     arrays = {}
     for key, shape in SHAPES.items():
-        array = argument_checks.as_floats(
-            f"state['chain_{key}']", state[f"chain_{key}"]
-        )
-        fits = array.ndim == 2 and array.shape[1] == 3
+        name = f"chain_{key}"
+        array = saved_states.array(name, state[name], shape)
         if key == "joined":
-            fits = fits and 1 <= len(array) <= count + 1
-        if not (fits and shape[0] in (-1, len(array))):
-            raise ValueError(
-                f"state['chain_{key}'] must have shape {shape}, got {array.shape}"
-            )
-        if not np.isfinite(array).all():
-            raise ValueError(f"state['chain_{key}'] must be finite")
+            if not 1 <= len(array) <= count + 1:
+                raise ValueError(
+                    f"state[{name!r}] must have 1 to {count + 1} rows, got {len(array)}"
+                )
+        else:
+            P = (array[1:] + array[1:].T) / 2
+            saved_states.refuse_indefinite(f"state[{name!r}]", P)
         arrays[key] = array
     return Chain.restored(arrays)
 
@@ -210,10 +207,13 @@ def _memory_store(state: Mapping[str, Any], count: int) -> MemoryStore:
 
 def _check(submap: Submap, index: int, landmarks: int) -> None:
     slots, mean, covariance = submap
+    if slots.ndim != 1 or slots.dtype.kind != "i":
+        raise ValueError(f"state['submap_{index}_slots'] must be whole numbers")
     size = 3 + 2 * len(slots)
     fits = mean.shape == (size,) and covariance.shape == (size, size)
     inside = slots.dtype.kind == "i" and all(0 <= s < landmarks for s in slots.tolist())
     if not (fits and inside):
         raise ValueError(f"submap {index} of the state does not fit the rest of it")
-    if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
-        raise ValueError(f"submap {index} of the state must be finite")
+    saved_states.array(f"submap_{index}_mean", mean, (size,))
+    P = saved_states.array(f"submap_{index}_covariance", covariance, (size, size))
+    saved_states.refuse_indefinite(f"state['submap_{index}_covariance']", (P + P.T) / 2)

@@ -1,0 +1,83 @@
+"""Filters take no number whose squares and products overflow."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from slamgym.estimator import list_estimators, make_batch, make_estimator
+from slamgym.magnitudes import LARGEST
+
+NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
+
+
+@pytest.mark.parametrize("name", list_estimators())
+@pytest.mark.parametrize(
+    "argument",
+    [
+        {"initial_pose_std": (1e160, 0.0, 0.0)},
+        {"initial_pose": (0.0, -2e12, 0.0)},
+        {"motion_std": (0.1, 0.1, 1e13)},
+        {"measurement_std": (1e200, 0.1)},
+        {"range_std_per_metre": 1e13},
+    ],
+)
+def test_a_setting_beyond_the_bound_is_refused_by_name(name, argument):
+    (key,) = argument
+    place = key.removeprefix("initial_")
+    with pytest.raises(ValueError, match=rf"{place} must not exceed 1e\+12, got"):
+        make_estimator(name, **NOISE | argument)
+
+
+@pytest.mark.parametrize("name", list_estimators())
+@pytest.mark.parametrize(
+    ("dt", "message"),
+    [
+        (1e300, r"dt must not exceed 1e\+12, got 1e\+300"),
+        (-1.0, "dt must be a finite number >= 0, got -1.0"),
+        (float("nan"), "dt must be a finite number >= 0, got nan"),
+        (None, "dt must be a finite number >= 0, got None"),
+        ("1", "dt must be a finite number >= 0, got '1'"),
+        (np.ones(2), "dt must be a finite number >= 0, got array"),
+        pytest.param(10**400, r"dt must not exceed 1e\+12, got 1000", id="10^400"),
+    ],
+)
+def test_a_duration_that_is_none_is_refused_by_name(name, dt, message):
+    slam = make_estimator(name, **NOISE)
+    with pytest.raises(ValueError, match=message):
+        slam.predict((1.0, 0.0), dt=dt)
+
+
+@pytest.mark.parametrize("name", list_estimators())
+def test_the_largest_numbers_give_finite_beliefs(name):
+    stds = {"motion_std": 3 * [LARGEST], "measurement_std": 2 * [LARGEST]}
+    slam = make_estimator(
+        name, **stds, initial_pose=3 * [LARGEST], initial_pose_std=3 * [LARGEST]
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(5):
+            slam.predict((LARGEST, LARGEST), dt=LARGEST)
+            slam.predict((LARGEST, 0.0), dt=LARGEST)
+        belief = slam.belief()
+    assert np.isfinite(belief.mean).all()
+    assert np.isfinite(belief.covariance).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"initial_poses": (1e13, 0.0, 0.0)}, "initial_poses must not exceed"),
+        ({"initial_pose_std": (1e160, 0.0, 0.0)}, "initial_pose_std must not exceed"),
+    ],
+)
+def test_a_batch_keeps_the_bound(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_batch("ekf", runs=2, landmarks=1, **NOISE, **changes)
+
+
+@pytest.mark.parametrize("dt", [1e300, [1.0, 1e13], "x", [None, 1.0], [1.0, 1.0, 1.0]])
+def test_a_batch_refuses_durations_by_name(dt):
+    batch = make_batch("ekf", runs=1, landmarks=1, **NOISE)
+    with pytest.raises(ValueError, match="dt must "):
+        batch.run(np.zeros((1, 2, 2)), np.ones((1, 2, 1, 2)), np.ones((1, 2, 1)), dt=dt)
