@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
+from ...magnitudes import LARGEST
 from ..kernels.belief_arrays import aligned_zeros
 from ..kernels.drive_likelihood import (
     NOISE_WIDTH,
@@ -133,11 +134,11 @@ def check_events(events: DriveEvents) -> None:
 def _refuse_numbers(name: str, numbers: Array, columns: int) -> None:
     if numbers.ndim != 2 or numbers.shape[1] != columns:
         raise ValueError(f"{name} must have {columns} columns, got {numbers.shape}")
-    usable = (np.abs(numbers) <= argument_checks.LARGEST).all(axis=1)
+    usable = (np.abs(numbers) <= LARGEST).all(axis=1)
     if not usable.all():
         row = int(np.argmin(usable))
         raise ValueError(
-            f"{name} must be finite numbers, at most {argument_checks.LARGEST:g}, "
+            f"{name} must be finite numbers, at most {LARGEST:g}, "
             f"got {numbers[row].tolist()} in row {row}"
         )
 

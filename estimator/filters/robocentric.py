@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array
 from ...jit import jit, njit_internal
 from ..belief import Belief, MapView
-from ..support import argument_checks
+from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..update_report import UpdateReport
 from .ekf import EkfSlam
@@ -71,7 +71,8 @@ class RobocentricEkfSlam(EkfSlam):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit in a filter of the same settings."""
-        ids = np.asarray(state.get("landmark_ids", ())).ravel().tolist()
+        saved_states.refuse_other_state(state, ["landmark_ids"])
+        ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
         if tuple(ids[: len(RESERVED)]) != RESERVED:
             raise ValueError("state must begin with the world's origin, got landmarks")
         super().load_state_dict(state)

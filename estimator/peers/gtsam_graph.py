@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array
 from ..models.bearing_range import locate_landmark
-from ..support import argument_checks
+from ..support import argument_checks, saved_states
 from .peer_slam import Innovation, PeerSlam, Readings
 from .whole_state import expected_readings, motion_covariance, moved_state, wrapped
 
@@ -166,7 +166,7 @@ class GtsamSlam(PeerSlam):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state: repeat its drive."""
         entries = ("first_pose", "events", "landmark_ids")
-        argument_checks.refuse_other_state(
+        saved_states.refuse_other_state(
             state, entries, **{"class": type(self).__name__}
         )
         ids = np.asarray(state["landmark_ids"]).tolist()

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...arrays import Array
 from ..models.bearing_range import locate_landmark
-from ..support import argument_checks
+from ..support import saved_states
 from .peer_slam import Innovation, PeerSlam, Readings
 
 SIGMA_ALPHA, SIGMA_BETA = 0.5, 2.0
@@ -78,7 +78,7 @@ class KalmanPeer(PeerSlam):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit."""
         entries = ("mean", "covariance", "landmark_ids")
-        argument_checks.refuse_other_state(
+        saved_states.refuse_other_state(
             state, entries, **{"class": type(self).__name__}
         )
         ids = np.asarray(state["landmark_ids"]).tolist()

@@ -119,7 +119,7 @@ def test_a_negative_covariance_is_refused_by_name(name, key, message):
 
 @pytest.mark.parametrize("key", ["ids", "sightings", "misses", "information"])
 def test_records_one_entry_short_are_refused(key):
-    slam = driven("ekf", True)
+    slam = driven("ekf", {"association": "joint"})
     state, name = slam.state_dict(), f"landmarks.{key}"
     with pytest.raises(ValueError, match=r"state\['landmarks"):
         slam.load_state_dict(state | {name: state[name][:-1]})

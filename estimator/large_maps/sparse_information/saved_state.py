@@ -88,10 +88,12 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
     _load_dissection(state, map_, local.slots)
     origin = saved_states.array("origin", state["origin"], (2,))
     reach = argument_checks.as_floats("state['reach']", state["reach"])
-    if reach.shape != () or not reach > 0:
+    if reach.shape != (1,) or not reach[0] > 0:
         raise ValueError(f"state['reach'] must be a number > 0, got {state['reach']!r}")
     widened = saved_states.flag("widened", state["widened"])
-    belief = SparseBelief(slots, free, map_, local, pose, origin, float(reach), widened)
+    belief = SparseBelief(
+        slots, free, map_, local, pose, origin, float(reach[0]), widened
+    )
     _check_definite(belief)
     return belief
 

@@ -137,7 +137,9 @@ def _check_names(
     local: Mapping[str, Any], index: LandmarkIndex, closed: ClosedSubmaps
 ) -> None:
     """Raise a ValueError if the active submap holds landmarks not in the map."""
-    names = np.asarray(local.get("landmark_ids", ())).ravel().tolist()
+    names = saved_states.landmark_ids(
+        "local_landmark_ids", local.get("landmark_ids", ())
+    )
     links = index.links(names)
     if unknown := {i for i in links if slot_of_link(i) not in closed.slots}:
         raise ValueError(
