@@ -46,7 +46,7 @@ def as_arrays(belief: SparseBelief, name: str, base: str) -> dict[str, Any]:
         "nodes": dissection.nodes.copy(),
         "parted": np.array(dissection.dissected),
         "origin": belief.origin.copy(),
-        "reach": np.array(belief.count),
+        "reach": np.array(float(belief.count)),
         "widened": np.array(belief.enlarged),
         **{k: getattr(map_, k)[: 2 * len(map_.information)].copy() for k in _MAP},
         **{f"matrix_{k}": v for k, v in map_.information.state_dict().items()},
