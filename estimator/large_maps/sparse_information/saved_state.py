@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ....arrays import IntArray
+from ....magnitudes import LARGEST_IN_STATE
 from ...support import argument_checks, saved_states
 from ..sparse_cholesky.landmark_elimination import RestFactor
 from ..sparse_cholesky.schur_complement import Factor, SchurComplement, SubsetFactor
@@ -163,6 +164,8 @@ def _part(state: Mapping[str, Any], prefix: str) -> dict[str, Any]:
         values = argument_checks.as_floats(name, state[f"{prefix}_{key}"])
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite")
+        if (np.abs(values) > LARGEST_IN_STATE).any():
+            raise ValueError(f"{name} must not exceed {LARGEST_IN_STATE:g}")
         part[key] = values.astype(np.int64) if key in _WHOLE_NUMBERS else values.copy()
     return part
 
