@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import ArrayLike
@@ -30,6 +30,7 @@ __all__ = [
     "SupportsRestore",
     "SupportsSmoothing",
     "SupportsTruth",
+    "SupportsViewCheckpoint",
     "UpdateReport",
     "optional_members",
     "restore",
@@ -127,6 +128,15 @@ class SupportsJoin(SupportsLocalView, Protocol):
 
     def join(self) -> None:
         """Join the parts of the map, and continue from the joined map."""
+
+
+@runtime_checkable
+class SupportsViewCheckpoint(SupportsLocalView, Protocol):
+    """An estimator whose local views change what it keeps for later ones."""
+
+    def view_checkpoint(self) -> Callable[[], None]:
+        """Return what takes back the effects of later local views."""
+        ...
 
 
 @runtime_checkable

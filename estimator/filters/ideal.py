@@ -82,6 +82,10 @@ class IdealEkfSlam(EkfSlam):
             True positions of all landmarks that may be seen [m].
         """
         truth = argument_checks.finite_vector("pose", pose, 3)
+        if not isinstance(landmarks, Mapping):
+            raise ValueError(
+                f"landmarks must map identities to positions, got {landmarks!r}"
+            )
         told = {
             i: argument_checks.finite_vector(f"landmarks[{i}]", xy, 2)
             for i, xy in landmarks.items()
@@ -121,10 +125,11 @@ class IdealEkfSlam(EkfSlam):
         """Correct the belief with one scan, linearised at the truth."""
         if self.rules.linearisation == AT_TRUTH and landmark_ids is not None:
             readings = argument_checks.scan(measurements)
+            ids = argument_checks.identities(landmark_ids, len(readings))
             self._make_room(len(readings), len(readings))
-            self._check_told(landmark_ids, self._true_landmarks)
+            self._check_told(ids, self._true_landmarks)
             column = self.map.size
-            for i, distance in zip(landmark_ids, readings[:, 1], strict=False):
+            for i, distance in zip(ids, readings[:, 1], strict=False):
                 if i not in self.map.slots and distance >= self.rules.min_range:
                     self.map.reference[column : column + 2] = self._true_landmarks[i]
                     column += 2

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ..belief import Belief, MapView, describe_filter
 from ..error_frames import ErrorFrame
 from ..kernels.rules import ADDITIVE, AT_ESTIMATE, INVARIANT, Rules
-from ..support import argument_checks, saved_states
+from ..support import argument_checks, pair_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.memory_limit import covariance_bytes
 from .gaussian_map import GaussianMap
@@ -80,7 +80,7 @@ class MapFilter:
         numpy.linalg.LinAlgError
             Where a distance has no uncertainty; nothing is then merged.
         """
-        kept, gone = argument_checks.landmark_pairs(pairs, self.map.slots)
+        kept, gone = pair_checks.landmark_pairs(pairs, self.map.slots)
         at_reference = self.rules.linearisation != AT_ESTIMATE
         self.map.merge(kept, gone, frame=self.frame, at_reference=at_reference)
 

@@ -61,11 +61,12 @@ class RobocentricEkfSlam(EkfSlam):
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct map and motion with one scan, then move the frame to the robot."""
-        given = () if landmark_ids is None else landmark_ids
-        if not set(RESERVED).isdisjoint(np.ravel(given).tolist()):
+        count = len(argument_checks.scan(measurements))
+        given = argument_checks.given_identities(landmark_ids, count, self)
+        if not set(RESERVED).isdisjoint(given):
             raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
         report = super().update(measurements, landmark_ids)
-        if np.size(measurements):
+        if count:
             move_frame(self.map.mean, self.map.covariance, self.map.size)
         return report
 

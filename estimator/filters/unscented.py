@@ -71,6 +71,7 @@ class UnscentedSlam(EkfSlam):
         )
         mapped = np.array([i in self.map.slots for i in ids], dtype=bool)
         known, skipped = mapped & usable, mapped & ~usable
+        self._make_room(len(ids), len(ids))  # it may raise: before anything changes
         corrected = UpdateReport()
         if known.any():
             corrected = self._correct(

@@ -22,7 +22,7 @@ from ..interface import (
     restore,
 )
 from ..models.rigid_motion import rotation
-from ..support import argument_checks, saved_states
+from ..support import argument_checks, pair_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.nested_state import with_prefix, without_prefix
 from ..update_report import ScanDecisions
@@ -169,9 +169,10 @@ class ManagedSlam:
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
-        if landmark_ids is None:
-            return self.take(readings, self.alternatives(readings)[0][1])
-        return self.take(readings, self.as_given(readings, landmark_ids))
+        with self._editor.views_undone_on_error():
+            if landmark_ids is None:
+                return self.take(readings, self.alternatives(readings)[0][1])
+            return self.take(readings, self.as_given(readings, landmark_ids))
 
     def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
         """Associate readings (m, 2) by their identities."""
@@ -227,7 +228,7 @@ class ManagedSlam:
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two mapped landmarks by hand; both identities then name the first."""
-        argument_checks.two_landmarks(kept, gone, self._slots)
+        pair_checks.two_landmarks(kept, gone, self._slots)
         self._pruner.merger.join([(kept, gone)])
         self._recent.note_edits((), [(kept, gone)])
 

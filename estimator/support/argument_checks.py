@@ -88,7 +88,12 @@ def _is_plain_scan(readings: AnyArray) -> bool:
 
 def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
     """Return ids as Python integers: one for each of ``count`` readings, no repeats."""
-    array = np.asarray(landmark_ids)
+    try:
+        array = np.asarray(landmark_ids)
+    except ValueError:  # a list of lists of several lengths
+        raise ValueError(
+            f"landmark_ids must be integers, got {landmark_ids!r}"
+        ) from None
     if array.dtype.kind != "i" or array.ndim != 1:
         array = _as_signed(array, landmark_ids)
     ids: list[int] = array.tolist()
@@ -148,29 +153,15 @@ def mapped_identities(
     landmark_ids: LandmarkIds, mapped: Mapping[int, int]
 ) -> list[int]:
     """Return ids of mapped landmarks, without repetition."""
-    ids = identities(landmark_ids, np.size(landmark_ids))
+    try:
+        count = np.size(landmark_ids)
+    except ValueError:
+        count = 0  # refused by the next line
+    ids = identities(landmark_ids, count)
     for i in ids:
         if i not in mapped:
             raise ValueError(f"landmark_ids must be of mapped landmarks, got {i}")
     return ids
-
-
-def two_landmarks(kept: int, gone: int, mapped: Mapping[int, int]) -> list[int]:
-    """Return the ids of two different landmarks of a map."""
-    if kept == gone:
-        raise ValueError(f"kept and gone must be two landmarks, got {kept} twice")
-    return mapped_identities([kept, gone], mapped)
-
-
-def landmark_pairs(
-    pairs: Sequence[tuple[int, int]], mapped: Mapping[int, int]
-) -> tuple[list[int], list[int]]:
-    """Return the first and the second landmarks of pairs, all mapped and different."""
-    kept, gone = [i for i, _ in pairs], [j for _, j in pairs]
-    for i, j in pairs:
-        two_landmarks(i, j, mapped)
-    ids = mapped_identities([*kept, *gone], mapped)
-    return ids[: len(kept)], ids[len(kept) :]
 
 
 def refuse_not_finite(readings: Array) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ class CompressedMap:
         self._virtual = 0
         self._strip = np.zeros((3, 0))  # covariance of local and all other coordinates
         self._origin = self.filter.map.mean[:2].copy()  # start of the phase
+        self._undo: Callable[[], None] | None = None  # of the last new local map
 
     def add(self, ids: Sequence[int]) -> None:
         """Assign slots to landmarks that the filter has added."""
@@ -132,6 +134,7 @@ class CompressedMap:
             covariance_bytes(3 * size),  # including virtual landmarks
             "take a smaller local_size",
         )
+        self._undo = self._checkpoint()
         now = self._phase()
         rows = self._apply(now)
         ahead = now.mean[:2] + (now.mean[:2] - self._origin) / 2  # likely direction
@@ -155,6 +158,32 @@ class CompressedMap:
         self._origin = now.mean[:2].copy()
         self._begin()
 
+    @contextmanager
+    def unchanged_on_error(self) -> Iterator[None]:
+        """Take back a change of the local map if an error follows it."""
+        self._undo = None
+        try:
+            yield
+        except Exception:
+            if self._undo is not None:
+                self._undo()
+            raise
+        finally:
+            self._undo = None
+
+    def _checkpoint(self) -> Callable[[], None]:
+        """Return what takes back a change of the local map."""
+        own = {k: v for k, v in vars(self).items() if k not in ("filter", "_undo")}
+        own |= {"_points": self._points.copy(), "_references": self._references.copy()}
+        saved, undo_deferred = self.filter.state_dict(), self.deferred.checkpoint()
+
+        def undo() -> None:
+            vars(self).update(own)
+            self.filter.restore(saved)
+            undo_deferred()
+
+        return undo
+
     @property
     def nbytes(self) -> int:
         """Memory of the belief [bytes]."""
@@ -164,6 +193,7 @@ class CompressedMap:
 
     def state_dict(self, numbers: Sequence[int]) -> dict[str, Any]:
         """Return copies of the whole state as arrays, with numbers of the caller."""
+        invalid = self._columns(list(self.local))
         local = {f"local_{k}": v for k, v in self.filter.state_dict().items()}
         return {
             "base": local.pop("local_estimator"),
@@ -175,7 +205,7 @@ class CompressedMap:
             "origin": self._origin.copy(),
             "numbers": np.array([self._virtual, *numbers, *self.free]),
             **local,
-            **{f"far_{k}": v for k, v in self.deferred.state_dict().items()},
+            **{f"far_{k}": v for k, v in self.deferred.state_dict(invalid).items()},
         }
 
     def load(self, saved: SavedState) -> list[int]:

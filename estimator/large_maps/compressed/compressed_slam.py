@@ -17,7 +17,7 @@ from ...filters.invariant import InvariantEkfSlam
 from ...filters.iterated import IteratedEkfSlam
 from ...filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from ...interface import Belief, MapView, UpdateReport
-from ...support import argument_checks, saved_states
+from ...support import argument_checks, pair_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
 from . import active_set
@@ -132,16 +132,20 @@ class CompressedEkfSlam:
             than ``local_size``; the belief is then unchanged.
         numpy.linalg.LinAlgError
             If an innovation covariance is not positive definite, naming the
-            measurement; the belief is then unchanged up to rounding.
+            measurement; the belief is then unchanged.
         MemoryError
             If memory cannot hold the landmarks; the belief is then unchanged.
         """
         readings = argument_checks.scan(measurements)
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_reserved(ids)
-        if (np.abs(readings) <= LARGEST).all():  # otherwise refused
-            self._choose_local_map([i for i in ids if i in self._map.slots])
-        report = self._map.filter.update(readings, ids)
+        counters = self._extra, self._age, self._rests
+        with self._map.unchanged_on_error():
+            if (np.abs(readings) <= LARGEST).all():  # otherwise refused
+                mapped = [i for i in ids if i in self._map.slots]
+                counters = self._choose_local_map(mapped)
+            report = self._map.filter.update(readings, ids)
+        self._extra, self._age, self._rests = counters
         self._map.add(report.added_ids)
         if report.degrees_of_freedom:
             self._age += 1
@@ -151,11 +155,6 @@ class CompressedEkfSlam:
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Remove landmarks by marginalisation; the belief about all else is unchanged.
-
-        Parameters
-        ----------
-        landmark_ids : sequence of int
-            Mapped landmarks, without repetition.
 
         Raises
         ------
@@ -168,11 +167,6 @@ class CompressedEkfSlam:
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being the same, and remove the second.
-
-        Parameters
-        ----------
-        kept, gone : int
-            Two mapped landmarks.
 
         Raises
         ------
@@ -194,12 +188,13 @@ class CompressedEkfSlam:
         ValueError
             If one is not in the map or in two pairs; nothing is then merged.
         """
-        kept, gone = argument_checks.landmark_pairs(pairs, self._map.slots)
+        kept, gone = pair_checks.landmark_pairs(pairs, self._map.slots)
         ids, local = [*kept, *gone], self._map.local
-        if not all(i in local for i in ids):
-            size = max(self._local_size or 0, len(local), len(ids))
-            self._map.change_local_map(ids, size)
-        self._map.merge_pairs(pairs)
+        with self._map.unchanged_on_error():
+            if not all(i in local for i in ids):
+                size = max(self._local_size or 0, len(local), len(ids))
+                self._map.change_local_map(ids, size)
+            self._map.merge_pairs(list(zip(kept, gone, strict=True)))
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return a snapshot of the belief, for the whole map or a part of it.
@@ -226,6 +221,7 @@ class CompressedEkfSlam:
 
         The distance is extended by 5σ.  The view always holds the local map.
         """
+        within = argument_checks.distance("within", within)
         near = self._map.ids_near(self.belief([]), within)
         belief = self.belief(near)
         return MapView(
@@ -270,15 +266,18 @@ class CompressedEkfSlam:
         self._map, self._extra, self._age = loaded, extra, age
         self._rests = bool(rests)
 
-    def _choose_local_map(self, required: Sequence[int]) -> None:
-        """Begin a new phase if the scan needs it or the local map is too large."""
+    def _choose_local_map(self, required: Sequence[int]) -> tuple[int, int, bool]:
+        """Begin a new phase if the scan needs it or the local map is too large.
+
+        Return the counters ``_extra``, ``_age`` and ``_rests`` after it.
+        """
         if self._local_size is not None and len(required) > self._local_size:
             raise ValueError(
                 f"local_size must be >= {len(required)}, the mapped landmarks of one "
                 f"scan, got {self._local_size}"
             )
         if self._is_adequate(required):
-            return
+            return self._extra, self._age, self._rests
         rests, extra = self._age >= active_set.SHORT_PHASE, self._extra
         size, mapped = self._local_size, len(self._map.slots)
         if size is None:
@@ -286,7 +285,7 @@ class CompressedEkfSlam:
             is_small = mapped <= active_set.LARGEST_WHOLE_MAP
             size = mapped if is_small else max(len(required), 4) + extra
         self._map.change_local_map(required, size)
-        self._age, self._rests, self._extra = 0, rests, extra
+        return extra, 0, rests
 
     def _is_adequate(self, required: Sequence[int]) -> bool:
         """Return whether the local map holds these landmarks and is not too large."""

@@ -1,26 +1,20 @@
 """Covariance between the landmarks of a large map, with deferred downdates."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
 from ....arrays import Array, IntArray
 from ...support import saved_states
 from ...support.memory_limit import refuse_beyond_memory
+from .downdate import Downdate, saved_downdates
 from .row_exchange import read_columns, write_columns
 
 # Rows of one block: 64 landmarks.
 BLOCK = 128
 # Smallest rank to apply; smaller downdates wait: memory limits thin products.
 WORTHWHILE = 40
-
-
-class Downdate(NamedTuple):
-    """A change not yet applied to the stored covariance: P ← P − W diag(s) Wᵀ."""
-
-    root: Array  # W, shape (width, rank)
-    signs: Array  # s, shape (rank,), each 1 or -1
 
 
 class DeferredCovariance:
@@ -108,6 +102,28 @@ class DeferredCovariance:
         for root, _ in self._pending:  # the rows put are up to date
             root[columns[columns < len(root)]] = 0.0
 
+    def checkpoint(self) -> Callable[[], None]:
+        """Return what takes back later calls of all methods but :meth:`work`.
+
+        The stored rows of local landmarks are invalid, and remain so.
+        """
+        blocks, pending, progress = (
+            len(self._blocks),
+            list(self._pending),
+            (
+                self._under_way,
+                self._done,
+                self._credit,
+            ),
+        )
+
+        def undo() -> None:
+            del self._blocks[blocks:]
+            self._pending = pending
+            self._under_way, self._done, self._credit = progress
+
+        return undo
+
     def defer(self, root: Array, signs: Array) -> None:
         """Subtract W diag(s) Wᵀ later, W of shape (width, rank)."""
         if len(signs):
@@ -154,16 +170,25 @@ class DeferredCovariance:
         diagonals = [block.diagonal(first) for first, block in self._enumerate()]
         return np.concatenate([np.empty(0), *diagonals])
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return copies of everything, as arrays."""
+    def state_dict(self, invalid: IntArray | None = None) -> dict[str, Any]:
+        """Return copies of everything as arrays, invalid rows (c,) as zeros."""
+        unused = np.zeros(0, dtype=np.int64) if invalid is None else invalid
+        unused = unused[unused < self.width]
         rank = [len(downdate.signs) for downdate in self._pending]
         root = np.zeros((self.width, sum(rank)))
         for downdate, last in zip(self._pending, np.cumsum(rank), strict=True):
             first = last - len(downdate.signs)
             root[: len(downdate.root), first:last] = downdate.root
+        root[unused] = 0.0
+        blocks = [np.empty(0)]
+        for first, block in self._enumerate():
+            valid = block.copy()
+            valid[:, unused[unused < first + BLOCK]] = 0.0
+            valid[unused[(unused >= first) & (unused < first + BLOCK)] - first] = 0.0
+            blocks.append(valid.ravel())
         signs = [downdate.signs for downdate in self._pending]
         return {
-            "covariance": np.concatenate([np.empty(0), *map(np.ravel, self._blocks)]),
+            "covariance": np.concatenate(blocks),
             "pending_root": root,
             "pending_signs": np.concatenate([np.empty(0), *signs]),
             "pending_shapes": np.array(
@@ -181,7 +206,7 @@ class DeferredCovariance:
                 "the stored covariance must be whole blocks of rows, got shape "
                 f"{flat.shape}"
             )
-        pending = _saved_downdates(state, BLOCK * count)
+        pending = saved_downdates(state, BLOCK * count)
         progress = saved_states.array("far_progress", state["progress"], (3,)).tolist()
         under_way, done, credit = progress
         if not (
@@ -237,29 +262,6 @@ class DeferredCovariance:
             trans_a=True,
             overwrite_c=True,
         )
-
-
-def _saved_downdates(state: Mapping[str, Any], width: int) -> list[Downdate]:
-    """Return the pending downdates of a state, or refuse them."""
-    signs = saved_states.array("far_pending_signs", state["pending_signs"], (-1,))
-    root = saved_states.array(
-        "far_pending_root", state["pending_root"], (width, len(signs))
-    )
-    shapes = saved_states.whole_numbers(
-        "far_pending_shapes", state["pending_shapes"], (-1, 2), 0
-    )
-    if shapes[:, 1].sum() != len(signs) or (shapes[:, 0] > width).any():
-        raise ValueError(
-            f"state['far_pending_shapes'] must add up to a rank of {len(signs)} in "
-            f"{width} rows, got {shapes.tolist()}"
-        )
-    if not np.isin(signs, (-1, 1)).all():
-        raise ValueError("state['far_pending_signs'] must be 1 or -1")
-    ends = np.cumsum(shapes[:, 1]).tolist()
-    return [
-        Downdate(root[:rows, end - rank : end].copy(), signs[end - rank : end].copy())
-        for (rows, rank), end in zip(shapes.tolist(), ends, strict=True)
-    ]
 
 
 def stored_bytes(landmarks: int) -> int:

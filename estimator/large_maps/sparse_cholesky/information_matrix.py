@@ -1,6 +1,6 @@
 """A large sparse information matrix over landmarks, stored row by row."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,15 @@ class InformationMatrix:
 
     def __len__(self) -> int:
         return len(self._links)
+
+    def checkpoint(self) -> Callable[[], None]:
+        """Return what takes back later changes; rows are replaced, never changed."""
+        links, blocks = list(self._links), list(self._blocks)
+
+        def undo() -> None:
+            self._links, self._blocks = links, blocks
+
+        return undo
 
     @property
     def nbytes(self) -> int:

@@ -9,6 +9,7 @@ Nodes that do not depend on the local map are cached.  When the local map change
 the nodes above the old and the new local map are computed again.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +55,16 @@ class LandmarkElimination:
     def __init__(self) -> None:
         self.dissection = LandmarkDissection()
         self._cache: dict[int, _Eliminated] = {}
+
+    def checkpoint(self) -> Callable[[], None]:
+        """Return what takes back later changes of the order."""
+        nodes, dissected = self.dissection.nodes.copy(), self.dissection.dissected
+
+        def undo() -> None:
+            self.dissection.nodes, self.dissection.dissected = nodes, dissected
+            self._cache.clear()
+
+        return undo
 
     @property
     def nbytes(self) -> int:

@@ -1,5 +1,6 @@
 """The landmarks near the robot, conditioned on the rest of a sparse information map."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +36,19 @@ class SparseMap:
             self.points = np.append(self.points, more)
             self.first = np.append(self.first, more)
             self.residual = np.append(self.residual, more)
+
+    def checkpoint(self) -> Callable[[], None]:
+        """Return what takes back later changes of means, information and order."""
+        arrays = {k: getattr(self, k).copy() for k in ("points", "first", "residual")}
+        undo_information = self.information.checkpoint()
+        undo_order = self.elimination.checkpoint()
+
+        def undo() -> None:
+            vars(self).update(arrays)
+            undo_information()
+            undo_order()
+
+        return undo
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The belief of the sparse information filter: map, local map and pose."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import inf
 
@@ -48,6 +49,8 @@ class SparseBelief:
     rest: RestFactor | None = field(default=None, repr=False)
     """Factor of all landmarks except the local ones, if known."""
 
+    _undo: Callable[[], None] | None = field(default=None, repr=False)
+
     @classmethod
     def empty(cls, pose: Array, std: Array) -> "SparseBelief":
         """Return the belief of a robot at this pose, shape (3,), without a map."""
@@ -70,6 +73,31 @@ class SparseBelief:
         self.slots.update(zip(ids, slots, strict=True))
         self.free = [slot for slot in self.free if slot not in slots]
         self.map_.grow(len(self.slots) + len(self.free))
+
+    @contextmanager
+    def unchanged_on_error(self) -> Iterator[None]:
+        """Take back changes of the local map if an error follows them."""
+        self._undo = None
+        try:
+            yield
+        except Exception:
+            if self._undo is not None:
+                self._undo()
+            raise
+        finally:
+            self._undo = None
+
+    def _checkpoint(self) -> Callable[[], None]:
+        """Return what takes back changes of the local map."""
+        names = ("local", "pose", "origin", "count", "enlarged")
+        own = {name: getattr(self, name) for name in names}
+        undo_map = self.map_.checkpoint()
+
+        def undo() -> None:
+            undo_map()
+            vars(self).update(own, rest=None)
+
+        return undo
 
     def choose_local_map(self, ids: Sequence[int], *, exact: bool) -> None:
         """Choose a new local map if a scan needs it or the old one is too large.
@@ -102,15 +130,18 @@ class SparseBelief:
 
     def remove(self, ids: Sequence[int], *, exact: bool) -> None:
         """Marginalise landmarks."""
-        gone = self._include_links(ids, exact=exact)
-        self._drop(ids, gone, marginalise(self.local, self.pose, gone))
+        with self.unchanged_on_error():
+            gone = self._include_links(ids, exact=exact)
+            rest = marginalise(self.local, self.pose, gone)
+        self._drop(ids, gone, rest)
 
     def merge(self, kept: int, gone: int, *, exact: bool) -> None:
         """Condition on two landmarks being the same, and drop the second."""
-        dropped = self._include_links([gone, kept], exact=exact)
-        place = int(np.flatnonzero(self.local.slots == self.slots[kept])[0])
-        dropped[place] = False
-        merged = merge_landmarks(self.local, self.pose, place, dropped)
+        with self.unchanged_on_error():
+            dropped = self._include_links([gone, kept], exact=exact)
+            place = int(np.flatnonzero(self.local.slots == self.slots[kept])[0])
+            dropped[place] = False
+            merged = merge_landmarks(self.local, self.pose, place, dropped)
         self._drop([gone], dropped, merged)
 
     def marginal(self, ids: Sequence[int]) -> Marginal:
@@ -172,6 +203,8 @@ class SparseBelief:
 
     def _change_local_map(self, slots: IntArray, count: float) -> None:
         """Write the local map back, and begin another one."""
+        if self._undo is None:
+            self._undo = self._checkpoint()
         old, pose = self.local.slots, self.pose
         write_back(self.map_, self.local)
         self.rest = None

@@ -13,7 +13,7 @@ from ....arrays import Array
 from ...belief import Belief, MapView, describe_filter
 from ...interface import UpdateReport
 from ...models.angles import wrap_angle
-from ...support import argument_checks
+from ...support import argument_checks, pair_checks
 from ...support.argument_checks import LandmarkIds
 from .conditional_pose import move
 from .linearisation import ESTIMATE
@@ -145,21 +145,19 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             If the arguments are malformed; the belief is then unchanged.
         numpy.linalg.LinAlgError
-            If a covariance is not positive definite; the belief is then unchanged up
-            to rounding.
+            If a covariance is not positive definite; the belief is then unchanged.
         """
         readings = argument_checks.scan(measurements)
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
         if not ids:
             return UpdateReport()
-        self._belief.choose_local_map(ids, exact=self._is_exact)
-        result = self._process(readings, ids)
-        fixed, shift = result.local.fixed, result.local.shift
-        while fixed.largest_residual(shift) > self._tolerance:
-            self._belief.enlarge_elimination()
+        with self._belief.unchanged_on_error():
+            self._belief.choose_local_map(ids, exact=self._is_exact)
             result = self._process(readings, ids)
-            fixed, shift = result.local.fixed, result.local.shift
+            while result.largest_residual > self._tolerance:
+                self._belief.enlarge_elimination()
+                result = self._process(readings, ids)
         self._belief.add(result.report.added_ids, result.added_slots)
         self._belief.pose, self._belief.local = result.pose, result.local
         return result.report
@@ -196,7 +194,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             If one is not in the map or both are the same; nothing is then merged.
         """
-        argument_checks.two_landmarks(kept, gone, self._belief.slots)
+        pair_checks.two_landmarks(kept, gone, self._belief.slots)
         self._belief.merge(kept, gone, exact=self._is_exact)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
@@ -228,6 +226,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         The distance is extended by 10σ of the robot's position, because landmarks near
         the robot are rarely less certain than the robot itself.
         """
+        within = argument_checks.distance("within", within)
         pose, ids = self.belief([]), self.landmark_ids
         away = np.hypot(*(self.landmarks - pose.pose[:2]).T)
         reach = within + 10 * np.sqrt(np.trace(pose.covariance[:2, :2]))

@@ -130,6 +130,15 @@ class Neighbourhood:
         self._reaches[-1] = max(within, self._reaches[-1])
         return copy.slam.map_view()
 
+    def checkpoint(self) -> Callable[[], None]:
+        """Return what takes back later calls of :meth:`view`."""
+        copy, reaches = self._copy, list(self._reaches)
+
+        def undo() -> None:
+            self._copy, self._reaches = copy, reaches
+
+        return undo
+
     def renew(self) -> None:
         """Replace the copy, if there is one and the submaps can be joined."""
         if self._copy is not None:

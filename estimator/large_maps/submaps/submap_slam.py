@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ...filters.ekf import EkfSlam
 from ...filters.invariant import InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport
-from ...support import argument_checks
+from ...support import argument_checks, pair_checks
 from ...support.argument_checks import LandmarkIds
 from .active_submap import ORIGIN, ActiveSubmap
 from .chain import Chain
@@ -134,9 +134,11 @@ class SubmapSlam(SubmapQueries):
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
+        motion = argument_checks.pair("odometry", odometry)
+        argument_checks.duration(dt)
         self._claim_folder()
-        self._active.filter.predict(odometry, dt)
-        self._neighbourhood.predict(odometry, dt)
+        self._active.filter.predict(motion, dt)
+        self._neighbourhood.predict(motion, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -160,24 +162,26 @@ class SubmapSlam(SubmapQueries):
             If the submap that the previous scan filled cannot be written; the belief
             is then unchanged.  Every later scan tries again.
         """
-        if np.size(measurements) > 2 * self._rule.size:
-            least = len(argument_checks.scan(measurements))
+        readings = argument_checks.scan(measurements)
+        if len(readings) > self._rule.size:
             raise ValueError(
-                f"submap_size must be >= {least}, the "
+                f"submap_size must be >= {len(readings)}, the "
                 f"landmarks of one scan, got {self._rule.size}"
             )
-        refuse_link_names(landmark_ids)
+        ids = argument_checks.given_identities(landmark_ids, len(readings), self)
+        refuse_link_names(ids)
+        argument_checks.refuse_unusable(readings, ids)
         self._claim_folder()
         if self._graph.is_overdue:
             self._close()
-        report = self._active.filter.update(measurements, landmark_ids)
+        report = self._active.filter.update(readings, ids)
         index = self._graph.index
         new = tuple(i for i in report.added_ids if i not in index)
         index.add(new)
         if new != report.added_ids:
             report = report.replace(added_ids=new)
-        self._neighbourhood.update(measurements, landmark_ids, report)
-        if np.size(measurements) and self._rule.closes(self._active):
+        self._neighbourhood.update(readings, ids, report)
+        if len(readings) and self._rule.closes(self._active):
             with suppress(OSError):  # the next scan tries again, and raises
                 self._close()
         return report
@@ -187,11 +191,6 @@ class SubmapSlam(SubmapQueries):
 
         A landmark in several submaps still connects them, but no belief contains it.
         If it is seen again, it is a new landmark.
-
-        Parameters
-        ----------
-        landmark_ids : sequence of int
-            Mapped landmarks, without repetition.
 
         Raises
         ------
@@ -221,7 +220,8 @@ class SubmapSlam(SubmapQueries):
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Merge several pairs (kept, gone) of landmarks; errors as :meth:`merge`."""
-        argument_checks.landmark_pairs(pairs, self._graph.index)
+        kept, gone = pair_checks.landmark_pairs(pairs, self._graph.index)
+        pairs = list(zip(kept, gone, strict=True))
         self._claim_folder()
         self._graph.merge_pairs(pairs)
         self._neighbourhood.merge_pairs(pairs)
@@ -248,17 +248,19 @@ class SubmapSlam(SubmapQueries):
             Distance from the robot that the view covers at least [m].  The view holds
             at most the 1000 nearest landmarks of closed submaps.
 
-        Returns
-        -------
-        MapView
-            Read-only arrays, valid until the next step; may hold farther landmarks.
+        The arrays are read-only and valid until the next step.
 
         Raises
         ------
         ValueError, numpy.linalg.LinAlgError
             As `belief`; the state is then unchanged.
         """
-        return self._neighbourhood.view(within)._replace(whole=self.landmark_ids)
+        reach = argument_checks.distance("within", within)
+        return self._neighbourhood.view(reach)._replace(whole=self.landmark_ids)
+
+    def view_checkpoint(self) -> Callable[[], None]:
+        """Return what takes back the effects of later calls of :meth:`local_view`."""
+        return self._neighbourhood.checkpoint()
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state as arrays, without submaps in a folder.
