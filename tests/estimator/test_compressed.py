@@ -411,12 +411,12 @@ def test_a_refused_reading_leaves_everything_as_it_was_also_before_a_new_phase(b
     [
         ({"estimator": np.array("EkfSlam")}, "state is of EkfSlam, not of Compressed"),
         ({"base": np.array("EkfSlam")}, "state is of EkfSlam, not of InvariantEkfSlam"),
-        ({"strip": np.zeros((3, 3))}, r"state\['strip'\] must fit"),
+        ({"strip": np.zeros((3, 3))}, r"state\['strip'\] must have shape"),
         ({"slots": np.zeros(3, dtype=int)}, r"state\['slots'\] must have one entry"),
-        ({"points": np.zeros(3)}, r"state\['points'\] must be \d+ finite numbers"),
+        ({"points": np.zeros(3)}, r"state\['points'\] must have shape"),
         ({"far_covariance": np.zeros(7)}, "must be whole blocks of rows"),
-        ({"far_pending_root": np.zeros((7, 0))}, "pending downdates must have shape"),
-        ({"local_mean": np.zeros(4)}, r"state\['mean'\] must be"),
+        ({"far_pending_root": np.zeros((7, 0))}, "pending_root.* must have shape"),
+        ({"local_mean": np.zeros(4)}, r"state\['mean'\] must have shape"),
         ({"origin": None}, "state must hold 'origin'"),
     ],
 )

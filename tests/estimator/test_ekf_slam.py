@@ -385,12 +385,12 @@ def test_saved_state_continues_bit_for_bit(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"mean": np.zeros(4)}, r"state\['mean'\] must be 15 finite numbers"),
+        ({"mean": np.zeros(4)}, r"state\['mean'\] must have shape \(15,\)"),
         ({"covariance": np.full((15, 15), np.nan)}, "covariance'] must be finite"),
         ({"estimator": "OtherFilter"}, "state is of OtherFilter, not of EkfSlam"),
         ({"landmark_ids": None}, "state must hold 'landmark_ids'"),
-        ({"landmark_ids": [3] * 6}, "landmark_ids must not repeat"),
-        ({"landmark_ids": [0.5] * 6}, "landmark_ids must be integers"),
+        ({"landmark_ids": [3] * 6}, r"landmark_ids'\] must not repeat"),
+        ({"landmark_ids": [0.5] * 6}, "must be whole numbers"),
         ({"covariance": np.triu(np.ones((15, 15)))}, "must be symmetric"),
     ],
 )
