@@ -66,7 +66,7 @@ def wrong_readings(reports, scans):
 @pytest.fixture(scope="module")
 def slippery_drive():
     world = slippery_world()
-    return world, drive(world)
+    return world, drive(world, seed=3)  # nearest errs 5 to 64 times in seeds 0 to 8
 
 
 @pytest.mark.slow
