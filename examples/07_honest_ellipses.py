@@ -9,27 +9,36 @@ Run it::
 
     python examples/07_honest_ellipses.py
 
-It writes ``results/07_honest_ellipses.png``, the picture at the head of the README
-(there as ``docs/images/honest_ellipses.png``), and counts the crosses inside.
+It writes ``results/07_honest_ellipses.png``, the film at the head of the README
+(there as ``docs/images/honest_ellipses.gif``), and counts the crosses inside.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import imsave
 from numpy.typing import NDArray
 
 from slamgym.envs import LandmarkWorldEnv
+from slamgym.envs.rendering import write_video
 from slamgym.estimator import Belief, SlamEstimator, make_estimator
 from slamgym.evaluation import landmark_distances
 from slamgym.sim_configs import action_sequence
 
+Image = NDArray[np.uint8]
+
 PICTURE = Path("results/07_honest_ellipses.png")
+FILM = Path("results/07_honest_ellipses.gif")
+EVERY = 15  # steps from one frame of the film to the next
+FPS = 12
 TITLES = {"ekf": "standard EKF", "invariant": "invariant EKF"}
 
 
-def follow(env: LandmarkWorldEnv) -> list[Belief]:
-    """Drive the episode; return what each filter believes at its end."""
+def follow(env: LandmarkWorldEnv) -> Iterator[list[Belief]]:
+    """Drive the episode; yield the beliefs of the filters after every scan."""
     scenario = env.scenario
     observation, _ = env.reset(seed=0)
     filters = [
@@ -44,11 +53,12 @@ def follow(env: LandmarkWorldEnv) -> list[Belief]:
     ]
     for action in action_sequence(scenario):
         look(filters, observation)
+        yield [slam.belief() for slam in filters]
         observation, *_ = env.step(action)
         for slam in filters:
             slam.predict(observation["odometry"])
     look(filters, observation)
-    return [slam.belief() for slam in filters]
+    yield [slam.belief() for slam in filters]
 
 
 def look(
@@ -68,34 +78,46 @@ def landmarks_within_3_sigma(belief: Belief, truth: NDArray[np.float64]) -> int:
     return int((distances.mahalanobis <= 3).sum())
 
 
-def side_by_side(frames: list[NDArray[np.uint8]], titles: list[str]) -> Figure:
-    """Show pictures beside each other, pixel by pixel, each under its title."""
+def picture(env: LandmarkWorldEnv, beliefs: list[Belief]) -> Image:
+    """Show the beliefs beside each other, each under its title and its count."""
+    frames, titles = [], []
+    for belief, title in zip(beliefs, TITLES.values(), strict=True):
+        env.show_belief(belief)
+        frames.append(np.asarray(env.render(), dtype=np.uint8))
+        inside = landmarks_within_3_sigma(belief, env.landmarks)
+        count = f"{inside} of {len(belief.landmark_ids)} landmarks inside 3σ"
+        titles.append(f"{title}: {count}")
+    return under_titles(frames, titles)
+
+
+def under_titles(frames: list[Image], titles: list[str]) -> Image:
+    """Draw pictures beside each other, pixel by pixel, each under its title."""
     height, width = frames[0].shape[:2]
     head = 40
     figure = Figure((len(frames) * width / 100, (height + head) / 100), dpi=100)
+    canvas = FigureCanvasAgg(figure)
     for k, (frame, title) in enumerate(zip(frames, titles, strict=True)):
         share = 1 / len(frames)
         axes = figure.add_axes((k * share, 0, share, height / (height + head)))
         axes.set_axis_off()
         axes.imshow(frame, interpolation="nearest", aspect="auto")
         axes.set_title(title, fontweight="bold", fontsize=14, pad=10)
-    return figure
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def main() -> None:
     env = LandmarkWorldEnv("loop", render_mode="rgb_array")
-    frames, titles = [], []
-    for belief, title in zip(follow(env), TITLES.values(), strict=True):
-        env.show_belief(belief)
-        frames.append(np.asarray(env.render(), dtype=np.uint8))
-        inside = landmarks_within_3_sigma(belief, env.landmarks)
-        count = f"{inside} of {len(belief.landmark_ids)} landmarks inside 3σ"
-        titles.append(f"{title}: {count}")
-        print(titles[-1])
     PICTURE.parent.mkdir(exist_ok=True)
-    side_by_side(frames, titles).savefig(PICTURE)
+    frames = [
+        picture(env, beliefs)
+        for step, beliefs in enumerate(follow(env))
+        if step % EVERY == 0 or step == env.scenario.steps
+    ]
+    write_video([*frames, *[frames[-1]] * FPS], FILM, FPS)
+    imsave(PICTURE, frames[-1])
+    print(f"wrote {PICTURE} and {FILM}")
     env.close()
-    print(f"wrote {PICTURE}")
 
 
 if __name__ == "__main__":

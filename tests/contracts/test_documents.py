@@ -41,7 +41,8 @@ PYTHON = [
     for document in DOCUMENTS
     for number, (code, output) in enumerate(blocks(document.read_text(), "python"), 1)
 ]
-MAIN_JOB = next(line for line in commands(README) if line.startswith("slamgym run"))
+FIRST_LINE = next(commands(README))
+MAIN_JOB = FIRST_LINE.rpartition(" && ")[2]
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,7 @@ def test_the_three_uses_fit_into_fifteen_lines_each():
 
 @pytest.mark.slow
 def test_the_main_job_writes_what_the_readme_promises(first_run):
-    section = README.split("## Drive, filter, look")[1].split("\n## ")[0]
+    section = README.split("## Set-up")[1].split("\n## ")[0]
     table = [line for line in section.splitlines() if line.startswith("| `")]
     promised = {name for line in table for name in re.findall(r"`([^`]+)`", line)}
     assert promised == {
@@ -139,8 +140,8 @@ def anchors(document):
 @pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
 def test_relative_links_resolve(document):
     for link in LINK.findall(document.read_text()):
-        if re.match(r"https?://", link):
-            continue
+        if re.match(r"https?://|learn/|generated/", link):
+            continue  # the last two are made by sphinx-build, which checks them
         path, _, anchor = link.partition("#")
         target = document.parent / path if path else document
         assert target.exists(), link
@@ -187,8 +188,9 @@ def test_ci_types_the_commands_of_the_readme():
     set_up = README.split("## Set-up")[1].split("\n## ")[0]
     test = README.split("## Test")[1].split("\n## ")[0]
     typed = [*commands(set_up), *commands(test)]
-    assert typed == [line for line in ci if line in typed]
-    assert ci[-1] == "pytest -n auto"
+    assert len(typed) == 2
+    for line in typed:  # "set -e" overlooks a failure before the last "&&"
+        assert f"{line} || exit 1" in ci
 
 
 def test_contributing_lists_the_checks_of_ci():
@@ -197,8 +199,8 @@ def test_contributing_lists_the_checks_of_ci():
     assert checks.splitlines() == [
         line
         for line in ci
-        if line in {"ruff check", "ruff format --check", "mypy", "pytest -n auto"}
-    ]
+        if line in {"ruff check", "ruff format --check", "mypy"}
+    ] + ["pytest -n auto"]
 
 
 def test_version_licence_and_python_agree_everywhere():

@@ -157,7 +157,7 @@ def test_ppo_learns_on_it(flat, sb3):
     assert lengths == [16] * 4
 
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "active_slam.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "reinforcement_learning.md"
 
 
 def blocks(heading):
@@ -171,7 +171,7 @@ def test_the_document_leads_from_make_vec_to_a_policy(sb3):
     """The block that needs Stable-Baselines3 is run here, in the place of readers."""
     scope = {"__name__": "reader"}
     languages = []
-    for language, code in blocks("From `make_vec` to an RL library"):
+    for language, code in blocks("Reinforcement learning"):
         languages.append(language)
         if language != "text":
             exec(compile(code, "document", "exec"), scope)
