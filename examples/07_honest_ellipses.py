@@ -1,18 +1,20 @@
 """See overconfidence: one drive, the same readings, two filters.
 
-Four laps of a circle past 20 landmarks.  At the end each filter draws its map, every
-landmark with the ellipse that should hold its true place (the cross) in 989 of 1000
-cases.  The mistakes of the two maps are much alike, a small turn of the whole; but one
-filter knows that it may be turned, and the other does not.
+Four laps of a circle past 20 landmarks.  Each filter draws its map: every landmark with
+the ellipse that holds the true place (the cross) in 989 of 1000 cases if the filter is
+honest.  Both maps are rotated a little as a whole; one filter knows this uncertainty,
+the other does not.
 
 Run it::
 
     python examples/07_honest_ellipses.py
 
-It writes ``results/07_honest_ellipses.png``, the film at the head of the README
-(there as ``docs/images/honest_ellipses.gif``), and counts the crosses inside.
+It writes ``results/07_honest_ellipses.png``, the end of the drive, and
+``results/07_honest_ellipses.gif``, the film at the head of the README (there as
+``docs/images/honest_ellipses.gif``), and counts the crosses inside.
 """
 
+import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,7 +34,6 @@ Image = NDArray[np.uint8]
 
 PICTURE = Path("results/07_honest_ellipses.png")
 FILM = Path("results/07_honest_ellipses.gif")
-EVERY = 15  # steps from one frame of the film to the next
 FPS = 12
 TITLES = {"ekf": "standard EKF", "invariant": "invariant EKF"}
 
@@ -78,16 +79,22 @@ def landmarks_within_3_sigma(belief: Belief, truth: NDArray[np.float64]) -> int:
     return int((distances.mahalanobis <= 3).sum())
 
 
+def titles(env: LandmarkWorldEnv, beliefs: list[Belief]) -> list[str]:
+    """Name each filter, and count the landmarks that its ellipses hold."""
+    return [
+        f"{title}: {landmarks_within_3_sigma(belief, env.landmarks)} of "
+        f"{len(belief.landmark_ids)} landmarks inside 3σ"
+        for belief, title in zip(beliefs, TITLES.values(), strict=True)
+    ]
+
+
 def picture(env: LandmarkWorldEnv, beliefs: list[Belief]) -> Image:
-    """Show the beliefs beside each other, each under its title and its count."""
-    frames, titles = [], []
-    for belief, title in zip(beliefs, TITLES.values(), strict=True):
+    """Show the beliefs beside each other, each under its title."""
+    frames = []
+    for belief in beliefs:
         env.show_belief(belief)
         frames.append(np.asarray(env.render(), dtype=np.uint8))
-        inside = landmarks_within_3_sigma(belief, env.landmarks)
-        count = f"{inside} of {len(belief.landmark_ids)} landmarks inside 3σ"
-        titles.append(f"{title}: {count}")
-    return under_titles(frames, titles)
+    return under_titles(frames, titles(env, beliefs))
 
 
 def under_titles(frames: list[Image], titles: list[str]) -> Image:
@@ -107,17 +114,20 @@ def under_titles(frames: list[Image], titles: list[str]) -> Image:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--every", type=int, default=15, help="steps between frames")
+    every = parser.parse_args().every
     env = LandmarkWorldEnv("loop", render_mode="rgb_array")
+    frames, beliefs = [], []
+    for step, beliefs in enumerate(follow(env)):
+        if step % every == 0 or step == env.scenario.steps:
+            frames.append(picture(env, beliefs))
+    print(*titles(env, beliefs), sep="\n")
     PICTURE.parent.mkdir(exist_ok=True)
-    frames = [
-        picture(env, beliefs)
-        for step, beliefs in enumerate(follow(env))
-        if step % EVERY == 0 or step == env.scenario.steps
-    ]
-    write_video([*frames, *[frames[-1]] * FPS], FILM, FPS)
     imsave(PICTURE, frames[-1])
-    print(f"wrote {PICTURE} and {FILM}")
+    write_video([*frames, *[frames[-1]] * FPS], FILM, FPS)
     env.close()
+    print(f"wrote {PICTURE} and {FILM}")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ the policy differs from each baseline on the same maps; and ``trajectories.png``
 they all do on one of these maps.
 
 On 100 maps of ``active_medium`` a policy of two million steps earns 15.1 ± 0.6,
-coverage 13.5 ± 0.7, greedy 11.2 ± 1.1 and chance -1.6 ± 0.5: see docs/active_slam_scores.md.
+coverage 13.5 ± 0.7 and chance -1.6 ± 0.5: see docs/active_slam_scores.md.
 """
 
 import argparse
