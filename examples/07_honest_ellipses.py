@@ -16,10 +16,11 @@ It writes ``results/07_honest_ellipses.png``, the end of the drive, and
 
 import argparse
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+import PIL.Image
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from numpy.typing import NDArray
@@ -102,15 +103,14 @@ def under_titles(frames: list[Image], titles: list[str]) -> Image:
     height, width = frames[0].shape[:2]
     head = 40
     figure = Figure((len(frames) * width / 100, (height + head) / 100), dpi=100)
-    canvas = FigureCanvasAgg(figure)
     for k, (frame, title) in enumerate(zip(frames, titles, strict=True)):
         share = 1 / len(frames)
         axes = figure.add_axes((k * share, 0, share, height / (height + head)))
         axes.set_axis_off()
         axes.imshow(frame, interpolation="nearest", aspect="auto")
         axes.set_title(title, fontweight="bold", fontsize=14, pad=10)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    figure.savefig(drawn := BytesIO())
+    return np.asarray(PIL.Image.open(drawn).convert("RGB"))
 
 
 def main() -> None:
@@ -118,7 +118,8 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=15, help="steps between frames")
     every = parser.parse_args().every
     env = LandmarkWorldEnv("loop", render_mode="rgb_array")
-    frames, beliefs = [], []
+    frames: list[Image] = []
+    beliefs: list[Belief] = []
     for step, beliefs in enumerate(follow(env)):
         if step % every == 0 or step == env.scenario.steps:
             frames.append(picture(env, beliefs))
