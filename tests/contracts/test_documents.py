@@ -180,7 +180,9 @@ def test_the_flow_of_a_step_names_rooms_and_modules_that_exist():
 def test_pictures_in_documents_are_small():
     pictures = list((ROOT / "docs" / "images").iterdir())
     assert pictures
-    assert all(picture.stat().st_size < 200_000 for picture in pictures)
+    for picture in pictures:
+        limit = 600_000 if picture.suffix == ".gif" else 200_000
+        assert picture.stat().st_size < limit, picture.name
 
 
 def test_ci_types_the_commands_of_the_readme():
