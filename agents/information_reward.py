@@ -186,12 +186,12 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
     --------
     >>> import gymnasium, slamgym
     >>> from slamgym.agents import BeliefObservation
-    >>> env = gymnasium.make("slamgym/LandmarkWorld-v0", sensor={"max_range": 7.0})
+    >>> env = gymnasium.make("slamgym/LandmarkWorld-v0", sensor={"max_range": 9.0})
     >>> env = InformationReward(BeliefObservation(env, "ekf"), effort_cost=0.1)
     >>> _ = env.reset(seed=0)
-    >>> rewards = [env.step([1.0, 0.0])[1] for _ in range(3)]  # more comes into view
+    >>> rewards = [env.step([1.0, 0.0])[1] for _ in range(3)]  # one comes into view
     >>> [reward > 1.0 for reward in rewards]
-    [False, True, True]
+    [False, True, False]
     """
 
     def __init__(

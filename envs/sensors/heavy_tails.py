@@ -33,7 +33,7 @@ def heavy_tails(unit: Array, degrees: float) -> Array:
     Examples
     --------
     >>> heavy_tails(np.array([-1.0, 0.0, 3.0]), 4.0).round(3)
-    array([-1.142, -0.   ,  6.62 ])
+    array([-1.142,  0.   ,  6.62 ])
     >>> heavy_tails(np.array([3.0]), np.inf)
     array([3.])
     """
