@@ -199,7 +199,7 @@ def _imported(path: str) -> EstimatorFactory:
     module, _, attribute = path.partition(":")
     try:
         return cast("EstimatorFactory", getattr(import_module(module), attribute))
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"cannot import estimator '{path}': {error}") from error
 
 

@@ -109,11 +109,17 @@ def _load_file(path: Path) -> Scenario:
         raise ScenarioError(f"cannot read the scenario '{path}': {reason}") from None
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(_syntax_message(path, str(error))) from None
+    except RecursionError:
+        raise ScenarioError(_too_deep(path)) from None
     except UnicodeDecodeError as error:
         raise ScenarioError(f"{path} must be UTF-8 text, got {error.reason}") from None
     except ScenarioError as error:
         lines = str(error).splitlines()
         raise ScenarioError("\n".join(f"{path}: {line}" for line in lines)) from None
+
+
+def _too_deep(path: Path) -> str:
+    return f"{path} must nest tables at most 2 deep, but nests them beyond reading"
 
 
 def _syntax_message(path: Path, message: str) -> str:

@@ -104,7 +104,9 @@ def add_moving(axes: Axes, radius: float) -> MovingArtists:
 
 
 def _title(x: float, align: str, text: str, colour: str = INK) -> Text:
-    return Text(x, 0.957, text, fontsize=11, ha=align, color=colour)
+    title = Text(x, 0.957, text, fontsize=11, ha=align, color=colour)
+    title.set_parse_math(False)  # a name with a $ is no formula
+    return title
 
 
 def _ellipses(axes: Axes, colour: str, fill: float) -> EllipseCollection:

@@ -88,6 +88,6 @@ def changes(option: str, texts: Iterable[str] | None) -> dict[str, Any]:
 def _toml_value(text: str) -> Any:
     try:
         table = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return text
     return table["value"] if len(table) == 1 else text

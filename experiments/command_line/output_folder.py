@@ -1,8 +1,10 @@
 """The folder that a command writes: it appears complete or not at all."""
 
 import contextlib
+import errno
 import glob
 import json
+import os
 import re
 import secrets
 import shutil
@@ -43,7 +45,7 @@ def output_folder(path: Path) -> Iterator[Path]:
     OSError
         If the folder cannot be written.
     """
-    path = path.absolute()
+    path = Path(os.path.realpath(path))  # a link stays, and names the folder to write
     _refuse_foreign_files(path)
     with _parents(path):
         partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
@@ -51,11 +53,24 @@ def output_folder(path: Path) -> Iterator[Path]:
             sweep(path)
             partial.mkdir()
         try:
-            with _in_use(partial):
+            with _in_use(partial), _naming_where_full(path):
                 yield partial
             _swap(partial, path)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _naming_where_full(path: Path) -> Iterator[None]:
+    """Name the folder in errors of a full disk, which name no file themselves."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+            raise
+        raise OSError(
+            f"the folder {path} cannot be written: {error.strerror}"
+        ) from error
 
 
 @contextlib.contextmanager
@@ -133,10 +148,13 @@ def _refuse_foreign_files(path: Path) -> None:
         return
     if not path.is_dir():
         raise BadInputError(f"--out must be a folder, got the file {path}")
-    foreign = sorted(set(files_in(path)) - _listed_in_summary(path))
-    if foreign:
+    own = {*_listed_in_summary(path), WRITER}
+    files = (entry for entry in path.rglob("*") if not entry.is_dir())
+    names = (file.relative_to(path).as_posix() for file in files)
+    foreign = next((name for name in names if name not in own), None)  # of many files
+    if foreign is not None:
         raise BadInputError(
-            f"{path} holds {foreign[0]}, which slamgym did not write there: "
+            f"{path} holds {foreign}, which slamgym did not write there: "
             "choose another --out"
         )
 
@@ -145,7 +163,7 @@ def _listed_in_summary(folder: Path) -> set[str]:
     """Return the files that slamgym wrote to a folder according to its summary."""
     try:
         summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return set()
     files = summary.get("files") if isinstance(summary, dict) else None
     return {str(file) for file in files} if isinstance(files, list) else set()

@@ -162,7 +162,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise ValueError(f"{folder} must be a data set with a {MANIFEST}, it has none")
     try:
         return _manifest(json.loads(path.read_text(encoding="utf-8")))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(
             f"{path} must be a manifest of '{_KIND}': {type(error).__name__}: {error}"
         ) from None
@@ -171,6 +171,9 @@ def read_manifest(folder: Path) -> Manifest:
 def _manifest(table: dict[str, Any]) -> Manifest:
     if table["kind"] != _KIND:
         raise ValueError(f"kind is {table['kind']!r}")
+    for name in (shard["name"] for shard in table["shards"]):
+        if name in ("", "..") or Path(name).name != name:
+            raise ValueError(f"a shard must be named without a folder, got {name!r}")
     scenario = scenario_from_text(table["job"]["scenario"])
     return Manifest(
         job=Job(**{**table["job"], "scenario": scenario}),

@@ -23,6 +23,7 @@ from ..lines import LogError, LogLine, read_lines
 from ..slamlog import SlamLog
 
 ODOMETRY_STEP = 0.1  # [s]
+LONGEST = 1e6  # [s]: 10 million rows
 TRUTH_STEP = 0.2  # [s]
 LAST_ROBOT = 5
 TIME_DIGITS = 6  # float64 resolves stamps near 1.25e9 s to 2.4e-7 s
@@ -64,6 +65,11 @@ def read_utias(folder: Path, *, robot: int | None = None) -> SlamLog:
     epoch = float(odometry[0, 0])
     odometry[:, 0] = np.round(odometry[:, 0] - epoch, TIME_DIGITS)
     end = float(odometry[-1, 0])
+    if end > LONGEST:
+        raise ValueError(
+            f"{folder}: the odometry of robot {number} must end within {LONGEST:g} s "
+            f"of its start, got {end:g} s: a time stamp is damaged"
+        )
     readings, left_out = _read_measurements(folder, number, epoch=epoch, end=end)
     truth = _read_truth(folder / f"Robot{number}_Groundtruth.dat", epoch)
     start = poses_at([0.0], truth)[0]
@@ -140,6 +146,9 @@ def _read_landmarks(folder: Path) -> tuple[IntArray, Array]:
     lines = _lines(folder / "Landmark_Groundtruth.dat", "subject x y σx σy")
     rows = [(line, line.text.split()) for line in lines]
     ids = [line.to_id(fields[0]) for line, fields in rows]
+    for place, (line, fields) in enumerate(rows):
+        if ids[place] in ids[:place]:
+            raise line.error("each subject once", fields[0])
     positions = [
         [line.to_real(field) for field in fields[1:3]] for line, fields in rows
     ]

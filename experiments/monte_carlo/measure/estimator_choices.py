@@ -122,7 +122,7 @@ def _read(spec: str) -> EstimatorChoice:
     options = _BARE_WORD.sub(r'\1"\2"', match["options"] or "")
     try:
         table = tomllib.loads(f"options = {{ {options} }}")["options"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         raise ValueError(
             f"options must be like [iterations=3,sequential=true], got '{spec}'"
         ) from None

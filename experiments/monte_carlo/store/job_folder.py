@@ -88,7 +88,7 @@ def identity_in(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} holds no Monte Carlo of slamgym: there is no {JOB}")
     try:
         identity = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError:
+    except (ValueError, RecursionError):
         identity = None
     if not isinstance(identity, dict) or identity.get("format") != FORMAT:
         raise ValueError(f"{file} is damaged, or not of a Monte Carlo of slamgym")

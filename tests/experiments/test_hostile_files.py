@@ -1,0 +1,96 @@
+"""Files and folders that no honest program writes end in one line."""
+
+import errno
+import json
+import os
+
+import matplotlib as mpl
+import pytest
+
+from slamgym.envs.rendering.artists import _title
+from slamgym.estimator import make_estimator
+from slamgym.experiments.command_line.output_folder import output_folder
+from slamgym.experiments.logs.importers.utias import read_utias
+from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
+from slamgym.sim_configs import load_scenario
+from slamgym.sim_configs.scenario_errors import ScenarioError
+
+DEEP = 100_000
+NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
+
+
+def test_a_scenario_nested_too_deeply_is_refused_by_name(tmp_path):
+    file = tmp_path / "deep.toml"
+    file.write_text(f"name = {'[' * DEEP}{']' * DEEP}")
+    with pytest.raises(ScenarioError, match=r"deep\.toml must nest tables at most 2"):
+        load_scenario(file)
+
+
+def test_a_manifest_nested_too_deeply_is_refused_by_name(tmp_path):
+    (tmp_path / MANIFEST).write_text("[" * DEEP + "]" * DEEP)
+    with pytest.raises(ValueError, match="must be a manifest of"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["../other.npz", "/etc/passwd", "", ".."])
+def test_a_shard_outside_the_folder_is_refused(name, tmp_path):
+    shard = {"name": name, "first_episode": 0, "episodes": 1, "sha256": ""}
+    table = {"kind": "slamgym trajectories 1", "shards": [shard]}
+    (tmp_path / MANIFEST).write_text(json.dumps(table))
+    with pytest.raises(ValueError, match="a shard must be named without a folder"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("path", ["..:x", ":x", ".:x"])
+def test_an_import_path_that_is_none_is_refused_by_name(path):
+    with pytest.raises(ValueError, match="cannot import estimator"):
+        make_estimator(path, **NOISE)
+
+
+def test_a_name_with_broken_mathematics_is_drawn():
+    figure = mpl.figure.Figure()
+    figure.add_artist(_title(0.1, "left", r"$\frac{$"))
+    figure.canvas.draw()
+
+
+def test_a_link_as_out_stays_a_link(tmp_path):
+    target, link = tmp_path / "target", tmp_path / "link"
+    target.mkdir()
+    link.symlink_to(target)
+    with output_folder(link) as partial:
+        (partial / "result.txt").write_text("new")
+    assert link.is_symlink()
+    assert (target / "result.txt").read_text() == "new"
+    assert sorted(os.listdir(tmp_path)) == ["link", "target"]
+
+
+def test_a_full_disk_names_the_folder_and_leaves_what_was_there(tmp_path):
+    out = tmp_path / "out"
+    full = pytest.raises(OSError, match=r"out cannot be written: No space left")
+    with full, output_folder(out):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert list(tmp_path.iterdir()) == []
+
+
+def utias_folder(folder, *, last="1.0", landmarks="6 1 1 0 0\n7 2 2 0 0\n"):
+    files = {
+        "Robot1_Odometry.dat": f"0.0 0.1 0.0\n{last} 0.1 0.0\n",
+        "Robot1_Measurement.dat": "0.5 63 1.0 0.1\n",
+        "Barcodes.dat": "6 63\n7 25\n",
+        "Landmark_Groundtruth.dat": landmarks,
+    }
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_a_damaged_time_stamp_is_refused_before_it_fills_the_memory(tmp_path):
+    folder = utias_folder(tmp_path, last="9e12")
+    with pytest.raises(ValueError, match=r"within 1e\+06 s of its start, got 9e\+12 s"):
+        read_utias(folder)
+
+
+def test_a_landmark_given_twice_is_refused_with_its_line(tmp_path):
+    folder = utias_folder(tmp_path, landmarks="6 1 1 0 0\n7 2 2 0 0\n6 3 3 0 0\n")
+    with pytest.raises(ValueError, match=r"Landmark_Groundtruth\.dat.*3.*once"):
+        read_utias(folder)
