@@ -168,3 +168,17 @@ def test_a_refused_scan_of_managed_submaps_keeps_the_neighbourhood():
     with pytest.raises(ValueError, match="submap_size must be >= 7"):
         slam.update(many, range(7))
     assert digest(slam) == before
+
+
+@pytest.mark.parametrize("seed", [0, 8, 9, 10, 11])
+def test_an_exact_sensor_that_reads_more_than_the_pose_has_is_refused(seed):
+    rng = np.random.default_rng(seed)
+    exact = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.0, 0.0)}
+    slam = make_estimator("ekf", **exact)
+    readings = np.column_stack([rng.uniform(-3, 3, 2), rng.uniform(1, 9, 2)])
+    slam.update(readings, [1, 2])
+    slam.predict(rng.uniform(-0.1, 0.1, 2))
+    before = digest(slam)
+    with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
+        slam.update(readings, [1, 2])  # 4 numbers about 3 unknown ones
+    assert digest(slam) == before
