@@ -21,6 +21,7 @@ from ..estimator.registry import (
     make_batch,
     make_estimator,
 )
+from ..estimator.support.filter_labels import read_label
 from ..sim_configs import Scenario
 
 
@@ -95,7 +96,7 @@ def choose_estimator(
     factory: Any
     if isinstance(estimator, str):
         factory = partial(make_estimator, estimator)
-        known = noise_options(find_estimator(estimator), scenario)
+        known = noise_options(find_estimator(read_label(estimator).name), scenario)
         if not scenario.sensor.identities:
             settings["management"] = _bounded(settings.get("management", True), rows)
     elif isinstance(estimator, type) or not _has_a_method(estimator):
@@ -141,7 +142,7 @@ def choose_batch(
             "estimator must be a registered name for vector environments, "
             f"got {estimator!r}"
         )
-    known = noise_options(find_estimator(estimator), scenario)
+    known = noise_options(find_estimator(read_label(estimator).name), scenario)
     return make_batch(
         estimator,
         runs=runs,

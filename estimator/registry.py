@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
-from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import ArrayLike
 
+from ..suggestions import closest
 from .filters.batch import BatchSlam
 from .filters.ekf import EkfSlam
 from .filters.first_estimates import FirstEstimatesEkfSlam
@@ -21,13 +22,23 @@ from .filters.robocentric import RobocentricEkfSlam
 from .filters.unscented import UnscentedSlam
 from .interface import SlamEstimator
 from .peers.catalogue import PEERS
+from .support.filter_labels import read_label
 
 if TYPE_CHECKING:
     from .map_management.policy import LandmarkPolicy
 
 EstimatorFactory = Callable[..., SlamEstimator]
+_NOISE = ("motion_std", "measurement_std", "initial_pose", "initial_pose_std")
+_REFUSED = re.compile(r"(?:unexpected keyword argument|no option) '(\w+)'")
 
 _factories: dict[str, EstimatorFactory | str] = {}  # or where to import it from
+
+
+class UnknownOptionError(ValueError, TypeError):
+    """Raised for an option that an estimator does not have.
+
+    It is a `TypeError` too, as for any function that gets a keyword it does not have.
+    """
 
 
 def register_estimator(name: str, factory: EstimatorFactory) -> None:
@@ -84,9 +95,7 @@ def find_estimator(name: str) -> EstimatorFactory:
         return factory
     if ":" in factory:
         return _imported(factory)
-    near = get_close_matches(name, _factories, n=1)
-    hint = f"; did you mean '{near[0]}'?" if near else ""
-    known = ", ".join(_factories)
+    hint, known = closest(name, _factories), ", ".join(_factories)
     raise ValueError(f"unknown estimator '{name}'{hint} (there are {known})")
 
 
@@ -106,7 +115,8 @@ def make_estimator(
     ----------
     name : str
         One of :func:`list_estimators` or of
-        :func:`~slamgym.estimator.list_peers`, or "module:Class".
+        :func:`~slamgym.estimator.list_peers`, or "module:Class"; with or without
+        options in brackets, which override those given as keywords.
     motion_std : array_like, shape (3,)
         (σx, σy, σα) of the motion noise in the robot frame [m, m, rad] per step.
     measurement_std : array_like, shape (2,)
@@ -123,29 +133,41 @@ def make_estimator(
     ------
     ValueError
         Where the name is unknown or an argument is refused.
-    TypeError
-        Where an option is unknown to the estimator.
+    UnknownOptionError
+        A ValueError and TypeError, where the estimator does not have an option; it
+        suggests the nearest one.
 
     Examples
     --------
     >>> slam = make_estimator(
-    ...     "ekf", motion_std=(0.1, 0.1, 0.05), measurement_std=(0.02, 0.1)
+    ...     "invariant[iterations=3]",
+    ...     motion_std=(0.1, 0.1, 0.05),
+    ...     measurement_std=(0.02, 0.1),
     ... )
     >>> slam.belief().pose
     array([0., 0., 0.])
     """
-    factory = find_estimator(name)
+    name, own = read_label(name)
+    options |= own
+    management = options.pop("management", management)
+    own_factory = factory = find_estimator(name)
     if management is not None and management is not False:
         from .map_management import manage  # noqa: PLC0415 (heavy)
 
         factory = manage(factory, management)
-    return factory(
-        motion_std=motion_std,
-        measurement_std=measurement_std,
-        initial_pose=initial_pose,
-        initial_pose_std=initial_pose_std,
-        **options,
-    )
+    try:
+        return factory(
+            motion_std=motion_std,
+            measurement_std=measurement_std,
+            initial_pose=initial_pose,
+            initial_pose_std=initial_pose_std,
+            **options,
+        )
+    except TypeError as error:
+        message = _unknown_option(error, name, own_factory, options)
+        if message is None:
+            raise
+        raise UnknownOptionError(message) from error
 
 
 def make_batch(
@@ -165,7 +187,7 @@ def make_batch(
     Parameters
     ----------
     name : str
-        One of :func:`list_estimators`.
+        One of :func:`list_estimators`, with or without options in brackets.
     runs, landmarks, initial_poses, initial_pose_std, threads
         As in :class:`BatchSlam`.
     motion_std, measurement_std, **options
@@ -180,8 +202,8 @@ def make_batch(
         raise ValueError(
             "initial_pose must be given as initial_poses, one for each run"
         )
-    estimator = find_estimator(name)(
-        motion_std=motion_std, measurement_std=measurement_std, **options
+    estimator = make_estimator(
+        name, motion_std=motion_std, measurement_std=measurement_std, **options
     )
     if not isinstance(estimator, EkfSlam):
         raise ValueError(f"{name} cannot run in batches")
@@ -201,6 +223,40 @@ def _imported(path: str) -> EstimatorFactory:
         return cast("EstimatorFactory", getattr(import_module(module), attribute))
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"cannot import estimator '{path}': {error}") from error
+
+
+def _unknown_option(
+    error: TypeError, name: str, factory: EstimatorFactory, options: Mapping[str, Any]
+) -> str | None:
+    """Return the message for an unknown option, or None if the error is another."""
+    refused = _REFUSED.search(str(error))
+    if refused is None or refused[1] not in options:
+        return None
+    known = [option for option in _known_options(factory) if option != refused[1]]
+    hint = closest(refused[1], known)
+    listed = f" (there are {', '.join(known)})" if known else ""
+    return f"{name} has no option '{refused[1]}'{hint}{listed}"
+
+
+def _known_options(factory: EstimatorFactory) -> list[str]:
+    """Return the options of a factory, and of the classes that get its others."""
+    if not isinstance(factory, type):
+        return _keywords(factory)[0]
+    names: list[str] = []
+    for maker in (*factory.__mro__[:-1], EkfSlam):  # the base filter of a large map
+        own, passes_others = _keywords(maker)
+        names += [name for name in own if name not in names]
+        if not passes_others:
+            break
+    return names
+
+
+def _keywords(factory: Callable[..., Any]) -> tuple[list[str], bool]:
+    """Return the options that a signature names, and whether it takes any other."""
+    parameters = inspect.signature(factory).parameters.values()
+    named = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    passes_others = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    return [name for name in named if name not in _NOISE], passes_others
 
 
 def accepted_options(

@@ -41,7 +41,9 @@ def simulated_log() -> Path:
 
 def run(log: SlamLog, landmark_init: str) -> Replay:
     """Replay the log through an EKF with the noise that the log tells."""
-    settings = settings_for(log, options={"landmark_init": landmark_init})
+    settings = settings_for(
+        log, estimator="ekf", options={"landmark_init": landmark_init}
+    )
     return replay(log, settings.make(log.start), name=f"ekf, {landmark_init}")
 
 

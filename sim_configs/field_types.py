@@ -22,7 +22,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from ..magnitudes import LARGEST, SMALLEST
-from .scenario_errors import closest
+from ..suggestions import closest
 
 
 class Part(BaseModel):

@@ -8,6 +8,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from ..arrays import Array
 from ..magnitudes import LARGEST, LARGEST_EPISODE, LARGEST_MAP
+from ..suggestions import closest
 from .controls import CircleSequence, ControlSequence, command_cycle
 from .field_types import Name, Part, Positive, Text, Wall, broken_rule, expect
 from .layouts import LandmarkLayout
@@ -15,7 +16,6 @@ from .randomisation import RANGES, Randomise
 from .scenario_errors import (
     ScenarioError,
     UnknownKeywordError,
-    closest,
     error_lines,
 )
 from .scenario_parts import Faults, Motion, Robot, Sensor, Start

@@ -1,10 +1,11 @@
 """Error messages of invalid scenarios: one line per mistake, with the field's name."""
 
 from collections.abc import Iterable
-from difflib import get_close_matches
 from typing import Any
 
 from pydantic import ValidationError
+
+from ..suggestions import closest
 
 _CONTAINERS = {
     "tuple_type": "a list",
@@ -23,20 +24,6 @@ class UnknownKeywordError(ScenarioError, TypeError):
     It is a `TypeError` too, as for any function that gets a keyword it does not have:
     libraries that try keywords of other environments rely on it.
     """
-
-
-def closest(word: str, words: Iterable[str]) -> str:
-    """Return the suggestion that ends an error message, empty if no word is similar.
-
-    Examples
-    --------
-    >>> closest("max_rage", ["min_range", "max_range"])
-    "; did you mean 'max_range'?"
-    >>> closest("zzz", ["min_range", "max_range"])
-    ''
-    """
-    nearest = get_close_matches(word, list(words), n=1)
-    return f"; did you mean '{nearest[0]}'?" if nearest else ""
 
 
 def unknown_choice(name: str, value: object, choices: Iterable[str]) -> str:

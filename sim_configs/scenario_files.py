@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..suggestions import closest
 from .scenario import Scenario
-from .scenario_errors import ScenarioError, closest
+from .scenario_errors import ScenarioError
 
 _FOLDER = Path(__file__).parent
 _PRESETS = _FOLDER / "presets"

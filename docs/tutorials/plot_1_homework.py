@@ -8,8 +8,8 @@ This tutorial answers them with a drive through the same world. With a log of yo
 
 .. code-block:: bash
 
-   slamgym replay data.txt
-   slamgym noise-study data.txt
+   slamgym replay data.txt -e ekf
+   slamgym noise-study data.txt -e ekf
 """
 
 # %%

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from math import sqrt
 from typing import Any, TypeVar
 
 import numpy as np
 
 from ...arrays import Array
+from ...suggestions import closest
 from ..association.association_policy import AssociationPolicy
 from ..association.constellations import Constellations
 from ..support import argument_checks
@@ -135,9 +135,7 @@ def _made(kind: type[Made], name: str, given: Mapping[str, Any]) -> Made:
     known = [field.name for field in fields(kind)]
     for key in given:
         if key not in known:
-            near = get_close_matches(str(key), known, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
-            raise ValueError(f"{name} has no '{key}'{hint}")
+            raise ValueError(f"{name} has no '{key}'{closest(str(key), known)}")
     try:
         return kind(**given)
     except TypeError as error:

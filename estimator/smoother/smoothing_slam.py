@@ -7,6 +7,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from ..registry import accepted_options, find_estimator, make_estimator
+from ..support.filter_labels import read_label
 from .batch_smoother import robust_kernel, smooth
 from .recorded_slam import RecordedSlam
 from .smoothed_drive import SmoothedDrive
@@ -24,6 +25,7 @@ class SmoothingSlam(RecordedSlam):
         As every filter takes them.
     follow : str
         The filter, by a name that :func:`~slamgym.estimator.make_estimator` takes.
+        Options in brackets override the keywords.
     robust, robust_scale
         As in `batch_smoother.smooth`.
     range_std_per_metre, range_noise_at, noise_at_rest, min_range
@@ -62,20 +64,23 @@ class SmoothingSlam(RecordedSlam):
             "initial_pose": initial_pose,
             "initial_pose_std": initial_pose_std,
         }
+        name, own = read_label(follow)
         sensor = {
             "range_std_per_metre": range_std_per_metre,
             "range_noise_at": range_noise_at,
             "noise_at_rest": noise_at_rest,
             "min_range": min_range,
         }
+        sensor |= {key: own.pop(key) for key in sensor if key in own}
+        options |= own
         if options.get("bearing_std_metres"):
             raise ValueError(
                 "bearing_std_metres must be 0 to smooth, "
                 f"got {options['bearing_std_metres']!r}"
             )
         robust_kernel(robust, robust_scale)
-        taken = accepted_options(find_estimator(follow), sensor)
-        slam = make_estimator(follow, **noise, **taken, **options)
+        taken = accepted_options(find_estimator(name), sensor)
+        slam = make_estimator(name, **noise, **taken, **options)
         super().__init__(slam, **noise, **sensor)
         self._kernel: dict[str, Any] = {"robust": robust, "robust_scale": robust_scale}
 

@@ -1,6 +1,6 @@
 """Filters by the names that the user gives, with options in brackets."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ..monte_carlo.measure.estimator_choices import estimator_choices
@@ -43,3 +43,19 @@ def chosen_filters(
         )
         for choice in estimator_choices(estimators)
     }
+
+
+def tested_filters(labels: Sequence[str]) -> list[str]:
+    """Return the filters of a Monte Carlo that tests these: one needs another beside.
+
+    Examples
+    --------
+    >>> tested_filters(["invariant"]), tested_filters(["mine:Filter"])
+    (['ekf', 'invariant'], ['mine:Filter', 'invariant'])
+    """
+    if len(labels) > 1:
+        return list(labels)
+    (label,) = labels
+    if label in ("ekf", "invariant"):
+        return ["ekf", "invariant"]
+    return [label, "invariant"]

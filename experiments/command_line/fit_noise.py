@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from ..runs.filter_settings import FilterSettings
     from .reporter import Reporter
 
-_NOTE = "compiling the likelihood, once after each installation …"
-
 
 @command
 def fit_noise(
@@ -114,7 +112,10 @@ def _fit_and_write(
     from ..noise_fitting import noise_fit_figure, summarise_fit
     from .output_folder import write_summary
 
-    with reporter.progress("fitting") as tick, reporter.note_if_slow(_NOTE):
+    with (
+        reporter.progress("fitting") as tick,
+        reporter.note_if_compiling("the likelihood"),
+    ):
         result = fit(drive, settings, progress=tick)
     with reporter.progress("replaying") as tick:
         summary = summarise_fit(result, progress=tick)
@@ -124,9 +125,9 @@ def _fit_and_write(
 
 def _show(summary: dict[str, Any], place: Path, reporter: "Reporter") -> None:
     from .noise_fit_tables import advice, comparison_table, noise_table
-    from .tables import written
+    from .tables import heading, written
 
-    title = f"Noise of [bold]{summary['log']}[/], by [bold]{summary['estimator']}[/]\n"
+    title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])
     reporter.show(title, noise_table(summary), "", comparison_table(summary), "")
     reporter.show(advice(summary), "")
     reporter.show_verbatim(summary["options"])

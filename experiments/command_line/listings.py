@@ -12,6 +12,11 @@ def scenarios(as_json: options.AsJson = False) -> None:
     """List the worlds there are.
 
     List the scenarios that come with slamgym, to run, to film, or to vary.
+
+    Examples
+    --------
+    slamgym scenarios
+    slamgym scenarios --json
     """
     from ...sim_configs import list_presets, load_scenario
 
@@ -34,6 +39,11 @@ def estimators(as_json: options.AsJson = False) -> None:
 
     List the filters that come with slamgym, and those of other libraries, which
     pip install 'slamgym[peers]' installs.
+
+    Examples
+    --------
+    slamgym estimators
+    slamgym estimators --json
     """
     from ...estimator.peers.catalogue import list_peers
     from ...estimator.registry import find_estimator, list_estimators

@@ -105,8 +105,8 @@ def monte_carlo(
     slamgym monte-carlo loop --estimators ekf,invariant --runs 200 --out loop
     slamgym monte-carlo six_landmarks -e mine:MyFilter --runs 100 --jobs 4
     slamgym monte-carlo loop --assume motion.std=[0.1,0.1,0.1]
-    slamgym monte-carlo hidden_identities -e 'ekf[management={association="joint"}]'
-    slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://boss:8786
+    slamgym monte-carlo hidden_identities -e 'ekf[management={association=joint}]'
+    slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
     from ...sim_configs.atomic_file import replace_when_written
     from .. import monte_carlo
@@ -123,7 +123,7 @@ def monte_carlo(
     estimator_choices(estimators)  # refuses a wrong name before any work
     place = out or default_folder("monte-carlo", world.name)
     told = world.with_changes(**assumed) if assumed else world
-    with reporter.note_if_slow("preparing the filters …"):
+    with reporter.note_if_compiling("the filters"):
         _compile(estimators, identities=world.sensor.identities)
     if merge:
         monte_carlo.merge_blocks(merge, place)

@@ -33,7 +33,7 @@ def noise_study(
         ),
     ],
     *,
-    estimator: options.EstimatorName = "ekf",
+    estimator: options.EstimatorName = "invariant",
     motion_std: options.MotionStd = None,
     measurement_std: options.MeasurementStd = None,
     initial_pose_std: options.InitialPoseStd = None,
@@ -72,6 +72,7 @@ def noise_study(
     --------
     slamgym noise-study data.txt
     slamgym noise-study six_landmarks --seed 3 --out study
+    slamgym noise-study loop -e 'invariant[iterations=3]'
     slamgym noise-study six_landmarks --runs 100 -e ekf,invariant
     """
     from ..noise_study.one_run import study_log, study_scenario
@@ -86,7 +87,9 @@ def noise_study(
         _refuse({"steps": steps, "set": set_}, "a scenario, not of a log")
         log = read_any_log(Path(source))
         settings = settings_for(log, estimator=estimator, options=chosen, **stds)
-        study = one_run_study(log.name, settings, partial(study_log, log, settings))
+        study = one_run_study(
+            log.name, estimator, settings, partial(study_log, log, settings)
+        )
     else:
         _refuse(stds, "a log; the filter knows the noise of a scenario")
         world = chosen_scenario(source, steps, set_)
@@ -96,6 +99,7 @@ def noise_study(
             record = partial(recorded, controller=controller, seed=seed)
             study = one_run_study(
                 world.name,
+                estimator,
                 settings,
                 partial(
                     study_scenario, world, record, estimator=estimator, options=chosen
@@ -129,16 +133,18 @@ class Study(NamedTuple):
 
 
 def one_run_study(
-    name: str, settings: "FilterSettings", study: "Callable[..., list[NoiseRun]]"
+    name: str,
+    estimator: str,
+    settings: "FilterSettings",
+    study: "Callable[..., list[NoiseRun]]",
 ) -> Study:
     """Prepare the study of a log or of one run of a scenario."""
     from ... import __version__
     from ..figures import noise_study_figure
     from ..runs.summary import settings_table
     from .noise_tables import runs_table
+    from .tables import heading
     from .warm_up import warm_up
-
-    estimator = settings.estimator
 
     def run(reporter: "Reporter") -> Results:
         warm_up(settings, reporter)
@@ -146,7 +152,7 @@ def one_run_study(
             runs = study(progress=tick)
         with reporter.progress("drawing"):
             figure = noise_study_figure([(run.title, run.trace) for run in runs])
-        title = f"[bold]{name}[/], noise study of [bold]{estimator}[/]\n"
+        title = heading("", name, ", noise study of ", estimator)
         rows, titles = [run.row for run in runs], [run.title for run in runs]
         return Results(rows, titles, figure, 130, (title, runs_table(runs)))
 
@@ -232,7 +238,7 @@ def _plain(row: "NoiseRow | NoiseEffect") -> dict[str, Any]:
 def _is_scenario(source: str) -> bool:
     """Whether a source is a scenario; refuse what is neither scenario nor log."""
     from ...sim_configs import list_presets
-    from ...sim_configs.scenario_errors import closest
+    from ...suggestions import closest
 
     if source in list_presets() or source.endswith(".toml"):
         return True

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 from rich.text import Text
 
+from ..monte_carlo.report.headings import headings_and_key
 from ..noise_study.variations import Variation
 from .tables import significant
 
@@ -41,14 +42,17 @@ def runs_table(runs: "Sequence[NoiseRun]") -> Table:
 
 def effects_table(name: str, runs: int, effects: "Sequence[NoiseEffect]") -> Table:
     """Lay out the study over many runs, a column for each estimator."""
+    labels = list(dict.fromkeys(effect.estimator for effect in effects))
+    headings, key = headings_and_key(labels)
+    note = "± is the standard error. noise_study.csv holds further figures."
     table = _table(
         "changed",
         "noise",
         title=f"{name}, {runs} runs each: NEES / 3 of the pose; 1 is expected",
-        caption="± is the standard error. noise_study.csv holds further figures.",
+        caption=f"{key}\n{note}".strip(),
     )
-    for label in dict.fromkeys(effect.estimator for effect in effects):
-        table.add_column(Text(label), justify="right", overflow="fold")
+    for heading in headings:
+        table.add_column(Text(heading), justify="right", overflow="fold")
     rows: dict[tuple[str, Variation], list[str]] = {}
     for effect in effects:
         variation = Variation(effect.sigma, effect.factor)
@@ -60,7 +64,12 @@ def effects_table(name: str, runs: int, effects: "Sequence[NoiseEffect]") -> Tab
 
 def _table(*names: str, title: str, caption: str | None = None) -> Table:
     table = Table(
-        title=title, caption=caption, title_justify="left", box=None, pad_edge=False
+        title=title,
+        caption=None if caption is None else Text(caption),
+        title_justify="left",
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
     )
     for name in names:
         table.add_column(name, no_wrap=True)

@@ -44,7 +44,8 @@ EstimatorName = Annotated[
     str,
     option(
         "--estimator -e NAME",
-        'A filter (see: slamgym estimators), or "module:Class" of your own.',
+        'A filter (see: slamgym estimators), or "module:Class" of your own, with or '
+        'without options, as in "invariant[iterations=3]".',
     ),
 ]
 EstimatorNames = Annotated[
@@ -60,7 +61,8 @@ EstimatorOptions = Annotated[
     list[str] | None,
     option(
         "--option KEY=VALUE",
-        f"An option of the filters, such as gate_probability=0.999. {REPEATED}",
+        "An option of all filters, such as gate_probability=0.999; those in brackets "
+        f"go before. {REPEATED}",
     ),
 ]
 ScenarioChanges = Annotated[

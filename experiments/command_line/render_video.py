@@ -30,7 +30,7 @@ def render(
         options.option(
             "--estimator -e NAME",
             'The filter whose belief is drawn, or "none".',
-            "ekf where readings carry identities",
+            "invariant",
         ),
     ] = None,
     option: options.EstimatorOptions = None,
@@ -63,7 +63,7 @@ def render(
     from .warm_up import warm_up
 
     world = chosen_scenario(scenario, steps, set_)
-    shown = estimator or ("ekf" if world.sensor.identities else "none")
+    shown = estimator or "invariant"
     chosen = assignments("--option", option)
     settings = None
     if shown != "none":

@@ -22,7 +22,7 @@ def replay(
         ),
     ],
     *,
-    estimator: options.EstimatorNames = "ekf",
+    estimator: options.EstimatorNames = "invariant",
     motion_std: options.MotionStd = None,
     measurement_std: options.MeasurementStd = None,
     initial_pose_std: options.InitialPoseStd = None,
@@ -75,9 +75,9 @@ def replay(
     Examples
     --------
     slamgym replay data.txt
-    slamgym replay data.txt --landmark-init independent --out homework
+    slamgym replay data.txt -e ekf --landmark-init independent --out homework
     slamgym replay sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
-    slamgym replay results/loop-ekf/log.csv --estimator ekf,invariant
+    slamgym replay results/loop-invariant/log.csv --estimator ekf,invariant
     slamgym replay graph.txt --truth true.g2o --noise-from-file
     """
     from ..logs.anonymous import without_identities

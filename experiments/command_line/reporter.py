@@ -3,7 +3,6 @@
 import contextlib
 import json
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -15,7 +14,6 @@ from rich.text import Text
 
 Tick = Callable[[int, int], None]
 
-_SLOW = 1.0  # [s] without output before a note is printed
 _BETWEEN = 0.1  # [s] between two updates of a bar
 
 
@@ -111,15 +109,20 @@ class Reporter:
             yield
 
     @contextlib.contextmanager
-    def note_if_slow(self, note: str) -> Iterator[None]:
-        """Print a note to standard error if the block takes long."""
-        timer = threading.Timer(_SLOW, self._notes.print, [note])
-        timer.daemon = True
-        timer.start()
-        try:
+    def note_if_compiling(self, what: str) -> Iterator[None]:
+        """Print a note to standard error, once, if the block compiles kernels."""
+        from ...kernel_cache import on_compilation
+
+        is_noted = False
+
+        def note() -> None:
+            nonlocal is_noted
+            if not is_noted:
+                self._notes.print(f"compiling {what}, once after each installation …")
+            is_noted = True
+
+        with on_compilation(note):
             yield
-        finally:
-            timer.cancel()
 
 
 class _Rate(bars.ProgressColumn):

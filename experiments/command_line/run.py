@@ -1,5 +1,6 @@
 """``slamgym run``: drive through a scenario, filter what the robot reads, draw."""
 
+import shlex
 from functools import partial
 
 from . import options
@@ -11,7 +12,7 @@ from .program import command
 def run(
     scenario: options.ScenarioName,
     *,
-    estimator: options.EstimatorNames = "ekf",
+    estimator: options.EstimatorNames = "invariant",
     option: options.EstimatorOptions = None,
     seed: options.Seed = 0,
     steps: options.Steps = None,
@@ -34,13 +35,14 @@ def run(
     slamgym run six_landmarks
     slamgym run loop --seed 3 --out loop_3
     slamgym run loop --estimator ekf,invariant
+    slamgym run loop -e 'invariant[iterations=3,gate_probability=0.999]'
     slamgym run dense --set sensor.max_range=4 --steps 100 --json
     slamgym run hidden_identities -e invariant --resolution 0.5
     slamgym run mine.toml --controller random --estimator mine:MyFilter
     """
     from ...sim_configs import save_scenario
     from ..runs.filter_settings import settings_for_scenario
-    from .chosen_filters import chosen_filters
+    from .chosen_filters import chosen_filters, tested_filters
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
     from .run_files import check_rerun, filter_and_write, show_run
@@ -70,3 +72,9 @@ def run(
             rerun=rerun,
         )
     show_run(summary, place, reporter)
+    tested = tested_filters([*filters])
+    command = ["slamgym", "monte-carlo", scenario, *(f"--set={s}" for s in set_ or ())]
+    reporter.show_verbatim(
+        "\nOne run tests no filter: its errors depend on the noise drawn. Test with\n"
+        f"{shlex.join([*command, '-e', ','.join(tested)])}"
+    )

@@ -21,7 +21,7 @@ from .association_table import association_table
 from .errors import BadInputError
 from .output_folder import write_summary
 from .reporter import Reporter
-from .tables import comparison_table, key_figures, landmark_table, written
+from .tables import comparison_table, heading, key_figures, landmark_table, written
 from .warm_up import warm_up
 
 _FEW_STEPS = 60  # of a run whose every step is drawn by default
@@ -197,7 +197,7 @@ def write_figures(
 
 def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
     """Print a run's landmarks, key figures and files."""
-    title = f"[bold]{summary['log']}[/] filtered by [bold]{summary['estimator']}[/]\n"
+    title = heading("", summary["log"], " filtered by ", summary["estimator"])
     reporter.show(
         title,
         landmark_table(summary),

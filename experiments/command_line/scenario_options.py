@@ -6,7 +6,7 @@ import numpy as np
 
 from ...envs.controllers import CONTROLLERS, Controller, make_controller
 from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.scenario_errors import closest
+from ...suggestions import closest
 from ..logs.recording import record_episode
 from ..logs.slamlog import SlamLog
 from .errors import BadInputError

@@ -9,8 +9,6 @@ from . import options
 from .option_values import assignments, standard_deviations
 from .program import command
 
-_NOTE = "compiling the smoother, once after each installation …"
-
 
 @command
 def smooth(
@@ -51,17 +49,19 @@ def smooth(
     --------
     slamgym smooth data.txt
     slamgym smooth sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
-    slamgym smooth log.csv --option gate_probability=0.999 --robust huber
+    slamgym smooth log.csv -e 'invariant[gate_probability=0.999]' --robust huber
     """
+    from ...estimator.support.filter_labels import read_label
     from ..figures import save_figure, smoothed_figure
     from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
     from ..runs.log_smoothing import smooth_log, summarise_smoothing
     from .output_folder import default_folder, output_folder, write_summary
     from .reporter import Reporter
     from .run_files import note_choices, read_any_log
-    from .tables import smoothing_figures, smoothing_table, written
+    from .tables import heading, smoothing_figures, smoothing_table, written
 
-    given = assignments("--option", option) | {"follow": estimator}
+    name, own = read_label(estimator)
+    given = assignments("--option", option) | own | {"follow": name}
     if robust is not None:
         given["robust"] = robust
     reporter = Reporter(as_json=as_json)
@@ -73,11 +73,14 @@ def smooth(
     settings = settings_for(drive, estimator=SMOOTHER, **stds, options=given)
     place = out or default_folder(drive.name, "smoother")
     with output_folder(place) as folder:
-        with reporter.progress("filtering") as tick, reporter.note_if_slow(_NOTE):
+        with (
+            reporter.progress("filtering") as tick,
+            reporter.note_if_compiling("the smoother"),
+        ):
             smoothed = smooth_log(drive, settings, progress=tick)
         save_figure(smoothed_figure(smoothed), folder / "map.png")
         summary = write_summary(folder, summarise_smoothing(smoothed, settings))
-    title = f"[bold]{summary['log']}[/] smoothed, following [bold]{estimator}[/]\n"
+    title = heading("", summary["log"], " smoothed, following ", estimator)
     files = written(str(place), summary["files"])
     figures = smoothing_figures(summary)
     reporter.show(title, smoothing_table(summary), "", figures, "", files)

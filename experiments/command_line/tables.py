@@ -1,11 +1,14 @@
 """The numbers of a run as tables for the terminal."""
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.table import Table
 from rich.text import Text
+
+from ..monte_carlo.report.headings import headings_and_key
 
 _FATES = (
     ("rejected", "rejected by the gate"),
@@ -13,22 +16,52 @@ _FATES = (
     ("tentative", "of unconfirmed ones"),
     ("ambiguous", "ambiguous"),
 )
+_MOST_ROWS = 10  # landmarks; larger maps show the worst ones
+_WORST = 5
+_WIDTH = 80  # of a terminal
 _TOO_MUCH, _TOO_LITTLE = 0.5, 2.0  # of NIS or NEES per degree, where 1 is expected
 
 
 def landmark_table(summary: dict[str, Any]) -> Table:
-    """Lay out the landmarks and their distances to the truth."""
-    table = Table(title="Landmarks", title_justify="left", box=None, pad_edge=False)
-    known = any(row["euclidean"] is not None for row in summary["landmarks"])
+    """Lay out the landmarks and their distances to the truth, the worst of many."""
+    rows = summary["landmarks"]
+    known = any(row["euclidean"] is not None for row in rows)
+    shown, caption = rows, None
+    if len(rows) > _MOST_ROWS:
+        shown = sorted(rows, key=_distance, reverse=True)[:_WORST]
+        which = "largest errors" if known else "first"
+        caption = Text(f"the {_WORST} {which} of {len(rows)}; all: summary.json", "dim")
+    table = Table(
+        title="Landmarks",
+        title_justify="left",
+        caption=caption,
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
+    )
     headings = ["id", "x [m]", "y [m]"]
     headings += ["Euclidean [m]", "Mahalanobis [σ]"] if known else []
     for heading in headings:
         table.add_column(Text(heading), justify="right")
-    for row in summary["landmarks"]:
+    for row in shown:
         cells = [str(row["id"]), _number(row["x"], 4), _number(row["y"], 4)]
         distances = [_number(row["euclidean"], 7), _number(row["mahalanobis"], 5)]
         table.add_row(*cells, *(distances if known else []))
     return table
+
+
+def _distance(row: Mapping[str, float | None]) -> tuple[float, float]:
+    """Rank a landmark by its error in σ, then in metres; -1 where unknown."""
+    sigmas, metres = row["mahalanobis"], row["euclidean"]
+    return (-1.0 if sigmas is None else sigmas, -1.0 if metres is None else metres)
+
+
+def heading(*parts: str) -> Text:
+    """Write a title with every second part bold, and an empty line below."""
+    text = Text()
+    for k, part in enumerate(parts):
+        text.append(part, style="bold" if k % 2 else "")
+    return text.append("\n")
 
 
 def key_figures(summary: dict[str, Any]) -> Table:
@@ -56,8 +89,9 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("map", _map(summary["map_changes"], len(summary["landmarks"]))),
         ("final pose", _pose(summary["pose"], summary["pose_covariance"])),
     ]
+    are_compared = bool(summary.get("others"))  # a table of its own has these
     for name, key in (("path error", "ate"), ("map error", "landmark_rmse")):
-        if summary[key] is not None:
+        if summary[key] is not None and not are_compared:
             rows.append((name, _rmse(summary[key])))
     frame = (summary["nees"] or {}).get("frame", "additive")
     for name, key, hint in (
@@ -109,15 +143,16 @@ def _ratio(numbers: dict[str, Any], hint: tuple[str, str]) -> str:
 
 
 def written(folder: str, files: Sequence[str]) -> Text:
-    """List the written files; the pictures of single steps take one line."""
+    """List the written files; the pictures of single steps count as one."""
     steps = [file for file in files if file.startswith("map_steps/")]
-    lines = [file for file in files if file not in steps]
+    names = sorted(file for file in files if file not in steps)
     if steps:
-        lines.append(f"map_steps/ ({len(steps)} pictures)")
+        names.append(f"map_steps/ ({len(steps)}\N{NO-BREAK SPACE}pictures)")
+    listed = textwrap.fill(
+        ", ".join(names), _WIDTH, initial_indent="  ", subsequent_indent="  "
+    )
     text = Text("Wrote ", style="bold").append(f"{folder}/", style="not bold")
-    for line in sorted(lines):
-        text.append(f"\n  {line}", style="not bold")
-    return text
+    return text.append(f"\n{listed}", style="not bold")
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -137,9 +172,15 @@ def comparison_table(columns: Mapping[str, Mapping[str, Any]]) -> Table:
     columns : mapping
         By the heading, ``ate``, ``landmark_rmse`` and ``nees`` as in a run's summary.
     """
-    table = Table(box=None, pad_edge=False)
+    headings, key_of_headings = headings_and_key(list(columns))
+    table = Table(
+        caption=Text(key_of_headings) if key_of_headings else None,
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
+    )
     table.add_column("")
-    for heading in columns:
+    for heading in headings:
         table.add_column(Text(heading), justify="right")
     for name, key, kind in (
         ("path error, raw [m RMS]", "ate", "raw"),

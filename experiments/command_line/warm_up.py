@@ -5,11 +5,9 @@ from dataclasses import replace
 from ..runs.filter_settings import FilterSettings
 from .reporter import Reporter
 
-_NOTE = "compiling the filter, once after each installation …"
-
 
 def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
-    """Take a filter's first steps, and print a note if it compiles for long.
+    """Take a filter's first steps, and print a note if it compiles.
 
     Raises
     ------
@@ -19,7 +17,7 @@ def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
     origin = (0.0, 0.0, 0.0)
     settings.make(origin)
     usual = replace(settings, motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2)
-    with reporter.note_if_slow(_NOTE):
+    with reporter.note_if_compiling("the filter"):
         estimator = usual.make(origin)
         try:
             for _ in range(2):

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.scenario_errors import closest
+from ...suggestions import closest
 from ..monte_carlo import monte_carlo
 from ..monte_carlo.report.scores import EstimatorScores, labels_of, scores_of
 from ..runs.nan_statistics import mean, root_mean_square, standard_error

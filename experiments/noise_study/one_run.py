@@ -90,7 +90,7 @@ def study_scenario(
     scenario: Scenario,
     record: Callable[[Scenario], SlamLog],
     *,
-    estimator: str = "ekf",
+    estimator: str = "invariant",
     options: Mapping[str, object] | None = None,
     progress: Progress | None = None,
 ) -> list[NoiseRun]:

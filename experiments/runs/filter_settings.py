@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...estimator import registry
 from ...estimator.interface import SlamEstimator
+from ...estimator.support.filter_labels import read_label
 from ...sim_configs import Scenario
 from ..logs.events import Scan
 from ..logs.lines import LogError
@@ -77,6 +78,8 @@ class FilterSettings:
                 initial_pose_std=self.initial_pose_std,
                 **self.options,
             )
+        except registry.UnknownOptionError:
+            raise
         except TypeError as error:
             raise ValueError(
                 f"estimator '{self.estimator}' refuses its options: {error}"
@@ -98,7 +101,7 @@ class FilterSettings:
 def settings_for(
     log: SlamLog,
     *,
-    estimator: str = "ekf",
+    estimator: str = "invariant",
     motion_std: Sequence[float] | None = None,
     measurement_std: Sequence[float] | None = None,
     initial_pose_std: Sequence[float] | None = None,
@@ -117,7 +120,8 @@ def settings_for(
     log : SlamLog
         The log.
     estimator : str
-        Registered name or "module:Class".
+        Registered name or "module:Class", with or without options in brackets, which
+        override `options`.
     motion_std, initial_pose_std : sequence of 3 floats, optional
         See :class:`FilterSettings`.
     measurement_std : sequence of 2 floats, optional
@@ -133,7 +137,8 @@ def settings_for(
     LogError
         If a value in the header is malformed.
     """
-    estimator = OFFLINE.get(estimator, estimator)
+    name, own = read_label(estimator)
+    estimator = OFFLINE.get(name, name)
     factory = registry.find_estimator(estimator)
     header = dict(log.header)
     if measurement_std is not None:
@@ -151,6 +156,7 @@ def settings_for(
             **_header_options(log.name, header, factory),
             **_needed_options(log, header),
             **(options or {}),
+            **own,
         },
     )
 
@@ -178,7 +184,7 @@ def noise_or_assumed(
 def settings_for_scenario(
     scenario: Scenario,
     *,
-    estimator: str = "ekf",
+    estimator: str = "invariant",
     options: Mapping[str, Any] | None = None,
 ) -> FilterSettings:
     """Set up an estimator with the noise of a world.

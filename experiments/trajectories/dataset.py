@@ -6,7 +6,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal
 
-from ...sim_configs.scenario_errors import closest
+from ...suggestions import closest
 from .formats import trajectory_format
 from .manifest import Manifest, ShardEntry, checksum, read_manifest
 from .trajectory import Trajectory

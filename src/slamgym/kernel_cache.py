@@ -14,7 +14,7 @@ import tempfile
 import time
 import uuid
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,20 @@ MAX_BYTES = 256 * 2**20
 _USER_CACHES = {"win32": "~/AppData/Local", "darwin": "~/Library/Caches"}
 _DAY = 86400.0
 _DIGEST = hashlib.sha256().digest_size
+_listeners: list[Callable[[], object]] = []
+
+
+@contextlib.contextmanager
+def on_compilation(notify: Callable[[], object]) -> Iterator[None]:
+    """Call a function whenever a kernel must be compiled in the block.
+
+    It is called before the compilation, and not for kernels that are loaded.
+    """
+    _listeners.append(notify)
+    try:
+        yield
+    finally:
+        _listeners.remove(notify)
 
 
 def cache_folder() -> Path:
@@ -89,6 +103,13 @@ class KernelCache:
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the compiled code for the types of a call, or None."""
+        found = self._loaded(signature, target_context)
+        if found is None:
+            for notify in tuple(_listeners):
+                notify()
+        return found
+
+    def _loaded(self, signature: Any, target_context: Any) -> Any:
         if not self.enabled or self._fingerprint is None:
             return None
         target_context.refresh()

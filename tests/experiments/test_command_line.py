@@ -3,22 +3,24 @@ import json
 import os
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from slamgym import kernel_cache
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.experiments.command_line import reporter, run_files
+from slamgym.experiments.command_line import reporter, run_files, tables
 from slamgym.experiments.command_line.app import main
+from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
 
 COMMANDS = (
     "run",
     "replay",
     "smooth",
+    "fit-noise",
     "generate",
     "monte-carlo",
     "noise-study",
@@ -157,12 +159,12 @@ def test_a_graph_is_replayed_against_the_truth_of_another_file(here, without_pic
     (here / "true.g2o").write_text("".join(f"VERTEX2 {k} {k} 0.5 0\n" for k in "012"))
     result = slamgym("replay", "graph.txt", *GRAPH_NOISE, "--truth", "true.g2o")
     assert "note: left out of the log: 1 loop closures between poses\n" in result.stderr
-    summary = json.loads((here / "results/graph-ekf/summary.json").read_text())
+    summary = json.loads((here / "results/graph-invariant/summary.json").read_text())
     assert summary["ate"]["raw"] == pytest.approx(0, abs=1e-9)
     assert summary["pose"] == pytest.approx([2, 0.5, 0], abs=1e-9)
     result = slamgym("replay", "graph.txt", "--noise-from-file")
     assert "note: noise from the file, by its information matrices\n" in result.stderr
-    settings = json.loads((here / "results/graph-ekf/summary.json").read_text())
+    settings = json.loads((here / "results/graph-invariant/summary.json").read_text())
     assert settings["settings"]["motion_std"] == pytest.approx((0.02, 0.02, 0.01))
     assert settings["settings"]["measurement_std"] == pytest.approx((0, 0.1))
     assert settings["settings"]["options"]["bearing_std_metres"] == pytest.approx(0.1)
@@ -186,7 +188,9 @@ def test_the_log_of_a_run_replays_to_the_same_numbers(finished_run, without_pict
 def test_a_replay_prints_every_landmark_with_both_distances(log, without_pictures):
     lines = printed("replay", log).splitlines()
     rows = [line.split() for line in lines if line.strip().startswith(("7 ", "9 "))]
-    summary = json.loads((log.parent / "results/little-ekf/summary.json").read_text())
+    summary = json.loads(
+        (log.parent / "results/little-invariant/summary.json").read_text()
+    )
     seven = summary["landmarks"][0]
     assert rows[0] == [
         "7",
@@ -196,15 +200,15 @@ def test_a_replay_prints_every_landmark_with_both_distances(log, without_picture
         f"{seven['mahalanobis']:.5f}",
     ]
     assert rows[1][3:] == ["-", "-"]
-    assert "Wrote results/little-ekf/" in lines
+    assert "Wrote results/little-invariant/" in lines
 
 
 def test_the_course_log_is_replayed_with_its_published_noise(
     public_logs, without_pictures
 ):
     data = public_logs / "raw" / "cmu16833" / "data.txt"
-    full = answered("replay", data)["landmarks"]
-    independent = answered("replay", data, "--landmark-init", "independent")
+    full = answered("replay", data, "-e", "ekf")["landmarks"]
+    independent = answered("replay", data, "-e", "ekf[landmark_init=independent]")
     assert full[0]["euclidean"] == pytest.approx(0.0042047, abs=1e-6)
     first = independent["landmarks"][0]
     assert first["euclidean"] == pytest.approx(0.0024197, abs=1e-6)
@@ -291,7 +295,8 @@ def test_a_recording_for_rerun_is_checked_before_the_work(log, monkeypatch):
 
 @pytest.mark.parametrize("names", ["ekf,ekf", ",", "ekf[x"])
 def test_malformed_lists_of_filters_are_refused(log, names):
-    assert refused("replay", log, "-e", names).startswith("estimators must")
+    message = refused("replay", log, "-e", names)
+    assert message.startswith(("estimators must", "an estimator must be like ekf or"))
 
 
 def test_an_older_output_is_replaced_as_a_whole(log, without_pictures):
@@ -393,7 +398,9 @@ def test_a_malformed_log_is_refused_with_its_line(log, wrong, message):
         (("--landmark-init", "half"), "landmark_init must be 'full' or 'independent'"),
         (("--estimator", "ekv"), "unknown estimator 'ekv'; did you mean 'ekf'?"),
         (("--option", "gate"), "--option must be KEY=VALUE, got 'gate'"),
-        (("--option", "gate=1"), "estimator 'ekf' refuses its options"),
+        (("--option", "gate=1"), "has no option 'gate'; did you mean 'gate_prob"),
+        (("-e", "ekf[iteration=3]"), "ekf has no option 'iteration' (there are"),
+        (("-e", "invariant[iteration=3]"), "'iteration'; did you mean 'iterations'?"),
         (("--every-steps",), "No such option: --every-steps"),
     ],
 )
@@ -418,7 +425,7 @@ def test_a_wrong_option_of_the_filter_is_refused(log, options, message):
         (("loop", "--set", "sensor"), "--set must be KEY=VALUE, got 'sensor'"),
         (("loop", "--steps", "1"), "steps must be an integer >= 2, got 1"),
         (("loop", "--controller", "waypoint"), "did you mean 'waypoints'?"),
-        (("loop", "--estimator", "EKF"), "unknown estimator 'EKF'"),
+        (("loop", "--estimator", "EKF"), "'EKF'; did you mean 'ekf'?"),
         (("loop", "--seed", "-1"), "Invalid value for '--seed'"),
     ],
 )
@@ -505,8 +512,6 @@ def test_help_explains_each_command(command):
     assert command in printed("--help")
     text = printed(command, "--help")
     assert "Usage:" in text
-    if command not in ("scenarios", "estimators"):
-        assert f"slamgym {command} " in text.partition("Examples:")[2]
 
 
 def test_without_a_command_the_help_is_shown():
@@ -540,14 +545,61 @@ def test_the_installed_program_answers_an_error_with_one_line():
     assert result.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(("slow_after", "note"), [(0.01, "compiling\n"), (60.0, "")])
-def test_a_long_silence_is_explained_on_standard_error(
-    slow_after, note, capsys, monkeypatch
+def test_a_compilation_is_noted_once_and_nothing_else_is(capsys, monkeypatch):
+    @jit
+    def double(x):
+        return 2 * x
+
+    monkeypatch.setattr(kernel_cache, "_save", lambda name, content: None)
+    report = reporter.Reporter(as_json=True)
+    for kinds, note in (((1.0, 1), "compiling the kernel, once"), ((1.0, 1), "")):
+        with report.note_if_compiling("the kernel"):
+            assert [double(x) for x in kinds] == [2, 2]
+        output = capsys.readouterr()
+        assert output.out == ""
+        assert output.err.startswith(note)
+        assert output.err.count("\n") == bool(note)
+
+
+@pytest.mark.parametrize("estimators", ["invariant", "ekf,invariant[iterations=3]"])
+def test_a_run_fits_on_a_screen_whatever_the_map(
+    estimators, without_pictures, monkeypatch
 ):
-    monkeypatch.setattr(reporter, "_SLOW", slow_after)
-    with reporter.Reporter(as_json=True).note_if_slow("compiling"):
-        time.sleep(0.2)
-    assert capsys.readouterr() == ("", note)
+    monkeypatch.setenv("COLUMNS", "80")
+    small = ("--set", "landmarks.count=80", "--set", "sensor.identities=false")
+    text = printed("run", "dense", *small, "--steps", 30, "-e", estimators)
+    lines = text.splitlines()
+    assert len(lines) <= 40
+    assert max(map(len, lines[:-1])) <= 80
+    assert "the 5 largest errors of " in text
+    assert lines[-1].startswith("slamgym monte-carlo dense --set=landmarks.count=80 ")
+
+
+def test_a_run_ends_with_the_command_that_tests_its_filter(without_pictures):
+    last = printed("run", "loop", "--steps", 3).splitlines()[-1]
+    assert last == "slamgym monte-carlo loop -e ekf,invariant"
+
+
+def test_the_worst_landmarks_of_a_large_map_are_shown():
+    rows = [
+        {"id": k, "x": 0.0, "y": 0.0, "euclidean": k % 7, "mahalanobis": None}
+        for k in range(12)
+    ]
+    table = tables.landmark_table({"landmarks": rows})
+    assert list(table.columns[0].cells) == ["6", "5", "4", "11", "3"]
+    rows[2]["mahalanobis"] = 0.5
+    table = tables.landmark_table({"landmarks": rows})
+    assert next(iter(table.columns[0].cells)) == "2"
+    few = tables.landmark_table({"landmarks": rows[:10]})
+    assert list(few.columns[0].cells) == [str(k) for k in range(10)]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_into_80_columns_with_an_example(command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = printed(command, "--help")
+    assert max(map(len, text.splitlines())) <= 80
+    assert f"slamgym {command} " in text.partition("Examples:")[2] + " "
 
 
 def test_submaps_may_lie_in_a_folder(here, without_pictures):

@@ -604,7 +604,7 @@ def test_memory_grows_with_the_block_and_not_with_the_runs(tmp_path):
         ({"estimators": "ekf,ekf"}, "'ekf' twice"),
         ({"estimators": ""}, "must name at least one"),
         ({"estimators": "ekf[iterations"}, "must be like ekf or invariant"),
-        ({"estimators": "ekf[speed=3]"}, "refuses its options"),
+        ({"estimators": "ekf[speed=3]"}, "has no option 'speed'"),
         ({"jobs": 0}, "jobs must be an integer >= 1"),
         ({"jobs": 2.5}, "jobs must be an integer >= 1"),
         ({"seed": 2**63}, "seed must be"),

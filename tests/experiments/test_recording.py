@@ -49,7 +49,7 @@ def in_the_loop(scenario, seed):
 def test_recording_and_replay_equal_the_loop_of_an_agent_bit_for_bit(preset):
     scenario = load_scenario(preset).with_changes(steps=29)
     log = recorded(scenario)
-    done = replay(log, settings_for(log).make(log.start))
+    done = replay(log, settings_for(log, estimator="ekf").make(log.start))
     beliefs = in_the_loop(scenario, seed=3)
     np.testing.assert_array_equal(done.trace.poses, [b.pose for b in beliefs])
     np.testing.assert_array_equal(done.belief.mean, beliefs[-1].mean)

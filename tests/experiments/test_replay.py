@@ -77,7 +77,7 @@ def circles(clutter=0.5, steps=80):
 def test_the_summary_scores_readings_without_identity(method):
     log = circles()
     policy = {"association": method, "backdate": False}  # reports say it all
-    settings = settings_for(log, options={"management": policy})
+    settings = settings_for(log, estimator="ekf", options={"management": policy})
     done = replay(log, settings.make(log.start))
     summary = summarise(done)["association"]
     ids, size = done.decisions.identities(), len(done.belief.landmark_ids)
@@ -442,7 +442,7 @@ def test_a_header_that_cannot_be_used_is_refused(header, message):
 
 def course_table(public_logs, **options):
     log = read_log(public_logs / "raw" / "cmu16833" / "data.txt")
-    settings = settings_for(log, options=options)
+    settings = settings_for(log, estimator="ekf", options=options)
     return summarise(replay(log, settings.make(log.start)))["landmarks"]
 
 
@@ -467,7 +467,11 @@ def test_independent_landmarks_reproduce_the_homeworks_table(public_logs):
 def errors_on(path, motion_std, measurement_std, **options):
     log = read_log(path)
     settings = settings_for(
-        log, motion_std=motion_std, measurement_std=measurement_std, options=options
+        log,
+        estimator="ekf",
+        motion_std=motion_std,
+        measurement_std=measurement_std,
+        options=options,
     )
     summary = summarise(replay(log, settings.make(log.start)))
     ate = summary["ate"] or {"aligned": None, "raw": None}

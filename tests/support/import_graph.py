@@ -12,7 +12,8 @@ PACKAGES = (
     "agents",
     "experiments",
 )
-GROUND = {"arrays", "jit", "magnitudes"}  # beside the rooms; every room may import them
+# Beside the rooms; every room may import them.
+GROUND = {"arrays", "jit", "kernel_cache", "magnitudes", "suggestions"}
 
 
 def module_name(file):

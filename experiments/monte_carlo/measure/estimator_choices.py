@@ -3,23 +3,19 @@
 import hashlib
 import inspect
 import marshal
-import re
-import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ....estimator import registry
 from ....estimator.registry import find_estimator, list_estimators, register_estimator
+from ....estimator.support.filter_labels import read_label, split_labels
 from ....sim_configs import Scenario
 from ...runs.filter_settings import OFFLINE, FilterSettings, settings_for_scenario
 
 _PACKAGE = Path(registry.__file__).resolve().parents[1]
-_BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")
 OWN_NAMES = frozenset(list_estimators())
 """Names that stay those of slamgym's own estimators."""
-_COMMA = re.compile(r",(?![^\[]*\])")  # outside brackets
-_SPEC = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>[^\]]*)\])?")
 
 
 class EstimatorChoice(NamedTuple):
@@ -109,30 +105,17 @@ def _choices(
     if isinstance(estimators, Mapping):
         return [_labelled(label, what) for label, what in estimators.items()]
     texts = [estimators] if isinstance(estimators, str) else estimators
-    parts = [part for text in texts for part in _COMMA.split(text)]
-    return [_read(part.strip()) for part in parts if part.strip()]
+    return [_read(label) for text in texts for label in split_labels(text)]
 
 
-def _read(spec: str) -> EstimatorChoice:
-    match = _SPEC.fullmatch(spec)
-    if match is None:
-        raise ValueError(
-            f"estimators must be like ekf or invariant[iterations=3], got '{spec}'"
-        )
-    options = _BARE_WORD.sub(r'\1"\2"', match["options"] or "")
-    try:
-        table = tomllib.loads(f"options = {{ {options} }}")["options"]
-    except (tomllib.TOMLDecodeError, RecursionError):
-        raise ValueError(
-            f"options must be like [iterations=3,sequential=true], got '{spec}'"
-        ) from None
-    name = match["name"].strip()
-    return EstimatorChoice(spec, OFFLINE.get(name, name), table)
+def _read(label: str) -> EstimatorChoice:
+    name, options = read_label(label)
+    return EstimatorChoice(label, OFFLINE.get(name, name), options)
 
 
 def _labelled(label: str, what: Any) -> EstimatorChoice:
     if isinstance(what, str):
-        return EstimatorChoice(label, OFFLINE.get(what, what))
+        return _read(what)._replace(label=label)
     if isinstance(what, tuple) and len(what) == 2:
         name, options = what
         return EstimatorChoice(label, _name_of(label, name), options)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from rich.table import Table
 from rich.text import Text
 
+from .headings import headings_and_key
 from .verdict import KINDS, in_degrees
 
 Entry = dict[str, Any]
@@ -165,19 +166,21 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
         Result of ``summarise_monte_carlo``.
     """
     entries = summary["estimators"]
+    headings, key = headings_and_key(list(entries))
     table = Table(
         title=Text(
             f"{summary['scenario']}: {summary['runs']} runs of {summary['steps']} "
             f"steps, seed {summary['seed']}"
         ),
-        caption=_caption(entries),
+        caption=Text(f"{key}\n{_caption(entries)}".strip()),
+        caption_justify="left",
         pad_edge=False,
         box=None,
     )
     table.add_column("")
     table.add_column("should be", justify="right", style="dim", no_wrap=True)
-    for label in entries:
-        table.add_column(Text(label), justify="right", overflow="fold", min_width=7)
+    for heading in headings:
+        table.add_column(Text(heading), justify="right", overflow="fold", min_width=7)
     verdicts = [entry["verdict"] for entry in entries.values()]
     table.add_row(
         "verdict", "", *(Text(word, _STYLES[KINDS[word]]) for word in verdicts)
