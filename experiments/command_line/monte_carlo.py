@@ -105,7 +105,7 @@ def monte_carlo(
     slamgym monte-carlo loop --estimators ekf,invariant --runs 200 --out loop
     slamgym monte-carlo six_landmarks -e mine:MyFilter --runs 100 --jobs 4
     slamgym monte-carlo loop --assume motion.std=[0.1,0.1,0.1]
-    slamgym monte-carlo hidden_identities -e 'ekf[management={association=joint}]'
+    slamgym monte-carlo hidden_identities -e 'ekf[management={backdate=true}]'
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
     from ...sim_configs.atomic_file import replace_when_written
