@@ -423,7 +423,7 @@ def test_a_wrong_option_of_the_filter_is_refused(log, options, message):
         ),
         (("loop", "--set", "motion.std=[0.1, 0.1]"), "motion.std must be 3 "),
         (("loop", "--set", "sensor"), "--set must be KEY=VALUE, got 'sensor'"),
-        (("loop", "--steps", "1"), "steps must be an integer >= 2, at most"),
+        (("loop", "--steps", "1"), "steps must be an integer >= 2, got 1"),
         (("loop", "--controller", "waypoint"), "did you mean 'waypoints'?"),
         (("loop", "--estimator", "EKF"), "'EKF'; did you mean 'ekf'?"),
         (("loop", "--seed", "-1"), "Invalid value for '--seed'"),
