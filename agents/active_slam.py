@@ -20,6 +20,7 @@ from .active_slam_task import ActiveSlamTask, split_settings
 from .agent_knowledge import AgentKnowledge
 from .belief_arrays import belief_storage, live_storage
 from .estimator_choice import EstimatorChoice, checked_belief, choose_estimator
+from .map_truth import map_rmse
 
 Observation = dict[str, Any]
 
@@ -64,7 +65,9 @@ class ActiveSlamEnv(LandmarkWorldEnv):
     | ``walls`` | (8,) | distance to the wall, by direction |
 
     `info` has the same keys in `reset` and `step`: the truth, ``pose`` (x, y, θ) and
-    ``collision``; the counts ``mapped`` and ``known``; and ``success``.
+    ``collision``; the counts ``mapped`` and ``known``; ``success``; ``true_rmse``, the
+    root mean square error of the mapped landmarks [m], nan without any; and
+    ``honest_success``: a success with a ``true_rmse`` of at most ``accuracy``.
 
     ## Rewards
     Per step, with U = ½ log det Σ / N the uncertainty of the map in nats per landmark,
@@ -145,8 +148,9 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         """Start an episode with a new map, and take the first scan."""
         observation, info = super().reset(seed=seed, options=options)
         self._estimator.reset(self.start_estimate, self.scenario.start.std)
-        self.task.begin(self._update(observation, step=0), _ONE_WORLD)
-        return self._output(info)
+        beliefs = self._update(observation, step=0)
+        self.task.begin(beliefs, _ONE_WORLD)
+        return self._output(beliefs, info)
 
     def step(
         self, action: ArrayLike
@@ -165,7 +169,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         actions = np.asarray(action, dtype=np.float64)[None]
         collision = np.array([info["collision"]])
         outcome = self.task.proceed(beliefs, _ONE_WORLD, actions, collision)
-        seen, info = self._output(info)
+        seen, info = self._output(beliefs, info)
         ends = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return seen, float(outcome.rewards[0]), *ends, info
 
@@ -201,12 +205,18 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         self.show_belief(belief)
         return belief_storage(belief, count, by_id=True)
 
-    def _output(self, info: dict[str, Any]) -> tuple[Observation, dict[str, Any]]:
+    def _output(
+        self, beliefs: BatchStorage, info: dict[str, Any]
+    ) -> tuple[Observation, dict[str, Any]]:
         rows = self.task.observations()
         shares = rows["progress"][0]
+        rmse = float(map_rmse(beliefs, self._landmarks[None])[0])
+        success = bool(self.task.outcome.success[0])
         counts = {
             "mapped": round(shares[1] * self.scenario.landmarks.count),
             "known": int(self.task.episodes.known.sum()),
-            "success": bool(self.task.outcome.success[0]),
+            "success": success,
+            "true_rmse": rmse,
+            "honest_success": success and rmse <= self.task.weights.accuracy,
         }
         return {key: row[0] for key, row in rows.items()}, {**info, **counts}

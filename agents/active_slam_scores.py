@@ -18,7 +18,16 @@ VALIDATION = 1_000_000
 HELD_OUT = 2_000_000
 """First seed of the maps for the final evaluation. No choice may depend on them."""
 
-MEASURES = ("total", "success", "known", "steps", "crashed")
+COLUMNS = {
+    "return": "total",
+    "success": "success",
+    "honest success": "honest",
+    "landmarks known": "known",
+    "steps": "steps",
+    "true RMSE [m]": "true_rmse",
+    "crashed": "crashed",
+}
+"""Columns of a table of scores, and the entries of `Episode` that they average."""
 
 
 class Episode(NamedTuple):
@@ -34,6 +43,10 @@ class Episode(NamedTuple):
     """Length of the episode."""
     crashed: bool
     """Whether the robot touched a wall."""
+    true_rmse: float
+    """Root mean square error of the mapped landmarks at the end [m]."""
+    honest: bool
+    """Whether it was a success, and the truth agrees."""
     path: Array
     """True positions, shape (steps + 1, 2) [m]."""
 
@@ -60,7 +73,14 @@ def run_episode(env: ActiveSlamEnv, policy: Policy, seed: int) -> Episode:
         ended = terminated or truncated
     share = info["known"] / env.scenario.landmarks.count
     return Episode(
-        total, info["success"], share, len(path) - 1, info["collision"], np.array(path)
+        total,
+        info["success"],
+        share,
+        len(path) - 1,
+        info["collision"],
+        info["true_rmse"],
+        info["honest_success"],
+        np.array(path),
     )
 
 
@@ -78,10 +98,9 @@ def baseline_policy(baseline: Baseline) -> Policy:
 
 def score_table(played: Mapping[str, Sequence[Episode]]) -> str:
     """Format a table of means with 95 % intervals, one line per policy."""
-    head = ("return", "success", "landmarks known", "steps", "crashed")
-    lines = [f"{'':10}" + "".join(f"{title:>18}" for title in head)]
+    lines = [f"{'':10}" + "".join(f"{title:>18}" for title in COLUMNS)]
     for name, episodes in played.items():
-        cells = [f"{mean_of(episodes, measure)!s:>18}" for measure in MEASURES]
+        cells = [f"{mean_of(episodes, measure)!s:>18}" for measure in COLUMNS.values()]
         lines.append(f"{name:10}" + "".join(cells))
     return "\n".join(lines)
 
@@ -92,7 +111,7 @@ def difference_lines(played: Mapping[str, Sequence[Episode]], name: str) -> str:
     Examples
     --------
     >>> low, high = (
-    ...     [Episode(x + y, True, 1.0, 9, False, np.empty((0, 2))) for x in (1.0, 7.0)]
+    ...     [Episode(x + y, *[True] * 6, np.empty((0, 2))) for x in (1.0, 7.0)]
     ...     for y in (0.0, 2.0)
     ... )
     >>> print(difference_lines({"a": high, "b": low}, "a"))
@@ -111,13 +130,13 @@ def difference_lines(played: Mapping[str, Sequence[Episode]], name: str) -> str:
 
 
 def mean_of(episodes: Sequence[Episode], measure: str) -> Mean:
-    """Return the mean of one of `MEASURES` over episodes, with its 95 % interval.
+    """Return the mean of an entry of `Episode` over episodes, with its 95 % interval.
 
     The interval is the normal one, 1.96 s / √n.
 
     Examples
     --------
-    >>> ends = [Episode(x, True, 1.0, 9, False, np.empty((0, 2))) for x in (1.0, 3.0)]
+    >>> ends = [Episode(x, *[True] * 6, np.empty((0, 2))) for x in (1.0, 3.0)]
     >>> print(mean_of(ends, "total"))
     2.00 ± 1.96
     """
@@ -132,7 +151,7 @@ def mean_difference(
     Examples
     --------
     >>> low, high = (
-    ...     [Episode(x + y, True, 1.0, 9, False, np.empty((0, 2))) for x in (1.0, 7.0)]
+    ...     [Episode(x + y, *[True] * 6, np.empty((0, 2))) for x in (1.0, 7.0)]
     ...     for y in (0.0, 2.0)
     ... )
     >>> print(mean_difference(high, low, "total"))
@@ -146,5 +165,6 @@ def _values(episodes: Sequence[Episode], measure: str) -> Array:
 
 
 def _mean(values: Array) -> Mean:
+    values = values[~np.isnan(values)]  # an empty map has no error
     spread = values.std(ddof=1) if len(values) > 1 else np.nan
     return Mean(float(values.mean()), float(1.96 * spread / np.sqrt(len(values))))

@@ -18,6 +18,7 @@ from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, split_settings
 from .belief_arrays import update_filters
 from .estimator_choice import choose_batch
+from .map_truth import map_rmse
 
 Observation = dict[str, AnyArray]
 
@@ -113,9 +114,13 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         return {key: rows.copy() for key, rows in observations.items()}
 
     def _infos(self) -> dict[str, Any]:
+        beliefs, success = self._filters.storage(), self.task.outcome.success.copy()
+        rmse = map_rmse(beliefs, self._worlds.complex_landmarks)
         return {
             **super()._infos(),
-            "mapped": (self._filters.storage().slots >= 0).sum(axis=1),
+            "mapped": (beliefs.slots >= 0).sum(axis=1),
             "known": self.task.episodes.known.sum(axis=1),
-            "success": self.task.outcome.success.copy(),
+            "success": success,
+            "true_rmse": rmse,
+            "honest_success": success & (rmse <= self.task.weights.accuracy),
         }

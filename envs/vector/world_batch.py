@@ -9,7 +9,14 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
-from ...arrays import AnyArray, Array, BoolArray, IndexArray, IntArray
+from ...arrays import (
+    AnyArray,
+    Array,
+    BoolArray,
+    ComplexArray,
+    IndexArray,
+    IntArray,
+)
 from ...sim_configs import Scenario
 from ...sim_configs.scenario import refuse_ranges
 from ..actions import clipped_actions
@@ -108,6 +115,11 @@ class WorldBatch:
     def landmarks(self) -> Array:
         """True positions, shape (B, N, 2) [m], a copy."""
         return self._landmarks.copy().view(np.float64).reshape(self.count, -1, 2)
+
+    @property
+    def complex_landmarks(self) -> ComplexArray:
+        """True positions x + iy, shape (B, N) [m]; not a copy."""
+        return self._landmarks
 
     @property
     def start_estimates(self) -> Array:
