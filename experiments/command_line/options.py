@@ -53,8 +53,8 @@ EstimatorNames = Annotated[
     option(
         "--estimator -e NAMES",
         'Filters with commas between, such as "ekf,invariant[iterations=3]" or '
-        '"module:Class" of your own. run.html shows all of them; the other files and '
-        "numbers are the first one's.",
+        '"module:Class" of your own. run.html and comparison.png show all of them; the '
+        "other files and numbers are the first one's.",
     ),
 ]
 EstimatorOptions = Annotated[

@@ -1,8 +1,9 @@
 """A log filtered by estimators: the files of the run, and what is printed of it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 from rich.text import Text
@@ -23,6 +24,9 @@ from .output_folder import write_summary
 from .reporter import Reporter
 from .tables import comparison_table, heading, key_figures, landmark_table, written
 from .warm_up import warm_up
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _FEW_STEPS = 60  # of a run whose every step is drawn by default
 
@@ -90,8 +94,8 @@ def filter_and_write(
 ) -> dict[str, Any]:
     """Filter a log, and write figures, run.html, log.csv and summary.json.
 
-    The page run.html shows all filters side by side; the other files are those of the
-    first one.
+    The page run.html and comparison.png show all filters side by side; the other files
+    are those of the first one.
 
     Parameters
     ----------
@@ -126,7 +130,12 @@ def filter_and_write(
         runs.append(run)
     first = runs[0]
     with reporter.progress("drawing") as tick:
-        write_figures(folder, first.trace, every_step=every_step, progress=tick)
+        write_figures(
+            folder, first.trace, every_step=every_step, progress=tick, walls=walls
+        )
+        if len(runs) > 1:
+            compared = figures.comparison_figure([run.trace for run in runs], walls)
+            figures.save_figure(compared, folder / "comparison.png", dpi=150)
     viewed = [
         ViewedRun(run.trace, kept) for run, kept in zip(runs, frames, strict=True)
     ]
@@ -167,6 +176,7 @@ def write_figures(
     *,
     every_step: bool,
     progress: Callable[[int, int], object],
+    walls: Sequence[Sequence[float]] = (),
 ) -> None:
     """Draw map.png, truth.png, covariance.png, errors.png and map_steps/.
 
@@ -180,18 +190,23 @@ def write_figures(
         Whether to draw the map after every step too.
     progress : callable
         Called with (figures done, figures).
+    walls : sequence of (x0, y0, x1, y1)
+        Walls to draw [m].
     """
-    drawn = {"map": figures.map_figure, "covariance": figures.covariance_figure}
-    drawn["errors"] = figures.errors_figure
+    drawn: dict[str, Callable[[RunTrace], Figure]] = {
+        "map": partial(figures.map_figure, walls=walls),
+        "covariance": figures.covariance_figure,
+        "errors": figures.errors_figure,
+    }
     if trace.true_poses is not None or trace.true_landmarks is not None:
-        drawn["truth"] = figures.truth_figure
+        drawn["truth"] = partial(figures.truth_figure, walls=walls)
     count = len(drawn) + every_step
     for done, (name, draw) in enumerate(drawn.items()):
         progress(done, count)
         figures.save_figure(draw(trace), folder / f"{name}.png")
     if every_step:
         progress(count - 1, count)
-        figures.map_sequence(trace, folder / "map_steps")
+        figures.map_sequence(trace, folder / "map_steps", walls=walls)
     progress(count, count)
 
 

@@ -1,4 +1,5 @@
 from .accuracy import truth_figure as truth_figure
+from .comparison import comparison_figure as comparison_figure
 from .consistency import errors_figure as errors_figure
 from .covariance import covariance_figure as covariance_figure
 from .maps import map_figure as map_figure

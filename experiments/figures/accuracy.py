@@ -1,5 +1,7 @@
 """Figure of the distances of a run's path and map from ground truth."""
 
+import math
+
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -14,13 +16,15 @@ from ..runs.trace import RunTrace
 from . import style
 from .map_picture import box_around
 from .style import ALARM, GREY, INK, TEAL, EllipseKind, dress, write_title
+from .walls import Walls, draw_walls, wall_ends
 
 _LANDMARK = EllipseKind("estimated landmark, 3σ", TEAL, fill=0.15)
 _MOST_ERRORS = 80  # error lines along the path
-_MOST_NAMES = 40  # landmarks; larger maps name only some
+_FEW = 40  # landmarks; larger maps have smaller marks
+_NAME_HEIGHT = 0.16  # [inches] of the name of a landmark beside its bar
 
 
-def truth_figure(trace: RunTrace) -> Figure:
+def truth_figure(trace: RunTrace, walls: Walls = ()) -> Figure:
     """Draw path and map over ground truth, and the distance of every landmark to it.
 
     Distances are Euclidean and Mahalanobis, as in section 2 of the CMU 16-833
@@ -30,6 +34,8 @@ def truth_figure(trace: RunTrace) -> Figure:
     ----------
     trace : RunTrace
         With true poses, true landmarks, or both; nan entries are not compared.
+    walls : sequence of (x0, y0, x1, y1)
+        Walls to draw [m].
 
     Raises
     ------
@@ -39,21 +45,22 @@ def truth_figure(trace: RunTrace) -> Figure:
     poses, landmarks = _known(trace.true_poses), _known(trace.true_landmarks)
     if not (poses.any() or landmarks.any()):
         raise ValueError("trace must have true poses or true landmarks, got neither")
-    limits = _limits(trace)
+    limits = truth_limits(trace, walls)
     width, height = limits[1] - limits[0]
     distances = _landmark_distances(trace, landmarks) if landmarks.any() else None
     if distances is None:
         figure = style.new_figure(7.2, 6.2 * height / width + 1.5)
         area = figure.add_subplot()
     else:  # its height makes the map as high as the bars beside it
-        figure = style.new_figure(10.8, 5.6 * height / width + 1.5)
+        tall = 5.6 * height / width
+        figure = style.new_figure(10.8, tall + 1.5)
         area, *beside = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
         names = [f"l{i}" for i in trace.landmark_ids[landmarks]]
-        _draw_distances(beside[0], beside[1], distances, names)
+        _draw_distances(beside[0], beside[1], distances, names, room=tall)
     dress(area)
     area.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
     area.set(xlabel="x [m]", ylabel="y [m]")
-    keys = _draw_comparison(area, trace, poses, landmarks)
+    keys = draw_against_truth(area, trace) + draw_walls(area, walls)
     write_title(area, "Estimate and ground truth", _summary(trace, poses, distances))
     style.legend_below(figure, keys, columns=len(keys))
     return figure
@@ -66,19 +73,20 @@ def _known(truth: Array | None) -> BoolArray:
     return np.asarray(np.isfinite(truth[:, :2]).all(axis=1))
 
 
-def _limits(trace: RunTrace) -> Array:
+def truth_limits(trace: RunTrace, walls: Walls = ()) -> Array:
+    """Return a box around a run's estimates, its truth and walls, shape (2, 2) [m]."""
     truths = [trace.true_poses, trace.true_landmarks]
     points = [trace.poses[:, :2], trace.landmarks]
     points += [truth[:, :2] for truth in truths if truth is not None]
+    points.append(wall_ends(walls))
     return box_around(
         np.concatenate(points), trace.landmarks, trace.landmark_covariances
     )
 
 
-def _draw_comparison(
-    axes: Axes, trace: RunTrace, poses: BoolArray, landmarks: BoolArray
-) -> list[Artist]:
+def draw_against_truth(axes: Axes, trace: RunTrace) -> list[Artist]:
     """Draw estimates, truth and the lines between them; return the legend's keys."""
+    poses, landmarks = _known(trace.true_poses), _known(trace.true_landmarks)
     shown = _LANDMARK.add_to(axes)
     style.set_ellipses(shown, trace.landmarks, trace.landmark_covariances)
     axes.plot(*trace.landmarks.T, ".", color=TEAL, ms=4)
@@ -94,7 +102,7 @@ def _draw_comparison(
         keys.insert(1, line)
     if landmarks.any() and trace.true_landmarks is not None:
         truth = trace.true_landmarks[landmarks]
-        few = len(truth) <= _MOST_NAMES
+        few = len(truth) <= _FEW
         size = 9 if few else 5
         (crosses,) = axes.plot(
             *truth.T, "+", color=INK, ms=size, mew=size / 7, label="true landmark"
@@ -123,12 +131,20 @@ def _landmark_distances(trace: RunTrace, known: BoolArray) -> LandmarkDistances:
 
 
 def _draw_distances(
-    metres: Axes, deviations: Axes, distances: LandmarkDistances, names: list[str]
+    metres: Axes,
+    deviations: Axes,
+    distances: LandmarkDistances,
+    names: list[str],
+    *,
+    room: float,
 ) -> None:
-    """Draw one bar per landmark, in the order of the state from the top."""
+    """Draw one bar per landmark, in the order of the state from the top.
+
+    As many are named as fit into the height of the axes, `room` [inches].
+    """
     _draw_bars(metres, distances.euclidean)
     _draw_bars(deviations, distances.mahalanobis)
-    stride = -(-len(names) // _MOST_NAMES)
+    stride = max(1, math.ceil(len(names) * _NAME_HEIGHT / room))
     metres.set_yticks(range(0, len(names), stride), names[::stride])
     deviations.set_yticks([])
     metres.set_xlabel("distance [m]")
@@ -142,7 +158,7 @@ def _draw_distances(
 
 
 def _draw_bars(axes: Axes, values: Array) -> None:
-    rows, few = np.arange(len(values)), len(values) <= _MOST_NAMES
+    rows, few = np.arange(len(values)), len(values) <= _FEW
     dress(axes)
     axes.grid(visible=False, axis="y")
     axes.hlines(rows, 0, values, color=ALARM, lw=1.6 if few else 0.8)

@@ -132,11 +132,14 @@ def _write_deviations(axes: Axes, std: Array) -> None:
 
 def _summary(covariance: Array, step: int) -> str:
     """Write the step, the number of landmarks, and their mean correlation."""
-    landmarks = correlations(covariance)[3:, 3:]
+    every = correlations(covariance)
+    landmarks = every[3:, 3:]
     n = len(landmarks) // 2
     between = ~np.kron(np.eye(n, dtype=bool), np.ones((2, 2), dtype=bool))
     values = np.abs(landmarks[between])
     text = f"after step {step}: {n} landmarks"
+    if np.isnan(every).any():
+        text = f"grey: known exactly; {text}"
     if not np.isfinite(values).any():
         return text
     return f"{text}, mean |correlation| between them {np.nanmean(values):.2f}"

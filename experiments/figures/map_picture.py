@@ -17,6 +17,7 @@ from matplotlib.patches import Polygon
 from ...arrays import Array
 from ..runs.trace import RunTrace
 from .style import GREY, INK, EllipseKind, set_ellipses
+from .walls import Walls, wall_ends
 
 PREDICTED = EllipseKind("predicted pose, 3σ", "#d216c6", (0, (4, 3)), width=1.2)
 UPDATED = EllipseKind("updated pose, 3σ", "#1d4ed8", fill=0.12, width=1.3)
@@ -165,8 +166,10 @@ def pose_stride(trace: RunTrace) -> int:
     return -(-len(trace.t) // _MOST_POSES)
 
 
-def map_limits(trace: RunTrace) -> Array:
-    """Return a box around a run's poses, landmarks and 3σ ellipses; see `box_around`.
+def map_limits(trace: RunTrace, walls: Walls = ()) -> Array:
+    """Return a box around a run's poses, landmarks, 3σ ellipses and walls.
+
+    See `box_around`.
 
     Returns
     -------
@@ -174,7 +177,7 @@ def map_limits(trace: RunTrace) -> Array:
         Lower left and upper right corner [m].
     """
     truth = trace.true_landmarks
-    points = [trace.poses[:, :2], trace.landmarks]
+    points = [trace.poses[:, :2], trace.landmarks, wall_ends(walls)]
     return box_around(
         np.concatenate(points if truth is None else [*points, truth]),
         np.concatenate(

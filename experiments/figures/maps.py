@@ -17,9 +17,10 @@ from ...sim_configs.atomic_file import replace_when_written
 from ..runs.trace import RunTrace
 from .map_picture import MapPicture, map_limits, pose_stride
 from .style import ELLIPSE_HANDLER, dress, legend_below, new_figure, write_title
+from .walls import Walls, draw_walls
 
 
-def map_figure(trace: RunTrace, step: int | None = None) -> Figure:
+def map_figure(trace: RunTrace, step: int | None = None, walls: Walls = ()) -> Figure:
     """Draw poses and landmarks up to a step, with their 3σ ellipses.
 
     Predicted poses are magenta and updated ones blue, first landmarks red and later
@@ -32,6 +33,8 @@ def map_figure(trace: RunTrace, step: int | None = None) -> Figure:
         The run.
     step : int, optional
         Step in 0 … K; the last one by default.
+    walls : sequence of (x0, y0, x1, y1)
+        Walls to draw [m].
 
     Raises
     ------
@@ -42,13 +45,13 @@ def map_figure(trace: RunTrace, step: int | None = None) -> Figure:
     step = last if step is None else step
     if not 0 <= step <= last:
         raise ValueError(f"step must be in 0 … {last}, got {step}")
-    parts = _map_parts(trace)
+    parts = _map_parts(trace, walls)
     parts.show(step)
     return parts.figure
 
 
 def map_sequence(
-    trace: RunTrace, folder: str | Path, *, dpi: float = 100
+    trace: RunTrace, folder: str | Path, *, dpi: float = 100, walls: Walls = ()
 ) -> list[Path]:
     """Save one map picture after every step, step_000.png, step_001.png, ….
 
@@ -62,6 +65,8 @@ def map_sequence(
         The folder; it is made if it does not exist.
     dpi : float, default 100
         Pixels per inch.
+    walls : sequence of (x0, y0, x1, y1)
+        Walls to draw [m].
 
     Returns
     -------
@@ -70,7 +75,7 @@ def map_sequence(
     """
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
-    parts = _map_parts(trace)
+    parts = _map_parts(trace, walls)
     parts.figure.set_dpi(dpi)
     blitted = BlittedFigure(parts.figure, [*parts.picture.moving, *parts.titles])
     digits = max(3, len(str(trace.last_step)))
@@ -145,15 +150,16 @@ class _MapParts(NamedTuple):
             artist.set_text(text)
 
 
-def _map_parts(trace: RunTrace) -> _MapParts:
-    limits = map_limits(trace)
+def _map_parts(trace: RunTrace, walls: Walls) -> _MapParts:
+    limits = map_limits(trace, walls)
     width, height = limits[1] - limits[0]
     figure = new_figure(7.2, 6.4 * height / width + 1.5)
     axes = figure.add_subplot()
     _prepare(axes, limits)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     picture = MapPicture(axes, trace)
-    legend_below(figure, picture.legend_keys(), columns=3)
+    keys = picture.legend_keys() + draw_walls(axes, walls)
+    legend_below(figure, keys, columns=3)
     titles = write_title(axes, *_title(trace, 0))
     figure.draw_without_rendering()  # equal axes need a second layout
     return _MapParts(figure, picture, titles, trace)

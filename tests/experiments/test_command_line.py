@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from slamgym import kernel_cache
 from slamgym.envs import LandmarkWorldEnv
+from slamgym.experiments import figures
 from slamgym.experiments.command_line import reporter, run_files, tables
 from slamgym.experiments.command_line.app import main
 from slamgym.jit import jit
@@ -281,6 +282,25 @@ def test_several_filters_share_a_page_and_a_table(log, without_pictures):
     assert alone["out"].endswith("little-ekf")
     assert alone["pose"] == summary["pose"]
     assert alone["others"] == []
+
+
+def test_several_filters_are_compared_in_a_picture_with_the_walls(monkeypatch):
+    drawn = {}
+
+    def keep(figure, path, **_):
+        drawn[path.name] = figure
+
+    monkeypatch.setattr(figures, "save_figure", keep)
+    world = ("run", "corridor", "--steps", 20, "--no-every-step", "-e")
+    answered(*world, "ekf,invariant")
+    shown = [axes.get_title(loc="left") for axes in drawn["comparison.png"].axes]
+    assert shown == ["ekf", "invariant"]
+    for name in ("map.png", "truth.png", "comparison.png"):
+        labels = [artist.get_label() for artist in drawn[name].axes[0].collections]
+        assert "wall" in labels, name
+    drawn.clear()
+    answered(*world, "ekf")
+    assert "comparison.png" not in drawn
 
 
 def test_a_recording_for_rerun_is_checked_before_the_work(log, monkeypatch):

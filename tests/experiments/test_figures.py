@@ -12,6 +12,7 @@ from run_traces import make_trace
 from scipy.stats import chi2
 
 from slamgym.experiments.figures import (
+    comparison_figure,
     covariance_figure,
     errors_figure,
     map_figure,
@@ -39,7 +40,19 @@ def typical(figure_of):
     return figure_of(make_trace())
 
 
-FIGURES = (map_figure, truth_figure, covariance_figure, errors_figure, noise_study)
+def comparison(trace):
+    return comparison_figure([trace, trace], walls=WALLS)
+
+
+WALLS = ((-30.0, 0.0, 30.0, 0.0), (30.0, 0.0, 30.0, 5.0))
+FIGURES = (
+    map_figure,
+    truth_figure,
+    covariance_figure,
+    errors_figure,
+    noise_study,
+    comparison,
+)
 
 
 def ellipses_of(figure, kind):
@@ -305,6 +318,54 @@ def test_truth_figure_without_any_truth_is_refused():
         truth_figure(make_trace(true_poses=None, true_landmarks=unknown))
 
 
+def test_the_names_of_many_landmarks_beside_a_low_map_do_not_overlap():
+    figure = truth_figure(make_trace(12, 90), walls=WALLS)
+    figure.draw_without_rendering()
+    labels = [label for label in figure.axes[1].get_yticklabels() if label.get_text()]
+    boxes = [label.get_window_extent() for label in labels]
+    assert 10 < len(boxes) < 40
+    for above, below in itertools.pairwise(sorted(boxes, key=lambda box: -box.y0)):
+        assert above.y0 >= below.y1 - 1
+
+
+@pytest.mark.parametrize("figure_of", [map_figure, truth_figure])
+def test_walls_are_drawn_within_the_limits(figure_of):
+    figure = figure_of(make_trace(), walls=WALLS)
+    axes = figure.axes[0]
+    (walls,) = (c for c in axes.collections if c.get_label() == "wall")
+    np.testing.assert_array_equal(
+        np.reshape(walls.get_segments(), (-1, 4)), np.array(WALLS)
+    )
+    assert axes.get_xlim()[0] < -30 < 30 < axes.get_xlim()[1]
+    assert "wall" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+# ---- several filters
+
+
+def test_filters_are_compared_on_the_same_area_with_landmarks_inside_3_sigma():
+    honest = make_trace(count=4)
+    overconfident = make_trace(
+        count=4,
+        estimator="certain",
+        final_covariance=1e-9 * honest.final_covariance,
+    )
+    figure = comparison_figure([honest, overconfident])
+    left, right = figure.axes
+    assert left.get_xlim() == right.get_xlim()
+    assert left.get_ylim() == right.get_ylim()
+    assert right.get_title(loc="left") == "certain"
+    texts = [text.get_text() for axes in figure.axes for text in axes.texts]
+    error = honest.landmarks - honest.true_landmarks
+    inverse = np.linalg.inv(honest.landmark_covariances)
+    inside = np.sum(np.einsum("ni,nij,nj->n", error, inverse, error) <= 9)
+    assert inside > 0
+    assert texts[0].startswith(f"{inside} of 4 landmarks inside 3σ")
+    assert texts[1].startswith("0 of 4 landmarks inside 3σ")
+    with pytest.raises(ValueError, match="two filters or more, got 1"):
+        comparison_figure([honest])
+
+
 # ---- covariance
 
 
@@ -355,6 +416,8 @@ def test_certain_rows_are_grey_not_white():
     certain = make_trace().first_covariance.copy()
     certain[:3], certain[:, :3] = 0, 0
     figure = covariance_figure(make_trace(first_covariance=certain))
+    explained = [axes.texts[-1].get_text() for axes in figure.axes[:2]]
+    assert [text.startswith("grey: known exactly") for text in explained] == [1, 0]
     image = figure.axes[0].images[0]
     assert np.ma.getmaskarray(image.get_array())[:3].all()
     assert image.axes.get_facecolor() != (1, 1, 1, 1)
