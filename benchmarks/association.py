@@ -1,6 +1,8 @@
 """Associate readings without identity by several methods, and score them by the truth.
 
     python benchmarks/association.py --runs 10
+    python benchmarks/association.py --world hidden_identities --methods hypotheses \
+        "a third of the density" "three times the density"
 
 For each world and method: the median error of the path with known and with hidden
 identities, the lost runs (more than 1 m worse than with known identities), readings
@@ -35,6 +37,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "joint": {"association": "joint"},
     "hypotheses": {"association": "hypotheses"},
 }
+WRONG_DENSITIES = {"a third of the density": 1 / 3, "three times the density": 3.0}
+"""Hypotheses, with the density of clutter assumed by this factor wrong."""
 LOST = 1.0  # [m]
 NOISE = (0.02, 0.1, 0.0)  # [rad, m, m/m]
 
@@ -65,12 +69,28 @@ def worlds() -> dict[str, Scenario]:
     loop["sensor"] |= {"identities": False, "clutter": 0.5, "max_clutter": 4}
     corridor = load_scenario("corridor").model_dump()
     corridor["sensor"]["identities"] = False
+    cluttered = load_scenario("hidden_identities").model_dump()
+    cluttered["sensor"] |= {"clutter": 5.0, "max_clutter": 16}
+    city = load_scenario("city").model_dump() | {"steps": 600}
+    city["sensor"] |= {"identities": False, "clutter": 0.3, "max_clutter": 4}
     return {
         "hidden_identities": load_scenario("hidden_identities"),
+        "clutter5": load_scenario(cluttered),
+        "city": load_scenario(city),
         "corridor": load_scenario(corridor),
         "slip60": load_scenario(slippery),
         "loop, clutter": load_scenario(loop),
     }
+
+
+def policy_of(method: str, world: Scenario) -> dict[str, Any]:
+    """Return the policy of a method, or with a wrong density of clutter."""
+    if method in METHODS:
+        return METHODS[method]
+    sensor = world.sensor
+    area = sensor.field_of_view * (sensor.max_range - sensor.min_range)
+    density = WRONG_DENSITIES[method] * max(sensor.clutter, 0.05) / area
+    return METHODS["hypotheses"] | {"density": density}
 
 
 def drive(world: Scenario, seed: int) -> list[Scan]:
@@ -166,23 +186,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=5000)
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--world", action="append", choices=worlds())
+    names = [*METHODS, *WRONG_DENSITIES]
+    parser.add_argument("--methods", nargs="+", choices=names, default=list(METHODS))
     options = parser.parse_args()
     for method in options.methods:  # compile
         world = worlds()["corridor"]
-        follow(make(world, management=METHODS[method]), drive(world, 0)[:30])
+        follow(make(world, management=policy_of(method, world)), drive(world, 0)[:30])
     print(f"12 readings against 60 landmarks, joint: {crowded_scan():.2f} ms\n")
     print(
         "| world | method | known ids [m] | error [m] | lost | wrong | duplicate "
         "| map | precision | recall | ms a step | of nearest |"
     )
     print("|---" * 12 + "|")
-    for name, world in worlds().items():
+    for name in options.world or worlds():
+        world = worlds()[name]
         scans = [drive(world, options.seed + i) for i in range(options.runs)]
         known = [follow(make(world), s, is_known=True).error for s in scans]
         base = 0.0
         for method in options.methods:
-            policy = METHODS[method]
+            policy = policy_of(method, world)
             runs = [follow(make(world, management=policy), s) for s in scans]
             base = base or float(np.mean([run.seconds for run in runs]))
             row = " | ".join([name, method, *row_of(runs, known, base)])

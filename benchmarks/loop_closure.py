@@ -52,8 +52,6 @@ class Outcome(NamedTuple):
 
 def scenarios() -> dict[str, Scenario]:
     """Return the worlds, all without identities."""
-    city = load_scenario("city").model_dump()
-    city["sensor"] |= {"identities": False, "clutter": 0.3, "max_clutter": 4}
     coarse = load_scenario("coarse_loop").model_dump()
     coarse["sensor"]["identities"] = False
     others = worlds()
@@ -61,7 +59,6 @@ def scenarios() -> dict[str, Scenario]:
         "lost_loop": load_scenario("lost_loop"),
         "look_alike": load_scenario("look_alike"),
         **others,
-        "city": load_scenario(city | {"steps": 600}),
         "coarse_loop": load_scenario(coarse),
     }
 

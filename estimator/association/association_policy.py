@@ -34,7 +34,7 @@ class AssociationPolicy:
     [1 / (rad m)]; None: estimate it from the scans so far."""
     hypotheses: int = 10
     """Most hypotheses at a time."""
-    branches: int = 3
+    branches: int = 4
     """Most assignments of one scan that a hypothesis splits into."""
     search_nodes: int = 2000
     """Limit of the search for joint assignments; beyond it the best found so far is

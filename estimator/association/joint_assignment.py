@@ -3,11 +3,11 @@
 An assignment gives each reading one landmark or none, and each landmark at most one
 reading.  Its cost is −2 ln of its likelihood, up to a constant of the scan::
 
-    cost = νᵀ S⁻¹ ν + ln det S + λ u,    λ = −2 ln ρ − 2 ln 2π
+    cost = νᵀ S⁻¹ ν + ln det S + Σ λᵢ,    λᵢ = −2 ln ρᵢ − 2 ln 2π
 
-ν and S = H P Hᵀ + Q belong to the paired readings together, u counts the readings left
-out, and ρ is the density of readings that come from no landmark of the map: clutter and
-landmarks that are not mapped yet [1 / (rad m)].
+ν and S = H P Hᵀ + Q belong to the paired readings together, the sum is over the
+readings left out, and ρᵢ is the density, at the reading, of those that come from no
+landmark of the map: clutter and landmarks that are not mapped yet [1 / (rad m)].
 
 A depth-first branch and bound decides one reading after the other.  A pair conditions
 the expected readings of all landmarks.  By the chain rule of the Gaussian, the cost of
@@ -17,7 +17,7 @@ an assignment is the sum of the costs of its pairs, each given the pairs before 
 
 The k readings still open add at least the following, since C ⪯ k blockdiag(Cⱼⱼ)::
 
-    Σᵢ min(λ, minⱼ νᵀ (k Cⱼⱼ + Q)⁻¹ ν + ln det Q)
+    Σᵢ min(λᵢ, minⱼ νᵀ (k Cⱼⱼ + Q)⁻¹ ν + ln det Q)
 """
 
 from typing import NamedTuple
@@ -110,7 +110,7 @@ def best_assignments(
     ...     joint=np.tile(0.04 * np.eye(2), (2, 2)),
     ...     variances=variances,
     ...     feasible=np.ones((2, 2), dtype=bool),
-    ...     missing=9.0,
+    ...     missing=np.full(2, 9.0),
     ...     gate=25.0,
     ...     limits=np.full(3, np.inf),
     ...     pairs_first=False,
@@ -125,7 +125,7 @@ def best_assignments(
     if problem.feasible.size:
         visited = search_assignments(problem, costs, marks, spread, ceiling, nodes)
     else:
-        costs[0] = rows * problem.missing
+        costs[0] = problem.missing.sum()
     count = int((np.isfinite(costs) & (costs <= costs[0] + spread)).sum())
     if problem.feasible.size:
         fill_distances(problem, marks[:count], distances[:count])

@@ -21,8 +21,8 @@ from .nearest_neighbour import (
     nearest_neighbours,
 )
 
-BRANCH_SPREAD = 8.0
-"""Assignments of a scan e^4 times less likely than the best one are not considered."""
+BRANCH_SPREAD = 16.0
+"""Assignments of a scan e^8 times less likely than the best one are not considered."""
 
 
 class Assignment(NamedTuple):
@@ -48,7 +48,7 @@ def assign_scan(
     view: MapView,
     readings: Array,
     noise: Noise,
-    density: float,
+    density: float | Array,
     *,
     ceiling: float = np.inf,
 ) -> Assignments:
@@ -64,8 +64,9 @@ def assign_scan(
         Rows (β, r) [rad, m].
     noise : Noise
         Of the sensor.
-    density : float
-        Readings per scan that belong to no landmark of the map [1 / (rad m)].
+    density : float or ndarray, shape (m,)
+        Readings per scan that belong to no landmark of the map, where each reading is
+        [1 / (rad m)].
     ceiling : float
         Cost beyond which only the likeliest assignment is of interest.
     """
@@ -77,15 +78,15 @@ def assign_scan(
         ranked = [Assignment(0.0, assign_nearest(policy, fit))]
         return Assignments(ranked, explained)
     expected, joint = predicted_readings(view.mean, view.covariance, explained)
-    pairs_first = policy.association == "compatibility"
+    pairs_first, count = policy.association == "compatibility", len(readings)
     problem = Problem(
         innovations=innovations_of(readings, expected),
         joint=joint,
         variances=_variances(readings, noise),
         feasible=fit.squared[:, explained] <= policy.pair_gate,
-        missing=0.0 if pairs_first else missing_cost(density),
+        missing=np.zeros(count) if pairs_first else missing_costs(density, count),
         gate=policy.pair_gate,
-        limits=_limits(policy, len(readings)),
+        limits=_limits(policy, count),
         pairs_first=pairs_first,
     )
     most = policy.branches if policy.association == "hypotheses" else 1
@@ -129,15 +130,15 @@ def _limits(policy: AssociationPolicy, rows: int) -> Array:
     return limits
 
 
-def missing_cost(density: float) -> float:
-    """Return λ = −2 ln ρ − 2 ln 2π, the cost of a reading without a landmark.
+def missing_costs(density: float | Array, rows: int) -> Array:
+    """Return λ = −2 ln ρ − 2 ln 2π of each reading, its cost without a landmark.
 
     Examples
     --------
-    >>> round(missing_cost(0.02), 2)
-    4.15
+    >>> missing_costs(0.02, 2).round(2)
+    array([4.15, 4.15])
     """
-    return float(-2 * np.log(density) - 2 * np.log(2 * np.pi))
+    return np.full(rows, -2 * np.log(density) - 2 * np.log(2 * np.pi))
 
 
 def _slots(

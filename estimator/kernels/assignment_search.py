@@ -163,7 +163,7 @@ def search_assignments(
             row, here = order[depth], level[depth]
             if is_new:  # list what the reading may be: nothing, or a landmark
                 visited += 1
-                child[depth, 0], child_cost[depth, 0] = UNPAIRED, missing
+                child[depth, 0], child_cost[depth, 0] = UNPAIRED, missing[row]
                 child_squared[depth, 0] = 0.0
                 count = 1
                 left = limits[pairs[depth] + 1] - squared[depth]
@@ -214,7 +214,7 @@ def search_assignments(
             bound, here = cost[depth + 1], level[depth + 1]
             for k in range(depth + 1, rows):  # a lower bound on the open readings
                 i = order[k]
-                base, least = least_base[i], missing
+                base, least = least_base[i], missing[i]
                 for a in listed[i, : options[i]]:
                     if not taken[a]:
                         x, _ = fit(

@@ -30,8 +30,8 @@ class Problem(NamedTuple):
     """Diagonal of Q for each reading, shape (m, 2)."""
     feasible: BoolArray
     """Pairs to consider, shape (m, J)."""
-    missing: float
-    """λ."""
+    missing: Array
+    """λ of each reading, shape (m,)."""
     gate: float
     """Largest νᵀ S⁻¹ ν of a pair, given the pairs before it."""
     limits: Array

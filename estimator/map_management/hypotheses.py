@@ -11,16 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
-from ..association.candidates import ScanAssociation
+from ..association.scan_association import ScanAssociation
 from ..interface import Belief, MapView, ScanDecisions, SlamEstimator, UpdateReport
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.nested_state import with_prefix, without_prefix
+from .filter_pool import FilterPool
 from .managed_slam import ManagedSlam
 from .policy import LandmarkPolicy, as_policy
 
-Option = tuple[float, int, ScanAssociation]
-"""Cost, the hypothesis that it continues, and the association of the scan."""
+Option = tuple[float, int, Callable[[], ScanAssociation]]
+"""Cost, the hypothesis that it continues, and what completes the association."""
 
 SPREAD = 16.0
 """Hypotheses e^8 times less probable than the best one are discarded."""
@@ -110,16 +111,10 @@ class HypothesisSlam:
         **options: Any,
     ) -> None:
         self._policy = as_policy(management)
-        self._make = partial(
-            ManagedSlam,
-            estimator,
-            motion_std,
-            measurement_std,
-            management=self._policy,
-            **options,
-        )
-        self._spare: list[ManagedSlam] = []
-        self.hypotheses = [Hypothesis(0.0, self._make())]
+        noise = motion_std, measurement_std
+        make = partial(ManagedSlam, estimator, *noise, management=self._policy)
+        self._pool = FilterPool(partial(make, **options))
+        self.hypotheses = [Hypothesis(0.0, self._pool.fresh())]
         """The hypotheses, the most probable first."""
 
     @property
@@ -180,10 +175,10 @@ class HypothesisSlam:
         if landmark_ids is None:
             options = self._options(readings)
         else:
-            plans = [h.slam.as_given(readings, landmark_ids) for h in self.hypotheses]
+            argument_checks.identities(landmark_ids, len(readings))
             options = [
-                (h.cost, k, plan)
-                for k, (h, plan) in enumerate(zip(self.hypotheses, plans, strict=True))
+                (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
+                for k, h in enumerate(self.hypotheses)
             ]
         return self._advance(readings, options)
 
@@ -229,12 +224,12 @@ class HypothesisSlam:
         costs = saved_states.array("costs", state["costs"], (-1,)).tolist()
         if not costs or min(costs) < 0:
             raise ValueError(f"state['costs'] must be numbers >= 0, got {costs}")
-        loaded = [Hypothesis(cost, self._fresh()) for cost in costs]
+        loaded = [Hypothesis(cost, self._pool.fresh()) for cost in costs]
         try:
             for k, hypothesis in enumerate(loaded):
                 hypothesis.slam.load_state_dict(without_prefix(state, str(k)))
         except Exception:
-            self._spare += [h.slam for h in loaded]
+            self._pool.free(h.slam for h in loaded)
             raise
         self._keep(loaded)
 
@@ -254,22 +249,19 @@ class HypothesisSlam:
 
     def _branches(self, origins: Sequence[int]) -> list[ManagedSlam]:
         """Return a filter for each option, copied where a hypothesis splits."""
-        used: set[int] = set()
-        slams = []
-        for k in origins:
-            slam = self.hypotheses[k].slam
-            if k in used:
-                slam = self._fresh()
-                slam.copy_from(self.hypotheses[k].slam)
-            used.add(k)
-            slams.append(slam)
-        return slams
+        slams = [self.hypotheses[k].slam for k in origins]
+        first = [k not in origins[:n] for n, k in enumerate(origins)]
+        return [
+            slam if is_first else self._pool.copy(slam)
+            for slam, is_first in zip(slams, first, strict=True)
+        ]
 
     def _advance(self, readings: Array, options: Sequence[Option]) -> UpdateReport:
         """Continue with the options whose filter succeeds; return the first report."""
+        plans = [complete() for _, _, complete in options]
         slams = self._branches([k for _, k, _ in options])
         reports, kept, errors = [], [], []
-        for (cost, _, plan), slam in zip(options, slams, strict=True):
+        for (cost, *_), plan, slam in zip(options, plans, slams, strict=True):
             try:
                 reports.append(slam.take(readings, plan))
                 kept.append(Hypothesis(cost, slam))
@@ -279,20 +271,17 @@ class HypothesisSlam:
             raise errors[0]
         kept = distinct(kept)
         least = kept[0].cost
-        self._keep([Hypothesis(h.cost - least, h.slam) for h in kept])
+        self._keep([Hypothesis(h.cost - least, h.slam) for h in kept], slams)
         return reports[0]
 
-    def _fresh(self) -> ManagedSlam:
-        """Return a filter that no hypothesis uses."""
-        return self._spare.pop() if self._spare else self._make()
-
-    def _keep(self, hypotheses: list[Hypothesis]) -> None:
-        """Go on with these, and reuse the filters of the others."""
+    def _keep(
+        self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()
+    ) -> None:
+        """Go on with these, and reuse all other filters."""
+        known = {id(slam): slam for slam in [h.slam for h in self.hypotheses]}
+        known |= {id(slam): slam for slam in others}
         kept = {id(h.slam) for h in hypotheses}
-        for hypothesis in self.hypotheses:
-            if id(hypothesis.slam) not in kept:
-                hypothesis.slam.reset(np.zeros(3), np.zeros(3))  # frees its scans
-                self._spare.append(hypothesis.slam)
+        self._pool.free(slam for key, slam in known.items() if key not in kept)
         self.hypotheses = hypotheses
 
     def __repr__(self) -> str:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
-from ..association.candidates import Candidates, ScanAssociation, Sensor, associate
+from ..association.candidates import Candidates, Sensor
+from ..association.scan_association import Option, ScanAssociation, associate
 from ..filters.motion_noise import MotionNoise
 from ..interface import (
     Belief,
@@ -171,7 +171,7 @@ class ManagedSlam:
         readings = argument_checks.scan(measurements)
         with self._editor.views_undone_on_error():
             if landmark_ids is None:
-                return self.take(readings, self.alternatives(readings)[0][1])
+                return self.take(readings, self.alternatives(readings)[0][1]())
             return self.take(readings, self.as_given(readings, landmark_ids))
 
     def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
@@ -182,18 +182,14 @@ class ManagedSlam:
         plan.translate(given, view.mapped, self._pruner.merger.aliases)
         return plan
 
-    def alternatives(
-        self, readings: Array, ceiling: float = np.inf
-    ) -> list[tuple[float, ScanAssociation]]:
+    def alternatives(self, readings: Array, ceiling: float = np.inf) -> list[Option]:
         """Associate readings (m, 2) without identity, in every way to consider.
 
         Of those that cost more than ``ceiling`` only the likeliest is of interest.
         """
         argument_checks.refuse_not_finite(readings)
-        view = self._pruner.view_for(readings)
-        return associate(
-            self._policy, self._candidates, readings, view, self._sensor, ceiling
-        )
+        known, view = self._candidates, self._pruner.view_for(readings)
+        return associate(self._policy, known, readings, view, self._sensor, ceiling)
 
     def resembles(self, other: ManagedSlam, tolerance: float) -> bool:
         """Return whether another run has the same landmarks, and nearly their means."""
@@ -262,23 +258,12 @@ class ManagedSlam:
         """
         entries = [k for k in self._remembered() if k.count(".") < 2]
         saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
-        self._continue(state, self._filter.load_state_dict)
-
-    def copy_from(self, other: ManagedSlam) -> None:
-        """Continue as another filter of the same settings, decisions included."""
-        self._continue(other.state_dict(), partial(restore, self._filter))
-        self.decisions.extend(other.decisions)
-
-    def _continue(
-        self, state: Mapping[str, Any], load: Callable[[Mapping[str, Any]], None]
-    ) -> None:
-        """Continue from a state; an error leaves all as before."""
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
         before = self._pruner.state_dict(), self._recent.state_dict(), self.decisions
         try:
             self._pruner.load_state_dict(without_prefix(state, "landmarks"))
             self._recent.load_state_dict(without_prefix(state, "recent"))
-            load(without_prefix(state, "filter"))
+            self._filter.load_state_dict(without_prefix(state, "filter"))
         except Exception:
             self._pruner.load_state_dict(before[0])
             self._recent.load_state_dict(before[1])
@@ -286,6 +271,14 @@ class ManagedSlam:
             raise
         self._editor.expire()
         self._candidates = candidates
+
+    def copy_from(self, other: ManagedSlam) -> None:
+        """Continue as another filter of the same settings, decisions included."""
+        restore(self._filter, other._filter.state_dict())
+        self._pruner.load_state_dict(other._pruner.state_dict())
+        self._recent.copy_from(other._recent)
+        self._editor.expire()
+        self._candidates = other._candidates
 
     def _remembered(self) -> dict[str, Any]:
         """Return all of the state except the filter's."""

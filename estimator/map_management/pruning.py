@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ..association.candidates import ScanAssociation
 from ..association.nearest_neighbour import Noise
+from ..association.scan_association import ScanAssociation
 from ..interface import MapView
 from .landmark_records import LandmarkRecords
 from .loop_closing import LoopCloser, Pairs

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ..association.candidates import LABEL_BITS, NO_LABEL
+from ..association.scan_association import LABEL_BITS, NO_LABEL
 from ..interface import SlamEstimator, UpdateReport
 from ..support import saved_states
 from ..support.nested_state import with_prefix, without_prefix

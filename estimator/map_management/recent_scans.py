@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ..association.candidates import NO_LABEL, ScanAssociation
+from ..association.scan_association import NO_LABEL, ScanAssociation
 from ..interface import (
     ScanDecisions,
     SlamEstimator,
@@ -59,6 +59,11 @@ class RecentScans:
         self._motions: tuple[Motion, ...] = ()
         self.decisions: list[ScanDecisions] = []
         """About every scan since the start, or since a saved state was loaded."""
+
+    def copy_from(self, other: RecentScans) -> None:
+        """Continue as another run would, whose filter is of the same kind."""
+        self._scans, self._motions = list(other._scans), other._motions
+        self.decisions = list(other.decisions)
 
     def note_motion(self, distance: float, turn: float, dt: float) -> None:
         """Remember a motion since the last scan."""

@@ -188,3 +188,13 @@ def test_09_refuses_what_cannot_be_before_it_trains(
     start = f"09_train_active_slam.py: error: argument {option}: "
     assert said.startswith(start + message)
     assert not Path("results").exists()
+
+
+@pytest.mark.slow
+def test_11_gives_every_reading_to_its_landmark_by_default(run):
+    rows = [line.split() for line in run("11_who_is_who").splitlines()[1:]]
+    nearest, default = ([float(value) for value in row[1:]] for row in rows)
+    assert [row[0] for row in rows] == ["nearest", "default"]
+    assert default[0] < nearest[0]
+    assert default[2:4] == [0, 0]
+    assert default[4] < nearest[4]

@@ -5,6 +5,7 @@ import pytest
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import make_estimator
+from slamgym.estimator.map_management.filter_pool import FilterPool
 from slamgym.estimator.map_management.hypotheses import HypothesisSlam
 from slamgym.sim_configs import action_sequence, load_scenario
 
@@ -282,14 +283,14 @@ def test_where_every_filter_fails_nothing_has_changed(slippery_drive):
     before = slam.state_dict()
     for hypothesis in slam.hypotheses:
         failing_after(hypothesis.slam, 0)
-    slam._spare, make_filter = [], slam._make
+    make_filter = slam._pool.fresh
 
     def make_failing():
         fresh = make_filter()
         failing_after(fresh, 0)
         return fresh
 
-    slam._make = make_failing
+    slam._pool = FilterPool(make_failing)
     with pytest.raises(np.linalg.LinAlgError, match="degenerate"):
         slam.update(readings)
     assert_same_state(before, slam.state_dict())
@@ -323,7 +324,14 @@ def test_loading_again_and_again_makes_no_more_filters(slippery_drive):
     slam, _ = several_hypotheses(scans, world)
     state = slam.state_dict()
     slam.load_state_dict(state)
-    count = len(slam._spare)
+    count = len(slam._pool)
     for _ in range(3):
         slam.load_state_dict(state)
-    assert len(slam._spare) == count
+    assert len(slam._pool) == count
+
+
+def test_no_more_filters_are_made_than_hypotheses_are_allowed(slippery_drive):
+    world, scans = slippery_drive
+    slam, _ = several_hypotheses(scans, world)
+    allowed = slam.policy.hypotheses
+    assert len(slam._pool) + len(slam.hypotheses) <= allowed + 1

@@ -32,7 +32,7 @@ def random_problem(rng, *, pairs_first=False):
         joint,
         rng.uniform(0.1, 0.5, (rows, 2)) ** 2,
         rng.random((rows, landmarks)) < 0.8,
-        0.0 if pairs_first else MISSING,
+        np.zeros(rows) if pairs_first else MISSING + rng.uniform(-1, 1, rows),
         np.inf,
         limits,
         pairs_first,
@@ -60,8 +60,9 @@ def all_assignments(problem):
             if problem.pairs_first:
                 result.append((-len(paired), squared, marks))
             else:
-                unpaired = rows - len(paired)
-                result.append((squared + logdet + MISSING * unpaired, marks))
+                unpaired = [i for i in range(rows) if marks[i] == UNPAIRED]
+                left_out = problem.missing[unpaired].sum()
+                result.append((squared + logdet + left_out, marks))
     return sorted(result)
 
 
@@ -129,6 +130,7 @@ def test_the_order_of_the_scan_changes_nothing():
             innovations=problem.innovations[order],
             variances=problem.variances[order],
             feasible=problem.feasible[order],
+            missing=problem.missing[order],
         )
         one, other = best_assignments(problem), best_assignments(turned)
         np.testing.assert_array_equal(one.marks[0][order], other.marks[0])
@@ -144,7 +146,7 @@ def test_the_limit_of_nodes_returns_the_best_so_far_and_says_so():
         0.2 * np.eye(2 * landmarks),
         np.full((rows, 2), 0.04),
         np.ones((rows, landmarks), dtype=bool),
-        2.0,
+        np.full(rows, 2.0),
         25.0,
         np.full(rows + 1, np.inf),
         False,
