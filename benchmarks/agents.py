@@ -1,4 +1,4 @@
-"""How fast agents get their steps: many worlds at once, in units of a physics step.
+"""Time of a step of an agent's worlds, in units of a bare physics step.
 
     python benchmarks/agents.py
 
@@ -7,7 +7,7 @@ step. The cases run interleaved in one process, in CPU time of this thread; a ra
 the median over the rounds. Stable-Baselines3 and, as peers of a single world, ir-sim
 and the Robotics Toolbox are timed where they are installed.
 
-A second table tells what observing beliefs costs, see `agents_beliefs`.
+A second table lists the cost of observing beliefs, see `agents_beliefs`.
 """
 
 import importlib.util

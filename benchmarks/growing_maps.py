@@ -1,4 +1,4 @@
-"""What a step costs as the map grows: compressed, full, and iSAM2, in one process.
+"""Time of a step as the map grows: compressed, full, and iSAM2, in one process.
 
     python benchmarks/growing_maps.py                   # the table, about 2 minutes
     python benchmarks/growing_maps.py --markdown        # … for a document
@@ -8,9 +8,9 @@
     python benchmarks/growing_maps.py --overview        # full, compressed, submaps,
                                                         # sparse; about 7 minutes
 
-The robot drives 0.5 m per step in a square with one landmark on 25 m², all of which are
-in the map; the ten nearest are seen in every step.  CPU time of one thread, stretches
-of steps of all filters in turn.
+The robot drives 0.5 m per step in a square with one landmark per 25 m².  All landmarks
+are in the map, and the robot sees the ten nearest in every step.  Times are CPU times
+of one thread; the filters take turns.
 """
 
 import os

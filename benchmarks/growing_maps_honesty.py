@@ -1,17 +1,17 @@
-"""Are the filters for growing maps as honest as the full ones?  NEES of each, by runs.
+"""Are the filters for growing maps as consistent as the full ones?  NEES of each.
 
     python benchmarks/growing_maps_honesty.py --markdown
     python benchmarks/growing_maps_honesty.py --runs 10 --world city
 
-Two worlds: the preset `loop`, four laps past 20 landmarks, and a city of 4 x 3 blocks
-with 192 landmarks, a corner of the preset `city`, of which the robot drives round every
-block.  All filters get the same readings.  Columns: NEES of the pose per dimension in
-the invariant frame, averaged over runs and steps, with the 90 % interval of the
-laboratory, then at the end; NEES of the whole state and of the map seen from the robot
-at the end; NIS per degree of freedom; whether the decisions accept the filter, and the
-verdict; the largest difference of a pose NEES, of any run and step, to that of the full
-filter which it is to be; CPU time of a run.  The laboratory asks every filter for its
-whole belief after every step, and `submaps` joins its map for each.
+Two worlds: the preset `loop`, four laps past 20 landmarks, and a corner of the preset
+`city` with 4 x 3 blocks and 192 landmarks, where the robot drives around every block.
+All filters get the same readings.  Columns: NEES of the pose per dimension in the
+invariant frame, averaged over runs and steps, with its 90 % interval, then at the end;
+NEES of the whole state and of the map seen from the robot at the end; NIS per degree of
+freedom; whether the decisions accept the filter, and the verdict; the largest
+difference of a pose NEES, over all runs and steps, from that of the corresponding full
+filter; CPU time of a run.  The Monte Carlo requests the whole belief of every filter
+after every step, so `submaps` joins its map in every step.
 """
 
 import os
@@ -92,7 +92,7 @@ def world_of(name: str) -> Scenario:
 
 
 def run_all(name: str, runs: int, seed: int) -> Iterator[Runs]:
-    """Run every filter by itself: its numbers do not hang on what runs beside it."""
+    """Run every filter alone, so that its numbers do not depend on the others."""
     for label in FULL[name]:
         monte_carlo("six_landmarks", label, 1)  # compiles
         began = time.process_time()

@@ -5,9 +5,10 @@
     python benchmarks/sparse_information.py --nees         # minutes
     python benchmarks/sparse_information.py --error --sizes 300 1000
 
-Ten nearest landmarks are seen per step.  The large map is made, not driven: a scan
-from beside each landmark, a place of which nothing is known, adds what it says about
-the ten landmarks around, and the landmarks near the start fix the frame.
+The robot sees the ten nearest landmarks in each step.  The large map is built without a
+drive: one scan per landmark, from a place beside it without prior knowledge, adds its
+information about the ten landmarks around, and the landmarks near the start fix the
+frame.
 """
 
 import os

@@ -1,16 +1,16 @@
-"""Submaps on maps that grow to 100,000 landmarks: time, memory, error, honesty.
+"""Submaps on maps that grow to 100,000 landmarks: time, memory, error, NEES.
 
     python benchmarks/submaps.py                          # to 10,000; half a minute
     python benchmarks/submaps.py --largest 100000         # … and to 100,000; minutes
     python benchmarks/submaps.py --folder /tmp/submaps    # closed submaps on disk
     python benchmarks/submaps.py --markdown               # … for a document
-    python benchmarks/submaps.py --nees 30                # honesty, over 30 runs
+    python benchmarks/submaps.py --nees 30                # consistency, over 30 runs
 
-The robot drives 2 m per step, row by row, over a square with one landmark on 25 m²,
-and sees the ten nearest in every step; a row sees again what the last one saw.  At the
-end the map is joined, and held against the truth: NEES per degree of freedom (1 is
-honest) of a hundred landmarks and the pose.  CPU time of one thread; memory is that of
-the filter, and the largest of the process so far.
+The robot drives 2 m per step, row by row, over a square with one landmark per 25 m²,
+and sees the ten nearest in every step.  Each row sees landmarks of the row before.  At
+the end, the map is joined and compared with the truth: NEES per degree of freedom (1 is
+expected) of a hundred landmarks and the pose.  Times are CPU times of one thread;
+memory is that of the filter, and the largest of the process so far.
 """
 
 import os

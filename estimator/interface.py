@@ -39,14 +39,14 @@ __all__ = [
 
 @runtime_checkable
 class SlamEstimator(Protocol):
-    """A filter that follows a robot among landmarks, fed step by step.
+    """A filter that estimates a robot's pose and a map of landmarks step by step.
 
-    Anything with these methods can stand in an experiment or an agent's loop;
-    :func:`slamgym.estimator.check_estimator` tells what a class of your own lacks.
+    Any class with these methods works in an experiment or an agent's loop.
+    :func:`slamgym.estimator.check_estimator` names what a class of your own lacks.
     """
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
+        """Start a new run at a pose (3,) with deviations (3,) [m, m, rad], no map."""
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
@@ -135,7 +135,7 @@ class SupportsViewCheckpoint(SupportsLocalView, Protocol):
     """An estimator whose local views change what it keeps for later ones."""
 
     def view_checkpoint(self) -> Callable[[], None]:
-        """Return what takes back the effects of later local views."""
+        """Return a function that reverts the effects of later local views."""
         ...
 
 

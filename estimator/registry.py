@@ -262,7 +262,7 @@ def _keywords(factory: Callable[..., Any]) -> tuple[list[str], bool]:
 def accepted_options(
     factory: EstimatorFactory, options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return those options that a factory takes, as its signature tells.
+    """Return those options that the signature of a factory accepts.
 
     Examples
     --------

@@ -52,7 +52,7 @@ class Finding(NamedTuple):
 
 
 def noise_findings(sums: Array) -> list[Finding]:
-    """Test each noise of which there are numbers.
+    """Test each noise that has numbers.
 
     ::
 

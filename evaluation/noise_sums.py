@@ -77,8 +77,8 @@ def noise_sums(
     Returns
     -------
     ndarray, shape (B, 5, 7)
-        By run, `CHANNELS` and `MOMENTS`.  A channel without noise of which the filter
-        assumes none has zeros.
+        By run, `CHANNELS` and `MOMENTS`.  A channel has zeros if it has no noise and
+        the filter assumes none.
 
     Raises
     ------

@@ -1,21 +1,21 @@
 """Replay a log through the EKF, as the CMU 16-833 homework asks, part 2.
 
-Give it the homework's ``data.txt``, or a log that the simulator wrote (other logs do
-not tell their noise; ``slamgym replay`` takes it from you)::
+Give it the homework's ``data.txt``, or a log that the simulator wrote. Other logs do
+not state their noise; use ``slamgym replay`` for them, and its options::
 
     python examples/03_replay_the_course_log.py path/to/data.txt
 
-Without a path it drives the same world itself, writes the drive to
-``results/03_drive.csv``, and replays that.
+Without a path, the example drives through the same world, writes the drive to
+``results/03_drive.csv``, and replays it.
 
 It prints how far each landmark ends from its true place, in metres and in standard
 deviations, and writes ``results/03_map.png``: predicted poses in magenta, updated poses
 in blue, first landmarks in red and later ones in green, all as 3σ ellipses.
 
 The log is replayed twice.  New landmarks should enter the belief with their correlation
-to the pose they were seen from ("full").  The homework leaves it out ("independent"):
-on its own log that happens to come out closer to the truth, but it makes the filter
-more certain than it may be.
+to the pose from which they were seen ("full").  The homework omits it ("independent").
+On the homework's log this happens to end closer to the truth, but it makes the filter
+overconfident.
 """
 
 import sys
@@ -31,7 +31,7 @@ RESULTS = Path("results")
 
 
 def simulated_log() -> Path:
-    """Drive the homework's world once, and write down what was read."""
+    """Drive once through the homework's world, and write the log."""
     scenario = load_scenario("six_landmarks")
     driver = OpenLoop(action_sequence(scenario), scenario.robot)
     path = RESULTS / "03_drive.csv"
@@ -40,7 +40,7 @@ def simulated_log() -> Path:
 
 
 def run(log: SlamLog, landmark_init: str) -> Replay:
-    """Replay the log through an EKF with the noise that the log tells."""
+    """Replay the log through an EKF with the noise in the log's header."""
     settings = settings_for(
         log, estimator="ekf", options={"landmark_init": landmark_init}
     )

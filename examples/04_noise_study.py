@@ -1,10 +1,10 @@
-"""Ask what each noise does: all five σ times 10 and divided by 10, one at a time.
+"""Show what each noise does: all five σ times 10 and divided by 10, one at a time.
 
-Section 3.2 of the CMU 16-833 homework.  The robot drives once; then the filter is told
-eleven different stories about the noise in what it reads, all but the first of them
-wrong.  Too large a σ makes it modest: wide ellipses, and a NIS and NEES below 1.
-Too small a σ makes it proud: narrow ellipses that the truth lies outside of, and a NIS
-and NEES above 1 (both are given per degree of freedom).
+Section 3.2 of the CMU 16-833 homework.  The robot drives once, and the filter replays
+the drive with eleven settings of its noise; only the first one is right.  If a σ is too
+large, the ellipses are too wide, and NIS and NEES are below 1.  If it is too small, the
+truth lies outside the ellipses, and NIS and NEES are above 1.  Both are given per
+degree of freedom.
 
 Run it::
 

@@ -1,14 +1,14 @@
-"""Does your filter tell the truth?  A Monte Carlo with decisions, in twenty lines.
+"""Is your filter consistent?  A Monte Carlo with verdicts, in twenty lines.
 
-``CautiousEkf`` counts its motion noise once more, in the hope of becoming honest. Two
-hundred drives through the homework's world, the same for all filters, tell whether it
-does; the verdicts are printed, and the report opens in a browser.
+``CautiousEkf`` doubles the variance of its motion noise to become consistent.  The
+example tests it on two hundred drives through the homework's world, the same for all
+filters.  It prints the verdicts and writes a report for the browser.
 
 Run it::
 
     python examples/10_test_your_filter.py
 
-The command line takes such a class by its import path, from the folder it lies in::
+The command line takes such a class by its import path, in the folder of its file::
 
     slamgym monte-carlo six_landmarks --estimators invariant,my_filters:CautiousEkf
 """
@@ -26,7 +26,7 @@ from slamgym.experiments.monte_carlo import (
 
 
 class CautiousEkf(EkfSlam):
-    """The textbook EKF, told twice the variance of the motion."""
+    """The textbook EKF with twice the variance of the motion noise."""
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Count the motion noise twice."""

@@ -154,11 +154,11 @@ class Sensor(Part):
 
 
 class Faults(Part):
-    """What is wrong with the world, and is told to no filter.
+    """Deviations of the world from its other tables; no filter knows of them.
 
     A scenario without this table has no faults. No other setting changes, so filters
-    assume the nominal noise. An odometry fault needs motion: a robot that is commanded
-    to rest reads none.
+    assume the nominal noise. Odometry faults act on motion only: a robot that is
+    commanded to rest reads exact odometry.
     """
 
     odometry_scale: Annotated[

@@ -56,7 +56,7 @@ def innovation_distances(
     noise : Noise
         Of the sensor.
     largest : float
-        Pairs with a νᵀ S⁻¹ ν above this need not be told apart.
+        Pairs with a νᵀ S⁻¹ ν above this may be left infinite.
 
     Examples
     --------

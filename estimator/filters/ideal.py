@@ -19,13 +19,13 @@ from .ekf import EkfSlam
 
 
 class IdealEkfSlam(EkfSlam):
-    """The standard filter with its Jacobians taken at the ground truth: no real filter.
+    """The standard filter with its Jacobians at the ground truth, for study only.
 
-    It shows how much of an inconsistency is the fault of the linearisation points [1]_.
-    The truth comes in by a door of its own, :meth:`observe_truth`, before each predict;
-    until it is first opened the filter linearises at its estimate like ``ekf``.  Where
-    the frame itself is uncertain it is no benchmark: Jacobians at the truth and
-    innovations at the estimate then live in different frames, and it diverges.
+    It shows how much of an inconsistency is caused by the linearisation points [1]_.
+    Pass the truth to :meth:`observe_truth` before each predict.  Until its first call,
+    the filter linearises at its estimate like ``ekf``.  If the first heading is
+    uncertain, the filter is no benchmark: the Jacobians are then in the frame of the
+    truth and the innovations in that of the estimate, and the filter diverges.
 
     Parameters are those of :class:`EkfSlam`.
 
@@ -36,17 +36,17 @@ class IdealEkfSlam(EkfSlam):
     """
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run, the door for the truth closed."""
+        """Start a new run; it linearises at the estimate until the truth is given."""
         super().reset(pose, pose_std)
         self._adopt(self.rules._replace(linearisation=AT_ESTIMATE))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of the state, and whether the truth has been told."""
+        """Return copies of the state, and whether the truth has been given."""
         told = self.rules.linearisation == AT_TRUTH
         return {**super().state_dict(), "at_truth": np.array(told)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state; the truth of each step must be told again."""
+        """Continue from a saved state; the truth of each further step must be given."""
         saved_states.refuse_other_state(state, ())
         at_truth = saved_states.flag("at_truth", state.get("at_truth", False))
         super().load_state_dict(state)
@@ -72,7 +72,7 @@ class IdealEkfSlam(EkfSlam):
     def observe_truth(
         self, pose: ArrayLike, landmarks: Mapping[int, ArrayLike]
     ) -> None:
-        """Tell the truth after a motion, before its predict (at the start: its update).
+        """Set the truth after a motion, before predict (at the start: before update).
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class IdealEkfSlam(EkfSlam):
         self._true_pose = truth
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], the covariance along the true way."""
+        """Move by odometry (d, α) [m, rad]; the covariance follows the true motion."""
         if self.rules.linearisation != AT_TRUTH:
             super().predict(odometry, dt)
             return

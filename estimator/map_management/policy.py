@@ -87,7 +87,7 @@ class LandmarkPolicy(AssociationPolicy):
 
     @property
     def worst_separation_std(self) -> float:
-        """Largest σ of an offset at which two landmarks can be told apart [m].
+        """Largest σ of an offset at which two landmarks can be distinguished [m].
 
         Two landmarks at the distance ``merge_within`` must fail the test in 99.8 % of
         cases: their offset, less 3 σ, must still lie outside the gate.

@@ -1,4 +1,4 @@
-"""Saved states inside saved states, told apart by a prefix of their keys."""
+"""Saved states inside saved states, distinguished by a prefix of their keys."""
 
 from collections.abc import Mapping
 from typing import Any

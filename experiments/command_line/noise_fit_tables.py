@@ -9,7 +9,7 @@ from .tables import named_rows, significant
 
 _VERDICTS = {
     "fitted": "",
-    "zero": "cannot be told from zero",
+    "zero": "may be zero",
     "unknown": "no reading depends on it: not fitted",
 }
 

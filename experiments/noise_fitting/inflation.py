@@ -88,7 +88,7 @@ def landmark_series(events: DriveEvents, record: DriveRecord, axis: int) -> Arra
 
 
 def _judged(series: Array, together: float = 1.0) -> Whiteness:
-    """Judge a series, of readings of which so many share the error of one pose.
+    """Test a series of readings; up to `together` of them share the error of one pose.
 
     Correlations of landmarks that are seen together are no independent evidence: at
     worst, so many of them count as one.

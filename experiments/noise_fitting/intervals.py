@@ -23,7 +23,7 @@ class Interval(NamedTuple):
     """What the readings say about one parameter."""
 
     verdict: Verdict
-    """Zero: it cannot be told from zero; "unknown": nothing depends on it."""
+    """Zero: the interval begins at zero; "unknown": nothing depends on it."""
     low: float
     """Of the 95 % interval; 0 and infinity where unknown."""
     high: float
@@ -64,7 +64,7 @@ def _is_open(found: dict[int, Interval], i: int) -> bool:
 
 
 def _vague(likelihoods: Likelihoods, parameters: Array, i: int) -> Interval:
-    """Judge a parameter of which little is known, by the likelihood along it."""
+    """Judge a poorly determined parameter by the likelihood along it."""
     tried = np.tile(parameters, (TRIED + 1, 1))
     tried[1:, i] = np.geomspace(parameters[i], max(FARTHEST, parameters[i]), TRIED)
     tried[0, i] = 0.0

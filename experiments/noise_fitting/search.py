@@ -49,7 +49,7 @@ class FittedNoise(NamedTuple):
     """Of its 95 % interval."""
     high: float
     verdict: Verdict
-    """Fitted; zero: cannot be told from zero; unknown: nothing depends on it."""
+    """Fitted; zero: the interval begins at zero; unknown: nothing depends on it."""
 
 
 class Found(NamedTuple):

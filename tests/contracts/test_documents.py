@@ -199,7 +199,9 @@ def test_contributing_lists_the_checks_of_ci():
     ci = (ROOT / ".ci" / "run").read_text().splitlines()
     checks = next(blocks((ROOT / "CONTRIBUTING.md").read_text(), "bash"))[0]
     assert checks.splitlines() == [
-        line for line in ci if line in {"ruff check", "ruff format --check", "mypy"}
+        line
+        for line in ci
+        if line in {"ruff check", "ruff format --check", "codespell", "mypy"}
     ] + ["pytest -n auto"]
 
 
