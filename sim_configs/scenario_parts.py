@@ -157,8 +157,8 @@ class Faults(Part):
     """Deviations of the world from its other tables; no filter knows of them.
 
     A scenario without this table has no faults. No other setting changes, so filters
-    assume the nominal noise. Odometry faults act on motion only: a robot that is
-    commanded to rest reads exact odometry.
+    assume the nominal noise. Odometry faults act on motion only, not on a robot
+    that is commanded to rest.
     """
 
     odometry_scale: Annotated[
