@@ -251,7 +251,9 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
             )
         measurements = readings.T
         if self._renderer is not None:
-            self._renderer.add(body.pose, measurements[mask], collision)
+            ids = info.get("landmark_ids")
+            clutter = None if ids is None else ids[mask] < 0
+            self._renderer.add(body.pose, measurements[mask], collision, clutter)
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
 
 

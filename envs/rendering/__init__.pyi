@@ -4,4 +4,5 @@ from .render_state import RENDER_MODES as RENDER_MODES
 from .render_state import BeliefLike as BeliefLike
 from .render_state import RenderState as RenderState
 from .renderer import WorldRenderer as WorldRenderer
+from .video import check_video as check_video
 from .video import write_video as write_video

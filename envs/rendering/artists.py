@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerPatch
 from matplotlib.lines import Line2D
-from matplotlib.patches import Polygon
+from matplotlib.patches import Ellipse, Polygon
 from matplotlib.text import Text
 
 from ...arrays import Array
@@ -28,6 +29,7 @@ class MovingArtists(NamedTuple):
     view: Polygon
     rays: LineCollection
     readings: Line2D
+    clutter: Line2D
     path: Line2D
     map_ellipses: EllipseCollection
     map: Line2D
@@ -84,9 +86,10 @@ def add_moving(axes: Axes, radius: float) -> MovingArtists:
         ),
         rays=LineCollection([], colors=RAY, linewidths=0.9, alpha=0.6),
         readings=_points("o", RAY, "reading"),
+        clutter=_points("x", ALARM, "clutter"),
         path=Line2D([], [], color=INK, linewidth=1.4, alpha=0.8, label="true path"),
         map_ellipses=_ellipses(axes, MAP, fill=0.13),
-        map=_points(".", MAP, "landmark belief, 3σ"),
+        map=_points(".", MAP, ""),
         pose_ellipse=_ellipses(axes, POSE, fill=0.15),
         body=_ellipses(axes, INK, fill=0.12),
         halo=_ellipses(axes, ALARM, fill=0.2),
@@ -141,3 +144,25 @@ def _points(marker: str, colour: str, label: str) -> Line2D:
 def arrow_key(face: str, edge: str, label: str) -> Line2D:
     """Return the legend entry of an arrow-shaped robot."""
     return Line2D([], [], ls="", marker=">", mfc=face, mec=edge, ms=7, label=label)
+
+
+def ellipse_key(colour: str, label: str, fill: float = 0.14) -> Ellipse:
+    """Return the legend entry of an ellipse, to be drawn with `ELLIPSE_HANDLER`."""
+    face = to_rgba(colour, fill)
+    return Ellipse((0, 0), 1, 1, fc=face, ec=colour, lw=1.2, label=label)
+
+
+def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)
+    legend: object,
+    orig_handle: object,
+    xdescent: float,
+    ydescent: float,
+    width: float,
+    height: float,
+    fontsize: float,
+) -> Ellipse:
+    centre = (width / 2 - xdescent, height / 2 - ydescent)
+    return Ellipse(centre, width=width, height=height + ydescent + 2)
+
+
+ELLIPSE_HANDLER = {Ellipse: HandlerPatch(patch_func=_lying_ellipse)}

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...arrays import Array, ImageArray
+from ...arrays import Array, BoolArray, ImageArray
 from ...sim_configs import Scenario
 from .render_state import RENDER_MODES, BeliefLike, RenderMode, RenderState
 
@@ -49,13 +49,20 @@ class EpisodeRenderer:
         self._present: dict[str, Any] = {}
         self._belief: BeliefLike | None = None
 
-    def add(self, pose: Array, measurements: Array, collision: bool) -> None:
+    def add(
+        self,
+        pose: Array,
+        measurements: Array,
+        collision: bool,
+        clutter: BoolArray | None = None,
+    ) -> None:
         """Add a step, see `RenderState`, and show it if there is a window."""
         self._path.append(pose[:2].tolist())
         self._present = {
             "pose": pose,
             "measurements": measurements,
             "collision": collision,
+            "clutter": clutter,
         }
         if self._mode == "human":
             self.draw()

@@ -2,7 +2,7 @@
 
 from typing import Literal, NamedTuple, Protocol
 
-from ...arrays import Array
+from ...arrays import Array, BoolArray
 
 RenderMode = Literal["human", "rgb_array"]
 RENDER_MODES: tuple[RenderMode, ...] = ("human", "rgb_array")
@@ -45,3 +45,5 @@ class RenderState(NamedTuple):
     """Since the start of the episode [s]."""
     step: int
     """Steps since the start of the episode."""
+    clutter: BoolArray | None = None
+    """Which measurements are of no landmark, shape (m,); None for none of them."""

@@ -4,22 +4,26 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
-from ...arrays import Array
+from ...arrays import Array, BoolArray
 from ...sim_configs import Scenario
 from .artists import (
     ALARM,
     AXES_BOX,
+    ELLIPSE_HANDLER,
     INK,
+    MAP,
     NO_POINT,
     POSE,
     add_axes,
     add_moving,
     add_still,
     arrow_key,
+    ellipse_key,
     set_ellipses,
 )
 from .axes_limits import AxesLimits
 from .render_state import BeliefLike, RenderState
+from .visible_area import visible_area
 
 _ARROW = np.array([[1.0, 0.0], [-0.75, 0.7], [-0.35, 0.0], [-0.75, -0.7]])
 _ARROW_SHARE = 0.024  # of the width of the axes, so that small robots stay visible
@@ -66,7 +70,7 @@ class Scene:
             self._show_legend()
         self._show_robot(state.pose, state.collision)
         self._moving.path.set_data(*np.transpose(state.path))
-        self._show_readings(state.pose, state.measurements)
+        self._show_readings(state.pose, state.measurements, state.clutter)
         self._show_belief(state.belief)
         self._show_clock(state)
         return resized or renamed
@@ -84,13 +88,17 @@ class Scene:
         moving.halo.set(widths=[diameter], heights=[diameter])
         moving.view.set_xy(self._area_in_view(pose))
 
-    def _show_readings(self, pose: Array, measurements: Array) -> None:
+    def _show_readings(
+        self, pose: Array, measurements: Array, clutter: BoolArray | None
+    ) -> None:
         direction, distance = pose[2] + measurements[:, 0], measurements[:, 1]
         along = np.stack([np.cos(direction), np.sin(direction)], axis=1)
         ends = pose[:2] + distance[:, None] * along
         starts = np.broadcast_to(pose[:2], ends.shape)
         self._moving.rays.set_segments(list(np.stack([starts, ends], axis=1)))
-        self._moving.readings.set_data(*ends.T)
+        false = np.zeros(len(ends), dtype=bool) if clutter is None else clutter
+        self._moving.readings.set_data(*ends[~false].T)
+        self._moving.clutter.set_data(*ends[false].T)
 
     def _show_belief(self, belief: BeliefLike | None) -> None:
         moving = self._moving
@@ -129,12 +137,16 @@ class Scene:
         moving = self._moving
         named: list[Artist] = [arrow_key(INK, INK, "robot"), moving.path, *self._still]
         named.append(moving.readings)
+        if self._scenario.sensor.clutter > 0:
+            named.append(moving.clutter)
         if self._view_is_limited():
             named.append(moving.view)
         if self._legend_has_belief:
-            named += [arrow_key("white", POSE, "pose belief, 3σ"), moving.map]
+            named.append(ellipse_key(POSE, "pose belief, 3σ"))
+            named.append(ellipse_key(MAP, "landmark belief, 3σ"))
         self._figure.legend(
             handles=named,
+            handler_map=ELLIPSE_HANDLER,
             loc="lower center",
             bbox_to_anchor=(0.52, 0.0),
             ncols=4,
@@ -158,14 +170,11 @@ class Scene:
         return bool(sensor.field_of_view < 2 * np.pi or np.isfinite(sensor.max_range))
 
     def _area_in_view(self, pose: Array) -> Array:
-        """Return the outline of the field of view: a sector or a disc."""
+        """Return the outline of what the sensor sees: a sector or disc, less walls."""
         if not self._view_is_limited():
             return NO_POINT
         sensor = self._scenario.sensor
         (left, right), (low, high) = self._limits.x, self._limits.y
-        reach = min(sensor.max_range, np.hypot(right - left, high - low))
-        angles = pose[2] + sensor.field_of_view * np.linspace(-0.5, 0.5, 65)
-        arc = pose[:2] + reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        if sensor.field_of_view < 2 * np.pi:
-            arc = np.concatenate([arc, pose[None, :2]])
-        return np.asarray(arc)
+        reach = float(min(sensor.max_range, np.hypot(right - left, high - low)))
+        walls = np.reshape(self._scenario.walls if sensor.occlusion else (), (-1, 2, 2))
+        return visible_area(pose, sensor.field_of_view, reach, walls)

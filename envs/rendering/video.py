@@ -13,6 +13,25 @@ from ...arrays import ImageArray
 from ...sim_configs.atomic_file import replace_when_written
 
 
+def check_video(path: str | Path, fps: float = 30.0) -> None:
+    """Refuse a video that `write_video` could not write, before its frames are made.
+
+    Raises
+    ------
+    ValueError
+        For a suffix other than .gif and .mp4, or an fps that is not positive.
+    ImportError
+        For .mp4 without imageio-ffmpeg.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".gif", ".mp4"):
+        raise ValueError(f"path must end in .gif or .mp4, got {str(path)!r}")
+    if not 0 < fps < np.inf:
+        raise ValueError(f"fps must be a finite number > 0, got {fps}")
+    if suffix == ".mp4":
+        _import_ffmpeg()
+
+
 def write_video(
     frames: Iterable[ImageArray], path: str | Path, fps: float = 30.0
 ) -> None:
@@ -37,10 +56,7 @@ def write_video(
         For .mp4 without imageio-ffmpeg.
     """
     target = Path(path)
-    if target.suffix.lower() not in (".gif", ".mp4"):
-        raise ValueError(f"path must end in .gif or .mp4, got {str(path)!r}")
-    if not 0 < fps < np.inf:
-        raise ValueError(f"fps must be a finite number > 0, got {fps}")
+    check_video(target, fps)
     if target.suffix.lower() == ".mp4":
         ffmpeg = _import_ffmpeg()
         with replace_when_written(target) as partial:

@@ -11,6 +11,13 @@ from typing import Any, NoReturn
 import numpy as np
 from typer.core import TyperGroup
 
+_OF_SCENARIOS = {
+    "--motion-std": "motion.std=[0.1,0.1,0.05]",
+    "--measurement-std": "sensor.std=[0.02,0.1]",
+    "--initial-pose-std": "start.std=[0.1,0.1,0.05]",
+    "--range-std-per-metre": "sensor.range_std_per_metre=0.05",
+    "--noise-at-rest": "motion.noise_at_rest=true",
+}
 FAILURE, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 
 
@@ -98,13 +105,21 @@ def message_of(error: Exception) -> str:
     if isinstance(error, InterruptedRunError):
         return str(error) or "interrupted; nothing was written"
     if hasattr(error, "format_message"):  # of the command line itself
-        return _one_line(error.format_message())
+        return _one_line(error.format_message()) + _way_to_set(error)
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, ValueError | OSError | ImportError | MemoryError):
         return _one_line(str(error))
     what = f"{type(error).__name__}: {_one_line(str(error))}"
     return f"internal error, {what} (SLAMGYM_TRACEBACK=1 shows where)"
+
+
+def _way_to_set(error: Any) -> str:
+    """Return how a command for scenarios sets a noise that has an option for logs."""
+    change = _OF_SCENARIOS.get(getattr(error, "option_name", None) or "")
+    taken = getattr(getattr(error, "ctx", None), "command", None)
+    options = [name for option in getattr(taken, "params", ()) for name in option.opts]
+    return f"; for the world: --set {change}" if change and "--set" in options else ""
 
 
 def exit_code_of(error: Exception) -> int:

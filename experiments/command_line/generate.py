@@ -45,7 +45,7 @@ def generate(
         options.option(
             "DIR",
             "The folder to write: new, empty, or begun by the same command, which then "
-            "continues.",
+            "continues, perhaps with more episodes.",
             "results/<name>-<controller>-<format>",
         ),
     ] = None,
@@ -55,7 +55,8 @@ def generate(
 
     Drive many episodes of a scenario and write them as a data set: the actions, the
     readings, and the truth. After an interruption, the same command continues where
-    it stopped, and the same command always writes the same bytes.
+    it stopped; with more episodes, it adds those to the folder. The same command always
+    writes the same bytes.
 
     Examples
     --------

@@ -56,7 +56,7 @@ def render(
     slamgym render loop --out loop.gif
     slamgym render corridor --out corridor.mp4 --fps 20 --controller waypoints
     """
-    from ...envs.rendering import write_video
+    from ...envs.rendering import check_video, write_video
     from ..runs.filter_settings import settings_for_scenario
     from .reporter import Reporter
     from .scenario_options import chosen_controller, chosen_scenario
@@ -71,6 +71,7 @@ def render(
     reporter = Reporter(as_json=as_json)
     driver = chosen_controller(controller, world, seed)
     speed = fps or min(max(world.steps / _DURATION, _SLOWEST), _FASTEST)
+    check_video(out, speed)
     if settings is not None:
         warm_up(settings, reporter)
     with reporter.progress("filming") as tick:

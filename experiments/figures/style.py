@@ -12,12 +12,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.legend_handler import HandlerPatch
 from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 
 from ...arrays import Array
 from ...envs.rendering import covariance_ellipses
+from ...envs.rendering.artists import ELLIPSE_HANDLER
 from ...sim_configs.atomic_file import replace_when_written
 
 INK, GREY, PALE = "#1b1f24", "#6b737c", "#e8eaed"
@@ -152,22 +152,6 @@ def set_ellipses(shown: EllipseCollection, means: Array, covariances: Array) -> 
         heights=outline.heights,
         angles=np.degrees(outline.angles),  # matplotlib's unit
     )
-
-
-def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)
-    legend: object,
-    orig_handle: object,
-    xdescent: float,
-    ydescent: float,
-    width: float,
-    height: float,
-    fontsize: float,
-) -> Ellipse:
-    centre = (width / 2 - xdescent, height / 2 - ydescent)
-    return Ellipse(centre, width=width, height=height + ydescent + 2)
-
-
-ELLIPSE_HANDLER = {Ellipse: HandlerPatch(patch_func=_lying_ellipse)}
 
 
 def legend_below(figure: Figure, keys: Sequence[Artist], columns: int) -> None:

@@ -1,6 +1,7 @@
 """Generate trajectories shard by shard, and continue after an interruption."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short_repr
@@ -45,14 +46,15 @@ def generate_trajectories(
 
     Every shard and the manifest appear complete or not at all. The same call on the
     same folder keeps complete shards, replaces damaged ones, and ends with the same
-    bytes, whatever happened before.
+    bytes, whatever happened before. A call with more episodes adds them to those there
+    are, and ends with the bytes of one call.
 
     Parameters
     ----------
     scenario : Scenario, mapping, str or Path
         The world, as in :func:`slamgym.sim_configs.load_scenario`, perhaps with ranges.
     out : path
-        The folder: new, empty, or begun by the same job.
+        The folder: new, empty, or begun by the same job, perhaps with fewer episodes.
     episodes : int
         Number of episodes, each of ``scenario.steps`` steps.
     controller : str, optional
@@ -138,10 +140,27 @@ def _begun(job: Job, out: Path, versions: dict[str, str]) -> Manifest:
         manifest = Manifest(job, versions)
         write_manifest(manifest, out)
         return manifest
-    _refuse_other(out, "scenario.", vars(manifest.job.scenario), vars(job.scenario))
-    _refuse_other(out, "", vars(manifest.job), vars(job))
+    there = manifest.job
+    _refuse_other(out, "scenario.", vars(there.scenario), vars(job.scenario))
     _refuse_other(out, "the version of ", manifest.versions, versions)
+    if there.episodes < job.episodes:
+        manifest = _extended(manifest, job.episodes)
+    _refuse_other(out, "", vars(manifest.job), vars(job))
     return manifest
+
+
+def _extended(manifest: Manifest, episodes: int) -> Manifest:
+    """Return the manifest of a job with more episodes.
+
+    A last shard that is not full is left out: it is written again with more episodes.
+    """
+    job = replace(manifest.job, episodes=episodes)
+    full = [
+        shard
+        for number, shard in enumerate(manifest.shards)
+        if shard.episodes == len(job.episodes_of(number))
+    ]
+    return replace(manifest, job=job, shards=tuple(full))
 
 
 def _refuse_other(

@@ -7,9 +7,12 @@ import time
 import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
+from matplotlib.patches import Ellipse
 
 from slamgym.envs.rendering import RenderState, WorldRenderer
 from slamgym.envs.rendering.axes_limits import AxesLimits
+from slamgym.envs.rendering.visible_area import visible_area
+from slamgym.envs.sensors.line_of_sight import LineOfSight
 from slamgym.sim_configs import action_sequence, load_scenario
 
 LANDMARKS = np.array([[3.0, 6.0], [3.0, 12.0], [7.0, 8.0], [7.0, 14.0], [11.0, 6.0]])
@@ -386,3 +389,72 @@ def test_ellipses_are_in_data_coordinates(renderer):
     renderer.render(snapshot())
     shown = [a for a in scene_of(renderer).moving if isinstance(a, EllipseCollection)]
     assert {artist._units for artist in shown} == {"xy"}
+
+
+def test_the_view_ends_at_walls_that_hide():
+    """Every corner of the outline has a free line of sight, and a wall or the range."""
+    corridor = load_scenario("corridor")
+    pose = np.array([0.3, 0.2, 0.4])
+    walls = np.reshape(corridor.walls, (-1, 2, 2))
+    area = visible_area(pose, 2 * np.pi, 8.0, walls)
+    sight = LineOfSight(corridor.walls)
+    position = np.array(complex(*pose[:2]))
+    inner = pose[:2] + (1 - 1e-6) * (area - pose[:2])
+    outer = pose[:2] + (1 + 1e-4) * (area - pose[:2])
+    assert not sight.blocked(inner @ np.array([1, 1j]), position).any()
+    ended = np.linalg.norm(area - pose[:2], axis=1) < 8.0 - 1e-9
+    assert 10 < ended.sum() < len(area)
+    assert sight.blocked(outer[ended] @ np.array([1, 1j]), position).all()
+    free = visible_area(pose, 2 * np.pi, 8.0, walls[:0])
+    assert np.linalg.norm(free - pose[:2], axis=1) == pytest.approx(8.0)
+
+
+def test_walls_that_hide_nothing_do_not_cut_the_view():
+    wall = ((3.0, -9.0, 3.0, 9.0),)
+    for occlusion, farthest in ((False, 6.0), (True, 3.0)):
+        world = SIX.with_changes(
+            walls=wall, sensor={"max_range": 4.0, "occlusion": occlusion}
+        )
+        renderer = WorldRenderer(world, LANDMARKS, "rgb_array", size_px=200)
+        renderer.render(snapshot((2.0, 1.0, 0.5)))
+        outline = scene_of(renderer)._moving.view.get_xy()
+        assert outline[:, 0].max() == pytest.approx(farthest, abs=0.01)
+
+
+def test_a_large_world_is_shown_around_the_robot():
+    city = load_scenario("city")
+    landmarks = np.array([[0.0, 0.0], [250.0, 250.0]])
+    limits = AxesLimits(city, landmarks, aspect=1.0)
+    assert np.ptp(limits.x) == pytest.approx(6 * city.sensor.max_range)
+    first = limits.x, limits.y
+    assert not limits.follow(snapshot((5.0, 0.0, 0.0)))
+    assert limits.follow(snapshot((9.0, 0.0, 0.0)))
+    assert np.mean(limits.x) == pytest.approx(9.0)
+    assert np.ptp(limits.x) == pytest.approx(6 * city.sensor.max_range)
+    assert limits.follow(snapshot((0.0, 0.0, 0.0), step=0))
+    assert (limits.x, limits.y) == first
+
+
+def test_clutter_is_marked_apart_from_readings():
+    world = SIX.with_changes(
+        sensor={"identities": False, "max_range": 9.0, "clutter": 1.0}
+    )
+    renderer = WorldRenderer(world, LANDMARKS, "rgb_array", size_px=200)
+    clutter = np.array([False, True, False, False, True])
+    renderer.render(snapshot(clutter=clutter))
+    moving = scene_of(renderer)._moving
+    np.testing.assert_allclose(
+        np.transpose(moving.clutter.get_data()), LANDMARKS[clutter]
+    )
+    np.testing.assert_allclose(
+        np.transpose(moving.readings.get_data()), LANDMARKS[~clutter]
+    )
+    labels = [t.get_text() for t in scene_of(renderer)._figure.legends[0].get_texts()]
+    assert "clutter" in labels
+
+
+def test_the_legend_shows_beliefs_as_ellipses(renderer):
+    renderer.render(snapshot(belief=FixedBelief()))
+    legend = scene_of(renderer)._figure.legends[0]
+    ellipses = [key for key in legend.legend_handles if isinstance(key, Ellipse)]
+    assert len(ellipses) == 2

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from slamgym import kernel_cache
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments import figures
-from slamgym.experiments.command_line import reporter, run_files, tables
+from slamgym.experiments.command_line import reporter, run_files, tables, warm_up
 from slamgym.experiments.command_line.app import main
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
@@ -447,6 +447,7 @@ def test_a_wrong_option_of_the_filter_is_refused(log, options, message):
         (("loop", "--controller", "waypoint"), "did you mean 'waypoints'?"),
         (("loop", "--estimator", "EKF"), "'EKF'; did you mean 'ekf'?"),
         (("loop", "--seed", "-1"), "Invalid value for '--seed'"),
+        (("loop", "--motion-std", "1,1,1"), "; for the world: --set motion.std=[0.1"),
     ],
 )
 def test_a_wrong_world_is_refused(arguments, message):
@@ -504,14 +505,30 @@ def test_a_film_shows_the_belief_of_a_replay(without_pictures, monkeypatch):
     assert shown[-1].pose.tolist() == summary["pose"]
 
 
-def test_a_world_that_hides_identities_is_filmed_without_a_filter():
-    printed("render", "hidden_identities", "--steps", 2, "--out", "film.gif")
+def test_a_world_that_hides_identities_is_filmed_with_and_without_a_filter(monkeypatch):
+    shown = []
+    monkeypatch.setattr(
+        LandmarkWorldEnv, "show_belief", lambda self, belief: shown.append(belief)
+    )
+    film = ("render", "hidden_identities", "--steps", 8, "--out", "film.gif")
+    printed(*film)
+    assert len(shown[-1].landmarks) > 0
+    printed(*film, "-e", "none")
+    assert len(shown) == 9
+
+
+def test_a_film_of_an_unknown_format_is_refused_before_anything_compiles(monkeypatch):
+    def fail(*_):
+        raise AssertionError
+
+    monkeypatch.setattr(warm_up, "warm_up", fail)
+    assert ".gif or .mp4" in refused("render", "loop", "--out", "film.webm")
 
 
 @pytest.mark.parametrize(
     ("out", "message", "code"),
     [
-        ("film.avi", "path must end in .gif or .mp4, got 'film.avi'", 2),
+        ("film.webm", "path must end in .gif or .mp4, got 'film.webm'", 2),
         ("nowhere/film.gif", "the folder of nowhere/film.gif does not exist", 1),
     ],
 )

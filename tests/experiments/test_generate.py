@@ -320,6 +320,28 @@ def test_a_repair_that_gives_other_bits_is_refused(tmp_path, monkeypatch):
     assert tree(tmp_path / "out") == before
 
 
+@pytest.mark.parametrize("first", [1, 3, 4, 6])
+@pytest.mark.parametrize("format", ["npz", "slamlog"])
+def test_more_episodes_end_with_the_bytes_of_one_call(first, format, tmp_path):
+    small(tmp_path / "once", format=format)
+    small(tmp_path / "out", episodes=first, format=format)
+    small(tmp_path / "out", format=format)
+    assert tree(tmp_path / "out") == tree(tmp_path / "once")
+
+
+def test_more_episodes_keep_the_full_shards(tmp_path, monkeypatch):
+    small(tmp_path / "out", episodes=5)
+    driven = []
+
+    def drive(scenario, controller, seeds, **options):
+        driven.extend(seeds)
+        return drive_episodes(scenario, controller, seeds, **options)
+
+    monkeypatch.setattr(generate, "drive_episodes", drive)
+    small(tmp_path / "out")
+    assert driven == [8, 9, 10, 11]  # of seeds 5 to 11 in shards of 3
+
+
 # what is refused
 
 
@@ -329,7 +351,7 @@ def test_a_repair_that_gives_other_bits_is_refused(tmp_path, monkeypatch):
         ({"seed": 6}, "seed = 5, not 6"),
         ({"controller": "random"}, "controller = 'waypoints', not 'random'"),
         ({"format": "slamlog"}, "format = 'npz', not 'slamlog'"),
-        ({"episodes": 8}, "episodes = 7, not 8"),
+        ({"episodes": 6}, "episodes = 7, not 6"),
         ({"episodes_per_shard": 4}, "episodes_per_shard = 3, not 4"),
         ({"scenario": LOOP.with_changes(dt=0.7)}, r"scenario\.dt = .*, not 0\.7"),
         (
