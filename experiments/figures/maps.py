@@ -13,10 +13,11 @@ from PIL import Image
 
 from ...arrays import Array
 from ...envs.rendering import BlittedFigure
+from ...envs.rendering.artists import ELLIPSE_HANDLER
 from ...sim_configs.atomic_file import replace_when_written
 from ..runs.trace import RunTrace
 from .map_picture import MapPicture, map_limits, pose_stride
-from .style import ELLIPSE_HANDLER, dress, legend_below, new_figure, write_title
+from .style import dress, legend_below, new_figure, write_title
 from .walls import Walls, draw_walls
 
 

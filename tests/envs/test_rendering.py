@@ -437,7 +437,7 @@ def test_a_large_world_is_shown_around_the_robot():
 
 def test_clutter_is_marked_apart_from_readings():
     world = SIX.with_changes(
-        sensor={"identities": False, "max_range": 9.0, "clutter": 1.0}
+        sensor={"identities": False, "max_range": 9.0, "clutter": 1.0, "max_clutter": 5}
     )
     renderer = WorldRenderer(world, LANDMARKS, "rgb_array", size_px=200)
     clutter = np.array([False, True, False, False, True])
