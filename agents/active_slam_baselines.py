@@ -9,17 +9,18 @@
 ``mpc``        the same of tours from goal to goal
 =============  =====================================================================
 
-They use `AgentKnowledge` only, not the truth. They drive straight to their goals, so
-they need a floor without inner walls.
+They use `AgentKnowledge` only, not the truth. They drive to their goals straight, or
+on the shortest way around inner walls (`wall_routes`).
 """
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, BoolArray
 from ..envs.angles import wrap_angle
 from ..envs.controllers import Waypoints
 from ..sim_configs import Robot, Scenario
@@ -27,10 +28,12 @@ from ..sim_configs.scenario_errors import unknown_choice
 from .agent_knowledge import AgentKnowledge, as_points
 from .belief_features import largest_variances, world_bounds
 from .belief_space_planner import GREEDY, MPC, BeliefSpacePlanner
+from .coverage_grid import CoverageGrid
 
 BASELINES = ("random", "coverage", "frontier", "revisit", "greedy", "mpc")
 
 _CLEARANCE = 1.0  # distance kept from the walls [m]
+_DOTS = 2.0  # distance of the points that a coverage around walls visits [m]
 _ALIGNED = 0.4  # heading error below which a robot drives while it turns [rad]
 
 
@@ -64,7 +67,8 @@ class RandomActions:
 class Coverage:
     """Drives in lanes over the whole floor, up and down, then across, repeatedly.
 
-    The fields of view of adjacent lanes just overlap.
+    The fields of view of adjacent lanes just overlap. On a floor with inner walls the
+    robot visits points on the lanes one after the other.
 
     Parameters
     ----------
@@ -73,18 +77,30 @@ class Coverage:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        lanes = coverage_lanes(scenario)
+        self._routes = CoverageGrid(scenario).routes
+        self._points = coverage_lanes(scenario)
+        if not self._routes.is_open:
+            self._points = self._routes.kept_clear(_dotted(self._points))
+        self._tolerance = 0.5 * scenario.robot.max_speed * scenario.dt
         self._waypoints = Waypoints(
-            lanes,
+            self._points,
             scenario.robot,
             dt=scenario.dt,
-            tolerance=0.5 * scenario.robot.max_speed * scenario.dt,
+            tolerance=self._tolerance,
             loop=True,
         )
+        self._next = 0
 
     def act(self, knowledge: AgentKnowledge) -> Array:
         """Drive on along the lanes; see `Baseline.act`."""
-        return self._waypoints.act(knowledge.belief.pose, knowledge.step)
+        if self._routes.is_open:
+            return self._waypoints.act(knowledge.belief.pose, knowledge.step)
+        if knowledge.step == 0:
+            self._next = 0
+        away = np.hypot(*(self._points - knowledge.belief.pose[:2]).T)
+        while away[self._next] < self._tolerance:
+            self._next = (self._next + 1) % len(self._points)
+        return _steer_around(knowledge, self._points[self._next])
 
 
 class Revisit:
@@ -105,13 +121,7 @@ class Revisit:
         goal = self._anchor(knowledge) if self._is_uncertain(knowledge) else None
         if goal is None:
             goal = nearest_goal(knowledge)
-        scenario = knowledge.scenario
-        return steer(
-            knowledge.belief.pose,
-            _kept_inside(goal, scenario),
-            scenario.robot,
-            scenario.dt,
-        )
+        return _steer_around(knowledge, goal)
 
     def _is_uncertain(self, knowledge: AgentKnowledge) -> bool:
         std = math.sqrt(largest_variances(knowledge.belief.pose_covariance[:2, :2]))
@@ -138,15 +148,12 @@ class Frontier:
 
     def act(self, knowledge: AgentKnowledge) -> Array:
         """Drive to the next goal; see `Baseline.act`."""
-        unseen = as_points(knowledge.grid.cells[~knowledge.explored])
+        unseen = as_points(knowledge.grid.cells[_to_explore(knowledge)])
         missing = len(knowledge.known) - len(knowledge.belief.landmark_ids)
         otherwise = self._revisit.act(knowledge)
         if not missing or not len(unseen):
             return otherwise
-        pose, scenario = knowledge.belief.pose, knowledge.scenario
-        nearest = unseen[np.argmin(np.hypot(*(unseen - pose[:2]).T))]
-        goal = _kept_inside(nearest, scenario)
-        return steer(pose, goal, scenario.robot, scenario.dt)
+        return _steer_around(knowledge, _nearest(knowledge, unseen))
 
 
 _PATIENCE = 25  # largest number of steps of a return, then steps of exploration
@@ -167,7 +174,7 @@ def make_baseline(name: str, scenario: Scenario, rng: np.random.Generator) -> Ba
     Raises
     ------
     ValueError
-        If there is no such baseline, or the floor has inner walls.
+        If there is no such baseline, or the scenario has no walls.
     """
     makers: dict[str, Callable[[], Baseline]] = {
         "random": lambda: RandomActions(rng),
@@ -179,8 +186,6 @@ def make_baseline(name: str, scenario: Scenario, rng: np.random.Generator) -> Ba
     }
     if name not in makers:
         raise ValueError(unknown_choice("name", name, BASELINES))
-    if name != "random":
-        _check_open_floor(scenario)
     return makers[name]()
 
 
@@ -211,9 +216,8 @@ def nearest_goal(knowledge: AgentKnowledge) -> Array:
     """
     points = knowledge.goals()
     if not len(points):
-        points = as_points(knowledge.grid.cells)
-    away = np.hypot(*(points - knowledge.belief.pose[:2]).T)
-    return np.asarray(points[np.argmin(away)])
+        points = as_points(knowledge.grid.cells[knowledge.grid.routes.reachable])
+    return _nearest(knowledge, points)
 
 
 def steer(pose: Array, goal: Array, robot: Robot, dt: float) -> Array:
@@ -233,10 +237,31 @@ def _landmark_variances(knowledge: AgentKnowledge) -> Array:
     return largest_variances(belief.covariance[rows[:, :, None], rows[:, None]])
 
 
-def _kept_inside(goal: Array, scenario: Scenario) -> Array:
-    left, bottom, right, top = world_bounds(scenario)
-    low = np.array([left, bottom]) + _CLEARANCE
-    return np.clip(goal, low, np.array([right, top]) - _CLEARANCE)
+def _to_explore(knowledge: AgentKnowledge) -> BoolArray:
+    return ~knowledge.explored & knowledge.grid.routes.reachable
+
+
+def _nearest(knowledge: AgentKnowledge, points: Array) -> Array:
+    """Return the point (2,) with the shortest way to it."""
+    here = knowledge.belief.pose[None, :2]
+    return np.asarray(points[np.argmin(knowledge.grid.routes.distances(here, points))])
+
+
+def _steer_around(knowledge: AgentKnowledge, goal: Array) -> Array:
+    """Return the action that drives to a goal, off the walls and around them."""
+    pose, scenario = knowledge.belief.pose, knowledge.scenario
+    routes = knowledge.grid.routes
+    legs = routes.legs(pose[:2], routes.kept_clear(goal[None])[0])
+    return steer(pose, legs[0], scenario.robot, scenario.dt)
+
+
+def _dotted(lanes: Array) -> Array:
+    """Return points on lanes (K, 2), at most `_DOTS` apart, (P, 2) [m]."""
+    parts = [
+        np.linspace(a, b, math.ceil(math.dist(a, b) / _DOTS), endpoint=False)
+        for a, b in pairwise(lanes)
+    ]
+    return np.concatenate([*parts, lanes[-1:]])
 
 
 def _spaced(first: float, last: float, gap: float) -> Array:
@@ -252,15 +277,3 @@ def _zigzag(across: Array, ends: tuple[float, float]) -> Array:
         for turn in (0, 1)
     ]
     return np.array(corners)
-
-
-def _check_open_floor(scenario: Scenario) -> None:
-    left, bottom, right, top = world_bounds(scenario)
-    for index, (x0, y0, x1, y1) in enumerate(scenario.walls):
-        on_x_side = x0 == x1 and x0 in (left, right)
-        on_y_side = y0 == y1 and y0 in (bottom, top)
-        if not (on_x_side or on_y_side):
-            raise ValueError(
-                f"the floor must be a rectangle without inner walls for a baseline, "
-                f"got walls[{index}] = {(x0, y0, x1, y1)}"
-            )

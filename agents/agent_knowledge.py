@@ -33,13 +33,14 @@ class AgentKnowledge(NamedTuple):
         """Return the positions worth a visit, shape (K, 2) [m].
 
         These are the mapped landmarks that are not yet known and, while a landmark is
-        not yet mapped, the unexplored cells.
+        not yet mapped, the unexplored cells that the robot can get to.
         """
         ids = list(self.belief.landmark_ids)
         landmarks: Array = self.belief.landmarks[~self.known[ids]]
         if len(ids) == len(self.known):
             return landmarks
-        return np.concatenate([landmarks, as_points(self.grid.cells[~self.explored])])
+        unseen = ~self.explored & self.grid.routes.reachable
+        return np.concatenate([landmarks, as_points(self.grid.cells[unseen])])
 
 
 def as_points(numbers: ComplexArray) -> Array:

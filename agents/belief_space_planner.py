@@ -31,7 +31,6 @@ from .agent_knowledge import AgentKnowledge, as_points
 from .belief_features import largest_variances
 
 _CLEARANCE = 0.5  # of arcs, distance kept from walls beyond the robot's radius [m]
-_MARGIN = 1.0  # of goals, distance kept from the walls [m]
 _ALIGNED = 0.5  # heading error below which a robot drives while it turns [rad]
 _TURNS = (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)  # of the largest turn rate
 
@@ -112,6 +111,7 @@ class BeliefSpacePlanner:
         explored, overlooked = knowledge.explored, self._settings.overlooked
         if knowledge.step == 0 or len(self._chance) != len(explored):
             self._tour, self._chance = None, np.where(explored, overlooked, 1.0)
+            self._chance *= knowledge.grid.routes.reachable
             return
         seen = knowledge.grid.visible_from(knowledge.belief.pose[None])[0]
         self._chance[seen] *= overlooked
@@ -190,12 +190,11 @@ def _distance_to_rest(
     away = np.hypot(*(landmarks - ends[:, None]).transpose(2, 0, 1))
     away[known] = math.inf
     if len(knowledge.belief.landmark_ids) < len(knowledge.known):
-        unseen = as_points(knowledge.grid.cells[~knowledge.explored])
         seen = knowledge.grid.visible_from(after.poses[0].reshape(-1, 3))
         shape = *after.poses.shape[1:3], seen.shape[1]
         found: BoolArray = np.logical_or.reduce(seen.reshape(shape), axis=1)
         left = ~found[:, ~knowledge.explored]
-        cells = np.hypot(*(unseen - ends[:, None]).transpose(2, 0, 1))
+        cells = knowledge.grid.routes.to_cells(ends)[:, ~knowledge.explored]
         away = np.concatenate([away, np.where(left, cells, math.inf)], axis=1)
     nearest = away.min(axis=1, initial=math.inf)
     return np.where(np.isfinite(nearest), nearest, 0.0)
@@ -204,7 +203,9 @@ def _distance_to_rest(
 def _is_free(knowledge: AgentKnowledge, poses: Array) -> BoolArray:
     """Return which plans keep clear of walls, or turn on the spot."""
     clearance = knowledge.scenario.robot.radius + _CLEARANCE
-    gap = knowledge.grid.clearance(poses[..., :2])
+    places = poses[..., :2]
+    between = 0.5 * (places[:, 1:] + places[:, :-1])  # a wall may be that thin
+    gap = knowledge.grid.clearance(np.concatenate([places, between], axis=1))
     here = knowledge.grid.clearance(knowledge.belief.pose[None, :2])[0]
     return np.asarray((gap >= min(clearance, here - 1e-9)).all(axis=1))
 
@@ -246,9 +247,8 @@ def _tours(knowledge: AgentKnowledge, chance: Array, cells: int) -> Array:
     starts, ends = np.concatenate(first), np.concatenate(second)
     pairs = np.empty((len(starts), len(ends), 2, 2))
     pairs[:, :, 0], pairs[:, :, 1] = starts[:, None], ends
-    left, bottom, right, top = grid.bounds
-    low, high = (left + _MARGIN, bottom + _MARGIN), (right - _MARGIN, top - _MARGIN)
-    return np.clip(pairs.reshape(-1, 2, 2), low, high)
+    kept = grid.routes.kept_clear(pairs.reshape(-1, 2))
+    return kept.reshape(-1, 2, 2)
 
 
 def _spread_out(points: Array, position: Array, most: int) -> IndexArray:
@@ -266,15 +266,17 @@ def _spread_out(points: Array, position: Array, most: int) -> IndexArray:
 def _driven(knowledge: AgentKnowledge, tours: Array, steps: int) -> Array:
     """Return plans that drive to the goals of tours (K, 2, 2), (K, T, 2).
 
-    A robot at its last goal turns on the spot and looks around.
+    They drive around inner walls. A robot at its last goal turns on the spot and looks
+    around.
     """
+    tours = knowledge.grid.routes.tours(knowledge.belief.pose[:2], tours)
     robot, dt = knowledge.scenario.robot, knowledge.scenario.dt
     longest, turning = robot.max_speed * dt, robot.max_turn_rate * dt
     x, y, heading = np.tile(knowledge.belief.pose, (len(tours), 1)).T
     leg, plans = np.zeros(len(tours), dtype=np.intp), np.empty((len(tours), steps, 2))
     each = np.arange(len(tours))
     for t in range(steps):
-        goal = tours[each, np.minimum(leg, 1)]
+        goal = tours[each, np.minimum(leg, tours.shape[1] - 1)]
         dx, dy = goal[:, 0] - x, goal[:, 1] - y
         distance = np.hypot(dx, dy)
         arrived = distance < 0.5 * longest

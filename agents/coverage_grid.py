@@ -4,6 +4,7 @@ An agent knows the walls but not the landmarks. Poses are estimates.
 """
 
 import math
+from functools import cached_property
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ..estimator.kernels.in_view import as_view
 from ..sim_configs import Scenario
 from .belief_features import Bounds, world_bounds
 from .floor_kernels import SECTORS, cells_in_view
+from .wall_routes import WallRoutes
 
 __all__ = ["SECTORS", "CoverageGrid"]
 
@@ -73,6 +75,12 @@ class CoverageGrid:
         places = np.stack([self.cells.real, self.cells.imag])
         self.plan = places, walls, self.bounds, self.diagonal, tuple(view)
         """A `Floor`, as kernels take it."""
+        self._scenario = scenario
+
+    @cached_property
+    def routes(self) -> WallRoutes:
+        """Routes on the floor, around inner walls."""
+        return WallRoutes(self._scenario, self.cells)
 
     def visible_from(self, poses: Array) -> BoolArray:
         """Return which cells are in view from poses, (B, 3) to (B, C).

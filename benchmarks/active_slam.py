@@ -32,7 +32,7 @@ from slamgym.agents.active_slam_scores import (
     score_table,
 )
 
-LEVELS = ("active_easy", "active_medium", "active_hard")
+LEVELS = ("active_easy", "active_medium", "active_hard", "active_rooms")
 TRAINING = Path(__file__).parents[1] / "examples" / "09_train_active_slam.py"
 
 

@@ -200,7 +200,7 @@ def arguments() -> argparse.Namespace:
         parser.error(f"argument --worlds: must be a multiple of 16, got {given.worlds}")
     try:
         env = ActiveSlamEnv(given.scenario)
-        for name in BASELINES:  # they need a floor without inner walls
+        for name in BASELINES:
             make_baseline(name, env.scenario, np.random.default_rng(0))
     except (OSError, ValueError) as error:
         parser.error(f"argument --scenario: {error}")

@@ -786,11 +786,6 @@ def test_an_unknown_baseline_is_refused_with_the_nearest_name():
         make_baseline("gredy", load_scenario("active_easy"), np.random.default_rng(0))
 
 
-def test_a_floor_with_inner_walls_is_refused_by_those_who_drive_straight():
-    with pytest.raises(ValueError, match=r"without inner walls .* walls\[4\]"):
-        make_baseline("greedy", load_scenario("corridor"), np.random.default_rng(0))
-
-
 def test_a_table_names_means_with_their_intervals():
     ends = [Episode(x, *[True] * 6, np.empty((0, 2))) for x in (1.0, 2.0, 3.0)]
     half = 1.96 * np.std([1, 2, 3], ddof=1) / 3**0.5

@@ -175,7 +175,6 @@ def test_08_and_09_explain_themselves(name, run, capsys):
         ("--scenario", "nope", "scenario must be a preset (active_easy, "),
         ("--scenario", "nope.toml", "cannot read the scenario 'nope.toml'"),
         ("--scenario", "loop", "scenario must have walls around its floor, got none"),
-        ("--scenario", "corridor", "the floor must be a rectangle without inner walls"),
     ],
 )
 def test_09_refuses_what_cannot_be_before_it_trains(

@@ -1,0 +1,208 @@
+"""Routes around walls, for agents that drive to goals.
+
+The shortest way between two points of a floor with inner walls passes ends of walls. A
+robot keeps a distance from them, so the routes run over points around the ends: a
+visibility graph. On a floor without inner walls every route is straight.
+
+Symbols
+-------
+a, b            ends of a way [m]
+e               end of a wall [m]
+"""
+
+import math
+
+import numpy as np
+from scipy.sparse.csgraph import shortest_path
+
+from ..arrays import Array, BoolArray, ComplexArray
+from ..envs.robot.wall_contacts import wall_distances
+from ..sim_configs import Scenario
+from .belief_features import world_bounds
+
+_CLEARANCE = 1.0  # of goals on a floor without inner walls [m]
+_GAP = 0.5  # kept between the robot and walls on a route [m]
+_CORNERS = np.exp(2j * np.pi * np.arange(8) / 8) / math.cos(math.pi / 8)
+_WIDER = 1.2  # way round an end of a wall: the robot does not drive exactly
+
+
+class WallRoutes:
+    """Shortest routes on the floor of a scenario.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With walls around the floor.
+    cells : complex ndarray, shape (C,)
+        Points of the floor [m].
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> scenario = load_scenario("active_easy").with_changes(
+    ...     walls=[[-6, -6, 6, -6], [6, -6, 6, 6], [6, 6, -6, 6], [-6, 6, -6, -6],
+    ...            [0, -6, 0, 3]])
+    >>> routes = WallRoutes(scenario, np.array([-3.0 - 3.0j, 3.0 - 3.0j]))
+    >>> routes.legs(np.array([-3.0, 0.0]), np.array([3.0, 0.0])).round(1).tolist()
+    [[-0.6, 3.6], [0.0, 3.9], [0.6, 3.6], [3.0, 0.0]]
+    """
+
+    def __init__(self, scenario: Scenario, cells: ComplexArray) -> None:
+        self._bounds, self._cells = world_bounds(scenario), cells
+        walls = np.array(scenario.walls).view(np.complex128)
+        self._starts, self._ends = walls[:, 0], walls[:, 1]
+        self._margin = scenario.robot.radius + _GAP
+        self.is_open = not has_inner_walls(scenario)
+        """Whether every way is straight."""
+        self.reachable: BoolArray = np.ones(len(cells), dtype=np.bool_)
+        """Which cells the robot can get to from its start, shape (C,)."""
+        if self.is_open:
+            return
+        rings = np.unique(walls)[:, None] + _WIDER * self._margin * _CORNERS
+        self._nodes: ComplexArray = rings[self._is_free(rings)]
+        between = self._lengths(self._nodes, self._nodes)
+        np.fill_diagonal(between, 0.0)
+        self._between, self._before = shortest_path(
+            np.where(np.isfinite(between), between, 0.0), return_predecessors=True
+        )
+        start = np.array(scenario.start.pose[:2])
+        self.reachable = np.isfinite(self.distances(start[None], _points(cells))[0])
+        self._free = cells[self.reachable & self._is_free(cells)]
+        self._by_cell = self.distances(_points(cells), _points(cells))
+
+    def distances(self, points: Array, goals: Array) -> Array:
+        """Return the lengths of the routes from points (S, 2) to goals (G, 2) [m].
+
+        Shape (S, G); inf where there is no way.
+        """
+        here, there = _numbers(points), _numbers(goals)
+        if self.is_open:
+            return np.asarray(np.abs(there - here[:, None]))
+        direct = self._lengths(here, there)
+        first, last = (
+            self._lengths(here, self._nodes),
+            self._lengths(there, self._nodes),
+        )
+        around = _min_plus(_min_plus(first, self._between), last.T)
+        return np.minimum(direct, around)
+
+    def to_cells(self, points: Array) -> Array:
+        """Return the distances of points (S, 2) from all cells, (S, C) [m].
+
+        Around inner walls, those of the cells that the points are in.
+        """
+        straight = np.hypot(
+            *(_points(self._cells) - points[:, None]).transpose(2, 0, 1)
+        )
+        if self.is_open:
+            return np.asarray(straight)
+        return np.asarray(self._by_cell[straight.argmin(axis=1)])
+
+    def legs(self, point: Array, goal: Array) -> Array:
+        """Return the corners of the route to a goal, which is the last, (L, 2) [m].
+
+        Where there is no way, the route is straight.
+        """
+        straight = goal[None]
+        if self.is_open:
+            return straight
+        here, there = _numbers(point[None]), _numbers(straight)
+        if np.isfinite(self._lengths(here, there)[0, 0]):
+            return straight
+        first = self._lengths(here, self._nodes)[0]
+        last = self._lengths(there, self._nodes)[0]
+        length = first[:, None] + self._between + last
+        start, node = np.unravel_index(int(length.argmin()), length.shape)
+        if not np.isfinite(length[start, node]):
+            return straight
+        corners = [int(node)]
+        while corners[-1] != start:
+            corners.append(int(self._before[start, corners[-1]]))
+        return np.concatenate([_points(self._nodes[corners[::-1]]), straight])
+
+    def tours(self, point: Array, tours: Array) -> Array:
+        """Return the routes of tours (K, 2, 2) from a point, to one goal and another.
+
+        Shape (K, L, 2) [m]; the last point is repeated where a route is shorter.
+        """
+        if self.is_open or not len(tours):
+            return tours
+        legs: dict[tuple[bytes, bytes], Array] = {}
+        routes = []
+        for first, second in tours:
+            for a, b in ((point, first), (first, second)):
+                if (a.tobytes(), b.tobytes()) not in legs:
+                    legs[a.tobytes(), b.tobytes()] = self.legs(a, b)
+            to_first = legs[point.tobytes(), first.tobytes()]
+            to_second = legs[first.tobytes(), second.tobytes()]
+            routes.append(np.concatenate([to_first, to_second]))
+        longest = max(map(len, routes))
+        padding = [np.tile(each[-1:], (longest - len(each), 1)) for each in routes]
+        return np.array([*map(np.concatenate, zip(routes, padding, strict=True))])
+
+    def kept_clear(self, goals: Array) -> Array:
+        """Return goals (G, 2) moved to where the robot can stand, off the walls [m]."""
+        left, bottom, right, top = self._bounds
+        low, high = np.array([left, bottom]), np.array([right, top])
+        if self.is_open:
+            return np.clip(goals, low + _CLEARANCE, high - _CLEARANCE)
+        points = _numbers(goals)
+        nearest = self._free[np.abs(points[:, None] - self._free).argmin(axis=1)]
+        return _points(np.where(self._is_free(points), points, nearest))
+
+    def _is_free(self, points: ComplexArray) -> BoolArray:
+        """Return which points are inside the bounds and off the walls."""
+        left, bottom, right, top = self._bounds
+        inside = (left < points.real) & (points.real < right)
+        inside &= (bottom < points.imag) & (points.imag < top)
+        return np.asarray(inside & (self._clearance(points) >= self._margin))
+
+    def _clearance(self, points: ComplexArray) -> Array:
+        along = self._ends - self._starts
+        return np.asarray(wall_distances(points, self._starts, along).min(axis=-1))
+
+    def _lengths(self, a: ComplexArray, b: ComplexArray) -> Array:
+        """Return |b - a| of straight ways, (A, B); inf where a wall is in the way.
+
+        A way keeps the margin, or what its own ends keep.
+        """
+        way, start = b - a[:, None], a[:, None]
+        kept = np.minimum(self._clearance(a)[:, None], self._clearance(b))
+        kept = np.minimum(kept, self._margin) * (1 - 1e-6)
+        square = np.maximum(np.abs(way) ** 2, 1e-12)
+        free = np.ones(way.shape, dtype=np.bool_)
+        for e, f in zip(self._starts, self._ends, strict=True):
+            wall = f - e
+            crosses = _cross(way, e - start) * _cross(way, f - start) <= 0
+            crosses &= _cross(wall, start - e) * _cross(wall, b - e) <= 0
+            free &= ~crosses
+            for end in (e, f):
+                share = np.clip((np.conj(way) * (end - start)).real / square, 0, 1)
+                free &= np.abs(start + share * way - end) >= kept
+        return np.where(free, np.abs(way), np.inf)
+
+
+def has_inner_walls(scenario: Scenario) -> bool:
+    """Return whether a wall is not on the rectangle around the floor."""
+    left, bottom, right, top = world_bounds(scenario)
+    return not all(
+        (x0 == x1 and x0 in (left, right)) or (y0 == y1 and y0 in (bottom, top))
+        for x0, y0, x1, y1 in scenario.walls
+    )
+
+
+def _min_plus(a: Array, b: Array) -> Array:
+    """Return min over k of a[i, k] + b[k, j], row by row."""
+    return np.array([(row[:, None] + b).min(axis=0) for row in a])
+
+
+def _cross(a: ComplexArray, b: ComplexArray) -> Array:
+    return np.asarray(a.real * b.imag - a.imag * b.real)
+
+
+def _numbers(points: Array) -> ComplexArray:
+    return np.asarray(points[..., 0] + 1j * points[..., 1])
+
+
+def _points(numbers: ComplexArray) -> Array:
+    return np.stack([numbers.real, numbers.imag], axis=-1)

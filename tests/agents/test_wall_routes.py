@@ -1,0 +1,89 @@
+"""Routes around walls against a search on a fine lattice."""
+
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import dijkstra
+
+from slamgym.agents import ActiveSlamEnv
+from slamgym.agents.active_slam_baselines import make_baseline
+from slamgym.agents.active_slam_scores import VALIDATION, baseline_policy, run_episode
+from slamgym.agents.coverage_grid import CoverageGrid
+from slamgym.sim_configs import load_scenario
+
+ROOMS = load_scenario("active_rooms")
+MARGIN = 0.7
+
+
+@pytest.fixture(scope="module")
+def grid():
+    return CoverageGrid(ROOMS)
+
+
+def points(count, seed=0):
+    return np.random.default_rng(seed).uniform(-7.2, 7.2, (count, 2))
+
+
+def dense(legs, start):
+    corners = np.concatenate([start[None], legs])
+    ways = zip(corners[:-1], corners[1:], strict=True)
+    shares = np.linspace(0, 1, 200)[:, None]
+    return np.concatenate([a + shares * (b - a) for a, b in ways])
+
+
+def test_routes_keep_off_the_walls(grid):
+    starts, goals = points(30), grid.routes.kept_clear(points(30, seed=1))
+    for start, goal in zip(starts, goals, strict=True):
+        kept = min(MARGIN, grid.clearance(start[None])[0])
+        way = dense(grid.routes.legs(start, goal), start)
+        assert grid.clearance(way).min() >= kept - 1e-4
+
+
+def test_distances_are_the_lengths_of_routes(grid):
+    starts, goals = points(20), grid.routes.kept_clear(points(20, seed=1))
+    lengths = grid.routes.distances(starts, goals)
+    for i, start in enumerate(starts):
+        for j, goal in enumerate(goals):
+            corners = np.concatenate([start[None], grid.routes.legs(start, goal)])
+            length = np.hypot(*np.diff(corners, axis=0).T).sum()
+            assert lengths[i, j] == pytest.approx(length, rel=1e-12)
+
+
+def test_no_route_is_longer_than_on_a_lattice(grid):
+    """The lattice stays as far from walls as the routes' corners do."""
+    axis = np.linspace(-7.2, 7.2, 37)
+    lattice = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    lattice = lattice[grid.clearance(lattice) >= 1.0]
+    gap = np.hypot(*(lattice[:, None] - lattice).transpose(2, 0, 1))
+    lengths = dijkstra(np.where(gap < 1.0, gap, 0.0), indices=range(0, len(gap), 60))
+    assert np.isfinite(lengths).all()
+    routes = grid.routes.distances(lattice[::60], lattice)
+    assert (routes <= lengths + 1e-9).all()
+    assert (routes >= gap[::60] - 1e-9).all()
+    assert routes.mean() > 0.85 * lengths.mean()  # and none goes through a wall
+
+
+def test_ways_on_a_floor_without_inner_walls_are_straight():
+    grid = CoverageGrid(load_scenario("active_easy"))
+    start, goal = np.array([-3.0, 2.0]), np.array([[4.0, -1.0], [5.9, 6.0]])
+    np.testing.assert_array_equal(grid.routes.legs(start, goal[0]), goal[:1])
+    expected = np.hypot(*(goal - start).T)
+    np.testing.assert_allclose(grid.routes.distances(start[None], goal)[0], expected)
+    np.testing.assert_array_equal(grid.routes.kept_clear(goal), [[4, -1], [5, 5]])
+    assert grid.routes.reachable.all()
+
+
+def test_cells_behind_closed_walls_are_out_of_reach():
+    grid = CoverageGrid(load_scenario("corridor"))
+    inside = np.maximum(np.abs(grid.cells.real - 6), np.abs(grid.cells.imag - 6)) < 4.8
+    assert not grid.routes.reachable[inside].any()
+    assert grid.routes.reachable[~inside].all()
+
+
+@pytest.mark.parametrize(("name", "rooms"), [("coverage", 4), ("mpc", 2)])
+@pytest.mark.slow
+def test_baselines_find_their_way_through_doors(name, rooms):
+    env = ActiveSlamEnv(ROOMS)
+    baseline = make_baseline(name, ROOMS, np.random.default_rng(0))
+    episode = run_episode(env, baseline_policy(baseline), VALIDATION + 1)
+    assert len(np.unique((episode.path > 0) @ [1, 2])) >= rooms
+    assert not episode.crashed
