@@ -1,5 +1,7 @@
 """Routes around walls against a search on a fine lattice."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import dijkstra
@@ -25,7 +27,7 @@ def points(count, seed=0):
 
 def dense(legs, start):
     corners = np.concatenate([start[None], legs])
-    ways = zip(corners[:-1], corners[1:], strict=True)
+    ways = pairwise(corners)
     shares = np.linspace(0, 1, 200)[:, None]
     return np.concatenate([a + shares * (b - a) for a, b in ways])
 
