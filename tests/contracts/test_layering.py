@@ -75,7 +75,7 @@ MAY_IMPORT = {  # besides the standard library and lazy_loader
     "envs": {"numpy", "scipy", "gymnasium", "pymunk"},
     "estimator": {"numpy", "scipy", "numba", "psutil"},
     "evaluation": {"numpy", "scipy"},
-    "agents": {"numpy", "gymnasium"},
+    "agents": {"numpy", "scipy", "gymnasium"},
 }
 DRAWING = {"artists", "scene", "blitting", "renderer", "video", "window"}
 DRAWING_LIBRARIES = {"matplotlib", "PIL", "imageio_ffmpeg"}
