@@ -62,7 +62,7 @@ class AssociatingFilters:
         self._slots = np.full((runs, rows), -1, dtype=np.int64)
 
     def reset(self, poses: Array, pose_std: Any, *, runs: BoolArray) -> None:
-        """Start new runs in some worlds, with poses (B, 3) known to (3,)."""
+        """Start new runs in some worlds, at poses (B, 3) with deviations (3,)."""
         for run in np.flatnonzero(runs).tolist():
             self._filters[run].reset(poses[run], pose_std)
             self._steps[run] = 0

@@ -114,7 +114,7 @@ def choose_estimator(
 
 
 def _bounded(management: Any, rows: int | None) -> LandmarkPolicy | Literal[False]:
-    """Return a policy that keeps at most so many landmarks; False for none."""
+    """Return a policy that keeps at most this many landmarks; False for none."""
     if management is False or management is None:
         return False
     policy = as_policy(management)

@@ -162,7 +162,7 @@ class SupportsRemoval(Protocol):
     """An estimator that removes landmarks from its map."""
 
     def remove(self, landmark_ids: Sequence[int]) -> None:
-        """Marginalise landmarks; all else keeps its last bit."""
+        """Marginalise landmarks; all else is unchanged to the last bit."""
 
 
 @runtime_checkable
@@ -186,7 +186,7 @@ class SupportsMemoryEstimate(Protocol):
     """An estimator that knows how much memory a map takes."""
 
     def memory_for(self, landmarks: int) -> int:
-        """Return the least memory that a map of so many landmarks takes [bytes]."""
+        """Return the least memory that a map of this many landmarks takes [bytes]."""
         ...
 
 

@@ -85,7 +85,7 @@ def find_estimator(name: str) -> EstimatorFactory:
     Raises
     ------
     ValueError
-        Where there is none, with the nearest name, or where its library is not
+        If there is none, with the nearest name, or where its library is not
         installed, with how to install it.
     """
     factory = _factories.get(name, name)
@@ -132,7 +132,7 @@ def make_estimator(
     Raises
     ------
     ValueError
-        Where the name is unknown or an argument is refused.
+        If the name is unknown or an argument is refused.
     UnknownOptionError
         A ValueError and TypeError, where the estimator does not have an option; it
         suggests the nearest one.
@@ -196,7 +196,7 @@ def make_batch(
     Raises
     ------
     ValueError
-        Where the filter is unknown or cannot run in batches.
+        If the filter is unknown or cannot run in batches.
     """
     if "initial_pose" in options:
         raise ValueError(

@@ -86,7 +86,7 @@ def posterior_bound(
     Raises
     ------
     ValueError
-        Where shapes do not fit or a deviation is refused.
+        If shapes do not fit or a deviation is refused.
     """
     poses = argument_checks.as_floats("true_poses", true_poses)
     places = argument_checks.as_floats("landmarks", landmarks)

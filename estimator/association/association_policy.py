@@ -20,12 +20,12 @@ class AssociationPolicy:
     Raises
     ------
     ValueError
-        Where a value is out of range.
+        If a value is out of range.
     """
 
     association: str = "auto"
     """How readings without identity are assigned to landmarks: "nearest", each reading
-    to its likeliest landmark; "joint", the likeliest assignment of the whole scan;
+    to its most likely landmark; "joint", the most likely assignment of the whole scan;
     "compatibility", the most pairs that are jointly compatible (JCBB); "hypotheses",
     several joint assignments, followed until the readings decide between them; "auto",
     hypotheses, but joint in filters for large maps and those that observe the truth."""

@@ -37,7 +37,7 @@ DISTANCE_GATE = 10.83
 RIVAL_SHARE = 0.75
 """A second place with a larger share of the landmarks is a rival."""
 RIVAL_GAP = 3.0
-"""A rival's pairs are so many times farther apart than the worst pair of the match."""
+"""How much farther apart a rival's pairs are than the worst pair of the match."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,9 @@ class Constellations:
     least: int = 6
     """Smallest number of landmarks that make a constellation."""
     margin: int = 3
-    """A second place that fits with fewer than so many landmarks less, or with more
-    than three quarters of them, is a rival: the constellation is not used."""
+    """A second place is a rival if it matches almost as many landmarks: fewer by less
+    than this number, or more than three quarters of them.  The constellation is then
+    not used."""
     lost_std: float = 1.0
     """A landmark whose position relative to the robot is less certain than this is not
     associated with single readings [m]."""

@@ -91,7 +91,7 @@ def best_assignments(
     nodes : int
         Limit of the search.  At the limit, the best assignments found so far are
         returned.  The first of them always gives each reading in turn the pair that is
-        likeliest given the pairs before it.
+        most likely given the pairs before it.
 
     Notes
     -----

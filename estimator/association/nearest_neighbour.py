@@ -23,7 +23,7 @@ class Distances(NamedTuple):
     unlikelihood: Array
     """νᵀ S⁻¹ ν + ln det S, shape (m, n): −2 ln of the likelihood, but for a constant.
 
-    Of two landmarks equally many σ away the better known one is the likelier.
+    Of two landmarks at the same distance in σ, the more certain one is more likely.
     """
 
 
@@ -129,8 +129,8 @@ def nearest_neighbours(
 ) -> IntArray:
     """Give each reading at most one landmark, and each landmark at most one reading.
 
-    A reading is of the landmark under which it is likeliest, among those whose
-    νᵀ S⁻¹ ν is within the gate, if it is also the likeliest reading for that landmark.
+    A reading belongs to the landmark under which it is most likely, among those whose
+    νᵀ S⁻¹ ν is within the gate, if it is also that landmark's most likely reading.
 
     Parameters
     ----------

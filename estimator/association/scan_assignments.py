@@ -38,7 +38,7 @@ class Assignments(NamedTuple):
     """The assignments to consider for one scan."""
 
     ranked: list[Assignment]
-    """The likeliest first."""
+    """The most likely first."""
     explained: IntArray
     """Landmarks that some reading may belong to, shape (k,)."""
 
@@ -68,7 +68,7 @@ def assign_scan(
         Readings per scan that belong to no landmark of the map, where each reading is
         [1 / (rad m)].
     ceiling : float
-        Cost beyond which only the likeliest assignment is of interest.
+        Cost beyond which only the most likely assignment is of interest.
     """
     fit = innovation_distances(
         view.mean, view.covariance, len(view.ids), readings, noise, policy.new_gate
@@ -105,7 +105,7 @@ def assign_scan(
 
 
 def assign_nearest(policy: AssociationPolicy, fit: Distances) -> IntArray:
-    """Assign each reading to its likeliest landmark, as the policy's gates allow."""
+    """Assign each reading to its most likely landmark, as the policy's gates allow."""
     return nearest_neighbours(
         fit,
         match=policy.match_gate,

@@ -23,7 +23,7 @@ from .scan_assignments import assign_nearest, assign_scan
 NO_LABEL = -1
 
 LABEL_BITS = 20
-"""A label is the scan of the first sighting, shifted by so many bits, plus its row."""
+"""A label is the scan of the first sighting, shifted by these bits, plus its row."""
 
 
 class ScanAssociation:
@@ -175,13 +175,13 @@ def associate(
     """Associate readings (m, 2) that have no identity, in every way to consider.
 
     Readings closer than the sensor's least range have no usable bearing: they are
-    ambiguous.  Of associations that cost more than ``ceiling`` only the likeliest is of
+    ambiguous.  Above a cost of ``ceiling``, only the most likely association is of
     interest.
 
     Returns
     -------
     list of Option
-        The likeliest first.
+        The most likely first.
     """
     rows = np.flatnonzero(readings[:, 1] >= sensor.min_range)
     density = _unexplained_density(policy, candidates, readings[rows], sensor.noise)

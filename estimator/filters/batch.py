@@ -44,12 +44,12 @@ class BatchSlam:
     initial_pose_std : array_like, shape (3,)
         Their standard deviation.
     threads : int, optional
-        As many as the machine has cores where not given.
+        By default, the number of cores.
 
     Raises
     ------
     ValueError
-        Where the filter cannot run in batches, or an argument has the wrong shape.
+        If the filter cannot run in batches, or an argument has the wrong shape.
 
     Examples
     --------
@@ -127,7 +127,7 @@ class BatchSlam:
             Duration that the motion noise of each step counts.  A first scan before
             any motion is odometry (0, 0) with dt = 0.
         runs : array_like of bool, shape (B,), optional
-            The runs that take part, all where not given.  The others stay as they are,
+            The runs that take part; by default all.  The others stay as they are,
             and their data is not read; the trace has nan for them.
 
         Returns
@@ -168,7 +168,7 @@ class BatchSlam:
         pose_std : array_like, shape (3,)
             Their standard deviation.
         runs : array_like of bool, shape (B,), optional
-            The runs that start anew, all where not given; the others go on.
+            The runs that start anew; by default all; the others go on.
         """
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         first = first_poses("poses", poses, self.runs)
@@ -219,7 +219,7 @@ class BatchSlam:
         Raises
         ------
         ValueError
-            Where a shape is wrong, or a belief cannot be; nothing is then loaded.
+            If a shape is wrong, or a belief cannot be; nothing is loaded.
         """
         chosen = chosen_runs(runs, self.runs)
         loaded = checked_beliefs(beliefs, references, chosen, self.landmarks)

@@ -42,7 +42,7 @@ class BatchBeliefs(NamedTuple):
         Raises
         ------
         ValueError
-            Where a belief has a landmark with another id.
+            If a belief has a landmark with another id.
         """
         count, size = len(beliefs), 3 + 2 * landmarks
         means, covariances = np.zeros((count, size)), np.zeros((count, size, size))

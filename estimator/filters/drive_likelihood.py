@@ -65,7 +65,7 @@ def drive_likelihood(
         Whether the record holds poses, their covariances, and the innovation of every
         reading too.
     threads : int, optional
-        As many as the machine has cores where not given.
+        By default, the number of cores.
 
     Returns
     -------
@@ -117,7 +117,7 @@ def check_events(events: DriveEvents) -> None:
     Raises
     ------
     ValueError
-        Where a number is not usable, or the parts do not fit together.
+        If a number is not usable, or the parts do not fit together.
     """
     _refuse_numbers("motions", events.motions, 3)
     _refuse_numbers("readings", events.readings, 2)

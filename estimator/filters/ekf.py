@@ -30,8 +30,8 @@ from .scan_workspace import (
 class EkfSlam(MapFilter):
     """Extended Kalman filter over the robot pose and a growing landmark map.
 
-    The state is (x, y, θ, l1x, l1y, …), landmarks in the order of first sight; the
-    readings of one scan are linearised together at the predicted state::
+    The state is (x, y, θ, l1x, l1y, …), with landmarks in the order in which they were
+    first seen.  The readings of a scan are linearised together at the predicted state::
 
         predict   x ← g(x, u),  P ← G P Gᵀ + F R Fᵀ
         update    S = H P Hᵀ + Q = L Lᵀ,  A = L⁻¹ H P
@@ -74,12 +74,12 @@ class EkfSlam(MapFilter):
     Raises
     ------
     ValueError
-        Where an argument has the wrong shape or is not finite, negative or unknown.
+        If an argument has the wrong shape or is not finite, negative or unknown.
 
     Notes
     -----
-    Wherever the heading is uncertain this filter comes to believe that it observes
-    what it cannot, its absolute heading [1]_.
+    If the heading is uncertain, this filter becomes overconfident, because it treats
+    the absolute heading as observable [1]_.
 
     References
     ----------
@@ -170,12 +170,12 @@ class EkfSlam(MapFilter):
         Raises
         ------
         ValueError
-            Where the arguments are malformed; the belief is then as before.
+            If the arguments are malformed; the belief is then as before.
         numpy.linalg.LinAlgError
-            Where an innovation covariance is not positive definite, naming the
+            If an innovation covariance is not positive definite, naming the
             reading; the belief is then as before.
         MemoryError
-            Where the landmarks would be more than memory holds; the belief is then as
+            If the landmarks would be more than memory holds; the belief is then as
             before.
         """
         readings = argument_checks.scan(measurements)
@@ -214,7 +214,7 @@ class EkfSlam(MapFilter):
         self.map.copies = covariances_for(rules)
 
     def _make_room(self, readings: int, new: int) -> None:
-        """Grow the arrays where a scan with so many new landmarks overflows them."""
+        """Grow the arrays where a scan with this many new landmarks overflows them."""
         self.map.make_room(new)
         self._workspace.make_room(readings, self.map.capacity)
 

@@ -79,7 +79,7 @@ class GaussianMap:
 
     @staticmethod
     def capacity_for(landmarks: int) -> int:
-        """Return the length of a mean with room for so many landmarks.
+        """Return the length of a mean with room for this many landmarks.
 
         Kernels need a multiple of 4, and one unused entry.
         """
@@ -101,7 +101,7 @@ class GaussianMap:
         self.arrays = BeliefArrays(np.zeros(capacity), covariance, np.zeros(capacity))
 
     def make_room(self, landmarks: int) -> None:
-        """Grow the arrays where so many more landmarks would not fit."""
+        """Grow the arrays where this many more landmarks would not fit."""
         n = self.size
         if n + 2 * landmarks < len(self.arrays.mean):
             return
@@ -196,7 +196,7 @@ class GaussianMap:
         Raises
         ------
         ValueError
-            Where the entries do not fit together; the map is then as before.
+            If the entries do not fit together; the map is then as before.
         """
         self.restore(checked_map(state))
 

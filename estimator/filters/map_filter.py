@@ -20,7 +20,7 @@ FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 
 
 class MapFilter:
-    """Everything of a filter but its steps: reset, belief, saved state, map editing."""
+    """A filter without its steps: reset, belief, saved state, map editing."""
 
     map: GaussianMap
     """The belief, in the arrays that steps change."""
@@ -49,12 +49,12 @@ class MapFilter:
         self.map.reset(first, np.diag(std**2))
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
-        """Marginalise landmarks; the belief about all else keeps its last bit.
+        """Marginalise landmarks; the remaining belief is unchanged to the last bit.
 
         Raises
         ------
         ValueError
-            Where one is not in the map; nothing is then removed.
+            If one is not in the map; nothing is removed.
         """
         self.map.remove(argument_checks.mapped_identities(landmark_ids, self.map.slots))
 
@@ -64,9 +64,9 @@ class MapFilter:
         Raises
         ------
         ValueError
-            Where one is not in the map, or they are the same.
+            If one is not in the map, or they are the same.
         numpy.linalg.LinAlgError
-            Where their distance has no uncertainty; nothing is then merged.
+            If their distance has no uncertainty; nothing is merged.
         """
         self.merge_pairs([(kept, gone)])
 
@@ -76,9 +76,9 @@ class MapFilter:
         Raises
         ------
         ValueError
-            Where a landmark is not in the map, or in two pairs.
+            If a landmark is not in the map, or in two pairs.
         numpy.linalg.LinAlgError
-            Where a distance has no uncertainty; nothing is then merged.
+            If a distance has no uncertainty; nothing is merged.
         """
         kept, gone = pair_checks.landmark_pairs(pairs, self.map.slots)
         at_reference = self.rules.linearisation != AT_ESTIMATE
@@ -122,7 +122,7 @@ class MapFilter:
         Raises
         ------
         ValueError
-            Where the state lacks an entry, is of another estimator, or does not fit
+            If the state lacks an entry, is of another estimator, or does not fit
             together; the belief is then as before.
         """
         entries = ("covariance", "landmark_ids", "mean", "reference")
@@ -134,5 +134,5 @@ class MapFilter:
         self.map.restore(state)
 
     def memory_for(self, landmarks: int) -> int:
-        """Return what a map of so many landmarks takes at least [bytes]."""
+        """Return the least memory of a map with this many landmarks [bytes]."""
         return self.map.copies * covariance_bytes(landmarks)

@@ -31,7 +31,7 @@ class MotionNoise(NamedTuple):
         Raises
         ------
         ValueError
-            Where dt is no number, negative, or too large.
+            If dt is no number, negative, or too large.
         """
         if type(dt) is float and dt == 1.0 and self.at_rest:
             return self.variance

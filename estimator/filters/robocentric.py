@@ -46,7 +46,7 @@ class RobocentricEkfSlam(EkfSlam):
     """
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run with an empty map at a pose (3,) known to (3,)."""
+        """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
         super().reset(pose, pose_std)
         mean, covariance = self.map.mean, self.map.covariance
         first, variance = mean[:3].copy(), covariance.diagonal()[:3].copy()

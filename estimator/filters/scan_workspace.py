@@ -55,7 +55,7 @@ class ScanWorkspace:
 
 
 def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
-    """Allocate what updates by these rules need, with so many readings at most."""
+    """Allocate what updates by these rules need, with this many readings at most."""
     repeated = rules.iterations > 1 or rules.sequential
     return new_workspace(
         readings,

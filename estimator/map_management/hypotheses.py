@@ -27,8 +27,7 @@ SPREAD = 16.0
 """Hypotheses e^8 times less probable than the best one are discarded."""
 
 SAME = 0.5
-"""Hypotheses of the same landmarks whose means differ by less than so many σ in every
-coordinate are the same."""
+"""Hypotheses of the same landmarks are one if all coordinates differ by fewer σ."""
 
 
 def manage(
@@ -69,10 +68,10 @@ def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 class HypothesisSlam:
     """A managed filter that follows several associations side by side.
 
-    Each hypothesis splits into its likeliest joint assignments of a scan.  The costs of
-    the scans add up; hypotheses beyond the number that the policy allows, and those e^8
-    times less probable than the best one, are discarded (Reid 1979).  The belief and
-    the reports are those of the most probable hypothesis.
+    Each hypothesis splits into the most likely joint assignments of a scan.  The costs
+    of the scans are added.  Hypotheses beyond the number that the policy allows, and
+    those e^8 times less probable than the best one, are discarded (Reid 1979).  The
+    belief and the reports are those of the most probable hypothesis.
 
     Parameters
     ----------
@@ -148,7 +147,7 @@ class HypothesisSlam:
         return self.best.decisions
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
+        """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
         self.best.reset(pose, pose_std)
         self._keep([Hypothesis(0.0, self.best)])
 
@@ -183,12 +182,12 @@ class HypothesisSlam:
         return self._advance(readings, options)
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
-        """Marginalise landmarks by hand; only the best hypothesis goes on."""
+        """Marginalise landmarks on request; only the best hypothesis continues."""
         self.best.remove(landmark_ids)
         self._keep(self.hypotheses[:1])
 
     def merge(self, kept: int, gone: int) -> None:
-        """Make one of two landmarks by hand; only the best hypothesis goes on."""
+        """Merge two landmarks on request; only the best hypothesis continues."""
         self.best.merge(kept, gone)
         self._keep(self.hypotheses[:1])
 
@@ -216,7 +215,7 @@ class HypothesisSlam:
         Raises
         ------
         ValueError
-            Where the state lacks an entry, or is of another estimator; all is then as
+            If the state lacks an entry, or is of another estimator; all is then as
             before.
         """
         name = type(self).__name__

@@ -30,7 +30,7 @@ Pairs = list[tuple[int, int]]
 """Landmarks that are the same: (kept, gone)."""
 
 LOCAL_REACH = 3.0
-"""Landmarks count as local within so many times the reach of the readings."""
+"""Landmarks count as local within this many times the reach of the readings."""
 OFFSET_GATE = 25.0
 """Largest χ² of the offset of two landmarks that may be the same; 2 degrees."""
 SAME_GATE = 9.21
@@ -38,10 +38,10 @@ SAME_GATE = 9.21
 ACCURATE = 0.25
 """An offset is accurate if its σ is less than this times that of lost landmarks."""
 NEAR_STDS = 10.0
-"""Readings may belong to landmarks that are so many σ farther away than they reach."""
+"""How many σ beyond the reach of a reading its landmark may be."""
 TURN_STDS = 4.0
 SLACK = 0.2
-"""The heading may be wrong by so many standard deviations and so much [rad]."""
+"""The heading may be wrong by this number of σ, and by this angle [rad]."""
 
 
 class LoopCloser:

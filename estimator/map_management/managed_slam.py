@@ -36,8 +36,8 @@ from .recent_scans import RecentScans
 class ManagedSlam:
     """A filter of any kind that associates, confirms, removes and merges landmarks.
 
-    A :class:`LandmarkPolicy` decides which landmark each reading is of, which new ones
-    to believe, and which to merge or to give up.
+    A :class:`LandmarkPolicy` decides which landmark each reading belongs to, when a new
+    landmark is confirmed, and which landmarks to merge or to remove.
 
     Parameters
     ----------
@@ -53,9 +53,9 @@ class ManagedSlam:
     Raises
     ------
     ValueError
-        Where filter or policy refuse a value.
+        If filter or policy refuse a value.
     TypeError
-        Where the filter's map cannot be edited.
+        If the filter's map cannot be edited.
 
     Notes
     -----
@@ -128,7 +128,7 @@ class ManagedSlam:
         return self._recent.decisions
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
+        """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
         self._filter.reset(pose, pose_std)
         self._editor.expire()
         self._pruner.forget()
@@ -165,7 +165,7 @@ class ManagedSlam:
         Raises
         ------
         ValueError, numpy.linalg.LinAlgError
-            Where the arguments are malformed, or the filter's covariance is degenerate;
+            If the arguments are malformed, or the filter's covariance is degenerate;
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
@@ -185,7 +185,7 @@ class ManagedSlam:
     def alternatives(self, readings: Array, ceiling: float = np.inf) -> list[Option]:
         """Associate readings (m, 2) without identity, in every way to consider.
 
-        Of those that cost more than ``ceiling`` only the likeliest is of interest.
+        Of those that cost more than ``ceiling`` only the most likely is of interest.
         """
         argument_checks.refuse_not_finite(readings)
         known, view = self._candidates, self._pruner.view_for(readings)

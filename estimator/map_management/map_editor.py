@@ -5,11 +5,11 @@ the whole covariance.  Others may support some of these, each by itself:
 
 * ``belief(landmark_ids)`` returns the marginal of the pose and these landmarks;
 * ``landmark_ids`` lists the mapped landmarks in the order of the belief;
-* ``remove(landmark_ids)`` marginalises landmarks, all else keeps its last bit;
+* ``remove(landmark_ids)`` marginalises landmarks and changes nothing else;
 * ``merge(kept, gone)`` conditions on two landmarks being one, and removes the second;
 * ``merge_pairs(pairs)`` does so with several pairs by one measurement;
 * ``local_view(within)`` returns the pose and at least those landmarks that are within
-  so many metres of it, where a view of all of them takes long.
+  this many metres of it, where a view of all of them takes long.
 
 What a filter lacks goes through ``belief()``, ``state_dict()`` and
 ``load_state_dict()``.
@@ -52,7 +52,7 @@ class MapEditor(Protocol):
         ...
 
     def remove(self, ids: Sequence[int]) -> None:
-        """Marginalise landmarks; all else keeps its last bit."""
+        """Marginalise landmarks; all else is unchanged to the last bit."""
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Condition on pairs of landmarks being one, and remove the second of each."""
@@ -70,7 +70,7 @@ def edit_map(slam: SlamEstimator, *, merging: bool = True) -> MapEditor:
     Raises
     ------
     TypeError
-        Where the filter has neither these methods nor a state that can be edited.
+        If the filter has neither these methods nor a state that can be edited.
     """
     can_remove, can_merge = (
         isinstance(slam, ability) and not hides_its_belief(slam)

@@ -86,7 +86,7 @@ class PeerSlam(ABC):
         return tuple(self._slots)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start a new run, the map empty, at a pose (3,) known to (3,) [m, m, rad]."""
+        """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
         mean = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         self._slots = {}

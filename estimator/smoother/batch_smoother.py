@@ -58,12 +58,12 @@ def smooth(
     Raises
     ------
     ValueError
-        Where the drive has no readings, the start does not fit, or it has a landmark
+        If the drive has no readings, the start does not fit, or it has a landmark
         without a reading.
     numpy.linalg.LinAlgError
-        Where the iterations do not converge.
+        If the iterations do not converge.
     MemoryError
-        Where memory does not suffice.
+        If memory does not suffice.
 
     References
     ----------

@@ -59,7 +59,7 @@ class Drive:
     Raises
     ------
     ValueError
-        Where an argument has the wrong shape, is not finite or negative, or a reading
+        If an argument has the wrong shape, is not finite or negative, or a reading
         would have no noise.
 
     Examples
@@ -143,7 +143,7 @@ class Drive:
         Raises
         ------
         ValueError
-            Where the arguments are malformed; the drive is then as before.
+            If the arguments are malformed; the drive is then as before.
         """
         readings = argument_checks.scan(measurements)
         ids = argument_checks.identities(landmark_ids, len(readings))
@@ -189,7 +189,7 @@ class Drive:
         Raises
         ------
         ValueError
-            Where there is no reading.
+            If there is no reading.
         """
         scans = [self.sightings(pose) for pose in range(self.poses)]
         ids = np.concatenate([scan.ids for scan in scans])

@@ -122,7 +122,7 @@ class Optimiser:
         Raises
         ------
         numpy.linalg.LinAlgError
-            Where that takes more than ``most`` iterations, or no step lowers the cost.
+            If that takes more than ``most`` iterations, or no step lowers the cost.
         """
         state = _State(start, self.range_stds(start))
         state.cost = first_cost = self.cost(start, state.stds)
@@ -224,7 +224,7 @@ def factorised(information: Array) -> tuple[Array, bool]:
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where it is not positive definite.
+        If it is not positive definite.
     """
     if not np.isfinite(information).all():
         raise np.linalg.LinAlgError("smoothing diverged: its system is not finite")

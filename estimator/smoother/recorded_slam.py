@@ -142,7 +142,7 @@ class RecordedSlam:
         Raises
         ------
         ValueError
-            Where the state holds no drive, or the filter refuses it.
+            If the state holds no drive, or the filter refuses it.
         """
         saved_states.refuse_other_state(state, [HISTORY])
         history = state[HISTORY]

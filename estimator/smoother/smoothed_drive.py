@@ -114,7 +114,7 @@ class SmoothedDrive:
         poses : sequence of int
             Which poses; negative ones count from the end.
         landmark_ids : sequence of int, optional
-            Which landmarks; all where not given.
+            Which landmarks; by default all.
 
         Returns
         -------
@@ -124,7 +124,7 @@ class SmoothedDrive:
         Raises
         ------
         ValueError
-            Where a pose does not exist or a landmark has no reading.
+            If a pose does not exist or a landmark has no reading.
         """
         chosen = [self._pose(pose) for pose in poses]
         columns = self._columns(self._known(landmark_ids))
@@ -146,7 +146,7 @@ class SmoothedDrive:
         pose : int
             Which pose; the last one by default.
         landmark_ids : sequence of int, optional
-            Which landmarks, in this order; all where not given.
+            Which landmarks, in this order; by default all.
         """
         ids = self._known(landmark_ids)
         mean = np.concatenate(

@@ -37,9 +37,9 @@ class SmoothingSlam(RecordedSlam):
     Raises
     ------
     ValueError
-        Where an argument is refused.
+        If an argument is refused.
     TypeError
-        Where the filter does not take an option.
+        If the filter does not take an option.
     """
 
     def __init__(

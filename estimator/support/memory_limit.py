@@ -14,7 +14,7 @@ _CONTAINER = Path("/sys/fs/cgroup")
 
 
 def covariance_bytes(landmarks: int) -> int:
-    """Return the size of a dense covariance of the pose and so many landmarks [bytes].
+    """Return the size of a dense covariance of a pose and n landmarks [bytes].
 
     Examples
     --------
@@ -69,7 +69,7 @@ def refuse_beyond_memory(
     Raises
     ------
     MemoryError
-        Where it does not fit, with both figures.
+        If it does not fit, with both figures.
     """
     if needed < SMALL:
         return
@@ -94,7 +94,7 @@ def landmarks_that_fit(least: int, wished: int, copies: int = 1) -> int:
     Raises
     ------
     MemoryError
-        Where the smallest number does not fit.
+        If the smallest number does not fit.
     """
     if copies * covariance_bytes(wished) < SMALL:
         return wished

@@ -17,16 +17,16 @@ def chosen_filters(
     Parameters
     ----------
     estimators : str
-        Names with commas between, such as "ekf,invariant[iterations=3]".
+        Names separated by commas, such as "ekf,invariant[iterations=3]".
     options : mapping
-        Options of all of them; those in brackets go before.
+        Options of all of them; options in brackets take precedence.
     settings : callable
         Called with ``estimator`` and ``options``.
 
     Raises
     ------
     ValueError
-        If there is none, one is unknown or malformed, or one stands there twice.
+        If there is none, or one is unknown, malformed, or named twice.
 
     Examples
     --------
@@ -46,7 +46,7 @@ def chosen_filters(
 
 
 def tested_filters(labels: Sequence[str]) -> list[str]:
-    """Return the filters of a Monte Carlo that tests these: one needs another beside.
+    """Return the filters for a Monte Carlo that tests these; one gets a companion.
 
     Examples
     --------

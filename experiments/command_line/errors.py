@@ -26,7 +26,7 @@ class BadInputError(ValueError):
 
 
 class TerminationError(KeyboardInterrupt):
-    """A scheduler or ``kill`` sent SIGTERM; what handles Ctrl-C handles it, too."""
+    """A scheduler or ``kill`` sent SIGTERM; it is handled like Ctrl-C."""
 
 
 class InterruptedRunError(Exception):

@@ -54,12 +54,12 @@ def fit_noise(
 ) -> None:
     """Fit the noise of a log by maximum likelihood.
 
-    Finds the noise under which the readings of a log are most likely, by the
-    innovations of a filter, with 95 % intervals; no truth is needed. Where the
-    innovations are not white, it suggests by how much to inflate the noise of the
-    sensor. Prints the options to paste, and compares filters with the noise before and
-    after. The noise given, or that of the log, is where the search begins, and what a
-    filter associates readings without identity with.
+    Estimates the noise that makes the readings of a log most likely, from the
+    innovations of a filter, with 95 % intervals. No truth is needed. If the innovations
+    are not white, it suggests a factor for the noise of the sensor. Prints the options
+    to paste, and compares the filter with the noise before and after. The search begins
+    at the given noise, or at that of the log, which is also used to associate readings
+    without identity.
 
     Examples
     --------

@@ -17,7 +17,7 @@ def generate(
     *,
     episodes: Annotated[
         int,
-        options.option("N", "How many to drive; episode i has seed SEED + i.", min=1),
+        options.option("N", "Number of episodes; episode i has seed SEED + i.", min=1),
     ],
     controller: options.ControllerName = "waypoints",
     seed: options.Seed = 0,
@@ -26,7 +26,7 @@ def generate(
         options.option(
             "--format NAME",
             "npz, parquet and minari hold everything; slamlog, g2o and tum hold what "
-            "their readers know.",
+            "their formats express.",
         ),
     ] = "npz",
     shard: Annotated[
@@ -51,7 +51,7 @@ def generate(
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Write trajectories by the million.
+    """Write a data set of trajectories.
 
     Drive many episodes of a scenario and write them as a data set: the actions, the
     readings, and the truth. After an interruption, the same command continues where

@@ -1,4 +1,4 @@
-"""``slamgym scenarios`` and ``slamgym estimators``: list what there is."""
+"""``slamgym scenarios`` and ``slamgym estimators``: list worlds and filters."""
 
 import inspect
 from typing import Any
@@ -9,9 +9,9 @@ from .program import command
 
 @command
 def scenarios(as_json: options.AsJson = False) -> None:
-    """List the worlds there are.
+    """List the scenarios.
 
-    List the scenarios that come with slamgym, to run, to film, or to vary.
+    List the scenarios that come with slamgym. Use their names in other commands.
 
     Examples
     --------
@@ -35,10 +35,10 @@ def scenarios(as_json: options.AsJson = False) -> None:
 
 @command
 def estimators(as_json: options.AsJson = False) -> None:
-    """List the filters there are.
+    """List the filters.
 
-    List the filters that come with slamgym, and those of other libraries, which
-    pip install 'slamgym[peers]' installs.
+    List the filters of slamgym, and those of other libraries, which you install with
+    pip install 'slamgym[peers]'.
 
     Examples
     --------

@@ -25,16 +25,16 @@ def monte_carlo(
         str,
         options.option(
             "--estimators -e NAMES",
-            'Filters with commas between, such as "ekf,invariant[iterations=3]" or '
-            '"module:Class" of your own; options stand in brackets.',
+            'Filters separated by commas, such as "ekf,invariant[iterations=3]", or '
+            'your own "module:Class"; options in brackets.',
         ),
     ] = "ekf,invariant",
     runs: Annotated[
         int,
         options.option(
             "",
-            "How many; run i is the world of seed SEED + i, so that seeds closer than "
-            "this share worlds.",
+            "Number of runs. Run i is the world of seed SEED + i; jobs whose seeds are "
+            "closer than this share worlds.",
         ),
     ] = 200,
     seed: options.Seed = 0,
@@ -54,29 +54,27 @@ def monte_carlo(
         str | None,
         options.option(
             "loky|dask|ray",
-            "Where the workers are: loky, on this machine; dask or ray, on a cluster.",
+            "Place of the workers: loky, on this machine; dask or ray, on a cluster.",
         ),
     ] = None,
     scheduler: Annotated[
         str | None,
         options.option(
-            "ADDRESS", "Of the Dask or Ray cluster.", "a cluster of this machine"
+            "ADDRESS", "The Dask or Ray cluster.", "a cluster of this machine"
         ),
     ] = None,
     block_size: Annotated[
-        int, options.option("N", "Runs done and written at a time.")
+        int, options.option("N", "Number of runs computed and written together.")
     ] = 64,
     first_run: Annotated[
         int,
-        options.option(
-            "N", "Leave the runs below N, a multiple of the block size, to others."
-        ),
+        options.option("N", "Omit the runs below N, a multiple of the block size."),
     ] = 0,
     merge: Annotated[
         list[Path] | None,
         options.option(
             "DIR",
-            "Take over what another machine has done of this job. " + options.REPEATED,
+            "Add the results of another machine for this job. " + options.REPEATED,
         ),
     ] = None,
     fresh: Annotated[
@@ -86,8 +84,8 @@ def monte_carlo(
         Path | None,
         options.option(
             "DIR",
-            "The folder to write. A job that was stopped there continues, and more "
-            "runs build on those there are.",
+            "The folder to write. An interrupted job there continues, and more runs "
+            "are added to existing ones.",
             "results/monte-carlo-<scenario>",
         ),
     ] = None,

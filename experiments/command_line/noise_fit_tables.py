@@ -34,7 +34,7 @@ def noise_table(summary: dict[str, Any]) -> Table:
 
 
 def comparison_table(summary: dict[str, Any]) -> Table:
-    """Lay out how filters do under each noise."""
+    """Lay out the results of filters under each noise."""
     table, runs = Table(box=None, pad_edge=False), summary["runs"]
     for heading in ("", *runs):
         table.add_column(Text(heading), justify="right" if heading else "left")
@@ -56,14 +56,14 @@ def comparison_table(summary: dict[str, Any]) -> Table:
 
 
 def advice(summary: dict[str, Any]) -> Table:
-    """Say by how much to inflate the noise of the sensor, and why."""
+    """Describe the suggested inflation of the sensor noise, and its reason."""
     factors = summary["inflation"]
     inflated = [
         f"{sigma} × {factors[name]:.3g}"
         for sigma, name in (("σβ", "bearing"), ("σr", "range"))
         if factors[name] > 1
     ]
-    text = "none: the innovations do not ask for it"
+    text = "none needed"
     if inflated:
         text = f"{', '.join(inflated)}: the errors of readings are correlated in time"
     rows = [("inflation", text)]

@@ -45,7 +45,7 @@ def noise_study(
     runs: Annotated[
         int,
         options.option(
-            "", "For a scenario: more than one runs a Monte Carlo for each change."
+            "", "For a scenario: with more than one, each change is a Monte Carlo."
         ),
     ] = 1,
     change: Annotated[
@@ -111,7 +111,7 @@ def noise_study(
 
 
 class Results(NamedTuple):
-    """What a noise study found."""
+    """The results of a noise study."""
 
     rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]"
     titles: Sequence[str]

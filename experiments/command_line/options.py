@@ -44,7 +44,7 @@ EstimatorName = Annotated[
     str,
     option(
         "--estimator -e NAME",
-        'A filter (see: slamgym estimators), or "module:Class" of your own, with or '
+        'A filter (see: slamgym estimators), or your own "module:Class", with or '
         'without options, as in "invariant[iterations=3]".',
     ),
 ]
@@ -52,17 +52,17 @@ EstimatorNames = Annotated[
     str,
     option(
         "--estimator -e NAMES",
-        'Filters with commas between, such as "ekf,invariant[iterations=3]" or '
-        '"module:Class" of your own. run.html and comparison.png show all of them; the '
-        "other files and numbers are the first one's.",
+        'Filters separated by commas, such as "ekf,invariant[iterations=3]", or your '
+        'own "module:Class". run.html and comparison.png show all of them; the other '
+        "files and numbers are those of the first.",
     ),
 ]
 EstimatorOptions = Annotated[
     list[str] | None,
     option(
         "--option KEY=VALUE",
-        "An option of all filters, such as gate_probability=0.999; those in brackets "
-        f"go before. {REPEATED}",
+        "An option of all filters, such as gate_probability=0.999; options in brackets "
+        f"take precedence. {REPEATED}",
     ),
 ]
 ScenarioChanges = Annotated[
@@ -72,21 +72,21 @@ ScenarioChanges = Annotated[
         f"A change of the scenario, such as sensor.max_range=4. {REPEATED}",
     ),
 ]
-Seed = Annotated[int, option("", "Fixes everything random.", min=0)]
+Seed = Annotated[int, option("", "Seed of all random numbers.", min=0)]
 Steps = Annotated[int | None, option("", "Steps to drive.", "those of the scenario")]
 ControllerName = Annotated[
     str,
     option(
         "NAME",
-        "open_loop follows the scenario's controls blindly, waypoints steers along the "
-        "path they mean, random wanders.",
+        "open_loop applies the scenario's controls, waypoints steers along their "
+        "nominal path, random drives at random.",
     ),
 ]
 TruthFile = Annotated[
     Path | None,
     option(
         "FILE",
-        "A graph file of the true poses of an iSAM or g2o text, by their ids.",
+        "A graph file with the true poses of an iSAM or g2o text, by their ids.",
         "none",
     ),
 ]
@@ -101,7 +101,7 @@ OutFolder = Annotated[
     Path | None,
     option(
         "DIR",
-        "The folder to write. What slamgym wrote there before is replaced.",
+        "The folder to write. It replaces earlier output of slamgym there.",
         "results/<name>-<estimator>",
     ),
 ]
@@ -109,7 +109,7 @@ RerunFile = Annotated[
     Path | None,
     option(
         "FILE",
-        "Write the content of run.html as a recording for the viewer rerun, too (.rrd; "
+        "Also write the content of run.html as a recording for the viewer rerun (.rrd; "
         "needs slamgym[viewer]).",
         "none",
     ),
@@ -154,7 +154,7 @@ NoiseAtRest = Annotated[
     bool | None,
     option(
         "--noise-at-rest/--no-noise-at-rest",
-        "Whether the pose becomes uncertain while the odometry reports no motion.",
+        "Whether there is motion noise while the odometry reports no motion.",
         "from the log, else not",
     ),
 ]

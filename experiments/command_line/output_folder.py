@@ -83,7 +83,7 @@ def _in_use(folder: Path) -> Iterator[None]:
 
 
 def sweep(path: Path) -> None:
-    """Remove what killed commands left beside a folder that they were writing.
+    """Remove unfinished folders that killed commands left beside a folder.
 
     A living process holds a lock in its unfinished folder.  One without a lock is left
     alone for an hour, and an older output if it is the only one.

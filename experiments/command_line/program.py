@@ -55,7 +55,7 @@ def _slamgym(
 ) -> None:
     """Run the program.
 
-    Landmark worlds to drive a robot in, and EKF-SLAM filters to follow it.
+    Simulate a robot among landmarks, and estimate its path and the map by EKF-SLAM.
 
     Examples
     --------

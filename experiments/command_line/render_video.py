@@ -40,9 +40,7 @@ def render(
     set_: options.ScenarioChanges = None,
     fps: Annotated[
         float | None,
-        options.option(
-            "N", "Frames, that is steps, per second.", "so that it lasts 12 s"
-        ),
+        options.option("N", "Frames (steps) per second.", "so that it lasts 12 s"),
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:

@@ -30,8 +30,8 @@ def replay(
         str | None,
         options.option(
             "full|independent",
-            "How a landmark enters the map: full correlates it with the pose it was "
-            "seen from; independent, as in the homework, does not.",
+            "How a landmark enters the map: full correlates it with the pose; "
+            "independent, as in the homework, does not.",
             "full",
         ),
     ] = None,
@@ -68,8 +68,8 @@ def replay(
 ) -> None:
     """Filter a log, compare with the truth, draw.
 
-    Filter a log, and compare with the truth as far as it is known: prints every
-    landmark with its Euclidean and Mahalanobis distance to its true place. Writes
+    Filter a log, and compare with the truth if it is known. Prints every landmark with
+    its Euclidean and Mahalanobis distance to its true position. Writes
     run.html, a page that plays the run, pictures and the numbers.
 
     Examples

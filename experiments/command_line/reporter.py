@@ -59,7 +59,7 @@ class Reporter:
         Parameters
         ----------
         doing : str
-            What goes on, such as "filtering".
+            The activity, such as "filtering".
         unit : str, optional
             What is counted; the bar then shows the rate and the time left too.
 

@@ -26,9 +26,9 @@ def run(
 ) -> None:
     """Drive through a scenario, filter, draw.
 
-    Drive a robot through a scenario and follow it with filters, which know the
-    scenario's noise. Writes run.html, a page that plays the run, pictures of map,
-    errors and covariance, the log, the scenario and the numbers.
+    Drive a robot through a scenario and estimate its path and the map with filters that
+    use the scenario's noise. Writes run.html, a page that plays the run, pictures of
+    map, errors and covariance, the log, the scenario and the numbers.
 
     Examples
     --------
@@ -75,6 +75,6 @@ def run(
     tested = tested_filters([*filters])
     command = ["slamgym", "monte-carlo", scenario, *(f"--set={s}" for s in set_ or ())]
     reporter.show_verbatim(
-        "\nOne run tests no filter: its errors depend on the noise drawn. Test with\n"
+        "\nOne run is no test of a filter: its errors depend on the noise. Test with\n"
         f"{shlex.join([*command, '-e', ','.join(tested)])}"
     )

@@ -1,4 +1,4 @@
-"""A log filtered by estimators: the files of the run, and what is printed of it."""
+"""Filter a log: the files of the run, and its printed results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -55,7 +55,7 @@ def read_any_log(
 
 
 def note_choices(log: SlamLog, reporter: Reporter) -> None:
-    """Note what the importer of a log left out, and which noise it took."""
+    """Note what the importer of a log omitted, and the noise it found."""
     if "left_out" in log.header:
         reporter.note(f"left out of the log: {log.header['left_out']}")
     if "noise" in log.header:

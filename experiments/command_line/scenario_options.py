@@ -30,7 +30,7 @@ def chosen_scenario(
 
 
 def chosen_controller(name: str, scenario: Scenario, seed: int) -> Controller:
-    """Make a controller; a random one wanders the same way for the same seed.
+    """Make a controller; a random one drives the same path for the same seed.
 
     Raises
     ------

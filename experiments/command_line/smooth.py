@@ -25,7 +25,7 @@ def smooth(
         str | None,
         options.option(
             "huber|cauchy",
-            "Give readings that are far off less weight.",
+            "Give outliers less weight.",
             "all weigh the same",
         ),
     ] = None,
@@ -38,11 +38,11 @@ def smooth(
     out: options.OutFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Smooth a log: all its poses and landmarks at once.
+    """Smooth a log: estimate all poses and landmarks at once.
 
     Filters a log, then finds the most likely poses and landmarks given all of its
     readings, with their covariances. The filter associates readings without identity,
-    and what its gate rejects is left out. Compares both with the truth. Where neither
+    and readings outside its gate are omitted. Compares both with the truth. If neither
     the log nor an option specifies a noise, the command assumes one and says so.
 
     Examples

@@ -62,7 +62,7 @@ class NoiseFit:
     """The same, the noise of the sensor inflated where innovations are not white."""
     calibration: float | None
     """The factor of the sensor's noise at which the pose NEES is 1 per degree of
-    freedom; None where the truth is unknown."""
+    freedom; None if the truth is unknown."""
     reading_times: Array
     """Shape (M,)."""
     readings: int
@@ -90,7 +90,7 @@ def fit_noise(
     progress : callable, optional
         Called with (steps done, steps) while a filter associates readings.
     threads : int, optional
-        As many as the machine has cores where not given.
+        By default, the number of cores.
 
     Returns
     -------

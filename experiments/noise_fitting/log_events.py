@@ -146,7 +146,7 @@ def _distinct(sightings: Sightings) -> Iterable[Sightings]:
 
 
 def _times_at(log: SlamLog, counts: list[int]) -> Array:
-    """Return the times at which so many odometry readings had been."""
+    """Return the times at which this many odometry readings had been."""
     times, until, done = [], [], 0
     for step in steps_of(log):
         done += len(_motions_of(log, step.motions))

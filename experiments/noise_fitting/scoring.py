@@ -64,7 +64,7 @@ def maximise(
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where no start has a finite likelihood.
+        If no start has a finite likelihood.
 
     References
     ----------

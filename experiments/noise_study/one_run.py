@@ -27,7 +27,7 @@ _UNITS = dict(zip(SIGMAS, ("m", "m", "rad", "rad", "m"), strict=True))
 
 
 class NoiseRow(NamedTuple):
-    """The numbers of one run of a noise study; None where the truth is unknown."""
+    """The numbers of one run of a noise study; None if the truth is unknown."""
 
     sigma: str
     """The noise that was changed, one of `SIGMAS`; "none" for the reference."""

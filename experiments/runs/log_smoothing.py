@@ -96,7 +96,7 @@ def summarise_smoothing(
         that were smoothed; ``cost``, half the sum of squares, at the ``first`` and the
         last estimate and ``per_degree`` (1 is expected without a robust kernel);
         ``iterations``; ``ate``, ``landmark_rmse`` and ``nees`` (of the pose), each
-        of ``filter`` and ``smoother``, None where the truth is unknown.
+        of ``filter`` and ``smoother``, None if the truth is unknown.
     """
     log, trace, drive = smoothed.log, smoothed.filtered.trace, smoothed.drive
     return {

@@ -15,7 +15,7 @@ NIS_RANGE = (0.5, 2.0)
 """NIS per degree of freedom that is no reason to worry."""
 
 MANY_SCANS = 10
-"""A landmark within reach in so many scans should be in one of them."""
+"""A landmark within reach in this many scans should be in one of them."""
 
 MOST_ABANDONED = 0.25
 """Share of landmarks that scans no longer show above which a map may be split."""

@@ -113,7 +113,7 @@ def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
     -------
     list of dict
         ``{id, x, y, euclidean, mahalanobis}`` [m, m, m, -] in the order of the state;
-        the distances are None where the truth is unknown, and the last one also where
+        the distances are None if the truth is unknown, and the last one also where
         the covariance is singular.
     """
     truth = trace.true_landmarks
@@ -197,7 +197,7 @@ def pose_nees(trace: RunTrace) -> Array:
     """
     if trace.true_poses is None:
         return np.full(len(trace.t), np.nan)
-    with np.errstate(invalid="ignore"):  # nan where the truth is unknown
+    with np.errstate(invalid="ignore"):  # nan if the truth is unknown
         return nees.pose_nees(
             np.asarray(trace.true_poses, dtype=np.float64),
             np.asarray(trace.poses, dtype=np.float64),

@@ -171,7 +171,7 @@ class CompressedEkfSlam:
         Raises
         ------
         ValueError
-            If one is not in the map or both are the same; nothing is then merged.
+            If one is not in the map or both are the same; nothing is merged.
         """
         self.merge_pairs([(kept, gone)])
 
@@ -186,7 +186,7 @@ class CompressedEkfSlam:
         Raises
         ------
         ValueError
-            If one is not in the map or in two pairs; nothing is then merged.
+            If one is not in the map or in two pairs; nothing is merged.
         """
         kept, gone = pair_checks.landmark_pairs(pairs, self._map.slots)
         ids, local = [*kept, *gone], self._map.local
@@ -244,7 +244,7 @@ class CompressedEkfSlam:
         return self._map.nbytes
 
     def memory_for(self, landmarks: int) -> int:
-        """Return the least memory of a map with so many landmarks [bytes]."""
+        """Return the least memory of a map with this many landmarks [bytes]."""
         return min(stored_bytes(landmarks), covariance_bytes(landmarks))
 
     def state_dict(self) -> dict[str, Any]:

@@ -55,12 +55,12 @@ class DeferredCovariance:
         return sum(array.nbytes for array in self._blocks + roots)
 
     def make_room(self, columns: int) -> None:
-        """Append blocks of zeros until there are at least so many columns.
+        """Append blocks of zeros until there are at least this many columns.
 
         Raises
         ------
         MemoryError
-            If memory does not suffice; nothing is then appended.
+            If memory does not suffice; nothing is appended.
         """
         if self.width >= columns:
             return
@@ -265,7 +265,7 @@ class DeferredCovariance:
 
 
 def stored_bytes(landmarks: int) -> int:
-    """Return the size of the blocks for so many landmarks [bytes]."""
+    """Return the size of the blocks for this many landmarks [bytes]."""
     blocks = -(-2 * landmarks // BLOCK)
     return 8 * BLOCK**2 * blocks * (blocks + 1) // 2
 

@@ -192,7 +192,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         Raises
         ------
         ValueError
-            If one is not in the map or both are the same; nothing is then merged.
+            If one is not in the map or both are the same; nothing is merged.
         """
         pair_checks.two_landmarks(kept, gone, self._belief.slots)
         self._belief.merge(kept, gone, exact=self._is_exact)

@@ -89,7 +89,7 @@ class FolderStore:
     Raises
     ------
     ValueError
-        If it is anything else; nothing is then written.
+        If it is anything else; nothing is written.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:

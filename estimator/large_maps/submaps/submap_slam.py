@@ -212,9 +212,9 @@ class SubmapSlam(SubmapQueries):
         ------
         ValueError
             If one is not in the map, both are the same, or the file of a submap is
-            lost; nothing is then merged.
+            lost; nothing is merged.
         numpy.linalg.LinAlgError
-            If the covariance of their distance is singular; nothing is then merged.
+            If the covariance of their distance is singular; nothing is merged.
         """
         self.merge_pairs([(kept, gone)])
 
