@@ -44,8 +44,8 @@ picture = map_figure(run.trace)
 #
 # How far are the landmarks from the truth?
 # -----------------------------------------
-# The Euclidean distance says how wrong the map is. The Mahalanobis distance divides the error by the filter's own
-# uncertainty. For an honest filter, 95 % of the squared Mahalanobis distances are below 5.99, that is the distances below 2.45.
+# The Euclidean distance is the error of the map. The Mahalanobis distance divides this error by the filter's own
+# uncertainty. For a consistent filter, 95 % of the Mahalanobis distances are below 2.45 (the square root of 5.99).
 
 for row in landmark_table(run.trace):
     print(
@@ -56,9 +56,9 @@ against_truth = truth_figure(run.trace)
 # %%
 # Why are all landmarks correlated?
 # ---------------------------------
-# A new landmark inherits the uncertainty of the pose it was seen from. All landmarks share this error, and the covariance
-# between them records it. After the loop nearly all of a landmark's uncertainty is shared with the others: the map is
-# rigid, and moves as a whole.
+# A new landmark inherits the uncertainty of the pose from which it was seen. All landmarks share this error, and the
+# covariance between them describes it. After the loop, nearly all of a landmark's uncertainty is shared with the others:
+# the relative positions are certain, and the map can only move as a whole.
 
 correlations = covariance_figure(run.trace)
 
@@ -66,8 +66,8 @@ correlations = covariance_figure(run.trace)
 # What does each noise do?
 # ------------------------
 # ``study_log`` filters the log eleven times: with the settings of the log, and with each of the five standard deviations
-# times 10 and divided by 10. NIS and NEES are given per degree of freedom, so 1 is expected. With too large a σ the
-# ellipses are wider than needed, and both are below 1; with too small a σ the truth lies outside, and they are above 1.
+# times 10 and divided by 10. NIS and NEES are given per degree of freedom, so 1 is expected. If a σ is too large, the
+# ellipses are too wide, and both are below 1. If it is too small, the truth lies outside the ellipses, and both are above 1.
 
 from slamgym.experiments.figures import noise_study_figure
 from slamgym.experiments.noise_study import study_log
@@ -81,4 +81,4 @@ for study in runs:
 maps = noise_study_figure([(study.title, study.trace) for study in runs])
 
 # %%
-# One drive decides nothing about a filter. :doc:`plot_2_consistency` asks the same of 200 drives.
+# A single drive is no test of a filter. :doc:`plot_2_consistency` tests filters with 100 drives.

@@ -9,8 +9,8 @@ tests it with 100 drives beside two filters of the package.
 # %%
 # Write and check a filter
 # ------------------------
-# A filter is any class with the six methods of ``SlamEstimator``. The shortest way is to change one that exists.
-# ``check_estimator`` drives it through a small world and names the first promise that it breaks.
+# A filter is any class with the six methods of ``SlamEstimator``. The shortest way is to change an existing filter.
+# ``check_estimator`` runs it in a small world and names the first requirement that it violates.
 
 from slamgym import EkfSlam, check_estimator
 
@@ -56,5 +56,5 @@ axes.set(xlabel="step", ylabel="pose NEES per degree", ylim=(0, None))
 axes.legend(frameon=False)
 
 # %%
-# More noise in the filter does not make it honest: the error of ``ekf`` lies in the heading, which its linearisation
-# takes to be observed. :doc:`/filters` explains the mechanism, and :doc:`/consistency` the tests.
+# More motion noise does not make the filter consistent. The problem of ``ekf`` is the heading, which its linearisation
+# treats as observable. :doc:`/filters` explains the mechanism, and :doc:`/consistency` the tests.

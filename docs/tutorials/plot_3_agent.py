@@ -3,7 +3,7 @@ An agent that knows what it does not know
 =========================================
 
 A wrapper runs a filter on the readings of a world and adds its belief to the observation. The agent of this tutorial
-drives a round, and goes home whenever the standard deviation of its position exceeds 30 cm.
+drives around a square, and returns to the start whenever the standard deviation of its position exceeds 30 cm.
 """
 
 # %%
@@ -24,7 +24,7 @@ for key, value in observation.items():
 # %%
 # A reward for information
 # ------------------------
-# ``InformationReward`` pays for every step by which the uncertainty of the map decreases.
+# ``InformationReward`` adds the decrease of the map's uncertainty in each step to the reward.
 
 env = InformationReward(believing, criterion="D")
 robot = believing.scenario.robot
@@ -60,5 +60,5 @@ axes.set(xlabel="step", ylabel="σ of the position [m]", ylim=(0, None))
 axes.legend(frameon=False)
 
 # %%
-# :doc:`/active_slam` has the task ``slamgym/ActiveSlam-v0`` with reference scores, a planner that imagines beliefs, and
-# vector worlds for reinforcement learning.
+# :doc:`/active_slam` describes the task ``slamgym/ActiveSlam-v0`` with reference scores, a planner that predicts beliefs,
+# and vector worlds for reinforcement learning.

@@ -2,7 +2,8 @@
 A world of your own
 ===================
 
-A world is data: a TOML file, or a mapping in Python. Ten lines suffice; :doc:`/generated/fields` lists every field.
+A world is described by data: a TOML file, or a mapping in Python. This tutorial writes one in a dozen lines.
+:doc:`/generated/fields` lists every field.
 """
 
 # %%

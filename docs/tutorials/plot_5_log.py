@@ -2,7 +2,7 @@
 A log of your own
 =================
 
-slamgym reads :doc:`several formats of logs </logs>`. This tutorial writes one, as a program of yours would, and filters it.
+slamgym reads :doc:`several formats of logs </logs>`. This tutorial writes a log, as your own program would, and filters it.
 """
 
 # %%
@@ -31,7 +31,7 @@ Path("corner.csv").write_text(LOG)
 # %%
 # Filter it
 # ---------
-# The header may hold the noise; otherwise you give it. On the command line:
+# Without a noise in the header, you have to specify it. On the command line:
 # ``slamgym replay corner.csv --motion-std .1,.05,.05 --measurement-std .02,.05``.
 
 from slamgym import InvariantEkfSlam, read_log, replay
@@ -49,8 +49,8 @@ picture = map_figure(run.trace)
 # %%
 # The smoother
 # ------------
-# A filter uses each reading once. The smoother finds all poses and landmarks of the log at once
-# (``slamgym smooth corner.csv``). See :doc:`/limits` for how much more accurate it is.
+# A filter processes the readings one after the other. The smoother estimates all poses and landmarks of the log at once
+# (``slamgym smooth corner.csv``). :doc:`/limits` compares their accuracy.
 
 from slamgym.experiments.figures import smoothed_figure
 from slamgym.experiments.runs import settings_for, smooth_log
