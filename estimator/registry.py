@@ -235,6 +235,7 @@ def _unknown_option(
     known = [option for option in _known_options(factory) if option != refused[1]]
     hint = closest(refused[1], known)
     listed = f" (there are {', '.join(known)})" if known else ""
+    name = name.rpartition(":")[2]
     return f"{name} has no option '{refused[1]}'{hint}{listed}"
 
 

@@ -21,8 +21,8 @@ _COLUMNS = {
     "landmark_rmse": "map\n[m]",
     "landmark_rmse_aligned": "fitted\n[m]",
     "ate": "path\n[m]",
-    "nees_per_degree": "NEES\nper dof",
-    "nis_per_degree": "NIS\nper dof",
+    "nees_per_degree": "NEES\n/ dof",
+    "nis_per_degree": "NIS\n/ dof",
 }
 
 
