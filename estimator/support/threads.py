@@ -24,7 +24,7 @@ def share_out(work: Callable[[slice], object], count: int, threads: int) -> None
     slice(0, 3, None)
     """
     threads = min(threads, count)
-    if threads == 1:
+    if threads <= 1:
         work(slice(0, count))
         return
     share = -(-count // (SHARES_PER_THREAD * threads))

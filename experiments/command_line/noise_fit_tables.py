@@ -68,8 +68,11 @@ def advice(summary: dict[str, Any]) -> Table:
         text = f"{', '.join(inflated)}: the errors of readings are correlated in time"
     rows = [("inflation", text)]
     if summary["calibration"] is not None:
-        factor = f"× {summary['calibration']:.3g} of the most likely σβ and σr"
-        rows.append(("by the truth", f"{factor} would make the pose NEES 1 per degree"))
+        factor, low, high = (
+            f"{summary['calibration'][key]:.3g}" for key in ("factor", "low", "high")
+        )
+        text = f"× {factor} ({low} … {high}) of the most likely σβ and σr"
+        rows.append(("by the truth", f"{text} would make the pose NEES 1 per degree"))
     return named_rows(rows)
 
 

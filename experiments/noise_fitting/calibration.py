@@ -2,23 +2,40 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from scipy.stats import chi2
 
 from ...arrays import Array
 from ...estimator.error_frames import ErrorFrame
 from ...evaluation.nees import pose_nees
 from ..logs.ground_truth import true_poses_of
 from ..logs.slamlog import SlamLog
+from .inflation import positive_sum
 from .likelihood import LogLikelihood
 from .noise_vector import BEARING
 
+TAILS = (0.025, 0.975)
 FACTORS = np.geomspace(0.25, 16.0, 19)
+
+
+class Calibration(NamedTuple):
+    """The factor of the sensor's noise at which the pose NEES is as it should be."""
+
+    factor: float
+    low: float
+    """Of its 95 % interval."""
+    high: float
 
 
 def calibrate(
     likelihood: LogLikelihood, log: SlamLog, times: Array, noise: Array
-) -> float | None:
+) -> Calibration | None:
     """Return the factor of the sensor's noise at which NEES is as it should be.
+
+    The mean NEES of one drive scatters, as that of a step is much like that of the step
+    before.  The interval holds the factors under which it is within `nees_bounds`.
 
     Parameters
     ----------
@@ -33,7 +50,7 @@ def calibrate(
 
     Returns
     -------
-    float or None
+    Calibration or None
         Where the mean NEES of the pose is 1 per degree of freedom; the nearest factor
         that was tried where there is none.  None where the true poses are unknown.
     """
@@ -43,27 +60,56 @@ def calibrate(
     noises = np.tile(noise, (len(FACTORS), 1))
     noises[:, BEARING:] *= FACTORS[:, None]
     record = likelihood.record(noises)
-    ratios = np.array(
-        [
-            _nees_per_degree(truth, poses, covariances, likelihood.filter.frame)
-            for poses, covariances in zip(
-                record.poses, record.pose_covariances, strict=True
-            )
-        ]
-    )
-    usable = np.isfinite(ratios) & (ratios > 0)
-    if not usable.any():
+    frame = likelihood.filter.frame
+    nees = [
+        _known_nees(truth, poses, covariances, frame)
+        for poses, covariances in zip(
+            record.poses, record.pose_covariances, strict=True
+        )
+    ]
+    usable = [k for k, values in enumerate(nees) if values.sum() > 0]
+    if not usable:
         return None
-    return _crossing(np.log(FACTORS[usable]), np.log(ratios[usable]))
+    ratios = np.array([nees[k].mean() / 3 for k in usable])
+    bounds = np.array([nees_bounds(nees[k]) for k in usable])
+    factors = np.log(FACTORS[usable])
+    return Calibration(
+        _crossing(factors, np.log(ratios)),
+        _crossing(factors, np.log(ratios / bounds[:, 1])),
+        _crossing(factors, np.log(ratios / bounds[:, 0])),
+    )
 
 
-def _nees_per_degree(
+def _known_nees(
     truth: Array, poses: Array, covariances: Array, frame: ErrorFrame
-) -> float:
+) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         values = pose_nees(truth, poses, covariances, frame=frame)
-    values = values[np.isfinite(values)]
-    return float(values.mean()) / 3 if len(values) else np.nan
+    return values[np.isfinite(values)]
+
+
+def nees_bounds(nees: Array) -> tuple[float, float]:
+    """Return between what the mean NEES per degree of a right noise is, in 95 %.
+
+    Those of χ²(ν)/ν, with ν ≥ 3 and the autocorrelations about the mean and variance
+    that are expected of the NEES of a pose, 3 and 6::
+
+        ν = 3N / (1 + 2 Σ ρ_k),    ρ_k = Σ_t (ε_t − 3)(ε_{t+k} − 3) / 6N
+
+    About its own mean, a series that stays at one value would look white.
+
+    Parameters
+    ----------
+    nees : ndarray, shape (N,)
+        Of one drive, step after step.
+    """
+    excess = nees - 3
+    lags = range(1, len(nees) // 2)
+    products = np.array([excess[k:] @ excess[:-k] for k in lags])
+    together = 1 + 2 * positive_sum(products / (6 * len(nees)))
+    degrees = max(3.0, 3 * len(nees) / together)
+    low, high = chi2.ppf(TAILS, degrees) / degrees
+    return float(low), float(high)
 
 
 def _crossing(factors: Array, ratios: Array) -> float:

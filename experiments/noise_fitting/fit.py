@@ -16,7 +16,7 @@ from ..logs.slamlog import SlamLog
 from ..runs.blas_threads import one_blas_thread
 from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import Progress
-from .calibration import calibrate
+from .calibration import Calibration, calibrate
 from .inflation import Whiteness, whiteness
 from .likelihood import LogLikelihood
 from .log_events import events_of
@@ -60,7 +60,7 @@ class NoiseFit:
     """With the most likely noise."""
     suggested: Fitted
     """The same, the noise of the sensor inflated where innovations are not white."""
-    calibration: float | None
+    calibration: Calibration | None
     """The factor of the sensor's noise at which the pose NEES is 1 per degree of
     freedom; None if the truth is unknown."""
     reading_times: Array

@@ -101,11 +101,11 @@ def _judged(series: Array, together: float = 1.0) -> Whiteness:
     p_value = float(chi2.sf(statistic, LAGS))
     factor = 1.0
     if p_value < SIGNIFICANT:
-        factor = max(1.0, float(np.sqrt(1 + 2 * _positive_sum(correlations))))
+        factor = max(1.0, float(np.sqrt(1 + 2 * positive_sum(correlations))))
     return Whiteness(p_value, float(correlations[0]), factor)
 
 
-def _positive_sum(correlations: Array) -> float:
+def positive_sum(correlations: Array) -> float:
     """Sum pairs of correlations up to the first pair that is not positive."""
     pairs = correlations[: len(correlations) // 2 * 2].reshape(-1, 2).sum(axis=1)
     ends = np.flatnonzero(pairs <= 0)

@@ -7,16 +7,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ...arrays import Array, IntArray
-from .scoring import Likelihoods, curvature, scores, totals
+from .profile import profile_at_zero, profile_crossing
+from .scoring import LITTLE, Likelihoods, curvature, restricted, scores, totals
 
 Verdict = Literal["fitted", "zero", "unknown"]
 
 WITHIN = 1.92  # ½ χ²(1) at 95 %: how much less likely the ends of an interval are
 NOT_ZERO = 1.35  # the same at 90 %, for a parameter that may lie at its end, zero
 NORMAL = 1.96
-VAGUE = 0.25  # a standard deviation of log σ above which zero is considered
-FARTHEST = 10.0  # [m, rad] up to which an upper end is looked for
-TRIED = 41  # values on the way
+ENDS = np.geomspace(1e-6, 10.0, 71)  # [m, rad] where ends are looked for
 
 
 class Interval(NamedTuple):
@@ -29,68 +28,74 @@ class Interval(NamedTuple):
     high: float
 
 
-def intervals(likelihoods: Likelihoods, parameters: Array) -> list[Interval]:
+def intervals(
+    likelihoods: Likelihoods, parameters: Array, log_likelihood: float
+) -> list[Interval]:
     """Return the 95 % intervals of the most likely parameters.
 
     For a parameter that the readings determine, from the curvature of the log
-    likelihood in log σ.  For another one, the upper end is where the readings are
-    significantly less likely, with the others as they are.
+    likelihood in log σ.  For another one, they are where the readings are significantly
+    less likely, the other parameters fitted anew (the profile likelihood).
 
     Parameters
     ----------
     likelihoods : callable
-        Smooth, see :data:`.scoring.Likelihoods`.
+        Smooth, see :data:`.scoring.Likelihoods`; of parameters ≥ 0.
     parameters : ndarray, shape (p,)
-        Where it has its maximum.
+        Where it has its maximum; some may be zero.
+    log_likelihood : float
+        The maximum.
     """
-    theta = np.log(parameters)
-    information = np.diag(scores(likelihoods, theta)[1])
-    is_vague = information < 1 / VAGUE**2
+    free = np.flatnonzero(parameters > 0)
+    information = np.zeros(len(parameters))
+    along = restricted(likelihoods, parameters, free)
+    information[free] = np.diag(scores(along, np.log(parameters[free])).information)
     found = {
-        i: _vague(likelihoods, parameters, i) for i in np.flatnonzero(is_vague).tolist()
+        i: _profiled(likelihoods, parameters, i, log_likelihood)
+        for i in np.flatnonzero(information < LITTLE).tolist()
     }
-    sure = np.array([i for i in range(len(theta)) if not _is_open(found, i)], int)
-    for i, width in zip(
-        sure.tolist(), _widths(likelihoods, theta, sure, information), strict=True
-    ):
-        spread = np.exp(NORMAL * width)
-        low, high = parameters[i] / spread, parameters[i] * spread
-        found[i] = Interval("fitted", float(low), float(high))
-    return [found[i] for i in range(len(theta))]
+    sure = np.flatnonzero(information >= 1.0)
+    widths = _widths(likelihoods, parameters, sure, information)
+    for i, width in zip(sure.tolist(), widths, strict=True):
+        if i not in found:
+            spread = np.exp(NORMAL * width)
+            low, high = parameters[i] / spread, parameters[i] * spread
+            found[i] = Interval("fitted", float(low), float(high))
+    return [found[i] for i in range(len(parameters))]
 
 
-def _is_open(found: dict[int, Interval], i: int) -> bool:
-    return i in found and found[i].verdict != "fitted"
-
-
-def _vague(likelihoods: Likelihoods, parameters: Array, i: int) -> Interval:
-    """Judge a poorly determined parameter by the likelihood along it."""
-    tried = np.tile(parameters, (TRIED + 1, 1))
-    tried[1:, i] = np.geomspace(parameters[i], max(FARTHEST, parameters[i]), TRIED)
-    tried[0, i] = 0.0
-    at_zero, *above = totals(likelihoods(tried))
-    most = above[0]
-    beyond = np.flatnonzero(np.array(above) < most - WITHIN)
-    high = float(tried[1 + beyond[0], i]) if len(beyond) else np.inf
-    if at_zero < most - NOT_ZERO:
-        return Interval("fitted", 0.0, high)
-    return Interval("zero" if len(beyond) else "unknown", 0.0, high)
+def _profiled(
+    likelihoods: Likelihoods, parameters: Array, i: int, most: float
+) -> Interval:
+    """Judge a poorly determined parameter by its profile likelihood."""
+    tried = np.tile(parameters, (len(ENDS), 1))
+    tried[:, i] = ENDS
+    outside = totals(likelihoods(tried)) < most - WITHIN
+    above = np.flatnonzero(outside & (parameters[i] < ENDS))
+    below = np.flatnonzero(outside & (parameters[i] > ENDS))
+    low, high = 0.0, np.inf
+    if len(above):
+        start = float(ENDS[above[0]])
+        high = profile_crossing(likelihoods, parameters, i, start, most - WITHIN)
+    least = profile_at_zero(likelihoods, parameters, i)
+    if least < most - WITHIN:
+        start = float(ENDS[below[-1]]) if len(below) else 0.5 * parameters[i]
+        low = profile_crossing(likelihoods, parameters, i, start, most - WITHIN)
+    if least < most - NOT_ZERO:
+        return Interval("fitted", low, high)
+    return Interval("zero" if len(above) else "unknown", 0.0, high)
 
 
 def _widths(
-    likelihoods: Likelihoods, theta: Array, chosen: IntArray, information: Array
+    likelihoods: Likelihoods, parameters: Array, chosen: IntArray, information: Array
 ) -> Array:
-    """Return standard deviations of some θ, by the curvature in them."""
+    """Return standard deviations of some log σ, by the curvature in them."""
     if not len(chosen):
         return np.empty(0)
-
-    def along(parameters: Array) -> Array:
-        whole = np.tile(np.exp(theta), (len(parameters), 1))
-        whole[:, chosen] = parameters
-        return likelihoods(whole)
-
+    along = restricted(likelihoods, parameters, chosen)
+    theta = np.log(parameters[chosen])
     steps = np.clip(0.5 / np.sqrt(information[chosen]), 0.005, 0.1)
-    bent = curvature(along, theta[chosen], steps)
+    bent = curvature(along, theta, steps)
     if not (np.linalg.eigvalsh(bent) > 0).all():
-        bent = scores(along, theta[chosen])[1]
+        bent = scores(along, theta).information
     return np.asarray(np.sqrt(np.diag(np.linalg.pinv(bent))))

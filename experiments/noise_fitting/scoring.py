@@ -15,18 +15,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 
 Likelihoods = Callable[[Array], Array]
 """Of parameters (B, p), the log likelihoods (B, S) of the steps."""
 
 NARROW = 0.01  # step of the differences, in θ
-FARTHEST = 1.5  # the most that an iteration changes one θ
-SHARES = (1.5, 1.0, 0.5, 0.2, 0.05)  # of the step that are tried at once
+FARTHEST = 2.0  # the most that an iteration changes one θ
+SHARES = (8.0, 3.0, 1.5, 1.0, 0.5, 0.15)  # of the step that are tried at once
 FAINT = 0.05  # information on θ beside which that of the readings is none
-GAIN = 1e-3  # in ℓ, below which an iteration ends the search
-MOST = 60  # iterations
+LITTLE = 16.0  # information on θ, that of a standard deviation of ¼
+GAIN = 1e-5  # in ℓ, below which an iteration ends a climb
+BETTER = 1e-2  # in ℓ, from which on one value is more likely than another
+MOST = 60  # iterations of a climb
+CLIMBS = 8
 LEAST, GREATEST = 1e-7, 1e3  # of a parameter
+SIZES = 10.0 * 2.0 ** -np.arange(21)  # tried of a poorly determined parameter
 
 
 class Maximum(NamedTuple):
@@ -38,6 +42,24 @@ class Maximum(NamedTuple):
     converged: bool
     passes: int
     """How many values were tried."""
+
+
+class Scores(NamedTuple):
+    """The log likelihood about one θ."""
+
+    value: float
+    """ℓ."""
+    gradient: Array
+    """Σ g_s, shape (p,)."""
+    information: Array
+    """I, shape (p, p)."""
+
+
+class _Climb(NamedTuple):
+    theta: Array
+    scores: Scores
+    converged: bool
+    passes: int
 
 
 def maximise(
@@ -52,6 +74,10 @@ def maximise(
     with the best of several a.  The damping λ grows where none is better.  A parameter
     on which nothing depends keeps its value.
 
+    As σ → 0 the slope along log σ vanishes like σ², whether zero is likely or not.
+    Where a climb ends, each poorly determined parameter is therefore tried at
+    values of all sizes, and the climb goes on from the best of them.
+
     Parameters
     ----------
     likelihoods : callable
@@ -59,7 +85,7 @@ def maximise(
     starts : ndarray, shape (k, p)
         Parameters > 0; the search begins at the most likely of them.
     most : int, optional
-        Iterations, `MOST` where not given.
+        Iterations of a climb, `MOST` where not given.
 
     Raises
     ------
@@ -76,38 +102,67 @@ def maximise(
     best = int(np.argmax(values))
     if not np.isfinite(values[best]):
         raise np.linalg.LinAlgError("the readings are impossible under every noise")
-    theta, value, passes = np.log(starts[best]), float(values[best]), len(starts)
-    damping, converged = 1e-3, False
-    for _ in range(MOST if most is None else most):
-        gradient, information = scores(likelihoods, theta)
-        passes += 2 * len(theta)
-        step = _step(gradient, information, damping)
-        if 0.5 * float(gradient @ step) < GAIN:
-            converged = True
+    theta, passes = np.log(starts[best]), len(starts)
+    for _ in range(CLIMBS):
+        climb = _climb(likelihoods, theta, MOST if most is None else most)
+        passes += climb.passes
+        if not climb.converged:
             break
-        tried = theta + np.outer(SHARES, step)
-        tried = np.clip(tried, np.log(LEAST), np.log(GREATEST))
+        tried = _of_other_sizes(climb)
+        values = totals(likelihoods(np.exp(tried)))
+        passes += len(tried)
+        if not (values > climb.scores.value + BETTER).any():
+            break
+        theta = tried[int(np.argmax(values))]
+    return Maximum(np.exp(climb.theta), climb.scores.value, climb.converged, passes)
+
+
+def _climb(likelihoods: Likelihoods, theta: Array, most: int) -> _Climb:
+    damping, passes, here = 1e-3, 0, None
+    for _ in range(most):
+        if here is None:
+            here = scores(likelihoods, theta)
+            passes += 2 * len(theta) + 1
+        step = _step(here, damping)
+        if 0.5 * float(here.gradient @ step) < GAIN:
+            return _Climb(theta, here, True, passes)
+        if damping > 1e4:
+            break
+        steps = np.clip(np.outer(SHARES, step), -FARTHEST, FARTHEST)
+        tried = np.clip(theta + steps, np.log(LEAST), np.log(GREATEST))
         found = totals(likelihoods(np.exp(tried)))
         passes += len(tried)
         best = int(np.argmax(found))
-        if not found[best] > value:
-            damping *= 30
-        else:
+        if found[best] > here.value:
             damping *= 0.2 if SHARES[best] >= 0.5 else 4
-            theta, value = tried[best], float(found[best])
-        if damping > 1e4:
-            break
-    return Maximum(np.exp(theta), value, converged, passes)
+            theta, here = tried[best], None
+        else:
+            damping *= 30
+    if here is None:
+        here = scores(likelihoods, theta)
+    return _Climb(theta, here, False, passes)
 
 
-def scores(likelihoods: Likelihoods, theta: Array) -> tuple[Array, Array]:
-    """Return the gradient Σ g_s, shape (p,), and I, shape (p, p)."""
-    offsets = NARROW * np.eye(len(theta))
-    around = likelihoods(np.exp(np.concatenate([theta + offsets, theta - offsets])))
-    above, below = around[: len(theta)], around[len(theta) :]
+def _of_other_sizes(climb: _Climb) -> Array:
+    """Return θ with other sizes of each poorly determined entry, (B, p)."""
+    little = np.flatnonzero(np.diag(climb.scores.information) < LITTLE)
+    tried = np.tile(climb.theta, (len(little) * len(SIZES), 1))
+    tried[np.arange(len(tried)), np.repeat(little, len(SIZES))] = np.tile(
+        np.log(SIZES), len(little)
+    )
+    return tried
+
+
+def scores(likelihoods: Likelihoods, theta: Array) -> Scores:
+    """Return ℓ, its gradient and I at one θ, of 2p + 1 passes."""
+    offsets, p = NARROW * np.eye(len(theta)), len(theta)
+    tried = np.concatenate([theta[None], theta + offsets, theta - offsets])
+    around = likelihoods(np.exp(tried))
+    above, below = around[1 : p + 1], around[p + 1 :]
     usable = np.isfinite(above) & np.isfinite(below)
     slopes = np.where(usable, above - below, 0.0) / (2 * NARROW)
-    return slopes.sum(axis=1), slopes @ slopes.T
+    value = float(totals(around[:1])[0])
+    return Scores(value, slopes.sum(axis=1), slopes @ slopes.T)
 
 
 def curvature(likelihoods: Likelihoods, theta: Array, widths: Array) -> Array:
@@ -126,14 +181,26 @@ def curvature(likelihoods: Likelihoods, theta: Array, widths: Array) -> Array:
     return result
 
 
+def restricted(
+    likelihoods: Likelihoods, parameters: Array, chosen: IntArray
+) -> Likelihoods:
+    """Return the likelihoods as functions of some parameters, the others as given."""
+
+    def along(some: Array) -> Array:
+        whole = np.tile(parameters, (len(some), 1))
+        whole[:, chosen] = some
+        return likelihoods(whole)
+
+    return along
+
+
 def totals(likelihoods: Array) -> Array:
     """Return ℓ of each value; -inf where it is not a number."""
     sums = likelihoods.sum(axis=1)
     return np.where(np.isnan(sums), -np.inf, sums)
 
 
-def _step(gradient: Array, information: Array, damping: float) -> Array:
-    """Return the step of θ, none of whose entries exceeds FARTHEST."""
-    weights = damping * np.diag(information) + FAINT
-    step = np.linalg.solve(information + np.diag(weights), gradient)
-    return np.asarray(np.clip(step, -FARTHEST, FARTHEST))
+def _step(here: Scores, damping: float) -> Array:
+    weights = damping * np.diag(here.information) + FAINT
+    step = np.linalg.solve(here.information + np.diag(weights), here.gradient)
+    return np.asarray(step, dtype=np.float64)

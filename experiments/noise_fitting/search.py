@@ -20,12 +20,11 @@ from .noise_vector import (
     replaceable_by_zero,
 )
 from .scoring import (
+    BETTER,
     FAINT,
     GREATEST,
-    LEAST,
-    Likelihoods,
-    Maximum,
     maximise,
+    restricted,
     scores,
     totals,
 )
@@ -35,7 +34,6 @@ COARSE = 6  # iterations of a round after which readings are rejected anew
 FACTORS = 4.0 ** np.arange(-3, 3)  # of motion and of sensor noise, tried at the start
 NEEDLESS = (PER_METRE, IN_METRES)
 PLAIN = 0.15  # standard deviation of log σ below which it is certainly not zero
-NONE = 1e-3  # of its start, below which a fitted noise is zero
 
 
 class FittedNoise(NamedTuple):
@@ -50,6 +48,19 @@ class FittedNoise(NamedTuple):
     high: float
     verdict: Verdict
     """Fitted; zero: the interval begins at zero; unknown: nothing depends on it."""
+
+
+class _Fit(NamedTuple):
+    """A noise on the way."""
+
+    noise: Array
+    """Shape (7,)."""
+    free: BoolArray
+    """Which entries are fitted, shape (7,); the others are zero."""
+    likelihood: float
+    """Its logarithm."""
+    converged: bool
+    passes: int
 
 
 class Found(NamedTuple):
@@ -83,35 +94,38 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
     """
     start = positive_start(before, _typical_range(likelihood))
     chosen = fitted_entries(start)
-    passes, noise = 0, _coarse_start(likelihood, start)
-    rejected = likelihood.rejected(noise)
-    for round_ in range(ROUNDS):
-        smooth = likelihood.without(rejected)
-        fit = _fit(smooth, noise, chosen, None if round_ > 2 else COARSE)
-        noise, passes = _filled(noise, chosen, fit), passes + fit.passes
-        again = likelihood.rejected(noise)
-        if fit.converged and (again == rejected).all():
-            break
-        rejected = again
-    smooth = likelihood.without(rejected)
-    fit = _fit(smooth, noise, chosen, None)
-    noise, chosen, more = _without_needless(
-        smooth, _filled(noise, chosen, fit), chosen, fit
+    smooth, found = _in_turns(likelihood, start, chosen)
+    found = _without_zeros(smooth, _without_needless(smooth, found))
+    _refuse_diverged(found)
+    noise, at = found.noise, np.flatnonzero(chosen)
+    along = restricted(smooth.of, noise, at)
+    judged = dict(
+        zip(at.tolist(), intervals(along, noise[at], found.likelihood), strict=True)
     )
-    passes += fit.passes + more + len(FACTORS) ** 2
-    _refuse_diverged(noise, chosen, fit)
-    at = np.flatnonzero(chosen)
-    found = intervals(_along(smooth, noise, chosen), noise[chosen])
-    judged = dict(zip(at.tolist(), found, strict=True))
     for i, interval in judged.items():
         if interval.verdict == "unknown":
             noise[i] = before[i]
-        elif noise[i] < NONE * start[i]:
-            noise[i] = 0.0
-    return Found(noise, _table(before, noise, judged, start), passes)
+    return Found(noise, _table(before, noise, judged), found.passes)
 
 
-def _coarse_start(likelihood: LogLikelihood, start: Array) -> Array:
+def _in_turns(
+    likelihood: LogLikelihood, start: Array, chosen: BoolArray
+) -> tuple[LogLikelihood, _Fit]:
+    """Reject readings and fit the noise to the others, until the same are rejected."""
+    found = _coarse_start(likelihood, start, chosen)
+    rejected = likelihood.rejected(found.noise)
+    for round_ in range(ROUNDS):
+        smooth = likelihood.without(rejected)
+        found = _fit(smooth, found, most=None if round_ > 2 else COARSE)
+        again = likelihood.rejected(found.noise)
+        if found.converged and (again == rejected).all():
+            return smooth, found
+        rejected = again
+    smooth = likelihood.without(rejected)
+    return smooth, _fit(smooth, found)
+
+
+def _coarse_start(likelihood: LogLikelihood, start: Array, chosen: BoolArray) -> _Fit:
     """Return the most likely of some multiples of motion and of sensor noise."""
     tried = np.array(
         [
@@ -123,100 +137,97 @@ def _coarse_start(likelihood: LogLikelihood, start: Array) -> Array:
     values = totals(likelihood.of(tried))
     if not np.isfinite(values).any():
         raise np.linalg.LinAlgError("the fit diverges: no noise explains the readings")
-    return np.asarray(tried[int(np.argmax(values))])
+    best = int(np.argmax(values))
+    return _Fit(tried[best], chosen, float(values[best]), False, len(tried))
 
 
 def _typical_range(likelihood: LogLikelihood) -> float:
     return max(float(np.median(np.abs(likelihood.events.readings[:, 1]))), 1e-3)
 
 
-def _fit(
-    smooth: LogLikelihood, noise: Array, chosen: BoolArray, most: int | None
-) -> Maximum:
-    along = _along(smooth, noise, chosen)
-    return maximise(along, noise[None, chosen], most=most)
+def _fit(smooth: LogLikelihood, found: _Fit, *, most: int | None = None) -> _Fit:
+    """Fit the free entries, from where they are."""
+    free = np.flatnonzero(found.free)
+    along = restricted(smooth.of, found.noise, free)
+    fit = maximise(along, found.noise[None, free], most=most)
+    noise = found.noise.copy()
+    noise[free] = fit.parameters
+    passes = found.passes + fit.passes
+    return _Fit(noise, found.free, fit.log_likelihood, fit.converged, passes)
 
 
-def _along(smooth: LogLikelihood, noise: Array, chosen: BoolArray) -> Likelihoods:
-    """Return the likelihoods as functions of the chosen entries alone."""
-
-    def likelihoods(parameters: Array) -> Array:
-        noises = np.tile(noise, (len(parameters), 1))
-        noises[:, chosen] = parameters
-        return smooth.of(noises)
-
-    return likelihoods
+def _fixed_at_zero(found: _Fit, entry: int) -> _Fit:
+    noise, free = found.noise.copy(), found.free.copy()
+    noise[entry], free[entry] = 0.0, False
+    return found._replace(noise=noise, free=free)
 
 
-def _filled(noise: Array, chosen: BoolArray, fit: Maximum) -> Array:
-    result = noise.copy()
-    result[chosen] = fit.parameters
-    return result
-
-
-def _without_needless(
-    smooth: LogLikelihood, noise: Array, chosen: BoolArray, fit: Maximum
-) -> tuple[Array, BoolArray, int]:
+def _without_needless(smooth: LogLikelihood, found: _Fit) -> _Fit:
     """Fit again without the part of σr per metre, or of σβ in metres, if needless."""
-    passes = 0
     for entry in NEEDLESS:
-        if not (chosen[entry] and replaceable_by_zero(noise)[entry]):
+        if not (found.free[entry] and replaceable_by_zero(found.noise)[entry]):
             continue
-        if _is_plain(smooth, noise, chosen, entry):
+        if _is_plain(smooth, found, entry):
             continue
-        fewer, tried = chosen.copy(), noise.copy()
-        fewer[entry], tried[entry] = False, 0.0
-        instead = RANGE if entry == PER_METRE else BEARING
+        fewer = _fixed_at_zero(found, entry)
         away = _typical_range(smooth)
-        tried[instead] += noise[entry] * (away if entry == PER_METRE else 1 / away)
-        simpler = _fit(smooth, tried, fewer, None)
-        passes += simpler.passes
-        if simpler.log_likelihood > fit.log_likelihood - NOT_ZERO:
-            noise, chosen, fit = _filled(tried, fewer, simpler), fewer, simpler
-    return noise, chosen, passes
+        if entry == PER_METRE:
+            fewer.noise[RANGE] += found.noise[entry] * away
+        else:
+            fewer.noise[BEARING] += found.noise[entry] / away
+        simpler = _fit(smooth, fewer)
+        if simpler.likelihood > found.likelihood - NOT_ZERO:
+            found = simpler
+    return found
 
 
-def _is_plain(
-    smooth: LogLikelihood, noise: Array, chosen: BoolArray, entry: int
-) -> bool:
+def _is_plain(smooth: LogLikelihood, found: _Fit, entry: int) -> bool:
     """Return whether an entry is so well known that it cannot be zero."""
-    theta = np.log(np.maximum(noise[chosen], LEAST))
-    information = scores(_along(smooth, noise, chosen), theta)[1]
-    at = int(np.count_nonzero(chosen[:entry]))
-    covariance = np.linalg.inv(information + FAINT * np.eye(len(theta)))
+    free = np.flatnonzero(found.free)
+    along = restricted(smooth.of, found.noise, free)
+    information = scores(along, np.log(found.noise[free])).information
+    at = int(np.flatnonzero(free == entry)[0])
+    covariance = np.linalg.inv(information + FAINT * np.eye(len(free)))
     return bool(covariance[at, at] < PLAIN**2)
 
 
-def _refuse_diverged(noise: Array, chosen: BoolArray, fit: Maximum) -> None:
-    largest = noise[chosen].max()
-    if not fit.converged or largest > 0.5 * GREATEST:
+def _without_zeros(smooth: LogLikelihood, found: _Fit) -> _Fit:
+    """Put to zero, one after the other, what makes no reading less likely there."""
+    for _ in range(int(np.count_nonzero(found.free)) - 1):
+        free = np.flatnonzero(found.free)
+        tried = [_fixed_at_zero(found, entry) for entry in free.tolist()]
+        values = totals(smooth.of(np.array([one.noise for one in tried])))
+        best = int(np.argmax(values))
+        if values[best] < found.likelihood - BETTER:
+            break
+        found = _fit(smooth, tried[best])
+    return found
+
+
+def _refuse_diverged(found: _Fit) -> None:
+    if not found.converged or found.noise.max() > 0.5 * GREATEST:
         values = ", ".join(
             f"{entry.name} {value:.3g}"
-            for entry, value in zip(ENTRIES, noise, strict=True)
+            for entry, value in zip(ENTRIES, found.noise, strict=True)
         )
         raise np.linalg.LinAlgError(
-            f"the fit diverges, after {fit.passes} passes it is at {values}"
+            f"the fit diverges, after {found.passes} passes it is at {values}"
         )
 
 
 def _table(
-    before: Array, noise: Array, judged: dict[int, Interval], start: Array
+    before: Array, noise: Array, judged: dict[int, Interval]
 ) -> tuple[FittedNoise, ...]:
-    """Return a row of each fitted entry; one that was needless is zero."""
-    rows = []
-    for i, entry in enumerate(ENTRIES):
-        if not fitted_entries(start)[i]:
-            continue
-        interval = judged.get(i, Interval("zero", 0.0, float("nan")))
-        rows.append(
-            FittedNoise(
-                entry.name,
-                entry.unit,
-                float(before[i]),
-                float(noise[i]),
-                interval.low,
-                interval.high,
-                interval.verdict,
-            )
+    """Return a row of each fitted entry."""
+    return tuple(
+        FittedNoise(
+            ENTRIES[i].name,
+            ENTRIES[i].unit,
+            float(before[i]),
+            float(noise[i]),
+            interval.low,
+            interval.high,
+            interval.verdict,
         )
-    return tuple(rows)
+        for i, interval in judged.items()
+    )

@@ -29,8 +29,9 @@ def summarise_fit(fit: NoiseFit, *, progress: Progress | None = None) -> dict[st
         ``suggested``, of each the ``settings``, ``log_likelihood``, ``rejected``,
         ``whiteness`` of ``bearing`` and ``range``, and as in a replay's summary
         ``nis``, ``nees``, ``ate``, ``landmark_rmse`` and ``readings``; ``inflation`` of
-        ``bearing`` and ``range``; ``calibration``, the factor of the sensor's noise
-        that the truth asks for, or None; ``options``, the line to paste.
+        ``bearing`` and ``range``; ``calibration``, the ``factor`` of the sensor's
+        noise that the truth asks for, ``low`` and ``high`` of its interval, or None;
+        ``options``, the line to paste.
     """
     runs: dict[str, Any] = {}
     for done, stage in enumerate(STAGES):
@@ -47,7 +48,7 @@ def summarise_fit(fit: NoiseFit, *, progress: Progress | None = None) -> dict[st
         "noise": [_row(noise) for noise in fit.noise],
         "runs": runs,
         "inflation": {"bearing": bearing.inflation, "range": distance.inflation},
-        "calibration": None if fit.calibration is None else finite(fit.calibration),
+        "calibration": _calibration(fit),
         "options": options_line(fit.suggested),
     }
 
@@ -84,6 +85,12 @@ def _run(fit: NoiseFit, fitted: Fitted) -> dict[str, Any]:
         },
         **{key: summary[key] for key in COMPARED},
     }
+
+
+def _calibration(fit: NoiseFit) -> dict[str, float | None] | None:
+    if fit.calibration is None:
+        return None
+    return {key: finite(value) for key, value in fit.calibration._asdict().items()}
 
 
 def _row(noise: FittedNoise) -> dict[str, Any]:
