@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false
-"""What runs on Ray: PPO of RLlib on every environment, and a Monte Carlo.
+"""What runs on Ray: PPO of RLlib on every environment, a Monte Carlo, trajectories.
 
 Not part of the suite, as Ray asks for an older Gymnasium and for two gigabytes; in an
 environment of its own::
@@ -19,6 +19,7 @@ import pytest
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.trajectories import generate_trajectories
 
 IDS = sorted(each for each in gym.registry if each.startswith("slamgym/"))
 STEPS = 20
@@ -117,3 +118,14 @@ def test_a_monte_carlo_has_the_bits_of_one_on_this_core(cluster, tmp_path):
     for block in blocks:
         other = tmp_path / "ray" / "blocks" / block.name
         assert block.read_bytes() == other.read_bytes()
+
+
+def test_trajectories_have_the_bytes_of_one_process(cluster, tmp_path):
+    job = {"episodes": 8, "episodes_per_shard": 2, "format": "slamlog"}
+    for name, workers in {"here": {}, "ray": {"backend": "ray", "jobs": 2}}.items():
+        generate_trajectories("six_landmarks", tmp_path / name, **job, **workers)
+    files = sorted(f for f in (tmp_path / "here").rglob("*") if f.is_file())
+    assert len(files) == 8 + 4 + 1
+    for file in files:
+        other = tmp_path / "ray" / file.relative_to(tmp_path / "here")
+        assert file.read_bytes() == other.read_bytes()

@@ -1,4 +1,4 @@
-"""The clusters that a Monte Carlo may use: Dask and Ray."""
+"""The clusters that may do the work of a command: Dask and Ray."""
 
 import contextlib
 from collections.abc import Iterator

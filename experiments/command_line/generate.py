@@ -38,6 +38,9 @@ def generate(
             min=1,
         ),
     ] = None,
+    jobs: options.Jobs = None,
+    backend: options.Backend = None,
+    scheduler: options.Scheduler = None,
     steps: options.Steps = None,
     set_: options.ScenarioChanges = None,
     out: Annotated[
@@ -62,9 +65,11 @@ def generate(
     --------
     slamgym generate loop --episodes 1000
     slamgym generate corridor --episodes 50 --controller random --format parquet
+    slamgym generate loop --episodes 100000 --jobs -1
     slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]
     """
     from ..trajectories import generate_trajectories
+    from .cluster import connected
     from .output_folder import default_folder
     from .reporter import Reporter
     from .scenario_options import chosen_scenario
@@ -73,7 +78,11 @@ def generate(
     place = out or default_folder(world.name, controller, format_)
     reporter = Reporter(as_json=as_json)
     stopped = f"interrupted; whole shards stay in {place}, the same command continues"
-    with reporter.progress("driving", unit="steps") as tick, interruptible(stopped):
+    with (
+        connected(backend, scheduler, jobs),
+        reporter.progress("driving", unit="steps") as tick,
+        interruptible(stopped),
+    ):
         manifest = generate_trajectories(
             world,
             place,
@@ -82,6 +91,8 @@ def generate(
             seed=seed,
             format=format_,
             episodes_per_shard=shard,
+            jobs=jobs,
+            backend=backend,
             progress=tick,
         )
     size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())

@@ -50,19 +50,8 @@ def monte_carlo(
     ] = None,
     resolution: options.Resolution = 0.0,
     jobs: options.Jobs = None,
-    backend: Annotated[
-        str | None,
-        options.option(
-            "loky|dask|ray",
-            "Place of the workers: loky, on this machine; dask or ray, on a cluster.",
-        ),
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        options.option(
-            "ADDRESS", "The Dask or Ray cluster.", "a cluster of this machine"
-        ),
-    ] = None,
+    backend: options.Backend = None,
+    scheduler: options.Scheduler = None,
     block_size: Annotated[
         int, options.option("N", "Number of runs computed and written together.")
     ] = 64,

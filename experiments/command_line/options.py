@@ -172,6 +172,17 @@ Jobs = Annotated[
     option(
         "--jobs -j N",
         "Worker processes, -1 for one on each core.",
-        "this process, its filters on all cores",
+        "this process alone",
     ),
+]
+Backend = Annotated[
+    str | None,
+    option(
+        "loky|dask|ray",
+        "Place of the workers: loky, on this machine; dask or ray, on a cluster.",
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    option("ADDRESS", "The Dask or Ray cluster.", "a cluster of this machine"),
 ]

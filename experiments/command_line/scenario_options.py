@@ -1,16 +1,18 @@
 """Scenarios and controllers by the names that the user gives."""
 
 from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...envs.controllers import CONTROLLERS, Controller, make_controller
 from ...sim_configs import Scenario, load_scenario
 from ...suggestions import closest
-from ..logs.recording import record_episode
-from ..logs.slamlog import SlamLog
 from .errors import BadInputError
 from .option_values import changes
+
+if TYPE_CHECKING:
+    from ..logs.slamlog import SlamLog
 
 
 def chosen_scenario(
@@ -48,7 +50,9 @@ def recorded(
     controller: str,
     seed: int,
     progress: Callable[[int, int], object] | None = None,
-) -> SlamLog:
+) -> "SlamLog":
     """Record one episode with the controller of a name; see `record_episode`."""
+    from ..logs.recording import record_episode
+
     driver = chosen_controller(controller, scenario, seed)
     return record_episode(scenario, driver, seed, progress=progress)

@@ -5,9 +5,8 @@ nothing else, such as the number of runs, estimators or workers. Runs are simula
 filtered and measured in blocks; a worker computes one block at a time.
 """
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +29,7 @@ from .measure.run_measures import Block, measure_runs
 from .store.job_folder import RESULTS
 from .store.result_blocks import BlockFolder, Job, Span
 from .store.results import dataset_of, load_results, write_results
-from .workers import Workers, engage_workers, integer
+from .workers import Workers, engage_workers, integer, saying_what_is_kept
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -178,7 +177,7 @@ def monte_carlo(
     )
     path = None if out is None else Path(out)
     with one_blas_thread(), BlockFolder(job, path, fresh=fresh) as folder:
-        with _saying_what_is_kept(path):
+        with saying_what_is_kept(_kept_in(path)):
             _complete(folder, asked, work, workers, progress or _no_progress)
         if path is None:
             return dataset_of(job, folder.blocks(asked), asked, command)
@@ -209,20 +208,10 @@ def _complete(
             progress(done, asked.size)
 
 
-@contextmanager
-def _saying_what_is_kept(path: Path | None) -> Iterator[None]:
-    """Report the loss of a worker process with what the same job needs not do again."""
-    try:
-        yield
-    except BrokenProcessPool as error:
-        kept = (
-            "nothing is kept without a folder for the results"
-            if path is None
-            else f"the finished runs are in {path}, and the same command continues"
-        )
-        raise OSError(
-            f"a worker process was killed, perhaps for want of memory; {kept}"
-        ) from error
+def _kept_in(path: Path | None) -> str:
+    if path is None:
+        return "nothing is kept without a folder for the results"
+    return f"the finished runs are in {path}, and the same command continues"
 
 
 def _computed(

@@ -1,10 +1,12 @@
-"""Engage the workers of a Monte Carlo: processes, threads, or a cluster."""
+"""Engage the workers of a long job: processes, threads, or a cluster."""
 
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -56,6 +58,17 @@ def integer(name: str, value: int, least: int) -> int:
     if not (whole and least <= value < _LARGEST):
         raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
     return int(value)
+
+
+@contextmanager
+def saying_what_is_kept(kept: str) -> Iterator[None]:
+    """Report the loss of a worker process with what the same job needs not do again."""
+    try:
+        yield
+    except BrokenProcessPool as error:
+        raise OSError(
+            f"a worker process was killed, perhaps for want of memory; {kept}"
+        ) from error
 
 
 def _joblib_workers(jobs: int | None, backend: str | None) -> Workers:

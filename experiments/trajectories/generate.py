@@ -1,29 +1,33 @@
 """Generate trajectories shard by shard, and continue after an interruption."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import closing
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short_repr
+from typing import TYPE_CHECKING
 
 from ...envs.controllers import CONTROLLERS
 from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_errors import unknown_choice
 from .dataset import is_whole
-from .driven_episodes import drive_episodes
-from .formats import TrajectoryFormat, trajectory_format
+from .formats import trajectory_format
 from .manifest import (
     MANIFEST,
     Job,
     Manifest,
     ShardEntry,
-    checksum,
     read_manifest,
     versions_now,
     write_manifest,
 )
-from .shard_folder import claimed, replace_shard
+from .shard_folder import claimed, put_in_place, staging_folder
+from .shard_work import MadeShard, ShardWork, make_shard
+
+if TYPE_CHECKING:
+    from ..monte_carlo.workers import Workers
 
 Progress = Callable[[int, int], object]
 
@@ -40,6 +44,8 @@ def generate_trajectories(
     seed: int = 0,
     format: str = "npz",
     episodes_per_shard: int | None = None,
+    jobs: int | None = None,
+    backend: str | None = None,
     progress: Progress | None = None,
 ) -> Manifest:
     """Drive episodes and write them to a folder, or write those that it lacks.
@@ -65,9 +71,14 @@ def generate_trajectories(
         Format of the files, see `formats`.
     episodes_per_shard : int, optional
         The default is 100, or fewer if they would take more than 256 MB of memory.
+    jobs : int, optional
+        Number of workers, each of which makes one shard at a time; -1 for one on each
+        core. By default this process does all. The bytes are the same.
+    backend : {"loky", "dask", "ray"}, optional
+        Provider of the workers.
     progress : callable, optional
         Called with (steps done, steps of all episodes), which includes steps of
-        earlier calls.
+        earlier calls; with workers, after every shard.
 
     Returns
     -------
@@ -82,7 +93,7 @@ def generate_trajectories(
     ImportError
         If the package of the format is not installed.
     OSError
-        If a file cannot be written.
+        If a file cannot be written, or a worker is killed.
     """
     world = load_scenario(scenario)
     _check_numbers(episodes=(episodes, 1), seed=(seed, 0))
@@ -94,8 +105,18 @@ def generate_trajectories(
     layout = trajectory_format(format)
     layout.check(world)
     job = Job(world, controller, seed, episodes, episodes_per_shard, format)
+    versions = versions_now(layout.LIBRARIES)
+    workers = _engaged(jobs, backend)
     with claimed(Path(out)):
-        return _continue(job, Path(out), layout, progress)
+        return _continue(job, Path(out), versions, workers, progress)
+
+
+def _engaged(jobs: int | None, backend: str | None) -> "Workers | None":
+    if jobs is None and backend is None:
+        return None
+    from ..monte_carlo.workers import engage_workers  # noqa: PLC0415 (loads joblib)
+
+    return engage_workers(jobs, backend)
 
 
 def default_episodes_per_shard(scenario: Scenario) -> int:
@@ -117,20 +138,55 @@ def _check_numbers(**numbers: tuple[int, int]) -> None:
 
 
 def _continue(
-    job: Job, out: Path, layout: TrajectoryFormat, progress: Progress | None
+    job: Job,
+    out: Path,
+    versions: dict[str, str],
+    workers: "Workers | None",
+    progress: Progress | None,
 ) -> Manifest:
-    manifest = _begun(job, out, versions_now(layout.LIBRARIES))
+    manifest = _begun(job, out, versions)
     bar = _Bar(job, progress)
-    entries = dict(enumerate(manifest.shards))
+    entries = {job.shard_of(entry.first_episode): entry for entry in manifest.shards}
+    missing = []
     for number in range(job.shards):
-        entry = entries.get(number)
-        if entry is not None and is_whole(out, entry):
+        if number in entries and is_whole(out, entries[number]):
             bar.skip(len(job.episodes_of(number)))
-            continue
-        entries[number] = _make_shard(job, number, out, layout, entry, bar)
-        manifest = manifest.with_shards(entries[k] for k in sorted(entries))
-        write_manifest(manifest, out)
+        else:
+            missing.append(number)
+    with staging_folder(out) as staging:
+        work = ShardWork(job, manifest.versions, staging)
+        with closing(_made(work, missing, workers, bar)) as made:  # ends the workers
+            for shard in made:
+                _check_promise(out, entries.get(shard.number), shard.entry)
+                put_in_place(work.fetch(shard), out / shard.entry.name)
+                entries[shard.number] = shard.entry
+                manifest = manifest.with_shards(entries[k] for k in sorted(entries))
+                write_manifest(manifest, out)
     return manifest
+
+
+def _made(
+    work: ShardWork, numbers: list[int], workers: "Workers | None", bar: "_Bar"
+) -> Generator[MadeShard, None, None]:
+    """Yield shards as they come, in any order where workers make them."""
+    if workers is None:
+        yield from (work.make(number, bar.advance) for number in numbers)
+        return
+    from ..monte_carlo.workers import saying_what_is_kept  # noqa: PLC0415
+
+    kept = f"whole shards stay in {work.staging.parent}, the same command continues"
+    with saying_what_is_kept(kept):
+        for made in workers((make_shard, (work, number), {}) for number in numbers):
+            yield made
+            bar.advance(made.entry.episodes * work.job.scenario.steps)
+
+
+def _check_promise(out: Path, promised: ShardEntry | None, made: ShardEntry) -> None:
+    if promised is not None and promised != made:
+        raise OSError(
+            f"{out / made.name} was damaged, and generated again it differs from "
+            f"{MANIFEST}: this machine does not make the same bits"
+        )
 
 
 def _begun(job: Job, out: Path, versions: dict[str, str]) -> Manifest:
@@ -157,8 +213,8 @@ def _extended(manifest: Manifest, episodes: int) -> Manifest:
     job = replace(manifest.job, episodes=episodes)
     full = [
         shard
-        for number, shard in enumerate(manifest.shards)
-        if shard.episodes == len(job.episodes_of(number))
+        for shard in manifest.shards
+        if shard.episodes == len(job.episodes_of(job.shard_of(shard.first_episode)))
     ]
     return replace(manifest, job=job, shards=tuple(full))
 
@@ -173,32 +229,6 @@ def _refuse_other(
                 f"{short_repr(there.get(name))}, not {short_repr(wanted.get(name))}: "
                 "choose another out"
             )
-
-
-def _make_shard(
-    job: Job,
-    number: int,
-    out: Path,
-    layout: TrajectoryFormat,
-    promised: ShardEntry | None,
-    bar: "_Bar",
-) -> ShardEntry:
-    """Drive and write the episodes of a shard."""
-    episodes = job.episodes_of(number)
-    name = f"shard_{number:05d}{layout.ENDING}"
-    seeds = [job.seed + episode for episode in episodes]
-    trajectories = drive_episodes(
-        job.scenario, job.controller, seeds, progress=bar.advance
-    )
-    with replace_shard(out / name) as partial:
-        layout.write(trajectories, partial)
-        entry = ShardEntry(name, episodes.start, len(episodes), checksum(partial))
-        if promised is not None and promised != entry:
-            raise OSError(
-                f"{out / name} was damaged, and generated again it differs from "
-                f"{MANIFEST}: this machine does not make the same bits"
-            )
-    return entry
 
 
 class _Bar:

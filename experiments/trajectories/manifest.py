@@ -57,6 +57,10 @@ class Job:
         """Number of shards."""
         return -(-self.episodes // self.episodes_per_shard)
 
+    def shard_of(self, episode: int) -> int:
+        """Return the number of the shard of an episode."""
+        return episode // self.episodes_per_shard
+
     def episodes_of(self, shard: int) -> range:
         """Return the numbers of the episodes of a shard.
 
@@ -102,7 +106,7 @@ class Manifest:
     versions : dict of str to str
         Versions of all that can change a bit: packages, Python, processor type.
     shards : tuple of ShardEntry
-        The shards in the order of their episodes, without gaps.
+        The shards in the order of their episodes; workers may leave gaps on the way.
     """
 
     job: Job

@@ -4,6 +4,7 @@ import contextlib
 import re
 import secrets
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from ..runs.folder_lock import WRITER, locked_folder
 from .manifest import MANIFEST
 
 _WRITING = ".writing-"
+_ATTEMPTS, _BETWEEN = 20, 0.1  # [s]
 _LEFTOVERS = re.compile(r"\.writing-[0-9a-f]{8}|\.manifest\.[0-9a-f]{8}\.json")
 
 
@@ -44,29 +46,33 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def replace_shard(path: Path) -> Iterator[Path]:
-    """Provide a temporary path of the same name, and move it to `path` after the block.
+def staging_folder(folder: Path) -> Iterator[Path]:
+    """Provide an absolute folder inside `folder`, and remove it after the block.
 
-    Works for files and for folders, and replaces what is there.
-
-    Yields
-    ------
-    Path
-        Where to write the file, or make the folder.
+    Shards are written there, and `put_in_place` moves them.
     """
-    temporary = path.with_name(f"{_WRITING}{secrets.token_hex(4)}")
-    temporary.mkdir()
+    staging = folder.resolve() / f"{_WRITING}{secrets.token_hex(4)}"
+    staging.mkdir()
     try:
-        partial = temporary / path.name
-        yield partial
-        _remove(path)
-        partial.replace(path)
+        yield staging
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _remove(staging)
+
+
+def put_in_place(staged: Path, path: Path) -> None:
+    """Move a complete shard, a file or a folder, and replace what is there."""
+    _remove(path)
+    staged.replace(path)
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
+    """Remove a file or a folder, to which a worker that is ending may still write."""
+    if not path.is_dir():
         path.unlink(missing_ok=True)
+        return
+    for _ in range(_ATTEMPTS):
+        shutil.rmtree(path, ignore_errors=True)
+        if not path.exists():
+            return
+        time.sleep(_BETWEEN)
+    shutil.rmtree(path)

@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import os
+import pickle
 import random
 import re
 import subprocess
@@ -24,7 +25,7 @@ from slamgym.experiments.command_line.errors import InterruptedRunError
 from slamgym.experiments.command_line.generate import generate as generate_command
 from slamgym.experiments.command_line.scenario_options import recorded
 from slamgym.experiments.logs.slamlog import write_slamlog
-from slamgym.experiments.trajectories import generate, shard_folder
+from slamgym.experiments.trajectories import driven_episodes, shard_folder, shard_work
 from slamgym.experiments.trajectories.dataset import (
     DamagedShardError,
     load_trajectories,
@@ -36,10 +37,15 @@ from slamgym.experiments.trajectories.generate import (
     default_episodes_per_shard,
     generate_trajectories,
 )
-from slamgym.experiments.trajectories.manifest import checksum, read_manifest
+from slamgym.experiments.trajectories.manifest import (
+    checksum,
+    read_manifest,
+    versions_now,
+)
 from slamgym.sim_configs import load_scenario
 
 LOOP = load_scenario("loop").with_changes(steps=30)
+KILLS = int(os.environ.get("SLAMGYM_TEST_KILLS", "2"))
 RANGES = {"motion_std": [0.5, 2.0], "landmark_shift": 0.5}
 
 
@@ -176,6 +182,53 @@ def test_the_same_job_gives_the_same_bytes(name, tmp_path):
     assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
+@pytest.mark.slow
+def test_workers_make_the_bytes_of_one_process_in_every_format(tmp_path):
+    for name in FORMATS:
+        format_or_skip(name)
+        job = {"format": name, "controller": "random", "episodes_per_shard": 2}
+        small(tmp_path / name / "one", **job)
+        small(tmp_path / name / "two", **job, jobs=2, backend="loky")
+        assert tree(tmp_path / name / "one") == tree(tmp_path / name / "two")
+
+
+def test_a_worker_that_does_not_see_the_folder_sends_its_files(tmp_path):
+    for name in ("npz", "slamlog"):
+        job = small(tmp_path / name, format=name).job
+        work = shard_work.ShardWork(job, versions_now(), tmp_path / f"{name} staging")
+        made = work.make(1)
+        assert made.files
+        work.staging.mkdir()
+        staged = work.fetch(pickle.loads(pickle.dumps(made)))
+        assert checksum(staged) == made.entry.sha256
+        assert made.entry == read_manifest(tmp_path / name).shards[1]
+
+
+def test_a_worker_with_other_versions_refuses_to_work(tmp_path):
+    job = small(tmp_path / "out").job
+    work = shard_work.ShardWork(job, {"numpy": "1.0.0"}, tmp_path)
+    with pytest.raises(ValueError, match=r"both must be equal, for equal bytes"):
+        work.make(0)
+
+
+@pytest.mark.parametrize("workers", [{"jobs": 0}, {"backend": "dusk"}, {"jobs": -2}])
+def test_workers_that_cannot_be_are_refused_and_nothing_is_written(workers, tmp_path):
+    with pytest.raises(ValueError, match=r"jobs must be an integer|mean 'dask'"):
+        small(tmp_path / "out", **workers)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_data_set_with_a_gap_is_extended_with_the_bytes_of_one_call(tmp_path):
+    small(tmp_path / "whole", episodes=11)
+    out = tmp_path / "out"
+    small(out, episodes=7)
+    table = json.loads((out / "manifest.json").read_text())
+    del table["shards"][1]  # as workers may leave it
+    (out / "manifest.json").write_text(json.dumps(table))
+    small(out, episodes=11)
+    assert tree(out) == tree(tmp_path / "whole")
+
+
 # killed and damaged
 
 
@@ -186,10 +239,10 @@ def whole_shards(out):
         return -1
 
 
-def run_until_killed(out, name, delay):
+def run_until_killed(out, name, delay, kind=jobs_to_kill.episodes):
     """Kill the job with SIGKILL a while after some progress."""
     before = whole_shards(out)
-    job = forked.start(jobs_to_kill.episodes, out, name)
+    job = forked.start(kind, out, name)
     while job.is_alive() and whole_shards(out) == before:
         time.sleep(0.001)
     time.sleep(delay)
@@ -212,6 +265,25 @@ def test_a_job_killed_at_random_ends_with_the_bytes_of_one_that_was_not(
     assert ends.count(forked.KILLED) >= kills - 1
     for folder in ("killed", "whole"):
         jobs_to_kill.episodes(tmp_path / folder, name)
+    assert read_manifest(tmp_path / "whole").is_complete
+    assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["loky", "dask"])
+def test_a_job_of_workers_killed_at_random_ends_with_the_bytes_of_one_process(
+    backend, tmp_path
+):
+    if backend == "dask":
+        pytest.importorskip("distributed", reason="needs dask.distributed")
+    kind = jobs_to_kill.episodes_by_workers
+    delays = [random.uniform(0.0, 0.3) for _ in range(KILLS)]
+    ends = [
+        run_until_killed(tmp_path / "killed", backend, delay, kind) for delay in delays
+    ]
+    assert forked.KILLED in ends
+    kind(tmp_path / "killed", backend)
+    kind(tmp_path / "whole", None, None)
     assert read_manifest(tmp_path / "whole").is_complete
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
 
@@ -243,7 +315,7 @@ def test_a_shard_that_was_moved_but_not_listed_is_made_again(name, tmp_path):
 
 def test_whole_shards_are_not_driven_again(tmp_path, monkeypatch):
     small(tmp_path / "out")
-    monkeypatch.setattr(generate, "drive_episodes", None)
+    monkeypatch.setattr(driven_episodes, "drive_episodes", None)
     assert small(tmp_path / "out").is_complete
 
 
@@ -314,7 +386,7 @@ def test_a_repair_that_gives_other_bits_is_refused(tmp_path, monkeypatch):
     def other(scenario, controller, seeds, progress):
         return drive_episodes(scenario, controller, [seed + 1 for seed in seeds])
 
-    monkeypatch.setattr(generate, "drive_episodes", other)
+    monkeypatch.setattr(driven_episodes, "drive_episodes", other)
     with pytest.raises(OSError, match="does not make the same bits"):
         small(tmp_path / "out")
     assert tree(tmp_path / "out") == before
@@ -337,7 +409,7 @@ def test_more_episodes_keep_the_full_shards(tmp_path, monkeypatch):
         driven.extend(seeds)
         return drive_episodes(scenario, controller, seeds, **options)
 
-    monkeypatch.setattr(generate, "drive_episodes", drive)
+    monkeypatch.setattr(driven_episodes, "drive_episodes", drive)
     small(tmp_path / "out")
     assert driven == [8, 9, 10, 11]  # of seeds 5 to 11 in shards of 3
 
@@ -554,6 +626,6 @@ def test_an_interrupted_command_says_that_whole_shards_stay(tmp_path, monkeypatc
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(generate, "drive_episodes", interrupt)
+    monkeypatch.setattr(driven_episodes, "drive_episodes", interrupt)
     with pytest.raises(InterruptedRunError, match=r"whole shards stay in .*out"):
         command(tmp_path / "out")

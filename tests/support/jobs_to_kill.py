@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from slamgym.experiments.command_line.cluster import connected
 from slamgym.experiments.monte_carlo import monte_carlo, runner
 from slamgym.experiments.monte_carlo.store import job_folder
 from slamgym.experiments.trajectories.generate import generate_trajectories
@@ -30,6 +31,19 @@ def episodes(folder, format):
         controller="waypoints",
         format=format,
     )
+
+
+def episodes_by_workers(folder, backend, jobs=2):
+    """Generate 16 shards of trajectories by workers, on a cluster of their own."""
+    with connected(backend, None, jobs):
+        generate_trajectories(
+            load_scenario("loop").with_changes(steps=200),
+            folder,
+            episodes=160,
+            episodes_per_shard=10,
+            jobs=jobs,
+            backend=backend,
+        )
 
 
 def three_blocks(folder, dies_at, began=None):
