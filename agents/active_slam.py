@@ -108,6 +108,10 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         Further options of the filter.
     criterion, accuracy, success_reward, crash_cost, effort_cost, step_cost
         See `RewardWeights`.
+    observation, max_landmarks, dtype
+        Form of the observation, see `ObservationForm`. With ``observation="set"`` the
+        entries with a row per landmark give way to ``landmarks`` (R, 15), one row of
+        `landmark_set.FEATURES` per mapped landmark, and ``mask`` (R,).
     render_mode : {"human", "rgb_array"}, optional
         As in `LandmarkWorldEnv`; the frames also show the belief.
     **changes
@@ -136,9 +140,9 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        weights, changes = split_settings(settings)
+        weights, form, changes = split_settings(settings)
         super().__init__(scenario, render_mode=render_mode, **changes)
-        self.task = ActiveSlamTask(self.scenario, weights)
+        self.task = ActiveSlamTask(self.scenario, weights, form=form)
         self.observation_space = self.task.observation_space
         self._estimator = choose_estimator(estimator, self.scenario, estimator_options)
 
@@ -209,11 +213,10 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         self, beliefs: BatchStorage, info: dict[str, Any]
     ) -> tuple[Observation, dict[str, Any]]:
         rows = self.task.observations()
-        shares = rows["progress"][0]
         rmse = float(map_rmse(beliefs, self._landmarks[None])[0])
         success = bool(self.task.outcome.success[0])
         counts = {
-            "mapped": round(shares[1] * self.scenario.landmarks.count),
+            "mapped": int((beliefs.slots >= 0).sum()),
             "known": int(self.task.episodes.known.sum()),
             "success": success,
             "true_rmse": rmse,

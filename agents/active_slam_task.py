@@ -17,6 +17,7 @@ from .active_slam_kernels import Episodes, StepOutcome, advance
 from .belief_features import belief_space, empty_features
 from .coverage_grid import SECTORS, CoverageGrid
 from .information_reward import CRITERIA, check_criterion, landmark_prior_std
+from .landmark_set import FEATURES, ObservationForm, form_names, write_landmark_sets
 
 _SIZES = {  # of the entries besides the belief
     "goals": 9,
@@ -67,6 +68,8 @@ class ActiveSlamTask:
         Rewards and costs.
     count : int
         B, the number of worlds.
+    form : ObservationForm
+        Of the observations.
 
     Attributes
     ----------
@@ -94,7 +97,11 @@ class ActiveSlamTask:
     """
 
     def __init__(
-        self, scenario: Scenario, weights: RewardWeights, count: int = 1
+        self,
+        scenario: Scenario,
+        weights: RewardWeights,
+        count: int = 1,
+        form: ObservationForm | None = None,
     ) -> None:
         if not scenario.sensor.identities:
             raise ValueError(
@@ -102,19 +109,19 @@ class ActiveSlamTask:
                 f"'{scenario.name}'"
             )
         self.scenario, self.weights = scenario, weights
+        self._form = form or ObservationForm()
         self.grid = CoverageGrid(scenario)
         self.prior_std = landmark_prior_std(scenario)
         landmarks, cells = scenario.landmarks.count, len(self.grid.cells)
         belief = belief_space(landmarks).items()
-        self.observation_space = spaces.Dict(
-            {
-                **{key: flatten_space(box) for key, box in belief},
-                **{
-                    key: spaces.Box(-float(key == "goals"), 1.0, (size,), np.float64)
-                    for key, size in _SIZES.items()
-                },
-            }
-        )
+        flat = {
+            **{key: flatten_space(box) for key, box in belief},
+            **{
+                key: spaces.Box(-float(key == "goals"), 1.0, (size,), np.float64)
+                for key, size in _SIZES.items()
+            },
+        }
+        self.observation_space = self._form.space(spaces.Dict(flat))
         self._shape = count, landmarks
         self._rules = _rules(scenario, weights, self.prior_std)
         self._scratch = (
@@ -130,6 +137,7 @@ class ActiveSlamTask:
             **{key: ((count, size), np.dtype(float)) for key, size in _SIZES.items()},
         }
         self._rows: dict[str, AnyArray] = {}
+        self._sets: dict[str, AnyArray] = {}
         self.episodes = Episodes(
             np.zeros((count, cells), dtype=np.bool_),
             np.zeros(count, dtype=np.int64),
@@ -147,6 +155,8 @@ class ActiveSlamTask:
         """Begin episodes in some worlds, (B,), after their first scan."""
         rows = self._rows or self._empty_rows()
         self._rows = {key: row.copy() for key, row in rows.items()}
+        sets = self._sets or self._empty_sets()
+        self._sets = {key: row.copy() for key, row in sets.items()}
         self.outcome.success[worlds] = False
         self._advance(beliefs, worlds, moved=False)
 
@@ -161,7 +171,7 @@ class ActiveSlamTask:
 
         The observations of other worlds are undefined until `begin`.
         """
-        self._rows = self._empty_rows()
+        self._rows, self._sets = self._empty_rows(), self._empty_sets()
         self.outcome = _no_outcome(self._shape[0])
         self._advance(beliefs, worlds, actions, collisions, moved=True)
         return self.outcome
@@ -169,10 +179,11 @@ class ActiveSlamTask:
     def observations(self) -> dict[str, AnyArray]:
         """Return the observations of all worlds: arrays that no later step changes."""
         count = self._shape[0]
-        return {
+        flat = {
             key: row if row.ndim == 2 else row.reshape(count, -1)
             for key, row in self._rows.items()
         }
+        return self._form.cast({**flat, **self._sets})
 
     def _advance(
         self,
@@ -196,16 +207,32 @@ class ActiveSlamTask:
         )
         plan = self.grid.plan
         advance(worlds, moved, worlds_now, plan, self._rules, self._scratch)
+        if self._sets:
+            write_landmark_sets(worlds, beliefs, self.episodes.known, self._sets)
+
+    def _empty_sets(self) -> dict[str, AnyArray]:
+        shape = self._shape[0], self._form.rows
+        if not self._form.rows:
+            return {}
+        return {
+            "landmarks": np.zeros((*shape, len(FEATURES))),
+            "mask": np.zeros(shape, dtype=np.bool_),
+        }
 
     def _empty_rows(self) -> dict[str, AnyArray]:
         return {key: np.empty(*form) for key, form in self._forms.items()}
 
 
-def split_settings(settings: Mapping[str, Any]) -> tuple[RewardWeights, dict[str, Any]]:
-    """Split settings into reward weights and changes of the scenario."""
-    own = {field.name for field in fields(RewardWeights)}
-    weights = RewardWeights(**{key: settings[key] for key in settings if key in own})
-    return weights, {key: settings[key] for key in settings if key not in own}
+def split_settings(
+    settings: Mapping[str, Any],
+) -> tuple[RewardWeights, ObservationForm, dict[str, Any]]:
+    """Split settings into weights, form of observation and changes of the scenario."""
+    own, form = {field.name for field in fields(RewardWeights)}, form_names()
+    return (
+        RewardWeights(**{key: settings[key] for key in settings if key in own}),
+        ObservationForm(**{key: settings[key] for key in settings if key in form}),
+        {key: settings[key] for key in settings if key not in own | form},
+    )
 
 
 def _rules(

@@ -63,7 +63,7 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        weights, changes = split_settings(settings)
+        weights, form, changes = split_settings(settings)
         super().__init__(
             num_envs,
             scenario,
@@ -72,7 +72,7 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
             render_mode=render_mode,
             **changes,
         )
-        self.task = ActiveSlamTask(self.scenario, weights, num_envs)
+        self.task = ActiveSlamTask(self.scenario, weights, num_envs, form)
         self.single_observation_space = self.task.observation_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         count = self.scenario.landmarks.count

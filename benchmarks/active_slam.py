@@ -32,15 +32,25 @@ from slamgym.agents.active_slam_scores import (
     score_table,
 )
 
-LEVELS = ("active_easy", "active_medium", "active_hard", "active_rooms")
+LEVELS = (
+    "active_easy",
+    "active_medium",
+    "active_hard",
+    "active_uncertain",
+    "active_rooms",
+)
 TRAINING = Path(__file__).parents[1] / "examples" / "09_train_active_slam.py"
 
 
 def score(
-    scenario: str, seeds: range, names: Sequence[str], policy: str | None
+    scenario: str,
+    seeds: range,
+    names: Sequence[str],
+    policy: str | None,
+    estimator: str,
 ) -> dict[str, list[Episode]]:
     """Let baselines and a policy play the maps of one difficulty."""
-    env = ActiveSlamEnv(scenario)
+    env = ActiveSlamEnv(scenario, estimator=estimator)
     players: dict[str, Policy] = {}
     for name in names:
         baseline = make_baseline(name, env.scenario, np.random.default_rng(0))
@@ -64,6 +74,9 @@ def main() -> None:
     parser.add_argument("--level", choices=LEVELS, action="append")
     parser.add_argument("--baseline", choices=BASELINES, action="append")
     parser.add_argument(
+        "--estimator", action="append", help="filters inside (default: invariant)"
+    )
+    parser.add_argument(
         "--policy", metavar="SCENARIO=FILE", action="append", default=[]
     )
     parser.add_argument(
@@ -74,14 +87,17 @@ def main() -> None:
     seeds = range(first, first + given.maps)
     policies = dict(each.split("=", 1) for each in given.policy)
     for scenario in given.level or LEVELS:
-        began = time.perf_counter()
-        names = given.baseline or BASELINES
-        played = score(scenario, seeds, names, policies.get(scenario))
-        took = time.perf_counter() - began
-        print(f"{scenario}, {given.maps} maps ({took:.0f} s)\n{score_table(played)}")
-        for name in ("mpc", "ppo"):
-            if name in played:
-                print(f"{difference_lines(played, name)}\n")
+        for estimator in given.estimator or ["invariant"]:
+            began = time.perf_counter()
+            names = given.baseline or BASELINES
+            policy = policies.get(scenario)
+            played = score(scenario, seeds, names, policy, estimator)
+            took = time.perf_counter() - began
+            print(f"{scenario}, {estimator}, {given.maps} maps ({took:.0f} s)")
+            print(score_table(played))
+            for name in ("mpc", "ppo"):
+                if name in played:
+                    print(f"{difference_lines(played, name)}\n")
 
 
 if __name__ == "__main__":
