@@ -114,7 +114,7 @@ class ActiveSlamTask:
         self.prior_std = landmark_prior_std(scenario)
         landmarks, cells = scenario.landmarks.count, len(self.grid.cells)
         belief = belief_space(landmarks).items()
-        flat = {
+        flat: dict[str, spaces.Space[Any]] = {
             **{key: flatten_space(box) for key, box in belief},
             **{
                 key: spaces.Box(-float(key == "goals"), 1.0, (size,), np.float64)

@@ -94,7 +94,7 @@ class ObservationForm:
             boxes = {key: box for key, box in boxes.items() if not _is_by_row(key)}
             shape, yes_or_no = (self.rows, len(FEATURES)), np.bool_
             boxes["landmarks"] = spaces.Box(-1.0, 1.0, shape, dtype=np.float64)
-            boxes["mask"] = spaces.Box(0, 1, shape[:1], dtype=yes_or_no)  # type: ignore[arg-type]
+            boxes["mask"] = spaces.Box(0, 1, shape[:1], dtype=yes_or_no)
         return spaces.Dict({key: self._box(box) for key, box in boxes.items()})
 
     def _box(self, box: Any) -> Any:
@@ -136,7 +136,10 @@ def write_landmark_sets(
         ``landmarks``, shape (B, R, 15), with the columns of `FEATURES`, and ``mask``,
         shape (B, R). The nearest landmarks come first; rows without one are 0.
     """
-    _write_sets(worlds, tuple(beliefs), known, sets["landmarks"], sets["mask"])
+    means, covariances, slots = beliefs
+    _write_sets(
+        worlds, (means, covariances, slots), known, sets["landmarks"], sets["mask"]
+    )
 
 
 @jit
