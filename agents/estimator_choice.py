@@ -208,12 +208,23 @@ def checked_belief(estimator: FollowingEstimator, step: int) -> BeliefOfMap:
     if _is_sound(len(belief.landmark_ids), *arrays.values()):
         return checked
     shapes = partial(_wrong_shape, count=len(belief.landmark_ids))
-    for problem_of, error in ((shapes, TypeError), (_wrong_number, ValueError)):
-        for part, array in arrays.items():
-            problem = problem_of(part, array)
-            if problem:
-                raise error(f"{name} must {problem} at step {step}")
+    _refuse_problem(arrays, shapes, TypeError, name, step)
+    _refuse_problem(arrays, _wrong_number, ValueError, name, step)
     return checked
+
+
+def _refuse_problem(
+    arrays: Mapping[str, AnyArray],
+    problem_of: Callable[[str, AnyArray], str | None],
+    error: type[Exception],
+    name: str,
+    step: int,
+) -> None:
+    """Raise an error about the first part with a problem."""
+    for part, array in arrays.items():
+        problem = problem_of(part, array)
+        if problem:
+            raise error(f"{name} must {problem} at step {step}")
 
 
 def _is_sound(
@@ -224,17 +235,13 @@ def _is_sound(
     covariance: AnyArray,
 ) -> bool:
     """Return whether shapes and numbers are certainly right: a quick look."""
-    size, finite = 3 + 2 * count, np.isfinite
-    return (
-        pose.shape == (3,)
-        and pose_covariance.shape == (3, 3)
-        and landmarks.shape == (count, 2)
-        and covariance.shape == (size, size)
-        and bool(finite(pose).all() and finite(pose_covariance).all())
-        and bool(finite(landmarks).all() and finite(covariance).all())
-        and pose_covariance.diagonal().min() >= 0.0
-        and covariance.diagonal().min() >= 0.0
-    )
+    parts = pose, pose_covariance, landmarks, covariance
+    size = 3 + 2 * count
+    if [part.shape for part in parts] != [(3,), (3, 3), (count, 2), (size, size)]:
+        return False
+    if not all(np.isfinite(part).all() for part in parts):
+        return False
+    return bool(min(pose_covariance.diagonal().min(), covariance.diagonal().min()) >= 0)
 
 
 def _wrong_shape(part: str, values: AnyArray, count: int) -> str | None:

@@ -214,37 +214,44 @@ def _of_the_filter(
     mistakes: Array | None,
 ) -> Diagnosis:
     """Answer for a filter whose assumptions about the noise are right."""
-    p_value, spurious = errors.p_value, 1.0
-    if knowledge is not None:
-        spurious = _spurious(knowledge)
-        p_value = min(1.0, 2 * min(p_value, spurious))
-    ratio_text, p_text = _ratio_text(errors), _p_text(p_value)
+    spurious, p_value = _both_tests(knowledge, errors.p_value)
     if p_value >= FILTER_RATE:
         sentence = "honest: the noise is what it assumes, and its errors agree."
         return Diagnosis(HONEST, p_value, sentence)
+    ratio_text = _ratio_text(errors)
     if errors.ratio < 1:
         sentence = f"cannot tell: the noise is what it assumes, but {ratio_text}."
         return Diagnosis(CANNOT_TELL, p_value, sentence)
     if mistakes is not None and mistakes.any():
         return _of_the_association(pose, mistakes, errors)
-    if nis_ratio is not None and nis_ratio > np.sqrt(errors.ratio):
+    if (nis_ratio or 0.0) > np.sqrt(errors.ratio):
         sentence = (
             f"cannot tell: the noise is what it assumes, but {ratio_text}, and "
             f"squared innovations are {nis_ratio:.3g} times too large: it may not use "
             "the noise that it is given."
         )
         return Diagnosis(CANNOT_TELL, p_value, sentence)
-    claims = ""
-    if knowledge is not None and spurious < _ERROR_RATE:
-        share = knowledge.mean()
-        claims = (
-            f"; it claims {share:.2g} of the least possible variance of its heading"
-        )
     sentence = (
-        f"linearisation: the noise is what it assumes, but {ratio_text} ({p_text})"
-        f"{claims}."
+        f"linearisation: the noise is what it assumes, but {ratio_text} "
+        f"({_p_text(p_value)}){_claims(knowledge, spurious)}."
     )
     return Diagnosis(LINEARISATION, p_value, sentence)
+
+
+def _claims(knowledge: Array | None, spurious: float) -> str:
+    """State the share of the least possible variance, if it is too small."""
+    if knowledge is None or spurious >= _ERROR_RATE:
+        return ""
+    share = knowledge.mean()
+    return f"; it claims {share:.2g} of the least possible variance of its heading"
+
+
+def _both_tests(knowledge: Array | None, p_value: float) -> tuple[float, float]:
+    """Return the p-value of the claimed variance, and that of both tests together."""
+    if knowledge is None:
+        return 1.0, p_value
+    spurious = _spurious(knowledge)
+    return spurious, min(1.0, 2 * min(p_value, spurious))
 
 
 def _spurious(knowledge: Array) -> float:

@@ -177,14 +177,14 @@ def _checked_density(
     if density is None:
         return np.zeros((2, 0)), np.zeros((count, 0))
     points, weights = (argument_checks.as_floats("density", part) for part in density)
-    shape = (len(points),) if points.ndim == 2 and points.shape[1] == 2 else None
-    if shape is None or weights.shape not in (shape, (count, *shape)):
+    cells = len(points) if points.shape[1:] == (2,) else -1
+    if weights.shape not in ((cells,), (count, cells)):
         raise ValueError(
             f"density must be points (C, 2) and counts (C,) or ({count}, C), "
             f"got {points.shape} and {weights.shape}"
         )
-    usable = [np.isfinite(points), np.isfinite(weights), weights >= 0]
-    if not all(entries.all() for entries in usable):
+    usable = np.isfinite(points).all() and np.isfinite(weights).all()
+    if not usable or (weights < 0).any():
         raise ValueError("density must be finite points and finite counts >= 0")
-    spread = np.broadcast_to(weights, (count, *shape))
+    spread = np.broadcast_to(weights, (count, cells))
     return np.ascontiguousarray(points.T), np.ascontiguousarray(spread)

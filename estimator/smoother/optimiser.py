@@ -131,11 +131,7 @@ class Optimiser:
             state.cost = np.inf
         for iteration in range(1, most + 1):
             self._descend(state)
-            is_found = state.error <= tolerance and state.damping <= FIRST_DAMPING
-            if state.searches and (is_found or iteration % RELOCATED == 0):
-                state.searches -= 1
-                is_found &= self._relocate(state) == 0
-            if is_found:
+            if self._is_found(state, tolerance, iteration):
                 cost = self.cost(state.estimate, self.range_stds(state.estimate))
                 return Solution(state.estimate, cost, first_cost, iteration)
             if self._varies and iteration < REWEIGHTED:
@@ -146,6 +142,14 @@ class Optimiser:
             f"{first_cost:.4g} to {state.cost:.4g}; a better start, another noise or a "
             "robust kernel may help"
         )
+
+    def _is_found(self, state: _State, tolerance: float, iteration: int) -> bool:
+        """Whether the last step was small, and no landmark belongs elsewhere."""
+        is_found = state.error <= tolerance and state.damping <= FIRST_DAMPING
+        if state.searches and (is_found or iteration % RELOCATED == 0):
+            state.searches -= 1
+            is_found &= self._relocate(state) == 0
+        return is_found
 
     def linearised(self, solution: Solution) -> Minimum:
         """Return a solution with its system, which the next call overwrites."""

@@ -71,10 +71,10 @@ def true_landmarks_of(
     """
     if identities is not None:
         ids = [identities.get(i, NO_LANDMARK) for i in ids]
-    elif ids and len(log.landmarks) and hides_identities(log):
+    elif len(landmarks) and len(log.landmarks) and hides_identities(log):
         return _nearest(log.landmarks, landmarks)
     known = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
-    if not any(i in known for i in ids):
+    if known.keys().isdisjoint(ids):
         return None
     return np.array([known.get(i, np.full(2, np.nan)) for i in ids])
 

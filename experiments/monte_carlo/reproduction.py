@@ -29,12 +29,11 @@ def python_call(summary: dict[str, Any]) -> str:
     if summary["assumed_toml"]:
         files.append(ASSUMED_FILE)
         arguments.append(f"assumed={ASSUMED_FILE!r}")
-    if summary["block_size"] is not None:
-        arguments.append(f"block_size={summary['block_size']}")
-    if summary["resolution"]:
-        arguments.append(f"resolution={summary['resolution']}")
-    if first:
-        arguments.append(f"first_run={first}")
+    arguments += [
+        f"{option}={summary[option]}"
+        for option in ("block_size", "resolution", "first_run")
+        if summary[option]
+    ]
     note = (
         f"# first save {' and '.join(map(repr, files))}, see below\n" if files else ""
     )

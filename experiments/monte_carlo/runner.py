@@ -154,17 +154,11 @@ def monte_carlo(
     """
     world, choices = load_scenario(scenario), estimator_choices(estimators)
     assumed_world = world if assumed is None else load_scenario(assumed)
-    if assumed_world.sensor.identities != world.sensor.identities:
-        raise ValueError(
-            "assumed must agree with scenario in sensor.identities: only its noise "
-            "may differ"
-        )
+    _refuse_other_kind(assumed_world, world)
     size = integer("block_size", block_size, 1)
     asked = _span(integer("first_run", first_run, 0), integer("runs", runs, 1), size)
-    if not 0 <= resolution < float("inf"):
-        raise ValueError(f"resolution must be a number >= 0, got {resolution!r}")
-    whole_seed = integer("seed", seed, 0)
-    job = Job(world, assumed_world, choices, whole_seed, size, float(resolution))
+    whole_seed, apart = integer("seed", seed, 0), _resolution(resolution)
+    job = Job(world, assumed_world, choices, whole_seed, size, apart)
     workers = engage_workers(jobs, backend)
     work = _Work(
         world,
@@ -179,11 +173,26 @@ def monte_carlo(
     with one_blas_thread(), BlockFolder(job, path, fresh=fresh) as folder:
         with saying_what_is_kept(_kept_in(path)):
             _complete(folder, asked, work, workers, progress or _no_progress)
+        blocks = folder.blocks(asked)
         if path is None:
-            return dataset_of(job, folder.blocks(asked), asked, command)
-        target = path / RESULTS
-        write_results(target, job, folder.blocks(asked), asked, command)
-        return load_results(target)
+            return dataset_of(job, blocks, asked, command)
+        write_results(path / RESULTS, job, blocks, asked, command)
+        return load_results(path / RESULTS)
+
+
+def _refuse_other_kind(assumed: Scenario, world: Scenario) -> None:
+    """Refuse an assumed world with other identities than the true one."""
+    if assumed.sensor.identities != world.sensor.identities:
+        raise ValueError(
+            "assumed must agree with scenario in sensor.identities: only its noise "
+            "may differ"
+        )
+
+
+def _resolution(value: float) -> float:
+    if not 0 <= value < float("inf"):
+        raise ValueError(f"resolution must be a number >= 0, got {value!r}")
+    return float(value)
 
 
 def _no_progress(done: int, runs: int) -> None:

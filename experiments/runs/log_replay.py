@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
@@ -120,19 +121,17 @@ def replay(
     steps = list(steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     show_truth = _truth_source(estimator, log, times)
-    most = _MOST_JOINED if isinstance(estimator, SupportsJoin) else _MOST_MAPS
-    history = MapHistory(None if keep_history else most)
+    history = MapHistory(None if keep_history else _most_maps(estimator))
     recorder = RunRecorder(estimator, len(steps), history)
     decisions = DecisionRecorder(estimator)
+    watch, progress = watch or _unwatched, progress or _unwatched
     with one_blas_thread():
         for number, step in enumerate(steps):
             with _naming_time(log, step):
                 show_truth(number)
                 report = _take(step, log, estimator, recorder, decisions)
-            if watch is not None:
-                watch(number, estimator, report)
-            if progress is not None:
-                progress(number + 1, len(steps))
+            watch(number, estimator, report)
+            progress(number + 1, len(steps))
     made = decisions.result() if hides_identities(log) else None
     identities = None if made is None else made.identities()
     trace = recorder.trace(name or _name_of(estimator), times, log, identities)
@@ -146,6 +145,14 @@ def replay(
         last_seen=recorder.last_seen,
         decisions=made,
     )
+
+
+def _most_maps(estimator: SlamEstimator) -> int:
+    return _MOST_JOINED if isinstance(estimator, SupportsJoin) else _MOST_MAPS
+
+
+def _unwatched(*_: object) -> None:
+    """Watch nothing."""
 
 
 def _name_of(estimator: SlamEstimator) -> str:
@@ -162,16 +169,21 @@ def _truth_source(
 
     It does nothing for other estimators, or if the log lacks a part of the truth.
     """
+    if not isinstance(estimator, SupportsTruth) or hides_identities(log):
+        return _unwatched  # with hidden identities, the estimator's ids are its own
     poses = true_poses_of(log, times)
-    seen = {i for e in log.events if isinstance(e, Scan) for i in _ids(e) or ()}
     landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
-    if not isinstance(estimator, SupportsTruth) or poses is None:
-        return lambda _: None
-    if hides_identities(log):  # the estimator's ids are its own
-        return lambda _: None
-    if not (seen <= set(landmarks) and np.isfinite(poses).all()):
-        return lambda _: None
+    if poses is None or not np.isfinite(poses).all():
+        return _unwatched
+    if not _seen(log) <= landmarks.keys():
+        return _unwatched
     return lambda step: estimator.observe_truth(poses[step], landmarks)
+
+
+def _seen(log: SlamLog) -> set[int]:
+    """Return the ids of the landmarks that the log has readings of."""
+    scans = (event for event in log.events if isinstance(event, Scan))
+    return set(chain.from_iterable(_ids(scan) or () for scan in scans))
 
 
 def _take(

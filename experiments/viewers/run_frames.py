@@ -147,15 +147,12 @@ def row_outcomes(
     by_id |= dict.fromkeys(report.added_ids, _NEW)
     by_id |= dict.fromkeys(report.rejected_ids, _REJECTED)
     by_id |= dict.fromkeys(report.skipped_ids, _SKIPPED)
-    codes = [_UNUSED if i is None else by_id.get(i, _USED) for i in ids]
-    for code, marked in (
-        (_TENTATIVE, report.tentative_rows),
-        (_AMBIGUOUS, report.ambiguous_rows),
-    ):
-        for row in marked:
-            codes[row] = code
-    known = [NO_ID if i is None else i for i in ids]
-    return np.array(codes, np.uint8), np.array(known, np.int64)
+    known = np.array([NO_ID if i is None else i for i in ids], np.int64)
+    codes = np.array([by_id.get(i, _USED) for i in known.tolist()], np.uint8)
+    codes[known == NO_ID] = _UNUSED
+    codes[list(report.tentative_rows)] = _TENTATIVE
+    codes[list(report.ambiguous_rows)] = _AMBIGUOUS
+    return codes, known
 
 
 def correlations_of(view: MapView) -> Array:

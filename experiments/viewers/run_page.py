@@ -11,18 +11,19 @@ import numpy as np
 from markupsafe import Markup
 from scipy.stats import chi2
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 from ...sim_configs.atomic_file import replace_when_written
 from ..figures.consistency import nis_band
 from ..figures.web_style import page_template
 from ..logs.anonymous import true_ids_of
+from ..logs.events import Scan
 from ..logs.slamlog import SlamLog
 from ..logs.steps import steps_of
 from ..runs.summary import pose_nees
 from ..runs.trace import RunTrace
 from . import run_frames
 from .packed_arrays import PackedArrays, deviation_codes, position_codes
-from .run_frames import OUTCOMES, RunFrames
+from .run_frames import OUTCOMES, MapFrame, RunFrames
 from .viewed_run import ViewedRun, map_at, shown_steps
 
 _PARTS = Path(__file__).parent / "run_page_parts"
@@ -112,18 +113,20 @@ def _pack_world(
     packed.put("landmark.id", log.landmark_ids, "int32")
     packed.put("landmark.x", log.landmarks[:, 0], "float32")
     packed.put("landmark.y", log.landmarks[:, 1], "float32")
-    none = np.empty((0, 2)), np.empty(0, np.int64)
-    rows, ids = [], []
-    for step in steps:
-        scan = scans[step]
-        true_ids = None if scan is None else true_ids_of(scan)
-        readings = none[0] if scan is None else scan.measurements
-        rows.append(readings)
-        ids.append(np.full(len(readings), -2) if true_ids is None else true_ids)
+    rows, ids = zip(*(_readings(scans[step]) for step in steps), strict=True)
     packed.put_frames("reading.true", ids, "int32")
     bearings = [np.round(readings[:, 0] * 1e4) for readings in rows]
     packed.put_frames("reading.bearing", bearings, "int32")
     packed.put_frames("reading.range", [position_codes(r[:, 1]) for r in rows], "int32")
+
+
+def _readings(scan: Scan | None) -> tuple[Array, IntArray]:
+    """Return the readings of a step (m, 2) and their true ids, -2 where unknown."""
+    if scan is None:
+        return np.empty((0, 2)), np.empty(0, np.int64)
+    unknown = np.full(len(scan.measurements), -2)
+    ids = true_ids_of(scan)
+    return scan.measurements, unknown if ids is None else ids
 
 
 def _pack_filter(
@@ -133,19 +136,26 @@ def _pack_filter(
     trace, maps = run.trace, [map_at(run, step) for step in steps]
     _pack_poses(packed, prefix, trace, steps)
     packed.put_frames(f"{prefix}id", [frame.ids for frame in maps], "int32")
+    _pack_maps(packed, prefix, maps)
+    packed.put_frames(f"{prefix}outcome", [frame.outcomes for frame in maps], "uint8")
+    packed.put_frames(f"{prefix}row_id", [frame.row_ids for frame in maps], "int32")
+    _pack_correlations(packed, prefix, run.frames, steps)
+    _pack_true_map(packed, prefix, trace)
+
+
+def _pack_maps(packed: PackedArrays, prefix: str, maps: Sequence[MapFrame]) -> None:
+    """Pack means and covariances of the landmarks."""
     for axis, name in enumerate("xy"):
         means = [position_codes(frame.means[:, axis]) for frame in maps]
         packed.put_frames(f"{prefix}{name}", means, "int32")
         std = [deviation_codes(_std(frame.covariances)[:, axis]) for frame in maps]
         packed.put_frames(f"{prefix}std_{name}", std, "int16")
-    packed.put_frames(
-        f"{prefix}rho",
-        [np.round(_rho(frame.covariances) * 32000) for frame in maps],
-        "int16",
-    )
-    packed.put_frames(f"{prefix}outcome", [frame.outcomes for frame in maps], "uint8")
-    packed.put_frames(f"{prefix}row_id", [frame.row_ids for frame in maps], "int32")
-    _pack_correlations(packed, prefix, run.frames, steps)
+    rho = [np.round(_rho(frame.covariances) * 32000) for frame in maps]
+    packed.put_frames(f"{prefix}rho", rho, "int16")
+
+
+def _pack_true_map(packed: PackedArrays, prefix: str, trace: RunTrace) -> None:
+    """Pack the true positions of the landmarks in a filter's map."""
     packed.put(f"{prefix}final.id", trace.landmark_ids, "int32")
     truth = trace.true_landmarks
     if truth is None:

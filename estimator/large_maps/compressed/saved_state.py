@@ -47,21 +47,7 @@ def checked_state(
         saved_states.whole_numbers(key, state[key], (-1,), 0).tolist()
         for key in ("slots", "numbers")
     )
-    if len(ids) != len(slots):
-        raise ValueError(
-            f"state['slots'] must have one entry for each of {len(ids)} landmarks, "
-            f"got {len(slots)}"
-        )
-    if len(numbers) < COUNTERS or numbers[0] > len(local_ids):
-        raise ValueError(
-            f"state['numbers'] must be at least {COUNTERS}, the first of them at most "
-            f"{len(local_ids)}, got {numbers}"
-        )
-    if sorted(slots + numbers[COUNTERS:]) != list(range(len(slots + numbers[4:]))):
-        raise ValueError(
-            "state['slots'] and the free ones in state['numbers'] must be 0, 1, … "
-            f"without repetition, got {slots} and {numbers[COUNTERS:]}"
-        )
+    _check_slots(slots, numbers, len(ids), len(local_ids))
     saved = SavedState(
         checked_map({k: state[f"local_{k}"] for k in _LOCAL}, semidefinite=False),
         far,
@@ -77,6 +63,28 @@ def checked_state(
     )
     _check_fit(saved, invariant)
     return saved
+
+
+def _check_slots(
+    slots: list[int], numbers: list[int], landmarks: int, local: int
+) -> None:
+    """Refuse places of landmarks that do not fit their number."""
+    if landmarks != len(slots):
+        raise ValueError(
+            f"state['slots'] must have one entry for each of {landmarks} landmarks, "
+            f"got {len(slots)}"
+        )
+    if len(numbers) < COUNTERS or numbers[0] > local:
+        raise ValueError(
+            f"state['numbers'] must be at least {COUNTERS}, the first of them at most "
+            f"{local}, got {numbers}"
+        )
+    free = numbers[COUNTERS:]
+    if sorted(slots + free) != list(range(len(slots + free))):
+        raise ValueError(
+            "state['slots'] and the free ones in state['numbers'] must be 0, 1, … "
+            f"without repetition, got {slots} and {free}"
+        )
 
 
 def _vector(state: Mapping[str, Any], key: str, size: int) -> Array:

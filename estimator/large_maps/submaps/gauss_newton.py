@@ -53,13 +53,22 @@ def minimise(
         if now.decrement <= converged:
             return True
         past = [*past[-MEMORY:], now] if now.decrement < 1 else []
-        trial = evaluate(now.values + accelerated(past)) if len(past) > 1 else None
         largest = np.inf if iteration >= PATIENCE else now.decrement
-        if trial and trial.cost <= now.largest_cost and trial.decrement < largest:
-            now = trial
-        else:
-            now = _descend(evaluate, now)
+        trial = _accelerated(evaluate, past, largest)
+        now = _descend(evaluate, now) if trial is None else trial
     return False
+
+
+def _accelerated(
+    evaluate: Callable[[Array], Iterate], past: list[Iterate], largest: float
+) -> Iterate | None:
+    """Step from the last iterates; None where that lowers too little."""
+    if len(past) < 2:
+        return None
+    now = past[-1]
+    trial = evaluate(now.values + accelerated(past))
+    is_better = trial.cost <= now.largest_cost and trial.decrement < largest
+    return trial if is_better else None
 
 
 def _descend(evaluate: Callable[[Array], Iterate], now: Iterate) -> Iterate:

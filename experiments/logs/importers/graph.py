@@ -86,8 +86,7 @@ def chain_of(graph: Graph) -> tuple[list[LogLine], dict[int, int], int]:
     steps, closures = {pose: 0}, 0
     for line in graph.edges:
         start, end = id_at(line, 1), id_at(line, 2)
-        is_edge = line.text.split()[0] in EDGE_TAGS
-        if is_edge and start != end and start in steps and end in steps:
+        if _is_closure(line, start, end, steps):
             closures += 1
             continue
         if start != pose:
@@ -97,6 +96,12 @@ def chain_of(graph: Graph) -> tuple[list[LogLine], dict[int, int], int]:
         chain.append(line)
         pose, steps[end] = end, len(chain)
     return chain, steps, closures
+
+
+def _is_closure(line: LogLine, start: int, end: int, steps: dict[int, int]) -> bool:
+    """Whether a line is an edge between two poses that were visited before."""
+    is_edge = line.text.split()[0] in EDGE_TAGS
+    return is_edge and start != end and {start, end} <= steps.keys()
 
 
 def id_at(line: LogLine, place: int) -> int:

@@ -57,15 +57,22 @@ def noise_header(graph: Graph, chain: Sequence[LogLine]) -> dict[str, str]:
     are_alike = _alike(motion)
     lines = [line for at_pose in graph.readings.values() for line in at_pose]
     if lines:
-        bearing, across, along = np.array([_reading_std(line) for line in lines]).T
-        sideways, bearing_std = bearing, float(np.median(bearing))
-        if _spread(across) < _spread(bearing):
-            sideways, bearing_std = across, 0.0
-            header["bearing_std_metres"] = numbers(np.median(across))
-        header["measurement_std"] = numbers(bearing_std, np.median(along))
-        are_alike &= _alike(np.column_stack([sideways, along]))
+        sensor, stds = _sensor_noise(lines)
+        header |= sensor
+        are_alike &= _alike(stds)
     what = "its" if are_alike else "the medians of its differing"
     return {**header, "noise": f"from the file, by {what} information matrices"}
+
+
+def _sensor_noise(lines: Sequence[LogLine]) -> tuple[dict[str, str], Array]:
+    """Return the entries of the readings, and the deviations that they are from."""
+    bearing, across, along = np.array([_reading_std(line) for line in lines]).T
+    if _spread(across) < _spread(bearing):
+        sensor = {"bearing_std_metres": numbers(np.median(across))}
+        sensor["measurement_std"] = numbers(0.0, np.median(along))
+        return sensor, np.column_stack([across, along])
+    stds = numbers(float(np.median(bearing)), np.median(along))
+    return {"measurement_std": stds}, np.column_stack([bearing, along])
 
 
 def _motion_std(line: LogLine, *, is_toro: bool) -> Array:

@@ -129,10 +129,7 @@ def _one_by_one(
     try:
         slam = settings.make(runs.initial_poses[run])
         recorder = DecisionRecorder(slam)
-        landmarks = dict(enumerate(runs.landmarks[run]))
         for step in range(runs.visible.shape[1]):
-            if isinstance(slam, SupportsTruth):  # it linearises there (``ideal``)
-                slam.observe_truth(runs.true_poses[run, step], landmarks)
             belief = _step(slam, runs, run, step, trace, recorder)
             if not _finite(trace, (run, step)):
                 return Failure(step, _NOT_FINITE)
@@ -143,8 +140,7 @@ def _one_by_one(
     if not _is_finite_map(belief):
         return Failure(step, _MAP_NOT_FINITE)
     beliefs.append(belief)
-    made = recorder.result()
-    if made is not None and runs.true_ids is not None:
+    if runs.true_ids is not None and (made := recorder.result()) is not None:
         decisions[run] = made
     return None
 
@@ -157,6 +153,9 @@ def _step(
     trace: BatchTrace,
     recorder: DecisionRecorder,
 ) -> Belief:
+    if isinstance(slam, SupportsTruth):  # it linearises there (``ideal``)
+        landmarks = dict(enumerate(runs.landmarks[run]))
+        slam.observe_truth(runs.true_poses[run, step], landmarks)
     if step > 0:  # the first scan is before any motion
         slam.predict(runs.odometry[run, step], runs.dt[step])
     seen = np.flatnonzero(runs.visible[run, step])

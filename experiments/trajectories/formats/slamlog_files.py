@@ -76,18 +76,14 @@ def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
     rows = count_rows(about["scenario"])
     measurements = np.zeros((len(moves) + 1, rows, 2))
     mask = np.zeros((len(moves) + 1, rows), dtype=np.bool_)
-    true_ids = None
-    if not about["scenario"].sensor.identities and _tells_true_ids(log):
-        true_ids = np.full(mask.shape, NO_LANDMARK, dtype=np.int64)
-    for event in log.events:
-        if isinstance(event, Scan):
-            places = event.landmark_ids
-            if places is None:
-                places = np.arange(len(event.measurements))
-            measurements[int(event.t), places] = event.measurements
-            mask[int(event.t), places] = True
-            if true_ids is not None and event.true_ids is not None:
-                true_ids[int(event.t), places] = event.true_ids
+    true_ids = np.full(mask.shape, NO_LANDMARK, dtype=np.int64)
+    for scan in _scans(log):
+        ids = scan.landmark_ids
+        places = int(scan.t), np.arange(len(scan.measurements)) if ids is None else ids
+        measurements[places], mask[places] = scan.measurements, True
+        if scan.true_ids is not None:
+            true_ids[places] = scan.true_ids
+    hides = not about["scenario"].sensor.identities
     return Trajectory(
         **about,
         start_estimate=log.start,
@@ -96,10 +92,13 @@ def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
         landmarks=log.landmarks,
         measurements=measurements,
         mask=mask,
-        landmark_ids=true_ids,
+        landmark_ids=true_ids if hides and _tells_true_ids(log) else None,
     )
 
 
 def _tells_true_ids(log: SlamLog) -> bool:
-    scans = (event for event in log.events if isinstance(event, Scan))
-    return all(scan.true_ids is not None for scan in scans)
+    return all(scan.true_ids is not None for scan in _scans(log))
+
+
+def _scans(log: SlamLog) -> Iterator[Scan]:
+    return (event for event in log.events if isinstance(event, Scan))
