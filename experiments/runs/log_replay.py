@@ -121,8 +121,7 @@ def replay(
     steps = list(steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     show_truth = _truth_source(estimator, log, times)
-    history = MapHistory(None if keep_history else _most_maps(estimator))
-    recorder = RunRecorder(estimator, len(steps), history)
+    recorder = RunRecorder(estimator, len(steps), _history(estimator, keep_history))
     decisions = DecisionRecorder(estimator)
     watch, progress = watch or _unwatched, progress or _unwatched
     with one_blas_thread():
@@ -147,8 +146,11 @@ def replay(
     )
 
 
-def _most_maps(estimator: SlamEstimator) -> int:
-    return _MOST_JOINED if isinstance(estimator, SupportsJoin) else _MOST_MAPS
+def _history(estimator: SlamEstimator, keep_all: bool) -> MapHistory:
+    if keep_all:
+        return MapHistory(None)
+    joins = isinstance(estimator, SupportsJoin)
+    return MapHistory(_MOST_JOINED if joins else _MOST_MAPS)
 
 
 def _unwatched(*_: object) -> None:
