@@ -17,7 +17,7 @@ _FATES = (
     ("ambiguous", "ambiguous"),
 )
 _MOST_ROWS = 10  # landmarks; larger maps show the worst ones
-_WORST = 5
+_WORST, _FEWER = 5, 3  # of them; fewer above the table of several filters
 _WIDTH = 80  # of a terminal
 _TOO_MUCH, _TOO_LITTLE = 0.5, 2.0  # of NIS or NEES per degree, where 1 is expected
 
@@ -28,9 +28,10 @@ def landmark_table(summary: dict[str, Any]) -> Table:
     known = any(row["euclidean"] is not None for row in rows)
     shown, caption = rows, None
     if len(rows) > _MOST_ROWS:
-        shown = sorted(rows, key=_distance, reverse=True)[:_WORST]
+        count = _FEWER if summary.get("others") else _WORST
+        shown = sorted(rows, key=_distance, reverse=True)[:count]
         which = "largest errors" if known else "first"
-        caption = Text(f"the {_WORST} {which} of {len(rows)}; all: summary.json", "dim")
+        caption = Text(f"the {count} {which} of {len(rows)}; all: summary.json", "dim")
     table = Table(
         title="Landmarks",
         title_justify="left",

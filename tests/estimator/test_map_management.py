@@ -651,7 +651,7 @@ def hidden_log(steps=30):
 
 def hidden_settings(**options):
     noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    return settings_for(hidden_log(1), **noise, options=options)
+    return settings_for(hidden_log(1), estimator="ekf", **noise, options=options)
 
 
 def test_a_log_without_identities_is_associated():
