@@ -1,13 +1,13 @@
-"""Reference scores of active SLAM: everybody on the same maps, with 95 % intervals.
+"""Reference scores of active SLAM: all policies on the same maps, with 95 % intervals.
 
 Run it::
 
     python benchmarks/active_slam.py --maps 100
 
-Every baseline plays the episodes of the seeds from `HELD_OUT` on at each difficulty,
-maps that nothing was chosen by; who still chooses takes those of ``--validation``.  A
-policy saved by ``examples/09_train_active_slam.py`` plays too where
-``--policy SCENARIO=FILE`` names it, and is compared with the others map by map.  A mean
+Every baseline plays the episodes of the seeds from `HELD_OUT` on, at each difficulty.
+These maps are for the final evaluation only; use ``--validation`` to choose between
+policies. ``--policy SCENARIO=FILE`` adds a policy saved by
+``examples/09_train_active_slam.py``, and compares it with the others map by map. A mean
 m of n episodes is given as m ± 1.96 s/√n.
 """
 
@@ -49,7 +49,7 @@ def score(
     policy: str | None,
     estimator: str,
 ) -> dict[str, list[Episode]]:
-    """Let baselines and a policy play the maps of one difficulty."""
+    """Run the baselines and a policy on the maps of one difficulty."""
     env = ActiveSlamEnv(scenario, estimator=estimator)
     players: dict[str, Policy] = {}
     for name in names:

@@ -62,7 +62,7 @@ class Case(NamedTuple):
 
 
 def steps_of(worlds: Any, **goals: Any) -> Case:
-    """Step a vector environment on and on, all its worlds with the same actions."""
+    """Step a vector environment repeatedly, with the same actions in all worlds."""
     worlds.reset(seed=0) if isinstance(worlds, VectorEnv) else worlds.reset()
     count = worlds.num_envs
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (count, 2))

@@ -1,16 +1,16 @@
-"""What the belief wrapper of many worlds costs beside the kernels that do the updates.
+"""The cost of the belief wrapper of many worlds, relative to its filters' kernels.
 
 For B worlds, in the same round and on the same scans::
 
     added / kernels = (wrapped step - plain step - kernels) / kernels
 
-wrapped step    `BeliefObservationVector.step` with ``ekf``, beliefs and all
-plain step      `step` of the same worlds without the wrapper, seeds and actions alike
-kernels         what `drive_runs` takes, by a stopwatch within the wrapped steps: one
-                predict and one update with six readings in each world
+    wrapped step    `BeliefObservationVector.step` with ``ekf``
+    plain step      `step` of the same worlds, seeds and actions without the wrapper
+    kernels         time of `drive_runs` within the wrapped steps: one predict and one
+                    update with six readings in each world
 
-So everything is "added" that is Python and numpy between the scans and the features
-that the agent observes, and the kernels' time is that of the very updates wrapped.
+"Added" is therefore all Python and numpy code between the scans and the observed
+features.
 """
 
 import time
@@ -47,26 +47,26 @@ class Round(NamedTuple):
 
     @property
     def added(self) -> float:
-        """What is neither the worlds nor the kernels."""
+        """Time that is spent neither in the worlds nor in the kernels."""
         return self.wrapped - self.plain - self.kernels
 
 
 class Stopwatch:
-    """Calls a function, and adds up the CPU time that it takes."""
+    """Calls a function, and adds up its CPU time."""
 
     def __init__(self, function: Callable[..., object]) -> None:
         self._function = function
         self.seconds = 0.0
 
     def __call__(self, *arguments: object) -> None:
-        """Call, with the watch running."""
+        """Call the function and measure its time."""
         began = time.thread_time()
         self._function(*arguments)
         self.seconds += time.thread_time() - began
 
 
 def belief_rounds(count: int, steps: int, rounds: int = ROUNDS) -> list[Round]:
-    """Step worlds with beliefs and without, in turns."""
+    """Step worlds with and without beliefs in turns."""
     plain, bare = (gymnasium.make_vec(ID, count, steps=EPISODE) for _ in range(2))
     wrapped = BeliefObservationVector(bare, estimator="ekf")
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (count, 2))
@@ -79,7 +79,7 @@ def belief_rounds(count: int, steps: int, rounds: int = ROUNDS) -> list[Round]:
 
 
 def belief_table() -> tuple[Table, int]:
-    """Measure every number of worlds; return the table and how many goals it missed."""
+    """Measure every number of worlds; return the table and the number of misses."""
     table = Table(title="one step of all worlds with an ekf each, 6 landmarks [µs]")
     columns = ("worlds", "plain step", "kernels", "added by the wrapper")
     for column in (*columns, "added / kernels", "goal", ""):

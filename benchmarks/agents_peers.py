@@ -1,9 +1,10 @@
-"""One world with six landmarks by other means: ir-sim and the Robotics Toolbox.
+"""One world with six landmarks in other simulators: ir-sim and the Robotics Toolbox.
 
-Each call is one step of a robot and one reading of bearings and ranges, of the same six
-landmarks, without drawing.  Neither emits what ours does: ir-sim has no sensor of
-landmarks, so it is asked for what its robot has in view, and where that is; the Toolbox
-reads all landmarks and gives one of them, with noise, and odometry.
+Each call is one step of a robot and one reading of bearings and ranges of the same six
+landmarks, without drawing. Neither simulator returns the same readings as ours. ir-sim
+has no landmark sensor, so the benchmark uses the objects in view of its robot and their
+positions. The Toolbox reads all landmarks and returns one of them, with noise, and
+odometry.
 """
 
 import importlib
@@ -28,7 +29,7 @@ def six_landmarks() -> list[tuple[float, float]]:
 
 
 def irsim_world() -> Call:
-    """Step ir-sim's differential drive among six circles, and read what is in view."""
+    """Step ir-sim's differential drive among six circles; read the objects in view."""
     irsim = importlib.import_module("irsim")
     tools = importlib.import_module("irsim.util.util")
     text = (
@@ -87,7 +88,7 @@ PEERS = {
 
 
 def peer_calls() -> dict[str, Call | None]:
-    """Make the world of each peer; None where it is not installed."""
+    """Make the world of each simulator; None if it is not installed."""
     return {
         name: make() if importlib.util.find_spec(module) else None
         for name, (module, make) in PEERS.items()

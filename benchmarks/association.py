@@ -1,4 +1,4 @@
-"""Associate readings without identity by several methods, and score them by the truth.
+"""Associate readings without identity by several methods, and score the decisions.
 
     python benchmarks/association.py --runs 10
     python benchmarks/association.py --world hidden_identities --methods hypotheses \
@@ -6,7 +6,7 @@
 
 For each world and method: the median error of the path with known and with hidden
 identities, the lost runs (more than 1 m worse than with known identities), readings
-given to a wrong landmark, landmarks mapped twice, the size of the map, precision and
+assigned to a wrong landmark, landmarks mapped twice, the size of the map, precision and
 recall, and the time of a step as a multiple of that of nearest neighbours.
 """
 
@@ -38,13 +38,13 @@ METHODS: dict[str, dict[str, Any]] = {
     "hypotheses": {"association": "hypotheses"},
 }
 WRONG_DENSITIES = {"a third of the density": 1 / 3, "three times the density": 3.0}
-"""Hypotheses, with the density of clutter assumed by this factor wrong."""
+"""Hypotheses with an assumed density of clutter that is wrong by this factor."""
 LOST = 1.0  # [m]
 NOISE = (0.02, 0.1, 0.0)  # [rad, m, m/m]
 
 
 class Scan(NamedTuple):
-    """What a filter gets in one step, and the truth."""
+    """The input of a filter in one step, and the truth."""
 
     odometry: np.ndarray[Any, Any]
     readings: np.ndarray[Any, Any]
@@ -53,7 +53,7 @@ class Scan(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came of one run."""
+    """The result of one run."""
 
     error: float
     seconds: float

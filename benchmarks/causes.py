@@ -2,9 +2,10 @@
 
     python benchmarks/causes.py --repetitions 20
 
-Every world is one line: an honest one, or one with a fault that its filter does not
-know, of such a size that NEES is off by about 1.3. Each answer is about the 100 runs of
-one Monte Carlo; the seeds are not those with which the rules were made.
+Every row is a world, without a fault or with one fault that its filter does not know.
+Each fault changes the NEES by a factor of about 1.3. Each answer is based on the 100
+runs of one Monte Carlo. The seeds differ from those with which the rules were
+developed.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ HONEST = "honest"
 
 
 class World(NamedTuple):
-    """A world, what its filter assumes, and the right answer."""
+    """A world, the assumptions of its filter, and the right answer."""
 
     cause: str
     scenario: str
@@ -36,7 +37,7 @@ class World(NamedTuple):
     changes: Mapping[str, Any] = {}
 
     def scenarios(self) -> tuple[Scenario, Scenario]:
-        """Return the world, and the one that the filter assumes."""
+        """Return the world, and the world that the filter assumes."""
         nominal = load_scenario(self.scenario).with_changes(**self.changes)
         motion, bearing, distance = (
             self.assumed.get(key, 1.0) for key in ("motion", "bearing", "range")

@@ -4,10 +4,11 @@
     python benchmarks/consistency_table.py --runs 20 --slow   # unscented and so on
 
 Columns: pose NEES per dimension in the invariant and in the additive frame, averaged
-over runs and steps; share of the steps at which the invariant average over the runs
+over runs and steps; share of the steps in which the invariant average over the runs
 lies in its 95 % band; median over the runs of their time average, and share of runs
 above 3; NEES of the heading; its deviation at the end in degrees; NIS per degree of
-freedom; share of runs that diverged beyond all numbers, which the others leave out.
+freedom; share of runs that diverged to numbers that are not finite, which the other
+columns omit.
 """
 
 import argparse
@@ -48,7 +49,7 @@ SLOW = ("unscented", "robocentric")
 
 
 class Row(NamedTuple):
-    """What is said of one filter on one scenario."""
+    """The results of one filter on one scenario."""
 
     invariant: float
     additive: float
@@ -62,7 +63,7 @@ class Row(NamedTuple):
 
 
 def measure(results: xr.Dataset) -> Row:
-    """Sum the runs of one filter up, leaving out the first scan: before any motion."""
+    """Summarise the runs of one filter, without the first scan, before any motion."""
     later = results.isel(step=slice(1, None))
     finite = (later.position_error < 1e6).all("step") & ~later.failed
     sound = later.isel(run=np.flatnonzero(finite))

@@ -1,10 +1,10 @@
-"""How efficient the filters are: the bound of any filter by their mean squared errors.
+"""Efficiency of the filters: the Cramér-Rao bound divided by the mean squared error.
 
     python benchmarks/efficiency.py --runs 200
 
 For each world and filter: the efficiency of the position and of the heading over all
 steps, and of the map about its centre at the end, each with its 95 % interval, in the
-invariant error frame; 1 for a filter that leaves nothing.
+invariant error frame. A filter that reaches the bound has 1.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""How fast is one step of the landmark world, in units of a bare physics step.
+"""Time of a step of the landmark world, in units of a bare physics step.
 
     python benchmarks/environment_speed.py
 
 A bare step is `pymunk.Space.step` with one kinematic body, which every step of the
-world contains once.  The cases run interleaved in one process, in CPU time of this
+world contains once. The cases run interleaved in one process, in CPU time of this
 thread; a ratio is the median over the rounds.
 """
 

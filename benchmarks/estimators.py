@@ -1,9 +1,9 @@
-"""How fast is one filter step, and a batch of runs: ratios in one process.
+"""Time of a filter step and of a batch of runs: ratios in one process.
 
-    python benchmarks/estimators.py            # with filterpy and Stone Soup if there
-    pip install "slamgym[benchmark]"           # brings them
+    python benchmarks/estimators.py     # with filterpy and Stone Soup if installed
+    pip install "slamgym[benchmark]"    # installs them
 
-Every case takes the same step: predict, then all readings.  "kernels" are the compiled
+Every case takes the same step: predict, then all readings. "kernels" are the compiled
 functions alone; "public" are ``predict`` and ``update`` with all checks and the report.
 """
 
@@ -170,7 +170,7 @@ RUNS, STEPS, LANDMARKS = 256, 100, 20  # of the batch
 
 
 def batch_run(runs: int, threads: int) -> Callable[[], object]:
-    """Prepare a batch and its data; what is returned makes it and runs it."""
+    """Prepare a batch and its data; return a function that runs it."""
     data = batch_data(runs, STEPS, LANDMARKS)
 
     def run() -> None:
@@ -183,12 +183,12 @@ def batch_run(runs: int, threads: int) -> Callable[[], object]:
 
 
 def half_of_the_runs() -> Callable[[], object]:
-    """Prepare what one of two processes does of the batch."""
+    """Prepare the share of the batch that one of two processes computes."""
     return batch_run(RUNS // 2, threads=1)
 
 
 def compare_batch() -> None:
-    """Print what a batch costs beside a loop over the stacked dense filter."""
+    """Print the time of a batch, and of a loop over the stacked dense filter."""
     data = batch_data(RUNS, STEPS, LANDMARKS)
     one_thread = batch_run(RUNS, threads=1)
 
@@ -230,7 +230,7 @@ def compare_batch() -> None:
 
 
 def compare_threads() -> None:
-    """Print what a second thread gains, and what the machine has to give."""
+    """Print the gain of a second thread, and that of a second process."""
     one_thread, two_threads = batch_run(RUNS, threads=1), batch_run(RUNS, threads=2)
     by_threads, by_processes = [], []
     with two_processes(half_of_the_runs) as in_two_processes:

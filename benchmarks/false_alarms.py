@@ -1,10 +1,10 @@
-"""How often decisions refuse a filter that is exactly consistent; nominal 5 %.
+"""How often decisions reject a filter that is exactly consistent; nominal 5 %.
 
     python benchmarks/false_alarms.py
 
-Two linear Kalman filters, 50 runs: one forgets its errors within a few steps; one, at
-rest, estimates three constants and forgets nothing.  All figures are shares of 2000
-repetitions, so they are known to half a percentage point.
+Two linear Kalman filters, 50 runs. One forgets its errors within a few steps. The other
+estimates three constants and never forgets. All figures are shares of 2000 repetitions,
+with a statistical error of half a percentage point.
 """
 
 from collections.abc import Callable

@@ -88,7 +88,7 @@ def rows_of(
 
 
 def cells(entry: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what a summary says of an estimator."""
+    """Yield the entries of a summary about an estimator."""
     yield entry["verdict"]
     yield str(len(entry["failed_runs"]))
     yield number(entry["pose_nees"]["invariant"]["mean"])
@@ -102,7 +102,7 @@ def cells(entry: Mapping[str, Any]) -> Iterator[str]:
 
 
 def number(value: float | None) -> str:
-    """Write three digits, or a dash for what is not known."""
+    """Write three digits, or a dash if the value is unknown."""
     return "–" if value is None else f"{value:.3g}"
 
 
@@ -148,7 +148,7 @@ def drive(
 
 
 def made(choice: EstimatorChoice, world: Scenario, pose: Any) -> SlamEstimator:
-    """Make an estimator; a graph without innovations, which take its marginals."""
+    """Make an estimator; graphs are made without innovations, which cost time."""
     silent = accepted_options(find_estimator(choice.name), {"innovations": False})
     wanted = silent if choice.name.startswith("gtsam") else {}
     options = {**wanted, **choice.options}
@@ -170,7 +170,7 @@ def print_world(name: str, runs: int, seed: int) -> None:
 
 
 def print_checks() -> None:
-    """Print what each check of `check_estimator` finds, one estimator a row."""
+    """Print the results of `check_estimator`, one row for each estimator."""
     print("| estimator | passed | findings |\n|---|---:|---|")
     for peer in list_peers():
         if peer.installed:

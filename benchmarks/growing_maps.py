@@ -90,14 +90,14 @@ def first_look(count: int) -> Iterator[tuple[Array, list[int]]]:
 
 
 def mapped(slam: Any, count: int) -> Any:
-    """Let a filter see the whole map."""
+    """Show the whole map to a filter."""
     for readings, ids in first_look(count):
         slam.update(readings, ids)
     return slam
 
 
 def dsyrk_floor(count: int) -> Step:
-    """Make what no full filter gets round: P ← P − Aᵀ A with A of 20 rows."""
+    """Make the least work of any full filter: P ← P − Aᵀ A with A of 20 rows."""
     size = 3 + 2 * count
     covariance = np.asfortranarray(np.eye(size))
     rows = np.random.default_rng(0).standard_normal((2 * SEEN, size)) * 1e-6
@@ -105,7 +105,7 @@ def dsyrk_floor(count: int) -> Step:
 
 
 def compare(count: int, steps: int, *, jumping: bool = False) -> dict[str, Costs]:
-    """Measure every filter in a map of so many landmarks."""
+    """Measure every filter in a map with this number of landmarks."""
     data = list(drive(count, steps, jumping=jumping))
     few = steps if count <= 500 else 3 * STRETCH
     slam = mapped(CompressedEkfSlam(*NOISE), count)
@@ -140,7 +140,7 @@ def row(name: str, costs: Costs) -> list[str]:
 
 
 def show(title: str, rows: list[list[str]], *, markdown: bool) -> None:
-    """Print a table, for the eye or for a document."""
+    """Print a table, for a terminal or for a document."""
     head = ["filter", "median µs", "mean µs", "worst µs", "MB"]
     if markdown:
         lines = [head, ["---"] + ["---:"] * 4, *rows]
@@ -161,7 +161,7 @@ def judge(what: str, value: float, goal: float) -> None:
 
 
 def judge_all(near: dict[int, dict[str, Costs]], far: dict[str, Costs]) -> None:
-    """Print the ratios that the library promises."""
+    """Print the ratios with their goals."""
     for count, costs in near.items():
         if "floor" in costs and count >= 500:
             floor = median(costs["floor"].steps)

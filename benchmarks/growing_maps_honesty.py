@@ -101,7 +101,7 @@ def run_all(name: str, runs: int, seed: int) -> Iterator[Runs]:
 
 
 def row_of(done: Runs, full: xr.Dataset | None) -> tuple[str, ...]:
-    """Write what is said of a filter."""
+    """Write the results of a filter."""
     entry = summarise_monte_carlo(done.results)["estimators"][done.label]
     low, high = consistency_of(done.results, done.label).equivalence.interval
     at_end = entry["nees_end"]

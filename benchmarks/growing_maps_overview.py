@@ -1,9 +1,9 @@
-"""Full, compressed, submaps and sparse information side by side, on the same drives.
+"""Full, compressed, submaps and sparse information filters on the same drives.
 
-Called by ``growing_maps.py --overview``.  The drives are those of submaps.py, row by
-row over a map that is unknown at first.  A known map seen from one known pose, as the
-other table of growing_maps.py has it, has no links between its landmarks, and would
-make the sparse information filter look cheaper than it is.
+``growing_maps.py --overview`` calls this module. The drives are those of submaps.py,
+row by row over an initially unknown map. The other table of growing_maps.py has a known
+map that is seen from one known pose. Such a map has no links between its landmarks, and
+the sparse information filter would look faster than it is.
 """
 
 import time
@@ -44,7 +44,7 @@ DRIVES = {300: 20, 1000: 10, 3000: 3}  # up to so many landmarks; over larger ma
 
 
 class Kind(NamedTuple):
-    """A filter, and the largest map on which the overview has the patience for it."""
+    """A filter, and the largest map on which the overview measures it."""
 
     make: Callable[[Array], Any]
     largest: int
@@ -117,7 +117,7 @@ def overview(count: int) -> list[Row]:
 
 
 def _drive(count: int, seed: int) -> dict[str, Drive]:
-    """Give the same readings to all filters, and ask them at the end."""
+    """Give the same readings to all filters, and request their beliefs at the end."""
     half = np.sqrt(25.0 * count) / 2
     landmarks = np.random.default_rng(seed).uniform(-half, half, (count, 2))
     start = np.array([-half, -half, 0.0])

@@ -1,4 +1,4 @@
-"""What the compressed filter is timed against: the fastest full filter known, iSAM2."""
+"""References for the compressed filter: the fastest known full filter, and iSAM2."""
 
 from collections.abc import Sequence
 from importlib import import_module

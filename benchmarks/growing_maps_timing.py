@@ -1,4 +1,4 @@
-"""Time filters on one drive: stretches of steps of all of them in turn."""
+"""Time filters on one drive: all filters take turns of several steps."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ STRETCH = 20  # steps of one filter before the next one's turn
 
 
 class Reading(NamedTuple):
-    """What one step brings."""
+    """The input of one step."""
 
     odometry: tuple[float, float]
     readings: Array

@@ -2,10 +2,11 @@
 
     python benchmarks/loop_closure.py --runs 10 --seed 7000
 
-For each world and policy: the runs whose map has within 5 % as many landmarks as could
-be confirmed, those whose aligned path error is at most twice that with known
-identities, and those that do both; the mean size of the map, the median of that ratio,
-the runs in which two different landmarks were merged, and the time of a step.
+For each world and policy: the runs whose number of landmarks is within 5 % of those
+that could be confirmed, the runs whose aligned path error is at most twice that with
+known identities, and the runs with both; the mean size of the map, the median of the
+ratio of path errors, the runs in which two different landmarks were merged, and the
+time of a step.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 
 class Outcome(NamedTuple):
-    """What came of one run."""
+    """The result of one run."""
 
     error: float
     """Root mean square error of the path after alignment [m]."""
@@ -78,7 +79,7 @@ def make(world: Scenario, estimator: str, **options: Any) -> SlamEstimator:
 
 
 def confirmable(scans: Iterable[Scan]) -> int:
-    """Count the landmarks that enough scans have shown in turn."""
+    """Count the landmarks that enough successive scans have shown."""
     needed, window = CONFIRM
     sightings = defaultdict[int, list[int]](list)
     found = set()

@@ -1,9 +1,9 @@
-"""A whole Monte Carlo against its filter alone, and against the plain loop.
+"""Time of a whole Monte Carlo, of its filter alone, and of a plain loop.
 
     python benchmarks/monte_carlo.py
 
-One core, one process, interleaved rounds; ratios are medians over the rounds.  The
-world: 20 landmarks around a circle, about half of them in view, 1000 steps.
+One core, one process, interleaved rounds; ratios are medians over the rounds. The world
+has 20 landmarks around a circle, about half of them in view, and 1000 steps.
 """
 
 import argparse
@@ -42,7 +42,7 @@ def world(steps: int) -> Scenario:
 
 
 def filter_alone(scenario: Scenario, runs: int) -> Callable[[], object]:
-    """Return what takes the batched kernels through drives that lie ready."""
+    """Return a function that runs the batched kernels on prepared drives."""
     drives = simulate_runs(scenario, runs, 0)
     print(f"{drives.visible.mean():.0%} of the landmarks in view")
 
@@ -64,9 +64,9 @@ def filter_alone(scenario: Scenario, runs: int) -> Callable[[], object]:
 
 
 def plain_loop(scenario: Scenario, runs: int) -> Callable[[], object]:
-    """Return what drives single environments and feeds the dense numpy filter.
+    """Return a function that runs single environments with the dense numpy filter.
 
-    It maps all landmarks at its start, from where the truth is, and measures nothing.
+    It initialises all landmarks at the start from the truth, and computes no measures.
     """
     env = gymnasium.make("slamgym/LandmarkWorld-v0", scenario=scenario)
     actions = action_sequence(scenario)
@@ -118,7 +118,7 @@ def compare(runs: int, steps: int, rounds: int) -> None:
 
 
 def compare_memory(steps: int) -> None:
-    """Print how the peak of numpy's memory grows with runs, written to disk."""
+    """Print the peak of numpy's memory against the number of runs."""
     scenario, peaks = world(steps), []
     for runs in (64, 256):
         with tempfile.TemporaryDirectory() as folder:

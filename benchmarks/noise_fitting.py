@@ -1,4 +1,4 @@
-"""Fit the noise of simulated logs: how often the intervals hold the true noise."""
+"""Fit the noise of simulated logs: how often the intervals contain the true noise."""
 
 import argparse
 import time
@@ -24,7 +24,7 @@ def simulated(world: str, seed: int) -> SlamLog:
 
 
 def fit(log: SlamLog, estimator: str = "invariant") -> NoiseFit:
-    """Fit the noise of a log, beginning far from it."""
+    """Fit the noise of a log, starting far from it."""
     motion, sensor = START
     settings = settings_for(
         log, estimator=estimator, motion_std=motion, measurement_std=sensor
@@ -33,7 +33,7 @@ def fit(log: SlamLog, estimator: str = "invariant") -> NoiseFit:
 
 
 def truth_of(log: SlamLog) -> dict[str, float]:
-    """Return the noise that a simulated log holds, by name."""
+    """Return the true noise of a simulated log, by name."""
     known = settings_for(log)
     values = (*known.motion_std, *known.measurement_std)
     names = ("σx", "σy", "σα", "σβ", "σr")
@@ -42,7 +42,7 @@ def truth_of(log: SlamLog) -> dict[str, float]:
 
 
 def coverage(world: str, runs: int, seed: int) -> None:
-    """Print how often the intervals of a world's logs hold its noise."""
+    """Print how often the intervals of a world's logs contain its noise."""
     held: Counter[str] = Counter()
     errors: dict[str, list[float]] = defaultdict(list)
     verdicts: dict[str, Counter[str]] = defaultdict(Counter)

@@ -1,7 +1,7 @@
 # pyright: reportMissingImports=false
-"""The same EKF-SLAM step by other means: stacked dense numpy, filterpy, Stone Soup.
+"""The same EKF-SLAM step in other libraries: stacked numpy, filterpy, Stone Soup.
 
-Each peer is given what it needs to be fast: one vectorised h and one vectorised full H.
+Each is made as fast as possible: with one vectorised h and one vectorised full H.
 """
 
 from collections.abc import Callable
@@ -52,9 +52,9 @@ def motion(mean: Array, odometry: Array) -> tuple[Array, Array, Array]:
 
 
 class StackedDense:
-    """The textbook, as courses write it: H stacked reading by reading, K = P Hᵀ S⁻¹.
+    """The textbook form: H stacked reading by reading, K = P Hᵀ S⁻¹.
 
-    P ← (I − K H) P, all over the whole state.
+    P ← (I − K H) P, over the whole state.
     """
 
     def __init__(self, mean: Array, P: Array, R: Array, Q: Array) -> None:

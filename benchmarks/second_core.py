@@ -1,4 +1,4 @@
-"""What the machine's second core is worth at the moment: two independent processes."""
+"""Measure the present gain of the machine's second core: two independent processes."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ Work = Callable[[], object]
 
 @contextmanager
 def two_processes(prepare: Callable[[], Work]) -> Iterator[Callable[[], float]]:
-    """Hold two processes ready, and give what makes both work once.
+    """Start two processes, and yield a function that runs both once.
 
     Parameters
     ----------

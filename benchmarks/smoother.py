@@ -3,9 +3,9 @@
     python benchmarks/smoother.py
 
 One drive of 1,000 steps among 20 landmarks, about half of them visible at each step.
-Ratios are formed round by round.  GTSAM gets the same start and the same graph, with
-its own factors and built beforehand, and optimises by Levenberg-Marquardt to the same
-accuracy: until neither estimate moves by more than about a nanometre.
+Ratios are formed round by round. GTSAM gets the same start and the same graph, built in
+advance with its own factors. Both optimise by Levenberg-Marquardt to the same accuracy,
+until no estimate moves by more than about a nanometre.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Data:
 
 
 class Gtsam:
-    """The same drive as a factor graph, built beforehand."""
+    """The same drive as a factor graph, built in advance."""
 
     def __init__(self, data: Data, poses: Array, landmarks: dict[int, Array]) -> None:
         self.gtsam: Any = import_module("gtsam")

@@ -50,7 +50,7 @@ CONSOLE = Console(width=110)
 
 
 class Step(NamedTuple):
-    """What a filter is given."""
+    """The input of a filter."""
 
     odometry: Array
     readings: Array
@@ -58,13 +58,13 @@ class Step(NamedTuple):
 
 
 def town(count: int) -> Array:
-    """Landmarks, one to 25 m²: (count, 2) [m]."""
+    """Landmarks, one per 25 m²: (count, 2) [m]."""
     half = np.sqrt(25.0 * count) / 2
     return np.random.default_rng(0).uniform(-half, half, (count, 2))
 
 
 def known_map(landmarks: Array) -> SparseInformationSlam:
-    """Make a filter that has mapped all landmarks and stands at the origin."""
+    """Make a filter that has mapped all landmarks, with the robot at the origin."""
     tree, count = cKDTree(landmarks), len(landmarks)
     places = landmarks + np.random.default_rng(1).normal(0.0, 2.0, landmarks.shape)
     total = csr_array((2 * count, 2 * count))
@@ -119,7 +119,7 @@ def _information_of(places: Array, landmarks: Array, tree: cKDTree) -> csr_array
 
 
 def drive(landmarks: Array, steps: int, seed: int = 0) -> Iterator[Step]:
-    """From place to place, half a metre per step."""
+    """Drive from place to place, half a metre per step."""
     rng, tree = np.random.default_rng(seed), cKDTree(landmarks)
     pose, goal = np.zeros(3), np.zeros(2)
     half = np.abs(landmarks).max()
@@ -140,7 +140,7 @@ def drive(landmarks: Array, steps: int, seed: int = 0) -> Iterator[Step]:
 
 
 class Cost(NamedTuple):
-    """What a map of one size costs."""
+    """The costs of a map of one size."""
 
     landmarks: int
     links: float
@@ -182,12 +182,12 @@ def cost(count: int, steps: int = 300, *, largest_belief: int = 10_000) -> Cost:
 
 
 class Case(NamedTuple):
-    """A scenario for the honesty table, and how many landmarks may be active."""
+    """A scenario for the table of NEES, and the largest number of active landmarks."""
 
     scenario: str
     bound: int
     blocks: int | None = None
-    """Blocks along either side of a smaller city, driven round once."""
+    """Blocks along either side of a smaller city, driven around once."""
 
     @property
     def name(self) -> str:
@@ -196,7 +196,7 @@ class Case(NamedTuple):
         return self.scenario + (size if self.blocks else "")
 
     def world(self) -> Scenario:
-        """Load it, and make it smaller where that is asked for."""
+        """Load the scenario, and make it smaller if required."""
         world = load_scenario(self.scenario)
         if not self.blocks:
             return world
@@ -234,7 +234,7 @@ def nees(case: Case, runs: int) -> dict[str, Array]:
 
 
 def _follow(world: Scenario, data: SimulatedRuns, kind: str, bound: int) -> float:
-    """Follow a run; the EKF as :class:`CompressedEkfSlam`, which is the same."""
+    """Filter a run; :class:`CompressedEkfSlam` stands for the EKF."""
     noise: dict[str, Any] = {
         "motion_std": world.motion.std,
         "measurement_std": world.sensor.std,
@@ -266,7 +266,7 @@ class Error(NamedTuple):
     error: float
     """Of the position, root mean square [m]."""
     std: float
-    """That it says, mean [m]."""
+    """Reported by the filter, mean [m]."""
     nees: float
     """Of the pose, per dimension, in the frame of the filter, mean."""
     apart: float
@@ -344,7 +344,7 @@ def print_costs(sizes: list[int]) -> None:
 
 
 def print_nees(runs: int) -> None:
-    """Print a line per case as soon as it is known."""
+    """Print the row of each case as soon as it is known."""
     print(f"NEES of the pose per dimension, {runs} runs: mean (median)")
     print("| scenario | Γ |", " | ".join(KINDS), "|")
     print("|---|---:|" + "---:|" * len(KINDS))
@@ -355,7 +355,7 @@ def print_nees(runs: int) -> None:
 
 
 def print_errors(sizes: list[int]) -> None:
-    """Print what the filters are off by, over as many drives as the overview has."""
+    """Print the errors of the filters, over as many drives as in the overview."""
     print("| landmarks | filter | error, m | std, m | NEES / 3 | from ekf, m", end="")
     print(" | from invariant, m | drives |\n| ---: | --- |" + " ---: |" * 6)
     for count in sizes:

@@ -47,7 +47,7 @@ CONSOLE = Console(width=130)
 
 
 class Reading(NamedTuple):
-    """What one step brings, and where the robot then is."""
+    """The input of one step, and the position of the robot after it."""
 
     odometry: tuple[float, float]
     readings: Array
@@ -56,7 +56,7 @@ class Reading(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Of one size of the map."""
+    """The results for one size of the map."""
 
     landmarks: int
     steps: int
@@ -226,7 +226,7 @@ def show_honesty(runs: int, *, markdown: bool) -> None:
 
 
 def print_table(names: list[str], cells: list[list[str]], *, markdown: bool) -> None:
-    """Print for people, or for a document."""
+    """Print for a terminal, or for a document."""
     if markdown:
         for line in (names, ["---:"] * len(names), *cells):
             print("| " + " | ".join(line) + " |")

@@ -1,13 +1,14 @@
-"""Submaps on a map whose landmarks nobody names: association, cost, honesty.
+"""Submaps on a map with hidden identities: association, cost, NEES.
 
     python benchmarks/submaps_hidden.py                     # 1000 and 3000; a minute
     python benchmarks/submaps_hidden.py --largest 10000     # … minutes
     python benchmarks/submaps_hidden.py --markdown          # … for a document
 
-The drives are those of ``submaps.py``, their readings without identities, which
-landmark management finds out.  Which landmark each reading was of is known here, and so
-how many are taken for another one, and how many landmarks are in the map twice.  CPU
-time of one thread; NEES per degree of freedom, 1 is honest.
+The drives are those of ``submaps.py``, without identities; landmark management
+associates the readings. The true identities are known to the benchmark. It counts the
+readings that are associated with a wrong landmark, and the landmarks that are in the
+map twice. Times are CPU times of one thread. NEES is given per degree of freedom, so 1
+is expected.
 """
 
 import os
@@ -28,7 +29,7 @@ from slamgym.estimator.map_management.map_view import marginal_without_joining
 
 
 class Row(NamedTuple):
-    """Of one size of the map, the readings without identity."""
+    """The results for one size of the map, with readings without identity."""
 
     landmarks: int  # in the map
     distinct: int  # of the world, that these are
@@ -44,7 +45,7 @@ class Row(NamedTuple):
 
 
 def measure(count: int, size: int) -> Row:
-    """Drive over a map of ``count`` landmarks that nobody names."""
+    """Drive over a map of ``count`` landmarks with hidden identities."""
     half = np.sqrt(25.0 * count) / 2
     landmarks = np.random.default_rng(0).uniform(-half, half, (count, 2))
     start = np.array([-half, -half, 0.0])

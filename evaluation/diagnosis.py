@@ -1,19 +1,18 @@
-"""Why a filter is not consistent: the cause that many runs point to.
+"""Name the cause if a filter is not consistent, from many runs.
 
-Two questions are asked in this order.
+The tests answer two questions in this order.
 
-1. Do odometry and readings have the noise that the filter assumes?  The truth reveals
-   every number of the noise (:mod:`.noise_sums`), so that a wrong deviation, a bias and
-   heavy tails are tested one by one (:mod:`.noise_findings`) and cannot be confused: a
-   bias has a mean, a wrong deviation none, and heavy tails have a fourth moment.
-2. If they do, do the covariances agree with the errors?  If not, the filter itself is
-   at fault: with hidden identities by its association, else by its linearisation.
-   Linearisation leaves the innovations as large as claimed.  A filter whose innovations
-   are as wrong as its errors does not use the noise that it is given, and the answer
-   is "cannot tell".
+1. Do odometry and readings have the noise that the filter assumes?  With the truth,
+   all noise values are known (:mod:`.noise_sums`).  A wrong standard deviation, a bias
+   and heavy tails are tested separately (:mod:`.noise_findings`): a bias changes the
+   mean, a wrong deviation the variance, and heavy tails the kurtosis.
+2. If so, do the covariances agree with the errors?  If not, the cause is in the filter:
+   its association if identities are hidden, otherwise its linearisation.  Linearisation
+   does not change the size of the innovations.  If the innovations are wrong too, the
+   filter does not use the noise that it is given, and the answer is "cannot tell".
 
-The scores of a run are correlated in time, so that every test of the second question
-adds up numbers of different runs.
+The scores of a run are correlated in time.  Every test of the second question therefore
+uses one number per run.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ CAUSES = (
 )
 """All answers of :func:`diagnose`."""
 NOISE_RATE, FILTER_RATE = 0.02, 0.02
-"""Probabilities of accusing an honest world of a fault, and an honest filter."""
+"""Probabilities of a false answer about the noise, and about the filter."""
 _ERROR_RATE = 0.05
 FEWEST_RUNS = 20
 _POSE = 3
@@ -92,7 +91,7 @@ def diagnose(
 ) -> Diagnosis:
     """Name why a filter is not consistent.
 
-    A cause is named wrongly in at most 5 % of Monte Carlos with an honest filter.
+    For a consistent filter, the answer is wrong in at most 5 % of Monte Carlos.
 
     Parameters
     ----------
@@ -173,10 +172,10 @@ def _checked(
 
 
 def _errors(pose: Array, heading: Array) -> _Errors:
-    """Test whether NEES of pose or heading is off by more than a tenth.
+    """Test whether the NEES of pose or heading deviates from 1 by more than a tenth.
 
-    The runs' scatter decides, not χ²: a few runs of an honest filter err more than
-    Gaussian ones, by the curvature of the world.
+    The test uses the variance between runs instead of χ²: in a nonlinear world, the
+    errors of a consistent filter vary more than Gaussian ones.
     """
     scores = [pose / _POSE] + [heading] * bool(heading.size)
     averages = [score.mean(axis=1) for score in scores]
@@ -213,7 +212,7 @@ def _of_the_filter(
     knowledge: Array | None,
     mistakes: Array | None,
 ) -> Diagnosis:
-    """Answer for a filter whose assumptions about the noise are right."""
+    """Return the answer for a filter that assumes the right noise."""
     spurious, p_value = _both_tests(knowledge, errors.p_value)
     if p_value >= FILTER_RATE:
         sentence = "honest: the noise is what it assumes, and its errors agree."
@@ -262,7 +261,7 @@ def _spurious(knowledge: Array) -> float:
 
 
 def _of_the_association(pose: Array, mistakes: Array, errors: _Errors) -> Diagnosis:
-    """Ask whether the runs with more mistakes are the ones that err."""
+    """Test whether the runs with more mistakes have larger errors."""
     p_value = _worse_with_mistakes(pose.mean(axis=1), mistakes > np.median(mistakes))
     ratio_text = _ratio_text(errors)
     if p_value < _ERROR_RATE:

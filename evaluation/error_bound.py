@@ -1,9 +1,9 @@
-"""How small the errors of any filter can be: the posterior Cramér-Rao bound.
+"""Lower bound of the errors of any filter: the posterior Cramér-Rao bound.
 
 The bound of Tichavský, Muravchik and Nehorai [1]_ is the recursion of a Kalman filter
-that is linearised at the truth.  It is taken in the invariant error frame, where the
-Jacobian of the motion is the identity and those of the readings depend on relative
-positions only: in the additive frame, such a filter claims to observe its heading.
+that is linearised at the truth. It is computed in the invariant error frame. In this
+frame, the Jacobian of the motion is the identity, and those of the readings depend on
+relative positions only. In the additive frame, such a filter would observe its heading.
 With p the position, l each landmark, J = [0 −1; 1 0] and G = ∂(β, r)/∂(l − p)::
 
     motion     ξ_p += R(θ) ε_xy − J p' ε_α,    ξ_θ += ε_α,    ξ_l −= J l ε_α

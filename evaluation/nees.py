@@ -1,6 +1,6 @@
 """NEES of poses, headings, landmarks and maps.
 
-NEES = eᵀ P⁻¹ e of an error e with claimed covariance P.  If the claim is true, NEES is
+NEES = eᵀ P⁻¹ e of an error e with claimed covariance P.  If P is correct, NEES is
 chi-square with as many degrees of freedom as e has entries.  Averages over runs (ANEES)
 are not divided by the dimension unless the name says so.  Every function names the
 frame of its error, additive or invariant (:mod:`slamgym.estimator.error_frames`),

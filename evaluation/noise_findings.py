@@ -1,7 +1,7 @@
-"""Tests of the noise that a world really had: its size, its mean and its tails.
+"""Tests of the actual noise of a world: its size, its mean and its tails.
 
-The standardised numbers of an honest world are independent and standard normal, so that
-every test here has a known distribution, however many runs or steps there are.
+In a world without faults, the standardised noise is independent and standard normal.
+Every test here therefore has a known distribution for any number of runs or steps.
 """
 
 from __future__ import annotations

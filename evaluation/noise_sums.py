@@ -1,9 +1,10 @@
-"""The noise that a world really had, against the noise that a filter assumes.
+"""The actual noise of a world, divided by the noise that a filter assumes.
 
-Where the truth is known, so is every number of the noise: the motion noise is the true
-motion minus the odometry, the sensor noise the reading minus the true bearing or range.
-Divided by the deviations that a filter assumes, the numbers of an honest world are
-independent and standard normal, over time as well as over runs.
+If the truth is known, all noise values are known: the motion noise is the true motion
+minus the odometry, and the sensor noise is the reading minus the true bearing or range.
+Each is divided by the standard deviation that the filter assumes. In a world without
+faults, the resulting numbers are independent and standard normal, over time as well as
+over runs.
 """
 
 from __future__ import annotations

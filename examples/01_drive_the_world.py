@@ -1,16 +1,16 @@
-"""Drive a robot round a square corridor, and keep what it saw as a picture.
+"""Drive a robot around a square corridor, and draw its path.
 
-The world is an ordinary Gymnasium environment: ``reset``, ``step``, ``render``.  Its
-observation is what the robot can know: odometry, and the bearing and range of the
-landmarks in view.  The truth stands in ``info`` alone; here it steers the robot from
-waypoint to waypoint, so that you see the world before you meet a filter.
+The world is an ordinary Gymnasium environment: ``reset``, ``step``, ``render``. The
+observation holds what the robot measures: odometry, and the bearing and range of the
+landmarks in view. Only ``info`` holds the truth. Here the truth steers the robot from
+waypoint to waypoint, so the example needs no filter.
 
 Run it::
 
     python examples/01_drive_the_world.py
 
-It writes ``results/01_drive_the_world.png``: the way the robot went, and the readings
-of its last step.
+It writes ``results/01_drive_the_world.png``: the path of the robot, and its last
+readings.
 """
 
 from pathlib import Path

@@ -1,17 +1,16 @@
-"""Let two filters follow one robot, step by step, and see which of them is honest.
+"""Run two filters on one drive, step by step, and compare their consistency.
 
 The world is that of the CMU 16-833 homework: six landmarks, long noisy steps, and a
-first heading known to 0.1 rad.  Turn this whole world by some angle, robot and all, and
-every reading stays what it is; so no reading can tell the robot its absolute heading,
-and an honest filter says σθ = 0.1 rad at the end as at the start.  The standard EKF
-claims to learn what cannot be learnt.
+first heading with σθ = 0.1 rad. A rotation of the whole world, robot included, does not
+change any reading. The absolute heading is therefore unobservable, and a consistent
+filter reports σθ = 0.1 rad at the end as at the start. The standard EKF reports less.
 
 Run it::
 
     python examples/02_filter_step_by_step.py
 
-It prints the errors of both filters along one episode, and then what counts: over many
-episodes, how large the heading's error really is, and how large each filter says it is.
+It prints the errors of both filters along one episode. Then it compares, over many
+episodes, the actual error of the heading with the one that each filter reports.
 """
 
 from collections.abc import Iterator
@@ -31,7 +30,7 @@ EPISODES = 200
 
 
 def start_filter(name: str, env: LandmarkWorldEnv) -> SlamEstimator:
-    """Make a filter that knows the noise of the world, and roughly its start."""
+    """Make a filter with the noise of the world and the uncertainty of its start."""
     scenario = env.scenario
     return make_estimator(
         name,

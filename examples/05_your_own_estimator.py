@@ -1,13 +1,13 @@
-"""Write a filter of your own, and hold it against the contract.
+"""Write a filter of your own, and check it against the interface.
 
-Anything with the six methods of `SlamEstimator` can stand wherever slamgym uses a
-filter; there is no base class.  Below is the EKF-SLAM of the textbook with dense
-matrices: the filtering is the twenty lines of ``predict``, ``_correct`` and ``_add``,
-the rest is what lets it be checked, saved and exchanged.
+slamgym accepts any class with the six methods of `SlamEstimator`; there is no base
+class. This example is a textbook EKF-SLAM with dense matrices. The filter itself is the
+twenty lines of ``predict``, ``_correct`` and ``_add``. The other methods start it, save
+it and return its belief.
 
-`check_estimator` drives a filter through a small known world, as Gymnasium's
-``check_env`` does with an environment, and names the first promise that it breaks.  The
-second class shows what that looks like: it turns before it drives.
+`check_estimator` runs a filter in a small known world and names the first requirement
+that it violates, like Gymnasium's ``check_env`` for environments. The second class of
+this example violates one: it turns before it drives.
 
 Run it::
 
@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 
 class TextbookEkf:
-    """EKF-SLAM as the textbook writes it; x is the state, P its covariance."""
+    """The textbook EKF-SLAM; x is the state, P its covariance."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class TextbookEkf:
         self.reset(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
-        """Start at a pose, the map empty."""
+        """Start at a pose with an empty map."""
         self._x = np.array(pose, dtype=np.float64)
         self._P = np.diag(np.square(pose_std, dtype=np.float64))
         self._ids: tuple[int, ...] = ()
@@ -75,7 +75,7 @@ class TextbookEkf:
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
     ) -> UpdateReport:
-        """Correct by the landmarks that are known, then add those that are new."""
+        """Correct with the known landmarks, then add the new ones."""
         z = argument_checks.scan(measurements)
         ids = argument_checks.identities(
             [] if landmark_ids is None else landmark_ids, len(z)
@@ -116,7 +116,7 @@ class TextbookEkf:
         )
 
     def _add(self, landmark_id: int, reading: Array) -> None:
-        """Append l = f(x, z), correlated with the pose it was seen from."""
+        """Append l = f(x, z), correlated with the pose from which it was seen."""
         seen = locate_landmark(self._x[:3], reading[None])
         Fp, Fz = seen.jacobian_pose[0], seen.jacobian_measurement[0]
         across = Fp @ self._P[:3]
@@ -126,7 +126,7 @@ class TextbookEkf:
         self._ids = (*self._ids, landmark_id)
 
     def belief(self) -> Belief:
-        """Answer with a snapshot: a Belief copies what it is made of."""
+        """Return a snapshot: a Belief copies its arguments."""
         return Belief(self._x, self._P, self._ids)
 
     def state_dict(self) -> dict[str, Any]:

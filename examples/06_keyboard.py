@@ -1,8 +1,8 @@
-"""Drive the robot yourself, and watch what an invariant EKF makes of it.
+"""Drive the robot yourself, and watch the belief of an invariant EKF.
 
-Up and down arrows drive forwards and backwards, left and right turn, Escape ends.  The
-ellipses are what the filter believes, at 3σ: the pose in blue, the map in green.  Drive
-into the dark, and come back to where you started.
+The up and down arrows drive forwards and backwards, left and right turn, Escape ends.
+The ellipses show the filter's belief at 3σ: the pose in blue, the map in green. Explore
+the corridor, and return to the start.
 
 Run it, with a screen::
 
@@ -58,7 +58,7 @@ class HeldKeys:
 
 
 def drivable_corridor() -> Scenario:
-    """Make the steps of the corridor short enough to steer by hand."""
+    """Make the steps of the corridor short enough for manual control."""
     return load_scenario("corridor").with_changes(
         dt=0.1,
         steps=3000,
@@ -68,7 +68,7 @@ def drivable_corridor() -> Scenario:
 
 
 def drive(env: LandmarkWorldEnv) -> None:
-    """Drive by hand until Escape, the window's end or the episode's."""
+    """Drive by keyboard until Escape, or until the window or the episode ends."""
     scenario = env.scenario
     slam = make_estimator(
         "invariant",

@@ -1,9 +1,10 @@
-"""See overconfidence: one drive, the same readings, two filters.
+"""Show overconfidence: one drive, the same readings, two filters.
 
-Four laps of a circle past 20 landmarks.  Each filter draws its map: every landmark with
-the ellipse that holds the true place (the cross) in 989 of 1000 cases if the filter is
-honest.  Both maps are rotated a little as a whole; one filter knows this uncertainty,
-the other does not.
+The robot drives four laps of a circle past 20 landmarks. The picture shows the map of
+each filter: every landmark with its 3σ ellipse, and the true position as a cross. For a
+consistent filter, 989 of 1000 ellipses contain their cross. Both maps are rotated
+slightly as a whole. One filter accounts for this rotation in its ellipses, and the
+other does not.
 
 Run it::
 
@@ -11,7 +12,7 @@ Run it::
 
 It writes ``results/07_honest_ellipses.png``, the end of the drive, and
 ``results/07_honest_ellipses.gif``, the film at the head of the README (there as
-``docs/images/honest_ellipses.gif``), and counts the crosses inside.
+``docs/images/honest_ellipses.gif``). It also counts the crosses inside.
 """
 
 import argparse
@@ -66,7 +67,7 @@ def follow(env: LandmarkWorldEnv) -> Iterator[list[Belief]]:
 def look(
     filters: list[SlamEstimator], observation: dict[str, NDArray[np.float64]]
 ) -> None:
-    """Give one scan to all filters."""
+    """Update all filters with one scan."""
     seen = np.flatnonzero(observation["mask"])
     for slam in filters:
         slam.update(observation["landmarks"][seen], seen.tolist())

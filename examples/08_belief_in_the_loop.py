@@ -1,19 +1,18 @@
-"""Put a filter into an agent's loop: observe the belief, act on it, be paid to know.
+"""Put a filter into an agent's loop: observe its belief, and reward information.
 
-A wrapper runs the filter of your choice on what the world emits, and adds what it
-believes to the observation; another pays for what the belief gains.  An agent that goes
-back when it is lost is a few lines then.  Two robots drive the same round along the
-walls of a floor: one whatever happens, the other home whenever it is unsure of its
-place, until it is sure again.
+One wrapper runs a filter on the observations of the world, and adds its belief to them.
+Another one rewards the decrease of the map's uncertainty. With both, an agent that
+returns when it is lost takes a few lines. Two robots drive around the walls of a floor.
+One drives on in any case. The other returns to the start whenever its position is
+uncertain, until it is certain again.
 
 Run it::
 
     python examples/08_belief_in_the_loop.py
 
-It prints what each of the two earns and how well it knows the map and its place, and
-writes ``results/08_belief_in_the_loop.png``: how sure of their place they are on their
-way.
-Then 64 worlds run side by side, each with its filter.
+It prints the rewards of both, and the uncertainty of their maps and positions. It
+writes ``results/08_belief_in_the_loop.png``, the uncertainty of their positions over
+the drive. Then it runs 64 worlds side by side, each with its own filter.
 """
 
 import argparse
@@ -35,7 +34,7 @@ UNSURE, SURE = 0.3, 0.15  # standard deviations of the position [m]
 
 
 class Drive(NamedTuple):
-    """What came of one drive."""
+    """The result of one drive."""
 
     earned: float
     """Information gained [nats per landmark]."""
@@ -46,7 +45,7 @@ class Drive(NamedTuple):
 
 
 def drive(*, goes_home: bool) -> Drive:
-    """Drive 200 steps on the belief alone."""
+    """Drive 200 steps, controlled by the belief alone."""
     world = gym.make("slamgym:slamgym/LandmarkWorld-v0", scenario="active_medium")
     believing = BeliefObservation(world, estimator="invariant")
     env = InformationReward(believing, criterion="D")
@@ -74,7 +73,7 @@ def median_std(covariances: NDArray[np.float64]) -> float:
 
 
 def many_worlds() -> tuple[int, ...]:
-    """Step 64 worlds with a filter each; return the shape of what is observed."""
+    """Step 64 worlds with a filter each; return the shape of the observations."""
     vector = gym.make_vec(
         "slamgym:slamgym/LandmarkWorld-v0", 64, scenario="active_medium"
     )
@@ -85,7 +84,7 @@ def many_worlds() -> tuple[int, ...]:
 
 
 def draw(drives: dict[str, Drive]) -> Figure:
-    """Draw how sure of their place the robots are."""
+    """Draw the uncertainty of the robots' positions."""
     figure = Figure((7, 3.5), layout="constrained")
     axes = figure.add_subplot()
     colours = "#999999", "#222222"

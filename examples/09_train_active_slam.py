@@ -1,24 +1,23 @@
-"""Train an agent to explore: PPO on ``slamgym/ActiveSlam-v0``, beside the baselines.
+"""Train an agent to explore: PPO on ``slamgym/ActiveSlam-v0``, with the baselines.
 
-An agent that sees only what a filter believes learns to find all landmarks, to go back
-to what it knows before it is lost, and not to touch a wall.  64 worlds, each with its
-filter, run side by side in this one process.  Needs Stable-Baselines3::
+The agent observes only the belief of a filter. It learns to find all landmarks, to
+return to known places before it is lost, and to avoid walls. 64 worlds, each with its
+filter, run side by side in one process. The example needs Stable-Baselines3::
 
     pip install torch==2.13.0 stable-baselines3
 
 Run it::
 
-    python examples/09_train_active_slam.py      # some seven minutes of a core's time
-    python examples/09_train_active_slam.py --steps 100000 --maps 10    # a taste
+    python examples/09_train_active_slam.py      # about seven minutes of CPU time
+    python examples/09_train_active_slam.py --steps 100000 --maps 10    # a short trial
 
-It writes into ``results/09_train_active_slam``: ``policy.zip``, which is then read
-back to be judged; ``learning_curve.csv`` and ``.png``; ``scores.txt``, the table of
-policy and baselines over maps that neither training nor any choice saw, and by how much
-the policy differs from each baseline on the same maps; and ``trajectories.png``, what
-they all do on one of these maps.
+It writes into ``results/09_train_active_slam``: ``policy.zip``, which the example then
+loads and evaluates; ``learning_curve.csv`` and ``.png``; ``scores.txt``, the scores of
+policy and baselines on held-out maps, with the differences between the policy and each
+baseline on the same maps; and ``trajectories.png``, their paths on one of these maps.
 
-On 100 maps of ``active_medium`` a policy of two million steps earns 15.1 ± 0.6,
-coverage 13.5 ± 0.7 and chance -1.6 ± 0.5: see docs/active_slam_scores.md.
+On 100 maps of ``active_medium``, a policy of two million steps earns 15.1 ± 0.6,
+coverage 13.5 ± 0.7 and random -1.6 ± 0.5: see docs/active_slam_scores.md.
 """
 
 import argparse
@@ -101,7 +100,7 @@ def train(scenario: str, steps: int, worlds: int) -> list[dict[str, float]]:
 
 
 def load_policy(path: Path) -> Policy:
-    """Read a saved policy; it acts without chance."""
+    """Read a saved policy; it acts deterministically."""
     from stable_baselines3 import PPO  # noqa: PLC0415 (an extra)
 
     model = PPO.load(path, device="cpu")
@@ -117,7 +116,7 @@ def load_policy(path: Path) -> Policy:
 def play_everyone(
     env: ActiveSlamEnv, policy: Policy, maps: int
 ) -> dict[str, list[Episode]]:
-    """Let policy and baselines play the same maps, none of them trained or tuned on."""
+    """Run policy and baselines on the same maps, which were not used for training."""
     seeds = range(HELD_OUT, HELD_OUT + maps)
     players = {"ppo": policy}
     for name in BASELINES:
@@ -145,7 +144,7 @@ def draw_curve(
 
 
 def draw_trajectories(env: ActiveSlamEnv, played: dict[str, list[Episode]]) -> Figure:
-    """Draw what everyone does on the first map, side by side."""
+    """Draw the paths of all policies on the first map, side by side."""
     figure = Figure((3 * len(played), 3.4), layout="constrained")
     env.reset(seed=HELD_OUT)
     landmarks = env.landmarks
@@ -174,7 +173,7 @@ def draw_episode(
 
 
 def outcome(episode: Episode) -> str:
-    """Say in a few words how an episode went."""
+    """Describe the end of an episode in a few words."""
     if episode.success:
         return f"all known in {episode.steps} steps"
     how = "crashed" if episode.crashed else "time is up"
@@ -182,7 +181,7 @@ def outcome(episode: Episode) -> str:
 
 
 def arguments() -> argparse.Namespace:
-    """Read the command line; what cannot be is refused before the training."""
+    """Read the command line; refuse invalid options before the training."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,

@@ -1,15 +1,16 @@
-"""Find out which landmark each reading is of, by two methods, and score them.
+"""Associate readings with landmarks by two methods, and score the decisions.
 
-In the world ``hidden_identities`` nobody tells the filter which landmark it sees, and
-one reading per step is of none.  The world knows the truth and reports it apart from
-the readings; it scores the decisions of the filter afterwards.
+In the world ``hidden_identities``, readings have no landmark id, and one reading per
+step is clutter. The world reports the true ids apart from the readings, and the example
+scores the filter's decisions with them.
 
 Run it::
 
     python examples/11_who_is_who.py
 
-"Nearest" takes each reading by itself.  The default policy follows several assignments
-of whole scans, and applies the sightings before a landmark is confirmed, too.
+"Nearest" associates each reading separately. The default policy follows several
+assignments of whole scans, and also uses the readings of a landmark before its
+confirmation.
 """
 
 import numpy as np

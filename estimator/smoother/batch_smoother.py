@@ -46,7 +46,7 @@ def smooth(
     landmarks : mapping from id to (2,), optional
         Landmarks to start from; else those of the filter, or as first read.
     robust : {"huber", "cauchy"}, optional
-        Kernel that gives readings far off less weight.
+        Kernel that gives outliers less weight.
     robust_scale : float, optional
         Normalised distance of a reading from which on it counts less; 1.345 for Huber's
         and 2.3849 for Cauchy's by default.
@@ -141,7 +141,7 @@ def _starts(
     given: Mapping[int, Array],
     order: IntArray,
 ) -> list[Callable[[], Estimate]]:
-    """Return what computes poses and landmarks to start from, the best guess first."""
+    """Return functions that compute poses and landmarks to start from, best first."""
 
     def estimate(poses: Array, found: Mapping[int, Array]) -> Estimate:
         return Estimate(poses, _landmarks_at(drive, poses, {**found, **given}, order))

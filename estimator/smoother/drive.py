@@ -154,14 +154,14 @@ class Drive:
         self._sightings[-1].append(Sightings(readings[usable], chosen))
 
     def end_motion(self) -> None:
-        """Make the present place a pose of the drive, also without a scan."""
+        """Make the present position a pose of the drive, also without a scan."""
         if self._pending:
             self._motions.append(self._composed(self._pending))
             self._sightings.append([])
             self._pending = []
 
     def merge(self, kept: int, gone: int) -> None:
-        """Take the readings of one landmark to be of another."""
+        """Assign the readings of one landmark to another."""
         for scans in self._sightings:
             for scan in scans:
                 scan.ids[scan.ids == gone] = kept

@@ -108,10 +108,10 @@ class Optimiser:
 
     @property
     def plausible_cost(self) -> float:
-        """Largest cost that is no sign of a wrong solution.
+        """Largest cost that is plausible for a correct solution.
 
-        Twice the cost of the right one is about χ², with two degrees of freedom for
-        each reading less two for each landmark.
+        Twice the cost of the correct solution is about χ², with two degrees of freedom
+        for each reading less two for each landmark.
         """
         freedom = 2 * len(self._drive.readings) - len(self._room.right)
         return 0.6 * freedom + 6 * float(np.sqrt(freedom / 2)) + 1
@@ -158,7 +158,7 @@ class Optimiser:
         return Minimum(solution, self._room, information)
 
     def range_stds(self, estimate: Estimate) -> Array:
-        """Return σr of each reading, shape (M,), at the range it should have."""
+        """Return σr of each reading, shape (M,), at its expected range."""
         return range_stds(*estimate, self._drive, self._rule_values)
 
     def cost(self, estimate: Estimate, stds: Array) -> float:
@@ -203,7 +203,7 @@ class Optimiser:
         return moved
 
     def _reweight(self, state: _State) -> None:
-        """Take the noise of ranges at the present estimate."""
+        """Update the noise of the ranges for the present estimate."""
         state.stds = self.range_stds(state.estimate)
         state.cost = self.cost(state.estimate, state.stds)
 

@@ -62,7 +62,7 @@ class RecordedSlam:
             setattr(self, name, member)
 
     def recorded(self) -> Drive:
-        """Return the drive until now; where it ended is a pose of it."""
+        """Return the drive until now; its last pose is the present one."""
         drive = Drive(**self._noise)
         for event in self._events():
             getattr(drive, event.name)(*event.arguments)
@@ -106,7 +106,7 @@ class RecordedSlam:
         self._record("forget", tuple(landmark_ids))
 
     def merge(self, kept: int, gone: int) -> None:
-        """Make one of two landmarks, in the filter and in the drive."""
+        """Merge two landmarks, in the filter and in the drive."""
         self.merge_pairs([(kept, gone)])
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:

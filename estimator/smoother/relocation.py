@@ -1,7 +1,7 @@
 """Move landmarks out of local minima, compiled.
 
-A landmark close to the path may be held on the wrong side of it: every bearing is then
-off, and yet no small step lowers the cost.  Some of its readings alone put it on the
+A landmark close to the path may be estimated on the wrong side of it. All bearings then
+have large errors, but no small step reduces the cost. Single readings place it on the
 right side.
 """
 

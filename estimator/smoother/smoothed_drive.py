@@ -1,4 +1,4 @@
-"""What the smoother knows of a drive: all poses and landmarks, and any covariance."""
+"""The result of the smoother: all poses and landmarks, and any covariance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The smoother where a filter is expected: it follows a drive, then smooths it."""
+"""The smoother with the interface of a filter: it records a drive, then smooths it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from .smoothed_drive import SmoothedDrive
 
 
 class SmoothingSlam(RecordedSlam):
-    """A filter that keeps its drive, and smooths it at the end.
+    """A filter that records its drive, and smooths it at the end.
 
-    Its beliefs on the way are the filter's.  :meth:`smoothed` returns those about all
-    poses given the whole drive, which experiments take in their place.
+    During the drive, its beliefs are those of the filter. :meth:`smoothed` returns the
+    beliefs about all poses given the whole drive, and experiments use these instead.
 
     Parameters
     ----------

@@ -58,11 +58,11 @@ def filter_drive(
 def start_of(
     drive: Drive, belief: Belief | None = None, *, iterations: int = 1
 ) -> tuple[Array, dict[int, Array]]:
-    """Return poses (N, 3) that fit the map a filter has at the end, and that map.
+    """Return poses (N, 3) that fit a filter's final map, and that map.
 
-    The poses of a filter on its way do not: each knows of the drive until then only,
-    and jumps where a loop is closed.  A second pass, which has the map from the
-    beginning, counts all readings twice, but its poses are a start without jumps.
+    The poses that a filter estimates during the drive do not fit it: each uses only the
+    readings until then, and they jump when a loop is closed. A second pass, which has
+    the map from the beginning, counts all readings twice, but its poses have no jumps.
 
     Parameters
     ----------

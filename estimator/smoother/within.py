@@ -1,4 +1,4 @@
-"""Find what smooths in an estimator that may be managed."""
+"""Find the smoother in an estimator that may be managed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from ..map_management.hypotheses import HypothesisSlam
 
 
 def smoother_in(slam: SlamEstimator) -> SupportsSmoothing | None:
-    """Return what smooths, of several hypotheses the most probable one; else None."""
+    """Return the smoother, that of the most probable hypothesis; None without one."""
     inner = slam.best if isinstance(slam, HypothesisSlam) else slam
     return inner if isinstance(inner, SupportsSmoothing) else None

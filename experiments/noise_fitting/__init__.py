@@ -1,4 +1,4 @@
-"""The noise of logs: fit it, and judge the fit."""
+"""Fit the noise of logs by maximum likelihood, and evaluate the fit."""
 
 from lazy_loader import attach_stub
 

@@ -1,4 +1,4 @@
-"""Calibrate the noise of a sensor by the true path."""
+"""Calibrate the noise of a sensor with the true path."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FACTORS = np.geomspace(0.25, 16.0, 19)
 
 
 class Calibration(NamedTuple):
-    """The factor of the sensor's noise at which the pose NEES is as it should be."""
+    """The factor of the sensor's noise at which the pose NEES is as expected."""
 
     factor: float
     low: float
@@ -32,10 +32,10 @@ class Calibration(NamedTuple):
 def calibrate(
     likelihood: LogLikelihood, log: SlamLog, times: Array, noise: Array
 ) -> Calibration | None:
-    """Return the factor of the sensor's noise at which NEES is as it should be.
+    """Return the factor of the sensor's noise at which NEES has its expected value.
 
-    The mean NEES of one drive scatters, as that of a step is much like that of the step
-    before.  The interval holds the factors under which it is within `nees_bounds`.
+    The mean NEES of one drive has a large variance, because successive steps are
+    correlated. The interval holds the factors whose mean NEES is within `nees_bounds`.
 
     Parameters
     ----------
@@ -89,14 +89,14 @@ def _known_nees(
 
 
 def nees_bounds(nees: Array) -> tuple[float, float]:
-    """Return between what the mean NEES per degree of a right noise is, in 95 %.
+    """Return the 95 % interval of the mean NEES per degree if the noise is right.
 
-    Those of χ²(ν)/ν, with ν ≥ 3 and the autocorrelations about the mean and variance
-    that are expected of the NEES of a pose, 3 and 6::
+    It is that of χ²(ν)/ν, with ν ≥ 3 and the autocorrelations about the expected mean
+    and variance of the NEES of a pose, 3 and 6::
 
         ν = 3N / (1 + 2 Σ ρ_k),    ρ_k = Σ_t (ε_t − 3)(ε_{t+k} − 3) / 6N
 
-    About its own mean, a series that stays at one value would look white.
+    About its own mean, a constant series would look white.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def nees_bounds(nees: Array) -> tuple[float, float]:
 
 
 def _crossing(factors: Array, ratios: Array) -> float:
-    """Return the factor, of logarithms, at which falling ratios first reach 1."""
+    """Return the factor at which decreasing ratios first reach 1, from logarithms."""
     below = np.flatnonzero(ratios <= 0)
     if not len(below):
         return float(np.exp(factors[-1]))

@@ -1,4 +1,4 @@
-"""Fit the noise of a log: the one under which its readings are most likely."""
+"""Fit the noise of a log: find the noise that makes its readings most likely."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ GATE_PROBABILITY = float(-np.expm1(-GATE / 2))
 
 
 class Fitted(NamedTuple):
-    """A noise and how the log looks under it."""
+    """A noise, and the innovations of the log under it."""
 
     settings: FilterSettings
     log_likelihood: float
@@ -67,7 +67,7 @@ class NoiseFit:
     """Shape (M,)."""
     readings: int
     passes: int
-    """How often the log was filtered."""
+    """Number of times that the log was filtered."""
 
 
 def fit_noise(
@@ -150,7 +150,7 @@ def fit_noise(
 
 
 def _filter(log: SlamLog, settings: FilterSettings) -> EkfSlam:
-    """Return the filter by itself, without management, at the start of the log."""
+    """Return the filter at the start of the log, without landmark management."""
     options = {k: v for k, v in settings.options.items() if k != "management"}
     slam = replace(settings, options=options).make(log.start)
     if not (isinstance(slam, EkfSlam) and can_batch(slam)):

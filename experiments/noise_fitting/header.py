@@ -1,4 +1,4 @@
-"""Put a noise into the header of a log's file, and leave all else as it is."""
+"""Write a noise into the header of a log's file, and change nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far innovations are from white, and by how much to inflate their noise for it."""
+"""The correlation of innovations in time, and the inflation of the noise for it."""
 
 from __future__ import annotations
 

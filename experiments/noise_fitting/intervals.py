@@ -1,4 +1,4 @@
-"""Which parameters of a fit the readings determine, and how well."""
+"""Confidence intervals of the fitted parameters."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ENDS = np.geomspace(1e-6, 10.0, 71)  # [m, rad] where ends are looked for
 
 
 class Interval(NamedTuple):
-    """What the readings say about one parameter."""
+    """The information of the readings about one parameter."""
 
     verdict: Verdict
     """Zero: the interval begins at zero; "unknown": nothing depends on it."""
@@ -33,9 +33,10 @@ def intervals(
 ) -> list[Interval]:
     """Return the 95 % intervals of the most likely parameters.
 
-    For a parameter that the readings determine, from the curvature of the log
-    likelihood in log σ.  For another one, they are where the readings are significantly
-    less likely, the other parameters fitted anew (the profile likelihood).
+    If the readings determine a parameter, its interval follows from the curvature of
+    the log likelihood in log σ. Otherwise, the interval ends where the readings are
+    significantly less likely, with the other parameters fitted again (the profile
+    likelihood).
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from .log_events import without_readings
 
 @dataclass(frozen=True, eq=False)
 class LogLikelihood:
-    """The log likelihood of a drive under noises, by the innovations of a filter."""
+    """The log likelihood of a drive's readings under a noise, from the innovations."""
 
     filter: EkfSlam
     """At its start."""
@@ -31,7 +31,7 @@ class LogLikelihood:
         ).log_likelihoods
 
     def record(self, noises: Array) -> DriveRecord:
-        """Return all that is known of the passes under noises (B, 7)."""
+        """Return the full records of the passes under noises (B, 7)."""
         return drive_likelihood(
             self.filter,
             self.events,

@@ -1,4 +1,4 @@
-"""The events of a log as the kernels take them: motions, readings, landmarks."""
+"""The events of a log as arrays for the kernels: motions, readings, landmarks."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def events_of(
 
 
 def without_readings(events: DriveEvents, dropped: BoolArray) -> DriveEvents:
-    """Return events without some of the readings, those where ``dropped`` (M,)."""
+    """Return the events without some readings, where ``dropped`` (M,) is True."""
     kept = ~dropped
     counts = np.concatenate([[0], np.cumsum(kept)])
     return events._replace(
@@ -63,7 +63,7 @@ def without_readings(events: DriveEvents, dropped: BoolArray) -> DriveEvents:
 
 
 class _EventList:
-    """Collect steps one after the other."""
+    """Collects steps one after the other."""
 
     def __init__(self) -> None:
         self.motions: list[Motion] = []
@@ -109,9 +109,9 @@ def _identified(log: SlamLog) -> TimedEvents:
 def _associated(
     log: SlamLog, settings: FilterSettings, progress: Progress | None
 ) -> TimedEvents:
-    """Return events whose steps are those between scans, as a filter associates them.
+    """Return events with one step per scan, as a filter associates the readings.
 
-    The landmarks are those of its map at the end, as the smoother has them.
+    The landmarks are those of its final map, as for the smoother.
     """
     options = {**settings.options, "follow": settings.estimator}
     slam = replace(settings, estimator=SMOOTHER, options=options).make(log.start)
@@ -146,7 +146,7 @@ def _distinct(sightings: Sightings) -> Iterable[Sightings]:
 
 
 def _times_at(log: SlamLog, counts: list[int]) -> Array:
-    """Return the times at which this many odometry readings had been."""
+    """Return the times after these numbers of odometry readings."""
     times, until, done = [], [], 0
     for step in steps_of(log):
         done += len(_motions_of(log, step.motions))

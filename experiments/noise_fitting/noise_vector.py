@@ -60,14 +60,14 @@ def with_noise(settings: FilterSettings, noise: Array) -> FilterSettings:
 
 
 def fitted_entries(noise: Array) -> BoolArray:
-    """Return which entries are fitted, (7,): all, but σβ in metres where it is used."""
+    """Return which entries are fitted, (7,): all, but σβ in metres only if used."""
     fitted = np.ones(len(ENTRIES), dtype=np.bool_)
     fitted[IN_METRES] = noise[IN_METRES] > 0
     return fitted
 
 
 def positive_start(noise: Array, typical_range: float) -> Array:
-    """Replace zeros of a noise (7,) by small numbers, from where a search can begin.
+    """Replace zeros of a noise (7,) by small numbers, with which a search can begin.
 
     Examples
     --------
@@ -90,7 +90,7 @@ def positive_start(noise: Array, typical_range: float) -> Array:
 
 
 def replaceable_by_zero(noise: Array) -> BoolArray:
-    """Return which entries of a sensor's noise another entry can stand in for, (7,)."""
+    """Return which entries of a sensor's noise another entry can replace, (7,)."""
     can = np.zeros(len(ENTRIES), dtype=np.bool_)
     can[[RANGE, PER_METRE]] = noise[RANGE] > 0 and noise[PER_METRE] > 0
     can[[BEARING, IN_METRES]] = noise[BEARING] > 0 and noise[IN_METRES] > 0

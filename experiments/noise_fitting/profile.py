@@ -1,10 +1,11 @@
-"""Profile likelihood: that of one parameter, the others fitted anew for each value.
+"""Profile likelihood: that of one parameter, with the others fitted for each value.
 
-With the score g and the information I about θ, and o the other parameters, it is ::
+With the score g, the information I about θ, and the other parameters o, it is to second
+order ::
 
     ℓ_p = ℓ + ½ g_oᵀ I_oo⁻¹ g_o,    dℓ_p/dθ_i = g_i − I_io I_oo⁻¹ g_o
 
-to second order (Venzon, Moolgavkar, Applied Statistics 37(1), 1988).
+(Venzon, Moolgavkar, Applied Statistics 37(1), 1988).
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class Maximum(NamedTuple):
     log_likelihood: float
     converged: bool
     passes: int
-    """How many values were tried."""
+    """Number of values tried."""
 
 
 class Scores(NamedTuple):
@@ -71,12 +71,12 @@ def maximise(
 
         θ ← θ + a (I + λ diag I)⁻¹ Σ g_s
 
-    with the best of several a.  The damping λ grows where none is better.  A parameter
-    on which nothing depends keeps its value.
+    with the best of several a. The damping λ increases if no step improves the
+    likelihood. A parameter without effect keeps its value.
 
-    As σ → 0 the slope along log σ vanishes like σ², whether zero is likely or not.
-    Where a climb ends, each poorly determined parameter is therefore tried at
-    values of all sizes, and the climb goes on from the best of them.
+    As σ → 0, the slope along log σ vanishes like σ², whether zero is likely or not.
+    When a climb ends, each poorly determined parameter is therefore tried with values
+    of all sizes, and the climb continues from the best of them.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def _climb(likelihoods: Likelihoods, theta: Array, most: int) -> _Climb:
 
 
 def _of_other_sizes(climb: _Climb) -> Array:
-    """Return θ with other sizes of each poorly determined entry, (B, p)."""
+    """Return θ with several values of each poorly determined entry, (B, p)."""
     little = np.flatnonzero(np.diag(climb.scores.information) < LITTLE)
     tried = np.tile(climb.theta, (len(little) * len(SIZES), 1))
     tried[np.arange(len(tried)), np.repeat(little, len(SIZES))] = np.tile(
@@ -195,7 +195,7 @@ def restricted(
 
 
 def totals(likelihoods: Array) -> Array:
-    """Return ℓ of each value; -inf where it is not a number."""
+    """Return ℓ of each value; -inf if it is not a number."""
     sums = likelihoods.sum(axis=1)
     return np.where(np.isnan(sums), -np.inf, sums)
 

@@ -1,4 +1,4 @@
-"""Search the most likely noise, readings rejected and zeros decided."""
+"""Search for the most likely noise, with rejected readings and noises at zero."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class FittedNoise(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """A noise on the way."""
+    """A noise during the search."""
 
     noise: Array
     """Shape (7,)."""
@@ -73,12 +73,12 @@ class Found(NamedTuple):
 
 
 def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
-    """Return the noise under which the readings are most likely.
+    """Return the noise that makes the readings most likely.
 
-    Readings beyond the gate are rejected and the noise is fitted to the others, in
-    turns, until the same readings are rejected.  An entry of the sensor's noise that
-    another one can stand in for, such as the part of σr that grows with the range, is
-    zero unless the readings are significantly more likely with it.
+    The search alternates between rejecting readings beyond the gate and fitting the
+    noise to the others, until the rejected readings stay the same. Some entries of the
+    sensor's noise can replace each other, such as the part of σr that grows with the
+    range. Such an entry is zero unless it makes the readings significantly more likely.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
 def _in_turns(
     likelihood: LogLikelihood, start: Array, chosen: BoolArray
 ) -> tuple[LogLikelihood, _Fit]:
-    """Reject readings and fit the noise to the others, until the same are rejected."""
+    """Alternate between rejecting readings and fitting, until nothing changes."""
     found = _coarse_start(likelihood, start, chosen)
     rejected = likelihood.rejected(found.noise)
     for round_ in range(ROUNDS):
@@ -146,7 +146,7 @@ def _typical_range(likelihood: LogLikelihood) -> float:
 
 
 def _fit(smooth: LogLikelihood, found: _Fit, *, most: int | None = None) -> _Fit:
-    """Fit the free entries, from where they are."""
+    """Fit the free entries, starting from their present values."""
     free = np.flatnonzero(found.free)
     along = restricted(smooth.of, found.noise, free)
     fit = maximise(along, found.noise[None, free], most=most)
@@ -163,7 +163,7 @@ def _fixed_at_zero(found: _Fit, entry: int) -> _Fit:
 
 
 def _without_needless(smooth: LogLikelihood, found: _Fit) -> _Fit:
-    """Fit again without the part of σr per metre, or of σβ in metres, if needless."""
+    """Fit again without the part of σr per metre, or of σβ in metres, if possible."""
     for entry in NEEDLESS:
         if not (found.free[entry] and replaceable_by_zero(found.noise)[entry]):
             continue
@@ -182,7 +182,7 @@ def _without_needless(smooth: LogLikelihood, found: _Fit) -> _Fit:
 
 
 def _is_plain(smooth: LogLikelihood, found: _Fit, entry: int) -> bool:
-    """Return whether an entry is so well known that it cannot be zero."""
+    """Return whether an entry is significantly above zero."""
     free = np.flatnonzero(found.free)
     along = restricted(smooth.of, found.noise, free)
     information = scores(along, np.log(found.noise[free])).information
@@ -192,7 +192,7 @@ def _is_plain(smooth: LogLikelihood, found: _Fit, entry: int) -> bool:
 
 
 def _without_zeros(smooth: LogLikelihood, found: _Fit) -> _Fit:
-    """Put to zero, one after the other, what makes no reading less likely there."""
+    """Set entries to zero, one by one, if the readings do not become less likely."""
     for _ in range(int(np.count_nonzero(found.free)) - 1):
         free = np.flatnonzero(found.free)
         tried = [_fixed_at_zero(found, entry) for entry in free.tolist()]

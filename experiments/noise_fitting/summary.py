@@ -1,4 +1,4 @@
-"""Judge a fitted noise: replay the log before and after, and summarise."""
+"""Evaluate a fitted noise: replay the log before and after, and summarise."""
 
 from __future__ import annotations
 

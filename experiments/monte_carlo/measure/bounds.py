@@ -1,4 +1,4 @@
-"""What simulated runs allow: the bound on the errors of any filter, and the noise."""
+"""The bound on the errors of any filter in simulated runs, and their actual noise."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Why an estimator is not consistent, as an entry of the summary and a sentence."""
+"""The cause of an inconsistency, as an entry of the summary and as a sentence."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -51,9 +51,9 @@ def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _diagnosed(scores: EstimatorScores, frame: ErrorFrame) -> Diagnosis:
-    """Diagnose the runs that succeeded; all runs' noise counts, as it is the world's.
+    """Diagnose the runs that succeeded; the noise of all runs counts.
 
-    Runs that failed leave nothing to say of a filter whose other runs are honest.
+    If runs failed and the others are consistent, the answer is "cannot tell".
     """
     nees = scores.over_time(f"pose_nees_{frame}")[:, scores.first - 1 :]
     heading = scores.over_time("heading_nees")[:, scores.first - 1 :]

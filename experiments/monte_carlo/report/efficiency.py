@@ -1,4 +1,4 @@
-"""How much of what can be known an estimator knows: its efficiency."""
+"""The efficiency of an estimator: the bound of any filter by its squared error."""
 
 from typing import Any
 

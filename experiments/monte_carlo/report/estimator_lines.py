@@ -1,4 +1,4 @@
-"""Colours, dashes and markers of several estimators in one figure, and thin lines."""
+"""Colours, dashes and markers of the estimators in a figure, and thinned lines."""
 
 import math
 from typing import Any, NamedTuple
