@@ -110,7 +110,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         See `RewardWeights`.
     observation, max_landmarks, dtype
         Form of the observation, see `ObservationForm`. With ``observation="set"`` the
-        entries with a row per landmark give way to ``landmarks`` (R, 15), one row of
+        rows per landmark are replaced by ``landmarks`` (R, 15), one row of
         `landmark_set.FEATURES` per mapped landmark, and ``mask`` (R,).
     render_mode : {"human", "rgb_array"}, optional
         As in `LandmarkWorldEnv`; the frames also show the belief.

@@ -72,7 +72,7 @@ def generate_trajectories(
     episodes_per_shard : int, optional
         The default is 100, or fewer if they would take more than 256 MB of memory.
     jobs : int, optional
-        Number of workers, each of which makes one shard at a time; -1 for one on each
+        Number of workers, which make one shard at a time each; -1 for one on each
         core. By default this process does all. The bytes are the same.
     backend : {"loky", "dask", "ray"}, optional
         Provider of the workers.
