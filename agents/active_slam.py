@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
+from ..arrays import BoolArray
 from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
 from ..estimator.filters.batch import can_batch
@@ -18,9 +19,10 @@ from ..estimator.filters.ekf import EkfSlam
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, split_settings
 from .agent_knowledge import AgentKnowledge
+from .association_record import AssociationRecord
 from .belief_arrays import belief_storage, live_storage
 from .estimator_choice import EstimatorChoice, checked_belief, choose_estimator
-from .map_truth import map_rmse
+from .map_truth import map_rmse, matched_rmse
 
 Observation = dict[str, Any]
 
@@ -66,7 +68,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
 
     `info` has the same keys in `reset` and `step`: the truth, ``pose`` (x, y, θ) and
     ``collision``; the counts ``mapped`` and ``known``; ``success``; ``true_rmse``, the
-    root mean square error of the mapped landmarks [m], nan without any; and
+    root mean square error of the mapped landmarks [m], 0 without any; and
     ``honest_success``: a success with a ``true_rmse`` of at most ``accuracy``.
 
     ## Rewards
@@ -100,7 +102,12 @@ class ActiveSlamEnv(LandmarkWorldEnv):
 
     ## Arguments
     scenario : Scenario, mapping, str or Path, default "active_medium"
-        "active_easy", "active_medium", "active_hard", or any with walls and identities.
+        "active_easy", "active_medium", "active_hard", or any with walls. Where it hides
+        identities, landmark management associates (``management`` in
+        `estimator_options`), a map has at most N landmarks, and row i is landmark i of
+        the map. ``true_rmse`` then compares with the nearest match of map and truth,
+        and ``association_precision``, ``…_recall``, ``…_duplicate`` and ``…_ghost`` in
+        `info` score the episode at its end; -1 before.
     estimator : str, callable or object, default "invariant"
         The filter, see `choose_estimator`. The reward depends on its covariance, so an
         overconfident filter collects reward for information that it does not have.
@@ -144,7 +151,14 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         super().__init__(scenario, render_mode=render_mode, **changes)
         self.task = ActiveSlamTask(self.scenario, weights, form=form)
         self.observation_space = self.task.observation_space
-        self._estimator = choose_estimator(estimator, self.scenario, estimator_options)
+        self._by_id = self.scenario.sensor.identities
+        self._record = None if self._by_id else AssociationRecord(1)
+        self._estimator = choose_estimator(
+            estimator,
+            self.scenario,
+            estimator_options,
+            rows=self.scenario.landmarks.count,
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -152,9 +166,11 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         """Start an episode with a new map, and take the first scan."""
         observation, info = super().reset(seed=seed, options=options)
         self._estimator.reset(self.start_estimate, self.scenario.start.std)
-        beliefs = self._update(observation, step=0)
+        if self._record is not None:
+            self._record.begin(_ONE_WORLD)
+        beliefs = self._update(observation, info, step=0)
         self.task.begin(beliefs, _ONE_WORLD)
-        return self._output(beliefs, info)
+        return self._output(beliefs, info, ~_ONE_WORLD)
 
     def step(
         self, action: ArrayLike
@@ -169,11 +185,12 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         step = self._steps() + 1
         observation, _, _, _, info = super().step(action)
         self._estimator.predict(observation["odometry"])
-        beliefs = self._update(observation, step=step)
+        beliefs = self._update(observation, info, step=step)
         actions = np.asarray(action, dtype=np.float64)[None]
         collision = np.array([info["collision"]])
         outcome = self.task.proceed(beliefs, _ONE_WORLD, actions, collision)
-        seen, info = self._output(beliefs, info)
+        ended = outcome.terminated | outcome.truncated
+        seen, info = self._output(beliefs, info, ended)
         ends = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return seen, float(outcome.rewards[0]), *ends, info
 
@@ -184,7 +201,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         return AgentKnowledge(
             self.scenario,
             self.task.grid,
-            self._estimator,
+            getattr(self._estimator, "filter", self._estimator),  # of managed ones
             self._estimator.belief(),
             episodes.explored[0].copy(),
             episodes.known[0].copy(),
@@ -198,28 +215,38 @@ class ActiveSlamEnv(LandmarkWorldEnv):
             raise ResetNeeded("call reset first: there is no episode yet")
         return int(self.task.episodes.steps[0])
 
-    def _update(self, observation: Observation, *, step: int) -> BatchStorage:
+    def _update(
+        self, observation: Observation, info: Mapping[str, Any], *, step: int
+    ) -> BatchStorage:
         """Update the estimator with one scan; return its belief."""
-        seen = np.flatnonzero(observation["mask"])
-        self._estimator.update(observation["landmarks"][seen], seen.tolist())
+        mask = observation["mask"]
+        seen = np.flatnonzero(mask)
+        if self._record is not None:
+            self._record.add(_ONE_WORLD, info["landmark_ids"][None], mask[None])
+        ids = seen.tolist() if self._by_id else None
+        self._estimator.update(observation["landmarks"][seen], ids)
         count = self.scenario.landmarks.count
         if self.render_mode is None and can_batch(self._estimator):
             return live_storage(cast("EkfSlam", self._estimator), count)
         belief = checked_belief(self._estimator, step)
         self.show_belief(belief)
-        return belief_storage(belief, count, by_id=True)
+        return belief_storage(belief, count, by_id=self._by_id)
 
     def _output(
-        self, beliefs: BatchStorage, info: dict[str, Any]
+        self, beliefs: BatchStorage, info: dict[str, Any], ended: BoolArray
     ) -> tuple[Observation, dict[str, Any]]:
         rows = self.task.observations()
-        rmse = float(map_rmse(beliefs, self._landmarks[None])[0])
+        error = map_rmse if self._by_id else matched_rmse
+        rmse = float(error(beliefs, self._landmarks[None])[0])
         success = bool(self.task.outcome.success[0])
-        counts = {
+        counts: dict[str, Any] = {
             "mapped": int((beliefs.slots >= 0).sum()),
             "known": int(self.task.episodes.known.sum()),
             "success": success,
             "true_rmse": rmse,
             "honest_success": success and rmse <= self.task.weights.accuracy,
         }
+        if self._record is not None:
+            scores = self._record.scores([self._estimator], ended)
+            counts |= {key: float(score[0]) for key, score in scores.items()}
         return {key: row[0] for key, row in rows.items()}, {**info, **counts}

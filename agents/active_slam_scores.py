@@ -44,7 +44,7 @@ class Episode(NamedTuple):
     crashed: bool
     """Whether the robot touched a wall."""
     true_rmse: float
-    """Root mean square error of the mapped landmarks at the end [m]."""
+    """Root mean square error of the map at the end [m]; nan of an empty one."""
     honest: bool
     """Whether it was a success, and the truth agrees."""
     path: Array
@@ -78,7 +78,7 @@ def run_episode(env: ActiveSlamEnv, policy: Policy, seed: int) -> Episode:
         share,
         len(path) - 1,
         info["collision"],
-        info["true_rmse"],
+        info["true_rmse"] if info["mapped"] else np.nan,
         info["honest_success"],
         np.array(path),
     )

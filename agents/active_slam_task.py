@@ -63,7 +63,7 @@ class ActiveSlamTask:
     Parameters
     ----------
     scenario : Scenario
-        With walls and with identities.
+        With walls. Where it hides identities, row i is landmark i of the map.
     weights : RewardWeights
         Rewards and costs.
     count : int
@@ -103,11 +103,6 @@ class ActiveSlamTask:
         count: int = 1,
         form: ObservationForm | None = None,
     ) -> None:
-        if not scenario.sensor.identities:
-            raise ValueError(
-                f"scenario must have sensor.identities = true, got false in "
-                f"'{scenario.name}'"
-            )
         self.scenario, self.weights = scenario, weights
         self._form = form or ObservationForm()
         self.grid = CoverageGrid(scenario)

@@ -21,7 +21,8 @@ class AgentKnowledge(NamedTuple):
     explored: BoolArray
     """Cells of the grid seen so far, as believed, shape (C,)."""
     known: BoolArray
-    """Landmarks known to the required accuracy, shape (N,)."""
+    """Landmarks known to the required accuracy, shape (N,); with hidden identities in
+    the order of the map."""
     accuracy: float
     """Required standard deviation of a landmark [m]."""
     prior_std: tuple[float, float]
@@ -29,15 +30,21 @@ class AgentKnowledge(NamedTuple):
     step: int
     """Steps so far."""
 
+    @property
+    def known_in_map(self) -> BoolArray:
+        """Which landmarks of the belief are known, in its order, shape (n,)."""
+        ids = list(self.belief.landmark_ids)
+        rows = ids if self.scenario.sensor.identities else list(range(len(ids)))
+        return self.known[rows]
+
     def goals(self) -> Array:
         """Return the positions worth a visit, shape (K, 2) [m].
 
         These are the mapped landmarks that are not yet known and, while a landmark is
         not yet mapped, the unexplored cells that the robot can get to.
         """
-        ids = list(self.belief.landmark_ids)
-        landmarks: Array = self.belief.landmarks[~self.known[ids]]
-        if len(ids) == len(self.known):
+        landmarks: Array = self.belief.landmarks[~self.known_in_map]
+        if len(self.known_in_map) == len(self.known):
             return landmarks
         unseen = ~self.explored & self.grid.routes.reachable
         return np.concatenate([landmarks, as_points(self.grid.cells[unseen])])

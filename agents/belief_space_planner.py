@@ -230,7 +230,7 @@ def _tours(knowledge: AgentKnowledge, chance: Array, cells: int) -> Array:
     belief, grid = knowledge.belief, knowledge.grid
     position = belief.pose[:2]
     ids = list(belief.landmark_ids)
-    unknown = belief.landmarks[~knowledge.known[ids]]
+    unknown = belief.landmarks[~knowledge.known_in_map]
     first, second = [unknown], [position[None]]
     if ids:
         blocks = belief.covariance[3:, 3:].diagonal().reshape(-1, 2).sum(axis=1)

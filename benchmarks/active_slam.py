@@ -38,6 +38,7 @@ LEVELS = (
     "active_hard",
     "active_uncertain",
     "active_rooms",
+    "active_hidden",
 )
 TRAINING = Path(__file__).parents[1] / "examples" / "09_train_active_slam.py"
 

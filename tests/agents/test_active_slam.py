@@ -212,10 +212,6 @@ def test_settings_survive_a_spec_written_as_json():
     ("settings", "message"),
     [
         ({"scenario": "loop"}, "scenario must have walls around its floor"),
-        (
-            {"sensor": {"identities": False}},
-            r"scenario must have sensor\.identities = true",
-        ),
         ({"accuracy": 0.0}, "accuracy must be a finite number > 0"),
         ({"crash_cost": -5}, "crash_cost must be a finite number >= 0, got -5"),
         ({"success_reward": math.nan}, "success_reward must be a finite number >= 0"),

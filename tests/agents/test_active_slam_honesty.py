@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
-from slamgym.agents.active_slam_scores import Episode, mean_of
+from slamgym.agents.active_slam_scores import Episode, mean_of, run_episode
 from slamgym.estimator import InvariantEkfSlam
 
 RING = {"layout": "ring", "count": 5, "radius": 2.0}
@@ -45,8 +45,11 @@ def test_the_error_is_that_of_the_belief_against_the_true_landmarks():
 
 
 def test_an_empty_map_has_no_error():
-    env = ActiveSlamEnv("active_easy", landmarks=RING, sensor={"max_range": 0.5})
-    assert math.isnan(env.reset(seed=0)[1]["true_rmse"])
+    env = ActiveSlamEnv(
+        "active_easy", landmarks=RING, sensor={"max_range": 0.5}, steps=2
+    )
+    assert env.reset(seed=0)[1]["true_rmse"] == 0.0
+    assert math.isnan(run_episode(env, lambda *_: np.zeros(2), 0).true_rmse)
 
 
 def test_a_success_is_honest_where_the_truth_agrees():

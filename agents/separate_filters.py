@@ -1,4 +1,4 @@
-"""One filter per world that associates readings without identity."""
+"""One filter per world, for worlds that hide identities or differ from each other."""
 
 from __future__ import annotations
 
@@ -11,13 +11,19 @@ from ..arrays import AnyArray, Array, BoolArray
 from ..estimator.filters.batch_results import BatchBeliefs, BatchStorage
 from ..sim_configs import Scenario
 from .belief_arrays import belief_storage
-from .estimator_choice import checked_belief, choose_estimator
+from .estimator_choice import (
+    BeliefOfMap,
+    FollowingEstimator,
+    checked_belief,
+    choose_estimator,
+)
 
 
-class AssociatingFilters:
-    """Managed filters side by side, for vector worlds that hide identities.
+class SeparateFilters:
+    """Filters side by side, for vector worlds in which batches cannot run.
 
-    Each filter runs by itself, since batches do not associate.
+    Batches do not associate, and all their filters have the same noise. Where the
+    scenario hides identities, the filters are managed and associate.
 
     Parameters
     ----------
@@ -51,20 +57,27 @@ class AssociatingFilters:
                 "estimator must be a registered name for vector environments, "
                 f"got {estimator!r}"
             )
-        self._filters = [
-            choose_estimator(estimator, scenario, options, rows=rows)
-            for _ in range(runs)
-        ]
+        self._choice, self._options = estimator, options
+        self._by_id = scenario.sensor.identities
+        self.filters = [self._made(scenario, rows) for _ in range(runs)]
+        """Filter i is that of world i."""
         self._steps = np.zeros(runs, dtype=np.int64)
         capacity = 3 + 2 * rows
         self._means = np.zeros((runs, capacity))
         self._covariances = np.zeros((runs, capacity, capacity))
         self._slots = np.full((runs, rows), -1, dtype=np.int64)
 
+    def _made(self, scenario: Scenario, rows: int) -> FollowingEstimator:
+        return choose_estimator(self._choice, scenario, self._options, rows=rows)
+
+    def replace(self, run: int, scenario: Scenario) -> None:
+        """Make the filter of a world anew, with the noise settings of a scenario."""
+        self.filters[run] = self._made(scenario, self._slots.shape[1])
+
     def reset(self, poses: Array, pose_std: Any, *, runs: BoolArray) -> None:
         """Start new runs in some worlds, at poses (B, 3) with deviations (3,)."""
         for run in np.flatnonzero(runs).tolist():
-            self._filters[run].reset(poses[run], pose_std)
+            self.filters[run].reset(poses[run], pose_std)
             self._steps[run] = 0
 
     def update(
@@ -82,14 +95,15 @@ class AssociatingFilters:
             Whether the worlds have moved. False for the scan from the start.
         """
         for run in np.flatnonzero(worlds).tolist():
-            slam = self._filters[run]
+            slam = self.filters[run]
             if moved:
                 slam.predict(observations["odometry"][run])
                 self._steps[run] += 1
-            seen = observations["mask"][run]
-            slam.update(observations["landmarks"][run][seen])
+            seen = np.flatnonzero(observations["mask"][run])
+            ids = seen.tolist() if self._by_id else None
+            slam.update(observations["landmarks"][run][seen], ids)
             belief = checked_belief(slam, int(self._steps[run]))
-            stored = belief_storage(belief, self._slots.shape[1], by_id=False)
+            stored = belief_storage(belief, self._slots.shape[1], by_id=self._by_id)
             self._means[run] = stored.means[0]
             self._covariances[run] = stored.covariances[0]
             self._slots[run] = stored.slots[0]
@@ -97,6 +111,10 @@ class AssociatingFilters:
     def storage(self) -> BatchStorage:
         """Return the arrays of the beliefs; they change with the next update."""
         return BatchStorage.of(self._means, self._covariances, self._slots)
+
+    def belief(self, run: int) -> BeliefOfMap:
+        """Return the belief of one world."""
+        return checked_belief(self.filters[run], int(self._steps[run]))
 
     def beliefs(self) -> BatchBeliefs:
         """Return the beliefs of all worlds side by side, as a snapshot."""
