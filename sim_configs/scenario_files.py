@@ -104,7 +104,10 @@ def scenario_schema() -> str:
 
 def _load_file(path: Path) -> Scenario:
     try:
-        return Scenario.from_table(tomllib.loads(path.read_text(encoding="utf-8")))
+        text = path.read_text(encoding="utf-8")
+        if _DOTTED.search(text):  # tomllib takes minutes for a key of 50,000 parts
+            raise RecursionError
+        return Scenario.from_table(tomllib.loads(text))
     except OSError as error:
         reason = error.strerror or error
         raise ScenarioError(f"cannot read the scenario '{path}': {reason}") from None
@@ -117,6 +120,9 @@ def _load_file(path: Path) -> Scenario:
     except ScenarioError as error:
         lines = str(error).splitlines()
         raise ScenarioError("\n".join(f"{path}: {line}" for line in lines)) from None
+
+
+_DOTTED = re.compile(r"(?:[\w\"'-]+[ \t]*\.[ \t]*){64}")  # a key, not numbers in a list
 
 
 def _too_deep(path: Path) -> str:

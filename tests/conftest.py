@@ -32,6 +32,40 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: not item.nodeid.startswith(_FIRST))
 
 
+def pytest_addoption(parser):
+    """Add how long tests/fuzz goes on."""
+    parser.addoption(
+        "--fuzz-seconds",
+        type=float,
+        default=0.0,
+        help="how long each test in tests/fuzz generates inputs, beyond the usual few",
+    )
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Print how many inputs the tests in tests/fuzz have generated."""
+    counts = {
+        each.nodeid.rpartition("::")[2]: dict(each.user_properties)["inputs"]
+        for reports in terminalreporter.stats.values()
+        for each in reports
+        if "inputs" in dict(getattr(each, "user_properties", ()))
+    }
+    for name, inputs in counts.items():
+        terminalreporter.write_line(f"{inputs:9,} inputs  {name}")
+    if counts:
+        terminalreporter.write_line(f"{sum(counts.values()):9,} inputs")
+
+
+@pytest.fixture
+def fuzzer(request, record_property):
+    """Return what generates inputs for a test, for as long as the option says."""
+    from fuzzing import Fuzzer
+
+    fuzzer = Fuzzer(request.config.getoption("--fuzz-seconds"))
+    yield fuzzer
+    record_property("inputs", fuzzer.inputs)
+
+
 @pytest.fixture
 def public_logs():
     """Return the folder of public logs, which are not part of the repository."""

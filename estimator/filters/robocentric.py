@@ -13,6 +13,7 @@ from ...jit import jit, njit_internal
 from ..belief import Belief, MapView
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
+from ..support.symmetric import as_covariance
 from ..update_report import UpdateReport
 from .ekf import EkfSlam
 
@@ -55,7 +56,8 @@ class RobocentricEkfSlam(EkfSlam):
         origin, jacobian = _inverse_pose(first)
         world = slice(ORIGIN, HEADING + 1)
         mean[world] = origin
-        covariance[world, world] = jacobian @ np.diag(variance) @ jacobian.T
+        moved = as_covariance(jacobian @ np.diag(variance) @ jacobian.T)
+        covariance[world, world] = moved
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -82,8 +84,8 @@ class RobocentricEkfSlam(EkfSlam):
         """Return the belief in the world's frame, as `EkfSlam.belief`."""
         n, ids = self.map.size, self.landmark_ids
         mean, jacobian = _in_world(self.map.mean[:n])
-        moved = jacobian @ self.map.covariance[:n, :n] @ jacobian.T
-        whole = Belief(mean, (moved + moved.T) / 2, ids)
+        moved = as_covariance(jacobian @ self.map.covariance[:n, :n] @ jacobian.T)
+        whole = Belief(mean, moved, ids)
         if landmark_ids is None:
             return whole
         slots = {i: slot for slot, i in enumerate(ids)}

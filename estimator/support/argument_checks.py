@@ -59,7 +59,7 @@ def as_floats(name: str, value: ArrayLike) -> Array:
         _refuse_masked_and_complex(name, value)
     try:
         return np.ascontiguousarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # an integer beyond all floats
         raise ValueError(f"{name} must be numbers, got {value!r}") from None
 
 

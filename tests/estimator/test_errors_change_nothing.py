@@ -41,6 +41,7 @@ def digest(slam):
 INSANE = {
     "predict(iterator)": lambda s: s.predict(iter([1, 2]), dt=None),
     "predict(None)": lambda s: s.predict(None),
+    "predict(10**400)": lambda s: s.predict((10**400, 0)),
     "predict(3)": lambda s: s.predict((1.0, 2.0, 3.0)),
     "predict(nan)": lambda s: s.predict((NAN, 0.0)),
     "predict(1e300)": lambda s: s.predict((1e300, 0.0)),

@@ -130,3 +130,11 @@ def test_progress_that_is_infinite_is_refused():
     progress = {"far_progress": np.array([0.0, 0.0, np.inf])}
     with pytest.raises(ValueError, match=r"state\['far_progress'\] must be finite"):
         slam.load_state_dict(slam.state_dict() | progress)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_state_saved_after_an_uncertain_start_is_accepted(name):
+    slam = make(name, False)
+    for pose in np.random.default_rng(3).normal(size=(20, 3)):
+        slam.reset(pose, (0.8, 0.3, 0.1))
+        slam.load_state_dict(slam.state_dict())

@@ -712,3 +712,11 @@ def test_submaps_that_cannot_be_joined_are_told(driven, monkeypatch):
     other.load_state_dict(driven.state_dict())
     with pytest.raises(np.linalg.LinAlgError, match="did not converge in 1 iterations"):
         other.belief()
+
+
+def test_rounding_makes_no_variance_negative():
+    rng = np.random.default_rng(2)
+    for distance, turn in rng.normal(size=(20, 2)):
+        slam = SubmapSlam((0.1, 0.0, 0.05), (0.1, 0.1))
+        slam.predict((distance, turn))
+        assert (slam.belief().covariance.diagonal() >= 0).all()

@@ -26,6 +26,13 @@ def test_a_scenario_nested_too_deeply_is_refused_by_name(tmp_path):
         load_scenario(file)
 
 
+def test_a_key_of_many_parts_is_refused_at_once(tmp_path):
+    file = tmp_path / "dotted.toml"
+    file.write_text("a." * DEEP + "b = 1")
+    with pytest.raises(ScenarioError, match=r"dotted\.toml must nest tables at most 2"):
+        load_scenario(file)
+
+
 def test_a_manifest_nested_too_deeply_is_refused_by_name(tmp_path):
     (tmp_path / MANIFEST).write_text("[" * DEEP + "]" * DEEP)
     with pytest.raises(ValueError, match="must be a manifest of"):

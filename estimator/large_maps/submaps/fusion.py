@@ -18,6 +18,7 @@ from ....arrays import Array, IntArray
 from ...error_frames import ErrorFrame, invariant_covariance
 from ...interface import Belief
 from ...models.rigid_motion import compose
+from ...support.symmetric import as_covariance
 from ..sparse_cholesky.coordinates import pairs
 from .factor import retract
 from .gaussian import Gaussian, points_of, state_of, times
@@ -121,8 +122,8 @@ def _composed(
     T[:, 2] += T[:, :cut] @ state_of(1j * points_of(mean), 0.0)
     if frame == "invariant":
         T[:, cut + 2] += T[:, cut:] @ state_of(1j * points_of(own), 0.0)
-    moved = T @ covariance @ T.T
-    return Gaussian(state_of(points, float(pose[2])), (moved + moved.T) / 2)
+    moved = as_covariance(T @ covariance @ T.T)
+    return Gaussian(state_of(points, float(pose[2])), moved)
 
 
 def part_of(
