@@ -38,6 +38,14 @@ def generate(
             min=1,
         ),
     ] = None,
+    smallest_std: Annotated[
+        float | None,
+        options.option(
+            "--smallest-std S",
+            "Smallest standard deviation in files of g2o [m, rad].",
+            "0.001",
+        ),
+    ] = None,
     jobs: options.Jobs = None,
     backend: options.Backend = None,
     scheduler: options.Scheduler = None,
@@ -91,6 +99,7 @@ def generate(
             seed=seed,
             format=format_,
             episodes_per_shard=shard,
+            smallest_std=smallest_std,
             jobs=jobs,
             backend=backend,
             progress=tick,

@@ -13,7 +13,7 @@ from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_errors import unknown_choice
 from .dataset import is_whole
-from .formats import trajectory_format
+from .formats import TrajectoryFormat, trajectory_format
 from .manifest import (
     MANIFEST,
     Job,
@@ -44,6 +44,7 @@ def generate_trajectories(
     seed: int = 0,
     format: str = "npz",
     episodes_per_shard: int | None = None,
+    smallest_std: float | None = None,
     jobs: int | None = None,
     backend: str | None = None,
     progress: Progress | None = None,
@@ -71,6 +72,9 @@ def generate_trajectories(
         Format of the files, see `formats`.
     episodes_per_shard : int, optional
         The default is 100, or fewer if they would take more than 256 MB of memory.
+    smallest_std : float, optional
+        Smallest standard deviation in the files of g2o [m, rad], 1e-3 by default; other
+        formats have none.
     jobs : int, optional
         Number of workers, which make one shard at a time each; -1 for one on each
         core. By default this process does all. The bytes are the same.
@@ -104,11 +108,28 @@ def generate_trajectories(
         raise ValueError(unknown_choice("controller", controller, CONTROLLERS))
     layout = trajectory_format(format)
     layout.check(world)
-    job = Job(world, controller, seed, episodes, episodes_per_shard, format)
+    smallest = _smallest_std(format, layout, smallest_std)
+    job = Job(world, controller, seed, episodes, episodes_per_shard, format, smallest)
     versions = versions_now(layout.LIBRARIES)
     workers = _engaged(jobs, backend)
     with claimed(Path(out)):
         return _continue(job, Path(out), versions, workers, progress)
+
+
+def _smallest_std(
+    format: str, layout: TrajectoryFormat, given: float | None
+) -> float | None:
+    """Return the smallest standard deviation that a format writes, if it has one."""
+    usual = layout.OPTIONS.get("smallest_std")
+    if given is None:
+        return usual
+    if usual is None:
+        raise ValueError(
+            f"smallest_std is of the format 'g2o': format '{format}' writes no noise"
+        )
+    if not 0 < given < float("inf"):
+        raise ValueError(f"smallest_std must be a finite number > 0, got {given!r}")
+    return float(given)
 
 
 def _engaged(jobs: int | None, backend: str | None) -> "Workers | None":

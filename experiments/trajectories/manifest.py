@@ -43,6 +43,8 @@ class Job:
         Number of episodes in each shard; the last one may have fewer.
     format : str
         Name of a format, see `trajectory_format`.
+    smallest_std : float, optional
+        Smallest standard deviation in files of g2o [m, rad].
     """
 
     scenario: Scenario
@@ -51,6 +53,7 @@ class Job:
     episodes: int
     episodes_per_shard: int
     format: str
+    smallest_std: float | None = None
 
     @property
     def shards(self) -> int:
@@ -141,7 +144,8 @@ def versions_now(libraries: Iterable[str] = ()) -> dict[str, str]:
 
 def write_manifest(manifest: Manifest, folder: Path) -> None:
     """Write a manifest, which appears complete or not at all."""
-    job = {**vars(manifest.job), "scenario": scenario_text(manifest.job.scenario)}
+    parts = {**vars(manifest.job), "scenario": scenario_text(manifest.job.scenario)}
+    job = {name: part for name, part in parts.items() if part is not None}
     table = {
         "kind": _KIND,
         "job": job,

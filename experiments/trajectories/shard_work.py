@@ -95,7 +95,8 @@ class ShardWork:
         )
         partial = staging / str(episodes.start) / name
         partial.parent.mkdir()
-        layout.write(trajectories, partial)
+        options = {name: getattr(job, name) for name in layout.OPTIONS}
+        layout.write(trajectories, partial, **options)
         return ShardEntry(name, episodes.start, len(episodes), checksum(partial))
 
 

@@ -10,11 +10,12 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from presets import PRESETS
 
 from slamgym.experiments.logs.events import OdometryRow
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.trajectories import (
-    generate,
+    driven_episodes,
     generate_trajectories,
     load_trajectories,
 )
@@ -414,6 +415,56 @@ def test_gtsam_reads_graph_and_truth_and_finds_the_noise_as_stated(tmp_path):
     assert graph.error(best) < graph.error(kept)
 
 
+def optimum(gtsam, graph, start):
+    solver = gtsam.LevenbergMarquardtOptimizer(graph, start)
+    solver.optimize()
+    return solver.error()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", PRESETS)
+def test_gtsam_finds_the_optimum_from_the_guess_in_the_file(preset, tmp_path):
+    gtsam = pytest.importorskip("gtsam", reason="reads and optimises g2o files")
+    scenario = load_scenario(preset)
+    if not scenario.sensor.identities:
+        pytest.skip("g2o needs identities")
+    if scenario.steps > 1100:  # thousands of steps take minutes
+        scenario = scenario.with_changes(steps=300)
+    (drive,) = drive_episodes(scenario, "waypoints", [14])
+    fmt("g2o").write([drive], tmp_path / "shard")
+    graph, guess = gtsam.readG2o(str(tmp_path / "shard/seed_00000014_gtsam.g2o"), False)
+    _, truth = gtsam.readG2o(str(tmp_path / "shard/seed_00000014_truth.g2o"), False)
+    first, kept = len(drive.landmarks), gtsam.Values()
+    for k in list(guess.keys()):
+        landmark = k >= gtsam.symbol("l", 0)
+        kept.insert(k, truth.atPoint2(k) if landmark else truth.atPose2(k))
+    tight = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+    graph.add(gtsam.PriorFactorPose2(first, guess.atPose2(first), tight))
+    best = optimum(gtsam, graph, kept)
+    assert optimum(gtsam, graph, guess) <= 1.01 * best
+
+
+def test_the_smallest_deviation_of_g2o_is_an_option(tmp_path):
+    for least in (1e-3, 0.02):
+        (drive,) = drives("corridor", seeds=(0,), motion={"std": [0.0, 0.0, 0.0]})
+        folder = tmp_path / str(least)
+        fmt("g2o").write([drive], folder, smallest_std=least)
+        *_, values = next(edges(folder / "seed_00000000.g2o", "EDGE_SE2"))
+        assert values[[3, 6, 8]] == pytest.approx([least**-2] * 3)
+    job = {"episodes": 1, "format": "g2o", "smallest_std": 0.5}
+    manifest = generate_trajectories("six_landmarks", tmp_path / "out", **job)
+    assert manifest == load_trajectories(tmp_path / "out").manifest
+    assert manifest.job.smallest_std == 0.5
+    with pytest.raises(ValueError, match=r"smallest_std must be a finite number > 0"):
+        generate_trajectories(
+            "six_landmarks", tmp_path / "x", **{**job, "smallest_std": 0}
+        )
+    with pytest.raises(ValueError, match=r"smallest_std is of the format 'g2o'"):
+        generate_trajectories(
+            "six_landmarks", tmp_path / "x", **{**job, "format": "npz"}
+        )
+
+
 def test_noise_of_zero_has_finite_information(tmp_path):
     (drive,) = drives("corridor", seeds=(0,), sensor={"std": [0.0, 0.0]})
     fmt("g2o").write([drive], tmp_path / "shard")
@@ -493,7 +544,7 @@ def interrupted(folder, whole):
         return drive_episodes(*arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generate, "drive_episodes", drive)
+        patch.setattr(driven_episodes, "drive_episodes", drive)
         with pytest.raises(KeyboardInterrupt):
             generate_trajectories("six_landmarks", folder, **job)
 

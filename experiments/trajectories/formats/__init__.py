@@ -1,11 +1,11 @@
 """File formats of trajectories, one module each, loaded on demand.
 
 A shard of some episodes is one file or one folder. Every module has `write` and `read`,
-and those of ``ENDING``, ``LIBRARIES`` and `check` that differ from the defaults of
-`TrajectoryFormat`.
+and those of ``ENDING``, ``LIBRARIES``, ``OPTIONS`` and `check` that differ from the
+defaults of `TrajectoryFormat`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -28,8 +28,9 @@ FORMATS = {
 class TrajectoryFormat(NamedTuple):
     """What a module of this package defines."""
 
-    write: Callable[[Sequence[Trajectory], Path], None]
-    """Writes a shard. The same trajectories give the same bytes."""
+    write: Callable[..., None]
+    """Writes a shard: (trajectories, path), and its options by name. The same
+    trajectories give the same bytes."""
     read: Callable[[Path], Iterator[Trajectory]]
     """Yields the trajectories of a shard, one after the other."""
     check: Callable[[Scenario], None] = lambda scenario: None
@@ -38,6 +39,8 @@ class TrajectoryFormat(NamedTuple):
     """The ending of the names of its shards."""
     LIBRARIES: tuple[str, ...] = ()
     """The packages besides numpy that write it; their versions determine the bytes."""
+    OPTIONS: Mapping[str, float] = {}
+    """Names and defaults of the numbers > 0 that its `write` also takes."""
 
 
 def trajectory_format(name: str) -> TrajectoryFormat:

@@ -5,7 +5,8 @@ episode:
 
 ``NAME.g2o``
     ``EDGE_SE2`` odometry (d, 0, α) and ``EDGE_SE2_XY`` readings in the form of g2o. The
-    vertices are initialised from odometry alone, and the first pose is fixed.
+    vertices stand where an invariant EKF puts them during the drive, near enough for
+    Gauss-Newton and Levenberg-Marquardt. The first pose is fixed.
 ``NAME_gtsam.g2o``
     The same with readings as ``BR`` lines, bearing and range, because GTSAM ignores
     ``EDGE_SE2_XY``, and without ``FIX``, which GTSAM rejects.
@@ -27,11 +28,13 @@ import numpy as np
 from ....arrays import Array
 from ....sim_configs import Scenario
 from ..trajectory import Trajectory, array_of
-from .dead_reckoning import dead_reckoning
 from .episode_files import numbers, read_metadata, write_lines, write_metadata
+from .filtered_path import filtered_path
 
-_LEAST_STD = 1e-6
-"""Replaces zero noise, whose information would be infinite [m, rad]."""
+LIBRARIES = ("numba", "scipy")
+OPTIONS = {"smallest_std": 1e-3}
+"""The smallest standard deviation in the files [m, rad]: noise of zero would have
+infinite information, and optimisers do not converge with 1e-6."""
 
 
 def check(scenario: Scenario) -> None:
@@ -43,21 +46,28 @@ def check(scenario: Scenario) -> None:
         )
 
 
-def write(trajectories: Sequence[Trajectory], path: Path) -> None:
+def write(
+    trajectories: Sequence[Trajectory],
+    path: Path,
+    smallest_std: float = OPTIONS["smallest_std"],
+) -> None:
     """Write a shard; see `TrajectoryFormat`."""
     for each in trajectories:
         check(each.scenario)
     for name, each in write_metadata(trajectories, path):
         landmarks = dict(enumerate(array_of(each, "landmarks")))
-        reckoned = dead_reckoning(each.start_estimate, each.odometry)
-        first_seen = _first_seen(each, reckoned)
+        poses, mapped = filtered_path(each)
+        places = dict(sorted({**_first_seen(each, poses), **mapped}.items()))
         graph = [
-            *_vertices(first_seen, reckoned, len(landmarks)),
-            *_odometry_edges(each, len(landmarks)),
+            *_vertices(places, poses, len(landmarks)),
+            *_odometry_edges(each, len(landmarks), smallest_std),
         ]
         fixed = f"FIX {len(landmarks)}"
-        write_lines(path / f"{name}.g2o", [*graph, *_xy_edges(each), fixed])
-        write_lines(path / f"{name}_gtsam.g2o", [*graph, *_bearing_range_edges(each)])
+        write_lines(
+            path / f"{name}.g2o", [*graph, *_xy_edges(each, smallest_std), fixed]
+        )
+        readings = _bearing_range_edges(each, smallest_std)
+        write_lines(path / f"{name}_gtsam.g2o", [*graph, *readings])
         truth = _vertices(landmarks, each.poses, len(landmarks))
         write_lines(path / f"{name}_truth.g2o", list(truth))
 
@@ -92,7 +102,9 @@ def _first_seen(trajectory: Trajectory, poses: Array) -> dict[int, Array]:
     return placed
 
 
-def _odometry_edges(trajectory: Trajectory, first_pose: int) -> Iterator[str]:
+def _odometry_edges(
+    trajectory: Trajectory, first_pose: int, smallest: float
+) -> Iterator[str]:
     """Yield odometry with the information of its noise.
 
     The noise (εx, εy) refers to the old heading, while the error of an edge refers to
@@ -104,7 +116,7 @@ def _odometry_edges(trajectory: Trajectory, first_pose: int) -> Iterator[str]:
     for step, (distance, turn) in enumerate(trajectory.odometry.tolist(), first_pose):
         rests = not motion.noise_at_rest and distance == turn == 0.0
         std = (0.0, 0.0, 0.0) if rests else motion.std
-        along, aside, heading = (max(value, _LEAST_STD) ** -2 for value in std)
+        along, aside, heading = (max(value, smallest) ** -2 for value in std)
         xx, xy, yy = _turned(along, aside, -turn)
         information = numbers((xx, xy, 0, yy, 0, heading))
         yield (
@@ -121,25 +133,25 @@ def _readings(trajectory: Trajectory) -> Iterator[tuple[int, int, float, float]]
         yield mask.shape[1] + step, landmark, bearing, distance
 
 
-def _stds(scenario: Scenario, distance: float) -> tuple[float, float]:
-    """Return (σβ, σr(r)) of a reading, never zero."""
+def _stds(scenario: Scenario, distance: float, smallest: float) -> tuple[float, float]:
+    """Return (σβ, σr(r)) of a reading, at least `smallest`."""
     bearing_std, range_std = scenario.sensor.std
     range_std += scenario.sensor.range_std_per_metre * distance
-    return max(bearing_std, _LEAST_STD), max(range_std, _LEAST_STD)
+    return max(bearing_std, smallest), max(range_std, smallest)
 
 
-def _xy_edges(trajectory: Trajectory) -> Iterator[str]:
+def _xy_edges(trajectory: Trajectory, smallest: float) -> Iterator[str]:
     """Yield readings as positions in the frame of the robot, Ω to first order."""
     for pose, landmark, bearing, distance in _readings(trajectory):
-        bearing_std, range_std = _stds(trajectory.scenario, distance)
+        bearing_std, range_std = _stds(trajectory.scenario, distance, smallest)
         information = _turned(range_std**-2, (distance * bearing_std) ** -2, bearing)
         position = distance * math.cos(bearing), distance * math.sin(bearing)
         yield f"EDGE_SE2_XY {pose} {landmark} {numbers((*position, *information))}"
 
 
-def _bearing_range_edges(trajectory: Trajectory) -> Iterator[str]:
+def _bearing_range_edges(trajectory: Trajectory, smallest: float) -> Iterator[str]:
     for pose, landmark, bearing, distance in _readings(trajectory):
-        stds = _stds(trajectory.scenario, distance)
+        stds = _stds(trajectory.scenario, distance, smallest)
         yield f"BR {pose} {landmark} {numbers((bearing, distance, *stds))}"
 
 
