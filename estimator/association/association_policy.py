@@ -15,7 +15,7 @@ MOST_SCANS = 63  # that fit one mask of a tentative landmark
 
 @dataclass(frozen=True)
 class AssociationPolicy:
-    """Which landmark a reading is of, and when a new one is believed.
+    """How readings are associated, and when a new landmark is confirmed.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What association remembers from scan to scan, and what it knows of the sensor."""
+"""The memory of association between scans, and its model of the sensor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .unexplained_density import UnexplainedDensity
 
 
 class Sensor(NamedTuple):
-    """What association knows of the sensor."""
+    """The properties of the sensor that association uses."""
 
     noise: Noise
     min_range: float

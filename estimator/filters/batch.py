@@ -1,4 +1,4 @@
-"""Many independent runs of one filter at once, on the single filter's kernels."""
+"""Many independent runs of one filter at once, on the kernels of the single filter."""
 
 from __future__ import annotations
 
@@ -99,9 +99,9 @@ class BatchSlam:
         self._mapped = np.zeros(self.runs, dtype=np.int64)
         self._kept_room: Workspace | None = None
         self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
-        """Step of the last :meth:`run` at which a run stopped, -1 where it did not.
+        """Step of the last :meth:`run` at which a run stopped, -1 if it did not.
 
-        A run that has stopped stays so, at step 0 of every later :meth:`run`.
+        A stopped run remains stopped, at step 0 of every later :meth:`run`.
         """
 
     def run(
@@ -113,7 +113,7 @@ class BatchSlam:
         *,
         runs: ArrayLike | None = None,
     ) -> BatchTrace:
-        """Take runs through T steps, each a predict and an update.
+        """Run T steps, each a predict and an update.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class BatchSlam:
         *,
         runs: ArrayLike | None = None,
     ) -> None:
-        """Start runs anew, with empty maps; also those that had stopped.
+        """Restart runs with empty maps, also those that had stopped.
 
         Parameters
         ----------
@@ -205,7 +205,7 @@ class BatchSlam:
         references: ArrayLike | None = None,
         runs: ArrayLike | None = None,
     ) -> None:
-        """Continue runs from beliefs; also those that had stopped.
+        """Continue runs from given beliefs, also those that had stopped.
 
         Parameters
         ----------
@@ -241,7 +241,7 @@ class BatchSlam:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the beliefs of all runs take [bytes]."""
+        """Memory of the beliefs of all runs [bytes]."""
         return sum(array.nbytes for array in self._arrays())
 
     def __repr__(self) -> str:
@@ -284,7 +284,7 @@ class BatchSlam:
 
 
 def can_batch(estimator: object) -> bool:
-    """Whether a filter is the shared kernels and nothing more, so that it can batch."""
+    """Whether a filter consists of the shared kernels only, and can run in batches."""
     return (
         isinstance(estimator, EkfSlam)
         and type(estimator).predict is EkfSlam.predict

@@ -117,7 +117,7 @@ def checked_beliefs(
 
 
 def _problem(mean: Array, covariance: Array, reference: Array) -> str | None:
-    """Return what is wrong with a belief, or None."""
+    """Return the error of a belief, or None."""
     for name, array in (
         ("beliefs.means", mean),
         ("beliefs.covariances", covariance),

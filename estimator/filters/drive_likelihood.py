@@ -1,4 +1,4 @@
-"""How likely the readings of a drive are under a noise, by a filter's innovations."""
+"""Likelihood of a drive's readings under given noises, from a filter's innovations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from .gaussian_map import GaussianMap
 from .scan_workspace import workspace_for
 
 GATE = 30.0
-"""NIS of one reading beyond which it is rejected: e⁻¹⁵ of those of a right noise."""
+"""NIS beyond which a reading is rejected: a share e⁻¹⁵ of them if the noise is right.
+"""
 
 
 def drive_likelihood(
@@ -96,7 +97,7 @@ def drive_likelihood(
     if not can_batch(estimator):
         raise ValueError(
             f"{type(estimator).__name__} is not one of the filters on the shared "
-            "kernels, whose innovations can be had for many noises at once"
+            "kernels, which can compute innovations for many noises at once"
         )
     values = argument_checks.as_floats("noises", noises)
     if values.ndim != 2 or values.shape[1] != NOISE_WIDTH:
@@ -112,7 +113,7 @@ def drive_likelihood(
 
 
 def check_events(events: DriveEvents) -> None:
-    """Refuse the events of a drive that kernels could not take.
+    """Refuse events of a drive that the kernels cannot process.
 
     Raises
     ------

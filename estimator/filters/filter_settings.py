@@ -1,4 +1,4 @@
-"""The settings of a filter of the family, checked and put into rules for kernels."""
+"""The settings of a filter, checked and converted to rules for kernels."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class GaussianMap:
         self.arrays = BeliefArrays(np.zeros(capacity), covariance, np.zeros(capacity))
 
     def make_room(self, landmarks: int) -> None:
-        """Grow the arrays where this many more landmarks would not fit."""
+        """Grow the arrays if this many more landmarks do not fit."""
         n = self.size
         if n + 2 * landmarks < len(self.arrays.mean):
             return
@@ -111,7 +111,7 @@ class GaussianMap:
         self.covariance[:n, :n] = covariance[:n, :n]
 
     def add(self, ids: Iterable[int]) -> None:
-        """Take landmarks that a kernel has written behind the state into the map."""
+        """Add landmarks that a kernel has written behind the state to the map."""
         for i in ids:
             self.slots[i] = len(self.slots)
         self.size = 3 + 2 * len(self.slots)
@@ -181,7 +181,7 @@ class GaussianMap:
         return Belief(self.mean[:n], self.covariance[:n, :n], tuple(self.slots), frame)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of the arrays, as far as they are in use."""
+        """Return copies of the used part of the arrays."""
         n = self.size
         return {
             "mean": self.mean[:n].copy(),

@@ -1,4 +1,4 @@
-"""The motion noise of a filter, as far as it depends on what the robot did."""
+"""The motion noise of a filter, which may depend on whether the robot moves."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..support import argument_checks
 
 
 class MotionNoise(NamedTuple):
-    """Variances of the motion noise, and whether a robot at rest has it too."""
+    """Variances of the motion noise, and whether it acts on a robot at rest."""
 
     variance: Array
     """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""

@@ -1,4 +1,4 @@
-"""The observability-constrained EKF-SLAM: Jacobians blind to a rotation of the map."""
+"""The observability-constrained EKF-SLAM: projected Jacobians."""
 
 from typing import ClassVar
 

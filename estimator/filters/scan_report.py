@@ -1,4 +1,4 @@
-"""The report of an update on the shared kernels, its parts computed when asked for."""
+"""The report of an update on the shared kernels; its parts are computed on request."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..update_report import UpdateReport
 
 
 class ScanReport(UpdateReport):
-    """What one scan did, by what its kernel has left: a snapshot, safe to keep.
+    """The results of one scan, from the arrays that its kernel has left; a snapshot.
 
     Parameters
     ----------

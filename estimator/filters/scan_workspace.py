@@ -1,4 +1,4 @@
-"""The arrays in which a filter takes in one scan, which grow with scan and map."""
+"""The arrays in which a filter processes a scan; they grow with scan and map."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class FilterPool:
         return self._spare.pop() if self._spare else self._make()
 
     def copy(self, slam: ManagedSlam) -> ManagedSlam:
-        """Return another filter that continues as this one would."""
+        """Return another filter that continues from the same state."""
         copied = self.fresh()
         copied.copy_from(slam)
         return copied

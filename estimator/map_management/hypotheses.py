@@ -123,7 +123,7 @@ class HypothesisSlam:
 
     @property
     def policy(self) -> LandmarkPolicy:
-        """What decides about landmarks."""
+        """The policy that decides about landmarks."""
         return self._policy
 
     @property
@@ -133,7 +133,7 @@ class HypothesisSlam:
 
     @property
     def tentative_landmarks(self) -> Array:
-        """Where landmarks not yet confirmed seem to be, shape (t, 2) [m]."""
+        """Estimated positions of unconfirmed landmarks, shape (t, 2) [m]."""
         return self.best.tentative_landmarks
 
     @property
@@ -143,7 +143,7 @@ class HypothesisSlam:
 
     @property
     def decisions(self) -> Sequence[ScanDecisions]:
-        """What the most probable hypothesis has decided about the scans so far."""
+        """The decisions of the most probable hypothesis about the scans so far."""
         return self.best.decisions
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
@@ -276,7 +276,7 @@ class HypothesisSlam:
     def _keep(
         self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()
     ) -> None:
-        """Go on with these, and reuse all other filters."""
+        """Continue with these hypotheses, and reuse all other filters."""
         known = {id(slam): slam for slam in [h.slam for h in self.hypotheses]}
         known |= {id(slam): slam for slam in others}
         kept = {id(h.slam) for h in hypotheses}

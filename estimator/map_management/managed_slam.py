@@ -124,7 +124,7 @@ class ManagedSlam:
 
     @property
     def decisions(self) -> list[ScanDecisions]:
-        """What was decided about the scans since the start or the last loaded state."""
+        """The decisions about the scans since the start or the last loaded state."""
         return self._recent.decisions
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:

@@ -1,4 +1,4 @@
-"""One of the last scans of a run, as it is kept to be repeated."""
+"""One of the last scans of a run, kept so that it can be repeated."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Motion = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class RecentScan:
-    """One scan, the motion before it, and what was done with it."""
+    """One scan, the motion before it, and its association."""
 
     number: int
     motions: tuple[Motion, ...]

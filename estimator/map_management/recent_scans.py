@@ -61,7 +61,7 @@ class RecentScans:
         """About every scan since the start, or since a saved state was loaded."""
 
     def copy_from(self, other: RecentScans) -> None:
-        """Continue as another run would, whose filter is of the same kind."""
+        """Continue from the scans of another run with the same kind of filter."""
         self._scans, self._motions = list(other._scans), other._motions
         self.decisions = list(other.decisions)
 
@@ -169,7 +169,7 @@ class RecentScans:
 
 
 def _decided(plan: ScanAssociation, report: UpdateReport) -> ScanDecisions:
-    """Return what became of the rows of a scan."""
+    """Return the outcome of each row of a scan."""
     new = {*report.added_ids, *plan.confirmed}.difference(report.skipped_ids)
     unused = {*report.rejected_ids, *report.skipped_ids} - new
     row_ids = tuple(None if i in unused else i for i in plan.row_ids)

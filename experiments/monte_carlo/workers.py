@@ -62,12 +62,12 @@ def integer(name: str, value: int, least: int) -> int:
 
 @contextmanager
 def saying_what_is_kept(kept: str) -> Iterator[None]:
-    """Report the loss of a worker process with what the same job needs not do again."""
+    """Report the loss of a worker process, and which results are kept."""
     try:
         yield
     except BrokenProcessPool as error:
         raise OSError(
-            f"a worker process was killed, perhaps for want of memory; {kept}"
+            f"a worker process was killed, perhaps for lack of memory; {kept}"
         ) from error
 
 

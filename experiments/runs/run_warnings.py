@@ -9,7 +9,7 @@ from .log_replay import Replay
 from .trace import RunTrace
 
 MOST_REJECTED = 0.05
-"""Share of rejected readings above which a filter may starve."""
+"""Share of rejected readings above which a filter may diverge."""
 
 NIS_RANGE = (0.5, 2.0)
 """NIS per degree of freedom that is no reason to worry."""
@@ -40,7 +40,7 @@ def _rejections(replay: Replay) -> str:
         return ""
     return (
         f"The gate rejects {counts.rejected / tested:.0%} of the readings of mapped "
-        "landmarks: the filter may have lost its way, or assume too little noise."
+        "landmarks: the filter may have diverged, or assume too little noise."
     )
 
 
@@ -54,8 +54,8 @@ def _nis(trace: RunTrace) -> str:
         return ""
     amount = "too much" if ratio < low else "too little"
     return (
-        f"The innovations are not as large as claimed, NIS {ratio:.3g} per degree of "
-        f"freedom: the filter assumes {amount} noise, or associates wrongly."
+        f"The NIS is {ratio:.3g} per degree of freedom, where 1 is expected: the "
+        f"filter assumes {amount} noise, or associates wrongly."
     )
 
 
@@ -64,9 +64,8 @@ def _crowded_map(replay: Replay) -> str:
     if not size or abandoned <= MOST_ABANDONED * size:
         return ""
     return (
-        f"{abandoned} of the {size} landmarks in the map should have been seen again "
-        "and were not: the map is much larger than what is seen at a time explains, "
-        "and may hold landmarks twice."
+        f"{abandoned} of the {size} landmarks in the map should have been seen again, "
+        "but were not: the map may hold landmarks twice."
     )
 
 

@@ -220,12 +220,12 @@ def _notes(steps: Sequence[int], runs: Sequence[ViewedRun]) -> list[str]:
         kept = [k for k in steps if k in frames.correlations]
         if frames.joins:
             notes.append(
-                f"{trace.estimator} joins its map only now and then: the page shows "
-                "the last joined one, without correlations."
+                f"{trace.estimator} joins its map only sometimes: the page shows the "
+                "last joined map, without correlations."
             )
         elif not kept:
             notes.append(
-                f"Correlations are left out: {trace.estimator} has more than "
+                f"Correlations are omitted: {trace.estimator} has more than "
                 f"{run_frames.MOST_CORRELATED} landmarks."
             )
         elif len(kept) < len(steps):

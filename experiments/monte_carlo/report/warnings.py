@@ -79,19 +79,19 @@ def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[st
 
 
 def _suspicions(entry: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what the numbers of an estimator give away, empty for nothing."""
+    """Yield suspicions from the numbers of an estimator, empty for none."""
     unused, nis = entry.get("unused_readings") or 0.0, entry.get("nis")
     is_managed = "management" in entry.get("options", {})  # it may leave readings out
     if unused > MOST_REJECTED and not is_managed:
         yield (
             f"{unused:.0%} of the readings corrected nothing, rejected by a gate or "
-            "too near: such a filter may starve."
+            "too near: the filter may diverge."
         )
     if nis is not None and not NIS_RANGE[0] <= nis <= NIS_RANGE[1]:
         amount = "too much" if nis < 1 else "too little"
         yield (
-            f"NIS is {nis:.3g} per degree of freedom: the filter assumes {amount} "
-            "noise, or associates wrongly."
+            f"the NIS is {nis:.3g} per degree of freedom, where 1 is expected: the "
+            f"filter assumes {amount} noise, or associates wrongly."
         )
     yield from _split_map(entry.get("association") or {})
 
@@ -100,7 +100,7 @@ def _split_map(scores: Mapping[str, float | None]) -> Iterator[str]:
     size, true_size = scores.get("map_size"), scores.get("true_map_size")
     if size and true_size and size > LARGE_MAP * true_size:
         yield (
-            f"the map has {size:.1f} landmarks on average where {true_size:.1f} were "
+            f"the map has {size:.1f} landmarks on average, but {true_size:.1f} were "
             "seen: it is split."
         )
 

@@ -21,7 +21,7 @@ from .result_blocks import Job, Span
 Blocks = Iterator[tuple[Span, list[Block]]]
 
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
-_FROM_TRUTH = "of a consistent filter NEES and NIS are χ² with the degrees told"
+_FROM_TRUTH = "for a consistent filter, NEES and NIS are χ² with the stated degrees"
 
 
 def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Dataset:
