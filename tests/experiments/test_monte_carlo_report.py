@@ -487,7 +487,7 @@ def test_warnings_name_unused_readings_and_innovations_of_another_size():
     assert run_warnings({"ekf": managed}, 40) == []
     split = {"map_size": 25.0, "true_map_size": 20.0}
     (warning,) = run_warnings({"ekf": managed | {"association": split}}, 40)
-    assert "25.0 landmarks on average where 20.0 were seen" in warning
+    assert "25.0 landmarks on average, but 20.0 were seen" in warning
 
 
 def test_readings_that_a_gate_rejects_are_counted():
