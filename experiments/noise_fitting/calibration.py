@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -59,7 +60,8 @@ def calibrate(
         return None
     noises = np.tile(noise, (len(FACTORS), 1))
     noises[:, BEARING:] *= FACTORS[:, None]
-    record = likelihood.record(noises)
+    whole = replace(likelihood, most_landmarks=len(likelihood.events.readings))
+    record = whole.record(noises)
     frame = likelihood.filter.frame
     nees = [
         _known_nees(truth, poses, covariances, frame)

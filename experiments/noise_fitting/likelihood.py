@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -11,35 +12,63 @@ from ...estimator.filters.drive_likelihood import GATE, drive_likelihood
 from ...estimator.filters.ekf import EkfSlam
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
 from ...estimator.kernels.scan_rows import GATED
-from .log_events import without_readings
+from .log_events import parts_of, without_readings
+
+MOST_LANDMARKS = 100  # of one map
 
 
 @dataclass(frozen=True, eq=False)
 class LogLikelihood:
-    """The log likelihood of a drive's readings under a noise, from the innovations."""
+    """The log likelihood of a drive's readings under a noise, from the innovations.
+
+    A pass of a filter takes a time that grows with the square of its map.  A drive past
+    many landmarks is therefore cut into parts, and each begins with an empty map.
+    """
 
     filter: EkfSlam
     """At its start."""
     events: DriveEvents
     gate: float = GATE
     threads: int | None = None
+    most_landmarks: int = MOST_LANDMARKS
+    """Of one part."""
+
+    @cached_property
+    def parts(self) -> tuple[DriveEvents, ...]:
+        """The parts of the drive."""
+        return parts_of(self.events, self.most_landmarks)
 
     def of(self, noises: Array) -> Array:
         """Return the log likelihoods of the steps (B, S) under noises (B, 7)."""
-        return drive_likelihood(
-            self.filter, self.events, noises, gate=self.gate, threads=self.threads
-        ).log_likelihoods
+        return self._passes(noises, keep_beliefs=False).log_likelihoods
 
     def record(self, noises: Array) -> DriveRecord:
-        """Return the full records of the passes under noises (B, 7)."""
-        return drive_likelihood(
-            self.filter,
-            self.events,
-            noises,
-            gate=self.gate,
-            keep_beliefs=True,
-            threads=self.threads,
+        """Return the full records of the passes under noises (B, 7).
+
+        The poses of each part begin where the filter does.
+        """
+        return self._passes(noises, keep_beliefs=True)
+
+    def _passes(self, noises: Array, *, keep_beliefs: bool) -> DriveRecord:
+        records = [
+            drive_likelihood(
+                self.filter,
+                part,
+                noises,
+                gate=self.gate,
+                keep_beliefs=keep_beliefs,
+                threads=self.threads,
+            )
+            for part in self.parts
+        ]
+        if len(records) == 1:
+            return records[0]
+        rejected = np.sum([record.rejected for record in records], axis=0)
+        joined = (
+            entries[0] if entries[0].ndim == 1 else np.concatenate(entries, axis=1)
+            for entries in zip(*records, strict=True)
         )
+        return DriveRecord(*joined)._replace(rejected=rejected)
 
     def rejected(self, noise: Array) -> BoolArray:
         """Return which readings the gate rejects under a noise (7,), shape (M,)."""

@@ -62,6 +62,42 @@ def without_readings(events: DriveEvents, dropped: BoolArray) -> DriveEvents:
     )
 
 
+def parts_of(events: DriveEvents, most: int) -> tuple[DriveEvents, ...]:
+    """Cut a drive into consecutive parts of at most so many landmarks each.
+
+    The landmarks of each part are numbered from 0.  A step with more landmarks is a
+    part of its own.
+    """
+    begins, seen = [0], set[int]()
+    for s in range(len(events.first_readings) - 1):
+        first, end = events.first_readings[s : s + 2]
+        read = set(events.landmarks[first:end].tolist())
+        if seen and len(seen | read) > most:
+            begins.append(s)
+            seen = set()
+        seen |= read
+    if len(begins) == 1:
+        return (events,)
+    ends = [*begins[1:], len(events.first_readings) - 1]
+    return tuple(
+        _part(events, begin, end) for begin, end in zip(begins, ends, strict=True)
+    )
+
+
+def _part(events: DriveEvents, begin: int, end: int) -> DriveEvents:
+    motions = events.first_motions[begin : end + 1]
+    readings = events.first_readings[begin : end + 1]
+    within = slice(readings[0], readings[-1])
+    _, landmarks = np.unique(events.landmarks[within], return_inverse=True)
+    return DriveEvents(
+        events.motions[motions[0] : motions[-1]],
+        motions - motions[0],
+        events.readings[within],
+        landmarks.astype(np.int64),
+        readings - readings[0],
+    )
+
+
 class _EventList:
     """Collects steps one after the other."""
 

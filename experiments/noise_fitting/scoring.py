@@ -25,7 +25,7 @@ FARTHEST = 2.0  # the most that an iteration changes one θ
 SHARES = (8.0, 3.0, 1.5, 1.0, 0.5, 0.15)  # of the step that are tried at once
 FAINT = 0.05  # information on θ beside which that of the readings is none
 LITTLE = 16.0  # information on θ, that of a standard deviation of ¼
-GAIN = 1e-5  # in ℓ, below which an iteration ends a climb
+GAIN = 1e-4  # in ℓ, below which an iteration ends a climb
 BETTER = 1e-2  # in ℓ, from which on one value is more likely than another
 MOST = 60  # iterations of a climb
 CLIMBS = 8
@@ -160,7 +160,8 @@ def scores(likelihoods: Likelihoods, theta: Array) -> Scores:
     around = likelihoods(np.exp(tried))
     above, below = around[1 : p + 1], around[p + 1 :]
     usable = np.isfinite(above) & np.isfinite(below)
-    slopes = np.where(usable, above - below, 0.0) / (2 * NARROW)
+    slopes = np.zeros_like(above)
+    slopes[usable] = (above[usable] - below[usable]) / (2 * NARROW)
     value = float(totals(around[:1])[0])
     return Scores(value, slopes.sum(axis=1), slopes @ slopes.T)
 

@@ -118,6 +118,7 @@ def _in_turns(
         smooth = likelihood.without(rejected)
         found = _fit(smooth, found, most=None if round_ > 2 else COARSE)
         again = likelihood.rejected(found.noise)
+        _refuse_most(again)
         if found.converged and (again == rejected).all():
             return smooth, found
         rejected = again
@@ -202,6 +203,15 @@ def _without_zeros(smooth: LogLikelihood, found: _Fit) -> _Fit:
             break
         found = _fit(smooth, tried[best])
     return found
+
+
+def _refuse_most(rejected: BoolArray) -> None:
+    count = int(np.count_nonzero(rejected))
+    if count > 0.5 * len(rejected):
+        raise np.linalg.LinAlgError(
+            f"the fit diverges: under the most likely noise {count} of {len(rejected)} "
+            "readings are beyond the gate"
+        )
 
 
 def _refuse_diverged(found: _Fit) -> None:

@@ -62,7 +62,7 @@ def options_line(fitted: Fitted) -> str:
         "--range-std-per-metre": f"{settings.options['range_std_per_metre']:.4g}",
     }
     metres = settings.options.get("bearing_std_metres")
-    if metres:
+    if metres is not None:
         given["--option"] = f"bearing_std_metres={metres:.4g}"
     gate = settings.options.get("gate_probability")
     if gate is not None:

@@ -25,7 +25,11 @@ from slamgym.experiments.noise_fitting import (
     write_noise,
 )
 from slamgym.experiments.noise_fitting.calibration import nees_bounds
+from slamgym.experiments.noise_fitting.likelihood import LogLikelihood
+from slamgym.experiments.noise_fitting.log_events import events_of, parts_of
+from slamgym.experiments.noise_fitting.noise_vector import noise_of
 from slamgym.experiments.noise_fitting.scoring import curvature, maximise
+from slamgym.experiments.noise_fitting.summary import options_line
 from slamgym.experiments.runs import replay, settings_for, summarise
 from slamgym.sim_configs import action_sequence, load_scenario
 
@@ -259,6 +263,63 @@ def test_the_figure_has_a_column_for_each_noise(example):
     assert axes[0].get_title(loc="left") == "bearing, before"
 
 
+def with_readings(log, change):
+    """Return a log whose readings (m, 2) are changed."""
+    events = tuple(
+        replace(event, measurements=change(event.measurements))
+        if isinstance(event, Scan)
+        else event
+        for event in log.events
+    )
+    return replace(log, events=events)
+
+
+def test_bearing_noise_that_shrinks_with_range_is_found():
+    rng = np.random.default_rng(8)
+
+    def noisier(readings):
+        added = 0.4 / readings[:, 1] * rng.standard_normal(len(readings))
+        return readings + np.column_stack([added, np.zeros_like(added)])
+
+    log = with_readings(a_log(sensor={"std": (1e-4, 0.08)}), noisier)
+    fit = fitted(log, options={"bearing_std_metres": 0.1})
+    noise = fit.noise[6]
+    assert (noise.name, noise.verdict) == ("σβ in metres", "fitted")
+    assert noise.low < 0.4 < noise.high
+    assert f"--option bearing_std_metres={noise.value:.4g}" in options_line(fit.fitted)
+
+
+def test_a_needless_bearing_noise_in_metres_is_zero_in_the_options_too():
+    fit = fitted(a_log(steps=60), options={"bearing_std_metres": 0.1})
+    assert (fit.noise[6].value, fit.noise[6].verdict) == (0, "zero")
+    assert "--option bearing_std_metres=0 " in options_line(fit.suggested)
+
+
+def test_a_drive_in_parts_has_the_likelihood_of_its_parts():
+    log = a_log(steps=40)
+    settings = settings_for(log, estimator="invariant")
+    events = events_of(log, settings).events
+    parts = parts_of(events, 4)
+    assert len(parts) > 3
+    assert all(part.landmarks.max() < 6 for part in parts)
+    assert sum(len(part.motions) for part in parts) == len(events.motions)
+    slam, noise = settings.make(log.start), noise_of(settings)[None]
+    whole = LogLikelihood(slam, events, most_landmarks=4).record(noise)
+    alone = [LogLikelihood(slam, part).record(noise) for part in parts]
+    for name in ("log_likelihoods", "innovations", "outcomes", "poses"):
+        joined = np.concatenate([getattr(record, name) for record in alone], axis=1)
+        np.testing.assert_array_equal(getattr(whole, name), joined)
+    np.testing.assert_array_equal(
+        np.concatenate([part.readings for part in parts]), events.readings
+    )
+
+
+def test_a_drive_past_few_landmarks_is_one_part():
+    log = a_log(steps=10)
+    events = events_of(log, settings_for(log)).events
+    assert parts_of(events, 6) == (events,)
+
+
 @pytest.mark.slow
 def test_readings_without_identity_are_associated_first():
     log = a_log(sensor={"identities": False}, steps=80)
@@ -341,6 +402,23 @@ def test_writing_keeps_line_ends_and_byte_order_mark(tmp_path):
         "odometry,1,1,0,1",
         "",
     ]
+
+
+def test_a_diverging_fit_is_one_line_of_the_command_and_writes_nothing(tmp_path):
+    rng, path, out = np.random.default_rng(0), tmp_path / "log.csv", tmp_path / "out"
+
+    def absurd(readings):
+        far = 10.0 ** rng.uniform(0, 6, len(readings))
+        return np.column_stack([readings[:, 0], far])
+
+    write_slamlog(with_readings(a_log(steps=20), absurd), path)
+    before = path.read_bytes()
+    result = run(path, "--out", out, "--write")
+    assert result.exit_code != 0
+    assert result.stderr.splitlines()[-1].startswith("slamgym: ")
+    assert "the fit diverges: under the most likely noise" in result.stderr
+    assert not out.exists()
+    assert path.read_bytes() == before
 
 
 def test_bad_input_of_the_command_is_one_line_and_writes_nothing(tmp_path):
