@@ -39,7 +39,7 @@ def visible_area(
     --------
     >>> wall = np.array([[[1.0, -9.0], [1.0, 9.0]]])
     >>> area = visible_area(np.zeros(3), 1.0, 5.0, wall)
-    >>> float(area[:, 0].max())
+    >>> round(float(area[:, 0].max()), 9)
     1.0
     """
     p, heading = pose[:2], pose[2]

@@ -34,11 +34,14 @@ class VectorRenderer:
 
     def add(self, batch: WorldBatch, worlds: BoolArray) -> None:
         """Add the present state of these worlds."""
+        ids = batch.landmark_ids
         for world in np.flatnonzero(worlds):
+            mask = batch.mask[world]
             self._renderers[world].add(
                 batch.poses[world].copy(),
-                batch.measurements[world][batch.mask[world]],
+                batch.measurements[world][mask],
                 bool(batch.collisions[world]),
+                None if ids is None else ids[world][mask] < 0,
             )
 
     def draw(self) -> tuple[ImageArray, ...]:

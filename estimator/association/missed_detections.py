@@ -39,7 +39,7 @@ class Detections(NamedTuple):
 
     Examples
     --------
-    >>> view = MapView(np.array([0, 0, 0, 4.0, 0]), 1e-6 * np.eye(5), (7,))
+    >>> view = MapView(np.array([0, 0, 0, 4.5, 0.5]), 1e-6 * np.eye(5), (7,))
     >>> detections = Detections.none()
     >>> for slot in (0, 0, 0, -1):
     ...     cost, detections = detections.after(view, np.array([slot]), longest=8.0)

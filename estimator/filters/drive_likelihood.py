@@ -92,7 +92,7 @@ def drive_likelihood(
     >>> noises = [(0.1, 0.1, 0.1, 0.1, sigma, 0.0, 0.0) for sigma in (0.01, 0.1)]
     >>> record = drive_likelihood(slam, events, noises)
     >>> record.log_likelihoods.sum(axis=1).round(2)
-    array([-1.06, -0.16])
+    array([0.  , 0.76])
     """
     if not can_batch(estimator):
         raise ValueError(

@@ -389,7 +389,7 @@ def own_registry(monkeypatch):
 
 @pytest.mark.usefixtures("own_registry")
 def test_a_filter_of_a_notebook_runs_and_is_known_by_its_methods(tmp_path, monkeypatch):
-    monkeypatch.delattr(sys.modules["__main__"], "__file__")
+    monkeypatch.delattr(sys.modules["__main__"], "__file__", raising=False)
 
     def written(factor):  # classes without a file, as in a notebook
         cell = {"EkfSlam": EkfSlam, "__name__": "__main__"}

@@ -394,7 +394,10 @@ def test_the_presets_are_these():
     assert list_presets() == (
         "active_easy",
         "active_hard",
+        "active_hidden",
         "active_medium",
+        "active_rooms",
+        "active_uncertain",
         "anchored",
         "city",
         "coarse_loop",

@@ -193,7 +193,8 @@ class CompressedMap:
 
     def state_dict(self, numbers: Sequence[int]) -> dict[str, Any]:
         """Return copies of the whole state as arrays, with numbers of the caller."""
-        invalid = self._columns(list(self.local))
+        near = [self.slots[i] for i in self.local]
+        invalid = pairs([*near, *self.free])  # arrays hold rests of these
         local = {f"local_{k}": v for k, v in self.filter.state_dict().items()}
         return {
             "base": local.pop("local_estimator"),
