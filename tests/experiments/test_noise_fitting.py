@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import lfilter
 from typer.testing import CliRunner
 
@@ -28,6 +29,7 @@ from slamgym.experiments.noise_fitting.calibration import nees_bounds
 from slamgym.experiments.noise_fitting.likelihood import LogLikelihood
 from slamgym.experiments.noise_fitting.log_events import events_of, parts_of
 from slamgym.experiments.noise_fitting.noise_vector import noise_of
+from slamgym.experiments.noise_fitting.profile import profile_crossing
 from slamgym.experiments.noise_fitting.scoring import curvature, maximise
 from slamgym.experiments.noise_fitting.summary import options_line
 from slamgym.experiments.runs import replay, settings_for, summarise
@@ -241,6 +243,39 @@ def test_scoring_finds_the_spread_of_normal_numbers_and_its_interval():
     assert best.parameters[0] == pytest.approx(np.sqrt(np.mean(x**2)), rel=1e-3)
     bent = curvature(likelihoods, np.log(best.parameters), np.array([0.05]))
     assert bent[0, 0] == pytest.approx(2 * len(x), rel=0.01)
+
+
+def two_spreads(parameters):
+    """Return log likelihoods of 120 numbers of variance a², 120 of variance a² + b²."""
+    x = np.random.default_rng(5).standard_normal(240)
+    x[120:] *= np.hypot(1.0, 0.8)
+    a, b = parameters.T
+    variances = np.repeat(np.stack([a**2, a**2 + b**2], axis=1), 120, axis=1)
+    return -0.5 * (x**2 / variances + np.log(variances))
+
+
+def test_a_search_that_begins_near_zero_does_not_stay_there():
+    near = maximise(two_spreads, np.array([[1.0, 1e-5]]))
+    far = maximise(two_spreads, np.array([[1.0, 1.0]]))
+    assert far.parameters[1] > 0.5
+    np.testing.assert_allclose(near.parameters, far.parameters, rtol=0.01)
+
+
+@pytest.mark.parametrize("start", [0.2, 1.5])
+def test_the_profile_is_that_of_fitting_the_other_parameter_anew(start):
+    best = maximise(two_spreads, np.array([[1.0, 1.0]]))
+    level = best.log_likelihood - 1.92
+
+    def profile(b):
+        def lost(a):
+            return -two_spreads(np.array([[a, b]])).sum()
+
+        return -minimize_scalar(lost, bounds=(0.3, 3), method="bounded").fun - level
+
+    top = best.parameters[1]
+    expected = brentq(profile, *((1e-3, top) if start < top else (top, 5.0)))
+    found = profile_crossing(two_spreads, best.parameters, 1, start, level)
+    assert found == pytest.approx(expected, rel=0.01)
 
 
 def test_the_whiteness_is_that_of_the_readings_used(example):
