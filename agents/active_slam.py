@@ -86,10 +86,9 @@ class ActiveSlamEnv(LandmarkWorldEnv):
 
     | mean return (success) | active_easy | active_medium | active_hard |
     |---|---|---|---|
-    | random | 0.6 (0.10) | -1.3 (0.01) | -4.7 (0.00) |
-    | coverage | 12.6 (0.90) | 13.7 (0.84) | 4.9 (0.25) |
-    | revisit | 10.9 (0.76) | 11.4 (0.72) | 2.0 (0.22) |
-    | PPO, 2 million steps | | 14.7 (0.90) | |
+    | random | 0.8 (0.14) | -0.8 (0.01) | -4.4 (0.00) |
+    | coverage | 12.3 (0.85) | 13.7 (0.85) | 5.5 (0.32) |
+    | revisit | 10.4 (0.72) | 11.5 (0.75) | 1.9 (0.22) |
 
     ## Starting State
     The robot is at the scenario's start, known to the estimator with
