@@ -182,12 +182,36 @@ def _manifest(table: dict[str, Any]) -> Manifest:
     for name in (shard["name"] for shard in table["shards"]):
         if name in ("", "..") or Path(name).name != name:
             raise ValueError(f"a shard must be named without a folder, got {name!r}")
-    scenario = scenario_from_text(table["job"]["scenario"])
+    scenario = scenario_from_text(_text(table["job"], "scenario"))
+    job = Job(**{**table["job"], "scenario": scenario})
+    for name, least in {"seed": 0, "episodes": 1, "episodes_per_shard": 1}.items():
+        _refuse_number(name, getattr(job, name), least)
+    _text(table["job"], "controller")
+    _text(table["job"], "format")
     return Manifest(
-        job=Job(**{**table["job"], "scenario": scenario}),
-        versions=table["versions"],
-        shards=tuple(ShardEntry(**shard) for shard in table["shards"]),
+        job=job,
+        versions=dict(table["versions"]),
+        shards=tuple(_shard(shard) for shard in table["shards"]),
     )
+
+
+def _shard(table: dict[str, Any]) -> ShardEntry:
+    _text(table, "sha256")
+    entry = ShardEntry(**table)
+    _refuse_number("first_episode", entry.first_episode, 0)
+    _refuse_number("episodes", entry.episodes, 0)
+    return entry
+
+
+def _text(table: dict[str, Any], name: str) -> str:
+    if not isinstance(table[name], str):
+        raise ValueError(f"{name} must be text, got {table[name]!r}")
+    return str(table[name])
+
+
+def _refuse_number(name: str, value: object, least: int) -> None:
+    if type(value) is not int or not least <= value < 2**63:
+        raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
 
 
 def checksum(path: Path) -> str:

@@ -14,6 +14,7 @@ from slamgym.experiments.logs.importers.utias import read_utias
 from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
 from slamgym.sim_configs import load_scenario
 from slamgym.sim_configs.scenario_errors import ScenarioError
+from slamgym.sim_configs.scenario_files import scenario_text
 
 DEEP = 100_000
 NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
@@ -45,6 +46,19 @@ def test_a_shard_outside_the_folder_is_refused(name, tmp_path):
     table = {"kind": "slamgym trajectories 1", "shards": [shard]}
     (tmp_path / MANIFEST).write_text(json.dumps(table))
     with pytest.raises(ValueError, match="a shard must be named without a folder"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("scenario", None), ("episodes_per_shard", 0), ("seed", 1.5), ("format", [])],
+)
+def test_a_manifest_of_an_impossible_job_is_refused(name, value, tmp_path):
+    job = {"seed": 0, "episodes": 1, "episodes_per_shard": 1, "controller": "random"}
+    job |= {"scenario": scenario_text(load_scenario("loop")), "format": "npz"}
+    table = {"kind": "slamgym trajectories 1", "versions": {}, "shards": []}
+    (tmp_path / MANIFEST).write_text(json.dumps(table | {"job": job | {name: value}}))
+    with pytest.raises(ValueError, match=f"{name} must be"):
         read_manifest(tmp_path)
 
 
