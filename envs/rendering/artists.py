@@ -15,11 +15,13 @@ from matplotlib.text import Text
 
 from ...arrays import Array
 from ...sim_configs import Scenario
+from .clock import Clock
 from .ellipses import covariance_ellipses
 
 INK, GREY, WALL = "#1b1f24", "#8a9199", "#6b5a4e"
 RAY, ALARM, POSE, MAP = "#e69f00", "#d55e00", "#0072b2", "#009e73"  # Okabe and Ito
 AXES_BOX = (0.105, 0.165, 0.87, 0.775)  # left, bottom, width, height of the figure
+_TITLE_HEIGHT = 0.957  # of the figure
 NO_POINT = np.full((1, 2), np.nan)
 
 
@@ -39,7 +41,7 @@ class MovingArtists(NamedTuple):
     arrow: Polygon
     estimate: Polygon
     alarm: Text
-    clock: Text
+    clock: Clock
 
 
 def add_axes(figure: Figure, name: str) -> Axes:
@@ -96,18 +98,18 @@ def add_moving(axes: Axes, radius: float) -> MovingArtists:
         arrow=Polygon(NO_POINT, fc=INK, ec="white", lw=0.7),
         estimate=Polygon(NO_POINT, fc="none", ec=POSE, lw=1.5),
         alarm=_title(0.64, "right", "collision", ALARM),
-        clock=_title(sum(AXES_BOX[::2]), "right", ""),
+        clock=Clock(sum(AXES_BOX[::2]), _TITLE_HEIGHT, INK),
     )
     moving.body.set(widths=[2 * radius], heights=[2 * radius], angles=[0.0])
     moving.halo.set(angles=[0.0], linewidth=2.0)
     for artist in moving:
-        home = axes.figure if isinstance(artist, Text) else axes
+        home = axes.figure if isinstance(artist, Text | Clock) else axes
         home.add_artist(artist)
     return moving
 
 
 def _title(x: float, align: str, text: str, colour: str = INK) -> Text:
-    title = Text(x, 0.957, text, fontsize=11, ha=align, color=colour)
+    title = Text(x, _TITLE_HEIGHT, text, fontsize=11, ha=align, color=colour)
     title.set_parse_math(False)  # a name with a $ is no formula
     return title
 

@@ -122,7 +122,7 @@ class Scene:
         set_ellipses(moving.pose_ellipse, belief.pose[None, :2], spread)
 
     def _show_clock(self, state: RenderState) -> None:
-        """Show step and time; every character costs 0.1 ms per frame."""
+        """Show step and time."""
         self._moving.clock.set_text(
             f"step {state.step}/{self._scenario.steps}   {state.time:.1f} s"
         )

@@ -77,7 +77,7 @@ MAY_IMPORT = {  # besides the standard library and lazy_loader
     "evaluation": {"numpy", "scipy"},
     "agents": {"numpy", "scipy", "gymnasium"},
 }
-DRAWING = {"artists", "scene", "blitting", "renderer", "video", "window"}
+DRAWING = {"artists", "clock", "scene", "blitting", "renderer", "video", "window"}
 DRAWING_LIBRARIES = {"matplotlib", "PIL", "imageio_ffmpeg"}
 PEERS = {"gtsam", "filterpy", "stonesoup"}
 

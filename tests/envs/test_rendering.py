@@ -6,11 +6,15 @@ import time
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.text import Text
 
 from slamgym.envs.rendering import RenderState, WorldRenderer
 from slamgym.envs.rendering.axes_limits import AxesLimits
+from slamgym.envs.rendering.clock import Clock
 from slamgym.envs.rendering.visible_area import visible_area
 from slamgym.envs.sensors.line_of_sight import LineOfSight
 from slamgym.sim_configs import action_sequence, load_scenario
@@ -196,6 +200,27 @@ def test_unlimited_view_is_not_drawn(renderer):
 def test_clock_tells_step_and_time(renderer):
     renderer.render(snapshot(step=7, time=21.0))
     assert scene_of(renderer)._moving.clock.get_text() == "step 7/29   21.0 s"
+
+
+def ink(artist):
+    """Draw one artist alone; return the darkness of its pixels."""
+    figure = Figure(figsize=(6, 1), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    figure.add_artist(artist)
+    canvas.draw()
+    return 255.0 - np.asarray(canvas.buffer_rgba())[..., 0]
+
+
+def test_the_clock_looks_like_text_of_matplotlib():
+    clock = Clock(0.9, 0.4, "black")
+    clock.set_text("step 107/1005   26.5 s")
+    text = Text(0.9, 0.4, clock.get_text(), fontsize=11, ha="right")
+    here, there = ink(clock), ink(text)
+    assert here.sum() == pytest.approx(there.sum(), rel=0.1)
+    for axis in (0, 1):
+        ends, usual = (np.flatnonzero(image.max(axis) > 99) for image in (here, there))
+        assert abs(ends[-1] - usual[-1]) <= 1
+        assert abs(ends[0] - usual[0]) <= 0.05 * (usual[-1] - usual[0]) + 1
 
 
 @pytest.mark.parametrize("sensor", [{}, {"max_range": 5.0}])
