@@ -25,6 +25,7 @@ from slamgym.estimator import (
     SlamEstimator,
     make_estimator,
 )
+from slamgym.estimator.association.nearest_neighbour import Noise
 from slamgym.estimator.association.scan_assignments import assign_scan
 from slamgym.estimator.belief import MapView
 from slamgym.estimator.models.bearing_range import predict_measurement
@@ -40,7 +41,7 @@ METHODS: dict[str, dict[str, Any]] = {
 WRONG_DENSITIES = {"a third of the density": 1 / 3, "three times the density": 3.0}
 """Hypotheses with an assumed density of clutter that is wrong by this factor."""
 LOST = 1.0  # [m]
-NOISE = (0.02, 0.1, 0.0)  # [rad, m, m/m]
+NOISE = Noise(0.02, 0.1)  # [rad, m]
 
 
 class Scan(NamedTuple):

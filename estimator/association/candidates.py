@@ -25,22 +25,13 @@ class Sensor(NamedTuple):
 
     @classmethod
     def checked(cls, measurement_std: ArrayLike, options: Mapping[str, Any]) -> Sensor:
-        """Read a sensor from the arguments of a filter.
-
-        Raises
-        ------
-        ValueError
-            If the bearing noise depends on the range.
-        """
-        if options.get("bearing_std_metres"):
-            raise ValueError(
-                "bearing_std_metres must be 0 with management, "
-                f"got {options['bearing_std_metres']!r}"
-            )
+        """Read a sensor from the arguments of a filter, which has checked them."""
         bearing_std, range_std = np.asarray(measurement_std, dtype=np.float64).tolist()
-        per_metre = float(options.get("range_std_per_metre", 0.0))
-        min_range = options.get("min_range", 1e-3)
-        return cls((bearing_std, range_std, per_metre), min_range)
+        names = "range_std_per_metre", "bearing_std_metres"
+        noise = Noise(
+            bearing_std, range_std, *(float(options.get(n, 0.0)) for n in names)
+        )
+        return cls(noise, options.get("min_range", 1e-3))
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,34 @@ from ...arrays import Array, IntArray
 from ...jit import jit
 from ..models.bearing_range import wrap_angle_jit
 
-Noise = tuple[float, float, float]
-"""(σβ, σr, k) of a sensor [rad, m, m/m]: a reading of range r has σr + k r."""
+
+class Noise(NamedTuple):
+    """Noise of a sensor: a reading of range r has σβ + b / r and σr + k r.
+
+    Examples
+    --------
+    >>> Noise(0.1, 0.5, bearing_std_metres=0.4).variances(np.array([4.0])).round(2)
+    array([[0.04, 0.25]])
+    """
+
+    bearing_std: float
+    """σβ [rad]."""
+    range_std: float
+    """σr [m]."""
+    range_std_per_metre: float = 0.0
+    """k."""
+    bearing_std_metres: float = 0.0
+    """b [m]."""
+
+    def variances(self, ranges: Array) -> Array:
+        """Return the variances of bearing and range at ranges (m,) > 0, (m, 2)."""
+        std = np.empty((len(ranges), 2))
+        std[:, 0] = self.bearing_std
+        if self.bearing_std_metres:
+            std[:, 0] += self.bearing_std_metres / ranges
+        std[:, 1] = self.range_std + self.range_std_per_metre * ranges
+        return np.asarray(std**2)
+
 
 # What a reading is of, where it is not a slot of the map.
 NEW, AMBIGUOUS = -1, -2
@@ -63,14 +89,15 @@ def innovation_distances(
     >>> mean = np.array([0, 0, 0, 5.0, 0, 0, 5.0])
     >>> readings = np.array([(0.0, 5.2), (1.57, 4.9)])
     >>> P = 0.01 * np.eye(7)
-    >>> fit = innovation_distances(mean, P, 2, readings, (0.1, 0.1, 0.0), largest=25)
+    >>> fit = innovation_distances(mean, P, 2, readings, Noise(0.1, 0.1), largest=25)
     >>> (fit.squared < 9.21).tolist()
     [[True, False], [False, True]]
     """
     shape = (len(readings), landmarks)
     fit = Distances(np.full(shape, np.inf), np.full(shape, np.inf))
     if fit.squared.size:
-        _compare(mean, covariance, readings, np.array([*noise, largest]), *fit)
+        variances = noise.variances(readings[:, 1])
+        _compare(mean, covariance, readings, variances, largest, fit)
     return fit
 
 
@@ -79,12 +106,12 @@ def _compare(
     mean: Array,
     covariance: Array,
     readings: Array,
-    settings: Array,
-    squared: Array,
-    unlikelihood: Array,
+    variances: Array,
+    largest: float,
+    fit: Distances,
 ) -> None:
+    squared, unlikelihood = fit
     P, x, y, heading = covariance, mean[0], mean[1], mean[2]
-    largest = settings[3]
     for j in range(squared.shape[1]):
         c = 3 + 2 * j
         dx, dy = mean[c] - x, mean[c + 1] - y
@@ -95,9 +122,8 @@ def _compare(
         yy = P[1, 1] + P[c + 1, c + 1] - 2 * P[1, c + 1]
         is_complete = False
         for k in range(len(readings)):
-            range_std = settings[1] + settings[2] * readings[k, 1]
             nu_r = readings[k, 1] - distance
-            if nu_r * nu_r > largest * (xx + yy + range_std * range_std):
+            if nu_r * nu_r > largest * (xx + yy + variances[k, 1]):
                 continue
             if not is_complete:  # what the readings share, for few landmarks only
                 is_complete = True
@@ -112,8 +138,8 @@ def _compare(
                 s_bb += P[2, 2] - 2 * (ax * gx + ay * gy)
                 bearing = np.arctan2(dy, dx) - heading
             nu_b = wrap_angle_jit(readings[k, 0] - bearing)
-            rr = s_rr + range_std * range_std
-            bb = s_bb + settings[0] * settings[0]
+            rr = s_rr + variances[k, 1]
+            bb = s_bb + variances[k, 0]
             determinant = rr * bb - s_br * s_br
             if not determinant > 0:
                 continue

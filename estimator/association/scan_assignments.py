@@ -116,10 +116,7 @@ def assign_nearest(policy: AssociationPolicy, fit: Distances) -> IntArray:
 
 def _variances(readings: Array, noise: Noise) -> Array:
     """Return (σβ², σr²) of each reading, shape (m, 2); above 0, for their logarithm."""
-    bearing_std, range_std, per_metre = noise
-    std = np.empty((len(readings), 2))
-    std[:, 0], std[:, 1] = bearing_std, range_std + per_metre * readings[:, 1]
-    return np.maximum(std**2, np.finfo(np.float64).tiny)
+    return np.maximum(noise.variances(readings[:, 1]), np.finfo(np.float64).tiny)
 
 
 def _limits(policy: AssociationPolicy, rows: int) -> Array:

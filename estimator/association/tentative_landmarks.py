@@ -34,7 +34,7 @@ class TentativeLandmarks(NamedTuple):
     --------
     Three sightings within five scans make a landmark:
 
-    >>> noise, none = (0.1, 0.1, 0.0), TentativeLandmarks.none()
+    >>> noise, none = Noise(0.1, 0.1), TentativeLandmarks.none()
     >>> one = none.with_new(np.array([[0.0, 4.0]]), noise, np.array([1]))
     >>> two = one.next_scan(5).with_sighting(0, np.array([0.1, 4.1]), noise)
     >>> two.sightings.tolist()
@@ -130,7 +130,7 @@ class TentativeLandmarks(NamedTuple):
         )
         nu = reading - (np.arctan2(y, x), distance)
         nu[0] = wrap_angle(float(nu[0]))
-        S = H @ C @ H.T + np.diag(_variances(reading, noise))
+        S = H @ C @ H.T + np.diag(noise.variances(reading[1:])[0])
         gain = np.linalg.solve(S, H @ C).T
         corrected = C - gain @ H @ C
         places, spread = self.places.copy(), self.covariances.copy()
@@ -147,8 +147,10 @@ class TentativeLandmarks(NamedTuple):
         if not len(readings):
             return self
         places, spread = [], []
-        for bearing, distance in readings:
-            across, along = _variances(np.array([bearing, distance]), noise)
+        variances = noise.variances(readings[:, 1])
+        for (bearing, distance), (across, along) in zip(
+            readings, variances, strict=True
+        ):
             direction = rotation(bearing)
             places.append(direction @ (distance, 0.0))
             local = np.diag([along, across * distance**2])
@@ -170,9 +172,3 @@ class TentativeLandmarks(NamedTuple):
             self.seen[which],
             self.labels[which],
         )
-
-
-def _variances(reading: Array, noise: Noise) -> tuple[float, float]:
-    """Return the variances of bearing and range of a reading."""
-    bearing_std, range_std, per_metre = noise
-    return bearing_std**2, float(range_std + per_metre * reading[1]) ** 2

@@ -35,7 +35,7 @@ class MapPruner:
 
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
         self._policy, self._editor = policy, editor
-        self._noise = np.maximum(noise, 1e-12)
+        self._noise = Noise(*np.maximum(noise[:3], 1e-12), noise.bearing_std_metres)
         self.forget()
 
     def forget(self) -> None:
@@ -51,9 +51,9 @@ class MapPruner:
         if not ids:
             return
         bearing, distance = readings.T
-        bearing_std, range_std, per_metre = self._noise
+        bearing_std, range_std, per_metre, metres = self._noise
         along = (range_std + per_metre * distance) ** -2.0
-        across = (np.maximum(distance, 1e-12) * bearing_std) ** -2.0
+        across = (np.maximum(distance, 1e-12) * bearing_std + metres) ** -2.0
         self._records.note_sightings(ids, bearing + view.mean[2], along, across)
         self.merger.note_scan(view, ids)
 

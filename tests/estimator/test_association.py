@@ -10,6 +10,7 @@ from slamgym.estimator.association.nearest_neighbour import (
     AMBIGUOUS,
     NEW,
     Distances,
+    Noise,
     innovation_distances,
     nearest_neighbours,
 )
@@ -19,7 +20,7 @@ from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.unicycle_motion import predict_pose
 from slamgym.sim_configs import action_sequence, load_scenario
 
-NOISE = (0.02, 0.1, 0.01)
+NOISE = Noise(0.02, 0.1, 0.01, 0.05)
 SHARP = (0.01, 0.05, 0.0)
 
 
@@ -31,6 +32,14 @@ def random_belief(seed, landmarks=12):
     return mean, root @ root.T
 
 
+def sensor_noise(noise, distance):
+    bearing_std, range_std, per_metre, metres = noise
+    return (
+        np.diag([bearing_std + metres / distance, range_std + per_metre * distance])
+        ** 2
+    )
+
+
 def dense_distance(mean, P, slot, reading, noise):
     """νᵀ S⁻¹ ν and ln det S from the model's own Jacobians, stacked over the state."""
     landmark = mean[3 + 2 * slot : 5 + 2 * slot]
@@ -38,8 +47,7 @@ def dense_distance(mean, P, slot, reading, noise):
     H = np.zeros((2, len(mean)))
     H[:, :3] = expected.jacobian_pose[0]
     H[:, 3 + 2 * slot : 5 + 2 * slot] = expected.jacobian_landmark[0]
-    Q = np.diag([noise[0], noise[1] + noise[2] * reading[1]]) ** 2
-    S = H @ P @ H.T + Q
+    S = H @ P @ H.T + sensor_noise(noise, reading[1])
     nu = reading - expected.measurement[0]
     nu[0] = wrap_angle(nu[0])
     return nu @ np.linalg.solve(S, nu), np.linalg.slogdet(S).logabsdet
@@ -122,7 +130,7 @@ def test_a_tentative_landmark_starts_where_it_was_read():
         return z[1] * np.array([np.cos(z[0]), np.sin(z[0])])
 
     J = numeric_jacobian(place, reading)
-    Q = np.diag([NOISE[0], NOISE[1] + NOISE[2] * 6.0]) ** 2
+    Q = sensor_noise(NOISE, 6.0)
     np.testing.assert_allclose(one.places[0], place(reading))
     np.testing.assert_allclose(one.covariances[0], J @ Q @ J.T, rtol=1e-6)
 
@@ -153,7 +161,7 @@ def test_a_sighting_corrects_a_tentative_landmark_like_any_filter():
     expected = predict_measurement(np.zeros(3), one.places)
     H = expected.jacobian_landmark[0]
     S = H @ one.covariances[0] @ H.T
-    S += np.diag([NOISE[0], NOISE[1] + NOISE[2] * 5.2]) ** 2
+    S += sensor_noise(NOISE, 5.2)
     K = one.covariances[0] @ H.T @ np.linalg.inv(S)
     seen = one.with_sighting(0, np.array(reading), NOISE)
     place = one.places[0] + K @ (np.array(reading) - expected.measurement[0])

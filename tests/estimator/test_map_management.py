@@ -189,9 +189,35 @@ def test_identities_need_confirmation_where_they_are_not_trusted():
     assert slam.update(scan[1:], [9]).confirmed_ids == (9,)
 
 
-def test_bearing_noise_that_depends_on_the_range_is_refused():
-    with pytest.raises(ValueError, match="bearing_std_metres must be 0 with manag"):
-        make(bearing_std_metres=0.1)
+def test_bearing_noise_that_grows_near_the_robot_widens_the_gate_there():
+    narrow, wide = make(), make(bearing_std_metres=0.2)
+    places = np.array([(1.0, 0.0), (10.0, 0.0)])
+    for slam in (narrow, wide):
+        for _ in range(3):
+            slam.update(polar(places))
+    aside = polar(places) + np.array([0.2, 0.0])  # 0.2 m and 2 m across
+    assert narrow.update(aside).row_ids == (None, None)
+    assert wide.update(aside).row_ids == (0, None)
+
+
+@pytest.mark.parametrize("association", ["nearest", "joint", "hypotheses"])
+def test_a_sensor_of_positions_is_managed_as_with_known_identities(association):
+    noise = {"measurement_std": (0.0, 0.1), "bearing_std_metres": 0.1}
+    slam = make(management={"association": association, "confirm": (1, 1)}, **noise)
+    known = make(management=None, **noise)
+    rng = np.random.default_rng(2)
+    pose = np.zeros(3)
+    for _ in range(12):
+        pose += [0.5 * np.cos(pose[2]), 0.5 * np.sin(pose[2]), 0.2]
+        seen = SIX + 0.1 * rng.standard_normal(SIX.shape)
+        for each in (slam, known):
+            each.predict((0.5, 0.2))
+        slam.update(polar(seen, pose))
+        known.update(polar(seen, pose), IDS)
+    found, expected = slam.belief(), known.belief()
+    assert len(found.landmark_ids) == 6
+    np.testing.assert_array_equal(found.mean[:3], expected.mean[:3])
+    np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-12)
 
 
 def test_a_reading_that_could_be_of_two_landmarks_is_left_out():
