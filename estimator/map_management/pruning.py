@@ -35,7 +35,8 @@ class MapPruner:
 
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
         self._policy, self._editor = policy, editor
-        self._noise = Noise(*np.maximum(noise[:3], 1e-12), noise.bearing_std_metres)
+        least = np.maximum(noise, 1e-12).tolist()
+        self._noise = Noise(*least[:3], noise.bearing_std_metres)
         self.forget()
 
     def forget(self) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from ...arrays import Array
 from ...jit import jit, njit_internal
 from ..kernels.rules import as_rules
-from ..kernels.screen import range_variance
+from ..kernels.screen import bearing_variance, range_variance
 from ..models.bearing_range import expected_reading_jit, wrap_angle_jit
 from ..models.rigid_motion import composed_jit
 from .drive_arrays import DriveArrays
@@ -48,12 +48,12 @@ def robust_weight(squared: float, kind: float, scale: float) -> float:
 
 
 @jit
-def range_stds(
+def reading_stds(
     poses: Array, landmarks: Array, drive: DriveArrays, rule_values: Array
 ) -> Array:
-    """Return σr of each reading, shape (M,), at the range that the estimate expects."""
+    """Return (σβ, σr) of each reading, (M, 2), at the range that it should have."""
     rules = as_rules(rule_values)
-    stds = np.empty(len(drive.readings))
+    stds = np.empty((len(drive.readings), 2))
     for k in range(len(poses)):
         for j in range(drive.firsts[k], drive.firsts[k + 1]):
             c = drive.columns[j]
@@ -61,7 +61,9 @@ def range_stds(
             distance = np.sqrt(dx * dx + dy * dy)
             if rules.noise_as_read:
                 distance = drive.readings[j, 1]
-            stds[j] = np.sqrt(range_variance(rules, distance))
+            distance = max(distance, rules.min_range)
+            stds[j, 0] = np.sqrt(bearing_variance(rules, distance))
+            stds[j, 1] = np.sqrt(range_variance(rules, distance))
     return stds
 
 
@@ -104,11 +106,10 @@ def total_cost(
     landmarks: Array,
     drive: DriveArrays,
     stds: Array,
-    bearing_std: float,
     kind: float,
     scale: float,
 ) -> float:
-    """Return the cost of poses (N, 3) and landmarks (2n,), with σr given, (M,)."""
+    """Return the cost of poses (N, 3) and landmarks (2n,); stds (M, 2) are (σβ, σr)."""
     total = 0.0
     for k in range(len(poses)):
         dx, dy, turn, cos, sin = motion_residual(poses, drive, k)
@@ -118,6 +119,6 @@ def total_cost(
             total += (v[0] * along + v[1] * across + v[2] * turn) ** 2 / 2
         for j in range(drive.firsts[k], drive.firsts[k + 1]):
             bearing, distance = innovation(poses, landmarks, drive, k, j)
-            squared = (bearing / bearing_std) ** 2 + (distance / stds[j]) ** 2
+            squared = (bearing / stds[j, 0]) ** 2 + (distance / stds[j, 1]) ** 2
             total += robust_loss(squared, kind, scale)
     return total

@@ -53,7 +53,7 @@ class Drive:
         (σβ, σr) of the measurement noise [rad, m].
     initial_pose, initial_pose_std : array_like, shape (3,)
         Mean and standard deviation of the first pose [m, m, rad].
-    range_std_per_metre, range_noise_at, noise_at_rest, min_range
+    range_std_per_metre, bearing_std_metres, range_noise_at, noise_at_rest, min_range
         As in :class:`~slamgym.estimator.EkfSlam`.
 
     Raises
@@ -80,13 +80,18 @@ class Drive:
         initial_pose: ArrayLike = (0.0, 0.0, 0.0),
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
         range_std_per_metre: float = 0.0,
+        bearing_std_metres: float = 0.0,
         range_noise_at: str = "expected",
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
     ) -> None:
         self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest)
         self.rules = _sensor_rules(
-            measurement_std, range_std_per_metre, range_noise_at, min_range
+            measurement_std,
+            range_std_per_metre,
+            bearing_std_metres,
+            range_noise_at,
+            min_range,
         )
         self.initial_pose = argument_checks.finite_vector(
             "initial_pose", initial_pose, 3
@@ -234,6 +239,7 @@ class Drive:
 def _sensor_rules(
     measurement_std: ArrayLike,
     range_std_per_metre: float,
+    bearing_std_metres: float,
     range_noise_at: str,
     min_range: float,
 ) -> Rules:
@@ -244,11 +250,13 @@ def _sensor_rules(
         frame=ADDITIVE,
         landmark_init="full",
         range_std_per_metre=range_std_per_metre,
+        bearing_std_metres=bearing_std_metres,
         range_noise_at=range_noise_at,
         gate_probability=None,
         min_range=min_range,
     )
-    if not (rules.bearing_std and (rules.range_std or rules.range_std_per_metre)):
+    bearing_noise = rules.bearing_std or rules.bearing_std_metres
+    if not (bearing_noise and (rules.range_std or rules.range_std_per_metre)):
         raise ValueError(
             "measurement_std must be > 0 to smooth, got "
             f"({rules.bearing_std:g}, {rules.range_std:g})"

@@ -76,7 +76,7 @@ def eliminate(
     landmarks: Array,
     drive: DriveArrays,
     stds: Array,
-    sensor: tuple[float, float, float],
+    robust: tuple[float, float],
     damping: float,
     out: Elimination,
 ) -> None:
@@ -84,10 +84,10 @@ def eliminate(
 
     Parameters
     ----------
-    stds : ndarray, shape (M,)
-        σr of each reading.
-    sensor
-        σβ, and kind and scale of the robust kernel.
+    stds : ndarray, shape (M, 2)
+        (σβ, σr) of each reading.
+    robust
+        Kind and scale of the robust kernel.
     damping : float
         Levenberg-Marquardt's: the part by which readings count more against a step.
     out
@@ -107,7 +107,7 @@ def eliminate(
                 landmarks,
                 drive,
                 (k, j),
-                (sensor[0], stds[j], sensor[1], sensor[2]),
+                (stds[j, 0], stds[j, 1], robust[0], robust[1]),
                 curvature,
                 slope,
                 coupling,

@@ -11,7 +11,7 @@ from ...arrays import Array
 from ..kernels.rules import Rules
 from ..models.angles import wrap_angle
 from ..support.memory_limit import refuse_beyond_memory
-from .cost import CAUCHY, HUBER, SQUARED, range_stds, total_cost
+from .cost import CAUCHY, HUBER, SQUARED, reading_stds, total_cost
 from .drive_arrays import DriveArrays
 from .elimination import Elimination, eliminate, new_elimination
 from .relocation import relocate
@@ -19,7 +19,7 @@ from .substitution import substitute
 
 KINDS = {None: SQUARED, "huber": HUBER, "cauchy": CAUCHY}
 SLACK = 1e-12  # of the cost, in rounding
-REWEIGHTED = 30  # iterations; from then on the noise of the ranges is fixed
+REWEIGHTED = 30  # iterations; from then on the noise is fixed
 SHRINKING = 0.5  # steps that shrink by this factor converge linearly
 SEARCHES = 5  # for better places of landmarks
 RELOCATED = 5  # iterations from one to the next
@@ -86,8 +86,8 @@ class _State:
 class Optimiser:
     """Minimise the cost of a drive.
 
-    The noise of a range that grows with the range is that at the latest estimate, and
-    fixed within an iteration, as in a filter's update.
+    Noise that depends on the range is that at the latest estimate, and fixed within an
+    iteration, as in a filter's update.
     """
 
     def __init__(self, drive: DriveArrays, noise: Noise) -> None:
@@ -101,8 +101,9 @@ class Optimiser:
         self._room = new_elimination(poses, landmarks)
         rules = noise.rules
         self._rule_values = np.array(rules)
-        self._sensor = rules.bearing_std, noise.kind, noise.scale
-        self._varies = rules.range_std_per_metre > 0 and not rules.noise_as_read
+        self._robust = noise.kind, noise.scale
+        varies = max(rules.range_std_per_metre, rules.bearing_std_metres) > 0
+        self._varies = varies and not rules.noise_as_read
         self._owners = np.repeat(np.arange(poses), np.diff(drive.firsts))
         self._by_landmark = np.argsort(drive.columns, kind="stable")
 
@@ -124,7 +125,7 @@ class Optimiser:
         numpy.linalg.LinAlgError
             If that takes more than ``most`` iterations, or no step lowers the cost.
         """
-        state = _State(start, self.range_stds(start))
+        state = _State(start, self.reading_stds(start))
         state.cost = first_cost = self.cost(start, state.stds)
         # A start that contradicts a motion without noise is no bound of the cost.
         if not self._drive.factors[1:].any(axis=1).all():
@@ -132,7 +133,7 @@ class Optimiser:
         for iteration in range(1, most + 1):
             self._descend(state)
             if self._is_found(state, tolerance, iteration):
-                cost = self.cost(state.estimate, self.range_stds(state.estimate))
+                cost = self.cost(state.estimate, self.reading_stds(state.estimate))
                 return Solution(state.estimate, cost, first_cost, iteration)
             if self._varies and iteration < REWEIGHTED:
                 self._reweight(state)
@@ -153,22 +154,22 @@ class Optimiser:
 
     def linearised(self, solution: Solution) -> Minimum:
         """Return a solution with its system, which the next call overwrites."""
-        stds = self.range_stds(solution.estimate)
+        stds = self.reading_stds(solution.estimate)
         information = self.linearise(solution.estimate, stds)
         return Minimum(solution, self._room, information)
 
-    def range_stds(self, estimate: Estimate) -> Array:
-        """Return σr of each reading, shape (M,), at its expected range."""
-        return range_stds(*estimate, self._drive, self._rule_values)
+    def reading_stds(self, estimate: Estimate) -> Array:
+        """Return (σβ, σr) of each reading, shape (M, 2), at its expected range."""
+        return reading_stds(*estimate, self._drive, self._rule_values)
 
     def cost(self, estimate: Estimate, stds: Array) -> float:
-        """Return the cost, with σr of every reading given."""
-        return total_cost(*estimate, self._drive, stds, *self._sensor)
+        """Return the cost, with the noise of every reading given."""
+        return total_cost(*estimate, self._drive, stds, *self._robust)
 
     def linearise(self, estimate: Estimate, stds: Array, damping: float = 0.0) -> Array:
         """Eliminate the poses; return the information of the landmarks, (2n, 2n)."""
         room, drive = self._room, self._drive
-        eliminate(*estimate, drive, stds, self._sensor, damping, room)
+        eliminate(*estimate, drive, stds, self._robust, damping, room)
         rows = room.rows.reshape(-1, len(room.right))
         information = -(rows.T @ rows)
         n = len(room.blocks)
@@ -196,15 +197,15 @@ class Optimiser:
             self._by_landmark,
             self._owners,
             self._rule_values,
-            self._sensor[1:],
+            self._robust,
         )
         if moved:
             self._reweight(state)
         return moved
 
     def _reweight(self, state: _State) -> None:
-        """Update the noise of the ranges for the present estimate."""
-        state.stds = self.range_stds(state.estimate)
+        """Update the noise of the readings for the present estimate."""
+        state.stds = self.reading_stds(state.estimate)
         state.cost = self.cost(state.estimate, state.stds)
 
     def _step(self, estimate: Estimate, stds: Array, damping: float) -> Estimate:

@@ -12,7 +12,7 @@ import numpy as np
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..kernels.rules import Rules, as_rules
-from ..kernels.screen import range_variance
+from ..kernels.screen import bearing_variance, range_variance
 from ..models.bearing_range import expected_reading_jit, located_jit, wrap_angle_jit
 from .cost import robust_loss
 from .drive_arrays import DriveArrays
@@ -34,7 +34,8 @@ def relocate(
 ) -> int:
     """Move each landmark to where one of its readings puts it, if that costs far less.
 
-    The poses are fixed, and σr is that at the range read, so that places compare.
+    The poses are fixed, and σβ and σr are those at the range read, so that places
+    compare.
     Landmarks whose readings cost no more than they should are passed over.
 
     Parameters
@@ -95,7 +96,8 @@ def _cost_at(
         bearing, distance = expected_reading_jit(
             place[0] - pose[0], place[1] - pose[1], pose[2]
         )
-        to_bearing = wrap_angle_jit(z[0] - bearing) / rules.bearing_std
-        squared = to_bearing**2 + (z[1] - distance) ** 2 / range_variance(rules, z[1])
+        to_bearing = wrap_angle_jit(z[0] - bearing)
+        squared = to_bearing**2 / bearing_variance(rules, z[1])
+        squared += (z[1] - distance) ** 2 / range_variance(rules, z[1])
         total += robust_loss(squared, robust[0], robust[1])
     return total

@@ -28,11 +28,10 @@ class SmoothingSlam(RecordedSlam):
         Options in brackets override the keywords.
     robust, robust_scale
         As in `batch_smoother.smooth`.
-    range_std_per_metre, range_noise_at, noise_at_rest, min_range
+    range_std_per_metre, bearing_std_metres, range_noise_at, noise_at_rest, min_range
         As in :class:`~slamgym.estimator.EkfSlam`; the filter gets those that it takes.
     **options
-        Further options of the filter, but for ``bearing_std_metres``: the smoother
-        takes a constant bearing noise.
+        Further options of the filter.
 
     Raises
     ------
@@ -53,6 +52,7 @@ class SmoothingSlam(RecordedSlam):
         initial_pose: ArrayLike = (0.0, 0.0, 0.0),
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
         range_std_per_metre: float = 0.0,
+        bearing_std_metres: float = 0.0,
         range_noise_at: str = "expected",
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
@@ -67,17 +67,13 @@ class SmoothingSlam(RecordedSlam):
         name, own = read_label(follow)
         sensor = {
             "range_std_per_metre": range_std_per_metre,
+            "bearing_std_metres": bearing_std_metres,
             "range_noise_at": range_noise_at,
             "noise_at_rest": noise_at_rest,
             "min_range": min_range,
         }
         sensor |= {key: own.pop(key) for key in sensor if key in own}
         options |= own
-        if options.get("bearing_std_metres"):
-            raise ValueError(
-                "bearing_std_metres must be 0 to smooth, "
-                f"got {options['bearing_std_metres']!r}"
-            )
         robust_kernel(robust, robust_scale)
         taken = accepted_options(find_estimator(name), sensor)
         slam = make_estimator(name, **noise, **taken, **options)

@@ -38,6 +38,7 @@ def filter_drive(
         initial_pose=drive.initial_pose,
         initial_pose_std=drive.initial_pose_std,
         range_std_per_metre=rules.range_std_per_metre,
+        bearing_std_metres=rules.bearing_std_metres,
         range_noise_at="reading" if rules.noise_as_read else "expected",
         noise_at_rest=noise.at_rest,
         min_range=rules.min_range,

@@ -32,13 +32,13 @@ def recorded(seed=3, steps=12, start_std=START_STD, **settings):
 
 def dense_twin(made, moves, scans, **noise):
     """Return the dense twin and its state of a smoothed drive."""
-    settings = (MOTION_STD, MEASUREMENT_STD, START_STD)
+    noise = {"measurement_std": MEASUREMENT_STD, "start_std": START_STD} | noise
     places = dict(zip(made.landmark_ids, made.landmarks, strict=True))
     order = sorted(places)
     slots = {i: slot for slot, i in enumerate(order)}
     indexed = [(z, [slots[i] for i in ids]) for z, ids in scans]
     state = np.concatenate([made.poses.ravel(), *(places[i] for i in order)])
-    return DenseSmoother(moves, indexed, *settings), state, order
+    return DenseSmoother(moves, indexed, MOTION_STD, **noise), state, order
 
 
 @pytest.fixture(scope="module")
@@ -269,6 +269,30 @@ def test_noise_that_grows_with_the_range_is_that_of_the_expected_range():
         measurement_std=(0.02, 0.0), range_std_per_metre=0.02, range_noise_at="reading"
     )
     assert not np.allclose(smooth(read).poses, smoothed.poses, atol=1e-4)
+
+
+def test_a_sensor_of_positions_is_smoothed_as_dense_least_squares():
+    noise = {"measurement_std": (0.005, 0.1), "bearing_std_metres": 0.1}
+    drive_, moves, scans = recorded(range_noise_at="reading", **noise)
+    made = smooth(drive_)
+    twin, state, order = dense_twin(made, moves, scans, **noise)
+    assert made.cost == pytest.approx((twin.residual(state) ** 2).sum() / 2)
+    found, expected = twin.solve(state + 0.001)
+    assert found == pytest.approx(state, abs=1e-7)
+    joint = made.covariance(range(len(made.poses)), order)
+    assert joint == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    of_expected, *_ = recorded(**noise)
+    assert not np.allclose(smooth(of_expected).poses, made.poses, atol=1e-5)
+
+
+def test_the_smoother_takes_the_noise_of_its_filter():
+    noise = {"measurement_std": (0.0, 0.1), "bearing_std_metres": 0.1}
+    slam = SmoothingSlam(MOTION_STD, initial_pose_std=START_STD, **noise)
+    made, moves, scans = recorded(**noise)
+    for move, (readings, seen) in zip(moves, scans[1:], strict=True):
+        slam.predict(move)
+        slam.update(readings, seen)
+    assert smooth(made).poses[-1] == pytest.approx(slam.smoothed().poses[-1], abs=1e-5)
 
 
 def test_a_landmark_on_the_wrong_side_of_the_path_is_moved():

@@ -14,9 +14,12 @@ class DenseSmoother:
     moves are odometry (d, α) to poses 1 … K, scans [(readings, landmark indices)].
     """
 
-    def __init__(self, moves, scans, motion_std, measurement_std, start_std):
+    def __init__(
+        self, moves, scans, motion_std, measurement_std, start_std, bearing_std_metres=0
+    ):
         self.moves, self.scans = moves, scans
         self.motion_std, self.measurement_std = motion_std, measurement_std
+        self.bearing_std_metres = bearing_std_metres
         self.start_std = np.asarray(start_std, dtype=float)
 
     def residual(self, state):
@@ -33,7 +36,9 @@ class DenseSmoother:
             expected = predict_measurement(pose, landmarks[seen]).measurement
             innovation = np.asarray(readings).reshape(-1, 2) - expected
             innovation[:, 0] = wrap_angle(innovation[:, 0])
-            parts.append((innovation / self.measurement_std).ravel())
+            std = np.tile(self.measurement_std, (len(innovation), 1))
+            std[:, 0] += self.bearing_std_metres / np.asarray(readings)[..., 1]
+            parts.append((innovation / std).ravel())
         return np.concatenate(parts)
 
     def solve(self, state, iterations=8):
