@@ -26,7 +26,7 @@ Option = tuple[float, int, Callable[[], ScanAssociation]]
 SPREAD = 16.0
 """Hypotheses e^8 times less probable than the best one are discarded."""
 
-SAME = 0.5
+SAME = 1.0
 """Hypotheses of the same landmarks are one if all coordinates differ by fewer σ."""
 
 

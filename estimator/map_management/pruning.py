@@ -35,8 +35,9 @@ class MapPruner:
 
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
         self._policy, self._editor = policy, editor
-        least = np.maximum(noise, 1e-12).tolist()
-        self._noise = Noise(*least[:3], noise.bearing_std_metres)
+        bearing_std, range_std, per_metre = np.maximum(noise[:3], 1e-12).tolist()
+        metres = noise.bearing_std_metres
+        self._noise = Noise(bearing_std, range_std, per_metre, metres)
         self.forget()
 
     def forget(self) -> None:

@@ -86,13 +86,14 @@ def readings_of(landmarks, pose=(0.0, 0.0, 0.0)):
     return np.column_stack([bearings, np.hypot(d[:, 0], d[:, 1])])
 
 
-def lost_and_seen_again(scans=3, given=None, **changes):
+def lost_and_seen_again(scans=3, given=None, name="invariant", **changes):
     """Map a place, lose the way by noise alone, and see the place again."""
     slam = make_estimator(
-        "invariant",
+        name,
         motion_std=(0.01, 0.01, 0.005),
         measurement_std=(0.01, 0.03),
         management={"constellations": True, "confirm": (2, 3)} | changes,
+        **OPTIONS[name],
     )
     for _ in range(3):
         slam.update(readings_of(PLACE))
@@ -125,6 +126,24 @@ def test_a_saved_state_continues_bit_for_bit_through_the_merge(association):
         assert copy.update(scan).merged_ids == merged
         np.testing.assert_array_equal(slam.belief().mean, copy.belief().mean)
     assert slam.landmark_ids == tuple(range(7))
+
+
+@pytest.mark.parametrize("name", ["compressed", "submaps"])
+def test_a_saved_large_map_continues_bit_for_bit_through_the_merge(name):
+    slam, merged, where = lost_and_seen_again(scans=1, name=name, association="joint")
+    copy, _, _ = lost_and_seen_again(scans=0, name=name, association="joint")
+    copy.load_state_dict(slam.state_dict())
+    scan = readings_of(PLACE, where)
+    for _ in range(3):
+        for each in (slam, copy):
+            each.predict((0.0, 0.0), dt=0.1)
+        report = slam.update(scan)
+        assert copy.update(scan).merged_ids == report.merged_ids
+        merged += report.merged_ids
+        one, other = slam.belief(), copy.belief()
+        np.testing.assert_array_equal(one.mean, other.mean)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert sorted(merged) == [(i, i + 7) for i in range(7)]
 
 
 def test_doubtful_landmarks_are_part_of_the_saved_state():
