@@ -27,6 +27,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -236,9 +237,10 @@ def digest_of_runs(
     world = load_scenario("six_landmarks")
     options: dict[str, Any] = {"jobs": jobs, "backend": backend, "block_size": 8}
     if backend == "dask":
-        from distributed import Client  # noqa: PLC0415 (optional)
-
-        with Client(n_workers=2, threads_per_worker=1, dashboard_address=None):
+        distributed: Any = import_module("distributed")  # optional
+        with distributed.Client(
+            n_workers=2, threads_per_worker=1, dashboard_address=None
+        ):
             results = monte_carlo(world, "ekf,invariant", runs, out=target, **options)
     else:
         results = monte_carlo(world, "ekf,invariant", runs, out=target, **options)
