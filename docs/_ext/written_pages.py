@@ -12,6 +12,7 @@ from types import ModuleType
 import preset_pictures
 import scenario_fields
 from sphinx.application import Sphinx
+from sphinx.config import Config
 from sphinx.util.display import status_iterator
 
 import slamgym
@@ -52,12 +53,12 @@ PACKAGES: tuple[ModuleType, ...] = (
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register with Sphinx."""
-    app.connect("builder-inited", write_pages, priority=100)
+    app.connect("config-inited", write_pages)  # before Sphinx lists the pages
     app.connect("source-read", point_into_the_site)
     return {"parallel_read_safe": True}
 
 
-def write_pages(app: Sphinx) -> None:
+def write_pages(app: Sphinx, config: Config) -> None:
     """Write all pages below ``docs/generated``."""
     folder = Path(app.srcdir) / "generated"
     (folder / "api").mkdir(parents=True, exist_ok=True)
