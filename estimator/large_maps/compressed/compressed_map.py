@@ -195,14 +195,19 @@ class CompressedMap:
         """Return copies of the whole state as arrays, with numbers of the caller."""
         near = [self.slots[i] for i in self.local]
         invalid = pairs([*near, *self.free])  # arrays hold rests of these
+        arrays = {
+            "points": self._points.copy(),
+            "references": self._references.copy(),
+            "strip": self._strip.copy(),
+        }
+        for array in arrays.values():
+            array[..., invalid[invalid < array.shape[-1]]] = 0.0
         local = {f"local_{k}": v for k, v in self.filter.state_dict().items()}
         return {
             "base": local.pop("local_estimator"),
             "landmark_ids": np.array(list(self.slots), dtype=np.int64),
             "slots": np.array(list(self.slots.values()), dtype=np.int64),
-            "points": self._points.copy(),
-            "references": self._references.copy(),
-            "strip": self._strip.copy(),
+            **arrays,
             "origin": self._origin.copy(),
             "numbers": np.array([self._virtual, *numbers, *self.free]),
             **local,
