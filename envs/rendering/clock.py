@@ -62,7 +62,7 @@ class Clock(Artist):
         context.restore()
 
     def _figure(self) -> Any:
-        return self.get_figure(root=True)
+        return self.get_figure()
 
     def _font(self) -> Any:
         """Return the font for the resolution of the figure."""
