@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from ...interface import Belief
 from ...support.argument_checks import LOWEST_ID
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ..sparse_cholesky.coordinates import pairs
+from ..undo import Undo
 from .active_set import choose_local
 from .deferred_covariance import DeferredCovariance, subtract, symmetric
 from .phase_update import (
@@ -41,6 +41,7 @@ class CompressedMap:
     def __init__(self, local_filter: EkfSlam) -> None:
         self.filter = local_filter
         self.is_invariant = type(local_filter) is InvariantEkfSlam
+        self.undo = Undo()
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map."""
@@ -54,7 +55,6 @@ class CompressedMap:
         self._virtual = 0
         self._strip = np.zeros((3, 0))  # covariance of local and all other coordinates
         self._origin = self.filter.map.mean[:2].copy()  # start of the phase
-        self._undo: Callable[[], None] | None = None  # of the last new local map
 
     def add(self, ids: Sequence[int]) -> None:
         """Assign slots to landmarks that the filter has added."""
@@ -134,7 +134,7 @@ class CompressedMap:
             covariance_bytes(3 * size),  # including virtual landmarks
             "take a smaller local_size",
         )
-        self._undo = self._checkpoint()
+        self.undo.save(self._checkpoint)
         now = self._phase()
         rows = self._apply(now)
         ahead = now.mean[:2] + (now.mean[:2] - self._origin) / 2  # likely direction
@@ -158,22 +158,9 @@ class CompressedMap:
         self._origin = now.mean[:2].copy()
         self._begin()
 
-    @contextmanager
-    def unchanged_on_error(self) -> Iterator[None]:
-        """Take back a change of the local map if an error follows it."""
-        self._undo = None
-        try:
-            yield
-        except Exception:
-            if self._undo is not None:
-                self._undo()
-            raise
-        finally:
-            self._undo = None
-
     def _checkpoint(self) -> Callable[[], None]:
         """Return what takes back a change of the local map."""
-        own = {k: v for k, v in vars(self).items() if k not in ("filter", "_undo")}
+        own = {k: v for k, v in vars(self).items() if k not in ("filter", "undo")}
         own |= {"_points": self._points.copy(), "_references": self._references.copy()}
         saved, undo_deferred = self.filter.state_dict(), self.deferred.checkpoint()
 

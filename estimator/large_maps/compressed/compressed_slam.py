@@ -140,7 +140,7 @@ class CompressedEkfSlam:
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_reserved(ids)
         counters = self._extra, self._age, self._rests
-        with self._map.unchanged_on_error():
+        with self._map.undo.on_error():
             if (np.abs(readings) <= LARGEST).all():  # otherwise refused
                 mapped = [i for i in ids if i in self._map.slots]
                 counters = self._choose_local_map(mapped)
@@ -190,7 +190,7 @@ class CompressedEkfSlam:
         """
         kept, gone = pair_checks.landmark_pairs(pairs, self._map.slots)
         ids, local = [*kept, *gone], self._map.local
-        with self._map.unchanged_on_error():
+        with self._map.undo.on_error():
             if not all(i in local for i in ids):
                 size = max(self._local_size or 0, len(local), len(ids))
                 self._map.change_local_map(ids, size)

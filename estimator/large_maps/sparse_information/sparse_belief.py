@@ -1,7 +1,6 @@
 """The belief of the sparse information filter: map, local map and pose."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import inf
 
@@ -10,6 +9,7 @@ import numpy as np
 from ....arrays import Array, BoolArray, IntArray
 from ..sparse_cholesky.coordinates import pairs
 from ..sparse_cholesky.landmark_elimination import RestFactor
+from ..undo import Undo
 from .active_set import (
     FIRST_COUNT,
     choose_local,
@@ -49,7 +49,7 @@ class SparseBelief:
     rest: RestFactor | None = field(default=None, repr=False)
     """Factor of all landmarks except the local ones, if known."""
 
-    _undo: Callable[[], None] | None = field(default=None, repr=False)
+    undo: Undo = field(default_factory=Undo, repr=False)
 
     @classmethod
     def empty(cls, pose: Array, std: Array) -> "SparseBelief":
@@ -73,19 +73,6 @@ class SparseBelief:
         self.slots.update(zip(ids, slots, strict=True))
         self.free = [slot for slot in self.free if slot not in slots]
         self.map_.grow(len(self.slots) + len(self.free))
-
-    @contextmanager
-    def unchanged_on_error(self) -> Iterator[None]:
-        """Take back changes of the local map if an error follows them."""
-        self._undo = None
-        try:
-            yield
-        except Exception:
-            if self._undo is not None:
-                self._undo()
-            raise
-        finally:
-            self._undo = None
 
     def _checkpoint(self) -> Callable[[], None]:
         """Return what takes back changes of the local map."""
@@ -130,14 +117,14 @@ class SparseBelief:
 
     def remove(self, ids: Sequence[int], *, exact: bool) -> None:
         """Marginalise landmarks."""
-        with self.unchanged_on_error():
+        with self.undo.on_error():
             gone = self._include_links(ids, exact=exact)
             rest = marginalise(self.local, self.pose, gone)
         self._drop(ids, gone, rest)
 
     def merge(self, kept: int, gone: int, *, exact: bool) -> None:
         """Condition on two landmarks being the same, and drop the second."""
-        with self.unchanged_on_error():
+        with self.undo.on_error():
             dropped = self._include_links([gone, kept], exact=exact)
             place = int(np.flatnonzero(self.local.slots == self.slots[kept])[0])
             dropped[place] = False
@@ -203,8 +190,7 @@ class SparseBelief:
 
     def _change_local_map(self, slots: IntArray, count: float) -> None:
         """Write the local map back, and begin another one."""
-        if self._undo is None:
-            self._undo = self._checkpoint()
+        self.undo.save(self._checkpoint)
         old, pose = self.local.slots, self.pose
         write_back(self.map_, self.local)
         self.rest = None

@@ -152,7 +152,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         argument_checks.refuse_unusable(readings, ids)
         if not ids:
             return UpdateReport()
-        with self._belief.unchanged_on_error():
+        with self._belief.undo.on_error():
             self._belief.choose_local_map(ids, exact=self._is_exact)
             result = self._process(readings, ids)
             while result.largest_residual > self._tolerance:
