@@ -9,10 +9,8 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, BoolArray
 from ..kernels.batch import RunArrays, StepData
-from ..support import argument_checks
+from ..support import argument_checks, saved_states
 from .batch_results import BatchBeliefs
-
-_ROUNDING = 1e-9  # tolerance of a negative eigenvalue, as in `check_estimator`
 
 
 def step_data(
@@ -127,8 +125,8 @@ def _problem(mean: Array, covariance: Array, reference: Array) -> str | None:
             return f"{name} must be finite, but is not"
     if not np.array_equal(covariance, covariance.T):
         return "beliefs.covariances must be symmetric, but is not"
-    least = float(np.linalg.eigvalsh(covariance)[0])
-    if least < -_ROUNDING * max(1.0, float(np.trace(covariance))):
+    if not saved_states.is_semidefinite(covariance):
+        least = float(np.linalg.eigvalsh(covariance)[0])
         return (
             "beliefs.covariances must be positive semidefinite, but has the "
             f"eigenvalue {least:.3g}"

@@ -29,10 +29,14 @@ def refuse_other_state(
             raise ValueError(f"state is of {state[key]}, not of {name}")
 
 
-def array(name: str, value: Any, shape: tuple[int, ...]) -> Array:
-    """Return a copy of a finite float64 array, or refuse it; -1 is any length."""
+def array(name: str, value: Any, shape: tuple[int, ...] | None = None) -> Array:
+    """Return a copy of a finite float64 array, or refuse it.
+
+    The shape is any without one; -1 is any length.
+    """
     numbers = as_floats(f"state[{name!r}]", value)
-    _refuse_other_shape(name, numbers.shape, shape)
+    if shape is not None:
+        _refuse_other_shape(name, numbers.shape, shape)
     if not np.isfinite(numbers).all():
         raise ValueError(f"state[{name!r}] must be finite")
     if (np.abs(numbers) > LARGEST_IN_STATE).any():

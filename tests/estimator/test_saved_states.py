@@ -138,3 +138,14 @@ def test_a_state_saved_after_an_uncertain_start_is_accepted(name):
     for pose in np.random.default_rng(3).normal(size=(20, 3)):
         slam.reset(pose, (0.8, 0.3, 0.1))
         slam.load_state_dict(slam.state_dict())
+
+
+def test_whole_numbers_beyond_those_of_floats_are_refused():
+    slam = make_estimator(
+        "sparse_information", motion_std=(0.1,) * 3, measurement_std=(0.1, 0.1)
+    )
+    slam.update([(0.0, 2.0), (1.0, 3.0)], [0, 1])
+    state = slam.state_dict()
+    state["around_slots"] = np.array([2.0**63])
+    with pytest.raises(ValueError, match="around_slots'] must be whole numbers <= 2⁵³"):
+        slam.load_state_dict(state)

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from ....arrays import IntArray
-from ....magnitudes import LARGEST_IN_STATE
 from ...support import argument_checks, saved_states
 from ..sparse_cholesky.landmark_elimination import RestFactor
 from ..sparse_cholesky.schur_complement import Factor, SchurComplement, SubsetFactor
@@ -25,6 +24,7 @@ _MAP = ("points", "first", "residual")
 _OTHERS = ("landmark_ids", "slots", "free", "nodes", "parted")
 _LOCAL_MAP = ("origin", "reach", "widened")
 _WHOLE_NUMBERS = {"counts", "links", "border", "slots"}
+_LARGEST_WHOLE = 2.0**53
 
 
 def as_arrays(belief: SparseBelief, name: str, base: str) -> dict[str, Any]:
@@ -160,13 +160,13 @@ def _part(state: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     """Return copies of the entries with a prefix, all of them finite numbers."""
     part: dict[str, Any] = {}
     for key in _PARTS[prefix]:
-        name = f"state['{prefix}_{key}']"
-        values = argument_checks.as_floats(name, state[f"{prefix}_{key}"])
-        if not np.isfinite(values).all():
-            raise ValueError(f"{name} must be finite")
-        if (np.abs(values) > LARGEST_IN_STATE).any():
-            raise ValueError(f"{name} must not exceed {LARGEST_IN_STATE:g}")
-        part[key] = values.astype(np.int64) if key in _WHOLE_NUMBERS else values.copy()
+        values = saved_states.array(f"{prefix}_{key}", state[f"{prefix}_{key}"])
+        if key not in _WHOLE_NUMBERS:
+            part[key] = values
+            continue
+        if (np.abs(values) > _LARGEST_WHOLE).any():
+            raise ValueError(f"state['{prefix}_{key}'] must be whole numbers <= 2⁵³")
+        part[key] = values.astype(np.int64)
     return part
 
 
