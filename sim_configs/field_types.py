@@ -5,7 +5,7 @@ Number types refuse strings, booleans and NaN; they accept integers for floats.
 
 import math
 from reprlib import repr as short_repr
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 from pydantic import (
     AfterValidator,
@@ -76,10 +76,10 @@ def _within_bounds(value: Any) -> Any:
 
 
 def _divisible(value: float) -> float:
-    """Refuse positive numbers whose quotients could overflow."""
+    """Refuse positive numbers whose products or quotients could overflow."""
     if value < SMALLEST:
         raise _out_of_bounds("be at least", SMALLEST, value)
-    return value
+    return cast("float", _within_bounds(value))
 
 
 def _out_of_bounds(rule: str, bound: float, value: object) -> PydanticCustomError:
@@ -90,6 +90,7 @@ def _out_of_bounds(rule: str, bound: float, value: object) -> PydanticCustomErro
     )
 
 
+# One of them to a type: older versions of pydantic keep the last one alone.
 BOUNDED, DIVISIBLE = AfterValidator(_within_bounds), AfterValidator(_divisible)
 
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -100,16 +101,13 @@ Text = Annotated[StrictStr, expect("a string")]
 Name = Annotated[StrictStr, Field(min_length=1), expect("a string that is not empty")]
 Flag = Annotated[StrictBool, expect("true or false")]
 
-Positive = Annotated[
-    _Number, Field(gt=0), expect("a finite number > 0"), BOUNDED, DIVISIBLE
-]
+Positive = Annotated[_Number, Field(gt=0), expect("a finite number > 0"), DIVISIBLE]
 NotNegative = Annotated[_NotNegative, expect("a finite number >= 0"), BOUNDED]
 Finite = Annotated[_Number, expect("a finite number"), BOUNDED]
 PositiveOrInfinite = Annotated[
     float,
     Field(strict=True, allow_inf_nan=True, gt=0),
     expect("a number > 0, or inf"),
-    BOUNDED,
     DIVISIBLE,
 ]
 Probability = Annotated[_NotNegative, Field(le=1), expect("a number from 0 to 1")]
