@@ -40,6 +40,11 @@ def pytest_addoption(parser):
         default=0.0,
         help="how long each test in tests/fuzz generates inputs, beyond the usual few",
     )
+    parser.addoption(
+        "--fuzz-seed",
+        type=int,
+        help="where these inputs begin; by default, somewhere else each time",
+    )
 
 
 def pytest_terminal_summary(terminalreporter):
@@ -61,7 +66,8 @@ def fuzzer(request, record_property):
     """Return what generates inputs for a test, for as long as the option says."""
     from fuzzing import Fuzzer
 
-    fuzzer = Fuzzer(request.config.getoption("--fuzz-seconds"))
+    options = request.config.getoption
+    fuzzer = Fuzzer(options("--fuzz-seconds"), options("--fuzz-seed"))
     yield fuzzer
     record_property("inputs", fuzzer.inputs)
 

@@ -35,10 +35,14 @@ class Fuzzer:
     ----------
     seconds : float
         How long; 0 for the few inputs of the suite, the same ones each time.
+    start : int, optional
+        The seed of the first round; drawn by default.
     """
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds: float, start: int | None = None) -> None:
         self.seconds, self.inputs = seconds, 0
+        drawn = random.SystemRandom().randrange(10**9)
+        self.start = drawn if start is None else start
         self.memory = psutil.Process().memory_info().rss
 
     def check(
@@ -106,13 +110,12 @@ class Fuzzer:
             once(settings(**options, **quick, max_examples=few), None)
             return
         ends, number = time.monotonic() + self.seconds, 0
-        first = random.SystemRandom().randrange(10**9)
         phases = [Phase.explicit, Phase.generate, Phase.shrink]
         while time.monotonic() < ends:
             size = min(ROUND, few)
             once(
                 settings(**options, max_examples=size, phases=phases),
-                first + number if number else 0,
+                self.start + number if number else 0,
             )
             number += 1
 
