@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from . import options
 from .option_values import assignments, standard_deviations
 from .program import command
@@ -18,10 +16,7 @@ if TYPE_CHECKING:
 
 @command
 def fit_noise(
-    log: Annotated[
-        Path,
-        typer.Argument(metavar="LOG", help="A log of any format that replay reads."),
-    ],
+    log: options.LogFile,
     *,
     estimator: options.EstimatorName = "invariant",
     motion_std: options.MotionStd = None,
@@ -37,10 +32,7 @@ def fit_noise(
             "Let the filter associate the readings of a log that identifies them.",
         ),
     ] = False,
-    robot: Annotated[
-        int | None,
-        options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
-    ] = None,
+    robot: options.RobotNumber = None,
     truth: options.TruthFile = None,
     noise_from_file: options.NoiseFromFile = False,
     write: Annotated[

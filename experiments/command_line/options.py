@@ -40,6 +40,9 @@ ScenarioName = Annotated[
         metavar="SCENARIO", help="A preset (see: slamgym scenarios) or a .toml file."
     ),
 ]
+LogFile = Annotated[
+    Path, typer.Argument(metavar="LOG", help="A log of any format that replay reads.")
+]
 EstimatorName = Annotated[
     str,
     option(
@@ -185,4 +188,8 @@ Backend = Annotated[
 Scheduler = Annotated[
     str | None,
     option("ADDRESS", "The Dask or Ray cluster.", "a cluster of this machine"),
+]
+RobotNumber = Annotated[
+    int | None,
+    option("K", "Which robot of a UTIAS folder.", "the lowest number"),
 ]

@@ -55,10 +55,7 @@ def replay(
         ),
     ] = False,
     resolution: options.Resolution = 0.0,
-    robot: Annotated[
-        int | None,
-        options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
-    ] = None,
+    robot: options.RobotNumber = None,
     truth: options.TruthFile = None,
     noise_from_file: options.NoiseFromFile = False,
     out: options.OutFolder = None,

@@ -1,9 +1,6 @@
 """``slamgym smooth``: all poses and landmarks of a log at once, with a picture."""
 
-from pathlib import Path
 from typing import Annotated
-
-import typer
 
 from . import options
 from .option_values import assignments, standard_deviations
@@ -12,10 +9,7 @@ from .program import command
 
 @command
 def smooth(
-    log: Annotated[
-        Path,
-        typer.Argument(metavar="LOG", help="A log of any format that replay reads."),
-    ],
+    log: options.LogFile,
     *,
     estimator: options.EstimatorName = "invariant",
     motion_std: options.MotionStd = None,
@@ -30,10 +24,7 @@ def smooth(
         ),
     ] = None,
     option: options.EstimatorOptions = None,
-    robot: Annotated[
-        int | None,
-        options.option("K", "Which robot of a UTIAS folder.", "the lowest number"),
-    ] = None,
+    robot: options.RobotNumber = None,
     truth: options.TruthFile = None,
     out: options.OutFolder = None,
     as_json: options.AsJson = False,
