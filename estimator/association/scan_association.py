@@ -216,8 +216,10 @@ def _unexplained_density(
     scans so far suggest; one of more sightings surely is.
     """
     density = np.full(len(readings), policy.density or candidates.density.value)
+    if policy.association in ("nearest", "compatibility"):  # they use none
+        return density
     tentative = candidates.tentative.next_scan(policy.confirm[1])
-    if policy.association == "nearest" or not len(tentative.seen):
+    if not len(tentative.seen):
         return density
     fit = tentative.distances(readings, noise, policy.new_gate)
     share = np.where(tentative.sightings > 1, 1.0, candidates.density.landmark_share)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array
 from ..interface import UpdateReport
 from ..kernels.rules import AT_ESTIMATE, AT_TRUTH
-from ..models.rigid_motion import rotation
+from ..models.rigid_motion import pose_rotation
 from ..models.unicycle_motion import drive
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
@@ -112,8 +112,7 @@ class IdealEkfSlam(EkfSlam):
         dx, dy = self._true_pose[:2] - reference[:2]
         G = np.eye(n)
         G[:2, 2] = -dy, dx
-        F = np.eye(3)
-        F[:2, :2] = rotation(heading)
+        F = pose_rotation(heading)
         moved = G @ covariance[:n, :n] @ G.T
         moved[:3, :3] += F @ np.diag(variance) @ F.T
         covariance[:n, :n] = (moved + moved.T) / 2

@@ -10,12 +10,11 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ..kernels.imagine import Imagined, imagine_plans
 from ..kernels.in_view import as_view
+from ..kernels.rules import AFTER_STDS, FIRST_STD
 from ..support import argument_checks
 from .batch import BatchSlam, can_batch
 from .ekf import EkfSlam
 from .scan_workspace import workspace_for
-
-_STDS = slice(5, 9)  # of `Rules`: the standard deviations of the measurement noise
 
 
 class SensorLimits(Protocol):
@@ -108,7 +107,7 @@ def imagine(
     ends = argument_checks.as_floats("walls", walls).reshape(-1, 4)
     dropout = float(sensor.dropout)
     rules = filters.rule_values.copy()
-    rules[_STDS] /= max(1.0 - dropout, 1e-9) ** 0.5
+    rules[FIRST_STD:AFTER_STDS] /= max(1.0 - dropout, 1e-9) ** 0.5
     view = as_view(
         float(sensor.max_range),
         float(sensor.field_of_view),

@@ -63,12 +63,12 @@ class RobocentricEkfSlam(EkfSlam):
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct map and motion with one scan, then move the frame to the robot."""
-        count = len(argument_checks.scan(measurements))
-        given = argument_checks.given_identities(landmark_ids, count, self)
+        readings = argument_checks.scan(measurements)
+        given = argument_checks.given_identities(landmark_ids, len(readings), self)
         if not set(RESERVED).isdisjoint(given):
             raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
-        report = super().update(measurements, landmark_ids)
-        if count:
+        report = super().update(readings, given)
+        if len(readings):
             move_frame(self.map.mean, self.map.covariance, self.map.size)
         return report
 

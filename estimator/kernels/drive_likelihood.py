@@ -10,13 +10,12 @@ from ...jit import jit, njit_internal
 from .belief_arrays import BeliefArrays
 from .linearise import linearise
 from .predict import predict
-from .rules import Rules, as_rules
+from .rules import FIRST_STD, Rules, as_rules
 from .scan_rows import (
     ADDED,
     FIRST,
     GATED,
     INNOVATION,
-    JACOBIAN,
     LEDGER_HEIGHT,
     OUTCOME,
     READING,
@@ -27,7 +26,7 @@ from .scan_rows import (
     prior_system_jit,
 )
 from .scan_update import DONE, update_belief
-from .screen import bearing_variance, range_variance
+from .screen import bearing_variance, own_covariance, range_variance
 
 LOG_TURN = math.log(2 * math.pi)
 
@@ -35,7 +34,6 @@ LOG_TURN = math.log(2 * math.pi)
 MOTION = 0  # σx, σy, σα [m, m, rad]
 SENSOR = 3  # σβ [rad], σr [m], part of σr per metre, part of σβ in metres [m]
 NOISE_WIDTH = 7
-SENSOR_RULES = 5  # the column of the rules at which the noise of the sensor begins
 
 
 class DriveEvents(NamedTuple):
@@ -108,7 +106,7 @@ def follow_drive(
     for b in range(len(noises)):
         begin(belief, slots, start)
         for i in range(NOISE_WIDTH - SENSOR):
-            rule_values[SENSOR_RULES + i] = noises[b, SENSOR + i]
+            rule_values[FIRST_STD + i] = noises[b, SENSOR + i]
         rules = as_rules(rule_values)
         size = len(start[0])  # a literal would compile all kernels anew
         for s in range(len(drive.first_motions) - 1):
@@ -258,20 +256,3 @@ def examine(
         own[k, 0] = system[row, INNOVATION] / math.sqrt(s00)
         own[k, 1] = system[below, INNOVATION] / math.sqrt(s11)
         own[k, 2] = math.log(s00 * s11 - s10 * s10)
-
-
-@njit_internal
-def own_covariance(
-    P: Array, system: Array, row: int, c: int
-) -> tuple[float, float, float]:
-    """Return S of the reading in two rows: S_ββ, S_βr, S_rr."""
-    h, h_below = system[row, JACOBIAN:], system[row + 1, JACOBIAN:]
-    s00, s10, s11 = system[row, VARIANCE], 0.0, system[row + 1, VARIANCE]
-    for i in range(5):
-        at_i = i if i < 3 else c + i - 3
-        for j in range(5):
-            entry = P[at_i, j if j < 3 else c + j - 3]
-            s00 += h[i] * entry * h[j]
-            s10 += h_below[i] * entry * h[j]
-            s11 += h_below[i] * entry * h_below[j]
-    return s00, s10, s11

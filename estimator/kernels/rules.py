@@ -35,6 +35,11 @@ class Rules(NamedTuple):
     noise_as_read: bool = False  # take noise at the range as read, not as expected
 
 
+FIRST_STD = Rules._fields.index("bearing_std")
+"""Column of the first of the four standard deviations of a reading in the rules."""
+AFTER_STDS = Rules._fields.index("min_range")
+
+
 @njit_inlined
 def as_rules(values: Array) -> Rules:
     """Read rules from the array ``numpy.array(rules)``.

@@ -91,19 +91,27 @@ def range_variance(rules: Rules, distance: float) -> float:
 
 
 @njit_internal
-def squared_innovation(covariance: Array, system: Array, row: int, c: int) -> float:
-    """Return the NIS of one reading by itself, νᵀ S⁻¹ ν, for the gate."""
-    below = row + 1
-    h, h_below = system[row, JACOBIAN:], system[below, JACOBIAN:]
-    s00, s10, s11 = system[row, VARIANCE], 0.0, system[below, VARIANCE]
+def own_covariance(
+    P: Array, system: Array, row: int, c: int
+) -> tuple[float, float, float]:
+    """Return S of the reading in two rows: S_ββ, S_βr, S_rr."""
+    h, h_below = system[row, JACOBIAN:], system[row + 1, JACOBIAN:]
+    s00, s10, s11 = system[row, VARIANCE], 0.0, system[row + 1, VARIANCE]
     for i in range(5):
         at_i = i if i < 3 else c + i - 3
         for j in range(5):
-            entry = covariance[at_i, j if j < 3 else c + j - 3]
+            entry = P[at_i, j if j < 3 else c + j - 3]
             s00 += h[i] * entry * h[j]
             s10 += h_below[i] * entry * h[j]
             s11 += h_below[i] * entry * h_below[j]
-    n0, n1 = system[row, INNOVATION], system[below, INNOVATION]
+    return s00, s10, s11
+
+
+@njit_internal
+def squared_innovation(covariance: Array, system: Array, row: int, c: int) -> float:
+    """Return the NIS of one reading by itself, νᵀ S⁻¹ ν, for the gate."""
+    s00, s10, s11 = own_covariance(covariance, system, row, c)
+    n0, n1 = system[row, INNOVATION], system[row + 1, INNOVATION]
     weighted = n0 * n0 * s11 - 2 * n0 * n1 * s10 + n1 * n1 * s00
     nis: float = weighted / (s00 * s11 - s10 * s10)
     return nis

@@ -267,6 +267,7 @@ class HypothesisSlam:
             except (np.linalg.LinAlgError, MemoryError) as error:
                 errors.append(error)
         if not kept:
+            self._keep(self.hypotheses, slams)
             raise errors[0]
         kept = distinct(kept)
         least = kept[0].cost
@@ -277,8 +278,8 @@ class HypothesisSlam:
         self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()
     ) -> None:
         """Continue with these hypotheses, and reuse all other filters."""
-        known = {id(slam): slam for slam in [h.slam for h in self.hypotheses]}
-        known |= {id(slam): slam for slam in others}
+        slams = [*(h.slam for h in self.hypotheses), *others]
+        known = {id(slam): slam for slam in slams}
         kept = {id(h.slam) for h in hypotheses}
         self._pool.free(slam for key, slam in known.items() if key not in kept)
         self.hypotheses = hypotheses

@@ -274,7 +274,7 @@ class ManagedSlam:
 
     def copy_from(self, other: ManagedSlam) -> None:
         """Continue as another filter of the same settings, decisions included."""
-        restore(self._filter, other._filter.state_dict())
+        restore(self._filter, other.filter.state_dict())
         self._pruner.load_state_dict(other._pruner.state_dict())
         self._recent.copy_from(other._recent)
         self._editor.expire()

@@ -55,20 +55,20 @@ class RecentScans:
 
     def forget(self) -> None:
         """Start a new run."""
-        self._scans: list[RecentScan] = []
-        self._motions: tuple[Motion, ...] = ()
+        self.scans: list[RecentScan] = []
+        self.motions: tuple[Motion, ...] = ()
         self.decisions: list[ScanDecisions] = []
         """About every scan since the start, or since a saved state was loaded."""
 
     def copy_from(self, other: RecentScans) -> None:
         """Continue from the scans of another run with the same kind of filter."""
-        self._scans, self._motions = list(other._scans), other._motions
+        self.scans, self.motions = list(other.scans), other.motions
         self.decisions = list(other.decisions)
 
     def note_motion(self, distance: float, turn: float, dt: float) -> None:
         """Remember a motion since the last scan."""
         if self._window:
-            self._motions += ((distance, turn, dt),)
+            self.motions += ((distance, turn, dt),)
 
     def note_edits(
         self, removed: Sequence[int], merged: Sequence[tuple[int, int]]
@@ -79,9 +79,9 @@ class RecentScans:
             self.decisions[-1] = made._replace(
                 removed=(*made.removed, *removed), merged=(*made.merged, *merged)
             )
-        if self._scans and (removed or merged):
-            last = self._scans[-1]
-            self._scans[-1] = replace(
+        if self.scans and (removed or merged):
+            last = self.scans[-1]
+            self.scans[-1] = replace(
                 last,
                 removed=(*last.removed, *removed),
                 merged=(*last.merged, *merged),
@@ -93,17 +93,17 @@ class RecentScans:
         An error leaves the filter and the scans as they were.
         """
         row_ids, labels = tuple(plan.row_ids), tuple(plan.labels)
-        scan = RecentScan(plan.scan, self._motions, readings, row_ids, labels)
+        scan = RecentScan(plan.scan, self.motions, readings, row_ids, labels)
         if not self._window:
             report = scan.feed(self._slam)
             self.decisions.append(_decided(plan, report))
             return report
         if scan.begins:
             scan = replace(scan, before=self._slam.state_dict())
-        scans = [*self._scans, scan][-self._window - 1 :]
+        scans = [*self.scans, scan][-self._window - 1 :]
         first = _relabel(scans, plan.confirmed)
         report = scan.feed(self._slam) if first is None else self._repeat(scans, first)
-        self._scans, self._motions = scans, ()
+        self.scans, self.motions = scans, ()
         self.decisions.append(_decided(plan, report))
         if first is not None:
             self._revise_decisions(scans[first:-1])
@@ -111,7 +111,7 @@ class RecentScans:
 
     def _revise_decisions(self, scans: Sequence[RecentScan]) -> None:
         """Note the landmarks that the readings of earlier scans belong to now."""
-        newest = self._scans[-1].number
+        newest = self.scans[-1].number
         for scan in scans:
             place = len(self.decisions) - 1 - (newest - scan.number)
             if place >= 0:
@@ -145,10 +145,10 @@ class RecentScans:
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
         state: dict[str, Any] = {
-            "motions": motion_array(self._motions),
-            "count": np.array(len(self._scans)),
+            "motions": motion_array(self.motions),
+            "count": np.array(len(self.scans)),
         }
-        for k, scan in enumerate(self._scans):
+        for k, scan in enumerate(self.scans):
             state |= with_prefix(str(k), scan.state_dict())
         return state
 
@@ -160,11 +160,11 @@ class RecentScans:
             raise ValueError(
                 f"state['recent.count'] must be at most {self._window + 1}, got {count}"
             )
-        self._scans = [
+        self.scans = [
             RecentScan.from_state_dict(without_prefix(state, str(k)))
             for k in range(count)
         ]
-        self._motions = motions
+        self.motions = motions
         self.decisions = []
 
 

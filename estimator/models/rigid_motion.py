@@ -35,6 +35,13 @@ def rotation(angle: float) -> Array:
     return np.array([[cos, -sin], [sin, cos]])
 
 
+def pose_rotation(angle: float) -> Array:
+    """Return R(t) for poses (x, y, θ), shape (3, 3); the heading stays."""
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(angle)
+    return turn
+
+
 def compose(start: Array, pose: Array) -> tuple[Array, Array, Array]:
     """Return start ⊕ pose, shape (3,), and its derivatives by both, (3, 3) each.
 
@@ -42,8 +49,7 @@ def compose(start: Array, pose: Array) -> tuple[Array, Array, Array]:
 
         (p, θ) ⊕ (q, φ) = (p + R(θ) q, θ + φ)
     """
-    by_pose = np.eye(3)
-    by_pose[:2, :2] = rotation(start[2])
+    by_pose = pose_rotation(start[2])
     moved = by_pose @ pose
     by_start = np.eye(3)
     by_start[:2, 2] = -moved[1], moved[0]

@@ -10,6 +10,7 @@ from filterpy.kalman import (
 )
 
 from ...arrays import Array
+from ..models.angles import wrap_angle
 from .kalman_slam import (
     SIGMA_ALPHA,
     SIGMA_BETA,
@@ -101,5 +102,5 @@ def _ukf(state: Moments, readings: int) -> UnscentedKalmanFilter:
 def _mean_reading(points: Array, weights: Array) -> Array:
     """Return the weighted mean of readings (N, 2m), bearings about the first row's."""
     away = points - points[0]
-    away[:, 0::2] = (away[:, 0::2] + np.pi) % (2 * np.pi) - np.pi
+    away[:, 0::2] = wrap_angle(away[:, 0::2])
     return np.asarray(points[0] + weights @ away)

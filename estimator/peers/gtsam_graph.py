@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array
 from ..models.bearing_range import locate_landmark
+from ..models.rigid_motion import pose_rotation
 from ..support import argument_checks, saved_states
 from .peer_slam import Innovation, PeerSlam, Readings
 from .whole_state import expected_readings, motion_covariance, moved_state, wrapped
@@ -70,7 +71,7 @@ class GtsamSlam(PeerSlam):
         self._estimate = self._solved = pose
         self._covariance: Array | None = np.diag(std**2)
         self._first = np.stack([pose, std])
-        own = _rotation(pose[2])
+        own = pose_rotation(pose[2])
         noise = gtsam.noiseModel.Gaussian.Covariance((own.T * std**2) @ own)
         self._graph.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(*pose), noise))
         self._guess.insert(X(0), gtsam.Pose2(*pose))
@@ -78,7 +79,7 @@ class GtsamSlam(PeerSlam):
     def _move(self, odometry: Array, variance: Array) -> None:
         self._events.append((MOVE, *odometry, *variance))
         self._moves.append((odometry, variance))
-        turned = _rotation(odometry[1])
+        turned = pose_rotation(odometry[1])
         covariance = (turned.T * np.maximum(variance, LEAST_VARIANCE)) @ turned
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         between = gtsam.Pose2(odometry[0], 0.0, odometry[1])
@@ -150,14 +151,14 @@ class GtsamSlam(PeerSlam):
             keys = [X(self._solved_k), *(L(slot) for slot in range((n - 3) // 2))]
             covariance, values = self._joint(keys)
             turn = np.eye(n)
-            turn[:3, :3] = _rotation(values.atPose2(keys[0]).theta())
+            turn[:3, :3] = pose_rotation(values.atPose2(keys[0]).theta())
             self._covariance = turn @ covariance @ turn.T
         return self._covariance
 
     def state_dict(self) -> dict[str, Any]:
         """Return the drive until now, from which a smoother solves anew."""
         return {
-            "class": type(self).__name__,
+            "estimator": type(self).__name__,
             "first_pose": self._first.copy(),
             "events": np.array(self._events, dtype=np.float64).reshape(-1, 6),
             "landmark_ids": np.array(self.landmark_ids, dtype=np.int64),
@@ -166,14 +167,14 @@ class GtsamSlam(PeerSlam):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state: repeat its drive."""
         entries = ("first_pose", "events", "landmark_ids")
-        saved_states.refuse_other_state(
-            state, entries, **{"class": type(self).__name__}
-        )
-        ids = np.asarray(state["landmark_ids"]).tolist()
+        saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
+        ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
+        pose, std = saved_states.array("first_pose", state["first_pose"], (2, 3))
+        events = saved_states.array("events", state["events"], (-1, 6))
         self._slots = {i: slot for slot, i in enumerate(ids)}
-        self._start(*np.array(state["first_pose"], dtype=np.float64))
+        self._start(pose, std)
         rows: list[Array] = []
-        for event in np.array(state["events"], dtype=np.float64):
+        for event in events:
             if event[0] == MOVE:
                 self._move(event[1:3], event[3:])
             elif event[0] == READING:
@@ -212,9 +213,3 @@ class GtsamSlam(PeerSlam):
     @abstractmethod
     def _joint(self, keys: list[int]) -> tuple[Array, Any]:
         """Return the joint marginal of keys in GTSAM's coordinates, and about what."""
-
-
-def _rotation(angle: float) -> Array:
-    """Return the rotation of a pose by an angle, (3, 3), the heading left as it is."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

@@ -69,7 +69,7 @@ class KalmanPeer(PeerSlam):
     def state_dict(self) -> dict[str, Any]:
         """Return mean, covariance and the landmarks, as copies."""
         return {
-            "class": type(self).__name__,
+            "estimator": type(self).__name__,
             "mean": self._state.mean.copy(),
             "covariance": self._state.covariance.copy(),
             "landmark_ids": np.array(self.landmark_ids, dtype=np.int64),
@@ -78,15 +78,14 @@ class KalmanPeer(PeerSlam):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit."""
         entries = ("mean", "covariance", "landmark_ids")
-        saved_states.refuse_other_state(
-            state, entries, **{"class": type(self).__name__}
-        )
-        ids = np.asarray(state["landmark_ids"]).tolist()
-        self._slots = {i: slot for slot, i in enumerate(ids)}
+        saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
+        ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
+        size = 3 + 2 * len(ids)
         self._state = Moments(
-            np.array(state["mean"], dtype=np.float64),
-            np.array(state["covariance"], dtype=np.float64),
+            saved_states.array("mean", state["mean"], (size,)),
+            saved_states.array("covariance", state["covariance"], (size, size)),
         )
+        self._slots = {i: slot for slot, i in enumerate(ids)}
 
 
 def _with_landmarks(state: Moments, new: Readings) -> Moments:

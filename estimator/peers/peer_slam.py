@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
+from ..association.nearest_neighbour import Noise
 from ..belief import Belief
 from ..filters.motion_noise import MotionNoise
 from ..support import argument_checks
@@ -70,12 +71,9 @@ class PeerSlam(ABC):
         min_range: float = 1e-3,
     ) -> None:
         self._noise = MotionNoise.checked(motion_std, noise_at_rest)
-        self._sensor_std = argument_checks.standard_deviations(
-            "measurement_std", measurement_std, 2
-        )
-        self._growth = argument_checks.at_least(
-            "range_std_per_metre", range_std_per_metre, 0
-        )
+        std = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
+        growth = argument_checks.at_least("range_std_per_metre", range_std_per_metre, 0)
+        self._sensor = Noise(float(std[0]), float(std[1]), growth)
         self._min_range = argument_checks.above("min_range", min_range, 0)
         self._slots: dict[int, int] = {}
         self.reset(initial_pose, initial_pose_std)
@@ -117,7 +115,7 @@ class PeerSlam(ABC):
         usable = np.minimum(readings[:, 1], ranges) >= self._min_range
         known, new = np.flatnonzero(mapped & usable), np.flatnonzero(~mapped & usable)
         slots[new] = len(self._slots) + np.arange(len(new))
-        variances = self._variances(ranges)
+        variances = self._sensor.variances(ranges)
         innovation = self._take_in(
             Readings(readings[known], slots[known], variances[known]),
             Readings(readings[new], slots[new], variances[new]),
@@ -165,10 +163,6 @@ class PeerSlam(ABC):
         mean = self._mean()
         offsets = mean[3:].reshape(-1, 2)[slots] - mean[:2]
         return np.asarray(np.linalg.norm(offsets, axis=1))
-
-    def _variances(self, ranges: Array) -> Array:
-        bearing = np.full_like(ranges, self._sensor_std[0])
-        return np.stack([bearing, self._sensor_std[1] + self._growth * ranges], 1) ** 2
 
     def __repr__(self) -> str:
         return f"{type(self).__name__} with {len(self._slots)} landmarks"

@@ -11,7 +11,7 @@ from ..filters.motion_noise import MotionNoise
 from ..kernels.predict import predict
 from ..kernels.rules import AT_ESTIMATE
 from ..models.angles import wrap_angle
-from ..models.rigid_motion import rotation
+from ..models.rigid_motion import pose_rotation
 from .drive import Motion
 
 
@@ -62,8 +62,7 @@ def _between(first: Array, last: Array, motion: Motion, noise: MotionNoise) -> A
     """Return the poses after the readings of one motion, shape (P, 3)."""
     if len(motion.steps) == 1:
         return last[None]
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(first[2])
+    turn = pose_rotation(first[2])
     gap = turn.T @ (last - first) - motion.increment
     gap[2] = wrap_angle(gap[2])
     pull = np.linalg.pinv(motion.covariance, hermitian=True) @ gap
