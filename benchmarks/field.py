@@ -133,10 +133,14 @@ def drive(
     runs = simulate_runs(world, 1, seed)
     slams = {c.label: made(c, world, runs.initial_poses[0]) for c in choices}
     times: dict[str, list[float]] = {label: [] for label in slams}
+    rng = np.random.default_rng(
+        seed
+    )  # of the order, so that all have cold caches alike
     for step in range(steps + 1):
         seen = np.flatnonzero(runs.visible[0, step])
         readings, ids = runs.measurements[0, step, seen], seen.tolist()
-        for label, slam in slams.items():
+        for label in rng.permutation(list(slams)).tolist():
+            slam = slams[label]
             began = thread_time()
             if step:
                 slam.predict(runs.odometry[0, step])
