@@ -135,7 +135,7 @@ def drive(
     times: dict[str, list[float]] = {label: [] for label in slams}
     rng = np.random.default_rng(
         seed
-    )  # of the order, so that all have cold caches alike
+    )  # of the order, for equally cold caches
     for step in range(steps + 1):
         seen = np.flatnonzero(runs.visible[0, step])
         readings, ids = runs.measurements[0, step, seen], seen.tolist()
