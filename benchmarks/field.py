@@ -133,9 +133,7 @@ def drive(
     runs = simulate_runs(world, 1, seed)
     slams = {c.label: made(c, world, runs.initial_poses[0]) for c in choices}
     times: dict[str, list[float]] = {label: [] for label in slams}
-    rng = np.random.default_rng(
-        seed
-    )  # of the order, for equally cold caches
+    rng = np.random.default_rng(seed)  # of the order, for equally cold caches
     for step in range(steps + 1):
         seen = np.flatnonzero(runs.visible[0, step])
         readings, ids = runs.measurements[0, step, seen], seen.tolist()
