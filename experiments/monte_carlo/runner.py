@@ -20,6 +20,7 @@ from ...evaluation.error_bound import PosteriorBound
 from ...sim_configs import Scenario, load_scenario
 from ..runs.blas_threads import one_blas_thread
 from ..runs.filter_settings import FilterSettings
+from ..runs.integers import integer
 from ..runs.simulated_runs import SimulatedRuns, simulate_runs
 from .measure.association_measures import KNOWN_IDS_ATE, known_ids_errors
 from .measure.bounds import bound_runs, noise_of_runs
@@ -29,7 +30,7 @@ from .measure.run_measures import Block, measure_runs
 from .store.job_folder import RESULTS
 from .store.result_blocks import BlockFolder, Job, Span
 from .store.results import dataset_of, load_results, write_results
-from .workers import Workers, engage_workers, integer, saying_what_is_kept
+from .workers import Workers, engage_workers, saying_what_is_kept
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -9,13 +9,13 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 import psutil
 from joblib import Parallel, effective_n_jobs, parallel_config
 from joblib.parallel import BACKENDS as KNOWN_BACKENDS
 from joblib.parallel import get_active_backend
 
 from ...sim_configs.scenario_errors import unknown_choice
+from ..runs.integers import integer
 
 Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed
 Workers = Callable[[Iterable[Call]], Iterable[Any]]
@@ -23,7 +23,6 @@ Workers = Callable[[Iterable[Call]], Iterable[Any]]
 BACKENDS = ("loky", "threading", "dask", "ray")
 _PATIENCE = 0.5
 """How long a worker lives on without the process that engaged it [s]."""
-_LARGEST = 2**63  # of the integers in a file of results
 
 
 def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
@@ -50,14 +49,6 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
     if backend is None and effective_n_jobs(jobs) == 1:
         return None
     return _joblib_workers(jobs, backend)
-
-
-def integer(name: str, value: int, least: int) -> int:
-    """Check an integer, and return it as int."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not (whole and least <= value < _LARGEST):
-        raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
-    return int(value)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from ...envs.controllers import CONTROLLERS
 from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_errors import unknown_choice
+from ..runs.integers import integer
 from .dataset import is_whole
 from .formats import TrajectoryFormat, trajectory_format
 from .manifest import (
@@ -100,10 +101,11 @@ def generate_trajectories(
         If a file cannot be written, or a worker is killed.
     """
     world = load_scenario(scenario)
-    _check_numbers(episodes=(episodes, 1), seed=(seed, 0))
+    episodes, seed = integer("episodes", episodes, 1), integer("seed", seed, 0)
+    integer("the seed of the last episode", seed + episodes - 1, 0)
     if episodes_per_shard is None:
         episodes_per_shard = default_episodes_per_shard(world)
-    _check_numbers(episodes_per_shard=(episodes_per_shard, 1))
+    episodes_per_shard = integer("episodes_per_shard", episodes_per_shard, 1)
     if controller not in CONTROLLERS:
         raise ValueError(unknown_choice("controller", controller, CONTROLLERS))
     layout = trajectory_format(format)
@@ -150,12 +152,6 @@ def default_episodes_per_shard(scenario: Scenario) -> int:
     """
     row = 25 * count_rows(scenario) + 57  # bytes of one moment
     return int(max(1, min(_MOST_EPISODES, _MOST_MEMORY // (row * scenario.steps))))
-
-
-def _check_numbers(**numbers: tuple[int, int]) -> None:
-    for name, (value, least) in numbers.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
 
 
 def _continue(

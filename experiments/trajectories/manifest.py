@@ -19,6 +19,7 @@ from ... import __version__
 from ...sim_configs import Scenario
 from ...sim_configs.atomic_file import replace_when_written
 from ...sim_configs.scenario_files import scenario_text
+from ..runs.integers import integer
 from .trajectory import scenario_from_text
 
 MANIFEST = "manifest.json"
@@ -185,7 +186,7 @@ def _manifest(table: dict[str, Any]) -> Manifest:
     scenario = scenario_from_text(_text(table["job"], "scenario"))
     job = Job(**{**table["job"], "scenario": scenario})
     for name, least in {"seed": 0, "episodes": 1, "episodes_per_shard": 1}.items():
-        _refuse_number(name, getattr(job, name), least)
+        integer(name, getattr(job, name), least)
     _text(table["job"], "controller")
     _text(table["job"], "format")
     return Manifest(
@@ -198,8 +199,8 @@ def _manifest(table: dict[str, Any]) -> Manifest:
 def _shard(table: dict[str, Any]) -> ShardEntry:
     _text(table, "sha256")
     entry = ShardEntry(**table)
-    _refuse_number("first_episode", entry.first_episode, 0)
-    _refuse_number("episodes", entry.episodes, 0)
+    integer("first_episode", entry.first_episode, 0)
+    integer("episodes", entry.episodes, 0)
     return entry
 
 
@@ -207,11 +208,6 @@ def _text(table: dict[str, Any], name: str) -> str:
     if not isinstance(table[name], str):
         raise ValueError(f"{name} must be text, got {table[name]!r}")
     return str(table[name])
-
-
-def _refuse_number(name: str, value: object, least: int) -> None:
-    if type(value) is not int or not least <= value < 2**63:
-        raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
 
 
 def checksum(path: Path) -> str:

@@ -487,6 +487,8 @@ def test_a_second_writer_is_refused(tmp_path):
         ({"episodes": 0}, "episodes must be an integer >= 1, got 0"),
         ({"episodes": True}, "episodes must be an integer >= 1, got True"),
         ({"seed": -1}, "seed must be an integer >= 0, got -1"),
+        ({"seed": 2**63}, "seed must be at most 9223372036854775807, got 92"),
+        ({"seed": 2**63 - 1}, "the seed of the last episode must be at most 9223"),
         ({"episodes_per_shard": 0}, "episodes_per_shard must be an integer >= 1"),
         ({"scenario": "hidden_identities", "format": "g2o"}, "needs sensor.identities"),
     ],
