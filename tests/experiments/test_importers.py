@@ -420,6 +420,10 @@ NOISE_OF_INFORMATION = [
         "VERTEX2 0 0 0 0\nEDGE2 0 1 0 1 0.5 400 0 2500 10000 0 0\n"
         "LANDMARK 1 2 3 4 10 0 10\n"
     ),
+    (
+        "VERTEX2\t0\t0\t0\t0\nEDGE2\t0\t1\t0\t1\t0.5\t400\t0\t2500\t10000\t0\t0\n"
+        "LANDMARK\t1\t2\t3\t4\t10\t0\t10\n"
+    ),
     # g2o: information in the frame of the second pose
     (
         f"EDGE_SE2 0 1 1 0 {math.pi / 2} 400 0 0 2500 0 10000\n"

@@ -51,7 +51,7 @@ def noise_header(graph: Graph, chain: Sequence[LogLine]) -> dict[str, str]:
     LogError
         If a line has no information, or a singular or indefinite one.
     """
-    is_toro = any(line.text.startswith("VERTEX2 ") for line in graph.vertices)
+    is_toro = any(line.text.split()[0] == "VERTEX2" for line in graph.vertices)
     motion = np.array([_motion_std(line, is_toro=is_toro) for line in chain])
     header = {"motion_std": numbers(*np.median(motion, axis=0))}
     are_alike = _alike(motion)
