@@ -1,10 +1,13 @@
 """Filters by the names that the user gives, with options in brackets."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from ...estimator.support.filter_labels import read_label
 from ..monte_carlo.measure.estimator_choices import estimator_choices
 from ..runs.filter_settings import FilterSettings
+from .option_values import assignments
 
 
 def chosen_filters(
@@ -43,6 +46,27 @@ def chosen_filters(
         )
         for choice in estimator_choices(estimators)
     }
+
+
+def with_options(label: str, texts: Sequence[str]) -> str:
+    """Write options of all filters, as "key=value", into the brackets of one label.
+
+    Examples
+    --------
+    >>> with_options("ekf[iterations=3]", ["iterations=1", "landmark_init=full"])
+    'ekf[iterations=3,landmark_init="full"]'
+    """
+    _, own = read_label(label)
+    given = assignments("--option", texts)
+    more = [
+        f"{key}={json.dumps(value)}" if isinstance(value, str) else text
+        for text, (key, value) in zip(texts, given.items(), strict=True)
+        if key not in own
+    ]
+    if not more:
+        return label
+    name, _, inside = label.removesuffix("]").partition("[")
+    return f"{name}[{','.join([inside, *more] if own else more)}]"
 
 
 def tested_filters(labels: Sequence[str]) -> list[str]:

@@ -42,7 +42,7 @@ def run(
     """
     from ...sim_configs import save_scenario
     from ..runs.filter_settings import settings_for_scenario
-    from .chosen_filters import chosen_filters, tested_filters
+    from .chosen_filters import chosen_filters, tested_filters, with_options
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
     from .run_files import check_rerun, filter_and_write, show_run
@@ -72,9 +72,12 @@ def run(
             rerun=rerun,
         )
     show_run(summary, place, reporter)
-    tested = tested_filters([*filters])
-    command = ["slamgym", "monte-carlo", scenario, *(f"--set={s}" for s in set_ or ())]
+    changed = [f"--set={change}" for change in set_ or ()]
+    if steps is not None:
+        changed.append(f"--steps={steps}")
+    tested = tested_filters([with_options(label, option or ()) for label in filters])
+    test = ["slamgym", "monte-carlo", scenario, *changed, "-e", ",".join(tested)]
     reporter.show_verbatim(
         "\nOne run is no test of a filter: its errors depend on the noise. Test with\n"
-        f"{shlex.join([*command, '-e', ','.join(tested)])}"
+        f"{shlex.join(test)}"
     )

@@ -1,6 +1,7 @@
 import csv
 import json
 import os
+import shlex
 import subprocess
 import sys
 
@@ -14,6 +15,7 @@ from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments import figures
 from slamgym.experiments.command_line import reporter, run_files, tables, warm_up
 from slamgym.experiments.command_line.app import main
+from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
 
@@ -615,7 +617,20 @@ def test_a_run_fits_on_a_screen_whatever_the_map(
 
 def test_a_run_ends_with_the_command_that_tests_its_filter(without_pictures):
     last = printed("run", "loop", "--steps", 3).splitlines()[-1]
-    assert last == "slamgym monte-carlo loop -e ekf,invariant"
+    assert last == "slamgym monte-carlo loop --steps=3 -e ekf,invariant"
+
+
+def test_the_command_that_tests_a_filter_gives_it_the_options_of_the_run(
+    without_pictures,
+):
+    options = ("--option", "gate_probability=0.9", "--option", "landmark_init=full")
+    filters = "ekf[gate_probability=0.8],invariant"
+    text = printed("run", "six_landmarks", "--steps", 3, "-e", filters, *options)
+    *_, names = shlex.split(text.splitlines()[-1])
+    assert [(each.name, each.options) for each in estimator_choices(names)] == [
+        ("ekf", {"gate_probability": 0.8, "landmark_init": "full"}),
+        ("invariant", {"gate_probability": 0.9, "landmark_init": "full"}),
+    ]
 
 
 def test_the_worst_landmarks_of_a_large_map_are_shown():
