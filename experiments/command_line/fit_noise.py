@@ -62,9 +62,9 @@ def fit_noise(
     from ..logs.anonymous import without_identities
     from ..noise_fitting.header import refuse_other_formats, write_noise
     from ..runs.filter_settings import noise_or_assumed, settings_for
+    from .log_files import note_choices, read_any_log
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
-    from .run_files import note_choices, read_any_log
 
     reporter = Reporter(as_json=as_json)
     drive = read_any_log(log, robot, truth=truth, noise_from_file=noise_from_file)

@@ -77,8 +77,8 @@ def noise_study(
     """
     from ..noise_study.one_run import study_log, study_scenario
     from ..runs.filter_settings import settings_for, settings_for_scenario
+    from .log_files import read_any_log
     from .reporter import Reporter
-    from .run_files import read_any_log
     from .scenario_options import chosen_controller, chosen_scenario, recorded
 
     chosen = assignments("--option", option)

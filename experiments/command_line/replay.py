@@ -80,15 +80,10 @@ def replay(
     from ..logs.anonymous import without_identities
     from ..runs.filter_settings import settings_for
     from .chosen_filters import chosen_filters
+    from .log_files import note_choices, read_any_log
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
-    from .run_files import (
-        check_rerun,
-        filter_and_write,
-        note_choices,
-        read_any_log,
-        show_run,
-    )
+    from .run_files import check_rerun, filter_and_write, show_run
 
     named = {
         "landmark_init": landmark_init,

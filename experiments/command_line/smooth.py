@@ -46,9 +46,9 @@ def smooth(
     from ..figures import save_figure, smoothed_figure
     from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
     from ..runs.log_smoothing import smooth_log, summarise_smoothing
+    from .log_files import note_choices, read_any_log
     from .output_folder import default_folder, output_folder, write_summary
     from .reporter import Reporter
-    from .run_files import note_choices, read_any_log
     from .tables import heading, smoothing_figures, smoothing_table, written
 
     name, own = read_label(estimator)
