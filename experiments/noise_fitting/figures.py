@@ -27,7 +27,7 @@ def noise_fit_figure(fit: NoiseFit) -> Figure:
         The fit.
     """
     stages: list[tuple[str, Fitted]] = [("before", fit.before), ("fitted", fit.fitted)]
-    if fit.suggested.settings != fit.fitted.settings:
+    if fit.suggested is not fit.fitted:
         stages.append(("suggested", fit.suggested))
     figure = new_figure(4.0 * len(stages), 5.2)
     axes = figure.subplots(2, len(stages), sharex=True, sharey=True, squeeze=False)

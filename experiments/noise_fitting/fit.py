@@ -59,7 +59,8 @@ class NoiseFit:
     fitted: Fitted
     """With the most likely noise."""
     suggested: Fitted
-    """The same, the noise of the sensor inflated where innovations are not white."""
+    """The same, the noise of the sensor inflated where innovations are not white; where
+    all are white, it is `fitted` itself."""
     calibration: Calibration | None
     """The factor of the sensor's noise at which the pose NEES is 1 per degree of
     freedom; None if the truth is unknown."""
@@ -133,7 +134,8 @@ def fit_noise(
         bearing, distance = fitted.whiteness
         inflated[[BEARING, IN_METRES]] *= bearing.inflation
         inflated[[RANGE, PER_METRE]] *= distance.inflation
-        suggested = _fitted(likelihood, settings, inflated)
+        same = np.array_equal(inflated, noise)
+        suggested = fitted if same else _fitted(likelihood, settings, inflated)
         calibration = calibrate(likelihood, log, timed.times, noise)
     steps = np.diff(timed.events.first_readings)
     return NoiseFit(

@@ -37,7 +37,8 @@ def summarise_fit(fit: NoiseFit, *, progress: Progress | None = None) -> dict[st
     for done, stage in enumerate(STAGES):
         if progress is not None:
             progress(done, len(STAGES))
-        runs[stage] = _run(fit, getattr(fit, stage))
+        is_known = stage == "suggested" and fit.suggested is fit.fitted
+        runs[stage] = runs["fitted"] if is_known else _run(fit, getattr(fit, stage))
     bearing, distance = fit.fitted.whiteness
     return {
         "slamgym": __version__,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import lfilter
+from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from slamgym.envs.controllers import OpenLoop
@@ -26,6 +27,7 @@ from slamgym.experiments.noise_fitting import (
     write_noise,
 )
 from slamgym.experiments.noise_fitting.calibration import nees_bounds
+from slamgym.experiments.noise_fitting.inflation import positive_sum
 from slamgym.experiments.noise_fitting.likelihood import LogLikelihood
 from slamgym.experiments.noise_fitting.log_events import events_of, parts_of
 from slamgym.experiments.noise_fitting.noise_vector import noise_of
@@ -114,6 +116,9 @@ def test_a_noise_of_zero_has_one_bound_from_any_start():
 
 def test_white_innovations_suggest_no_inflation(example):
     assert example.suggested.settings == example.fitted.settings
+    assert example.suggested is example.fitted
+    runs = summarise_fit(example)["runs"]
+    assert runs["suggested"] is runs["fitted"]
 
 
 def test_the_calibration_makes_the_nees_one_and_has_an_interval(example):
@@ -142,6 +147,18 @@ def test_the_bounds_hold_the_mean_nees_of_correlated_errors(memory):
     assert held >= 181
     together = (1 + memory**2) / (1 - memory**2)
     assert np.median(widths) < 1.2 * 2 * 1.96 * np.sqrt(2 / 3 * together / 400)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 64, 401])
+def test_the_bounds_are_those_of_the_products_of_all_lags(count):
+    rng = np.random.default_rng(4)
+    nees = lfilter([1.0], [1.0, -0.8], rng.chisquare(3, count))
+    excess = nees - 3
+    products = [excess[k:] @ excess[:-k] for k in range(1, count // 2)]
+    together = 1 + 2 * positive_sum(np.array(products) / (6 * count))
+    degrees = max(3.0, 3 * count / together)
+    expected = chi2.ppf([0.025, 0.975], degrees) / degrees
+    assert nees_bounds(nees) == pytest.approx(expected)
 
 
 @pytest.mark.slow
