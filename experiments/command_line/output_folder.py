@@ -120,9 +120,14 @@ def default_folder(*names: str) -> Path:
 
 def files_in(folder: Path) -> list[str]:
     """List the files below a folder but its lock, by their relative paths, sorted."""
-    files = (entry for entry in folder.rglob("*") if not entry.is_dir())
-    names = {file.relative_to(folder).as_posix() for file in files}
-    return sorted(names - {WRITER})
+    return sorted(set(_files_below(folder)) - {WRITER})
+
+
+def _files_below(folder: Path) -> Iterator[str]:
+    """Yield the relative paths of the files below a folder, its lock among them."""
+    for entry in folder.rglob("*"):
+        if not entry.is_dir():
+            yield entry.relative_to(folder).as_posix()
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
@@ -149,9 +154,8 @@ def _refuse_foreign_files(path: Path) -> None:
     if not path.is_dir():
         raise BadInputError(f"--out must be a folder, got the file {path}")
     own = {*_listed_in_summary(path), WRITER}
-    files = (entry for entry in path.rglob("*") if not entry.is_dir())
-    names = (file.relative_to(path).as_posix() for file in files)
-    foreign = next((name for name in names if name not in own), None)  # of many files
+    files = _files_below(path)  # perhaps very many
+    foreign = next((name for name in files if name not in own), None)
     if foreign is not None:
         raise BadInputError(
             f"{path} holds {foreign}, which slamgym did not write there: "

@@ -47,7 +47,7 @@ def truth_figure(trace: RunTrace, walls: Walls = ()) -> Figure:
         raise ValueError("trace must have true poses or true landmarks, got neither")
     limits = truth_limits(trace, walls)
     width, height = limits[1] - limits[0]
-    distances = _landmark_distances(trace, landmarks) if landmarks.any() else None
+    distances = distances_from_truth(trace)
     if distances is None:
         figure = style.new_figure(7.2, 6.2 * height / width + 1.5)
         area = figure.add_subplot()
@@ -123,7 +123,11 @@ def _join(axes: Axes, estimates: Array, truth: Array, *, width: float) -> None:
     axes.add_collection(lines, autolim=False)
 
 
-def _landmark_distances(trace: RunTrace, known: BoolArray) -> LandmarkDistances:
+def distances_from_truth(trace: RunTrace) -> LandmarkDistances | None:
+    """Return the distances of the landmarks with known truth; None if there is none."""
+    known = _known(trace.true_landmarks)
+    if not known.any():
+        return None
     truth = np.asarray(trace.true_landmarks)[known]
     return landmark_distances(
         trace.landmarks[known], trace.landmark_covariances[known], truth

@@ -6,10 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...arrays import Array
-from ...evaluation.trajectory_error import landmark_distances
 from ..runs.trace import RunTrace
 from . import style
-from .accuracy import draw_against_truth, truth_limits
+from .accuracy import distances_from_truth, draw_against_truth, truth_limits
 from .walls import Walls, draw_walls
 
 _COLUMNS = 2
@@ -58,27 +57,19 @@ def comparison_figure(traces: Sequence[RunTrace], walls: Walls = ()) -> Figure:
 
 def honesty(trace: RunTrace) -> str:
     """Write how many true landmarks lie inside their 3σ ellipses, and the error."""
-    if trace.true_landmarks is None:
+    distances = distances_from_truth(trace)
+    if distances is None:
         return f"{len(trace.landmarks)} landmarks"
-    known = np.isfinite(trace.true_landmarks).all(axis=1)
-    if not known.any():
-        return f"{len(trace.landmarks)} landmarks"
-    distances = landmark_distances(
-        trace.landmarks[known],
-        trace.landmark_covariances[known],
-        trace.true_landmarks[known],
-    )
+    count = len(distances.euclidean)
     inside = int((distances.mahalanobis <= 3).sum())
     rms = np.sqrt(np.mean(distances.euclidean**2))
-    return (
-        f"{inside} of {known.sum()} landmarks inside 3σ  ·  map error {rms:.2g} m RMS"
-    )
+    return f"{inside} of {count} landmarks inside 3σ  ·  map error {rms:.2g} m RMS"
 
 
 def _common_limits(traces: Sequence[RunTrace], walls: Walls) -> Array:
-    low, high = truth_limits(traces[0], walls)
-    room = 0.5 * float((high - low).max())
     boxes = np.array([truth_limits(trace, walls) for trace in traces])
+    low, high = boxes[0]
+    room = 0.5 * float((high - low).max())
     return np.stack(
         [
             np.maximum(boxes[:, 0].min(axis=0), low - room),

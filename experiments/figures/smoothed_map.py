@@ -5,7 +5,8 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
 from ...arrays import Array
-from ...evaluation.trajectory_error import poses_at
+from ...estimator.models.rigid_motion import rotation
+from ...evaluation.trajectory_error import PositionAccuracy, poses_at
 from ..logs.ground_truth import path_accuracy
 from ..runs.log_smoothing import SmoothedLog
 from . import style
@@ -51,40 +52,37 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
     )
     axes.plot(*drive.landmarks.T, ".", color=TEAL, ms=3)
     keys: list[Artist] = [path, filtered, _POSE.legend_key(), _LANDMARK.legend_key()]
-    truth = _truth_beside(smoothed)
+    accuracy = path_accuracy(smoothed.log, trace.t, smoothed.poses)
+    truth = _truth_beside(smoothed, accuracy)
     if truth is not None:
         (line,) = axes.plot(*truth.T, "--", color=INK, lw=0.9, label="ground truth")
         keys.insert(0, line)
-    write_title(axes, f"{smoothed.log.name}, smoothed", _subtitle(smoothed))
+    write_title(axes, f"{smoothed.log.name}, smoothed", _subtitle(smoothed, accuracy))
     style.legend_below(figure, keys, columns=3)
     return figure
 
 
-def _truth_beside(smoothed: SmoothedLog) -> Array | None:
+def _truth_beside(
+    smoothed: SmoothedLog, accuracy: PositionAccuracy | None
+) -> Array | None:
     """Return the true path moved onto the smoothed one, (m, 2), or None."""
-    log, times = smoothed.log, smoothed.filtered.trace.t
-    accuracy = path_accuracy(log, times, smoothed.poses)
     if accuracy is None:
         return None
-    truth = log.ground_truth
+    truth, times = smoothed.log.ground_truth, smoothed.filtered.trace.t
     inside = np.isfinite(
         poses_at(truth[:, 0], np.column_stack([times, smoothed.poses]))
     ).all(axis=1)
     angle, shift = accuracy.alignment
-    cos, sin = np.cos(angle), np.sin(angle)
-    back = np.array([[cos, -sin], [sin, cos]])
-    return np.asarray((truth[inside, 1:3] - shift) @ back)
+    return np.asarray((truth[inside, 1:3] - shift) @ rotation(angle))
 
 
-def _subtitle(smoothed: SmoothedLog) -> str:
-    drive = smoothed.drive
+def _subtitle(smoothed: SmoothedLog, accuracy: PositionAccuracy | None) -> str:
+    drive, trace = smoothed.drive, smoothed.filtered.trace
     parts = [f"{len(drive.poses)} poses, {len(drive.landmarks)} landmarks"]
-    accuracies = (
-        path_accuracy(smoothed.log, smoothed.filtered.trace.t, poses)
-        for poses in (smoothed.poses, smoothed.filtered.trace.poses)
-    )
-    errors = [each.aligned_rmse for each in accuracies if each is not None]
-    if errors:
-        smoother, filtered = errors
-        parts.append(f"path error, aligned: {smoother:.3g} m, filter {filtered:.3g} m")
+    filtered = path_accuracy(smoothed.log, trace.t, trace.poses)
+    if accuracy is not None and filtered is not None:
+        parts.append(
+            f"path error, aligned: {accuracy.aligned_rmse:.3g} m, "
+            f"filter {filtered.aligned_rmse:.3g} m"
+        )
     return "  ·  ".join(parts)

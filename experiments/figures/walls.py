@@ -8,10 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from ...arrays import Array
+from ...envs.rendering.artists import WALL
 
 Walls = Sequence[Sequence[float]]
 """Rows (x0, y0, x1, y1) [m]."""
-_COLOUR = "#6b5a4e"
 
 
 def wall_ends(walls: Walls) -> Array:
@@ -25,7 +25,7 @@ def draw_walls(axes: Axes, walls: Walls) -> list[Artist]:
         return []
     lines = LineCollection(
         list(wall_ends(walls).reshape(-1, 2, 2)),
-        colors=_COLOUR,
+        colors=WALL,
         linewidths=2.2,
         capstyle="round",
         zorder=1.5,

@@ -140,11 +140,9 @@ def settings_for(
     name, own = read_label(estimator)
     estimator = OFFLINE.get(name, name)
     factory = registry.find_estimator(estimator)
-    header = dict(log.header)
+    header = _noise_header(log)
     if measurement_std is not None:
         header.pop("bearing_std_metres", None)
-    if header.get("source") == _COURSE_SOURCE:
-        header = {**_COURSE_NOISE, **header}
     return FilterSettings(
         estimator=estimator,
         motion_std=_std(log.name, header, "motion_std", motion_std),
@@ -169,9 +167,7 @@ def noise_or_assumed(
     Warns with the values: those of a car with a laser scanner, per √s, which are larger
     than those of most robots.
     """
-    known = {**log.header, **stds}
-    if log.header.get("source") == _COURSE_SOURCE:
-        return dict(stds)
+    known = {**_noise_header(log), **stds}
     missing = {key: std for key, std in _ASSUMED_NOISE.items() if key not in known}
     for key, std in missing.items():
         values = ",".join(map(str, std))
@@ -202,6 +198,12 @@ def settings_for_scenario(
     """
     log = SlamLog(scenario.name, log_header(scenario, seed=0))
     return settings_for(log, estimator=estimator, options=options)
+
+
+def _noise_header(log: SlamLog) -> dict[str, str]:
+    """Return the header of a log; that of the course log with its published noise."""
+    is_course = log.header.get("source") == _COURSE_SOURCE
+    return {**(_COURSE_NOISE if is_course else {}), **log.header}
 
 
 def _std(

@@ -12,7 +12,6 @@ from ...arrays import Array, IntArray
 from ...estimator.smoother import SmoothedDrive
 from ...estimator.smoother.within import smoother_in
 from ...evaluation import nees
-from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
 from ..logs.slamlog import SlamLog
 from ..logs.steps import predictions, steps_of
@@ -20,7 +19,14 @@ from .blas_threads import one_blas_thread
 from .filter_settings import FilterSettings
 from .log_replay import Progress, Replay, replay
 from .nan_statistics import finite
-from .summary import map_accuracy, nees_summary, rmse_table, settings_table
+from .summary import (
+    accuracy_of,
+    map_accuracy,
+    nees_summary,
+    nees_table,
+    rmse_table,
+    settings_table,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +105,7 @@ def summarise_smoothing(
         of ``filter`` and ``smoother``, None if the truth is unknown.
     """
     log, trace, drive = smoothed.log, smoothed.filtered.trace, smoothed.drive
+    true_landmarks = true_landmarks_of(log, drive.landmark_ids, drive.landmarks)
     return {
         "slamgym": __version__,
         "log": log.name,
@@ -121,7 +128,7 @@ def summarise_smoothing(
         },
         "landmark_rmse": {
             "filter": rmse_table(map_accuracy(trace)),
-            "smoother": rmse_table(_map_accuracy(smoothed)),
+            "smoother": rmse_table(accuracy_of(drive.landmarks, true_landmarks)),
         },
         "nees": {"filter": nees_summary(trace), "smoother": _nees(smoothed)},
     }
@@ -134,15 +141,6 @@ def _readings_until(log: SlamLog) -> IntArray:
         for step in steps_of(log)
     ]
     return np.cumsum(counts, dtype=np.int64)
-
-
-def _map_accuracy(smoothed: SmoothedLog) -> PositionAccuracy | None:
-    drive = smoothed.drive
-    truth = true_landmarks_of(smoothed.log, drive.landmark_ids, drive.landmarks)
-    if truth is None:
-        return None
-    known = np.isfinite(truth).all(axis=1)
-    return position_accuracy(drive.landmarks[known], truth[known])
 
 
 def _nees(smoothed: SmoothedLog) -> dict[str, Any] | None:
@@ -160,11 +158,4 @@ def _nees(smoothed: SmoothedLog) -> dict[str, Any] | None:
         drive.pose_covariances[known],
         frame="invariant",
     )
-    values = values[np.isfinite(values)]
-    return {
-        "mean": finite(values.mean()),
-        "degrees_of_freedom": 3,
-        "per_degree": finite(values.mean() / 3),
-        "steps": len(values),
-        "frame": "invariant",
-    }
+    return nees_table(values, "invariant")

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from ... import __version__
 from ...arrays import Array
+from ...estimator.error_frames import ErrorFrame
 from ...evaluation import nees
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
 from ..logs.anonymous import hides_identities
@@ -174,16 +175,23 @@ def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
         filter's own. None if it is defined nowhere.
     """
     values = pose_nees(trace)
-    known = np.isfinite(values)
-    if not known.any():
+    table = nees_table(values, trace.frame)
+    if table is None:
+        return None
+    return {"mean": table["mean"], "final": finite(values[-1]), **table}
+
+
+def nees_table(values: Array, frame: ErrorFrame) -> dict[str, Any] | None:
+    """Write NEES of the pose (K,), as `nees_summary` does, without the final one."""
+    known = values[np.isfinite(values)]
+    if not len(known):
         return None
     return {
-        "mean": finite(values[known].mean()),
-        "final": finite(values[-1]),
+        "mean": finite(known.mean()),
         "degrees_of_freedom": 3,
-        "per_degree": finite(values[known].mean() / 3),
-        "steps": int(known.sum()),
-        "frame": trace.frame,
+        "per_degree": finite(known.mean() / 3),
+        "steps": len(known),
+        "frame": frame,
     }
 
 
@@ -208,10 +216,15 @@ def pose_nees(trace: RunTrace) -> Array:
 
 def map_accuracy(trace: RunTrace) -> PositionAccuracy | None:
     """Compare the final map with the truth; None if it is unknown."""
-    if trace.true_landmarks is None:
+    return accuracy_of(trace.landmarks, trace.true_landmarks)
+
+
+def accuracy_of(landmarks: Array, truth: Array | None) -> PositionAccuracy | None:
+    """Compare landmarks (n, 2) with the truth, nan where unknown; None without it."""
+    if truth is None:
         return None
-    known = np.isfinite(trace.true_landmarks).all(axis=1)
-    return position_accuracy(trace.landmarks[known], trace.true_landmarks[known])
+    known = np.isfinite(truth).all(axis=1)
+    return position_accuracy(landmarks[known], truth[known])
 
 
 def settings_table(settings: FilterSettings) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...sim_configs.atomic_file import replace_when_written
+from ..logs.events import Scan
 from ..logs.slamlog import SlamLog
 from ..logs.steps import steps_of
 from ..runs.summary import pose_nees
@@ -77,11 +78,11 @@ def write_rerun(
         recording.send_recording_name(log.name)
         recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         _log_world(rerun, recording, log, walls)
+        scans = [step.scan for step in steps_of(log)]
+        steps = shown_steps([run.frames for run in runs])
         for number, run in enumerate(runs):
             colour = _COLOURS[number % len(_COLOURS)]
-            _Writer(rerun, recording, log, run, colour).write(
-                shown_steps([kept.frames for kept in runs])
-            )
+            _Writer(rerun, recording, scans, run, colour).write(steps)
         recording.flush()
         recording.disconnect()
 
@@ -105,11 +106,15 @@ class _Writer:
     """Log one filter's run."""
 
     def __init__(
-        self, rerun: Any, recording: Any, log: SlamLog, run: ViewedRun, colour: Any
+        self,
+        rerun: Any,
+        recording: Any,
+        scans: Sequence[Scan | None],
+        run: ViewedRun,
+        colour: Any,
     ) -> None:
         self._rerun, self._recording, self._run = rerun, recording, run
-        self._colour = colour
-        self._scans = [step.scan for step in steps_of(log)]
+        self._scans, self._colour = scans, colour
         self._name = rerun.escape_entity_path_part(run.trace.estimator)
 
     def write(self, steps: Sequence[int]) -> None:

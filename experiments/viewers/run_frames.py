@@ -143,8 +143,7 @@ def row_outcomes(
     if scan is None or report is None:
         return np.zeros(rows, np.uint8), np.full(rows, NO_ID)
     ids = _landmark_of_rows(scan, report)
-    by_id = dict.fromkeys(report.associated_ids, _USED)
-    by_id |= dict.fromkeys(report.added_ids, _NEW)
+    by_id = dict.fromkeys(report.added_ids, _NEW)
     by_id |= dict.fromkeys(report.rejected_ids, _REJECTED)
     by_id |= dict.fromkeys(report.skipped_ids, _SKIPPED)
     known = np.array([NO_ID if i is None else i for i in ids], np.int64)

@@ -78,7 +78,6 @@ def _page(log: SlamLog, runs: Sequence[ViewedRun], walls: list[list[float]]) -> 
     names = [run.trace.estimator for run in runs]
     facts = {
         "filters": names,
-        "frames": [run.trace.frame for run in runs],
         "unit": runs[0].trace.time_unit,
         "last": runs[0].trace.last_step,
         "outcomes": OUTCOMES,
@@ -178,7 +177,6 @@ def _pack_poses(
     dof = trace.nis_dof[steps]
     known = np.where(dof > 0, dof, np.nan)
     packed.put(f"{prefix}nis", trace.nis[steps] / known, "float32")
-    packed.put(f"{prefix}nis_dof", dof, "int32")
     for name, bound in zip(("low", "high"), nis_band(dof, _SHARE), strict=True):
         packed.put(f"{prefix}nis_{name}", bound / known, "float32")
 

@@ -2,13 +2,14 @@
 
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 from typer.testing import CliRunner
 
-from slamgym.estimator.smoother import Drive, smooth
+from slamgym.estimator.smoother import Drive, SmoothedDrive, smooth
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.logs.events import OdometryRow, Scan
 from slamgym.experiments.logs.slamlog import SlamLog, write_slamlog
@@ -63,6 +64,22 @@ def test_the_smoother_is_closer_to_the_truth_than_the_filter(example):
     assert 0.2 < summary["nees"]["smoother"]["per_degree"] < 3
     assert summary["poses"] == 31
     assert summary["readings"] == 30 * 6
+
+
+def test_poses_that_are_certain_have_no_nees(example, monkeypatch):
+    certain = np.zeros_like(example.drive.pose_covariances)
+    monkeypatch.setattr(SmoothedDrive, "pose_covariances", certain)
+    summary = summarise_smoothing(example)
+    assert summary["nees"]["smoother"] is None
+
+
+def test_no_known_true_heading_gives_no_nees(example):
+    log = example.log
+    unknown = log.ground_truth * [1, 1, 1, np.nan]
+    filtered = replace(example.filtered, log=replace(log, ground_truth=unknown))
+    summary = summarise_smoothing(replace(example, filtered=filtered))
+    assert summary["nees"]["smoother"] is None
+    assert summary["ate"]["smoother"]["raw"] > 0
 
 
 def test_every_step_of_the_log_has_a_pose(example):

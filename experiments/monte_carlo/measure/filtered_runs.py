@@ -1,6 +1,6 @@
 """Run one filter over many simulated runs: in a batch if possible, else one by one."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -129,7 +129,9 @@ def _one_by_one(
     try:
         slam = settings.make(runs.initial_poses[run])
         recorder = DecisionRecorder(slam)
+        pass_truth = _truth_source(slam, runs, run)
         for step in range(runs.visible.shape[1]):
+            pass_truth(step)
             belief = _step(slam, runs, run, step, trace, recorder)
             if not _finite(trace, (run, step)):
                 return Failure(step, _NOT_FINITE)
@@ -145,6 +147,20 @@ def _one_by_one(
     return None
 
 
+def _truth_source(
+    slam: SlamEstimator, runs: SimulatedRuns, run: int
+) -> Callable[[int], None]:
+    """Return the function that passes the truth of a step to an observing filter."""
+    if not isinstance(slam, SupportsTruth):
+        return _unobserved
+    landmarks = dict(enumerate(runs.landmarks[run]))
+    return lambda step: slam.observe_truth(runs.true_poses[run, step], landmarks)
+
+
+def _unobserved(_: int) -> None:
+    """Pass nothing."""
+
+
 def _step(
     slam: SlamEstimator,
     runs: SimulatedRuns,
@@ -153,9 +169,6 @@ def _step(
     trace: BatchTrace,
     recorder: DecisionRecorder,
 ) -> Belief:
-    if isinstance(slam, SupportsTruth):  # it linearises there (``ideal``)
-        landmarks = dict(enumerate(runs.landmarks[run]))
-        slam.observe_truth(runs.true_poses[run, step], landmarks)
     if step > 0:  # the first scan is before any motion
         slam.predict(runs.odometry[run, step], runs.dt[step])
     seen = np.flatnonzero(runs.visible[run, step])

@@ -39,10 +39,9 @@ const deviation = (code) => (code === NO_DEVIATION ? 0 : Math.exp(code / 2000));
 
 /** One filter's beliefs. */
 class FilterRun {
-  constructor(arrays, number, name, frame) {
+  constructor(arrays, number, name) {
     this.number = number;
     this.name = name;
-    this.frame = frame;
     this.array = (key) => arrays[`${number}.${key}`].values;
     this.starts = arrays[`${number}.id`].starts;
     this.columns = Object.fromEntries(
@@ -113,7 +112,7 @@ class Run {
     this.truth = { x: values("true.x"), y: values("true.y"), theta: values("true.theta") };
     const [ids, x, y] = [values("landmark.id"), values("landmark.x"), values("landmark.y")];
     this.landmarks = Array.from(ids, (id, i) => ({ id, x: x[i], y: y[i] }));
-    this.filters = facts.filters.map((name, i) => new FilterRun(arrays, i, name, facts.frames[i]));
+    this.filters = facts.filters.map((name, i) => new FilterRun(arrays, i, name));
     this.length = this.steps.length;
     this.hasTruth = this.truth.x.some((value) => !Number.isNaN(value));
   }

@@ -160,7 +160,7 @@ class MapView {
 
   draw(place, chosen) {
     const { context, width, height } = sharpen(this.canvas);
-    Object.assign(this, { context, width, place, palette: colours(this.filter.number) });
+    Object.assign(this, { context, palette: colours(this.filter.number) });
     const pose = this.filter.pose(place);
     const centre = this.camera.follows ? pose : this.camera;
     const scale = this.camera.scale(width, height);
