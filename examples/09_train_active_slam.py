@@ -48,11 +48,19 @@ from slamgym.agents.active_slam_scores import (
 from slamgym.envs.vector import FlattenBatch, to_stable_baselines
 
 FOLDER = Path("results/09_train_active_slam")
+SETTINGS: dict[str, Any] = {
+    "n_steps": 64,
+    "batch_size": 1024,
+    "n_epochs": 5,
+    "gamma": 0.995,
+    "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -0.5},
+}
+LEARNING_RATE = 5e-4  # falls to 0 in proportion to the steps left
 INK, PALE, RED = "#222222", "#bbbbbb", "#c0392b"
 
 
-def train(scenario: str, steps: int, worlds: int) -> list[dict[str, float]]:
-    """Train PPO, save the policy, and return the learning curve."""
+def make_learner(scenario: str, worlds: int, seed: int = 0) -> Any:
+    """Make PPO on worlds of the seeds from ``worlds * seed`` on."""
     import torch  # noqa: PLC0415 (an extra)
     from stable_baselines3 import PPO  # noqa: PLC0415
     from stable_baselines3.common.vec_env import VecMonitor  # noqa: PLC0415
@@ -60,18 +68,19 @@ def train(scenario: str, steps: int, worlds: int) -> list[dict[str, float]]:
     torch.set_num_threads(1)  # small networks: more threads wait for each other
     vector = ActiveSlamVectorEnv(worlds, scenario, autoreset_mode="SameStep")
     adapted = to_stable_baselines(FlattenBatch(vector))
-    model = PPO(
+    return PPO(
         "MlpPolicy",
         VecMonitor(adapted, info_keywords=("success",)),
-        learning_rate=lambda left: 5e-4 * left,
-        n_steps=64,
-        batch_size=1024,
-        n_epochs=5,
-        gamma=0.995,
-        policy_kwargs={"net_arch": [128, 128], "log_std_init": -0.5},
+        learning_rate=lambda left: LEARNING_RATE * left,
         device="cpu",
-        seed=0,
+        seed=worlds * seed,
+        **SETTINGS,
     )
+
+
+def train(scenario: str, steps: int, worlds: int) -> list[dict[str, float]]:
+    """Train PPO, save the policy, and return the learning curve."""
+    model = make_learner(scenario, worlds)
     curve: list[dict[str, float]] = []
     began = time.perf_counter()
 
