@@ -68,7 +68,7 @@ def save_actor(model: Any, path: Path) -> None:
     """Write the layers of a policy's mean action, and the limits of actions."""
     policy = model.policy
     linear = [*policy.mlp_extractor.policy_net, policy.action_net]
-    arrays: dict[str, NDArray[np.float32]] = {}
+    arrays: dict[str, Any] = {}
     for k, layer in enumerate(each for each in linear if hasattr(each, "weight")):
         arrays[f"weight_{k}"] = layer.weight.detach().numpy()
         arrays[f"bias_{k}"] = layer.bias.detach().numpy()
@@ -91,7 +91,7 @@ def load_actor(path: Path) -> Policy:
             hidden = np.tanh(weight @ hidden + bias)
         weight, bias = layers[-1]
         action = np.clip(weight @ hidden + bias, arrays["low"], arrays["high"])
-        return action.astype(np.float64)
+        return np.asarray(action, dtype=np.float64)
 
     return act
 
