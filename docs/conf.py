@@ -28,6 +28,7 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "written_pages",  # _ext/written_pages.py: pages made from the package itself
+    "site_checks",  # _ext/site_checks.py: links, anchors and public names
 ]
 exclude_patterns = ["_build", "_ext", "_templates", "tutorials", "**/GALLERY_HEADER.*"]
 suppress_warnings = ["config.cache"]  # functions among the settings below
@@ -47,7 +48,9 @@ html_theme_options = {
     "pygments_light_style": "tango",
     "pygments_dark_style": "monokai",
 }
+html_sidebars = dict.fromkeys(("index", "start", "consistency"), ())  # no subpages
 html_show_sourcelink = False
+toc_object_entries_show_parents = "hide"
 html_domain_indices = False
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "attrs_inline"]
@@ -57,7 +60,12 @@ autosummary_generate = True
 autosummary_ignore_module_all = False
 autodoc_inherit_docstrings = False
 autodoc_typehints = "none"  # the docstrings give types, shapes and units
-autodoc_default_options = {"members": True, "inherited-members": False}
+_OUTSIDE = ("BaseModel", "BaseException", "Env", "Generic", "Protocol", "VectorEnv")
+_OUTSIDE += ("VectorWrapper", "Wrapper", "tuple")
+autodoc_default_options = {
+    "members": True,
+    "inherited-members": ",".join(_OUTSIDE),  # but not those of these
+}
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = False
 intersphinx_mapping: dict[str, tuple[str, None]] = {}  # the build uses no network
@@ -89,6 +97,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_memory": False,
+    "capture_repr": (),
     "abort_on_example_error": True,
     "image_scrapers": (figures_of,),
     "default_thumb_file": str(HERE / "images/honest_ellipses.png"),

@@ -4,6 +4,7 @@ It writes into ``docs/generated``: a page per environment, the gallery of preset
 table of a scenario's fields, and the lists of public names.
 """
 
+import importlib
 import inspect
 import re
 from pathlib import Path
@@ -69,7 +70,7 @@ def write_pages(app: Sphinx, config: Config) -> None:
     listed = public_names()
     for package in status_iterator(listed, "listing public names … "):
         _write(folder / "api" / f"{package}.rst", names_page(package, listed[package]))
-    _write(folder / "api" / "index.rst", api_index(list(listed)))
+    _write(folder / "api" / "index.rst", api_index(listed))
     for name in ("CONVENTIONS", "CHANGELOG", "CONTRIBUTING"):
         text = (ROOT / f"{name}.md").read_text()
         _write(folder / f"{name.lower()}.md", text)
@@ -87,6 +88,7 @@ def environment_page(name: str, environment: type, preset: str) -> str:
     body, _, example = rest.partition("\nExamples\n--------\n")
     body = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"`\1`", body)
     body = re.sub(r"``", "`", body)
+    body = re.sub(r"(?<=## Arguments\n).*?(?=\n## |\Z)", _definitions, body, flags=re.S)
     return f"""# {name}
 
 {title}
@@ -113,6 +115,23 @@ env = gymnasium.make("slamgym/{name}-v0", scenario="{preset}")
 """
 
 
+def _definitions(arguments: re.Match[str]) -> str:
+    """Turn the arguments of a numpydoc docstring into a definition list."""
+    lines = []
+    for line in arguments.group().strip().splitlines():
+        if line.startswith(" "):
+            lines.append(line)
+            continue
+        name, _, kind = line.partition(" : ")
+        lines += ["", f"`{name}`" + f" ({kind})" * bool(kind)]
+    text = re.sub(r"\n    (\S)", r"\n: \1", "\n".join(lines))
+    return re.sub(r"(\n: [^\n]*(?:\n: [^\n]*)*)", _one_definition, text) + "\n"
+
+
+def _one_definition(lines: re.Match[str]) -> str:
+    return "\n: " + lines.group().replace("\n: ", "\n").strip().replace("\n", "\n  ")
+
+
 def public_names() -> dict[str, list[str]]:
     """Return the public names of each package; every object under one package only."""
     taken: set[int] = set()
@@ -133,9 +152,7 @@ def public_names() -> dict[str, list[str]]:
 def names_page(package: str, names: list[str]) -> str:
     """Return the page of a package: its docstring and a table of its names."""
     rule = "=" * len(package)
-    about = (inspect.getdoc(inspect.importlib.import_module(package)) or "").split(
-        "\n\n"
-    )[0]
+    about = (inspect.getdoc(importlib.import_module(package)) or "").split("\n\n")[0]
     environments = {cls.__name__: page for page, (cls, _) in ENVIRONMENTS.items()}
     rows = "\n".join(f"   {name}" for name in names if name not in environments)
     pages = "\n".join(
@@ -160,14 +177,21 @@ def names_page(package: str, names: list[str]) -> str:
 """
 
 
-def api_index(packages: list[str]) -> str:
+def api_index(listed: dict[str, list[str]]) -> str:
     """Return the page that lists the packages, and the names at the top."""
+    pages = {
+        id(getattr(importlib.import_module(package), name)): f"{package}.{name}"
+        for package, names in listed.items()
+        for name in names
+    }
     top = "\n".join(
-        f"* ``slamgym.{name}``"
+        f"* {_link(name, pages[id(thing)])}"
         for name in slamgym.__all__
-        if not inspect.ismodule(getattr(slamgym, name))
+        if not inspect.ismodule(thing := getattr(slamgym, name))
     )
-    rows = "\n".join(f"   {package}" for package in packages)
+    rows = "\n".join(
+        f"   {package.removeprefix('slamgym.')} <{package}>" for package in listed
+    )
     return f"""Public names
 ============
 
@@ -180,6 +204,13 @@ The names used most can be imported from ``slamgym`` itself:
 
 {rows}
 """
+
+
+def _link(name: str, page: str) -> str:
+    environments = {cls.__name__: page for page, (cls, _) in ENVIRONMENTS.items()}
+    if name in environments:
+        return f":doc:`slamgym.{name} <../{environments[name]}>`"
+    return f":py:obj:`slamgym.{name} <{page}>`"
 
 
 _OUTSIDE = re.compile(r"\[([^\]]+)\]\((?:\.\./)+([^)#\s]*)(#[^)]*)?\)")
