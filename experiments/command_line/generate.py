@@ -46,6 +46,15 @@ def generate(
             "0.001",
         ),
     ] = None,
+    estimator: Annotated[
+        str | None,
+        options.option(
+            "--estimator -e NAME",
+            "A filter whose beliefs after every scan are written beside the truth "
+            "(npz, parquet and minari).",
+            "none",
+        ),
+    ] = None,
     jobs: options.Jobs = None,
     backend: options.Backend = None,
     scheduler: options.Scheduler = None,
@@ -74,6 +83,7 @@ def generate(
     slamgym generate loop --episodes 1000
     slamgym generate corridor --episodes 50 --controller random --format parquet
     slamgym generate loop --episodes 100000 --jobs -1
+    slamgym generate hidden_identities --episodes 100 --estimator invariant
     slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]
     """
     from ..trajectories import generate_trajectories
@@ -100,6 +110,7 @@ def generate(
             format=format_,
             episodes_per_shard=shard,
             smallest_std=smallest_std,
+            estimator=estimator,
             jobs=jobs,
             backend=backend,
             progress=tick,

@@ -9,31 +9,31 @@ from reprlib import repr as short_repr
 from typing import TYPE_CHECKING
 
 from ...envs.controllers import CONTROLLERS
-from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_errors import unknown_choice
 from ..runs.integers import integer
 from .dataset import is_whole
-from .formats import TrajectoryFormat, trajectory_format
+from .formats import trajectory_format
+from .job_options import (
+    check_estimator,
+    checked_smallest_std,
+    default_episodes_per_shard,
+)
 from .manifest import (
     MANIFEST,
     Job,
     Manifest,
     ShardEntry,
     read_manifest,
-    versions_now,
     write_manifest,
 )
 from .shard_folder import claimed, put_in_place, staging_folder
-from .shard_work import MadeShard, ShardWork, make_shard
+from .shard_work import MadeShard, ShardWork, make_shard, versions_of
 
 if TYPE_CHECKING:
     from ..monte_carlo.workers import Workers
 
 Progress = Callable[[int, int], object]
-
-_MOST_EPISODES = 100
-_MOST_MEMORY = 256e6  # [bytes] of a shard
 
 
 def generate_trajectories(
@@ -46,6 +46,7 @@ def generate_trajectories(
     format: str = "npz",
     episodes_per_shard: int | None = None,
     smallest_std: float | None = None,
+    estimator: str | None = None,
     jobs: int | None = None,
     backend: str | None = None,
     progress: Progress | None = None,
@@ -76,6 +77,10 @@ def generate_trajectories(
     smallest_std : float, optional
         Smallest standard deviation in the files of g2o [m, rad], 1e-3 by default; other
         formats have none.
+    estimator : str, optional
+        A filter, with or without options in brackets, whose beliefs after every scan
+        are written beside the truth; see `with_beliefs`. The formats npz, parquet and
+        minari hold them.
     jobs : int, optional
         Number of workers, which make one shard at a time each; -1 for one on each
         core. By default this process does all. The bytes are the same.
@@ -104,34 +109,30 @@ def generate_trajectories(
     episodes, seed = integer("episodes", episodes, 1), integer("seed", seed, 0)
     integer("the seed of the last episode", seed + episodes - 1, 0)
     if episodes_per_shard is None:
-        episodes_per_shard = default_episodes_per_shard(world)
+        episodes_per_shard = default_episodes_per_shard(
+            world, beliefs=estimator is not None
+        )
     episodes_per_shard = integer("episodes_per_shard", episodes_per_shard, 1)
     if controller not in CONTROLLERS:
         raise ValueError(unknown_choice("controller", controller, CONTROLLERS))
     layout = trajectory_format(format)
     layout.check(world)
-    smallest = _smallest_std(format, layout, smallest_std)
-    job = Job(world, controller, seed, episodes, episodes_per_shard, format, smallest)
-    versions = versions_now(layout.LIBRARIES)
+    smallest = checked_smallest_std(format, layout, smallest_std)
+    check_estimator(world, format, layout, estimator)
+    job = Job(
+        world,
+        controller,
+        seed,
+        episodes,
+        episodes_per_shard,
+        format,
+        smallest,
+        estimator,
+    )
+    versions = versions_of(job)
     workers = _engaged(jobs, backend)
     with claimed(Path(out)):
         return _continue(job, Path(out), versions, workers, progress)
-
-
-def _smallest_std(
-    format: str, layout: TrajectoryFormat, given: float | None
-) -> float | None:
-    """Return the smallest standard deviation that a format writes, if it has one."""
-    usual = layout.OPTIONS.get("smallest_std")
-    if given is None:
-        return usual
-    if usual is None:
-        raise ValueError(
-            f"smallest_std is of the format 'g2o': format '{format}' writes no noise"
-        )
-    if not 0 < given < float("inf"):
-        raise ValueError(f"smallest_std must be a finite number > 0, got {given!r}")
-    return float(given)
 
 
 def _engaged(jobs: int | None, backend: str | None) -> "Workers | None":
@@ -140,18 +141,6 @@ def _engaged(jobs: int | None, backend: str | None) -> "Workers | None":
     from ..monte_carlo.workers import engage_workers  # noqa: PLC0415 (loads joblib)
 
     return engage_workers(jobs, backend)
-
-
-def default_episodes_per_shard(scenario: Scenario) -> int:
-    """Return how many episodes of a scenario a shard holds by default.
-
-    Examples
-    --------
-    >>> default_episodes_per_shard(load_scenario("loop"))
-    100
-    """
-    row = 25 * count_rows(scenario) + 57  # bytes of one moment
-    return int(max(1, min(_MOST_EPISODES, _MOST_MEMORY // (row * scenario.steps))))
 
 
 def _continue(

@@ -46,6 +46,8 @@ class Job:
         Name of a format, see `trajectory_format`.
     smallest_std : float, optional
         Smallest standard deviation in files of g2o [m, rad].
+    estimator : str, optional
+        Filter whose beliefs are beside the truth.
     """
 
     scenario: Scenario
@@ -55,6 +57,7 @@ class Job:
     episodes_per_shard: int
     format: str
     smallest_std: float | None = None
+    estimator: str | None = None
 
     @property
     def shards(self) -> int:
@@ -189,6 +192,8 @@ def _manifest(table: dict[str, Any]) -> Manifest:
         integer(name, getattr(job, name), least)
     _text(table["job"], "controller")
     _text(table["job"], "format")
+    if job.estimator is not None:
+        _text(table["job"], "estimator")
     return Manifest(
         job=job,
         versions=dict(table["versions"]),

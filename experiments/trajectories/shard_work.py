@@ -58,7 +58,7 @@ class ShardWork:
         ValueError
             If this machine has other versions than the manifest.
         """
-        here = versions_now(trajectory_format(self.job.format).LIBRARIES)
+        here = versions_of(self.job)
         if here != self.versions:
             raise ValueError(
                 f"a worker has the versions {here}, the data set {self.versions}: both "
@@ -93,11 +93,22 @@ class ShardWork:
         trajectories = drive_episodes(
             job.scenario, job.controller, seeds, progress=progress
         )
+        if job.estimator is not None:
+            from .beliefs import with_beliefs  # noqa: PLC0415
+
+            name_of = job.estimator
+            trajectories = [with_beliefs(each, name_of) for each in trajectories]
         partial = staging / str(episodes.start) / name
         partial.parent.mkdir()
         options = {name: getattr(job, name) for name in layout.OPTIONS}
         layout.write(trajectories, partial, **options)
         return ShardEntry(name, episodes.start, len(episodes), checksum(partial))
+
+
+def versions_of(job: Job) -> dict[str, str]:
+    """Return the versions that determine the bits of a job on this machine."""
+    kernels = () if job.estimator is None else ("numba",)
+    return versions_now((*trajectory_format(job.format).LIBRARIES, *kernels))
 
 
 def make_shard(work: ShardWork, number: int) -> MadeShard:

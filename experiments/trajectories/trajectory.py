@@ -1,8 +1,10 @@
 """One drive as arrays: actions, readings, and the truth."""
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...sim_configs import Scenario, load_scenario
@@ -42,6 +44,17 @@ class Trajectory:
     landmark_ids : int64 ndarray, shape (T + 1, M), or None
         For hidden identities, the true landmark of each row, -1 for clutter and empty
         rows. For known identities None: row i is landmark i.
+    belief_poses : ndarray, shape (T + 1, 3), or None
+        Of a filter after each scan [m, m, rad]; see `with_beliefs`.
+    belief_pose_covariances : ndarray, shape (T + 1, 3, 3), or None
+        Of the additive error, as everywhere.
+    belief_landmarks : ndarray, shape (T + 1, M, 2), or None
+        Of its map, zeros in empty rows [m].
+    belief_landmark_covariances : ndarray, shape (T + 1, M, 2, 2), or None
+        Of each landmark alone [m²].
+    belief_landmark_ids : int64 ndarray, shape (T + 1, M), or None
+        The filter's landmark of each row, -1 in empty rows. For known identities row i
+        is landmark i.
     """
 
     scenario: Scenario
@@ -56,6 +69,11 @@ class Trajectory:
     mask: BoolArray | None = None
     collisions: BoolArray | None = None
     landmark_ids: IntArray | None = None
+    belief_poses: Array | None = None
+    belief_pose_covariances: Array | None = None
+    belief_landmarks: Array | None = None
+    belief_landmark_covariances: Array | None = None
+    belief_landmark_ids: IntArray | None = None
 
     @property
     def steps(self) -> int:
@@ -74,7 +92,16 @@ ARRAYS = (
     "collisions",
     "landmark_ids",
 )
-"""The names of all arrays of a trajectory."""
+"""The names of the arrays of a drive."""
+
+BELIEFS = (
+    "belief_poses",
+    "belief_pose_covariances",
+    "belief_landmarks",
+    "belief_landmark_covariances",
+    "belief_landmark_ids",
+)
+"""The names of the arrays of what a filter believes during it."""
 
 
 def scenario_from_text(text: str) -> Scenario:
@@ -103,4 +130,28 @@ def array_of(trajectory: Trajectory, name: str) -> AnyArray:
 def arrays_to_write(trajectories: Sequence[Trajectory]) -> tuple[str, ...]:
     """Return the names of the arrays; landmark_ids only if identities are hidden."""
     hidden = not trajectories[0].scenario.sensor.identities
-    return ARRAYS if hidden else ARRAYS[:-1]
+    names = ARRAYS if hidden else ARRAYS[:-1]
+    return names if trajectories[0].belief_poses is None else (*names, *BELIEFS)
+
+
+def belief_rows(trajectory: Trajectory) -> dict[str, AnyArray]:
+    """Return the arrays of beliefs with one row per moment, (T + 1, …); {} of none.
+
+    `belief_arrays` is the inverse.
+    """
+    if trajectory.belief_poses is None:
+        return {}
+    arrays = {name: array_of(trajectory, name) for name in BELIEFS}
+    return {name: array.reshape(len(array), -1) for name, array in arrays.items()}
+
+
+def belief_arrays(rows: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
+    """Return the arrays of beliefs, from rows that hold them all or none."""
+    if BELIEFS[0] not in rows:
+        return {}
+    scans, landmarks = rows["belief_landmark_ids"].shape
+    shapes = (3,), (3, 3), (landmarks, 2), (landmarks, 2, 2), (landmarks,)
+    return {
+        name: np.asarray(rows[name]).reshape(scans, *shape)
+        for name, shape in zip(BELIEFS, shapes, strict=True)
+    }

@@ -33,10 +33,8 @@ from slamgym.experiments.trajectories.dataset import (
 from slamgym.experiments.trajectories.driven_episodes import drive_episodes
 from slamgym.experiments.trajectories.formats import FORMATS, npz, trajectory_format
 from slamgym.experiments.trajectories.formats.slamlog_files import to_slamlog
-from slamgym.experiments.trajectories.generate import (
-    default_episodes_per_shard,
-    generate_trajectories,
-)
+from slamgym.experiments.trajectories.generate import generate_trajectories
+from slamgym.experiments.trajectories.job_options import default_episodes_per_shard
 from slamgym.experiments.trajectories.manifest import (
     checksum,
     read_manifest,

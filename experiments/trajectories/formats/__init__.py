@@ -1,8 +1,8 @@
 """File formats of trajectories, one module each, loaded on demand.
 
 A shard of some episodes is one file or one folder. Every module has `write` and `read`,
-and those of ``ENDING``, ``LIBRARIES``, ``OPTIONS`` and `check` that differ from the
-defaults of `TrajectoryFormat`.
+and those of the other fields of `TrajectoryFormat` that differ from
+their defaults.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -41,6 +41,8 @@ class TrajectoryFormat(NamedTuple):
     """The packages besides numpy that write it; their versions determine the bytes."""
     OPTIONS: Mapping[str, float] = {}
     """Names and defaults of the numbers > 0 that its `write` also takes."""
+    HOLDS_BELIEFS: bool = False
+    """Whether it writes and reads the beliefs of a filter too."""
 
 
 def trajectory_format(name: str) -> TrajectoryFormat:

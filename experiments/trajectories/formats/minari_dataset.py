@@ -1,10 +1,10 @@
 """Shards as data sets of Minari in its Arrow format, for offline learning; exact.
 
 Observations, actions and truncations are those of the environment. The true pose, the
-collision and the hidden landmark ids are infos; the collision has one column because
-Minari cannot combine infos without columns. The options of each episode hold the
-landmarks, the start estimate, and the scenario as TOML. Actions are float64, wider than
-the environment's action space, so that they keep every bit.
+collision, the hidden landmark ids and a filter's beliefs are infos; the collision has
+one column because Minari cannot combine infos without columns. The options of each
+episode hold the landmarks, the start estimate, and the scenario as TOML. Actions are
+float64, wider than the environment's action space, so that they keep every bit.
 """
 
 import json
@@ -26,9 +26,16 @@ from minari.data_collector import EpisodeBuffer
 from ....envs.spaces import action_space, observation_space
 from ....sim_configs import Scenario
 from ....sim_configs.scenario_files import scenario_text
-from ..trajectory import Trajectory, array_of, scenario_from_text
+from ..trajectory import (
+    Trajectory,
+    array_of,
+    belief_arrays,
+    belief_rows,
+    scenario_from_text,
+)
 
 ENDING = "-v0"
+HOLDS_BELIEFS = True
 LIBRARIES = ("minari", "pyarrow")
 
 _ROOT = "MINARI_DATASETS_PATH"
@@ -120,6 +127,7 @@ def _buffer(trajectory: Trajectory) -> EpisodeBuffer:
     }
     if trajectory.landmark_ids is not None:
         infos["landmark_ids"] = trajectory.landmark_ids
+    infos |= belief_rows(trajectory)
     return EpisodeBuffer(
         seed=trajectory.seed,
         options={
@@ -156,4 +164,5 @@ def _trajectory(episode: Any, about: dict[str, Any]) -> Trajectory:
         mask=seen["mask"],
         collisions=episode.infos["collision"][1:, 0],
         landmark_ids=episode.infos.get("landmark_ids"),
+        **belief_arrays(episode.infos),
     )

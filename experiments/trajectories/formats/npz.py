@@ -13,6 +13,7 @@ import numpy as np
 from ....sim_configs.scenario_files import scenario_text
 from ..trajectory import (
     ARRAYS,
+    BELIEFS,
     Trajectory,
     array_of,
     arrays_to_write,
@@ -20,6 +21,7 @@ from ..trajectory import (
 )
 
 ENDING = ".npz"
+HOLDS_BELIEFS = True
 
 _NO_DATE = (1980, 1, 1, 0, 0, 0)  # a constant: equal arrays give equal bytes
 
@@ -43,7 +45,7 @@ def read(path: Path) -> Iterator[Trajectory]:
     """Yield the trajectories of a shard; see `TrajectoryFormat`."""
     with np.load(path, allow_pickle=False) as archive:
         columns = {name: archive[name] for name in archive.files}
-    arrays = [name for name in ARRAYS if name in columns]
+    arrays = [name for name in (*ARRAYS, *BELIEFS) if name in columns]
     for k in range(len(columns["seed"])):
         yield Trajectory(
             scenario=scenario_from_text(str(columns["scenario"][k])),

@@ -2,7 +2,8 @@
 
 ``steps.parquet`` has one row per step and one for the start, T + 1 per episode: seed,
 step, the action, the odometry and the collision before it (null at step 0), the true
-pose, and the readings as lists of M. ``episodes.parquet`` has one row per episode:
+pose, the readings as lists of M, and a filter's beliefs as lists in the order of the
+arrays of `Trajectory`. ``episodes.parquet`` has one row per episode:
 seed, controller, scenario (as TOML), start_estimate, and the landmarks as (x, y, x, …).
 """
 
@@ -16,9 +17,17 @@ import pyarrow.parquet as pq
 
 from ....arrays import AnyArray, Array
 from ....sim_configs.scenario_files import scenario_text
-from ..trajectory import Trajectory, array_of, scenario_from_text
+from ..trajectory import (
+    BELIEFS,
+    Trajectory,
+    array_of,
+    belief_arrays,
+    belief_rows,
+    scenario_from_text,
+)
 
 LIBRARIES = ("pyarrow",)
+HOLDS_BELIEFS = True
 
 _STEPS, _EPISODES = "steps.parquet", "episodes.parquet"
 
@@ -82,6 +91,8 @@ def _step_table(trajectory: Trajectory) -> Any:
     }
     if trajectory.landmark_ids is not None:
         columns["landmark_ids"] = _lists(trajectory.landmark_ids)
+    for name, rows in belief_rows(trajectory).items():
+        columns[name] = _lists(rows)
     return pa.table(columns)
 
 
@@ -110,6 +121,7 @@ def _trajectory(episode: dict[str, Any], steps: Any) -> Trajectory:
         return np.column_stack([column(name)[1:] for name in names])
 
     hidden = "landmark_ids" in steps.column_names
+    beliefs = {name: rows(name) for name in BELIEFS if name in steps.column_names}
     return Trajectory(
         scenario=scenario_from_text(episode["scenario"]),
         controller=episode["controller"],
@@ -123,4 +135,5 @@ def _trajectory(episode: dict[str, Any], steps: Any) -> Trajectory:
         mask=rows("seen"),
         collisions=column("collision")[1:].astype(np.bool_),
         landmark_ids=rows("landmark_ids") if hidden else None,
+        **belief_arrays(beliefs),
     )

@@ -1,0 +1,151 @@
+"""The beliefs of a filter beside the truth of generated trajectories."""
+
+import numpy as np
+import pytest
+
+from slamgym.estimator import make_estimator
+from slamgym.experiments.trajectories import (
+    drive_episodes,
+    generate_trajectories,
+    load_trajectories,
+)
+from slamgym.experiments.trajectories.beliefs import with_beliefs
+from slamgym.experiments.trajectories.manifest import read_manifest
+from slamgym.experiments.trajectories.trajectory import ARRAYS, BELIEFS
+from slamgym.sim_configs import load_scenario
+
+KNOWN = load_scenario("corridor").with_changes(steps=12)
+HIDDEN = load_scenario("hidden_identities").with_changes(steps=12)
+HOLDING = ("npz", "parquet", "minari")
+
+
+def beliefs_by_hand(drive, slam, ids_of):
+    """Drive a filter through a trajectory, scan by scan."""
+    out = []
+    for step, seen in enumerate(drive.mask):
+        if step > 0:
+            slam.predict(drive.odometry[step - 1])
+        if seen.any():
+            slam.update(drive.measurements[step][seen], ids_of(seen))
+        out.append(slam.belief())
+    return out
+
+
+def noise(scenario):
+    return {
+        "motion_std": scenario.motion.std,
+        "measurement_std": scenario.sensor.std,
+        "initial_pose_std": scenario.start.std,
+    }
+
+
+def test_row_i_is_what_a_filter_driven_by_hand_believes_of_landmark_i():
+    (drive,) = drive_episodes(KNOWN, "waypoints", [3])
+    found = with_beliefs(drive, "ekf")
+    slam = make_estimator("ekf", initial_pose=drive.start_estimate, **noise(KNOWN))
+    for step, belief in enumerate(beliefs_by_hand(drive, slam, np.flatnonzero)):
+        ids = list(belief.landmark_ids)
+        empty = np.setdiff1d(np.arange(len(drive.landmarks)), ids)
+        np.testing.assert_array_equal(found.belief_poses[step], belief.pose)
+        np.testing.assert_array_equal(
+            found.belief_pose_covariances[step], belief.covariance[:3, :3]
+        )
+        np.testing.assert_array_equal(
+            found.belief_landmarks[step, ids], belief.landmarks
+        )
+        for place, row in enumerate(ids):
+            block = slice(3 + 2 * place, 5 + 2 * place)
+            np.testing.assert_array_equal(
+                found.belief_landmark_covariances[step, row],
+                belief.covariance[block, block],
+            )
+        np.testing.assert_array_equal(found.belief_landmark_ids[step, ids], ids)
+        assert (found.belief_landmark_ids[step, empty] == -1).all()
+        assert not found.belief_landmarks[step, empty].any()
+    assert 0 < len(ids) < len(drive.landmarks)
+
+
+def test_the_truth_and_the_readings_stay_as_they_are():
+    (drive,) = drive_episodes(KNOWN, "waypoints", [3])
+    found = with_beliefs(drive, "invariant")
+    for name in ARRAYS:
+        assert getattr(found, name) is getattr(drive, name)
+
+
+def test_hidden_identities_are_associated_and_maps_stay_within_the_rows():
+    (drive,) = drive_episodes(HIDDEN, "waypoints", [3])
+    found = with_beliefs(drive, "invariant")
+    rows = drive.mask.shape[1]
+    assert found.belief_landmark_ids.shape == (13, rows)
+    mapped = (found.belief_landmark_ids >= 0).sum(axis=1)
+    in_use = found.belief_landmark_ids >= 0
+    np.testing.assert_array_equal(in_use, np.arange(rows) < mapped[:, None])
+    near = found.belief_landmarks[-1, : mapped[-1]]
+    gaps = np.hypot(*(near[:, None] - drive.landmarks).T).min(axis=0)
+    assert mapped[-1] >= 4
+    assert np.median(gaps) < 0.5
+
+
+def test_the_filter_knows_the_noise_that_an_episode_drew():
+    ranges = {"motion_std": [4.0, 4.0]}
+    scenario = KNOWN.with_changes(randomise=ranges)
+    (drive,) = drive_episodes(scenario, "waypoints", [3])
+    other = with_beliefs(drive, "ekf").belief_pose_covariances[1, 0, 0]
+    slam = make_estimator(
+        "ekf", initial_pose=drive.start_estimate, **noise(drive.scenario)
+    )
+    belief = beliefs_by_hand(drive, slam, np.flatnonzero)[1]
+    assert other == belief.covariance[0, 0]
+    assert drive.scenario.motion.std[0] == 4.0 * KNOWN.motion.std[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", [KNOWN, HIDDEN], ids=["known", "hidden"])
+@pytest.mark.parametrize("name", HOLDING)
+def test_formats_return_every_bit_and_workers_write_equal_bytes(
+    name, scenario, tmp_path
+):
+    job = {"episodes": 4, "format": name, "episodes_per_shard": 2, "estimator": "ekf"}
+    alone = generate_trajectories(scenario, tmp_path / "alone", **job)
+    shared = generate_trajectories(scenario, tmp_path / "shared", jobs=2, **job)
+    assert alone == shared == read_manifest(tmp_path / "alone")
+    drives = drive_episodes(scenario, "waypoints", range(4))
+    for drive, read in zip(drives, load_trajectories(tmp_path / "alone"), strict=True):
+        expected = with_beliefs(drive, "ekf")
+        for array in BELIEFS:
+            before, after = getattr(expected, array), getattr(read, array)
+            assert after.dtype == before.dtype
+            assert after.shape == before.shape
+            assert after.tobytes() == before.tobytes()
+
+
+def test_without_a_filter_neither_manifest_nor_files_name_beliefs(tmp_path):
+    manifest = generate_trajectories(KNOWN, tmp_path, episodes=1)
+    text = (tmp_path / "manifest.json").read_text()
+    assert "estimator" not in text
+    assert "numba" not in manifest.versions
+    with np.load(tmp_path / "shard_00000.npz") as arrays:
+        assert not set(BELIEFS) & set(arrays.files)
+
+
+def test_another_filter_is_another_job(tmp_path):
+    generate_trajectories(KNOWN, tmp_path, episodes=1, estimator="ekf")
+    with pytest.raises(ValueError, match=r"another job, with estimator = 'ekf', not"):
+        generate_trajectories(KNOWN, tmp_path, episodes=1, estimator="invariant")
+
+
+@pytest.mark.parametrize(
+    ("job", "message"),
+    [
+        ({"estimator": "ekv"}, r"unknown estimator 'ekv'.*'ekf'"),
+        ({"estimator": "ekf[nope=1]"}, "nope"),
+        ({"estimator": "ekf", "format": "tum"}, "'tum', which holds no beliefs"),
+        ({"estimator": "ekf", "format": "g2o"}, "'g2o', which holds no beliefs"),
+        ({"estimator": ""}, "estimator"),
+        ({"estimator": 5}, "estimator"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(job, message, tmp_path):
+    with pytest.raises((ValueError, TypeError), match=message):
+        generate_trajectories(KNOWN, tmp_path / "out", episodes=1, **job)
+    assert not (tmp_path / "out").exists()
