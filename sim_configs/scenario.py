@@ -168,11 +168,12 @@ class Scenario(Part):
         if not changes:
             return self
         fields = type(self).model_fields
-        for key in changes.keys() - fields:
-            raise UnknownKeywordError(
-                f"unexpected keyword argument '{key}': unknown key '{key}' in the "
-                f"scenario{closest(key, fields)}"
-            )
+        for key in changes:
+            if key not in fields:
+                raise UnknownKeywordError(
+                    f"unexpected keyword argument '{key}': unknown key '{key}' in the "
+                    f"scenario{closest(key, fields)}"
+                )
         return self.from_table(_merge(self.model_dump(), changes))
 
     def drawn_at(self, shares: Mapping[str, float], directions: Array) -> Self:

@@ -3,6 +3,7 @@ import math
 import pickle
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,11 @@ def mistake_of(**changes):
 )  # fmt: skip
 def test_an_unknown_key_is_refused_with_a_suggestion(changes, message):
     assert mistake_of(**changes) == message
+
+
+def test_of_many_unknown_keys_the_first_is_named():
+    wrong = {f"zzz{i}": 0 for i in range(50)}
+    assert mistake_of(dt=0.5, **wrong).endswith("unknown key 'zzz0' in the scenario")
 
 
 @pytest.mark.parametrize("std", [[-1, 0.1], [0.1], [0.1, 0.1, 0.1], 0.1, ["0.1", 0.1]])
@@ -325,6 +331,14 @@ def test_a_saved_layout_loads_back_equal(layout, tmp_path):
     scenario = load_scenario("six_landmarks").with_changes(landmarks=layout)
     save_scenario(scenario, tmp_path / "copy.toml")
     assert load_scenario(tmp_path / "copy.toml") == scenario
+
+
+def test_a_description_of_one_long_word_is_read_at_once(tmp_path):
+    scenario = load_scenario("six_landmarks").with_changes(description="a" * 10**5)
+    save_scenario(scenario, tmp_path / "long.toml")
+    start = time.process_time()
+    assert load_scenario(tmp_path / "long.toml") == scenario
+    assert time.process_time() - start < 5.0  # a minute where it is quadratic
 
 
 @pytest.mark.slow
