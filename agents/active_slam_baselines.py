@@ -78,29 +78,25 @@ class Coverage:
 
     def __init__(self, scenario: Scenario) -> None:
         self._routes = CoverageGrid(scenario).routes
-        self._points = coverage_lanes(scenario)
+        points = coverage_lanes(scenario)
         if not self._routes.is_open:
-            self._points = self._routes.kept_clear(_dotted(self._points))
-        self._tolerance = 0.5 * scenario.robot.max_speed * scenario.dt
+            points = self._routes.kept_clear(_dotted(points))
         self._waypoints = Waypoints(
-            self._points,
+            points,
             scenario.robot,
             dt=scenario.dt,
-            tolerance=self._tolerance,
+            tolerance=0.5 * scenario.robot.max_speed * scenario.dt,
             loop=True,
         )
-        self._next = 0
 
     def act(self, knowledge: AgentKnowledge) -> Array:
         """Drive on along the lanes; see `Baseline.act`."""
+        pose = knowledge.belief.pose
         if self._routes.is_open:
-            return self._waypoints.act(knowledge.belief.pose, knowledge.step)
-        if knowledge.step == 0:
-            self._next = 0
-        away = np.hypot(*(self._points - knowledge.belief.pose[:2]).T)
-        while away[self._next] < self._tolerance:
-            self._next = (self._next + 1) % len(self._points)
-        return _steer_around(knowledge, self._points[self._next])
+            return self._waypoints.act(pose, knowledge.step)
+        point = self._waypoints.next_point(pose[0], pose[1], knowledge.step)
+        assert point is not None  # they loop
+        return _steer_around(knowledge, point)
 
 
 class Revisit:

@@ -81,13 +81,11 @@ class Waypoints:
 
     def act(self, pose: ArrayLike, step: int) -> Array:
         """Drive towards the next waypoint; see `Controller.act`."""
-        if step == 0:
-            self._next = 0
         x, y, heading = finite_pose(pose)
-        self._pass_reached(x, y)
-        if self._next >= len(self.points):
+        point = self.next_point(x, y, step)
+        if point is None:
             return np.zeros(2)
-        dx, dy = self.points[self._next] - (x, y)
+        dx, dy = point - (x, y)
         error = wrap_angle(math.atan2(dy, dx) - heading)
         speed = 0.0
         if abs(error) < _ALIGNED:
@@ -96,8 +94,14 @@ class Waypoints:
         turn_rate = min(max(error / self.dt, -limit), limit)
         return np.array([min(speed, self.robot.max_speed), turn_rate])
 
-    def _pass_reached(self, x: float, y: float) -> None:
-        """Skip the waypoints within the tolerance, at most once round the loop."""
+    def next_point(self, x: float, y: float, step: int) -> Array | None:
+        """Return the next waypoint of a robot at (x, y), (2,) [m]; None after the last.
+
+        Skips the waypoints within the tolerance, at most once round the loop. Step 0
+        starts again.
+        """
+        if step == 0:
+            self._next = 0
         for _ in range(len(self.points)):
             if self._next >= len(self.points):
                 break
@@ -106,6 +110,7 @@ class Waypoints:
             self._next += 1
             if self.loop:
                 self._next %= len(self.points)
+        return self.points[self._next] if self._next < len(self.points) else None
 
 
 class VectorWaypoints:

@@ -81,6 +81,14 @@ def test_cells_behind_closed_walls_are_out_of_reach():
     assert grid.routes.reachable[~inside].all()
 
 
+def test_coverage_acts_where_all_its_points_are_within_a_step():
+    rooms = ROOMS.with_changes(dt=60.0)
+    env = ActiveSlamEnv(rooms)
+    env.reset(seed=0)
+    baseline = make_baseline("coverage", rooms, np.random.default_rng(0))
+    assert np.isfinite(baseline.act(env.knowledge)).all()
+
+
 @pytest.mark.parametrize(("name", "rooms"), [("coverage", 4), ("mpc", 2)])
 @pytest.mark.slow
 def test_baselines_find_their_way_through_doors(name, rooms):
