@@ -17,7 +17,7 @@ from .active_slam_kernels import Episodes, StepOutcome, advance
 from .belief_features import belief_space, empty_features
 from .coverage_grid import SECTORS, CoverageGrid
 from .information_reward import CRITERIA, check_criterion, landmark_prior_std
-from .landmark_set import FEATURES, ObservationForm, form_names, write_landmark_sets
+from .landmark_set import FEATURES, ObservationForm, write_landmark_sets
 
 _SIZES = {  # of the entries besides the belief
     "goals": 9,
@@ -222,12 +222,17 @@ def split_settings(
     settings: Mapping[str, Any],
 ) -> tuple[RewardWeights, ObservationForm, dict[str, Any]]:
     """Split settings into weights, form of observation and changes of the scenario."""
-    own, form = {field.name for field in fields(RewardWeights)}, form_names()
-    return (
-        RewardWeights(**{key: settings[key] for key in settings if key in own}),
-        ObservationForm(**{key: settings[key] for key in settings if key in form}),
-        {key: settings[key] for key in settings if key not in own | form},
-    )
+    rest = dict(settings)
+    weights = RewardWeights(**_taken(RewardWeights, rest))
+    return weights, ObservationForm(**_taken(ObservationForm, rest)), rest
+
+
+def _taken(
+    kind: type[RewardWeights | ObservationForm], rest: dict[str, Any]
+) -> dict[str, Any]:
+    """Take the settings of a kind out of the rest."""
+    names = [field.name for field in fields(kind) if field.name in rest]
+    return {name: rest.pop(name) for name in names}
 
 
 def _rules(

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -14,15 +13,12 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, BoolArray
 from ..envs.vector import LandmarkWorldVectorEnv
-from ..estimator.filters.batch import BatchSlam
 from ..estimator.filters.batch_results import BatchBeliefs
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, split_settings
 from .association_record import AssociationRecord
-from .belief_arrays import update_filters
-from .estimator_choice import choose_batch
 from .map_truth import map_rmse, matched_rmse
-from .separate_filters import SeparateFilters
+from .separate_filters import SeparateFilters, choose_filters, update_filters
 
 Observation = dict[str, AnyArray]
 
@@ -81,13 +77,11 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         self.single_observation_space = self.task.observation_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         count = self.scenario.landmarks.count
-        by_id = self.scenario.sensor.identities
-        choose = choose_batch if by_id else SeparateFilters
-        self._filters: BatchSlam | SeparateFilters = choose(
+        self._filters = choose_filters(
             estimator, self.scenario, num_envs, count, estimator_options
         )
+        by_id = self.scenario.sensor.identities
         self._record = None if by_id else AssociationRecord(num_envs)
-        self._over = np.zeros(num_envs, dtype=np.bool_)
 
     def beliefs(self) -> BatchBeliefs:
         """Return the present beliefs of all filters."""
@@ -100,13 +94,11 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         outcome = self.task.proceed(
             self._filters.storage(), moving, actions, self._worlds.collisions
         )
-        self._over = outcome.terminated | (moving & (self._steps_left <= 0))
         return outcome.rewards, outcome.terminated
 
     def _begin(self, worlds: BoolArray, seeds: Sequence[int | None] = ()) -> None:
         """Start episodes in some worlds, each with its first scan."""
         super()._begin(worlds, seeds)
-        self._over = self._over & ~worlds
         if self._record is not None:
             self._record.begin(worlds)
         estimates = self._worlds.start_estimates
@@ -115,14 +107,11 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         self.task.begin(self._filters.storage(), worlds)
 
     def _filter(self, worlds: BoolArray, *, moved: bool) -> None:
-        observations, filters = super()._observations(), self._filters
+        observations = super()._observations()
         if self._record is not None:
             true_ids: Any = self._worlds.landmark_ids
             self._record.add(worlds, true_ids, observations["mask"])
-        if isinstance(filters, SeparateFilters):
-            filters.update(observations, worlds, moved=moved)
-        else:
-            update_filters(filters, observations, worlds, moved=moved)
+        update_filters(self._filters, observations, worlds, moved=moved)
         if self.render_mode is not None:
             self.show_beliefs(list(map(self._filters.belief, range(self.num_envs))))
 
@@ -137,15 +126,14 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         beliefs, success = self._filters.storage(), self.task.outcome.success.copy()
         error = map_rmse if self._record is None else matched_rmse
         rmse = error(beliefs, self._worlds.complex_landmarks)
-        scores = {}
-        if self._record is not None and isinstance(self._filters, SeparateFilters):
-            scores = self._record.scores(self._filters.filters, self._over)
-        return {
+        infos = {
             **super()._infos(),
             "mapped": (beliefs.slots >= 0).sum(axis=1),
             "known": self.task.episodes.known.sum(axis=1),
             "success": success,
             "true_rmse": rmse,
             "honest_success": success & (rmse <= self.task.weights.accuracy),
-            **scores,
         }
+        if self._record is not None and isinstance(self._filters, SeparateFilters):
+            infos |= self._record.scores(self._filters.filters, self._ended)
+        return infos

@@ -1,5 +1,7 @@
 """Beliefs in the storage of a batch of filters, for one world or many."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from ..arrays import AnyArray, BoolArray
@@ -63,9 +65,9 @@ def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
     return BatchStorage(gaussian.mean[None], gaussian.covariance[None], slots)
 
 
-def update_filters(
+def update_batch(
     filters: BatchSlam,
-    observations: dict[str, AnyArray],
+    observations: Mapping[str, AnyArray],
     worlds: BoolArray,
     *,
     moved: bool,
@@ -76,7 +78,7 @@ def update_filters(
     ----------
     filters : BatchSlam
         One filter for each of B worlds.
-    observations : dict
+    observations : mapping
         The batched observation of a landmark world, each key with a leading axis B.
     worlds : bool ndarray, shape (B,)
         Worlds whose filters are updated.

@@ -10,9 +10,7 @@ from gymnasium.vector.utils import batch_space
 
 from ..arrays import AnyArray, BoolArray
 from ..envs.vector.episodes import final_infos
-from ..estimator.filters.batch import BatchSlam
 from ..estimator.filters.batch_results import BatchBeliefs
-from .belief_arrays import update_filters
 from .belief_features import belief_features, world_bounds
 from .belief_observation import (
     count_landmark_rows,
@@ -20,8 +18,7 @@ from .belief_observation import (
     with_belief,
     with_features,
 )
-from .estimator_choice import choose_batch
-from .separate_filters import SeparateFilters
+from .separate_filters import choose_filters, update_filters
 
 Observation = dict[str, AnyArray]
 Infos = dict[str, Any]
@@ -80,8 +77,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         is_hidden = not self.scenario.sensor.identities
         self._missing_rows = 0 if is_hidden else rows - self.scenario.landmarks.count
         self._bounds = world_bounds(self.scenario)
-        choose = SeparateFilters if is_hidden else choose_batch
-        self._filters: BatchSlam | SeparateFilters = choose(
+        self._filters = choose_filters(
             estimator, self.scenario, self.num_envs, rows, estimator_options
         )
         self._mode = env.metadata["autoreset_mode"]
@@ -156,10 +152,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
                 for key in ("landmarks", "mask")
             }
             observations = {**observations, **longer}
-        if isinstance(self._filters, SeparateFilters):
-            self._filters.update(observations, worlds, moved=moved)
-        else:
-            update_filters(self._filters, observations, worlds, moved=moved)
+        update_filters(self._filters, observations, worlds, moved=moved)
 
     def _with_beliefs(self, observations: Observation) -> Observation:
         features = belief_features(self._filters.storage(), self._bounds)

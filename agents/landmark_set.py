@@ -11,7 +11,7 @@ e_l, e_p        errors of landmark and pose in the map, turned into the robot's 
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
 
@@ -67,8 +67,7 @@ class ObservationForm:
 
     def __post_init__(self) -> None:
         if self.observation not in _KINDS:
-            name = unknown_choice("observation", self.observation, _KINDS)
-            raise ValueError(name)
+            raise ValueError(unknown_choice("observation", self.observation, _KINDS))
         if self.dtype not in _PRECISIONS:
             raise ValueError(unknown_choice("dtype", self.dtype, _PRECISIONS))
         rows = self.max_landmarks
@@ -109,16 +108,10 @@ class ObservationForm:
             rows = {key: rows[key] for key in sorted(rows) if not _is_by_row(key)}
         if self.dtype == "float64":
             return rows
-        kept = {key: row.dtype == np.bool_ for key, row in rows.items()}
         return {
-            key: row if kept[key] else row.astype(self.dtype)
+            key: row if row.dtype == np.bool_ else row.astype(self.dtype)
             for key, row in rows.items()
         }
-
-
-def form_names() -> set[str]:
-    """Return the keywords of `ObservationForm`."""
-    return {field.name for field in fields(ObservationForm)}
 
 
 def write_landmark_sets(

@@ -1,4 +1,4 @@
-"""One filter per world, for worlds that hide identities or differ from each other."""
+"""One filter per world: in a batch, or side by side where worlds hide identities."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Any
 import numpy as np
 
 from ..arrays import AnyArray, Array, BoolArray
+from ..estimator.filters.batch import BatchSlam
 from ..estimator.filters.batch_results import BatchBeliefs, BatchStorage
 from ..sim_configs import Scenario
-from .belief_arrays import belief_storage
+from .belief_arrays import belief_storage, update_batch
 from .estimator_choice import (
     BeliefOfMap,
-    FollowingEstimator,
     checked_belief,
+    choose_batch,
     choose_estimator,
 )
 
 
 class SeparateFilters:
-    """Filters side by side, for vector worlds in which batches cannot run.
+    """Filters side by side, for vector worlds that hide identities.
 
-    Batches do not associate, and all their filters have the same noise. Where the
-    scenario hides identities, the filters are managed and associate.
+    Batches do not associate; these filters are managed and do.
 
     Parameters
     ----------
@@ -57,22 +57,16 @@ class SeparateFilters:
                 "estimator must be a registered name for vector environments, "
                 f"got {estimator!r}"
             )
-        self._choice, self._options = estimator, options
-        self._by_id = scenario.sensor.identities
-        self.filters = [self._made(scenario, rows) for _ in range(runs)]
+        self.filters = [
+            choose_estimator(estimator, scenario, options, rows=rows)
+            for _ in range(runs)
+        ]
         """Filter i is that of world i."""
         self._steps = np.zeros(runs, dtype=np.int64)
         capacity = 3 + 2 * rows
         self._means = np.zeros((runs, capacity))
         self._covariances = np.zeros((runs, capacity, capacity))
         self._slots = np.full((runs, rows), -1, dtype=np.int64)
-
-    def _made(self, scenario: Scenario, rows: int) -> FollowingEstimator:
-        return choose_estimator(self._choice, scenario, self._options, rows=rows)
-
-    def replace(self, run: int, scenario: Scenario) -> None:
-        """Make the filter of a world anew, with the noise settings of a scenario."""
-        self.filters[run] = self._made(scenario, self._slots.shape[1])
 
     def reset(self, poses: Array, pose_std: Any, *, runs: BoolArray) -> None:
         """Start new runs in some worlds, at poses (B, 3) with deviations (3,)."""
@@ -100,10 +94,9 @@ class SeparateFilters:
                 slam.predict(observations["odometry"][run])
                 self._steps[run] += 1
             seen = np.flatnonzero(observations["mask"][run])
-            ids = seen.tolist() if self._by_id else None
-            slam.update(observations["landmarks"][run][seen], ids)
+            slam.update(observations["landmarks"][run][seen], None)
             belief = checked_belief(slam, int(self._steps[run]))
-            stored = belief_storage(belief, self._slots.shape[1], by_id=self._by_id)
+            stored = belief_storage(belief, self._slots.shape[1], by_id=False)
             self._means[run] = stored.means[0]
             self._covariances[run] = stored.covariances[0]
             self._slots[run] = stored.slots[0]
@@ -119,3 +112,40 @@ class SeparateFilters:
     def beliefs(self) -> BatchBeliefs:
         """Return the beliefs of all worlds side by side, as a snapshot."""
         return self.storage().beliefs()
+
+
+Filters = BatchSlam | SeparateFilters
+
+
+def choose_filters(
+    estimator: str,
+    scenario: Scenario,
+    runs: int,
+    rows: int,
+    options: Mapping[str, Any] | None = None,
+) -> Filters:
+    """Make a batch of filters; where the scenario hides identities, separate ones.
+
+    Raises
+    ------
+    ValueError
+        If the name is unknown, an option does not fit, or the filter cannot run in
+        batches and must.
+    """
+    choose = choose_batch if scenario.sensor.identities else SeparateFilters
+    filters: Filters = choose(estimator, scenario, runs, rows, options)
+    return filters
+
+
+def update_filters(
+    filters: Filters,
+    observations: Mapping[str, AnyArray],
+    worlds: BoolArray,
+    *,
+    moved: bool,
+) -> None:
+    """Update the filters of some worlds; see `SeparateFilters.update`."""
+    if isinstance(filters, SeparateFilters):
+        filters.update(observations, worlds, moved=moved)
+    else:
+        update_batch(filters, observations, worlds, moved=moved)

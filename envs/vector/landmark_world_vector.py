@@ -164,9 +164,8 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
             self._begin(resetting)
         truncated = ~terminated & (self._steps_left <= 0)
         ended, final = terminated | truncated, {}
-        if self.autoreset_mode != AutoresetMode.SAME_STEP:
-            self._ended = ended
-        elif np.count_nonzero(ended):
+        self._ended = ended
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
             final = final_infos(self._observations(), self._infos(), ended)
             self._begin(ended)
         infos = {**final, **with_masks(self._infos(), None, self.num_envs)}
