@@ -20,19 +20,19 @@ from typing import Protocol
 
 import numpy as np
 
-from ..arrays import Array, BoolArray
+from ..arrays import Array
 from ..envs.angles import wrap_angle
 from ..envs.controllers import Waypoints
 from ..sim_configs import Robot, Scenario
 from ..sim_configs.scenario_errors import unknown_choice
-from .agent_knowledge import AgentKnowledge, as_points
+from .agent_knowledge import AgentKnowledge
 from .belief_features import largest_variances, world_bounds
 from .belief_space_planner import GREEDY, MPC, BeliefSpacePlanner
 from .coverage_grid import CoverageGrid
+from .wall_routes import CLEARANCE, as_points
 
 BASELINES = ("random", "coverage", "frontier", "revisit", "greedy", "mpc")
 
-_CLEARANCE = 1.0  # distance kept from the walls [m]
 _DOTS = 2.0  # distance of the points that a coverage around walls visits [m]
 _ALIGNED = 0.4  # heading error below which a robot drives while it turns [rad]
 
@@ -144,10 +144,9 @@ class Frontier:
 
     def act(self, knowledge: AgentKnowledge) -> Array:
         """Drive to the next goal; see `Baseline.act`."""
-        unseen = as_points(knowledge.grid.cells[_to_explore(knowledge)])
-        missing = len(knowledge.known) - len(knowledge.belief.landmark_ids)
+        unseen = as_points(knowledge.grid.cells[knowledge.to_explore])
         otherwise = self._revisit.act(knowledge)
-        if not missing or not len(unseen):
+        if not knowledge.missing or not len(unseen):
             return otherwise
         return _steer_around(knowledge, _nearest(knowledge, unseen))
 
@@ -198,7 +197,7 @@ def coverage_lanes(scenario: Scenario) -> Array:
     aside = math.sin(min(sensor.field_of_view / 2, math.pi / 2))
     left, bottom, right, top = world_bounds(scenario)
     reach = min(sensor.max_range, math.hypot(right - left, top - bottom)) * aside
-    margin = max(_CLEARANCE, 0.72 * reach)
+    margin = max(CLEARANCE, 0.72 * reach)
     x = _spaced(left + margin, right - margin, 1.4 * reach)
     y = _spaced(bottom + margin, top - margin, 1.4 * reach)
     up = _zigzag(x, (y[0], y[-1]))
@@ -231,10 +230,6 @@ def _landmark_variances(knowledge: AgentKnowledge) -> Array:
     first = 3 + 2 * np.arange(len(belief.landmark_ids))
     rows = first[:, None] + (0, 1)
     return largest_variances(belief.covariance[rows[:, :, None], rows[:, None]])
-
-
-def _to_explore(knowledge: AgentKnowledge) -> BoolArray:
-    return ~knowledge.explored & knowledge.grid.routes.reachable
 
 
 def _nearest(knowledge: AgentKnowledge, points: Array) -> Array:

@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, BoolArray, ComplexArray
+from ..arrays import Array, BoolArray
 from ..sim_configs import Scenario
 from .coverage_grid import CoverageGrid
 from .estimator_choice import BeliefOfMap, FollowingEstimator
+from .wall_routes import as_points
 
 
 class AgentKnowledge(NamedTuple):
@@ -37,6 +38,16 @@ class AgentKnowledge(NamedTuple):
         rows = ids if self.scenario.sensor.identities else list(range(len(ids)))
         return self.known[rows]
 
+    @property
+    def missing(self) -> int:
+        """How many landmarks are not yet mapped."""
+        return len(self.known) - len(self.belief.landmark_ids)
+
+    @property
+    def to_explore(self) -> BoolArray:
+        """Which cells are unseen and within the robot's reach, shape (C,)."""
+        return ~self.explored & self.grid.routes.reachable
+
     def goals(self) -> Array:
         """Return the positions worth a visit, shape (K, 2) [m].
 
@@ -44,12 +55,7 @@ class AgentKnowledge(NamedTuple):
         not yet mapped, the unexplored cells that the robot can get to.
         """
         landmarks: Array = self.belief.landmarks[~self.known_in_map]
-        if len(self.known_in_map) == len(self.known):
+        if not self.missing:
             return landmarks
-        unseen = ~self.explored & self.grid.routes.reachable
-        return np.concatenate([landmarks, as_points(self.grid.cells[unseen])])
-
-
-def as_points(numbers: ComplexArray) -> Array:
-    """Return complex numbers x + iy, (K,), as points (K, 2)."""
-    return np.column_stack([numbers.real, numbers.imag])
+        cells = self.grid.cells[self.to_explore]
+        return np.concatenate([landmarks, as_points(cells)])

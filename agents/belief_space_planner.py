@@ -27,8 +27,9 @@ from ..arrays import Array, BoolArray, IndexArray
 from ..envs.angles import wrap_angle
 from ..estimator.filters.imagine import imagine
 from ..estimator.kernels.imagine import Imagined
-from .agent_knowledge import AgentKnowledge, as_points
+from .agent_knowledge import AgentKnowledge
 from .belief_features import largest_variances
+from .wall_routes import as_points
 
 _CLEARANCE = 0.5  # of arcs, distance kept from walls beyond the robot's radius [m]
 _ALIGNED = 0.5  # heading error below which a robot drives while it turns [rad]
@@ -136,10 +137,9 @@ def plan_values(
     """
     scenario, size = knowledge.scenario, len(knowledge.known)
     slam: Any = knowledge.estimator
-    missing = size - len(knowledge.belief.landmark_ids)
     points = as_points(knowledge.grid.cells)
-    counts = missing * chance / chance.sum()
-    kept = counts > 0.02 * counts.max() if missing else counts > 0
+    counts = knowledge.missing * chance / chance.sum()
+    kept = counts > 0.02 * counts.max() if knowledge.missing else counts > 0
     density = points[kept], counts[kept]
     now = np.linalg.slogdet(knowledge.belief.covariance[3:, 3:])[1]
     steps = plans.shape[1]
@@ -189,7 +189,7 @@ def _distance_to_rest(
     landmarks = knowledge.belief.landmarks
     away = np.hypot(*(landmarks - ends[:, None]).transpose(2, 0, 1))
     away[known] = math.inf
-    if len(knowledge.belief.landmark_ids) < len(knowledge.known):
+    if knowledge.missing:
         seen = knowledge.grid.visible_from(after.poses[0].reshape(-1, 3))
         shape = *after.poses.shape[1:3], seen.shape[1]
         found: BoolArray = np.logical_or.reduce(seen.reshape(shape), axis=1)
@@ -229,17 +229,16 @@ def _tours(knowledge: AgentKnowledge, chance: Array, cells: int) -> Array:
     """Return pairs of goals to drive to one after the other, (K, 2, 2) [m]."""
     belief, grid = knowledge.belief, knowledge.grid
     position = belief.pose[:2]
-    ids = list(belief.landmark_ids)
     unknown = belief.landmarks[~knowledge.known_in_map]
     first, second = [unknown], [position[None]]
-    if ids:
+    if belief.landmark_ids:
         blocks = belief.covariance[3:, 3:].diagonal().reshape(-1, 2).sum(axis=1)
         best = belief.landmarks[[int(np.argmin(blocks))]]
         first.append(best)
         second.append(best)
     if len(unknown):
         second.append(unknown[[int(_distances(unknown, position).argmin())]])
-    if len(ids) < len(knowledge.known):
+    if knowledge.missing:
         unseen = as_points(grid.cells[chance >= chance.max()])
         spread = unseen[_spread_out(unseen, position, cells)]
         first.append(spread)

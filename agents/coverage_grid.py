@@ -9,12 +9,11 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import Array, BoolArray, ComplexArray
-from ..envs.robot.wall_contacts import wall_distances
 from ..estimator.kernels.in_view import as_view
 from ..sim_configs import Scenario
 from .belief_features import Bounds, world_bounds
 from .floor_kernels import SECTORS, cells_in_view
-from .wall_routes import WallRoutes
+from .wall_routes import WallRoutes, wall_clearance
 
 __all__ = ["SECTORS", "CoverageGrid"]
 
@@ -94,6 +93,5 @@ class CoverageGrid:
 
     def clearance(self, points: Array) -> Array:
         """Return the distance of points (…, 2) from the nearest wall, to (…) [m]."""
-        start, along = self._ends[:, 0], self._ends[:, 1] - self._ends[:, 0]
-        away = wall_distances(points[..., 0] + 1j * points[..., 1], start, along)
-        return np.asarray(away.min(axis=-1))
+        places = points[..., 0] + 1j * points[..., 1]
+        return wall_clearance(places, *self._ends.T)

@@ -11,6 +11,7 @@ e               end of a wall [m]
 """
 
 import math
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse.csgraph import shortest_path
@@ -20,7 +21,7 @@ from ..envs.robot.wall_contacts import wall_distances
 from ..sim_configs import Scenario
 from .belief_features import world_bounds
 
-_CLEARANCE = 1.0  # of goals on a floor without inner walls [m]
+CLEARANCE = 1.0  # of goals on a floor without inner walls [m]
 _GAP = 0.5  # kept between the robot and walls on a route [m]
 _CORNERS = np.exp(2j * np.pi * np.arange(8) / 8) / math.cos(math.pi / 8)
 _WIDER = 1.2  # way round an end of a wall: the robot does not drive exactly
@@ -60,15 +61,20 @@ class WallRoutes:
             return
         rings = np.unique(walls)[:, None] + _WIDER * self._margin * _CORNERS
         self._nodes: ComplexArray = rings[self._is_free(rings)]
-        between = self._lengths(self._nodes, self._nodes)
+        self._kept = self._clearance(self._nodes)
+        between = self._to_nodes(self._nodes)
         np.fill_diagonal(between, 0.0)
         self._between, self._before = shortest_path(
             np.where(np.isfinite(between), between, 0.0), return_predecessors=True
         )
         start = np.array(scenario.start.pose[:2])
-        self.reachable = np.isfinite(self.distances(start[None], _points(cells))[0])
+        self.reachable = np.isfinite(self.distances(start[None], as_points(cells))[0])
         self._free = cells[self.reachable & self._is_free(cells)]
-        self._by_cell = self.distances(_points(cells), _points(cells))
+
+    @cached_property
+    def _by_cell(self) -> Array:
+        """Distances between all cells, shape (C, C) [m]."""
+        return self.distances(as_points(self._cells), as_points(self._cells))
 
     def distances(self, points: Array, goals: Array) -> Array:
         """Return the lengths of the routes from points (S, 2) to goals (G, 2) [m].
@@ -79,11 +85,8 @@ class WallRoutes:
         if self.is_open:
             return np.asarray(np.abs(there - here[:, None]))
         direct = self._lengths(here, there)
-        first, last = (
-            self._lengths(here, self._nodes),
-            self._lengths(there, self._nodes),
-        )
-        around = _min_plus(_min_plus(first, self._between), last.T)
+        around = _min_plus(self._to_nodes(here), self._between)
+        around = _min_plus(around, self._to_nodes(there).T)
         return np.minimum(direct, around)
 
     def to_cells(self, points: Array) -> Array:
@@ -92,7 +95,7 @@ class WallRoutes:
         Around inner walls, those of the cells that the points are in.
         """
         straight = np.hypot(
-            *(_points(self._cells) - points[:, None]).transpose(2, 0, 1)
+            *(as_points(self._cells) - points[:, None]).transpose(2, 0, 1)
         )
         if self.is_open:
             return np.asarray(straight)
@@ -109,8 +112,7 @@ class WallRoutes:
         here, there = _numbers(point[None]), _numbers(straight)
         if np.isfinite(self._lengths(here, there)[0, 0]):
             return straight
-        first = self._lengths(here, self._nodes)[0]
-        last = self._lengths(there, self._nodes)[0]
+        first, last = self._to_nodes(here)[0], self._to_nodes(there)[0]
         length = first[:, None] + self._between + last
         start, node = np.unravel_index(int(length.argmin()), length.shape)
         if not np.isfinite(length[start, node]):
@@ -118,7 +120,7 @@ class WallRoutes:
         corners = [int(node)]
         while corners[-1] != start:
             corners.append(int(self._before[start, corners[-1]]))
-        return np.concatenate([_points(self._nodes[corners[::-1]]), straight])
+        return np.concatenate([as_points(self._nodes[corners[::-1]]), straight])
 
     def tours(self, point: Array, tours: Array) -> Array:
         """Return the routes of tours (K, 2, 2) from a point, to one goal and another.
@@ -145,10 +147,10 @@ class WallRoutes:
         left, bottom, right, top = self._bounds
         low, high = np.array([left, bottom]), np.array([right, top])
         if self.is_open:
-            return np.clip(goals, low + _CLEARANCE, high - _CLEARANCE)
+            return np.clip(goals, low + CLEARANCE, high - CLEARANCE)
         points = _numbers(goals)
         nearest = self._free[np.abs(points[:, None] - self._free).argmin(axis=1)]
-        return _points(np.where(self._is_free(points), points, nearest))
+        return as_points(np.where(self._is_free(points), points, nearest))
 
     def _is_free(self, points: ComplexArray) -> BoolArray:
         """Return which points are inside the bounds and off the walls."""
@@ -158,16 +160,23 @@ class WallRoutes:
         return np.asarray(inside & (self._clearance(points) >= self._margin))
 
     def _clearance(self, points: ComplexArray) -> Array:
-        along = self._ends - self._starts
-        return np.asarray(wall_distances(points, self._starts, along).min(axis=-1))
+        return wall_clearance(points, self._starts, self._ends)
 
-    def _lengths(self, a: ComplexArray, b: ComplexArray) -> Array:
+    def _to_nodes(self, points: ComplexArray) -> Array:
+        """Return the lengths of straight ways to the nodes, shape (P, nodes)."""
+        return self._lengths(points, self._nodes, self._kept)
+
+    def _lengths(
+        self, a: ComplexArray, b: ComplexArray, kept_by_b: Array | None = None
+    ) -> Array:
         """Return |b - a| of straight ways, (A, B); inf where a wall is in the way.
 
-        A way keeps the margin, or what its own ends keep.
+        A way keeps the margin, or what its own ends keep: `kept_by_b`, if given.
         """
+        if kept_by_b is None:
+            kept_by_b = self._clearance(b)
         way, start = b - a[:, None], a[:, None]
-        kept = np.minimum(self._clearance(a)[:, None], self._clearance(b))
+        kept = np.minimum(self._clearance(a)[:, None], kept_by_b)
         kept = np.minimum(kept, self._margin) * (1 - 1e-6)
         square = np.maximum(np.abs(way) ** 2, 1e-12)
         free = np.ones(way.shape, dtype=np.bool_)
@@ -204,5 +213,13 @@ def _numbers(points: Array) -> ComplexArray:
     return np.asarray(points[..., 0] + 1j * points[..., 1])
 
 
-def _points(numbers: ComplexArray) -> Array:
-    return np.stack([numbers.real, numbers.imag], axis=-1)
+def as_points(numbers: ComplexArray) -> Array:
+    """Return complex numbers x + iy, (K,), as points (K, 2)."""
+    return np.column_stack([numbers.real, numbers.imag])
+
+
+def wall_clearance(
+    points: ComplexArray, starts: ComplexArray, ends: ComplexArray
+) -> Array:
+    """Return the distances of points (…) from the nearest wall of (W,) [m]."""
+    return np.asarray(wall_distances(points, starts, ends - starts).min(axis=-1))
