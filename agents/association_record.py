@@ -7,7 +7,7 @@ import numpy as np
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.interface import SupportsDecisions
-from ..estimator.map_management.policy import LandmarkPolicy
+from ..estimator.map_management.policy import policy_of
 from ..evaluation.association_scores import score_association
 
 SCORES = ("precision", "recall", "duplicate", "ghost")
@@ -52,12 +52,9 @@ class AssociationRecord:
         for b in np.flatnonzero(ended).tolist():
             slam = filters[b]
             if isinstance(slam, SupportsDecisions):
-                policy = getattr(slam, "policy", None)
-                known = (
-                    policy if isinstance(policy, LandmarkPolicy) else LandmarkPolicy()
-                )
+                confirm = policy_of(slam).confirm
                 scores = score_association(
-                    slam.decisions, self._true_ids[b], confirm=known.confirm
+                    slam.decisions, self._true_ids[b], confirm=confirm
                 ).as_dict()
                 table[:, b] = [scores[name] for name in SCORES]
         table = np.nan_to_num(table, nan=-1.0)

@@ -71,9 +71,9 @@ def turned(
     )
 
 
-_clip, _root = njit_internal(clip), njit_internal(root)
-_on_log_scale = njit_internal(on_log_scale)
-_correlation, _turned = njit_internal(correlation), njit_internal(turned)
+clip_jit, root_jit = njit_internal(clip), njit_internal(root)
+on_log_scale_jit = njit_internal(on_log_scale)
+correlation_jit, turned_jit = njit_internal(correlation), njit_internal(turned)
 
 
 @njit_internal
@@ -89,17 +89,19 @@ def write_pose_features(
     left, bottom, right, top = bounds
     heading = wrap_angle_jit(mean[2])
     cos, sin = math.cos(heading), math.sin(heading)
-    pose[0] = _clip((2 * mean[0] - left - right) / (right - left), -1.0, 1.0)
-    pose[1] = _clip((2 * mean[1] - bottom - top) / (top - bottom), -1.0, 1.0)
+    pose[0] = clip_jit((2 * mean[0] - left - right) / (right - left), -1.0, 1.0)
+    pose[1] = clip_jit((2 * mean[1] - bottom - top) / (top - bottom), -1.0, 1.0)
     pose[2], pose[3] = cos, sin
-    aa, ab, bb = _turned(covariance[0, 0], covariance[0, 1], covariance[1, 1], cos, sin)
+    aa, ab, bb = turned_jit(
+        covariance[0, 0], covariance[0, 1], covariance[1, 1], cos, sin
+    )
     x_h, y_h = covariance[0, 2], covariance[1, 2]
-    ahead, aside, turn = _root(aa), _root(bb), _root(covariance[2, 2])
-    std[0], std[1] = _on_log_scale(ahead), _on_log_scale(aside)
-    std[2] = _on_log_scale(turn)
-    correlations[0] = _correlation(ab, ahead * aside)
-    correlations[1] = _correlation(cos * x_h + sin * y_h, ahead * turn)
-    correlations[2] = _correlation(cos * y_h - sin * x_h, aside * turn)
+    ahead, aside, turn = root_jit(aa), root_jit(bb), root_jit(covariance[2, 2])
+    std[0], std[1] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
+    std[2] = on_log_scale_jit(turn)
+    correlations[0] = correlation_jit(ab, ahead * aside)
+    correlations[1] = correlation_jit(cos * x_h + sin * y_h, ahead * turn)
+    correlations[2] = correlation_jit(cos * y_h - sin * x_h, aside * turn)
 
 
 @njit_internal
@@ -145,14 +147,14 @@ def write_belief_features(
             continue
         x = 3 + 2 * slots[i]
         dx, dy = mean[x] - mean[0], mean[x + 1] - mean[1]
-        landmarks[b, i, 0] = _clip((cos * dx + sin * dy) / diagonal, -1.0, 1.0)
-        landmarks[b, i, 1] = _clip((cos * dy - sin * dx) / diagonal, -1.0, 1.0)
+        landmarks[b, i, 0] = clip_jit((cos * dx + sin * dy) / diagonal, -1.0, 1.0)
+        landmarks[b, i, 1] = clip_jit((cos * dy - sin * dx) / diagonal, -1.0, 1.0)
         xx, xy, yy = relative_spread(covariance, x, dx, dy)
-        aa, ab, bb = _turned(xx, xy, yy, cos, sin)
-        ahead, aside = _root(aa), _root(bb)
-        std[b, i, 0], std[b, i, 1] = _on_log_scale(ahead), _on_log_scale(aside)
-        corr[b, i] = _correlation(ab, ahead * aside)
-        map_std[b, i] = _on_log_scale(_root(largest_variance(covariance, x)))
+        aa, ab, bb = turned_jit(xx, xy, yy, cos, sin)
+        ahead, aside = root_jit(aa), root_jit(bb)
+        std[b, i, 0], std[b, i, 1] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
+        corr[b, i] = correlation_jit(ab, ahead * aside)
+        map_std[b, i] = on_log_scale_jit(root_jit(largest_variance(covariance, x)))
 
 
 @jit

@@ -23,7 +23,13 @@ from ..estimator.filters.batch_results import BatchStorage
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..jit import jit, njit_internal
 from ..sim_configs.scenario_errors import unknown_choice
-from .belief_kernels import correlation, on_log_scale, relative_spread, root, turned
+from .belief_kernels import (
+    correlation_jit,
+    on_log_scale_jit,
+    relative_spread,
+    root_jit,
+    turned_jit,
+)
 
 FEATURES = (
     "ahead",  # of ρ, squashed
@@ -49,9 +55,6 @@ SCALE = 10.0
 
 _ROWS = 32
 _KINDS, _PRECISIONS = ("flat", "set"), ("float64", "float32")
-
-_on_log_scale, _correlation = njit_internal(on_log_scale), njit_internal(correlation)
-_root, _turned = njit_internal(root), njit_internal(turned)
 
 
 @dataclass(frozen=True)
@@ -177,26 +180,26 @@ def _write_row(
     row[0] = (cos * dx + sin * dy) / (distance + SCALE)
     row[1] = (cos * dy - sin * dx) / (distance + SCALE)
     xx, xy, yy = relative_spread(covariance, x, dx, dy)
-    aa, ab, bb = _turned(xx, xy, yy, cos, sin)
-    ahead, aside = _root(aa), _root(bb)
-    row[2], row[3] = _on_log_scale(ahead), _on_log_scale(aside)
-    row[4] = _correlation(ab, ahead * aside)
+    aa, ab, bb = turned_jit(xx, xy, yy, cos, sin)
+    ahead, aside = root_jit(aa), root_jit(bb)
+    row[2], row[3] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
+    row[4] = correlation_jit(ab, ahead * aside)
     P, y = covariance, x + 1
-    aa, ab, bb = _turned(P[x, x], P[x, y], P[y, y], cos, sin)
-    ahead, aside = _root(aa), _root(bb)
-    row[5], row[6] = _on_log_scale(ahead), _on_log_scale(aside)
-    row[7] = _correlation(ab, ahead * aside)
-    aa, ab, bb = _turned(P[0, 0], P[0, 1], P[1, 1], cos, sin)
-    pose_ahead, pose_aside, turn = _root(aa), _root(bb), _root(P[2, 2])
+    aa, ab, bb = turned_jit(P[x, x], P[x, y], P[y, y], cos, sin)
+    ahead, aside = root_jit(aa), root_jit(bb)
+    row[5], row[6] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
+    row[7] = correlation_jit(ab, ahead * aside)
+    aa, ab, bb = turned_jit(P[0, 0], P[0, 1], P[1, 1], cos, sin)
+    pose_ahead, pose_aside, turn = root_jit(aa), root_jit(bb), root_jit(P[2, 2])
     # Rᵀ C R with C the covariance of landmark and position
     left = cos * P[x, 0] + sin * P[y, 0], cos * P[x, 1] + sin * P[y, 1]
     right = cos * P[y, 0] - sin * P[x, 0], cos * P[y, 1] - sin * P[x, 1]
-    row[9] = _correlation(cos * left[0] + sin * left[1], ahead * pose_ahead)
-    row[10] = _correlation(cos * left[1] - sin * left[0], ahead * pose_aside)
-    row[11] = _correlation(cos * P[x, 2] + sin * P[y, 2], ahead * turn)
-    row[12] = _correlation(cos * right[0] + sin * right[1], aside * pose_ahead)
-    row[13] = _correlation(cos * right[1] - sin * right[0], aside * pose_aside)
-    row[14] = _correlation(cos * P[y, 2] - sin * P[x, 2], aside * turn)
+    row[9] = correlation_jit(cos * left[0] + sin * left[1], ahead * pose_ahead)
+    row[10] = correlation_jit(cos * left[1] - sin * left[0], ahead * pose_aside)
+    row[11] = correlation_jit(cos * P[x, 2] + sin * P[y, 2], ahead * turn)
+    row[12] = correlation_jit(cos * right[0] + sin * right[1], aside * pose_ahead)
+    row[13] = correlation_jit(cos * right[1] - sin * right[0], aside * pose_aside)
+    row[14] = correlation_jit(cos * P[y, 2] - sin * P[x, 2], aside * turn)
 
 
 def _is_by_row(key: str) -> bool:

@@ -128,6 +128,12 @@ def as_policy(value: "LandmarkPolicy | Mapping[str, Any] | bool") -> LandmarkPol
     return _made(LandmarkPolicy, "management", given)
 
 
+def policy_of(slam: object) -> LandmarkPolicy:
+    """Return the policy of an estimator; the default where it has none."""
+    policy = getattr(slam, "policy", None)
+    return policy if isinstance(policy, LandmarkPolicy) else LandmarkPolicy()
+
+
 Made = TypeVar("Made", LandmarkPolicy, FieldOfView, Constellations)
 
 

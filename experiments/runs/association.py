@@ -15,7 +15,7 @@ from ...estimator.interface import (
     SupportsDecisions,
     UpdateReport,
 )
-from ...estimator.map_management import LandmarkPolicy
+from ...estimator.map_management.policy import policy_of
 from ...evaluation.association_scores import (
     AssociationScores,
     known_places,
@@ -117,9 +117,7 @@ class DecisionRecorder:
         true_ids = [ids for ids in self._true_ids if ids is not None]
         if [len(scan.row_ids) for scan in made] != [len(ids) for ids in true_ids]:
             return None
-        policy = getattr(self._slam, "policy", None)
-        known = policy if isinstance(policy, LandmarkPolicy) else LandmarkPolicy()
-        return RunDecisions(made, true_ids, known.confirm)
+        return RunDecisions(made, true_ids, policy_of(self._slam).confirm)
 
 
 def compare_association(
