@@ -44,6 +44,8 @@ class Scene:
 
     def __init__(self, figure: Figure, scenario: Scenario, landmarks: Array) -> None:
         self._scenario = scenario
+        hiding = scenario.walls if scenario.sensor.occlusion else ()
+        self._hiding = np.reshape(hiding, (-1, 2, 2))
         self._figure = figure
         self._axes = add_axes(figure, scenario.name)
         width, height = figure.get_size_inches() * AXES_BOX[2:]
@@ -176,5 +178,4 @@ class Scene:
         sensor = self._scenario.sensor
         (left, right), (low, high) = self._limits.x, self._limits.y
         reach = float(min(sensor.max_range, np.hypot(right - left, high - low)))
-        walls = np.reshape(self._scenario.walls if sensor.occlusion else (), (-1, 2, 2))
-        return visible_area(pose, sensor.field_of_view, reach, walls)
+        return visible_area(pose, sensor.field_of_view, reach, self._hiding)

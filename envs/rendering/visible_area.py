@@ -3,6 +3,7 @@
 import numpy as np
 
 from ...arrays import Array
+from ..angles import wrap_angle
 
 _RAYS, _MORE_RAYS = 65, 257  # the latter where walls cut some off
 _BESIDE = 1e-6  # [rad] between the rays to both sides of the end of a wall
@@ -45,8 +46,7 @@ def visible_area(
     p, heading = pose[:2], pose[2]
     angles = field_of_view * np.linspace(-0.5, 0.5, _MORE_RAYS if len(walls) else _RAYS)
     offset = walls.reshape(-1, 2) - p
-    ends = np.arctan2(offset[:, 1], offset[:, 0]) - heading
-    ends = (ends + np.pi) % (2 * np.pi) - np.pi
+    ends = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - heading)
     ends = np.concatenate([ends - _BESIDE, ends + _BESIDE])
     angles = np.sort(np.append(angles, ends[np.abs(ends) < field_of_view / 2]))
     rays = np.stack([np.cos(heading + angles), np.sin(heading + angles)], axis=1)

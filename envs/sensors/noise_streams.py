@@ -219,21 +219,17 @@ class WorldNoise:
         return NoiseRows(partial(self._sensor_by_step, key))
 
     def _motion_by_step(self, key: WordArray, steps: IntArray) -> list[list[float]]:
-        rows: list[list[float]] = self.motion(_repeated(key, steps), steps).tolist()
+        rows: list[list[float]] = self.motion(
+            key.repeat(len(steps), axis=0), steps
+        ).tolist()
         return rows
 
     def _sensor_by_step(self, key: WordArray, steps: IntArray) -> Iterable[SensorNoise]:
-        noise = self.sensor(_repeated(key, steps), steps)
-        error, nearest, clutter, order = noise
+        keys = key.repeat(len(steps), axis=0)
+        error, nearest, clutter, order = self.sensor(keys, steps)
         fields = _by_step(error), nearest, _by_step(clutter), order
         rows = ([None] * len(steps) if field is None else field for field in fields)
         return cast("Iterable[SensorNoise]", zip(*rows, strict=True))
-
-
-def _repeated(key: WordArray, steps: IntArray) -> WordArray:
-    keys = np.empty((len(steps), 2), dtype=np.uint64)
-    keys[:] = key
-    return keys
 
 
 def _by_step(pairs: Array | None) -> Array | None:
