@@ -4,12 +4,23 @@ The homework: filter a log, look at the map, change the noise
 
 The EKF-SLAM homework of CMU 16-833 gives a log, ``data.txt``, and asks for four things: the map with its ellipses, the
 distances of the landmarks from their true positions, an explanation of the covariance, and the effect of the noise.
-This tutorial answers them with a drive through the same world. With a log of your own, two commands do the same:
+Two commands answer them, and write their files into the folder ``results``:
 
 .. code-block:: bash
 
    slamgym replay data.txt -e ekf
    slamgym noise-study data.txt -e ekf
+
+=================================================== ==================================================
+question                                            answer
+=================================================== ==================================================
+Map, path and ellipses after each step?             ``map.png``, ``map_steps/``; ``run.html`` plays them
+Distance of each landmark from its true position?   printed by ``replay``; ``truth.png``
+Why are the landmarks correlated?                   ``covariance.png``, explained below
+What do the noise settings change?                  printed by ``noise-study``; ``noise_study.png``
+=================================================== ==================================================
+
+This tutorial does the same in Python, with a drive through the same world.
 """
 
 # %%

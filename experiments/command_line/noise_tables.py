@@ -16,22 +16,22 @@ if TYPE_CHECKING:
     from ..noise_study.one_run import NoiseRun
 
 _COLUMNS = {
-    "pose_area": "pose\n[m²]",
-    "landmark_area": "landmark\n[m²]",
-    "landmark_rmse": "map\n[m]",
-    "landmark_rmse_aligned": "fitted\n[m]",
-    "ate": "path\n[m]",
-    "nees_per_degree": "NEES\n/ dof",
-    "nis_per_degree": "NIS\n/ dof",
+    "pose_area": "pose\narea\n[m²]",
+    "landmark_area": "landmark\narea\n[m²]",
+    "landmark_rmse": "map\nerror\n[m]",
+    "landmark_rmse_aligned": "map,\naligned\n[m]",
+    "ate": "path\nerror\n[m]",
+    "nees_per_degree": "NEES\n/ degree",
+    "nis_per_degree": "NIS\n/ degree",
 }
 
 
 def runs_table(runs: "Sequence[NoiseRun]") -> Table:
     """Lay out the study of one run, a row for each variation."""
-    title = "Final 3σ areas and RMS errors; NEES and NIS of a consistent filter are 1"
+    title = "Final 3σ areas and RMS errors; for NEES and NIS, 1 is expected"
     rows: list[dict[str, Any]] = [run.row._asdict() for run in runs]
     shown = [key for key in _COLUMNS if any(row[key] is not None for row in rows)]
-    table = _table("noise", "which is", title=title)
+    table = _table("noise", "value", title=title)
     for key in shown:
         table.add_column(Text(_COLUMNS[key]), justify="right", no_wrap=True)
     for run, row in zip(runs, rows, strict=True):

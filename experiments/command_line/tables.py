@@ -33,7 +33,7 @@ def landmark_table(summary: dict[str, Any]) -> Table:
         which = "largest errors" if known else "first"
         caption = Text(f"the {count} {which} of {len(rows)}; all: summary.json", "dim")
     table = Table(
-        title="Landmarks",
+        title="Landmarks, with their distances from the truth" * known or "Landmarks",
         title_justify="left",
         caption=caption,
         caption_justify="left",

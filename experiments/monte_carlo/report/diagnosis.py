@@ -7,7 +7,7 @@ import numpy as np
 
 from ....arrays import Array
 from ....estimator.error_frames import ErrorFrame
-from ....evaluation.diagnosis import CANNOT_TELL, Diagnosis, diagnose
+from ....evaluation.diagnosis import CANNOT_TELL, HONEST, Diagnosis, diagnose
 from ...runs.nan_statistics import finite
 from ..measure.association_measures import KNOWN_IDS_ATE, PREFIX
 from .scores import EstimatorScores
@@ -39,15 +39,18 @@ def diagnosis_summary(
 
 
 def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
-    """Write the diagnosis of an entry of the summary as a line, if there is one.
+    """Write the cause in an entry of the summary as a line, if there is one.
 
     Examples
     --------
-    >>> diagnosis_lines("ekf", {"diagnosis": {"sentence": "honest: all is well."}})
-    ('ekf: cause: honest: all is well.',)
+    >>> found = {"cause": "clutter", "sentence": "clutter: it is used."}
+    >>> diagnosis_lines("ekf", {"diagnosis": found})
+    ('ekf: cause: clutter: it is used.',)
     """
     found = entry.get("diagnosis")
-    return () if found is None else (f"{label}: cause: {found['sentence']}",)
+    if found is None or found["cause"] == HONEST:
+        return ()
+    return (f"{label}: cause: {found['sentence']}",)
 
 
 def _diagnosed(scores: EstimatorScores, frame: ErrorFrame) -> Diagnosis:

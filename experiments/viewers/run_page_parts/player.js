@@ -196,7 +196,7 @@ class Player {
       const turn = wrapped(pose.theta - run.truth.theta[place]);
       const row = make("tr", body);
       make("th", row, filter.name).scope = "row";
-      const fixed = (value) => (Number.isFinite(value) ? value.toFixed(3) : "–");
+      const fixed = (value) => (Number.isFinite(value) ? value.toFixed(3).replace(/^-(0\.0+)$/, "$1") : "–");
       const count = filter.starts[place + 1] - filter.starts[place];
       for (const text of [fixed(gap), fixed(turn), short(filter.array("nees")[place]), short(filter.array("nis")[place]), count]) {
         make("td", row, String(text));
