@@ -77,6 +77,32 @@ class UpdateReport:
         factor = self.innovation_factor
         return factor @ factor.T
 
+    def squared_given_others(self, landmark_id: int) -> float:
+        """Return νᵀ S⁻¹ ν of the reading of a landmark, given the other readings.
+
+        With Λ = S⁻¹ it is (Λν)ᵢᵀ Λᵢᵢ⁻¹ (Λν)ᵢ, i the two rows of the reading.
+
+        Raises
+        ------
+        ValueError
+            If the landmark is not among ``associated_ids``.
+
+        Examples
+        --------
+        >>> report = UpdateReport(
+        ...     associated_ids=(7,), innovation=np.array([[0.2, 1.0]]), factor=np.eye(2)
+        ... )
+        >>> round(report.squared_given_others(7), 2)
+        1.04
+        """
+        place = 2 * self.associated_ids.index(landmark_id)
+        rows = slice(place, place + 2)
+        root = np.linalg.inv(self.innovation_factor)
+        weighted = root[:, rows].T @ (root @ self.innovation.ravel())
+        return float(
+            weighted @ np.linalg.solve(root[:, rows].T @ root[:, rows], weighted)
+        )
+
     def replace(self, **changes: Any) -> UpdateReport:
         """Return a report with some parts changed.
 

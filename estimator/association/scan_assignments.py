@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from ...arrays import Array, IntArray
 from ..belief import MapView
-from ..kernels.joint_readings import UNPAIRED, Problem
+from ..kernels.joint_readings import UNPAIRED, Problem, largest_change
 from .association_policy import AssociationPolicy
 from .joint_assignment import best_assignments, innovations_of, predicted_readings
 from .nearest_neighbour import (
@@ -23,6 +23,9 @@ from .nearest_neighbour import (
 
 BRANCH_SPREAD = 16.0
 """Assignments of a scan e^8 times less likely than the best one are not considered."""
+
+SAME = 1.0
+"""Beliefs with the same landmarks are one if no coordinate changes by more σ."""
 
 
 class Assignment(NamedTuple):
@@ -75,8 +78,7 @@ def assign_scan(
     )
     explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
     if policy.association == "nearest":
-        ranked = [Assignment(0.0, assign_nearest(policy, fit))]
-        return Assignments(ranked, explained)
+        return Assignments([Assignment(0.0, assign_nearest(policy, fit))], explained)
     expected, joint = predicted_readings(view.mean, view.covariance, explained)
     pairs_first, count = policy.association == "compatibility", len(readings)
     problem = Problem(
@@ -97,11 +99,24 @@ def assign_scan(
         ceiling=ceiling,
         nodes=policy.search_nodes,
     )
-    ranked = [
-        Assignment(float(cost), _slots(policy, marks, distances, explained))
-        for cost, marks, distances in zip(*found[:3], strict=True)
-    ]
+    ranked, chosen = [], list[IntArray]()
+    for cost, marks, distances in zip(*found[:3], strict=True):
+        slots = _slots(policy, marks, distances, explained)
+        if not _is_superfluous(problem, marks, slots, chosen):
+            chosen.append(marks)
+            ranked.append(Assignment(float(cost), slots))
     return Assignments(ranked, explained)
+
+
+def _is_superfluous(
+    problem: Problem, marks: IntArray, slots: IntArray, better: list[IntArray]
+) -> bool:
+    """Return whether these only leave out readings that hardly change the belief."""
+    ambiguous = slots == AMBIGUOUS
+    return any(
+        ambiguous[marks != other].all() and largest_change(problem, other, marks) < SAME
+        for other in better
+    )
 
 
 def assign_nearest(policy: AssociationPolicy, fit: Distances) -> IntArray:

@@ -176,3 +176,52 @@ def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
                         innovations[i], variances[i], shifts[here], joints[here], j, 1.0
                     )
                     distances[s, i] = min(distances[s, i], x)
+
+
+@jit
+def largest_change(problem: Problem, marks: IntArray, fewer: IntArray) -> float:
+    """Bound how much some pairs change any coordinate of the state, in its σ.
+
+    With means μ and deviations σ, after all pairs 1 and without some of them 2, no
+    coordinate has a larger √((μ₂ − μ₁)² + σ₂² − σ₁²) / σ₁.  One pair with innovation ν,
+    given the others, shifts a coordinate of variance P by at most √(P λ νᵀ S⁻¹ ν) and
+    leaves it at least the variance (1 − λ) P::
+
+        λ = largest eigenvalue of S⁻¹ C = 1 − smallest eigenvalue of S⁻¹ Q
+
+    Parameters
+    ----------
+    problem : Problem
+    marks, fewer : ndarray, shape (m,)
+        Two assignments.
+
+    Returns
+    -------
+    float
+        Infinite unless ``fewer`` is ``marks`` without some pairs.
+    """
+    rows, landmarks = problem.feasible.shape
+    shifts = np.zeros((2, landmarks, 2))
+    joints = np.empty((2, 2 * landmarks, 2 * landmarks))
+    joints[0] = problem.joint
+    here, shift, variance = 0, 0.0, 1.0  # in the σ after all pairs
+    for is_extra in (False, True):
+        for i in range(rows):
+            j = marks[i]
+            if fewer[i] != j and fewer[i] != UNPAIRED:
+                return np.inf
+            if j == UNPAIRED or (fewer[i] != j) != is_extra:
+                continue
+            z, q = problem.innovations[i], problem.variances[i]
+            if is_extra:
+                x, determinant = fit(z, q, shifts[here], joints[here], j, 1.0)
+                s00 = joints[here][2 * j, 2 * j] + q[0]
+                s11 = joints[here][2 * j + 1, 2 * j + 1] + q[1]
+                half = (s11 * q[0] + s00 * q[1]) / (2 * determinant)
+                root = np.sqrt(max(half * half - q[0] * q[1] / determinant, 0.0))
+                left = half - root  # 1 − λ
+                shift = (shift + np.sqrt(x * (1 - left))) / np.sqrt(left)
+                variance /= left
+            condition(z, q, j, landmarks, shifts, joints, here, 1 - here)
+            here = 1 - here
+    return float(np.sqrt(shift * shift + variance - 1))

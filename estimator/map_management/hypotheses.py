@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
+from ..association.scan_assignments import SAME
 from ..association.scan_association import ScanAssociation
 from ..interface import Belief, MapView, ScanDecisions, SlamEstimator, UpdateReport
 from ..support import argument_checks, saved_states
@@ -25,9 +26,6 @@ Option = tuple[float, int, Callable[[], ScanAssociation]]
 
 SPREAD = 16.0
 """Hypotheses e^8 times less probable than the best one are discarded."""
-
-SAME = 1.0
-"""Hypotheses of the same landmarks are one if all coordinates differ by fewer σ."""
 
 
 def manage(
@@ -56,7 +54,7 @@ class Hypothesis:
 def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the hypotheses that differ from all that are more probable.
 
-    Readings that were left out long ago no longer matter.
+    The effect of readings that were left out fades with time.
     """
     chosen: list[Hypothesis] = []
     for hypothesis in hypotheses:

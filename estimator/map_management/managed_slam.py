@@ -101,7 +101,9 @@ class ManagedSlam:
         self._pruner = MapPruner(self._policy, self._editor, self._sensor.noise)
         self._candidates = Candidates()
         window = self._policy.confirm[1] if self._policy.backdate else 0
-        self._recent = RecentScans(self._filter, self._editor, window)
+        self._recent = RecentScans(
+            self._filter, self._editor, window, self._policy.pair_gate
+        )
         for name, member in optional_members(self._filter).items():
             setattr(self, name, member)
 

@@ -37,17 +37,20 @@ def mapped_ids(slam: SlamEstimator) -> tuple[int, ...]:
 
 
 def is_near(one: MapView, other: MapView, tolerance: float) -> bool:
-    """Return whether two maps of the same landmarks have nearly the same mean.
+    """Return whether two maps of the same landmarks have nearly the same belief.
 
-    They differ by at most ``tolerance`` σ in every coordinate.
+    In every coordinate with means μ₁, μ₂ and deviations σ₁, σ₂, the second belief must
+    not be far off the first one and not be much less certain::
+
+        (μ₂ − μ₁)² + σ₂² − σ₁² ≤ (tolerance σ₁)²
     """
     if one.ids != other.ids:
         return False
     size = 3 + 2 * len(one.ids)
     gap = other.mean[:size] - one.mean[:size]
     gap[2] = wrap_angle(float(gap[2]))
-    variances = np.diagonal(one.covariance)[:size]
-    return bool((gap**2 <= tolerance**2 * variances).all())
+    variances, others = (np.diagonal(m.covariance)[:size] for m in (one, other))
+    return bool((gap**2 + others <= (1 + tolerance**2) * variances).all())
 
 
 def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:

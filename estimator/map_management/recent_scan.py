@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,15 @@ class RecentScan:
         rows = [row for row, i in enumerate(self.row_ids) if i is not None]
         ids = [i for i in self.row_ids if i is not None]
         return slam.update(self.readings[rows], ids)
+
+    def without(self, landmark_id: int) -> RecentScan:
+        """Return the scan with the reading of a landmark, if any, left out."""
+        if landmark_id not in self.row_ids:
+            return self
+        row = self.row_ids.index(landmark_id)
+        row_ids, labels = list(self.row_ids), list(self.labels)
+        row_ids[row], labels[row] = None, NO_LABEL
+        return replace(self, row_ids=tuple(row_ids), labels=tuple(labels))
 
     def edit(self, editor: CachedEditor) -> None:
         """Remove and merge landmarks as after the scan."""

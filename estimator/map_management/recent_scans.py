@@ -2,7 +2,9 @@
 
 The sightings before the confirming one are readings of the new landmark, too.  To apply
 them, the filter goes back to its state before the first of them and repeats the scans
-since then, with the new landmark in them.
+since then, with the new landmark in them.  Where a sighting contradicts the ones before
+it, given the other readings of its scan, those before it were clutter or of another
+landmark: they are dropped, and the scans are repeated once more.
 """
 
 from __future__ import annotations
@@ -40,6 +42,8 @@ class RecentScans:
         Of its map.
     window : int
         Number of scans within which a landmark is confirmed; 0: keep no scans.
+    gate : float
+        Largest νᵀ S⁻¹ ν of a sighting, given the other readings of its scan.
 
     Notes
     -----
@@ -47,10 +51,12 @@ class RecentScans:
     of those that need the truth at every step.
     """
 
-    def __init__(self, slam: SlamEstimator, editor: CachedEditor, window: int) -> None:
+    def __init__(
+        self, slam: SlamEstimator, editor: CachedEditor, window: int, gate: float
+    ) -> None:
         can_repeat = not isinstance(slam, SupportsTruth | SupportsLocalView)
         self._slam, self._editor = slam, editor
-        self._window = window if can_repeat else 0
+        self._window, self._gate = window if can_repeat else 0, gate
         self.forget()
 
     def forget(self) -> None:
@@ -102,7 +108,10 @@ class RecentScans:
             scan = replace(scan, before=self._slam.state_dict())
         scans = [*self.scans, scan][-self._window - 1 :]
         first = _relabel(scans, plan.confirmed)
-        report = scan.feed(self._slam) if first is None else self._repeat(scans, first)
+        if first is None:
+            report = scan.feed(self._slam)
+        else:
+            report = self._apply_earlier(scans, first, {*plan.confirmed})
         self.scans, self.motions = scans, ()
         self.decisions.append(_decided(plan, report))
         if first is not None:
@@ -120,27 +129,37 @@ class RecentScans:
                 ids = tuple(new if label != NO_LABEL else i for i, new, label in pairs)
                 self.decisions[place] = made._replace(row_ids=ids)
 
-    def _repeat(self, scans: list[RecentScan], first: int) -> UpdateReport:
-        """Repeat the scans since one, and renew the states kept before them."""
+    def _apply_earlier(
+        self, scans: list[RecentScan], first: int, confirmed: set[int]
+    ) -> UpdateReport:
+        """Repeat the scans since one until no sighting contradicts those before it."""
         now = self._slam.state_dict()
         self._editor.expire()
         try:
-            before = scans[first].before
-            assert before is not None  # a tentative landmark begins here
-            restore(self._slam, before)
-            report = scans[first].feed(self._slam)
-            for k in range(first + 1, len(scans)):
-                scans[k - 1].edit(self._editor)
-                for distance, turn, dt in scans[k].motions:
-                    self._slam.predict((distance, turn), dt)
-                if scans[k].before is not None:
-                    scans[k] = replace(scans[k], before=self._slam.state_dict())
-                report = scans[k].feed(self._slam)
+            reports = self._repeat(scans, first)
+            while _drop_contradicted(scans, reports, confirmed, self._gate):
+                reports = self._repeat(scans, first)
         except Exception:
             restore(self._slam, now)
             self._editor.expire()
             raise
-        return report
+        return reports[-1]
+
+    def _repeat(self, scans: list[RecentScan], first: int) -> list[UpdateReport]:
+        """Repeat the scans since one, and renew the states kept before them."""
+        before = scans[first].before
+        assert before is not None  # a tentative landmark begins here
+        restore(self._slam, before)
+        self._editor.expire()
+        reports = [scans[first].feed(self._slam)]
+        for k in range(first + 1, len(scans)):
+            scans[k - 1].edit(self._editor)
+            for distance, turn, dt in scans[k].motions:
+                self._slam.predict((distance, turn), dt)
+            if scans[k].before is not None:
+                scans[k] = replace(scans[k], before=self._slam.state_dict())
+            reports.append(scans[k].feed(self._slam))
+        return reports
 
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
@@ -204,3 +223,32 @@ def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | Non
         ids = tuple(names.get(label, i) for i, label in pairs)
         scans[k] = replace(scans[k], row_ids=ids)
     return shown[0]
+
+
+def _drop_contradicted(
+    scans: list[RecentScan],
+    reports: Sequence[UpdateReport],
+    confirmed: set[int],
+    gate: float,
+) -> bool:
+    """Drop the sightings before one that contradicts them; return whether any were.
+
+    Parameters
+    ----------
+    scans : list of RecentScan
+        The scans kept.
+    reports : sequence of UpdateReport
+        Of the last ones of them.
+    confirmed : set of int
+        The landmarks confirmed in the present scan.
+    gate : float
+        Largest νᵀ S⁻¹ ν of a sighting, given the other readings of its scan.
+    """
+    first = len(scans) - len(reports)
+    for k, report in enumerate(reports):
+        for landmark_id in confirmed.intersection(report.associated_ids):
+            if report.squared_given_others(landmark_id) > gate:
+                for n in range(first, first + k):
+                    scans[n] = scans[n].without(landmark_id)
+                return True
+    return False

@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.estimator import make_estimator
+from slamgym.estimator import UpdateReport, make_estimator
+from slamgym.estimator.association import scan_assignments
+from slamgym.estimator.interface import MapView
 from slamgym.estimator.map_management.filter_pool import FilterPool
 from slamgym.estimator.map_management.hypotheses import HypothesisSlam
+from slamgym.estimator.map_management.map_view import is_near
+from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.evaluation import score_association
 from slamgym.sim_configs import action_sequence, load_scenario
 
@@ -364,3 +368,90 @@ def test_no_more_filters_are_made_than_hypotheses_are_allowed(slippery_drive):
     slam, _ = several_hypotheses(scans, world)
     allowed = slam.policy.hypotheses
     assert len(slam._pool) + len(slam.hypotheses) <= allowed + 1
+
+
+def test_alternatives_that_are_skipped_would_not_have_been_kept(
+    slippery_drive, monkeypatch
+):
+    world, scans = slippery_drive
+    options = [make(world, association="hypotheses") for _ in range(2)]
+    quick = follow(options[0], scans[:60])
+    monkeypatch.setattr(scan_assignments, "_is_superfluous", lambda *_: False)
+    thorough = follow(options[1], scans[:60])
+    assert [r.row_ids for r in quick] == [r.row_ids for r in thorough]
+    assert_same_state(options[0].best.state_dict(), options[1].best.state_dict())
+
+
+def test_a_sighting_of_clutter_does_not_drag_a_new_landmark_along():
+    slam = make_estimator(
+        "invariant",
+        motion_std=(0.02, 0.02, 0.06),
+        measurement_std=(0.02, 0.1),
+        management={"association": "joint", "confirm": (3, 8)},
+    )
+    known = np.array([[4.0, 3.0], [3.0, -4.0], [6.0, 1.0], [-2.0, 5.0]])
+    place, clutter = np.array([7.0, 4.0]), np.array([7.8, 3.0])
+    for step in range(8):
+        beside = {3: [clutter]}.get(step, [place] if step > 4 else [])
+        seen = np.array([*known, *beside])
+        slam.update(predict_measurement(np.zeros(3), seen).measurement)
+        slam.predict((0.0, 0.0))
+    landmarks = slam.belief().landmarks
+    assert len(landmarks) == 5
+    assert np.linalg.norm(landmarks[-1] - place) < 1e-3
+    assert [d.row_ids[4] for d in slam.decisions if len(d.row_ids) > 4] == [
+        None,
+        *[slam.landmark_ids[-1]] * 3,
+    ]
+
+
+def test_the_distance_of_a_reading_given_the_others_is_that_of_the_conditional():
+    rng = np.random.default_rng(5)
+    root, innovation = rng.normal(size=(6, 6)), rng.normal(size=(3, 2))
+    S = root @ root.T
+    report = UpdateReport(
+        associated_ids=(4, 7, 9), innovation=innovation, factor=np.linalg.cholesky(S)
+    )
+    i, o = [2, 3], [0, 1, 4, 5]
+    gain = S[np.ix_(i, o)] @ np.linalg.inv(S[np.ix_(o, o)])
+    nu = innovation[1] - gain @ innovation[[0, 2]].ravel()
+    squared = nu @ np.linalg.solve(S[np.ix_(i, i)] - gain @ S[np.ix_(o, i)], nu)
+    assert report.squared_given_others(7) == pytest.approx(squared, rel=1e-9)
+    with pytest.raises(ValueError, match="not in tuple"):
+        report.squared_given_others(5)
+
+
+def view(mean, std):
+    return MapView(np.array(mean, dtype=float), np.diag(np.square(std)), ())
+
+
+def test_a_belief_that_is_much_less_certain_is_another_one():
+    sure = view([1.0, 2.0, 3.1], [0.1, 0.1, 0.05])
+    unsure = view([1.0, 2.0, 3.1], [0.1, 0.3, 0.05])
+    turned = view([1.0, 2.0, -3.14], [0.1, 0.1, 0.05])
+    shifted = view([1.0, 2.11, 3.1], [0.1, 0.1, 0.05])
+    assert is_near(sure, sure, 1.0)
+    assert is_near(sure, turned, 1.0)  # by .04 rad, across π
+    assert is_near(unsure, sure, 1.0)
+    assert not is_near(sure, unsure, 1.0)
+    assert not is_near(sure, shifted, 1.0)
+
+
+def test_a_loop_is_not_closed_for_good_by_one_reading_of_clutter():
+    # A false reading where the old landmark is expected: both associations go on.
+    slam = make_estimator(
+        "invariant",
+        motion_std=(0.1, 0.05, 0.05),
+        measurement_std=(0.02, 0.1),
+        management={"association": "hypotheses", "confirm": (2, 8)},
+    )
+    reading = predict_measurement(np.zeros(3), np.array([[3.0, 0.5]])).measurement
+    for _ in range(6):
+        slam.update(reading)
+    for _ in range(40):
+        slam.predict((0.0, 0.0))
+        slam.update(np.empty((0, 2)))
+    slam.update(reading)
+    stds = [np.sqrt(h.slam.map_view().covariance[0, 0]) for h in slam.hypotheses]
+    assert len(stds) == 2
+    assert max(stds) > 2 * min(stds)

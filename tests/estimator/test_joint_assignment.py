@@ -11,7 +11,7 @@ from slamgym.estimator.association.joint_assignment import (
     innovations_of,
     predicted_readings,
 )
-from slamgym.estimator.kernels.joint_readings import UNPAIRED, Problem
+from slamgym.estimator.kernels.joint_readings import UNPAIRED, Problem, largest_change
 from slamgym.estimator.models.bearing_range import predict_measurement
 
 MISSING = 2.0
@@ -197,3 +197,55 @@ def conditional_distance(problem, rows, marks, row, mark):
         nu = nu - gain @ problem.innovations[rows, marks].ravel()
         S = S - gain @ cross
     return float(nu @ np.linalg.solve(S, nu))
+
+
+def posterior(P, H, problem, rows, marks):
+    """Return the shift of the mean and the covariance after some pairs, dense."""
+    at = np.array([(2 * j, 2 * j + 1) for j in marks], dtype=int).ravel()
+    S = problem.joint[np.ix_(at, at)] + np.diag(problem.variances[rows].ravel())
+    gain = P @ H[at].T @ np.linalg.inv(S)
+    return gain @ problem.innovations[rows, marks].ravel(), P - gain @ H[at] @ P
+
+
+def linear_problem(rng, rows=4, landmarks=4):
+    """Return a state's covariance P, H of its readings, and their problem."""
+    root = rng.normal(scale=0.2, size=(11, 11))
+    P, H = root @ root.T, rng.normal(size=(2 * landmarks, 11))
+    problem = Problem(
+        rng.normal(scale=0.5, size=(rows, landmarks, 2)),
+        H @ P @ H.T,
+        rng.uniform(0.1, 0.5, (rows, 2)) ** 2,
+        np.ones((rows, landmarks), dtype=bool),
+        np.zeros(rows),
+        np.inf,
+        np.full(rows + 1, np.inf),
+        False,
+    )
+    return P, H, problem
+
+
+def test_the_bound_on_the_change_by_some_pairs_holds_and_is_not_far_off():
+    rng = np.random.default_rng(11)
+    ratios = []
+    for count in (1, 1, 1, 2) * 50:
+        P, H, problem = linear_problem(rng)
+        marks = rng.permutation(4)
+        fewer = marks.copy()
+        fewer[:count] = UNPAIRED
+        with_all = posterior(P, H, problem, np.arange(4), marks)
+        without = posterior(P, H, problem, np.arange(count, 4), marks[count:])
+        variances, others = np.diag(with_all[1]), np.diag(without[1])
+        squared = (with_all[0] - without[0]) ** 2 + others - variances
+        change = np.sqrt((squared / variances).max())
+        bound = largest_change(problem, marks, fewer)
+        assert change <= bound * (1 + 1e-9)
+        ratios.append(change / bound)
+    assert max(ratios) > 0.5
+
+
+def test_only_pairs_that_are_left_out_have_a_bound():
+    *_, problem = linear_problem(np.random.default_rng(2), rows=2, landmarks=3)
+    marks, other = np.array([0, 1]), np.array([0, 2])
+    assert largest_change(problem, marks, marks) == 0
+    assert largest_change(problem, marks, other) == np.inf
+    assert largest_change(problem, np.array([0, UNPAIRED]), marks) == np.inf
