@@ -212,6 +212,8 @@ def test_version_licence_and_python_agree_everywhere():
     assert f"license: {project['license']}\n" in citation
     assert (ROOT / "LICENSE").read_text().startswith(f"{project['license']} License")
     assert slamgym.__version__ in (ROOT / "CHANGELOG.md").read_text()
+    pythons = re.findall(r"Python :: (3\.\d+)", " ".join(project["classifiers"]))
+    assert pythons == [f"3.{minor}" for minor in range(11, 11 + len(pythons))]
     oldest = project["requires-python"].removeprefix(">=")
     assert f"Python {oldest} or newer" in README
 
