@@ -46,7 +46,7 @@ def fit_noise(
 ) -> None:
     """Fit the noise of a log by maximum likelihood.
 
-    Estimates the noise that makes the readings of a log most likely, from the
+    Estimate the noise that makes the readings of a log most likely, from the
     innovations of a filter, with 95 % intervals. No truth is needed. If the innovations
     are not white, it suggests a factor for the noise of the sensor. Prints the options
     to paste, and compares the filter with the noise before and after. The search begins

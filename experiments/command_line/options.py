@@ -182,7 +182,7 @@ Backend = Annotated[
     str | None,
     option(
         "loky|dask|ray",
-        "Place of the workers: loky, on this machine; dask or ray, on a cluster.",
+        "Where the workers run: loky, on this machine; dask or ray, on a cluster.",
     ),
 ]
 Scheduler = Annotated[

@@ -31,9 +31,9 @@ def smooth(
 ) -> None:
     """Smooth a log: estimate all poses and landmarks at once.
 
-    Filters a log, then finds the most likely poses and landmarks given all of its
+    Filter a log, then find the most likely poses and landmarks given all of its
     readings, with their covariances. The filter associates readings without identity,
-    and readings outside its gate are omitted. Compares both with the truth. If neither
+    and readings outside its gate are omitted. Compare both with the truth. If neither
     the log nor an option specifies a noise, the command assumes one and says so.
 
     Examples
