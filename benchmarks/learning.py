@@ -2,7 +2,7 @@
 
 Run it::
 
-    python benchmarks/learning.py            # about six minutes of CPU time a seed
+    python benchmarks/learning.py            # about three minutes of CPU time a seed
 
 It trains the PPO of ``examples/09_train_active_slam.py`` once per seed, skips what the
 folder already holds, and writes into the folder (docs/learning, as committed):
@@ -250,7 +250,7 @@ def arguments() -> argparse.Namespace:
     add("--folder", type=Path, default=ROOT / "docs" / "learning", help="of the files")
     add("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="one policy each")
     add("--scenario", default="active_medium", help="a preset or .toml file with walls")
-    add("--steps", type=int, default=2_000_000, help="of training, in all worlds")
+    add("--steps", type=int, default=1_000_000, help="of training, in all worlds")
     add("--worlds", type=int, default=64, help="side by side, a multiple of 16")
     add("--maps", type=int, default=100, help="held out, to judge by in the end")
     add("--validation-maps", type=int, default=VALIDATION_MAPS, help="for the curves")
