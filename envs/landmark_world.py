@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, ComplexArray, ImageArray
 from ..sim_configs import Scenario, load_scenario
-from ..sim_configs.scenario import refuse_ranges
 from .actions import clipped_action
 from .rendering.episode_renderer import EpisodeRenderer
 from .rendering.render_state import RENDER_MODES, BeliefLike
@@ -24,7 +23,7 @@ from .sensors.bearing_range import BearingRangeSensor, hide_identities
 from .sensors.noise_streams import NoiseRows, WorldNoise
 from .sensors.odometry import OdometrySensor
 from .spaces import action_space, observation_space
-from .streams.episodes import EpisodeStarts, episode_keys
+from .streams.episodes import EpisodeStarts, drawn_scenarios, episode_keys
 
 Observation = dict[str, Any]
 
@@ -68,7 +67,8 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
     ## Starting State
     ``scenario.start.pose``. Either the true start or the start pose of a filter
     (`start_estimate`) is drawn around it. A random layout without its own seed places
-    new landmarks in every episode.
+    new landmarks in every episode. Ranges (``randomise``) draw noise, sensor and start
+    anew, see `drawn_scenario`.
 
     ## Episode End
     Never terminated; truncated after ``scenario.steps`` steps.
@@ -108,7 +108,6 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         **changes: object,
     ) -> None:
         self.scenario = load_scenario(scenario).with_changes(**changes)
-        refuse_ranges(self.scenario)
         self.action_space = action_space(self.scenario)
         self.observation_space = observation_space(self.scenario)
         self.render_mode = render_mode
@@ -119,11 +118,9 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         self._limits = robot.max_speed, robot.max_turn_rate
         self._body = UnicycleBody(robot.radius, self.scenario.walls)
         self._odometer = OdometrySensor(self.scenario)
-        self._sensor = BearingRangeSensor(self.scenario)
         self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
-        self._starts = EpisodeStarts(self.scenario)
-        self._noise = WorldNoise(self.scenario)
+        self._adopt(self.scenario)
         self._motion_noise = NoiseRows(_refuse_to_step)
 
     @property
@@ -158,7 +155,11 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
             raise ValueError(f"options must be empty, got {options!r}")
         super().reset(seed=seed)
         key = episode_keys([self.np_random])
-        if self._starts.redraws_landmarks or len(self._landmarks) == 0:
+        has_ranges = self.scenario.randomise is not None
+        if has_ranges:
+            self._adopt(drawn_scenarios(self.scenario, key)[0])
+        redraws = has_ranges or self._starts.redraws_landmarks
+        if redraws or len(self._landmarks) == 0:
             self._landmarks = self._starts.landmarks(key)[0]
         poses, estimates = self._starts.poses(key)
         self._body.place(poses[0].tolist())
@@ -211,6 +212,19 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         """Close the window, if there is one. Further calls have no effect."""
         if self._renderer is not None:
             self._renderer.close()
+
+    def _adopt(self, scenario: Scenario) -> None:
+        """Take the settings that an episode draws from a scenario."""
+        self._drawn_scenario = scenario
+        self._sensor = BearingRangeSensor(scenario)
+        self._starts = EpisodeStarts(scenario)
+        self._noise = WorldNoise(scenario)
+
+    @property
+    def drawn_scenario(self) -> Scenario:
+        """The scenario of this episode, with what it drew from ranges."""
+        self._refuse_before_reset()
+        return self._drawn_scenario
 
     @property
     def pose(self) -> Array:

@@ -6,6 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..sim_configs import Scenario
+from ..sim_configs.drawn_scenarios import widest_scenario
 from ..sim_configs.layouts import possible_positions
 from .sensors.heavy_tails import MANY_STD, largest_noise
 
@@ -27,8 +28,11 @@ def observation_space(scenario: Scenario) -> spaces.Dict:
     >>> list(observation_space(load_scenario("six_landmarks")))
     ['landmarks', 'mask', 'odometry']
     """
-    rows = count_rows(scenario)
-    highest = np.tile([np.pi, _longest_reading(scenario)], (rows, 1))
+    rows, family = count_rows(scenario), scenario
+    scenario = widest_scenario(family)
+    highest = np.tile(
+        [np.pi, _longest_reading(scenario, _displacement(family))], (rows, 1)
+    )
     lowest = np.tile([-np.pi, 0.0], (rows, 1))
     odometry = np.array(_largest_odometry(scenario))
     return spaces.Dict(
@@ -58,11 +62,20 @@ def _largest_odometry(scenario: Scenario) -> tuple[float, float]:
     )
 
 
-def _longest_reading(scenario: Scenario) -> float:
+def _displacement(family: Scenario) -> float:
+    """Bound how much ranges move the start from the widest one, and a landmark [m]."""
+    ranges = family.randomise
+    if ranges is None:
+        return 0.0
+    x, y = ranges.start_x or (0.0, 0.0), ranges.start_y or (0.0, 0.0)
+    return math.hypot(x[1] - x[0], y[1] - y[0]) + math.sqrt(2) * ranges.landmark_shift
+
+
+def _longest_reading(scenario: Scenario, displacement: float) -> float:
     sensor = scenario.sensor
     reach = sensor.max_range
     if math.isinf(reach):
-        reach = _farthest_landmark(scenario)
+        reach = _farthest_landmark(scenario) + displacement
     faults = scenario.present_faults
     largest = largest_noise(faults.sensor_dof)
     noise = largest * (sensor.std[1] + sensor.range_std_per_metre * reach)

@@ -1,7 +1,7 @@
+from .drawn_scenarios import drawn_scenario as drawn_scenario
 from .layouts import place_landmarks as place_landmarks
 from .scenario import Scenario as Scenario
 from .scenario import action_sequence as action_sequence
-from .scenario import drawn_scenario as drawn_scenario
 from .scenario_errors import ScenarioError as ScenarioError
 from .scenario_files import list_presets as list_presets
 from .scenario_files import load_scenario as load_scenario

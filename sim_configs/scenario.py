@@ -215,53 +215,6 @@ def action_sequence(scenario: Scenario) -> Array:
     return np.resize(cycle, (scenario.steps, 2))
 
 
-def drawn_scenario(scenario: Scenario, rng: np.random.Generator) -> Scenario:
-    """Draw the scenario of one episode.
-
-    Every range has its own random number u, so no range affects the draw of another::
-
-        factor = low (high / low)^u,    value = low + u (high - low),    u ~ U[0, 1)
-
-    Parameters
-    ----------
-    scenario : Scenario
-        With or without ``randomise``.
-    rng : numpy.random.Generator
-        Source of the random numbers.
-
-    Returns
-    -------
-    Scenario
-        Without ``randomise``. A scenario without ranges is returned unchanged. A map
-        that is scaled or shifted becomes a layout of points.
-
-    Examples
-    --------
-    >>> from slamgym.sim_configs import load_scenario
-    >>> ranges = {"motion_std": [0.5, 2.0], "start_heading": [-3.0, 3.0]}
-    >>> scenario = load_scenario("six_landmarks").with_changes(randomise=ranges)
-    >>> drawn = drawn_scenario(scenario, np.random.default_rng(0))
-    >>> [round(std / 0.1, 3) for std in drawn.motion.std]
-    [3.023, 1.209, 1.209]
-    >>> drawn == drawn_scenario(scenario, np.random.default_rng(0))
-    True
-    """
-    if scenario.randomise is None:
-        return scenario
-    shares = dict(zip(RANGES, rng.random(len(RANGES)).tolist(), strict=True))
-    directions = rng.uniform(-1.0, 1.0, (scenario.landmarks.count, 2))
-    return scenario.drawn_at(shares, directions)
-
-
-def refuse_ranges(scenario: Scenario) -> None:
-    """Raise a `ScenarioError` if a scenario has ranges (``randomise``)."""
-    if scenario.randomise is not None:
-        raise ScenarioError(
-            f"scenario '{scenario.name}' has ranges (randomise): draw a scenario from "
-            "them with drawn_scenario, as slamgym generate does for every episode"
-        )
-
-
 def _merge(table: dict[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:
     merged = dict(table)
     for key, change in changes.items():

@@ -17,6 +17,7 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ...sim_configs import Scenario
+from ...sim_configs.scenario_parts import Sensor
 from ..angles import wrap_bearings
 from .heavy_tails import largest_noise
 from .line_of_sight import LineOfSight
@@ -38,6 +39,29 @@ class AnonymousScan(NamedTuple):
     """The true landmark of each row, -1 for clutter and empty rows, shape (…, M)."""
 
 
+class Reach(NamedTuple):
+    """What sensors see, and their range error; arrays (…, 1) of worlds that differ."""
+
+    max_range: Array | None
+    """[m]; None for no limit."""
+    half_view: Array | None
+    """Half the field of view [rad]; None for no limit."""
+    range_std: float | Array
+    """σr at range 0 [m]."""
+    growth: float | Array
+    """k in σr(r) = σr + k r."""
+
+    @classmethod
+    def of(cls, sensor: Sensor) -> "Reach":
+        """Return the reach of one world's sensor."""
+        return cls(
+            _limit(sensor.max_range, above=math.inf),
+            _limit(sensor.field_of_view / 2, above=math.pi),
+            sensor.std[1],
+            sensor.range_std_per_metre,
+        )
+
+
 class BearingRangeSensor:
     """Simulates the sensor of a scenario.
 
@@ -53,13 +77,10 @@ class BearingRangeSensor:
 
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
-        bearing_std, self._std = sensor.std
-        self._growth = sensor.range_std_per_metre  # of σr, per metre of range
-        self._max_range = _limit(sensor.max_range, above=math.inf)
-        self._half_view = _limit(sensor.field_of_view / 2, above=math.pi)
+        self._reach, self._grows = Reach.of(sensor), sensor.range_std_per_metre > 0
         faults = scenario.present_faults
         self._bias = _bias(faults.bearing_bias, faults.range_bias)
-        largest = largest_noise(faults.sensor_dof) * bearing_std
+        largest = largest_noise(faults.sensor_dof) * sensor.std[0]
         largest += abs(faults.bearing_bias)
         self._may_wrap = sensor.field_of_view / 2 + largest >= math.pi
         hides = sensor.occlusion and scenario.walls
@@ -71,6 +92,7 @@ class BearingRangeSensor:
         position: ComplexArray,
         inverse_heading: ComplexArray,
         noise: SensorNoise,
+        reach: Reach | None = None,
     ) -> tuple[Array, BoolArray]:
         """Measure the landmarks from one pose per world.
 
@@ -88,6 +110,8 @@ class BearingRangeSensor:
             cos θ - i sin θ.
         noise : SensorNoise
             Noise of this step.
+        reach : Reach, optional
+            Of each world, where worlds differ.
 
         Returns
         -------
@@ -97,6 +121,7 @@ class BearingRangeSensor:
             Landmarks that the sensor reads.
         """
         error, nearest, _, _ = noise
+        reach = reach or self._reach
         relative = (landmarks - position) * inverse_heading
         readings = np.empty(error.shape)  # without noise at first
         y, x = relative.imag, relative.real
@@ -104,10 +129,10 @@ class BearingRangeSensor:
             y, x = y.copy(), x.copy()
         bearings = np.arctan2(y, x, readings[0])
         np.abs(relative, readings[1])
-        mask = self._in_view(readings, nearest)
+        mask = _in_view(readings, nearest, reach)
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
-        readings += self._scaled(error, readings[1])
+        readings += self._scaled(error, readings[1], reach)
         if self._bias is not None:
             bearings += self._bias[0]
             readings[1] += self._bias[1]
@@ -117,20 +142,22 @@ class BearingRangeSensor:
             readings = np.where(mask, readings, _UNSEEN)
         return readings, mask
 
-    def _in_view(self, readings: Array, nearest: Array) -> BoolArray:
-        """Return which noise-free readings, (2, …, N), the sensor can take."""
-        mask: BoolArray = readings[1] > nearest
-        if self._max_range is not None:
-            mask &= readings[1] <= self._max_range
-        if self._half_view is not None:
-            mask &= np.abs(readings[0]) <= self._half_view
-        return mask
-
-    def _scaled(self, error: Array, ranges: Array) -> Array:
+    def _scaled(self, error: Array, ranges: Array, reach: Reach) -> Array:
         """Scale the range error where its standard deviation grows with the range."""
-        if not self._growth:
+        if not self._grows:
             return error
-        return np.stack([error[0], error[1] * (self._std + self._growth * ranges)])
+        std = reach.range_std + reach.growth * ranges
+        return np.stack([error[0], error[1] * std])
+
+
+def _in_view(readings: Array, nearest: Array, reach: Reach) -> BoolArray:
+    """Return which noise-free readings, (2, …, N), the sensor can take."""
+    mask: BoolArray = readings[1] > nearest
+    if reach.max_range is not None:
+        mask &= readings[1] <= reach.max_range
+    if reach.half_view is not None:
+        mask &= np.abs(readings[0]) <= reach.half_view
+    return mask
 
 
 def _bias(bearing: float, distance: float) -> Array | None:

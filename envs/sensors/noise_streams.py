@@ -14,6 +14,7 @@ import numpy as np
 
 from ...arrays import Array, IntArray, WordArray
 from ...sim_configs import Scenario
+from ...sim_configs.scenario_parts import Sensor
 from ..streams.draws import draw_normals, draw_uniforms
 from ..streams.episodes import CLUTTER, DROPOUT, MEASUREMENT, MOTION, ORDER
 from .heavy_tails import heavy_tails
@@ -110,6 +111,38 @@ def unit_widths(scenario: Scenario) -> tuple[int, int, int, int]:
     )
 
 
+class SensorScales(NamedTuple):
+    """Settings of the sensor: numbers, or arrays (K, 1) of K worlds that differ."""
+
+    scale: Array
+    """Of unit noise, shape (2, 1, 1) or (2, K, 1); (σβ, σr) [rad, m], 1 instead of σr
+    where that grows with the range."""
+    range_std: float | Array
+    """σr at range 0 [m]."""
+    growth: float | Array
+    """k in σr(r) = σr + k r; of K worlds, zero in all or none."""
+    dropout: float | Array
+    counts_below: Array
+    """P(at most k false readings), shape (C,) or (K, C)."""
+    max_range: float | Array
+    field_of_view: float | Array
+
+    @classmethod
+    def of(cls, sensor: Sensor) -> "SensorScales":
+        """Return the settings of one world."""
+        bearing_std, std = sensor.std
+        range_std = 1.0 if sensor.range_std_per_metre else std
+        return cls(
+            np.array([[[bearing_std]], [[range_std]]]),
+            std,
+            sensor.range_std_per_metre,
+            sensor.dropout,
+            _poisson_cdf(sensor.clutter, sensor.max_clutter),
+            sensor.max_range,
+            sensor.field_of_view,
+        )
+
+
 class SensorNoiseModel:
     """Scales unit draws to the noise of a scenario's sensor.
 
@@ -123,25 +156,26 @@ class SensorNoiseModel:
         self._sensor = sensor = scenario.sensor
         faults = scenario.present_faults
         self._degrees, self._bias = faults.sensor_dof, faults.range_bias
-        bearing_std, self._std = sensor.std
-        self._growth = sensor.range_std_per_metre
-        range_std = 1.0 if self._growth else self._std
-        self._scale = np.array([[[bearing_std]], [[range_std]]])
+        self._grows = sensor.range_std_per_metre > 0
         self._nearest = np.nextafter(sensor.min_range, -1.0)
-        self._counts_below = _poisson_cdf(sensor.clutter, sensor.max_clutter)
+        self._scales = SensorScales.of(sensor)
 
-    def apply(self, draws: UnitDraws) -> SensorNoise:
-        """Scale the draws of some steps or worlds."""
+    def apply(
+        self, draws: UnitDraws, scales: SensorScales | None = None
+    ) -> SensorNoise:
+        """Scale the draws of some steps or worlds, perhaps with scales of their own."""
         sensor, unit = self._sensor, heavy_tails(draws.measurement, self._degrees)
-        nearest = _nearest_readable(unit[1], self._std, self._growth, self._bias)
+        scales = scales or self._scales
+        growth = scales.growth if self._grows else None
+        nearest = _nearest_readable(unit[1], scales.range_std, growth, self._bias)
         np.maximum(nearest, self._nearest, out=nearest)
         if draws.dropout is not None:
-            nearest[draws.dropout < sensor.dropout] = np.inf
+            nearest[draws.dropout < scales.dropout] = np.inf
         if sensor.identities:
-            return unit * self._scale, nearest, None, None
-        return unit * self._scale, nearest, self._clutter(draws), draws.order
+            return unit * scales.scale, nearest, None, None
+        return unit * scales.scale, nearest, self._clutter(draws, scales), draws.order
 
-    def _clutter(self, draws: UnitDraws) -> Array:
+    def _clutter(self, draws: UnitDraws, scales: SensorScales) -> Array:
         """Draw false readings, uniform over the visible bearings and ranges.
 
         One number per step determines their count, two more determine (β, r) of each
@@ -151,11 +185,11 @@ class SensorNoiseModel:
         if draws.clutter is None:
             return np.zeros((*draws.measurement.shape[:-1], rows))
         drawn = draws.clutter
-        counts = np.searchsorted(self._counts_below, drawn[..., 0], side="right")
-        width = sensor.max_range - sensor.min_range
-        bearings = (drawn[..., 1::2] - 0.5) * sensor.field_of_view
-        ranges = sensor.max_range - drawn[..., 2::2] * width  # above min_range
-        present = np.arange(rows) < counts[..., None]
+        counts = (scales.counts_below <= drawn[..., :1]).sum(axis=-1, keepdims=True)
+        width = scales.max_range - sensor.min_range
+        bearings = (drawn[..., 1::2] - 0.5) * scales.field_of_view
+        ranges = scales.max_range - drawn[..., 2::2] * width  # above min_range
+        present = np.arange(rows) < counts
         return np.where(present, np.stack([bearings, ranges]), 0.0)
 
 
@@ -179,20 +213,26 @@ class WorldNoise:
         self._motion_dof = scenario.present_faults.motion_dof
         self._motion_std = np.array(scenario.motion.std)
 
-    def motion(self, keys: WordArray, steps: IntArray) -> Array:
+    def motion(
+        self, keys: WordArray, steps: IntArray, std: Array | None = None
+    ) -> Array:
         """Draw the motion noise (εx, εy, εα), shape (K, 3) [m, m, rad].
 
         Parameters
         ----------
         keys : uint64 ndarray, shape (K, 2)
         steps : int64 ndarray, shape (K,)
+        std : ndarray, shape (K, 3), optional
+            Of each world, where worlds differ.
         """
         unit = np.empty((len(steps), 3))
         draw_normals(keys, steps, MOTION, unit[None])
-        noise: Array = heavy_tails(unit, self._motion_dof) * self._motion_std
-        return noise
+        noise: Array = heavy_tails(unit, self._motion_dof)
+        return noise * (self._motion_std if std is None else std)
 
-    def sensor(self, keys: WordArray, steps: IntArray) -> SensorNoise:
+    def sensor(
+        self, keys: WordArray, steps: IntArray, scales: SensorScales | None = None
+    ) -> SensorNoise:
         """Draw the sensor noise; see `motion`."""
         unit = np.empty((2, len(steps), self._landmarks))
         draw_normals(keys, steps, MEASUREMENT, unit)
@@ -202,7 +242,7 @@ class WorldNoise:
             if drawn is not None:
                 draw_uniforms(keys, steps, stream, drawn)
             uniform.append(drawn)
-        return self._model.apply(UnitDraws(unit, *uniform))
+        return self._model.apply(UnitDraws(unit, *uniform), scales)
 
     def motion_rows(self, key: WordArray) -> NoiseRows[list[float]]:
         """Return the motion noise of an episode from step 1 on, as lists of floats.
@@ -237,9 +277,11 @@ def _by_step(pairs: Array | None) -> Array | None:
     return None if pairs is None else np.ascontiguousarray(pairs.transpose(1, 0, 2))
 
 
-def _nearest_readable(unit: Array, std: float, per_metre: float, bias: float) -> Array:
+def _nearest_readable(
+    unit: Array, std: float | Array, per_metre: float | Array | None, bias: float
+) -> Array:
     """Return the range r above which r + (σ + k r) ε + bias > 0, with unit noise ε."""
-    if per_metre == 0.0:
+    if per_metre is None:
         return -std * unit - bias
     slope = 1.0 + per_metre * unit
     with np.errstate(divide="ignore", invalid="ignore"):

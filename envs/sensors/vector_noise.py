@@ -4,7 +4,7 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IndexArray, WordArray
 from ...sim_configs import Scenario
-from .noise_streams import SensorNoise, WorldNoise
+from .noise_streams import SensorNoise, SensorScales, WorldNoise
 
 
 class VectorNoise:
@@ -35,13 +35,18 @@ class VectorNoise:
         """Go to the next step in the worlds that move (None: all)."""
         self._steps += 1 if moving is None else moving
 
-    def motion(self) -> Array:
-        """Return (εx, εy, εα) of this step, shape (B, 3) [m, m, rad]."""
-        return self._noise.motion(self._keys, self._steps)
+    def motion(self, std: Array | None = None) -> Array:
+        """Return (εx, εy, εα) of this step, shape (B, 3) [m, m, rad].
 
-    def sensor(self, worlds: IndexArray | slice | None) -> SensorNoise:
+        `std`, (B, 3), holds where worlds differ.
+        """
+        return self._noise.motion(self._keys, self._steps, std)
+
+    def sensor(
+        self, worlds: IndexArray | slice | None, scales: SensorScales | None = None
+    ) -> SensorNoise:
         """Return the sensor noise of this step in some worlds (None: all)."""
         keys, steps = self._keys, self._steps
         if worlds is not None:
             keys, steps = keys[worlds], steps[worlds]
-        return self._noise.sensor(keys, steps)
+        return self._noise.sensor(keys, steps, scales)

@@ -6,11 +6,13 @@ import numpy as np
 
 from ...arrays import Array, ComplexArray, WordArray
 from ...sim_configs import Scenario, place_landmarks
+from ...sim_configs.drawn_scenarios import copied_draw
 from ...sim_configs.layouts import TRIES_PER_LANDMARK, RandomLayout
-from .draws import draw_normals, throw_darts
+from ...sim_configs.randomisation import RANGES
+from .draws import draw_normals, draw_uniforms, throw_darts
 
 # the independent streams of an episode: plain integers, which numba takes quickly
-START, MAP, MOTION, MEASUREMENT, DROPOUT, CLUTTER, ORDER = range(7)
+START, MAP, MOTION, MEASUREMENT, DROPOUT, CLUTTER, ORDER, DRAWN = range(8)
 
 
 def episode_keys(generators: Sequence[np.random.Generator]) -> WordArray:
@@ -30,6 +32,23 @@ def episode_keys(generators: Sequence[np.random.Generator]) -> WordArray:
     """
     words = [rng.bit_generator.random_raw() for rng in generators for _ in range(2)]
     return np.array(words, dtype=np.uint64).reshape(-1, 2)
+
+
+def drawn_scenarios(scenario: Scenario, keys: WordArray) -> list[Scenario]:
+    """Return the scenarios of the episodes with these keys, (K, 2).
+
+    A scenario with ranges (``randomise``) draws every setting from a stream of its own.
+    """
+    if scenario.randomise is None:
+        return [scenario] * len(keys)
+    drawn = np.empty((len(keys), len(RANGES) + 2 * scenario.landmarks.count))
+    draw_uniforms(keys, np.zeros(len(keys), dtype=np.int64), DRAWN, drawn)
+    directions = 2.0 * drawn[:, len(RANGES) :].reshape(len(keys), -1, 2) - 1.0
+    shares = drawn[:, : len(RANGES)].tolist()
+    return [
+        copied_draw(scenario, dict(zip(RANGES, share, strict=True)), direction)
+        for share, direction in zip(shares, directions, strict=True)
+    ]
 
 
 class EpisodeStarts:

@@ -190,6 +190,11 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
             self._renderer.close()
 
     @property
+    def drawn_scenarios(self) -> list[Scenario]:
+        """The scenario of each world, with what its episode drew from ranges."""
+        return self._begun_worlds().scenarios
+
+    @property
     def poses(self) -> Array:
         """True (x, y, θ) of the worlds, shape (B, 3) [m, m, rad], a copy."""
         return self._begun_worlds().poses.copy()

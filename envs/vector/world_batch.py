@@ -16,9 +16,10 @@ from ...arrays import (
     ComplexArray,
     IndexArray,
     IntArray,
+    WordArray,
 )
 from ...sim_configs import Scenario
-from ...sim_configs.scenario import refuse_ranges
+from ...sim_configs.drawn_scenarios import widest_scenario
 from ..actions import clipped_actions
 from ..robot.vector_bodies import UnicycleBodies
 from ..sensors.bearing_range import BearingRangeSensor, hide_identities
@@ -26,6 +27,7 @@ from ..sensors.odometry import VectorOdometrySensor
 from ..sensors.vector_noise import VectorNoise
 from ..spaces import count_rows
 from ..streams.episodes import EpisodeStarts, episode_keys
+from .drawn_worlds import DrawnWorlds
 
 Scan = tuple[Array, BoolArray, IntArray | None]
 
@@ -42,6 +44,7 @@ class WorldBatch:
     ----------
     scenario : Scenario
         The scenario of every world. A random layout without a seed differs per world.
+        With ranges, every world draws its settings anew for every episode.
     count : int
         B, the number of worlds.
 
@@ -82,12 +85,12 @@ class WorldBatch:
     def __init__(self, scenario: Scenario, count: int) -> None:
         if count < 1:
             raise ValueError(f"count must be >= 1, got {count}")
-        refuse_ranges(scenario)
         self.scenario = scenario
         self.count = count
-        self._starts = EpisodeStarts(scenario)
-        self._noise = VectorNoise(scenario, count)
-        self._sensor = BearingRangeSensor(scenario)
+        self._drawn = DrawnWorlds(scenario, count) if scenario.randomise else None
+        self._starts, widest = EpisodeStarts(scenario), widest_scenario(scenario)
+        self._noise = VectorNoise(widest, count)
+        self._sensor = BearingRangeSensor(widest)
         self._odometer = VectorOdometrySensor(scenario, count)
         robot = scenario.robot
         self._bodies = UnicycleBodies(count, robot.radius, scenario.walls)
@@ -122,6 +125,13 @@ class WorldBatch:
         return self._landmarks
 
     @property
+    def scenarios(self) -> list[Scenario]:
+        """The scenario of each world, with what its episode drew from ranges."""
+        if self._drawn is None:
+            return [self.scenario] * self.count
+        return list(self._drawn.scenarios)
+
+    @property
     def start_estimates(self) -> Array:
         """Start poses for filters, shape (B, 3) [m, m, rad], a copy."""
         return self._start_estimates.copy()
@@ -154,9 +164,7 @@ class WorldBatch:
                 f"generators must be {self.count}, one per world, got {len(generators)}"
             )
         keys = episode_keys([generators[world] for world in chosen.tolist()])
-        if self._starts.redraws_landmarks or not self.begun:
-            self._landmarks[chosen] = self._starts.landmarks(keys)
-        poses, estimates = self._starts.poses(keys)
+        poses, estimates = self._start(chosen, keys)
         self._noise.begin(chosen, keys)
         self._start_estimates = _replaced(self._start_estimates, chosen, estimates)
         self._bodies.place(chosen, poses)
@@ -165,6 +173,15 @@ class WorldBatch:
         self.collisions = _replaced(self.collisions, chosen, False)
         self.begun = True
         self._measure_some(chosen)
+
+    def _start(self, chosen: IndexArray, keys: WordArray) -> tuple[Array, Array]:
+        """Place landmarks; return true and estimated start poses, each (b, 3)."""
+        if self._drawn is not None:
+            self._landmarks[chosen], *starts = self._drawn.begin(chosen, keys)
+            return starts[0], starts[1]
+        if self._starts.redraws_landmarks or not self.begun:
+            self._landmarks[chosen] = self._starts.landmarks(keys)
+        return self._starts.poses(keys)
 
     def step(self, actions: ArrayLike, moving: BoolArray | None = None) -> None:
         """Drive and turn for one step, then measure.
@@ -213,7 +230,8 @@ class WorldBatch:
         return np.flatnonzero(chosen)
 
     def _drive(self, commands: Array, moving: BoolArray | None) -> None:
-        slip, error = self._odometer.split_noise(commands, self._noise.motion())
+        std = None if self._drawn is None else self._drawn.motion_std()
+        slip, error = self._odometer.split_noise(commands, self._noise.motion(std))
         share = self._bodies.drive(commands, slip, moving)
         odometry = self._odometer.read(commands, share, error)
         collisions = np.zeros(self.count, dtype=np.bool_)
@@ -247,11 +265,14 @@ class WorldBatch:
         return np.concatenate(measurements), np.concatenate(masks), all_ids
 
     def _scan(self, worlds: IndexArray | slice | None = None) -> Scan:
-        bodies, noise = self._bodies, self._noise.sensor(worlds)
+        scales = reach = None
+        if self._drawn is not None:
+            scales, reach = self._drawn.sensor_scales(worlds), self._drawn.reach(worlds)
+        bodies, noise = self._bodies, self._noise.sensor(worlds, scales)
         poses = self._landmarks, bodies.position, bodies.inverse_heading
         if worlds is not None:
             poses = poses[0][worlds], poses[1][worlds], poses[2][worlds]
-        readings, mask = self._sensor.scan(*poses, noise)
+        readings, mask = self._sensor.scan(*poses, noise, reach)
         ids = None
         if self._hides_identities:
             readings, mask, ids = hide_identities(readings, mask, noise)

@@ -11,6 +11,7 @@ from ...arrays import Array
 from ...envs.controllers import Controller
 from ...envs.landmark_world import LandmarkWorldEnv, Observation
 from ...sim_configs import Scenario, load_scenario
+from ...sim_configs.drawn_scenarios import refuse_ranges
 from .events import OdometryRow, Scan
 from .slamlog import SlamLog, numbers
 
@@ -57,6 +58,7 @@ def record_episode(
     ['Scan', 'OdometryRow', 'Scan', 'OdometryRow', 'Scan']
     """
     world = load_scenario(scenario)
+    refuse_ranges(world)
     env = gymnasium.make(
         "slamgym/LandmarkWorld-v0", scenario=world, disable_env_checker=True
     )

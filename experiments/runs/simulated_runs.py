@@ -11,6 +11,7 @@ from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...envs.vector import MixedWorlds, WorldBatch
 from ...estimator.support.memory_limit import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
+from ...sim_configs.drawn_scenarios import refuse_ranges
 
 _EACH_SCAN = ("odometry", "measurements", "mask", "poses", "landmark_ids")
 
@@ -75,6 +76,7 @@ def simulate_runs(
         If ``runs`` is below 1.
     """
     world = load_scenario(scenario)
+    refuse_ranges(world)
     if runs < 1:
         raise ValueError(f"runs must be >= 1, got {runs}")
     actions, batch = action_sequence(world), WorldBatch(world, runs)

@@ -180,7 +180,7 @@ def test_the_document_leads_from_make_vec_to_a_policy(sb3):
 
 
 def randomised():
-    """Return the two blocks on randomisation: draws per round, draws per episode."""
+    """Return the two blocks on randomisation: draws per episode, draws per round."""
     found = blocks("Domain randomisation")
     return [code for language, code in found if language == "python"]
 
@@ -188,7 +188,7 @@ def randomised():
 @pytest.mark.slow
 def test_a_policy_goes_on_in_worlds_drawn_anew_per_round(sb3):
     """The document's lines, also those that stand in comments there."""
-    code = randomised()[0].replace("# model.", "model.").replace("64 * 512", "1024")
+    code = randomised()[-1].replace("# model.", "model.").replace("64 * 512", "1024")
     easy = gym.make_vec(
         "slamgym/ActiveSlam-v0", 64, scenario="active_easy", autoreset_mode="SameStep"
     )
@@ -204,7 +204,7 @@ def test_a_policy_goes_on_in_worlds_drawn_anew_per_round(sb3):
 @pytest.mark.slow
 def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed(sb3):
     scope = {"__name__": "reader"}
-    exec(compile(randomised()[1], "document", "exec"), scope)
+    exec(compile(randomised()[0], "document", "exec"), scope)
     drives, noises = [], set()
     for seed in (3, 3):
         worlds = scope["worlds"]
@@ -216,7 +216,8 @@ def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed(sb3):
             observations, _, dones, _ = vector.step(ahead)
             seen.append(observations)
             ends += dones.sum()
-            noises |= {env.unwrapped.scenario.motion.std for env in worlds.envs}
+            drawn = worlds.unwrapped.drawn_scenarios
+            noises |= {scenario.motion.std for scenario in drawn}
         drives.append(seen)
     assert ends > 4
     assert len(noises) == ends + 4
@@ -226,7 +227,7 @@ def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed(sb3):
 @pytest.mark.slow
 def test_ppo_takes_worlds_that_are_drawn_anew_per_episode(sb3):
     scope = {"__name__": "reader"}
-    exec(compile(randomised()[1], "document", "exec"), scope)
+    exec(compile(randomised()[0], "document", "exec"), scope)
     worlds = to_stable_baselines(FlattenBatch(scope["worlds"]))
     model = sb3.PPO("MlpPolicy", worlds, n_steps=16, batch_size=32, n_epochs=1, seed=0)
     model.learn(128)

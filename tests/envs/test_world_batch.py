@@ -40,7 +40,38 @@ FAULTS = {
     "motion_dof": 3.0,
     "sensor_dof": 4.5,
 }
+RANGES = {
+    "motion_std": [0.2, 5.0],
+    "measurement_std": [0.2, 5.0],
+    "start_std": [0.5, 2.0],
+    "dropout": [0.0, 0.6],
+    "clutter": [0.0, 3.0],
+    "max_range": [3.0, 9.0],
+    "field_of_view": [1.0, 6.0],
+    "start_x": [-2.0, 2.0],
+    "start_y": [-1.0, 1.0],
+    "start_heading": [-3.0, 3.0],
+    "map_scale": [0.5, 1.5],
+}
+SHIFTED = {"layout": "points", "points": [[1.0, 2.0], [-4.0, 3.0], [5.0, -1.0]]}
 VARIANTS = {
+    "drawn anew": {
+        "randomise": RANGES,
+        "walls": WALLS,
+        "sensor": {**HALF_BLIND, **HIDDEN, "range_std_per_metre": 0.1},
+        "start": {"std": [0.1, 0.1, 0.1]},
+    },
+    "drawn anew, by id": {
+        "randomise": {**RANGES, "clutter": None},
+        "sensor": {"dropout": 0.0},
+        "faults": FAULTS,
+        "motion": ENCODERS,
+    },
+    "few ranges": {"randomise": {"motion_std": [0.5, 2.0]}},
+    "map shifted": {
+        "randomise": {"landmark_shift": 0.5, "map_scale": [0.8, 1.2]},
+        "landmarks": SHIFTED,
+    },
     "walls": {"walls": WALLS},
     "walls that hide": {"walls": WALLS, "sensor": HALF_BLIND},
     "everything": {"walls": WALLS, "sensor": {**HALF_BLIND, **HIDDEN}},

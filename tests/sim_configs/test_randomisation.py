@@ -5,8 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.vector import WorldBatch
 from slamgym.sim_configs import (
     ScenarioError,
     drawn_scenario,
@@ -171,11 +169,3 @@ def test_a_shift_of_landmarks_that_are_new_anyway_is_refused():
     layout = {"layout": "random", "count": 5, "bounds": [0.0, 0.0, 2.0, 4.0]}
     with pytest.raises(ScenarioError, match="landmark_shift must be 0 where every"):
         BASE.with_changes(landmarks=layout, randomise={"landmark_shift": 1.0})
-
-
-def test_a_world_is_not_made_of_ranges_silently():
-    ranges = {"motion_std": [0.5, 2.0]}
-    scenario = load_scenario("six_landmarks").with_changes(randomise=ranges)
-    for make in (LandmarkWorldEnv, lambda asked: WorldBatch(asked, 2)):
-        with pytest.raises(ScenarioError, match="draw a scenario from them"):
-            make(scenario)
