@@ -11,8 +11,7 @@ The tests answer two questions in this order.
    does not change the size of the innovations.  If the innovations are wrong too, the
    filter does not use the noise that it is given, and the answer is "cannot tell".
 
-The scores of a run are correlated in time.  Every test of the second question therefore
-uses one number per run.
+The tests of the second question are those of :mod:`.error_findings`.
 """
 
 from __future__ import annotations
@@ -21,14 +20,18 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import mannwhitneyu
-from scipy.stats import t as student
 
-from ..arrays import Array, BoolArray
+from ..arrays import Array
 from ..estimator.support import argument_checks
+from .error_findings import (
+    Blame,
+    Errors,
+    blame_association,
+    errors_of,
+    spurious_knowledge,
+)
 from .noise_findings import HEAVY_TAILS, Finding, noise_findings
 from .noise_sums import CHANNELS, MOMENTS
-from .time_average_tests import time_average_test
 
 HONEST, CANNOT_TELL = "honest", "cannot tell"
 LINEARISATION, ASSOCIATION = "linearisation", "association"
@@ -53,10 +56,6 @@ NOISE_RATE, FILTER_RATE = 0.02, 0.02
 """Probabilities of a false answer about the noise, and about the filter."""
 _ERROR_RATE = 0.05
 FEWEST_RUNS = 20
-_POSE = 3
-_LEAST_RATIO = 1.1
-_KNOWABLE = 0.9
-_FEWEST_OF_A_KIND = 5
 
 
 class Diagnosis(NamedTuple):
@@ -72,14 +71,6 @@ class Diagnosis(NamedTuple):
     """Further causes that the noise shows, the one with the largest effect first."""
 
 
-class _Errors(NamedTuple):
-    """How far the covariances are from the errors."""
-
-    p_value: float
-    ratio: float
-    """NEES per degree over runs and steps, of pose or heading: farthest from 1."""
-
-
 def diagnose(
     noise: ArrayLike,
     nees: ArrayLike,
@@ -88,6 +79,7 @@ def diagnose(
     nis_ratio: float | None = None,
     heading_knowledge: ArrayLike | None = None,
     mistakes: ArrayLike | None = None,
+    known_nees: ArrayLike | None = None,
 ) -> Diagnosis:
     """Name why a filter is not consistent.
 
@@ -109,6 +101,9 @@ def diagnose(
     mistakes : array_like, shape (M,), optional
         Number of readings that a run gave to a wrong landmark, where identities are
         hidden.
+    known_nees : array_like, shape (M, K), optional
+        NEES of the pose of the same filter on the same readings with known identities.
+        With it, the effect of wrong associations is found in single runs.
 
     Returns
     -------
@@ -139,12 +134,25 @@ def diagnose(
     tests = max(1, len(findings))
     adjusted = [f._replace(p_value=min(1.0, f.p_value * tests)) for f in findings]
     guilty = [f for f in adjusted if f.p_value < NOISE_RATE and f.matters]
-    errors = _errors(pose, heading)
+    errors = errors_of(pose, heading)
     if guilty:
         return _of_the_noise(sorted(guilty, key=lambda f: -f.impact), errors)
     known = None if heading_knowledge is None else np.asarray(heading_knowledge, float)
-    wrong = None if mistakes is None else np.asarray(mistakes, float)
-    return _of_the_filter(pose, errors, nis_ratio, known, wrong)
+    blame = None
+    if mistakes is not None and np.any(mistakes):
+        paired = None if known_nees is None else _paired(known_nees, nees, pose)
+        blame = blame_association(pose, np.asarray(mistakes, float), paired)
+    return _of_the_filter(errors, nis_ratio, known, blame)
+
+
+def _paired(known_nees: ArrayLike, nees: ArrayLike, pose: Array) -> Array:
+    """Return the NEES with known identities, at the steps that count."""
+    known = argument_checks.as_floats("known_nees", known_nees)
+    if known.shape != np.shape(nees):
+        raise ValueError(
+            f"known_nees must be shape {np.shape(nees)}, got {known.shape}"
+        )
+    return known[:, known.shape[1] - pose.shape[1] :]
 
 
 def _checked(
@@ -171,29 +179,7 @@ def _checked(
     return sums, pose[:, first:], heading[:, np.isfinite(heading).all(axis=0)]
 
 
-def _errors(pose: Array, heading: Array) -> _Errors:
-    """Test whether the NEES of pose or heading deviates from 1 by more than a tenth.
-
-    The test uses the variance between runs instead of χ²: in a nonlinear world, the
-    errors of a consistent filter vary more than Gaussian ones.
-    """
-    scores = [pose / _POSE] + [heading] * bool(heading.size)
-    averages = [score.mean(axis=1) for score in scores]
-    p_values = [_beyond_margin(average) for average in averages]
-    ratio = max((float(a.mean()) for a in averages), key=lambda x: abs(np.log(x)))
-    return _Errors(min(1.0, len(p_values) * min(p_values)), ratio)
-
-
-def _beyond_margin(averages: Array) -> float:
-    """Return the p-value of a mean between 1 / 1.1 and 1.1."""
-    mean = averages.mean()
-    if 1 / _LEAST_RATIO <= mean <= _LEAST_RATIO:
-        return 1.0
-    nearest = _LEAST_RATIO if mean > 1 else 1 / _LEAST_RATIO
-    return time_average_test(averages / nearest, 1).p_value
-
-
-def _of_the_noise(guilty: list[Finding], errors: _Errors) -> Diagnosis:
+def _of_the_noise(guilty: list[Finding], errors: Errors) -> Diagnosis:
     """Answer by the finding with the largest effect."""
     first = guilty[0]
     others = dict.fromkeys(f.cause for f in guilty[1:] if f.cause != first.cause)
@@ -206,23 +192,29 @@ def _of_the_noise(guilty: list[Finding], errors: _Errors) -> Diagnosis:
 
 
 def _of_the_filter(
-    pose: Array,
-    errors: _Errors,
+    errors: Errors,
     nis_ratio: float | None,
     knowledge: Array | None,
-    mistakes: Array | None,
+    blame: Blame | None,
 ) -> Diagnosis:
     """Return the answer for a filter that assumes the right noise."""
-    spurious, p_value = _both_tests(knowledge, errors.p_value)
+    spurious = 1.0 if knowledge is None else spurious_knowledge(knowledge)
+    tests = [errors.p_value]
+    if knowledge is not None:
+        tests.append(spurious)
+    if blame is not None and blame.is_paired:
+        tests.append(blame.p_value)
+    p_value = min(1.0, len(tests) * min(tests))
     if p_value >= FILTER_RATE:
         sentence = "honest: the noise is what it assumes, and its errors agree."
         return Diagnosis(HONEST, p_value, sentence)
     ratio_text = _ratio_text(errors)
-    if errors.ratio < 1:
+    is_association = blame is not None and blame.p_value < _ERROR_RATE
+    if errors.ratio < 1 and not (is_association and errors.p_value >= FILTER_RATE):
         sentence = f"cannot tell: the noise is what it assumes, but {ratio_text}."
         return Diagnosis(CANNOT_TELL, p_value, sentence)
-    if mistakes is not None and mistakes.any():
-        return _of_the_association(pose, mistakes, errors)
+    if blame is not None and (is_association or not blame.is_paired):
+        return _of_the_association(blame, errors)
     if (nis_ratio or 0.0) > np.sqrt(errors.ratio):
         sentence = (
             f"cannot tell: the noise is what it assumes, but {ratio_text}, and "
@@ -245,32 +237,14 @@ def _claims(knowledge: Array | None, spurious: float) -> str:
     return f"; it claims {share:.2g} of the least possible variance of its heading"
 
 
-def _both_tests(knowledge: Array | None, p_value: float) -> tuple[float, float]:
-    """Return the p-value of the claimed variance, and that of both tests together."""
-    if knowledge is None:
-        return 1.0, p_value
-    spurious = _spurious(knowledge)
-    return spurious, min(1.0, 2 * min(p_value, spurious))
-
-
-def _spurious(knowledge: Array) -> float:
-    """Test whether the claimed variance is below what any filter can reach."""
-    error = knowledge.std(ddof=1) / np.sqrt(len(knowledge))
-    score = (knowledge.mean() - _KNOWABLE) / max(error, 1e-12)
-    return float(student.cdf(score, len(knowledge) - 1))
-
-
-def _of_the_association(pose: Array, mistakes: Array, errors: _Errors) -> Diagnosis:
-    """Test whether the runs with more mistakes have larger errors."""
-    p_value = _worse_with_mistakes(pose.mean(axis=1), mistakes > np.median(mistakes))
+def _of_the_association(blame: Blame, errors: Errors) -> Diagnosis:
     ratio_text = _ratio_text(errors)
-    if p_value < _ERROR_RATE:
+    if blame.p_value < _ERROR_RATE:
         sentence = (
-            f"association: {np.mean(mistakes > 0):.0%} of the runs give readings to "
-            f"wrong landmarks, and those with more mistakes err more "
-            f"({_p_text(p_value)}); {ratio_text}."
+            f"association: {blame.share:.0%} of the runs give readings to wrong "
+            f"landmarks, and {blame.text} ({_p_text(blame.p_value)}); {ratio_text}."
         )
-        return Diagnosis(ASSOCIATION, p_value, sentence)
+        return Diagnosis(ASSOCIATION, blame.p_value, sentence)
     sentence = (
         f"cannot tell: the noise is what it assumes, and {ratio_text}, but runs with "
         "more wrong associations err no more than others."
@@ -278,15 +252,9 @@ def _of_the_association(pose: Array, mistakes: Array, errors: _Errors) -> Diagno
     return Diagnosis(CANNOT_TELL, errors.p_value, sentence)
 
 
-def _worse_with_mistakes(averages: Array, many: BoolArray) -> float:
-    if min(many.sum(), (~many).sum()) < _FEWEST_OF_A_KIND:
-        return 1.0
-    test = mannwhitneyu(averages[many], averages[~many], alternative="greater")
-    return float(test.pvalue)
-
-
-def _ratio_text(errors: _Errors) -> str:
-    return f"its squared errors are {errors.ratio:.3g} times what it claims"
+def _ratio_text(errors: Errors) -> str:
+    lost = f", and {errors.lost} runs are lost" if errors.lost > 1 else ""
+    return f"its squared errors are {errors.ratio:.3g} times what it claims{lost}"
 
 
 def _p_text(p_value: float) -> str:

@@ -22,7 +22,7 @@ from ..runs.blas_threads import one_blas_thread
 from ..runs.filter_settings import FilterSettings
 from ..runs.integers import integer
 from ..runs.simulated_runs import SimulatedRuns, simulate_runs
-from .measure.association_measures import KNOWN_IDS_ATE, known_ids_errors
+from .measure.association_measures import with_known_ids
 from .measure.bounds import bound_runs, noise_of_runs
 from .measure.estimator_choices import EstimatorChoice, estimator_choices
 from .measure.filtered_runs import filter_runs
@@ -74,7 +74,7 @@ class _Work:
         filtered = filter_runs(settings, runs, threads=self.threads)
         block = measure_runs(runs, filtered, bound, noise, resolution=self.resolution)
         if runs.true_ids is not None:
-            block[KNOWN_IDS_ATE] = known_ids_errors(settings, runs, self.threads)
+            block |= with_known_ids(settings, runs, self.threads)
         return block
 
 

@@ -45,6 +45,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         whiteness noise_sums
         hypothesis_tests noise_findings
         time_average_tests
+        error_findings
         diagnosis
         consistency_report
     """,

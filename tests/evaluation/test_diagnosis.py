@@ -205,6 +205,46 @@ def test_runs_with_wrong_associations_that_err_more_point_to_the_association():
     assert diagnose(**wrong, mistakes=np.zeros(RUNS)).cause == "linearisation"
 
 
+def test_errors_that_known_identities_remove_are_of_the_association():
+    scores, mistakes = honest(17), np.ones(RUNS)
+    nees = scores["nees"]
+    known = nees / np.linspace(1.0, 1.6, RUNS)[:, None]
+    found = diagnose(**scores, mistakes=mistakes, known_nees=known)
+    assert found.cause == "association"  # though all its errors together are honest
+    assert "with known identities" in found.sentence
+    assert diagnose(**scores, known_nees=known).cause == "honest"  # none is wrong
+    slightly = nees / np.linspace(1.0, 1.1, RUNS)[:, None]
+    close = diagnose(**scores, mistakes=mistakes, known_nees=slightly)
+    assert close.cause == "honest"
+
+
+def test_errors_that_known_identities_share_are_not_of_the_association():
+    scores, rng = honest(18), np.random.default_rng(18)
+    nees = 1.8 * scores["nees"]
+    nees[3] = 60.0
+    known = nees * rng.uniform(0.8, 1.25, nees.shape)
+    wrong = scores | {"nees": nees, "mistakes": np.ones(RUNS), "known_nees": known}
+    assert diagnose(**wrong).cause == "linearisation"
+    nees[[5, 7]] = 60.0
+    assert diagnose(**wrong | {"nees": nees}).cause == "association"
+    with pytest.raises(ValueError, match="known_nees must be shape"):
+        diagnose(**wrong | {"known_nees": known[:, 1:]})
+
+
+def test_a_few_lost_runs_are_not_called_honest():
+    scores, mistakes = honest(16), np.ones(RUNS)
+    nees = scores["nees"].copy()
+    nees[[3, 30, 50]] = nees[[3, 30, 50]] * [[60.0], [400.0], [15.0]]
+    mistakes[[3, 30, 50]] = 5
+    lost = scores | {"nees": nees}
+    assert diagnose(**lost).cause == "linearisation"
+    assert "and 3 runs are lost" in diagnose(**lost).sentence
+    assert diagnose(**lost, mistakes=mistakes).cause == "association"
+    assert diagnose(**lost, mistakes=6 - mistakes).cause == "cannot tell"
+    nees[[3, 50]] = scores["nees"][[3, 50]]
+    assert diagnose(**lost | {"nees": nees}).cause == "honest"  # one is chance
+
+
 def test_a_heading_known_for_certain_has_no_part_in_the_answer():
     certain = honest(15) | {"heading_nees": np.full((RUNS, STEPS), np.nan)}
     assert diagnose(**certain).cause == "honest"

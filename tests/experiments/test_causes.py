@@ -55,6 +55,21 @@ def test_linearisation_is_the_fault_of_one_filter_and_not_of_the_other():
     assert escape(found["estimators"]["ekf"]["diagnosis"]["sentence"]) in page
 
 
+def test_association_is_named_where_landmarks_are_confused_and_not_elsewhere():
+    points = [[x + d, y] for x, y in WORLD.landmarks.points for d in (-0.15, 0.15)]
+    apart = WORLD.with_changes(
+        sensor={"identities": False}, motion={"std": [0.025, 0.01, 0.01]}
+    )
+    pairs = apart.with_changes(landmarks={"points": points})
+    managed = {"association": "nearest", "confirm": [1, 1]}
+    chosen = {"managed": ("invariant", {"management": managed})}
+    confused = summary_of(pairs, chosen, runs=20)
+    assert causes(confused) == {"managed": "association"}
+    sentence = confused["estimators"]["managed"]["diagnosis"]["sentence"]
+    assert "per degree with known identities" in sentence
+    assert causes(summary_of(apart, chosen, runs=20)) == {"managed": "honest"}
+
+
 def test_results_without_noise_have_no_diagnosis():
     results = monte_carlo(WORLD, "invariant", 2).drop_vars("noise_sums")
     summary = summarise_monte_carlo(results)

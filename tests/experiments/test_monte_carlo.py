@@ -208,6 +208,11 @@ def test_bad_runs_are_told_by_the_same_filter_with_known_identities(hidden):
             twin.ate.sel(estimator="invariant"),
             rtol=1e-12,
         )
+        np.testing.assert_allclose(
+            hidden.known_ids_nees_invariant.sel(estimator=label),
+            twin.pose_nees_invariant.sel(estimator="invariant"),
+            rtol=1e-9,
+        )
 
 
 def test_the_summary_holds_the_scores_of_association(hidden):

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....arrays import Array
+from ....estimator.error_frames import ERROR_FRAMES, ErrorFrame
 from ....estimator.interface import Belief
 from ....evaluation.association_scores import AssociationScores
 from ....evaluation.gospa import Gospa
+from ....evaluation.nees import pose_nees
 from ...runs.association import RunAssociation, TrueLandmarks, compare_association
 from ...runs.filter_settings import FilterSettings
 from ...runs.simulated_runs import SimulatedRuns
@@ -27,6 +29,8 @@ SHARES = ("precision", "recall")
 MAPS = ("raw", "aligned")
 
 KNOWN_IDS_ATE = "known_ids_ate"
+KNOWN_IDS_NEES = "known_ids_nees"
+"""Followed by the error frame."""
 
 PREFIX = "association_"
 
@@ -100,15 +104,40 @@ def identified(belief: Belief, identities: Mapping[int, int]) -> Belief:
     return replace(part, landmark_ids=tuple(chosen))
 
 
-def known_ids_errors(
+def with_known_ids(
     settings: FilterSettings, runs: SimulatedRuns, threads: int | None
-) -> Array:
-    """Return the path errors of the same filter with known identities, (B,) [m].
+) -> dict[str, Array]:
+    """Return the scores of the same filter with known identities.
 
-    It has no landmark management; nan in runs that fail.
+    It has no landmark management.
+
+    Returns
+    -------
+    dict
+        Path errors (B,) [m], and the NEES of the pose (B, T) in both frames; nan in
+        runs that fail.
     """
     options = {k: v for k, v in settings.options.items() if k != "management"}
     plain = replace(settings, options=options)
-    known = filter_runs(plain, runs.identified(), threads=threads)
-    gaps = known.trace.poses[:, :, :2] - runs.true_poses[:, :, :2]
-    return np.asarray(np.sqrt((gaps**2).sum(axis=2).mean(axis=1)))
+    trace = filter_runs(plain, runs.identified(), threads=threads).trace
+    gaps = trace.poses[:, :, :2] - runs.true_poses[:, :, :2]
+    errors = np.sqrt((gaps**2).sum(axis=2).mean(axis=1))
+    posed = runs.true_poses, trace.poses, trace.pose_covariances
+    with np.errstate(all="ignore"):  # a diverged run may overflow
+        scores = {
+            f"{KNOWN_IDS_NEES}_{frame}": _pose_nees(*posed, frame)
+            for frame in ERROR_FRAMES
+        }
+    return {KNOWN_IDS_ATE: errors, **scores}
+
+
+def _pose_nees(
+    truth: Array, poses: Array, covariances: Array, frame: ErrorFrame
+) -> Array:
+    """Return the NEES of the pose run by run, (B, T)."""
+    return np.array(
+        [
+            pose_nees(*run, frame=frame)
+            for run in zip(truth, poses, covariances, strict=True)
+        ]
+    )

@@ -19,7 +19,12 @@ from ....evaluation.noise_sums import CHANNELS, MOMENTS
 from ....evaluation.trajectory_error import ellipse_areas, position_accuracy
 from ....sim_configs import Scenario
 from ...runs.simulated_runs import SimulatedRuns
-from .association_measures import MEANINGS, identified, measure_association
+from .association_measures import (
+    KNOWN_IDS_NEES,
+    MEANINGS,
+    identified,
+    measure_association,
+)
 from .filtered_runs import Failure, FilteredRuns
 
 Block = dict[str, NDArray[np.generic]]
@@ -84,6 +89,10 @@ VARIABLES: dict[str, Variable] = {
 
 HIDDEN_VARIABLES: dict[str, Variable] = VARIABLES | {
     name: Variable(RUN, "f8", meaning) for name, meaning in MEANINGS.items()
+}
+HIDDEN_VARIABLES |= {
+    f"{KNOWN_IDS_NEES}_{frame}": Variable(STEP, "f8", "NEES with known identities")
+    for frame in ERROR_FRAMES
 }
 """Those of a world that hides identities."""
 

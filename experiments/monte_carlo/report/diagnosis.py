@@ -9,7 +9,11 @@ from ....arrays import Array
 from ....estimator.error_frames import ErrorFrame
 from ....evaluation.diagnosis import CANNOT_TELL, HONEST, Diagnosis, diagnose
 from ...runs.nan_statistics import finite
-from ..measure.association_measures import KNOWN_IDS_ATE, PREFIX
+from ..measure.association_measures import (
+    KNOWN_IDS_ATE,
+    KNOWN_IDS_NEES,
+    PREFIX,
+)
 from .scores import EstimatorScores
 
 _MISTAKES = ("wrong", "duplicate", "ghost", "clutter_used")
@@ -67,6 +71,7 @@ def _diagnosed(scores: EstimatorScores, frame: ErrorFrame) -> Diagnosis:
         nis_ratio=scores.nis_per_degree,
         heading_knowledge=_heading_knowledge(scores),
         mistakes=_mistakes(scores),
+        known_nees=_known_nees(scores, frame),
     )
     if found.cause != "honest" or not scores.failures:
         return found
@@ -91,3 +96,15 @@ def _mistakes(scores: EstimatorScores) -> Array | None:
         return None
     counts = [scores.per_run(f"{PREFIX}{name}") for name in _MISTAKES]
     return np.asarray(np.nan_to_num(np.sum(counts, axis=0)))
+
+
+def _known_nees(scores: EstimatorScores, frame: ErrorFrame) -> Array | None:
+    """Return the NEES of the same filter with known identities, if it failed nowhere.
+
+    Results that an older version wrote have none.
+    """
+    name = f"{KNOWN_IDS_NEES}_{frame}"
+    if name not in scores.results:
+        return None
+    known = scores.over_time(name)[:, scores.first - 1 :]
+    return known if np.isfinite(known).all() else None
