@@ -32,6 +32,7 @@ from .coverage_grid import CoverageGrid
 from .wall_routes import CLEARANCE, as_points
 
 BASELINES = ("random", "coverage", "frontier", "revisit", "greedy", "mpc")
+"""The names that :func:`make_baseline` accepts."""
 
 _DOTS = 2.0  # distance of the points that a coverage around walls visits [m]
 _ALIGNED = 0.4  # heading error below which a robot drives while it turns [rad]

@@ -39,7 +39,7 @@ CHECKS: tuple[Callable[[Factory], None], ...] = (
 
 
 def check_estimator(factory: Factory) -> None:
-    """Check that an estimator can stand wherever slamgym uses one.
+    """Check that an estimator works wherever slamgym uses one.
 
     Drives a small known world and looks at interface, beliefs, reports, independence
     of snapshots, refusal of bad input, and save and restore.

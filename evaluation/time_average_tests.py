@@ -20,6 +20,7 @@ from .chi_square import Band, to_band
 from .hypothesis_tests import HypothesisTest, one_per_run
 
 EQUIVALENCE_MARGIN = Band(0.8, 1.25)
+"""Ratios of NEES to its expectation that count as consistent."""
 FEWEST_RESAMPLED = 5
 """Smallest number of runs with enough different resamples for a bootstrap."""
 

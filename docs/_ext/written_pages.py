@@ -7,6 +7,7 @@ table of a scenario's fields, and the lists of public names.
 import importlib
 import inspect
 import re
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +15,7 @@ import preset_pictures
 import scenario_fields
 from sphinx.application import Sphinx
 from sphinx.config import Config
+from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.display import status_iterator
 
 import slamgym
@@ -152,9 +154,13 @@ def public_names() -> dict[str, list[str]]:
 def names_page(package: str, names: list[str]) -> str:
     """Return the page of a package: its docstring and a table of its names."""
     rule = "=" * len(package)
-    about = (inspect.getdoc(importlib.import_module(package)) or "").split("\n\n")[0]
+    module = importlib.import_module(package)
+    about = (inspect.getdoc(module) or "").split("\n\n")[0]
     environments = {cls.__name__: page for page, (cls, _) in ENVIRONMENTS.items()}
-    rows = "\n".join(f"   {name}" for name in names if name not in environments)
+    constants = [name for name in names if not callable(getattr(module, name))]
+    described = {*environments, *constants}
+    rows = "\n".join(f"   {name}" for name in names if name not in described)
+    data = "\n\n".join(_constant(package, name) for name in constants)
     pages = "\n".join(
         f"* :doc:`{name} <../{environments[name]}>`"
         for name in names
@@ -174,7 +180,24 @@ def names_page(package: str, names: list[str]) -> str:
    :nosignatures:
 
 {rows}
+
+{data}
 """
+
+
+def _constant(package: str, name: str) -> str:
+    """Describe a constant: its value, and the text below it in its module."""
+    thing = getattr(importlib.import_module(package), name)
+    texts = [
+        text
+        for module in list(sys.modules.values())
+        if module.__name__.startswith("slamgym.") and vars(module).get(name) is thing
+        for text in ModuleAnalyzer.for_module(module.__name__)
+        .find_attr_docs()
+        .get(("", name), ())
+    ]
+    about = " ".join(texts).strip()
+    return f".. py:data:: {name}\n   :value: {thing!r}\n\n   {about}"
 
 
 def api_index(listed: dict[str, list[str]]) -> str:

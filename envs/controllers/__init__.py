@@ -38,6 +38,7 @@ __all__ = [
 ]
 
 CONTROLLERS = ("open_loop", "waypoints", "random")
+"""The names that :func:`make_controller` accepts."""
 
 
 def make_controller(

@@ -6,6 +6,7 @@ from ...arrays import Array, BoolArray
 
 RenderMode = Literal["human", "rgb_array"]
 RENDER_MODES: tuple[RenderMode, ...] = ("human", "rgb_array")
+"""The values of ``render_mode``: a window, or arrays of pixels."""
 
 
 class BeliefLike(Protocol):

@@ -42,7 +42,7 @@ RIVAL_GAP = 3.0
 
 @dataclass(frozen=True)
 class Constellations:
-    """When landmarks around the robot are recognised as an older part of the map.
+    """Settings for recognising landmarks around the robot as an older part of the map.
 
     Raises
     ------

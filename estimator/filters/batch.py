@@ -27,10 +27,11 @@ from .scan_workspace import workspace_for
 class BatchSlam:
     """B runs of one filter, each with its own data, visibility and map.
 
-    Run i gives the same bits as a single filter fed the data of run i; landmark ids
-    are the rows 0 … L−1 of the measurement arrays.  The runs are shared out over
-    threads.  A run whose data is not finite, or beyond 1e12, or whose innovation
-    covariance fails stops there for good, with nan from that step on; the others go on.
+    Run i has the same bits as a single filter with the data of run i.  Landmark ids
+    are the rows 0 … L−1 of the measurement arrays.  The runs are distributed over
+    threads.  A run fails if its data is not finite or exceeds 1e12, or if its
+    innovation covariance is not positive definite.  It is nan from this step on, and
+    the other runs continue.
 
     Parameters
     ----------

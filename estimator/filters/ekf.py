@@ -48,28 +48,28 @@ class EkfSlam(MapFilter):
     initial_pose : array_like, shape (3,)
         Mean of the first pose (x, y, θ) [m, m, rad].
     initial_pose_std : array_like, shape (3,)
-        Its standard deviation; zeros when the first pose defines the map's frame.
+        Its standard deviation; zeros if the first pose defines the map's frame.
     landmark_init : {"full", "independent"}
-        "full" correlates a new landmark with the pose it was seen from.  "independent"
-        drops that correlation, which makes the filter overconfident: it exists to
-        reproduce results obtained so.
+        "full" correlates a new landmark with the pose from which it was seen.
+        "independent" omits this correlation, which makes the filter overconfident;
+        it serves to reproduce published results.
     range_std_per_metre : float
         Part of σr that grows with the range: σr(r) = σr + k r.
     bearing_std_metres : float
         Part of σβ that shrinks with the range: σβ(r) = σβ + b / r. A sensor that
         reads positions with the noise σ has σβ = 0, σr = b = σ.
     range_noise_at : {"expected", "reading"}
-        Which range r is: the one that the belief expects, or the one read, which
-        many filters take although it trusts readings more just when they are short.
-        For a new landmark it is always the one read.
+        The range r in these formulas: the expected one, or the measured one.  The
+        latter is common, but gives more weight to readings that are too short.  For
+        a new landmark, it is always the measured one.
     gate_probability : float or None
         Readings of mapped landmarks outside this chi-square region of their own
         innovation are rejected; None accepts all.
     noise_at_rest : bool
         False: odometry of exactly (0, 0) adds no motion noise.
     min_range : float
-        Readings closer than this [m], or of landmarks expected closer, are skipped:
-        they have no usable bearing.
+        Readings below this range [m], and those of landmarks expected below it, are
+        skipped, because they have no usable bearing.
 
     Raises
     ------

@@ -9,15 +9,15 @@ from .ekf import EkfSlam
 class FirstEstimatesEkfSlam(EkfSlam):
     """First-estimates-Jacobian EKF: the standard filter, linearised at fixed points.
 
-    A Jacobian is taken at the first estimate of each landmark and at the predicted
-    pose, also when later estimates are better [1]_::
+    The Jacobians are evaluated at the first estimate of each landmark and at the
+    predicted pose, even if later estimates are better [1]_::
 
         G = I + (−(ŷ⁻ₖ₊₁ − ŷ⁻ₖ), x̂⁻ₖ₊₁ − x̂⁻ₖ, 0, …) e_θᵀ,   x̂⁻ predicted
         H = ∂h at (x̂⁻ₖ, first l̂)
 
-    All rows of the stacked observability matrix are then blind to the same turn of the
-    whole map, and the heading gains no information that is not there.  Poor first
-    estimates stay: with coarse sensors some runs diverge.
+    No row of the stacked observability matrix then observes the rotation of the whole
+    map, and the heading gains no spurious information.  Poor first estimates are kept,
+    so some runs diverge with coarse sensors.
 
     Parameters are those of :class:`EkfSlam`.
 

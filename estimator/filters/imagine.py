@@ -49,15 +49,15 @@ def imagine(
     walls: ArrayLike = (),
     density: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Imagined:
-    """Imagine the beliefs after plans that nobody has driven.
+    """Predict the beliefs after given plans, without driving them.
 
-    From its present belief, the filter predicts with the odometry of a plan and
-    updates with the readings that it expects: of the mapped landmarks that the sensor
-    would see from the believed pose. Their innovations are zero, so that the means
-    follow the plan and only covariances change. No filter changes.
+    From its present belief, the filter predicts with the odometry of a plan, and
+    updates with the readings that it expects: those of the mapped landmarks that the
+    sensor sees from the estimated pose. Their innovations are zero, so the means follow
+    the plan and only the covariances depend on the readings. No filter changes.
 
-    A reading that can drop out counts with the expected share of its information: its
-    variance is divided by 1 - dropout.
+    If readings can drop out, their variance is divided by 1 - dropout, which gives
+    them the expected share of their information.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The right-invariant EKF-SLAM: the filter that knows what it cannot know."""
+"""The right-invariant EKF-SLAM, which stays consistent if the heading is uncertain."""
 
 from __future__ import annotations
 
@@ -12,28 +12,29 @@ from .ekf import EkfSlam
 
 
 class InvariantEkfSlam(EkfSlam):
-    """Right-invariant EKF on SE_{1+n}(2), in ordinary coordinates; the recommended one.
+    """Right-invariant EKF, the recommended filter.
 
-    The error is ξ = Log(χ χ̂⁻¹), in which a turn of the whole map is a straight line:
-    the filter gains no information about its absolute heading, however often it
-    linearises [1]_ [2]_.  It is the ordinary filter but for what follows the gain.
-    With δ = Aᵀ L⁻¹ ν, t = δθ, J = [0 −1; 1 0], for the position and every landmark q::
+    The error ξ = Log(χ χ̂⁻¹) is on SE_{1+n}(2).  A rotation of the whole map is a
+    straight line in it, so the filter gains no information about its absolute heading,
+    however often it linearises [1]_ [2]_.  Mean and covariance are stored in ordinary
+    coordinates.  Up to the gain, the filter equals the standard one.  With
+    δ = Aᵀ L⁻¹ ν, t = δθ and J = [0 −1; 1 0], for the position and every landmark q::
 
         retraction   q ← R(t) q + V(t) (δq − t J q),   θ ← θ + t
         transport    P ← P + v cᵀ + c vᵀ + c_θ v vᵀ,   v = J (q⁺ − q), c = P e_θ
 
-    so propagation costs O(n) and the additive covariance stays at hand.
+    Propagation costs O(n), and the additive covariance is always available.
 
     Parameters
     ----------
     motion_std, measurement_std
         As in :class:`EkfSlam`.
     iterations : int
-        More than one: linearise again at each iterate, against the same prior; for
-        coarse sensors.  The heading column of H stays that of the prior, since the
-        exact Gauss-Newton column would let the filter see its heading.
+        Number of linearisations of a scan, with the same prior; more than one for
+        coarse sensors.  The heading column of H remains that of the prior, because the
+        exact Gauss-Newton column would make the heading observable.
     sequential : bool
-        Take in one landmark after the other instead of the whole scan at once: for
+        Process one landmark after the other instead of the whole scan at once, for
         heading errors of half a radian and more.  The order of readings then matters.
     **settings
         The other keywords of :class:`EkfSlam`.
@@ -47,7 +48,7 @@ class InvariantEkfSlam(EkfSlam):
 
     Examples
     --------
-    A robot that stands and looks cannot learn its heading:
+    A robot at rest gains no information about its heading:
 
     >>> slam = InvariantEkfSlam((0, 0, 0), (0.03, 0.1), initial_pose_std=(0, 0, 0.3))
     >>> for _ in range(100):

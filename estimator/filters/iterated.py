@@ -13,16 +13,14 @@ from .ekf import EkfSlam
 class IteratedEkfSlam(EkfSlam):
     """Iterated EKF: linearise again at each iterate, condition once.
 
-    The Gauss-Newton method on one scan and its prior [1]_.
-
-    ::
+    The update is the Gauss-Newton method on one scan and its prior [1]_::
 
         x_{i+1} = x_0 + K_i (z − h(x_i) − H_i (x_0 − x_i)),   x_0, P the prior
         P ← (I − K H) P with the last H
 
-    Every iteration starts from the same prior, so that a linear problem keeps its
-    exact answer however often it iterates.  It fits precise sensors with strongly
-    curved measurements; it does not cure the filter's false certainty of heading.
+    Every iteration uses the same prior, so the result of a linear problem is exact
+    for any number of iterations.  The filter suits precise sensors with strongly
+    nonlinear measurements.  Its heading is as overconfident as that of ``ekf``.
 
     Parameters
     ----------

@@ -7,14 +7,14 @@ from .ekf import EkfSlam
 
 
 class ObservabilityConstrainedEkfSlam(EkfSlam):
-    """Observability-constrained EKF: the best linearisation, made blind by projection.
+    """Observability-constrained EKF: Jacobians at the latest estimate, projected.
 
-    H is taken at the present estimate and projected off the direction w in which the
-    whole map turns, as it was when the landmark was first seen [1]_ [2]_::
+    H is evaluated at the latest estimate.  The projection removes its component along
+    w, the rotation of the whole map at the first estimates of the landmarks [1]_ [2]_::
 
         H ← H − (H w) wᵀ / wᵀw
 
-    with G as in :class:`FirstEstimatesEkfSlam`.
+    G is that of :class:`FirstEstimatesEkfSlam`.
 
     Parameters are those of :class:`EkfSlam`.
 

@@ -27,15 +27,17 @@ RESERVED = (-(2**63), 1 - 2**63)  # ids of these two places
 class RobocentricEkfSlam(EkfSlam):
     """EKF-SLAM with world origin and landmarks estimated in the robot's frame.
 
-    After Castellanos et al. [1]_.  Between scans, the filter estimates only the motion
-    w = (x, y, θ) since the last scan, which starts at zero without uncertainty.  A scan
-    is linearised at w and the map in the frame of the last scan.  Then the frame moves
-    to the robot.  Every point q and the world's heading φ in the robot's frame become::
+    The method is that of Castellanos et al. [1]_.  Between scans, the filter estimates
+    only the motion w = (x, y, θ) since the last scan, which starts at zero without
+    uncertainty.  A scan is linearised at w and at the map in the frame of the last
+    scan.  Then the frame moves to the robot.  Every point q and the world's heading φ
+    in the robot's frame become::
 
         q ← R(−θ_w) (q − (x_w, y_w)),    φ ← φ − θ_w,    w ← 0
 
-    Therefore no Jacobian depends on an absolute pose.  The heading stays consistent;
-    the covariance of the map does not in long loops.  Beliefs are in the world's frame.
+    Therefore no Jacobian depends on an absolute pose.  The heading remains consistent;
+    in long loops, the covariance of the map is too small.  Beliefs are in the world's
+    frame.
 
     Parameters are those of :class:`EkfSlam`.
 

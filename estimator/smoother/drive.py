@@ -40,9 +40,10 @@ class Sightings(NamedTuple):
 class Drive:
     """The motions and scans of a drive, with the noise that filters assume.
 
-    It takes what a filter takes, step by step.  A pose of the drive is where a scan was
-    taken; readings of odometry between two scans are composed, and their noise is
-    propagated to first order as in a filter's prediction (exactly, for a single one).
+    It has the methods ``predict`` and ``update`` of a filter.  The poses of the drive
+    are those of the scans.  Odometry readings between two scans are composed, and their
+    noise is propagated to first order, as in a filter's prediction (exactly, for a
+    single reading).
 
     Parameters
     ----------

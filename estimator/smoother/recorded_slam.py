@@ -27,12 +27,12 @@ class Event(NamedTuple):
 
 
 class RecordedSlam:
-    """A filter, and beside it the drive that it followed.
+    """A filter that also records its drive, for the smoother.
 
-    The drive gets the readings that the filter used.  Landmarks that the filter merged
-    are one in the drive, and those that it removed are not in it.  With landmark
-    management around this filter, these are the associations that management decided
-    on, also those of landmarks confirmed later.
+    The drive receives the readings that the filter used.  Landmarks that the filter
+    merged are one landmark in the drive, and landmarks that it removed are not in it.
+    With landmark management around this filter, the drive has the associations of the
+    management, including those of landmarks that are confirmed later.
 
     Parameters
     ----------
