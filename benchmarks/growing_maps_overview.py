@@ -89,6 +89,9 @@ class Row(NamedTuple):
     filter: str
     median: float  # ms, of a step
     mean: float  # ms
+    slow: float  # ms, percentile 99
+    slowest: float  # ms, percentile 99.9
+    worst: float  # ms
     asking: float  # ms, median over the drives
     megabytes: float
     error: float  # m, root mean square over the drives
@@ -101,6 +104,9 @@ COLUMNS = (
     ("filter", "{}"),
     ("median ms", "{:.3f}"),
     ("mean ms", "{:.3f}"),
+    ("99 %", "{:.2f}"),
+    ("99.9 %", "{:.2f}"),
+    ("worst", "{:.2f}"),
     ("asking, ms", "{:.2f}"),
     ("MB", "{:.1f}"),
     ("error, m", "{:.2f}"),
@@ -157,6 +163,9 @@ def _row(count: int, name: str, drives: Sequence[Drive]) -> Row:
         name,
         float(np.median(times)),
         float(np.mean(times)),
+        float(np.percentile(times, 99)),
+        float(np.percentile(times, 99.9)),
+        float(np.max(times)),
         1e3 * float(np.median([each.asking for each in drives])),
         float(np.mean([each.nbytes for each in drives])) / 1e6,
         float(np.sqrt(np.mean([each.error**2 for each in drives]))),

@@ -54,3 +54,13 @@ def measure(
                     costs[name].append(time.thread_time() - began)
     # the first stretch warms up caches and compiles
     return {name: Costs(steps[STRETCH:]) for name, steps in costs.items()}
+
+
+def least(drives: Sequence[dict[str, Costs]]) -> dict[str, Costs]:
+    """Return the least time of each step over repetitions of one drive."""
+    return {
+        name: Costs(
+            np.min([each[name].steps for each in drives], axis=0).tolist(), costs.nbytes
+        )
+        for name, costs in drives[0].items()
+    }

@@ -91,7 +91,9 @@ def posterior_bound(
     poses = argument_checks.as_floats("true_poses", true_poses)
     places = argument_checks.as_floats("landmarks", landmarks)
     seen = np.ascontiguousarray(visible, dtype=np.bool_)
-    count, steps, points = seen.shape if seen.ndim == 3 else (0, 0, 0)
+    if seen.ndim != 3:
+        raise ValueError(f"visible must have shape (B, T, L), got {seen.shape}")
+    count, steps, points = seen.shape
     for name, array, shape in (
         ("true_poses", poses, (count, steps, 3)),
         ("landmarks", places, (count, points, 2)),

@@ -30,19 +30,22 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from growing_maps_peers import FullWithDsyrk
 
 NOISE = (TOWN_MOTION_STD, MEASUREMENT_STD)
-WHOLE = active_set.LARGEST_WHOLE_MAP
+WHOLE = 250
+LIMITS = ("LARGEST_WHOLE_MAP", "LARGEST_WHOLE_INVARIANT")
 
 
 @pytest.fixture(autouse=True)
 def _small_maps_are_split_too(monkeypatch):
     """So that what is put off is tested where tests are fast."""
-    monkeypatch.setattr(active_set, "LARGEST_WHOLE_MAP", 0)
+    for limit in LIMITS:
+        monkeypatch.setattr(active_set, limit, 0)
 
 
 @pytest.fixture
 def _small_maps_are_whole(monkeypatch):
     """As the filter does unless told a local size."""
-    monkeypatch.setattr(active_set, "LARGEST_WHOLE_MAP", WHOLE)
+    for limit in LIMITS:
+        monkeypatch.setattr(active_set, limit, WHOLE)
 
 
 def forget(full, ids):

@@ -9,6 +9,7 @@ from slamgym.estimator.error_frames import (
     invariant_covariance,
     invariant_error,
 )
+from slamgym.estimator.models.rigid_motion import compose, composed
 from slamgym.evaluation.chi_square import average_band
 from slamgym.evaluation.nees import heading_nees, normalised_squared_error, pose_nees
 
@@ -122,3 +123,12 @@ def test_band_holds_the_average_as_often_as_it_says():
 def test_a_belief_in_an_unknown_frame_is_refused():
     with pytest.raises(ValueError, match=r"frame must be .*, got 'rubbish'"):
         Belief(np.zeros(3), np.eye(3), (), frame="rubbish")
+
+
+def test_composed_entries_are_those_of_compose():
+    start, pose = np.array([1.5, -2.0, 0.7]), np.array([0.4, -0.9, 2.1])
+    *entries, cos, sin = composed(*start, *pose)
+    expected = (group(start) @ group(pose))[:2, 2]
+    assert entries == pytest.approx([*expected, 2.8])
+    assert compose(start, pose)[0] == pytest.approx(entries)
+    assert (cos, sin) == pytest.approx((np.cos(0.7), np.sin(0.7)))

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from numeric_jacobian import numeric_jacobian
 
+from slamgym.estimator.models.angles import wrap_angle
 from slamgym.estimator.models.unicycle_motion import drive_jit, predict_pose
 
 
@@ -64,3 +65,11 @@ def test_the_jacobian_entries_of_the_compiled_equation_equal_central_differences
     G = np.eye(3)
     G[:2, 2] = -distance * sin, distance * cos
     np.testing.assert_allclose(G, numeric, atol=1e-7)
+
+
+def test_an_angle_just_below_minus_pi_stays_in_the_interval():
+    below = np.nextafter(-np.pi, -4.0)
+    assert wrap_angle(below) == -np.pi
+    assert wrap_angle(np.array([below, 4.0])) == pytest.approx(
+        [-np.pi, 4.0 - 2 * np.pi], abs=1e-15
+    )

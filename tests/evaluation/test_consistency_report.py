@@ -8,6 +8,7 @@ from slamgym.evaluation.consistency_report import (
     assert_consistent,
     evaluate_consistency,
 )
+from slamgym.evaluation.hypothesis_tests import final_step_test
 
 RUNS, STEPS = 100, 40
 
@@ -132,3 +133,11 @@ def test_unknown_frames_and_misfit_shapes_are_refused(scores):
         report(*scores, frame="global")
     with pytest.raises(ValueError, match="nis must be shape"):
         report(nees, nis[:-1], freedom)
+
+
+def test_the_last_step_is_tested_at_the_last_step(scores):
+    nees = scores[0]
+    nees[:, -1] *= 2
+    expected = final_step_test(nees[:, -1], 3)
+    assert report(*scores).final_step == expected
+    assert not expected.accepted

@@ -7,6 +7,7 @@ from scipy.stats import kurtosistest
 from slamgym.evaluation import CAUSES, diagnose, noise_sums
 from slamgym.evaluation.noise_findings import _kurtosis_score, noise_findings
 from slamgym.evaluation.noise_sums import CHANNELS, MOMENTS
+from slamgym.evaluation.time_average_tests import time_average_test
 
 RUNS, STEPS = 60, 40
 MOTION_STD, SENSOR_STD = (0.2, 0.1, 0.05), (0.02, 0.1)
@@ -192,6 +193,14 @@ def test_a_filter_that_ignores_the_noise_it_is_given_is_not_explained():
     assert diagnose(**wrong, nis_ratio=1.7).cause == "cannot tell"
     cautious = scores | {"nees": 0.5 * scores["nees"]}
     assert diagnose(**cautious).cause == "cannot tell"
+
+
+@pytest.mark.parametrize(("factor", "margin"), [(0.5, 1 / 1.1), (2.0, 1.1)])
+def test_errors_are_compared_with_the_nearer_end_of_a_tenth(factor, margin):
+    scores = honest(17)
+    scores["nees"] *= factor
+    pose = time_average_test(scores["nees"].mean(axis=1) / margin, 3)
+    assert diagnose(**scores).p_value == pytest.approx(2 * pose.p_value, rel=1e-9)
 
 
 def test_runs_with_wrong_associations_that_err_more_point_to_the_association():

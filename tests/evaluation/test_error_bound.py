@@ -124,10 +124,38 @@ def test_no_landmark_leaves_dead_reckoning():
 
 
 def test_squares_are_those_of_the_invariant_error():
+    assert invariant_squares(np.array([3.0, 5.0, 0.5]))[0].tolist() == [34, 0.25]
     squares, about_centre = invariant_squares(np.array([1, 2, 3, 4, 0, 6, 0, 5, 3.0]))
     assert squares.tolist() == [5, 9]
     assert about_centre == pytest.approx((1 + 1 + 1 + 1 + 0 + 4) / 3)
     assert np.isnan(invariant_squares(np.zeros(3))[1])
+
+
+def test_the_map_is_bounded_about_its_centre():
+    poses, visible = exact_drive()
+    visible[:, 1] = False
+    bound = posterior_bound(
+        poses[None],
+        PLACES[None],
+        visible[None],
+        np.ones(len(poses)),
+        start_std=START_STD,
+        **NOISE,
+    )
+    P, centre = bound.covariances[0], np.eye(3) - 1 / 3
+    known = [0, 2, 3]
+    about = [
+        np.trace(centre @ P[np.ix_(at, at)] @ centre) / 3
+        for at in ([3 + 2 * i + axis for i in known] for axis in (0, 1))
+    ]
+    assert bound.map[0] == pytest.approx(sum(about))
+
+
+def test_the_interval_of_the_efficiency_is_that_of_student():
+    found = efficiency(np.ones(3), np.array([0.5, 1.0, 1.5]))
+    reach = 4.302652729911275 * 0.5 / np.sqrt(3)
+    assert found.value == 1
+    assert found.interval == pytest.approx((1 - reach, 1 + reach))
 
 
 def test_the_interval_of_the_efficiency_covers_the_true_ratio():
@@ -144,6 +172,7 @@ def test_the_interval_of_the_efficiency_covers_the_true_ratio():
     ("change", "message"),
     [
         ({"landmarks": np.zeros((1, 3, 2))}, r"landmarks must have shape \(1, 4, 2\)"),
+        ({"visible": np.ones((1, 26))}, r"visible must have shape \(B, T, L\), got"),
         ({"motion_std": (0.1, -1, 0)}, "motion_std must be 3 finite numbers >= 0"),
     ],
 )

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from linear_filter import kalman_scores
-from scipy.stats import chi2, norm
+from scipy.stats import chi2, norm, skew
+from scipy.stats import t as student
 
 from slamgym.evaluation.chi_square import average_band, family_band
 from slamgym.evaluation.hypothesis_tests import (
@@ -200,3 +201,30 @@ def test_what_is_not_one_number_per_run_is_refused():
         runs_to_detect(1.0, DOF)
     with pytest.raises(ValueError, match="lags must be in"):
         ljung_box(np.ones((2, 5)), lags=5)
+
+
+@pytest.mark.parametrize("runs", [10, 40])
+def test_the_time_averages_have_the_p_value_of_halls_cubic(runs):
+    averages = np.random.default_rng(runs).gamma(3.0, 1.1, runs)
+    ratios = averages / DOF
+    t = (ratios.mean() - 1) / (ratios.std(ddof=1) / np.sqrt(runs))
+    gamma, root = skew(ratios), np.sqrt(runs)
+    g = t + gamma * t**2 / (3 * root) + gamma**2 * t**3 / (27 * runs)
+    g += gamma / (6 * root)
+    found = time_average_test(averages, DOF)
+    assert found.p_value == pytest.approx(2 * student.sf(abs(g), runs - 1))
+
+
+@pytest.mark.parametrize("factor", [0.01, 100])
+def test_the_bootstrap_never_reports_an_impossible_mean(factor):
+    averages = factor * DOF * np.linspace(0.9, 1.1, 10)
+    found = bootstrap_test(averages, DOF, rng=np.random.default_rng(0))
+    assert found.p_value == 2 / 2000
+
+
+@pytest.mark.parametrize(
+    ("factor", "accepted"), [(1.0, True), (1.24, False), (2, False)]
+)
+def test_equivalence_is_accepted_where_it_is_shown(factor, accepted):
+    averages = factor * DOF * np.linspace(0.9, 1.1, 10)
+    assert equivalence_test(averages, DOF).accepted is accepted

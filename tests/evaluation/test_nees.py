@@ -5,6 +5,7 @@ import pytest
 
 from slamgym.evaluation.nees import (
     landmark_nees,
+    normalised_squared_error,
     pose_nees,
     position_nees,
     relative_map_nees,
@@ -71,3 +72,15 @@ def test_autocorrelation_of_a_moving_sum_and_across_gaps():
     correlations, pairs = autocorrelation(series, lags=2)
     np.testing.assert_allclose(correlations, [0.5, 0.0], atol=0.02)
     np.testing.assert_array_equal(pairs, [50 * 997, 50 * 996])
+
+
+@pytest.mark.parametrize("size", [3, 7])
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e10])
+def test_the_error_is_normalised_over_all_leading_axes_and_at_any_scale(size, scale):
+    rng = np.random.default_rng(1)
+    root = rng.standard_normal((2, 5, size, size))
+    covariances = root @ root.mT + np.eye(size)
+    errors = rng.standard_normal((2, 5, size))
+    solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
+    found = normalised_squared_error(scale * errors, scale**2 * covariances)
+    np.testing.assert_allclose(found, (errors * solved).sum(axis=-1), rtol=1e-9)

@@ -207,6 +207,12 @@ def test_positions_that_do_not_fit_are_refused(estimate, truth, message):
         position_accuracy(estimate, truth)
 
 
+@pytest.mark.parametrize("path", [[0.0, 1.0, 2.0, 3.0], [[0.0, 1.0, 2.0]]])
+def test_a_true_path_must_have_a_time_and_a_pose_in_each_row(path):
+    with pytest.raises(ValueError, match=r"ground_truth must be shape \(n, 4\), got"):
+        poses_at([0.5], path)
+
+
 def test_error_speaks_of_landmarks_where_the_caller_does():
     with pytest.raises(ValueError, match="landmarks must be finite"):
         landmark_distances([[math.inf, 0]], [np.eye(2)], [[0, 0]])

@@ -6,8 +6,13 @@ import numpy as np
 
 from ....arrays import Array
 
-LARGEST_WHOLE_MAP = 250
-"""Up to this many landmarks, the local map is the whole map."""
+LARGEST_WHOLE_MAP = 500
+"""Up to this many landmarks, the local map is the whole map.
+
+The end of a phase has a cost of its own.  In smaller maps it exceeds two full updates.
+"""
+LARGEST_WHOLE_INVARIANT = 700
+"""The same in the invariant frame, where phases end at twice the cost."""
 SMALLEST_LOCAL_MAP = 30
 """Smallest number of landmarks at which a local map may be too large."""
 SHORT_PHASE = 4
@@ -18,6 +23,11 @@ LARGEST_RATIO, LANDMARKS_PER_RATIO = 2.5, 400
 The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
 costs a² n.
 """
+
+
+def largest_whole_map(*, invariant: bool) -> int:
+    """Return the number of landmarks up to which the local map is the whole map."""
+    return LARGEST_WHOLE_INVARIANT if invariant else LARGEST_WHOLE_MAP
 
 
 def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:

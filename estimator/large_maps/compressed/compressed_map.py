@@ -16,7 +16,7 @@ from ...support.argument_checks import LOWEST_ID
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ..sparse_cholesky.coordinates import pairs
 from ..undo import Undo
-from .active_set import choose_local
+from .active_set import choose_local, largest_whole_map
 from .deferred_covariance import DeferredCovariance, subtract, symmetric
 from .phase_update import (
     Phase,
@@ -172,6 +172,11 @@ class CompressedMap:
         return undo
 
     @property
+    def is_small(self) -> bool:
+        """Whether one local map may hold the whole map."""
+        return len(self.slots) <= largest_whole_map(invariant=self.is_invariant)
+
+    @property
     def nbytes(self) -> int:
         """Memory of the belief [bytes]."""
         local = covariance_bytes(len(self.local) + self._virtual)
@@ -245,7 +250,10 @@ class CompressedMap:
             self.deferred.defer(lost, signs)
         else:
             rows = np.zeros((a, self.deferred.width))
-        rows[:, columns] = now.covariance[:, 3:]
+        if np.array_equal(columns, np.arange(len(columns))):  # far faster in large maps
+            rows[:, : len(columns)] = now.covariance[:, 3:]
+        else:
+            rows[:, columns] = now.covariance[:, 3:]
         self._points[columns] = now.mean[3:]
         self._references[columns] = now.reference[3:]
         return rows

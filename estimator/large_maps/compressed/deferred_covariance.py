@@ -98,7 +98,8 @@ class DeferredCovariance:
             if end > start:
                 own = rows[places[start:end], : first + BLOCK]
                 block[columns[start:end] - first] = own
-            write_columns(block, first, columns[:end], rows, places)
+            others = np.delete(np.arange(len(block)), columns[start:end] - first)
+            write_columns(block, first, others, columns[:end], rows, places)
         for root, _ in self._pending:  # the rows put are up to date
             root[columns[columns < len(root)]] = 0.0
 

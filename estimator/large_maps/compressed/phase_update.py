@@ -84,9 +84,16 @@ def begin_phase(
 
 
 def end_phase(slam: EkfSlam, virtual: int) -> Phase:
-    """Split the belief of a filter that ran on an extended state; return copies."""
+    """Split the belief of a filter that ran on an extended state; return copies.
+
+    Without an extension the covariance is a view: the local map may be large.
+    """
     size, rest = slam.map.size, 3 + 2 * virtual
     mean, covariance = slam.map.mean[:size], slam.map.covariance[:size, :size]
+    if not virtual:
+        reference, nothing = slam.map.reference[:size].copy(), np.empty((size, 0))
+        none = np.empty((1, 0))
+        return Phase(mean.copy(), reference, covariance, nothing, none[:0], none)
     rows = np.concatenate([covariance[:3], covariance[rest:]])
     return Phase(
         _without(mean, rest),

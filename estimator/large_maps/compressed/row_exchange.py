@@ -17,10 +17,18 @@ def read_columns(block: Array, first: int, columns: IntArray, rows: Array) -> No
 
 @jit
 def write_columns(
-    block: Array, first: int, columns: IntArray, rows: Array, places: IntArray
+    block: Array,
+    first: int,
+    own: IntArray,
+    columns: IntArray,
+    rows: Array,
+    places: IntArray,
 ) -> None:
-    """Copy the rows at ``places``, from column ``first`` on, into some columns."""
-    for i in range(len(block)):
+    """Copy the rows at ``places``, from column ``first`` on, into some columns.
+
+    Only the rows ``own`` of the block change.
+    """
+    for i in own:
         for j in range(len(columns)):
             block[i, columns[j]] = rows[places[j], first + i]
 

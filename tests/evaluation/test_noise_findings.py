@@ -1,0 +1,137 @@
+"""The tests of a world's noise, against the same tests of scipy on the numbers."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from slamgym.evaluation.noise_findings import HEAVY_TAILS, noise_findings
+from slamgym.evaluation.noise_sums import CHANNELS, noise_sums
+
+RUNS = 3
+
+
+def sums_of(channel, numbers, lever=4.0):
+    """Sums of one channel's numbers, shape (runs, n), and of no other."""
+    sums = np.zeros((len(numbers), 5, 7))
+    powers = [(numbers**k).sum(axis=1) for k in range(5)]
+    leverage = np.full(len(numbers), lever**2 * numbers.shape[1])
+    sums[:, CHANNELS.index(channel)] = np.stack(
+        [*powers, lever * powers[1], leverage], axis=1
+    )
+    return sums
+
+
+def findings_of(channel, numbers):
+    found = noise_findings(sums_of(channel, numbers))
+    return {each.cause: each for each in found}
+
+
+def draw(shape=(RUNS, 200), *, scale=1.0, shift=0.0, seed=3):
+    return shift + scale * np.random.default_rng(seed).standard_normal(shape)
+
+
+@pytest.mark.parametrize(("scale", "cause"), [(1.4, "too small"), (0.6, "too large")])
+def test_the_size_has_the_p_value_of_the_chi_square_test(scale, cause):
+    numbers = draw(scale=scale)
+    n, variance = numbers.size, numbers.var(ddof=1)
+    found = findings_of("bearing", numbers)[f"bearing noise {cause}"]
+    law = stats.chi2(n - 1)
+    tails = law.cdf((n - 1) * variance), law.sf((n - 1) * variance)
+    assert found.p_value == pytest.approx(2 * min(tails), rel=1e-6)
+    assert found.impact == pytest.approx(abs(np.log(variance)))
+    assert f"σβ is {np.sqrt(variance):.3g} times" in found.text
+
+
+def test_a_size_as_assumed_is_likely_and_does_not_matter():
+    found = findings_of("bearing", draw())
+    size = next(each for cause, each in found.items() if cause.startswith("bearing n"))
+    assert 0.05 < size.p_value <= 1
+    assert not size.matters
+
+
+@pytest.mark.parametrize(("variance", "matters"), [(1.04, False), (0.94, True)])
+def test_a_twentieth_of_the_variance_matters(variance, matters):
+    numbers = draw()
+    numbers = (numbers - numbers.mean()) / numbers.std(ddof=1) * np.sqrt(variance)
+    found = findings_of("sideways", numbers)
+    size = next(each for cause, each in found.items() if cause.startswith("motion"))
+    assert size.matters == matters
+
+
+@pytest.mark.parametrize(
+    ("channel", "shift", "cause", "words"),
+    [
+        ("along", 0.5, "odometry scale", "distances {:.2%} too short"),
+        ("along", -0.5, "odometry scale", "distances {:.2%} too long"),
+        ("turn", 0.5, "odometry turn", "{d:.2g}° per step too far to the right"),
+        ("turn", -0.5, "odometry turn", "{d:.2g}° per step too far to the left"),
+        ("bearing", 0.5, "bearing bias", "bearings are {d:.2g}° too large"),
+        ("bearing", -0.5, "bearing bias", "bearings are {d:.2g}° too small"),
+        ("range", 0.5, "range bias", "ranges are {:.2g} m too large"),
+        ("range", -0.5, "range bias", "ranges are {:.2g} m too small"),
+    ],
+)
+def test_a_mean_has_the_p_value_of_students_test_and_its_direction(
+    channel, shift, cause, words
+):
+    numbers = draw(shift=shift)
+    found = findings_of(channel, numbers)[cause]
+    test = stats.ttest_1samp(numbers.ravel(), 0.0)
+    assert found.p_value == pytest.approx(test.pvalue, rel=1e-6)
+    assert found.impact == pytest.approx(test.statistic**2 / RUNS / 3)
+    bias = abs(numbers.mean()) / 4.0  # of the lever
+    assert words.format(bias, d=np.degrees(bias)) in found.text
+    assert found.matters
+
+
+@pytest.mark.parametrize("scale", [0.6, 1.0, 1.5])
+@pytest.mark.parametrize("law", [stats.uniform(-1.7, 3.4), stats.laplace(0, 0.7)])
+def test_tails_have_the_p_value_of_anscombe_and_glynn(law, scale):
+    numbers = 0.3 + scale * law.rvs((RUNS, 100), random_state=4)
+    found = findings_of("range", numbers)[HEAVY_TAILS]
+    kurtosis = stats.kurtosis(numbers, axis=None, fisher=False)
+    assert found.p_value == pytest.approx(stats.kurtosistest(numbers.ravel()).pvalue)
+    by_size = abs(np.log(numbers.var(ddof=1)))
+    assert found.impact == pytest.approx(max(by_size, (kurtosis - 3) / 10))
+    assert found.matters == (kurtosis >= 3.5)
+    assert f"kurtosis of {kurtosis:.3g}" in found.text
+
+
+def test_thirty_numbers_are_enough_and_fewer_are_not():
+    assert findings_of("turn", draw((1, 30)))
+    assert not findings_of("turn", draw((1, 29)))
+
+
+def test_a_bias_of_the_sensor_is_that_of_its_readings():
+    poses = np.zeros((1, 2, 3))
+    points = np.array([[[4.0, 0.0], [0.0, 3.0], [-2.0, 0.0]]])
+    readings = np.zeros((1, 2, 3, 2))
+    readings[..., 0] = [0.0, np.pi / 2, np.pi]
+    readings[..., 1] = [4.0, 3.0, 2.0]
+    sums = noise_sums(
+        poses,
+        points,
+        np.zeros((1, 2, 2)),
+        readings + np.array([0.02, 0.3]),
+        np.ones((1, 2, 3), dtype=bool),
+        motion_std=(0.1, 0.1, 0.1),
+        measurement_std=(0.05, 0.4),
+    )
+    slope, leverage = sums[0, 3:, 5:].T
+    assert slope / leverage == pytest.approx([0.02, 0.3])
+
+
+def test_noise_where_none_is_assumed_counts_in_units_of_a_millionth():
+    odometry = np.zeros((1, 2, 2))
+    poses = np.zeros((1, 2, 3))
+    poses[0, 1] = 0.0, 0.003, 0.0
+    sums = noise_sums(
+        poses,
+        np.ones((1, 1, 2)),
+        odometry,
+        np.ones((1, 2, 1, 2)),
+        np.zeros((1, 2, 1), dtype=bool),
+        motion_std=(0.1, 0.0, 0.1),
+        measurement_std=(0.1, 0.1),
+    )
+    assert sums[0, 1, 1] == pytest.approx(3000.0)
