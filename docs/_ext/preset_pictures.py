@@ -1,5 +1,6 @@
-"""The gallery of presets: a picture and a short film of each world."""
+"""The gallery of presets: a picture of each world, and films of the environments."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium
@@ -7,11 +8,12 @@ import numpy as np
 from PIL import Image
 from sphinx.util.display import status_iterator
 
+from slamgym.agents import make_baseline
 from slamgym.envs.controllers import OpenLoop
 from slamgym.sim_configs import Scenario, action_sequence, list_presets, load_scenario
 
-FILMED = ("loop", "active_medium")
 FRAMES = 40
+SIZE = (480, 480)
 
 INTRODUCTION = """# Presets
 
@@ -30,7 +32,7 @@ def page(folder: Path) -> str:
     for name in status_iterator(list_presets(), "drawing presets … "):
         scenario = load_scenario(name)
         if not (folder / f"{name}.png").exists():
-            draw(scenario, folder)
+            draw(scenario, folder / f"{name}.png")
         cards.append(
             f":::{{grid-item-card}} {name}\n:img-top: {name}.png\n\n"
             f"{scenario.description}\n:::\n"
@@ -38,31 +40,48 @@ def page(folder: Path) -> str:
     return "\n".join([*cards, "::::"]) + "\n"
 
 
-def draw(scenario: Scenario, folder: Path) -> None:
-    """Drive half of an episode; save its last frame, and a film if asked for."""
+def draw(scenario: Scenario, path: Path) -> None:
+    """Save a picture of a world after half of its drive."""
     env = gymnasium.make(
         "slamgym/LandmarkWorld-v0", scenario=scenario, render_mode="rgb_array"
     )
-    world = env.unwrapped
-    controller = OpenLoop(action_sequence(scenario), scenario.robot)
-    env.reset(seed=0)
     steps = min(scenario.steps // 2, 400)
-    filmed = scenario.name in FILMED
-    moments = (
-        set(np.linspace(1, steps, FRAMES, dtype=int).tolist()) if filmed else {steps}
-    )
+    _frames(env, _open_loop(env), {steps})[-1].save(path)
+
+
+def film(name: str, preset: str, path: Path) -> None:
+    """Save a film of an environment; ActiveSlam is driven by a baseline."""
+    env = gymnasium.make(f"slamgym/{name}-v0", scenario=preset, render_mode="rgb_array")
+    act = _revisiting(env) if name == "ActiveSlam" else _open_loop(env)
+    steps = env.unwrapped.scenario.steps // 2
+    moments = np.linspace(1, steps, FRAMES, dtype=int).tolist()
+    first, *others = _frames(env, act, set(moments))
+    first.save(path, save_all=True, append_images=others, duration=80, loop=0)
+
+
+def _open_loop(env: gymnasium.Env) -> Callable[[int], np.ndarray]:
+    scenario = env.unwrapped.scenario
+    controller = OpenLoop(action_sequence(scenario), scenario.robot)
+    return lambda step: controller.act(env.unwrapped.pose, step)
+
+
+def _revisiting(env: gymnasium.Env) -> Callable[[int], np.ndarray]:
+    world = env.unwrapped
+    baseline = make_baseline("revisit", world.scenario, np.random.default_rng(0))
+    return lambda _: baseline.act(world.knowledge)
+
+
+def _frames(
+    env: gymnasium.Env, act: Callable[[int], np.ndarray], moments: set[int]
+) -> list[Image.Image]:
+    """Drive an episode, and return the frames after some of its steps."""
+    env.reset(seed=0)
     frames = []
-    for step in range(1, steps + 1):
-        env.step(controller.act(world.pose, step - 1))
-        if step in moments:
-            frames.append(Image.fromarray(env.render()).resize((480, 480)))
-    frames[-1].save(folder / f"{scenario.name}.png")
-    if filmed:
-        frames[0].save(
-            folder / f"{scenario.name}.gif",
-            save_all=True,
-            append_images=frames[1:],
-            duration=80,
-            loop=0,
-        )
+    for step in range(max(moments)):
+        *_, terminated, _, _ = env.step(act(step))
+        if step + 1 in moments or terminated:
+            frames.append(Image.fromarray(env.render()).resize(SIZE))
+        if terminated:
+            break
     env.close()
+    return frames

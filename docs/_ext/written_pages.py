@@ -67,6 +67,8 @@ def write_pages(app: Sphinx, config: Config) -> None:
     (folder / "api").mkdir(parents=True, exist_ok=True)
     for name, (environment, preset) in ENVIRONMENTS.items():
         _write(folder / f"{name}.md", environment_page(name, environment, preset))
+        if not (picture := folder / f"{name}.gif").exists():
+            preset_pictures.film(name, preset, picture)
     _write(folder / "fields.md", scenario_fields.page())
     _write(folder / "presets.md", preset_pictures.page(folder))
     listed = public_names()
@@ -95,7 +97,7 @@ def environment_page(name: str, environment: type, preset: str) -> str:
 
 {title}
 
-```{{image}} {preset}.gif
+```{{image}} {name}.gif
 :alt: An episode of {name} in the preset {preset}
 :width: 480px
 ```

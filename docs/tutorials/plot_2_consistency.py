@@ -28,8 +28,8 @@ check_estimator(CautiousEkf)
 # %%
 # A hundred drives
 # ----------------
-# All filters see the same drives. On the command line:
-# ``slamgym monte-carlo six_landmarks -e ekf,invariant,my_filters:CautiousEkf --runs 100``.
+# All filters receive the same readings. The command line does the same with a class in a file ``my_filters.py``, and writes a
+# report: ``slamgym monte-carlo six_landmarks -e ekf,invariant,my_filters:CautiousEkf --runs 100``.
 
 from slamgym import monte_carlo
 from slamgym.experiments.monte_carlo import consistency_of
