@@ -149,7 +149,7 @@ def whiteness_test(
 
     :func:`.normal_scores` first transforms each NIS.  NIS is quadratic: innovations
     with correlation ρ give ρ² here, so this test finds gross errors only.
-    :func:`.ljung_box` takes normalised innovations, if they are at hand.
+    :func:`.ljung_box` takes normalised innovations, if they are available.
 
     Parameters
     ----------

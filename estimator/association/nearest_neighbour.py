@@ -1,4 +1,4 @@
-"""Which landmark a reading is of, when nobody says: gated nearest neighbours."""
+"""Association of readings without identity: gated nearest neighbours."""
 
 from typing import NamedTuple
 

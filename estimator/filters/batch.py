@@ -169,7 +169,7 @@ class BatchSlam:
         pose_std : array_like, shape (3,)
             Their standard deviation.
         runs : array_like of bool, shape (B,), optional
-            The runs that start anew; by default all; the others go on.
+            The runs that start anew; by default all; the others continue.
         """
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         first = first_poses("poses", poses, self.runs)

@@ -1,4 +1,4 @@
-"""Beliefs after plans that nobody has driven, compiled.
+"""Predicted beliefs after given plans, compiled.
 
 Every plan starts from a copy of a belief. Its steps are those of a real filter: the
 expected readings have innovations of zero, so that only the covariance changes.
