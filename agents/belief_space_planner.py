@@ -97,12 +97,12 @@ class BeliefSpacePlanner:
         arcs = len(plans)
         if settings.goals:
             tours = _tours(knowledge, self._chance, settings.goals)
-        if self._tour is not None:
-            tours = np.concatenate([tours, _rest(knowledge, self._tour)[None]])
+        rest = _rest(knowledge, self._tour)
+        tours = np.concatenate([tours, rest])
         driven = _driven(knowledge, tours, settings.horizon)
         plans = np.concatenate([plans, driven])
         values = plan_values(knowledge, plans, self._chance, settings)
-        values[-1] += settings.persistence * (self._tour is not None)
+        values[-1] += settings.persistence * len(rest)
         best = int(np.argmax(values))
         self._tour = tours[best - arcs] if best >= arcs else None
         return np.asarray(plans[best, 0] / knowledge.scenario.dt)
@@ -118,11 +118,15 @@ class BeliefSpacePlanner:
         self._chance[seen] *= overlooked
 
 
-def _rest(knowledge: AgentKnowledge, tour: Array) -> Array:
-    """Return what is left of a tour: its second goal where the first is reached."""
+def _rest(knowledge: AgentKnowledge, tour: Array | None) -> Array:
+    """Return what is left of a tour, (1, 2, 2) [m], or nothing, (0, 2, 2)."""
+    if tour is None:
+        return np.empty((0, 2, 2))
     longest = knowledge.scenario.robot.max_speed * knowledge.scenario.dt
-    near = np.hypot(*(tour[0] - knowledge.belief.pose[:2])) < 0.5 * longest
-    return np.asarray(tour[[1, 1]] if near else tour)
+    near = np.hypot(*(tour - knowledge.belief.pose[:2]).T) < 0.5 * longest
+    if not near[0]:
+        return tour[None]
+    return tour[None, [1, 1]] if not near[1] else np.empty((0, 2, 2))
 
 
 def plan_values(

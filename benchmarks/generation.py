@@ -2,12 +2,19 @@
 
     python benchmarks/generation.py             # a million steps to npz
     python benchmarks/generation.py --quick     # a tenth of it, and the other formats
+    python benchmarks/generation.py --jobs      # what a second job gains
 
 A bare step is `pymunk.Space.step` with one kinematic body. It is timed before, between
 and after the cases, in CPU time of this process, which generates in one thread.
+
+``--jobs`` compares, in wall time, ``slamgym generate loop --episodes 2000`` with one
+and with two jobs, whose bytes must be equal, and with two processes that write half of
+the episodes each and share nothing: no way to use two cores gains more than these.
 """
 
+import os
 import resource
+import shutil
 import sys
 import tempfile
 import time
@@ -18,11 +25,16 @@ from statistics import median
 from interleaved import bare_steps
 from rich.console import Console
 from rich.table import Table
+from second_core import two_processes
 
 from slamgym.experiments.trajectories.formats import FORMATS, trajectory_format
 from slamgym.experiments.trajectories.generate import generate_trajectories
+from slamgym.experiments.trajectories.manifest import Manifest
 from slamgym.sim_configs import Scenario, load_scenario
 
+EPISODES = 2000  # of `loop`, for two jobs
+ROUNDS = 3
+GAIN = 1.7  # of two jobs, where two processes gain that
 GOAL = 10.0  # bare steps per step: 150,000 steps/s where a bare step takes 1 / 1.5 M s
 STEPS = 1000
 BARE_STEPS = 300_000
@@ -70,7 +82,52 @@ def cases(quick: bool) -> list[tuple[str, str, int, Scenario]]:
     ]
 
 
+def half_of_the_episodes() -> Callable[[], object]:
+    """Return the work of one of two processes that share nothing."""
+    folder = tempfile.mkdtemp()
+
+    def write() -> None:
+        generate_trajectories("loop", folder, episodes=EPISODES // 2)
+        shutil.rmtree(folder)
+
+    return write
+
+
+def seconds_with(jobs: int) -> tuple[float, Manifest]:
+    """Generate with this many jobs, and return the wall time and the checksums."""
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        manifest = generate_trajectories(
+            "loop", folder, episodes=EPISODES, jobs=jobs if jobs > 1 else None
+        )
+        return time.perf_counter() - began, manifest
+
+
+def compare_jobs() -> int:
+    """Print what two jobs gain; return 1 if less than they could."""
+    of_jobs, of_processes = [], []
+    with two_processes(half_of_the_episodes) as both:
+        for _ in range(ROUNDS):
+            one, alone = seconds_with(1)
+            two, shared = seconds_with(2)
+            if alone != shared:
+                raise SystemExit("two jobs wrote other bytes than one")
+            of_jobs.append(one / two)
+            of_processes.append(one / both())
+    gain, possible = median(of_jobs), median(of_processes)
+    missed = gain < GAIN <= possible
+    word = "MISSED" if missed else "ok" if gain >= GAIN else "too busy to judge"
+    print(
+        f"loop, {EPISODES} episodes, equal bytes: two jobs gain {gain:.2f} × "
+        f"(>= {GAIN} where two processes do: {word}); two processes that share nothing "
+        f"gain {possible:.2f} ×; load {os.getloadavg()[0]:.1f}"
+    )
+    return int(missed)
+
+
 def main() -> int:
+    if "--jobs" in sys.argv:
+        return compare_jobs()
     table = Table(title="generation of trajectories, 20 landmarks, 1000 steps each")
     for column in ("case", "steps", "µs", "× bare", "goal", "", "memory"):
         table.add_column(column, justify="left" if column == "case" else "right")
