@@ -2,14 +2,14 @@
 
 Run it::
 
-    python benchmarks/learning.py            # about three minutes of CPU time a seed
+    python benchmarks/learning.py            # about two minutes of CPU time a seed
 
 It trains the PPO of ``examples/09_train_active_slam.py`` once per seed, skips what the
 folder already holds, and writes into the folder (docs/learning, as committed):
 
 * ``hyperparameters.json``: all settings, and the versions of the libraries;
 * ``evaluations_0.csv``, one per seed: during training, the mean scores of the policy
-  without noise on 50 validation maps;
+  without noise on 30 validation maps;
 * ``policy_0.npz``, one per seed: the layers of the policy, which `load_actor` reads;
 * ``baselines.csv``: the scores of the baselines on the same maps;
 * ``held_out.csv``: the episodes of all policies on the held-out maps.
@@ -59,7 +59,7 @@ MEASURES = {
     "crashed": "crashed",
 }
 EVALUATIONS = 20
-VALIDATION_MAPS = 50
+VALIDATION_MAPS = 30
 INK, BAND, PALE = "#222222", "#c9d7e8", "#999999"
 Rows = list[dict[str, float | str]]
 
@@ -250,7 +250,7 @@ def arguments() -> argparse.Namespace:
     add("--folder", type=Path, default=ROOT / "docs" / "learning", help="of the files")
     add("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="one policy each")
     add("--scenario", default="active_medium", help="a preset or .toml file with walls")
-    add("--steps", type=int, default=1_000_000, help="of training, in all worlds")
+    add("--steps", type=int, default=500_000, help="of training, in all worlds")
     add("--worlds", type=int, default=64, help="side by side, a multiple of 16")
     add("--maps", type=int, default=100, help="held out, to judge by in the end")
     add("--validation-maps", type=int, default=VALIDATION_MAPS, help="for the curves")
