@@ -104,7 +104,7 @@ def imagine(
     means, covariances, references, slots = _beliefs(filters)
     count, landmarks = slots.shape
     driven = _checked_plans(plans, count)
-    ends = argument_checks.as_floats("walls", walls).reshape(-1, 4)
+    ends = _checked_walls(walls)
     dropout = float(sensor.dropout)
     rules = filters.rule_values.copy()
     rules[FIRST_STD:AFTER_STDS] /= max(1.0 - dropout, 1e-9) ** 0.5
@@ -167,6 +167,17 @@ def _checked_plans(plans: ArrayLike, count: int) -> Array:
     if not np.isfinite(given).all():
         raise ValueError("plans must be finite")
     return np.ascontiguousarray(np.broadcast_to(given, (count, *given.shape[-3:])))
+
+
+def _checked_walls(walls: ArrayLike) -> Array:
+    ends = argument_checks.as_floats("walls", walls)
+    if ends.size and (ends.ndim != 2 or ends.shape[1] != 4):
+        raise ValueError(
+            f"walls must have shape (W, 4), rows (x0, y0, x1, y1), got {ends.shape}"
+        )
+    if not np.isfinite(ends).all():
+        raise ValueError("walls must be finite")
+    return ends.reshape(-1, 4)
 
 
 def _checked_density(

@@ -216,6 +216,12 @@ def test_wrong_densities_are_refused(density, message):
         imagine(driven("ekf"), PLANS, sensor(), density=density)
 
 
+@pytest.mark.parametrize("walls", [[[0, 1, 2]], [0, 1, 2, 3], [[0, 1, 2, np.nan]]])
+def test_wrong_walls_are_refused(walls):
+    with pytest.raises(ValueError, match=r"walls must (have shape \(W, 4\)|be finite)"):
+        imagine(driven("ekf"), PLANS, sensor(), walls=walls)
+
+
 def test_other_filters_and_keywords_are_refused():
     with pytest.raises(TypeError, match="can run in batches, got RobocentricEkfSlam"):
         imagine(RobocentricEkfSlam(**NOISE), PLANS, sensor())
