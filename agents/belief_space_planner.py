@@ -148,7 +148,7 @@ def plan_values(
     now = np.linalg.slogdet(knowledge.belief.covariance[3:, 3:])[1]
     steps = plans.shape[1]
     values = np.zeros(len(plans))
-    for horizon in (steps // 2, steps):
+    for horizon in (steps // 4, steps // 2, steps):
         after = imagine(
             slam,
             plans[:, :horizon],
@@ -157,8 +157,8 @@ def plan_values(
             density=density if horizon == steps else None,
         )
         known = after.worst_variances[0] <= knowledge.accuracy**2
-        values += 0.25 * (now - after.log_det[0]) / size
-        values += 0.5 * settings.known_bonus * known.sum(axis=1)
+        values += (now - after.log_det[0]) / (6.0 * size)
+        values += settings.known_bonus * known.sum(axis=1) / 3.0
     found = np.diff(after.new_landmarks[0], axis=1, prepend=0.0)
     values += (_worth(knowledge, after, settings) * found) @ (
         settings.discount ** np.arange(steps)

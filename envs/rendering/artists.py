@@ -125,6 +125,10 @@ def _ellipses(axes: Axes, colour: str, fill: float) -> EllipseCollection:
         facecolors=[(*to_rgba(colour)[:3], fill)],
         edgecolors=colour,
         linewidths=1.2,
+        antialiaseds=[
+            True,
+            True,
+        ],  # two: a single ellipse is not measured first, slowly
     )
 
 
