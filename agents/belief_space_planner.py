@@ -7,6 +7,9 @@ The value of a plan, in the units of the task's reward, is what it is expected t
   that of the pose it is seen from, and of the reading;
 * a bonus for every landmark that becomes known.
 
+The first and the last are means over a quarter, a half and the whole of the plan, so
+that gaining early is worth more.
+
 A missing landmark is equally likely in any unseen cell, and less so in cells seen.
 
 A horizon of a few steps does not reach what is far away. Attractors [1]_ therefore
@@ -58,17 +61,17 @@ class PlannerSettings(NamedTuple):
 
 
 MPC = PlannerSettings(
-    horizon=20,
-    straight=(20,),
-    goals=12,
-    known_bonus=1.5,
+    horizon=40,
+    straight=(40,),
+    goals=6,
+    known_bonus=3.0,
     discount=0.9,
     overlooked=0.3,
-    persistence=0.1,
+    persistence=0.3,
     attraction=0.06,
 )
-GREEDY = MPC._replace(straight=(2, 5, 10), goals=0)
-"""Looks as far ahead, along motions that turn and then drive straight on."""
+GREEDY = MPC._replace(horizon=20, straight=(2, 5, 10), goals=0)
+"""Looks ahead along motions that turn and then drive straight on."""
 
 
 class BeliefSpacePlanner:
