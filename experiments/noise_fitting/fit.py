@@ -16,6 +16,7 @@ from ..logs.slamlog import SlamLog
 from ..runs.blas_threads import one_blas_thread
 from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import Progress
+from .associated_log import associated_log
 from .calibration import Calibration, calibrate
 from .inflation import Whiteness, whiteness
 from .likelihood import LogLikelihood
@@ -32,6 +33,9 @@ from .search import FittedNoise, most_likely_noise
 
 GATE_PROBABILITY = float(-np.expm1(-GATE / 2))
 """Of the gate of the fit, as an option of filters."""
+ASSOCIATIONS = 2
+"""How often the readings of a log without identities are associated at most."""
+ALIKE = 0.2
 
 
 class Fitted(NamedTuple):
@@ -69,6 +73,8 @@ class NoiseFit:
     readings: int
     passes: int
     """Number of times that the log was filtered."""
+    is_associated: bool = False
+    """Whether a filter associated the readings; they have its identities in `log`."""
 
 
 def fit_noise(
@@ -83,8 +89,9 @@ def fit_noise(
     Parameters
     ----------
     log : SlamLog
-        With odometry and readings.  Where it identifies no landmarks, the filter of the
-        settings associates its readings once, with the noise of the settings.
+        With odometry and readings.  If it does not identify all landmarks, the filter
+        of the settings associates its readings, with the noise of the settings, and
+        once more if the fitted noise differs from it.
     settings : FilterSettings
         The noise to begin with, and the filter: one that runs in batches.  Without a
         gate they get that of the fit, `GATE_PROBABILITY`.
@@ -119,14 +126,26 @@ def fit_noise(
     >>> [(noise.name, noise.verdict) for noise in fit.noise][:2]
     [('σx', 'fitted'), ('σy', 'fitted')]
     """
-    timed = events_of(log, settings, progress)
     if not hides_identities(log):
         options = {"gate_probability": GATE_PROBABILITY, **settings.options}
-        settings = replace(settings, options=options)
+        return _fit_known(log, replace(settings, options=options), threads)
+    assumed = settings
+    for _ in range(ASSOCIATIONS):
+        known = associated_log(log, assumed, progress)
+        fit = _fit_known(known, settings, threads)
+        before, assumed = assumed, fit.suggested.settings
+        if _is_alike(noise_of(before), noise_of(assumed)):
+            break
+    return replace(fit, is_associated=True)
+
+
+def _fit_known(log: SlamLog, settings: FilterSettings, threads: int | None) -> NoiseFit:
+    """Fit the noise of a log that identifies its readings."""
+    timed = events_of(log)
     slam = _filter(log, settings)
     likelihood = LogLikelihood(slam, timed.events, threads=threads)
     with one_blas_thread():
-        found = most_likely_noise(likelihood, noise_of(settings))
+        found = most_likely_noise(likelihood.sample(), noise_of(settings))
         noise = found.noise
         before = _fitted(likelihood, settings, noise_of(settings))
         fitted = _fitted(likelihood, settings, noise)
@@ -134,8 +153,7 @@ def fit_noise(
         bearing, distance = fitted.whiteness
         inflated[[BEARING, IN_METRES]] *= bearing.inflation
         inflated[[RANGE, PER_METRE]] *= distance.inflation
-        same = np.array_equal(inflated, noise)
-        suggested = fitted if same else _fitted(likelihood, settings, inflated)
+        suggested = _fitted(likelihood, settings, inflated)
         calibration = calibrate(likelihood, log, timed.times, noise)
     steps = np.diff(timed.events.first_readings)
     return NoiseFit(
@@ -149,6 +167,16 @@ def fit_noise(
         len(timed.events.readings),
         found.passes,
     )
+
+
+def _is_alike(one: Array, other: Array) -> bool:
+    """Whether no standard deviation of two noises differs by more than a fifth.
+
+    One is compared to the largest of its kind: motion, turn, bearing, range.
+    """
+    sizes = np.maximum(one, other)
+    sizes[:2] = sizes[:2].max()
+    return bool((np.abs(one - other) <= ALIKE * sizes).all())
 
 
 def _filter(log: SlamLog, settings: FilterSettings) -> EkfSlam:

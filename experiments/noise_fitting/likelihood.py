@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,9 +13,17 @@ from ...estimator.filters.drive_likelihood import GATE, drive_likelihood
 from ...estimator.filters.ekf import EkfSlam
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
 from ...estimator.kernels.scan_rows import GATED
-from .log_events import parts_of, without_readings
+from .log_events import (
+    Stretch,
+    parts_of,
+    sample_of,
+    stretches_of,
+    without_readings,
+)
 
 MOST_LANDMARKS = 100  # of one map
+MOST_READINGS = 12_000  # of a sample
+SAMPLED_LANDMARKS = 40  # of one map of a sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +41,27 @@ class LogLikelihood:
     threads: int | None = None
     most_landmarks: int = MOST_LANDMARKS
     """Of one part."""
+    stretches: Sequence[Stretch] = ()
+    """The parts, if they are given."""
 
     @cached_property
     def parts(self) -> tuple[DriveEvents, ...]:
         """The parts of the drive."""
-        return parts_of(self.events, self.most_landmarks)
+        stretches = self.stretches or stretches_of(self.events, self.most_landmarks)
+        return parts_of(self.events, stretches)
+
+    def sample(self, most_readings: int = MOST_READINGS) -> LogLikelihood:
+        """Return the likelihood of evenly spread parts of a drive with many readings.
+
+        A drive with fewer readings is returned whole.
+        """
+        if len(self.events.readings) <= most_readings:
+            return self
+        stretches = stretches_of(self.events, SAMPLED_LANDMARKS)
+        if len(stretches) == 1:
+            return self
+        events, chosen = sample_of(self.events, stretches, most_readings)
+        return replace(self, events=events, stretches=chosen)
 
     def of(self, noises: Array) -> Array:
         """Return the log likelihoods of the steps (B, S) under noises (B, 7)."""

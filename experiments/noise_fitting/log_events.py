@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, BoolArray
-from ...estimator.interface import SlamEstimator
+from ...arrays import Array, BoolArray, IntArray
 from ...estimator.kernels.drive_likelihood import DriveEvents
-from ...estimator.map_management.hypotheses import HypothesisSlam
-from ...estimator.map_management.managed_slam import ManagedSlam
-from ...estimator.smoother import Drive, RecordedSlam
 from ...estimator.smoother.drive import Sightings
-from ..logs.anonymous import hides_identities
 from ..logs.events import OdometryRow
 from ..logs.slamlog import SlamLog
 from ..logs.steps import predictions, steps_of
-from ..runs.filter_settings import SMOOTHER, FilterSettings
-from ..runs.log_replay import Progress, replay
 
 Motion = tuple[float, float, float]
+Stretch = tuple[int, int]
+"""Steps of a drive, from the first to before the second."""
 
 
 class TimedEvents(NamedTuple):
@@ -33,20 +28,23 @@ class TimedEvents(NamedTuple):
     """Shape (S,)."""
 
 
-def events_of(
-    log: SlamLog, settings: FilterSettings, progress: Progress | None = None
-) -> TimedEvents:
-    """Return the events of a log; a filter associates readings without identity.
+def events_of(log: SlamLog) -> TimedEvents:
+    """Return the events of a log that identifies its readings, one step of each replay.
 
     Raises
     ------
     ValueError
         If the log has no scan, no motion, or no landmark that is read twice.
     """
-    if hides_identities(log):
-        timed = _associated(log, settings, progress)
-    else:
-        timed = _identified(log)
+    collected, times = _EventList(), []
+    for step in steps_of(log):
+        motions = _motions_of(log, step.motions)
+        scan, sightings = step.scan, None
+        if scan is not None and scan.landmark_ids is not None:
+            sightings = Sightings(scan.measurements, scan.landmark_ids)
+        collected.add(motions, sightings)
+        times.append(step.t)
+    timed = TimedEvents(collected.events(), np.array(times))
     _refuse_empty(log, timed.events)
     return timed
 
@@ -62,11 +60,10 @@ def without_readings(events: DriveEvents, dropped: BoolArray) -> DriveEvents:
     )
 
 
-def parts_of(events: DriveEvents, most: int) -> tuple[DriveEvents, ...]:
-    """Cut a drive into consecutive parts of at most so many landmarks each.
+def stretches_of(events: DriveEvents, most: int) -> list[Stretch]:
+    """Cut a drive into consecutive stretches with at most so many landmarks each.
 
-    The landmarks of each part are numbered from 0.  A step with more landmarks is a
-    part of its own.
+    A step with more landmarks is a stretch of its own.
     """
     begins, seen = [0], set[int]()
     for s in range(len(events.first_readings) - 1):
@@ -76,11 +73,47 @@ def parts_of(events: DriveEvents, most: int) -> tuple[DriveEvents, ...]:
             begins.append(s)
             seen = set()
         seen |= read
-    if len(begins) == 1:
+    return list(pairwise([*begins, len(events.first_readings) - 1]))
+
+
+def parts_of(
+    events: DriveEvents, stretches: Sequence[Stretch]
+) -> tuple[DriveEvents, ...]:
+    """Return stretches of a drive, the landmarks of each numbered from 0."""
+    if len(stretches) == 1:
         return (events,)
-    ends = [*begins[1:], len(events.first_readings) - 1]
-    return tuple(
-        _part(events, begin, end) for begin, end in zip(begins, ends, strict=True)
+    return tuple(_part(events, *stretch) for stretch in stretches)
+
+
+def sample_of(
+    events: DriveEvents, stretches: Sequence[Stretch], most_readings: int
+) -> tuple[DriveEvents, list[Stretch]]:
+    """Return evenly spread stretches of a drive as one drive, and where they are there.
+
+    About as many readings as asked remain.
+    """
+    every = int(np.ceil(len(events.readings) / most_readings))
+    chosen = stretches[every // 2 :: every] if every > 1 else stretches
+    ends = np.cumsum([0, *(end - begin for begin, end in chosen)]).tolist()
+    return _joined(events, chosen), list(pairwise(ends))
+
+
+def _joined(events: DriveEvents, stretches: Sequence[Stretch]) -> DriveEvents:
+    def rows(first: IntArray) -> tuple[IntArray, IntArray]:
+        """Return which rows are in the stretches, and where those of a step begin."""
+        spans = [np.arange(first[begin], first[end]) for begin, end in stretches]
+        counts = [np.diff(first[begin : end + 1]) for begin, end in stretches]
+        until = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+        return np.concatenate(spans), until
+
+    motions, first_motions = rows(events.first_motions)
+    readings, first_readings = rows(events.first_readings)
+    return DriveEvents(
+        events.motions[motions],
+        first_motions,
+        events.readings[readings],
+        events.landmarks[readings],
+        first_readings,
     )
 
 
@@ -127,69 +160,6 @@ class _EventList:
             landmarks.astype(np.int64),
             np.array(self.until_readings, dtype=np.int64),
         )
-
-
-def _identified(log: SlamLog) -> TimedEvents:
-    """Return events whose steps are those of a replay."""
-    collected, times = _EventList(), []
-    for step in steps_of(log):
-        motions = _motions_of(log, step.motions)
-        scan, sightings = step.scan, None
-        if scan is not None and scan.landmark_ids is not None:
-            sightings = Sightings(scan.measurements, scan.landmark_ids)
-        collected.add(motions, sightings)
-        times.append(step.t)
-    return TimedEvents(collected.events(), np.array(times))
-
-
-def _associated(
-    log: SlamLog, settings: FilterSettings, progress: Progress | None
-) -> TimedEvents:
-    """Return events with one step per scan, as a filter associates the readings.
-
-    The landmarks are those of its final map, as for the smoother.
-    """
-    options = {**settings.options, "follow": settings.estimator}
-    slam = replace(settings, estimator=SMOOTHER, options=options).make(log.start)
-    replay(log, slam, progress=progress)
-    drive = _recorded(slam)
-    collected, counts = _EventList(), []
-    for pose in range(drive.poses):
-        motions: tuple[Motion, ...] = drive.motions[pose].steps
-        for sightings in _distinct(drive.sightings(pose)):
-            collected.add(motions, sightings)
-            motions = ()
-            counts.append(len(collected.motions))
-    return TimedEvents(collected.events(), _times_at(log, counts))
-
-
-def _recorded(slam: SlamEstimator) -> Drive:
-    """Return the drive that a managed smoother has recorded."""
-    inner = slam.best if isinstance(slam, HypothesisSlam) else slam
-    inner = inner.filter if isinstance(inner, ManagedSlam) else inner
-    if not isinstance(inner, RecordedSlam):
-        raise ValueError(f"{type(inner).__name__} records no associations")
-    return inner.recorded()
-
-
-def _distinct(sightings: Sightings) -> Iterable[Sightings]:
-    """Split the readings of one pose so that no landmark repeats; at least one part."""
-    _, which = np.unique(sightings.ids, return_inverse=True)
-    turn = np.array([(which[:k] == j).sum() for k, j in enumerate(which)], dtype=int)
-    for part in range(turn.max(initial=0) + 1):
-        chosen = turn == part
-        yield Sightings(sightings.measurements[chosen], sightings.ids[chosen])
-
-
-def _times_at(log: SlamLog, counts: list[int]) -> Array:
-    """Return the times after these numbers of odometry readings."""
-    times, until, done = [], [], 0
-    for step in steps_of(log):
-        done += len(_motions_of(log, step.motions))
-        times.append(step.t)
-        until.append(done)
-    reached = np.searchsorted(until, counts)
-    return np.array(times)[np.minimum(reached, len(times) - 1)]
 
 
 def _motions_of(log: SlamLog, rows: Iterable[OdometryRow]) -> list[Motion]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 from ... import __version__
+from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import Progress, replay
 from ..runs.nan_statistics import finite
 from ..runs.summary import settings_table, summarise
-from .fit import Fitted, NoiseFit
+from .fit import GATE_PROBABILITY, Fitted, NoiseFit
 from .search import FittedNoise
 
 STAGES = ("before", "fitted", "suggested")
@@ -72,12 +74,12 @@ def options_line(fitted: Fitted) -> str:
 
 
 def _run(fit: NoiseFit, fitted: Fitted) -> dict[str, Any]:
-    settings = fitted.settings
+    settings = _of_the_readings(fit, fitted.settings)
     run = replay(fit.log, settings.make(fit.log.start), name=settings.estimator)
     summary = summarise(run, settings)
     bearing, distance = fitted.whiteness
     return {
-        "settings": settings_table(settings),
+        "settings": settings_table(fitted.settings),
         "log_likelihood": finite(fitted.log_likelihood),
         "rejected": fitted.rejected,
         "whiteness": {
@@ -86,6 +88,15 @@ def _run(fit: NoiseFit, fitted: Fitted) -> dict[str, Any]:
         },
         **{key: summary[key] for key in COMPARED},
     }
+
+
+def _of_the_readings(fit: NoiseFit, settings: FilterSettings) -> FilterSettings:
+    """Leave out landmark management if the log has its associations."""
+    if not fit.is_associated:
+        return settings
+    options = {k: v for k, v in settings.options.items() if k != "management"}
+    gate = {"gate_probability": GATE_PROBABILITY}
+    return replace(settings, options=gate | options)
 
 
 def _calibration(fit: NoiseFit) -> dict[str, float | None] | None:

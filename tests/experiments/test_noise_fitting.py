@@ -20,16 +20,23 @@ from slamgym.experiments.logs import (
     record_episode,
     write_slamlog,
 )
+from slamgym.experiments.logs.anonymous import without_identities
 from slamgym.experiments.noise_fitting import (
     fit_noise,
     noise_fit_figure,
     summarise_fit,
     write_noise,
 )
+from slamgym.experiments.noise_fitting.associated_log import associated_log
 from slamgym.experiments.noise_fitting.calibration import nees_bounds
 from slamgym.experiments.noise_fitting.inflation import positive_sum
 from slamgym.experiments.noise_fitting.likelihood import LogLikelihood
-from slamgym.experiments.noise_fitting.log_events import events_of, parts_of
+from slamgym.experiments.noise_fitting.log_events import (
+    events_of,
+    parts_of,
+    sample_of,
+    stretches_of,
+)
 from slamgym.experiments.noise_fitting.noise_vector import noise_of
 from slamgym.experiments.noise_fitting.profile import profile_crossing
 from slamgym.experiments.noise_fitting.scoring import curvature, maximise
@@ -350,8 +357,8 @@ def test_a_needless_bearing_noise_in_metres_is_zero_in_the_options_too():
 def test_a_drive_in_parts_has_the_likelihood_of_its_parts():
     log = a_log(steps=40)
     settings = settings_for(log, estimator="invariant")
-    events = events_of(log, settings).events
-    parts = parts_of(events, 4)
+    events = events_of(log).events
+    parts = parts_of(events, stretches_of(events, 4))
     assert len(parts) > 3
     assert all(part.landmarks.max() < 6 for part in parts)
     assert sum(len(part.motions) for part in parts) == len(events.motions)
@@ -368,14 +375,84 @@ def test_a_drive_in_parts_has_the_likelihood_of_its_parts():
 
 def test_a_drive_past_few_landmarks_is_one_part():
     log = a_log(steps=10)
-    events = events_of(log, settings_for(log)).events
-    assert parts_of(events, 6) == (events,)
+    events = events_of(log).events
+    assert parts_of(events, stretches_of(events, 6)) == (events,)
+
+
+def test_a_sample_is_evenly_spread_parts_of_a_drive():
+    log = a_log(steps=60)
+    settings, events = settings_for(log, estimator="invariant"), events_of(log).events
+    stretches = stretches_of(events, 4)
+    sampled, chosen = sample_of(events, stretches, len(events.readings) // 3 + 1)
+    slam, noise = settings.make(log.start), noise_of(settings)[None]
+    parts = parts_of(events, stretches)[1::3]
+    alone = [LogLikelihood(slam, part).of(noise) for part in parts]
+    likelihood = LogLikelihood(slam, sampled, stretches=chosen)
+    np.testing.assert_array_equal(likelihood.of(noise), np.concatenate(alone, axis=1))
+    dropped = np.zeros(len(sampled.readings), dtype=bool)
+    dropped[0] = True
+    kept = likelihood.without(dropped)
+    assert len(kept.parts) == len(parts)
+    assert len(kept.parts[0].readings) == len(parts[0].readings) - 1
+    whole = LogLikelihood(slam, events)
+    assert whole.sample(len(events.readings)) is whole
+    few = replace(whole, most_landmarks=4)
+    assert few.sample(10) is few  # one stretch holds all landmarks of this world
+
+
+def test_the_associations_of_a_filter_become_identities_of_the_log():
+    log = a_log(steps=60)
+    hidden = without_identities(log)
+    settings = settings_for(hidden, estimator="invariant")
+    known = associated_log(hidden, settings)
+    scans = [event for event in known.events if isinstance(event, Scan)]
+    true = {
+        (event.t, *reading): landmark
+        for event in log.events
+        if isinstance(event, Scan)
+        for reading, landmark in zip(
+            event.measurements.tolist(), event.landmark_ids, strict=True
+        )
+    }
+    pairs = {
+        (true[scan.t, *reading], landmark)
+        for scan in scans
+        for reading, landmark in zip(
+            scan.measurements.tolist(), scan.landmark_ids, strict=True
+        )
+    }
+    assert len(pairs) == len(dict(pairs)) == len({i for _, i in pairs}) == 6
+    motions = [e for e in known.events if isinstance(e, OdometryRow)]
+    assert motions == [e for e in log.events if isinstance(e, OdometryRow)]
+
+
+def test_the_comparison_of_a_log_without_identities_is_on_its_associations():
+    log = without_identities(a_log(steps=60))
+    fit = fitted(log, start=(*MOTION, *SENSOR))
+    summary = summarise_fit(fit)
+    assert fit.is_associated
+    assert summary["runs"]["before"]["readings"]["added"] == 6
+    assert "gate" not in summary["options"]  # landmark management has its own
+    assert summary["runs"]["before"]["settings"]["options"]["management"]
 
 
 @pytest.mark.slow
-def test_readings_without_identity_are_associated_first():
-    log = a_log(sensor={"identities": False}, steps=80)
-    fit = fitted(log, start=(*MOTION, *SENSOR))
+@pytest.mark.parametrize(("factor", "times"), [(1.0, 1), (3.0, 2)])
+def test_readings_without_identity_are_associated_again_if_the_noise_differs(
+    factor, times
+):
+    log, ends = a_log(sensor={"identities": False}, steps=150), []
+    settings = settings_for(
+        log,
+        estimator="invariant",
+        motion_std=factor * np.array(MOTION),
+        measurement_std=factor * np.array(SENSOR),
+        options={"management": {"association": "nearest"}},
+    )
+    fit = fit_noise(
+        log, settings, progress=lambda done, steps: ends.append(done == steps)
+    )
+    assert sum(ends) == times
     by_name = {noise.name: noise for noise in fit.noise}
     for name, true in (("σβ", SENSOR[0]), ("σr", SENSOR[1])):
         assert abs(np.log(by_name[name].value / true)) < 0.25
