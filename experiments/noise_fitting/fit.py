@@ -153,7 +153,8 @@ def _fit_known(log: SlamLog, settings: FilterSettings, threads: int | None) -> N
         bearing, distance = fitted.whiteness
         inflated[[BEARING, IN_METRES]] *= bearing.inflation
         inflated[[RANGE, PER_METRE]] *= distance.inflation
-        suggested = _fitted(likelihood, settings, inflated)
+        same = np.array_equal(inflated, noise)
+        suggested = fitted if same else _fitted(likelihood, settings, inflated)
         calibration = calibrate(likelihood, log, timed.times, noise)
     steps = np.diff(timed.events.first_readings)
     return NoiseFit(

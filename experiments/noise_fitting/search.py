@@ -33,6 +33,7 @@ ROUNDS = 12  # of rejecting readings and fitting the others
 COARSE = 6  # iterations of a round after which readings are rejected anew
 FACTORS = 4.0 ** np.arange(-3, 3)  # of motion and of sensor noise, tried at the start
 NEEDLESS = (PER_METRE, IN_METRES)
+EXACT = 1e-6  # [rad, m] below which readings have no noise
 PLAIN = 0.15  # standard deviation of log σ below which it is certainly not zero
 
 
@@ -97,6 +98,7 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
     smooth, found = _in_turns(likelihood, start, chosen)
     found = _without_zeros(smooth, _without_needless(smooth, found))
     _refuse_diverged(found)
+    _refuse_exact(found.noise, _typical_range(smooth))
     noise, at = found.noise, np.flatnonzero(chosen)
     along = restricted(smooth.of, noise, at)
     judged = dict(
@@ -223,6 +225,18 @@ def _refuse_diverged(found: _Fit) -> None:
         raise np.linalg.LinAlgError(
             f"the fit diverges, after {found.passes} passes it is at {values}"
         )
+
+
+def _refuse_exact(noise: Array, typical_range: float) -> None:
+    """Refuse readings without any noise, which no filter can use."""
+    bearing = noise[BEARING] + noise[IN_METRES] / typical_range
+    distance = noise[RANGE] + noise[PER_METRE] * typical_range
+    for name, std in (("bearing", bearing), ("range", distance)):
+        if std < EXACT:
+            raise np.linalg.LinAlgError(
+                f"the fit diverges: the readings seem to have no noise in {name}, so "
+                "that there is nothing to fit; is the log exact, or very short?"
+            )
 
 
 def _table(

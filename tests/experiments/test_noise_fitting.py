@@ -482,6 +482,16 @@ def test_a_log_that_says_nothing_is_refused_in_one_line(events, message):
         fitted(SlamLog("bad", events=events))
 
 
+def test_exact_readings_are_refused():
+    exact = (
+        Scan(0.0, [(0.0, 3.0)], [1]),
+        OdometryRow(1.0, 1.0, 0.0, 1.0),
+        Scan(1.0, [(0.0, 2.0)], [1]),
+    )
+    with pytest.raises(np.linalg.LinAlgError, match="have no noise in"):
+        fitted(SlamLog("exact", events=exact))
+
+
 def test_a_filter_off_the_kernels_is_refused():
     log = a_log(steps=5)
     with pytest.raises(ValueError, match="runs in batches"):
