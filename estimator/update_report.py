@@ -96,12 +96,13 @@ class UpdateReport:
         1.04
         """
         place = 2 * self.associated_ids.index(landmark_id)
-        rows = slice(place, place + 2)
-        root = np.linalg.inv(self.innovation_factor)
-        weighted = root[:, rows].T @ (root @ self.innovation.ravel())
-        return float(
-            weighted @ np.linalg.solve(root[:, rows].T @ root[:, rows], weighted)
-        )
+        sides = np.zeros((self.innovation.size, 3))
+        sides[:, 0] = self.innovation.ravel()
+        sides[place, 1] = sides[place + 1, 2] = 1.0
+        white = np.linalg.solve(self.innovation_factor, sides)
+        root = white[:, 1:]
+        weighted = root.T @ white[:, 0]
+        return float(weighted @ np.linalg.solve(root.T @ root, weighted))
 
     def replace(self, **changes: Any) -> UpdateReport:
         """Return a report with some parts changed.
