@@ -128,7 +128,7 @@ def diagnose(
     runs = len(pose)
     if runs < FEWEST_RUNS:
         return Diagnosis(
-            CANNOT_TELL, 1.0, f"{runs} runs decide nothing: at least {FEWEST_RUNS}."
+            CANNOT_TELL, 1.0, f"{runs} runs are too few; {FEWEST_RUNS} are needed."
         )
     findings = noise_findings(sums)
     tests = max(1, len(findings))

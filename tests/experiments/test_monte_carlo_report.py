@@ -295,7 +295,7 @@ def test_fewer_than_two_good_runs_decide_nothing_and_break_nothing(good):
     summary = summarise_monte_carlo(dataset)
     entry = summary["estimators"]["ekf"]
     assert entry["verdict"] == "not shown"
-    assert f"{good} run" in entry["reason"]
+    assert f"{good} of 40 runs" in entry["reason"]
     assert entry["decisions"] is None
     json.dumps(summary, allow_nan=False)
     assert "not shown" in table_text(summary).replace("\n", " ")

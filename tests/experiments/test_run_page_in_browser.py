@@ -229,7 +229,9 @@ def test_zoom_drag_and_follow_move_the_map(page, file):
     page.click_on("#follow")
     pose = file[1][0].trace.poses[50]
     found = page.evaluate(f"player.views[0].px({pose[0]})")
-    assert found == pytest.approx(page.evaluate("player.views[0].width") / 2, abs=0.1)
+    assert found == pytest.approx(
+        page.evaluate("player.views[0].canvas.clientWidth") / 2, abs=0.1
+    )
 
 
 def test_a_finger_on_a_phone_chooses_and_shows(browser, file):

@@ -47,9 +47,8 @@ def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
         Numbers of failed runs and of all runs.
     """
     if report is None:
-        used = runs - failed
-        what = "run that did not fail" if used == 1 else "runs that did not fail"
-        return Verdict(NOT_SHOWN, f"{used} {what} of {runs} decide nothing")
+        reason = f"{runs - failed} of {runs} runs succeeded: too few to decide"
+        return Verdict(NOT_SHOWN, reason)
     verdict = _verdict_on_successes(report)
     if not failed:
         return verdict
