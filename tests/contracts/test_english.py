@@ -39,6 +39,12 @@ BETTER = {
     r"thereof|wherein|whence|whereof|therein": "of it; in which; where",
     r"is it that|be it": "whether",
     r"nought": "zero; nothing",
+    r"at hand": "available",
+    r"likeliest": "most likely",
+    r"goes? on (?:after|with)": "continues after; continues with",
+    r"wander(?:s|ed|ing)?|blindly": "drives at random; without feedback",
+    r"what there is": "the available …",
+    r"nobody (?:names|says|knows|has driven|(?:has )?stopped)": "without …",
 }
 """Regular expression, and what to write instead."""
 BAD = re.compile(r"\b(?:" + "|".join(f"({bad})" for bad in BETTER) + r")\b", re.I)
