@@ -6,7 +6,7 @@ Run it::
 
 Every baseline plays the episodes of the seeds from `HELD_OUT` on, at each difficulty.
 These maps are for the final evaluation only; use ``--validation`` to choose between
-policies. ``--policy SCENARIO=FILE`` adds a policy saved by
+policies. ``--policy SCENARIO=FILE`` adds a policy of ``benchmarks/learning.py`` or
 ``examples/09_train_active_slam.py``, and compares it with the others map by map. A mean
 m of n episodes is given as m ± 1.96 s/√n.
 """
@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from learning import load_actor
 
 from slamgym.agents import ActiveSlamEnv
 from slamgym.agents.active_slam_baselines import BASELINES, make_baseline
@@ -43,6 +44,14 @@ LEVELS = (
 TRAINING = Path(__file__).parents[1] / "examples" / "09_train_active_slam.py"
 
 
+def load_policy(path: Path) -> Policy:
+    """Read a policy of `learning`, or of the example that trains."""
+    if path.suffix == ".npz":
+        return load_actor(path)
+    policy: Policy = runpy.run_path(str(TRAINING))["load_policy"](path)
+    return policy
+
+
 def score(
     scenario: str,
     seeds: range,
@@ -57,7 +66,6 @@ def score(
         baseline = make_baseline(name, env.scenario, np.random.default_rng(0))
         players[name] = baseline_policy(baseline)
     if policy is not None:
-        load_policy = runpy.run_path(str(TRAINING))["load_policy"]
         players["ppo"] = load_policy(Path(policy))
     played = {}
     for name, player in players.items():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from slamgym.agents import ActiveSlamEnv
+from slamgym.agents.active_slam_scores import run_episode
 
 ROOT = Path(__file__).parents[2]
 ONE_FILE = ROOT / "examples" / "12_ppo_in_one_file.py"
@@ -136,3 +137,16 @@ def test_a_saved_policy_acts_as_that_of_the_library(learning, tmp_path):
         np.testing.assert_allclose(
             ours(observation, env), library(observation, env), atol=1e-6
         )
+
+
+def test_the_committed_policies_repeat_their_scores_on_held_out_maps(learning):
+    with (ROOT / "docs" / "learning" / "held_out.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    env = ActiveSlamEnv("active_medium")
+    for row in rows[::90]:
+        policy = learning["load_actor"](
+            ROOT / "docs" / "learning" / f"policy_{row['seed']}.npz"
+        )
+        episode = run_episode(env, policy, int(row["map"]))
+        assert episode.total == pytest.approx(float(row["return"]), abs=2e-3)
+        assert episode.honest == bool(float(row["honest_success"]))
