@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from ..arrays import Array, BoolArray
 from ..estimator.models.bearing_range import reading_slopes_jit
@@ -153,7 +153,7 @@ def efficiency(bound: Array, squared_error: Array) -> Efficiency:
     if len(found) < 2:
         return Efficiency(value, (np.nan, np.nan))
     residual = (least - value * found) / found.mean()
-    reach = float(student.ppf(0.975, len(found) - 1) * residual.std(ddof=1))
+    reach = float(stdtrit(len(found) - 1, 0.975) * residual.std(ddof=1))
     reach = reach / len(found) ** 0.5
     return Efficiency(value, (value - reach, value + reach))
 

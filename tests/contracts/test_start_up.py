@@ -50,11 +50,19 @@ print((times[2] - times[1]) / (times[1] - times[0]))
 
 
 @pytest.mark.slow
-def test_importing_the_estimators_loads_no_statistics_and_no_pictures():
-    code = "import sys; from slamgym import EkfSlam; print(*sys.modules)"
-    loaded = run_python(code).split()
-    assert "numba" in loaded
-    assert not {"scipy.special", "scipy.stats", "matplotlib", "pymunk"} & set(loaded)
+def test_importing_the_estimators_and_workers_loads_little():
+    code = """
+import sys
+from slamgym import EkfSlam
+print(*sys.modules)
+import slamgym.experiments.monte_carlo.runner
+print(*sys.modules)
+"""
+    estimators, workers = map(str.split, run_python(code).splitlines())
+    heavy = {"scipy.stats", "matplotlib", "xarray", "netCDF4", "slamgym.agents"}
+    assert "numba" in estimators
+    assert not (heavy | {"scipy.special", "pymunk"}) & set(estimators)
+    assert not heavy & set(workers)
 
 
 @pytest.mark.slow

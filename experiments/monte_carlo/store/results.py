@@ -1,15 +1,18 @@
-"""The results of a Monte Carlo as one dataset: estimator × run × step."""
+"""The results of a Monte Carlo as one dataset: estimator × run × step.
+
+xarray and netCDF are loaded where they are used, because workers need neither.
+"""
+
+from __future__ import annotations
 
 import json
 import platform
 from collections.abc import Iterator, Mapping, MutableMapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import netCDF4
 import numpy as np
-import xarray as xr
 
 from .... import __version__
 from ....evaluation.noise_sums import CHANNELS, MOMENTS
@@ -17,6 +20,9 @@ from ....sim_configs.atomic_file import replace_when_written
 from ..measure.run_measures import NOISE_SIZES, VARIABLES, Block, Variable
 from .job_folder import RESULTS
 from .result_blocks import Job, Span
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Blocks = Iterator[tuple[Span, list[Block]]]
 
@@ -38,6 +44,8 @@ def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Da
     command : str
         Command that reproduces the results.
     """
+    import xarray as xr  # noqa: PLC0415
+
     sizes = _sizes(job, runs)
     arrays: dict[str, Any] = {
         name: np.empty(
@@ -91,6 +99,8 @@ def load_results(path: str | Path) -> xr.Dataset:
     ValueError
         If the file is not one, or not complete.
     """
+    import xarray as xr  # noqa: PLC0415
+
     file = Path(path)
     file = file / RESULTS if file.is_dir() else file
     if not file.exists():
@@ -110,6 +120,8 @@ def load_results(path: str | Path) -> xr.Dataset:
 
 
 def _write(path: Path, job: Job, blocks: Blocks, runs: Span, command: str) -> None:
+    import netCDF4  # noqa: PLC0415
+
     with netCDF4.Dataset(path, "w") as file:
         for dim, size in _sizes(job, runs).items():
             file.createDimension(dim, size)
