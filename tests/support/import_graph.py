@@ -1,6 +1,7 @@
 """The imports between the modules of the repository, read from their source."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -41,6 +42,7 @@ def absolute(module, node):
     return ".".join([*inside, *filter(None, [node.module])])
 
 
+@cache
 def stub_targets():
     """Return what each lazy name of each package stands for: module → name → module."""
     targets = {}
@@ -60,31 +62,27 @@ def stub_targets():
     return targets
 
 
-STUBS = stub_targets()
-
-
 def defining_module(module, name):
     """Return the module that ``from module import name`` takes the name from."""
-    if f"{module}.{name}" in FILES and name not in STUBS.get(module, {}):
+    stubs = stub_targets()
+    if f"{module}.{name}" in FILES and name not in stubs.get(module, {}):
         return f"{module}.{name}"
-    while name in STUBS.get(module, {}) and STUBS[module][name] != module:
-        module = STUBS[module][name]
+    while name in stubs.get(module, {}) and stubs[module][name] != module:
+        module = stubs[module][name]
     return module
 
 
-def import_statements(file):
-    """Return the import statements of a file, also those in functions."""
-    nodes = ast.walk(ast.parse(file.read_text()))
+@cache
+def import_statements(module):
+    """Return the import statements of a module, also those in functions."""
+    nodes = ast.walk(ast.parse(FILES[module].read_text()))
     return [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
-
-
-STATEMENTS = {module: import_statements(file) for module, file in FILES.items()}
 
 
 def imports_of(module):
     """Return the modules of the repository that a module imports."""
     found = set()
-    for node in STATEMENTS[module]:
+    for node in import_statements(module):
         if isinstance(node, ast.ImportFrom) and node.level:
             target = absolute(module, node)
             found |= {defining_module(target, alias.name) for alias in node.names}
@@ -94,7 +92,7 @@ def imports_of(module):
 def libraries(module):
     """Return the packages outside the repository that a module imports."""
     found = set()
-    for node in STATEMENTS[module]:
+    for node in import_statements(module):
         if isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         elif not node.level:
@@ -102,4 +100,7 @@ def libraries(module):
     return found
 
 
-GRAPH = {module: imports_of(module) for module in FILES}
+@cache
+def graph():
+    """Return the modules that each module imports."""
+    return {module: imports_of(module) for module in FILES}
