@@ -2,12 +2,9 @@
 
 import errno
 import json
-import os
 import resource
 import signal
-import subprocess
 import sys
-import textwrap
 import time
 import tracemalloc
 import zipfile
@@ -250,7 +247,7 @@ def test_a_report_shows_association_only_where_identities_are_hidden(hidden, who
     }
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_the_page_shows_association_and_says_what_a_bad_run_is(hidden):
     page = html_report(hidden, summarise_monte_carlo(hidden))
     assert "precision" in page
@@ -658,38 +655,17 @@ def test_options_may_be_words():
 
 @pytest.mark.slow
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(whole, tmp_path):
-    distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
-    script = textwrap.dedent(
-        """
-        import os, signal, sys
-        from distributed import Client, LocalCluster
-        from slamgym.experiments.monte_carlo import monte_carlo
-        if __name__ == "__main__":
-            with LocalCluster(
-                2, threads_per_worker=1, dashboard_address=None
-            ) as cluster:
-                with Client(cluster) as client:
-                    pids = list(client.run(os.getpid).values())
-                    def kill_one(done, of):
-                        if done and pids:
-                            os.kill(pids.pop(), signal.SIGKILL)
-                            pids.clear()
-                    monte_carlo("six_landmarks", "ekf,invariant", 20, block_size=1,
-                                out=sys.argv[1], backend="dask", progress=kill_one)
-                    print("killed one" if not pids else "nobody died")
-        """
+    pytest.importorskip("distributed", reason="needs dask.distributed")
+    out = tmp_path / "here" / "out"
+    out.parent.mkdir()
+    job = "six_landmarks -e ekf,invariant --runs 20 --block-size 1 --out out"
+    child = forked.start(
+        jobs_to_kill.command_that_loses_a_worker,
+        out.parent,
+        *f"monte-carlo {job} --backend dask --jobs 2".split(),
     )
-    file = tmp_path / "on_dask.py"
-    file.write_text(script)
-    assert distributed is not None
-    done = subprocess.run(
-        [sys.executable, str(file), str(tmp_path / "out")],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-        env=os.environ | {"PYTHONWARNINGS": "default"},
-    )
-    assert done.stdout.strip() == "killed one", done.stderr
-    with load_results(tmp_path / "out") as results:
+    child.join(300)
+    assert child.exitcode == 0, (tmp_path / "here.messages").read_text()
+    assert (tmp_path / "here.victim").exists()
+    with load_results(out) as results:
         xr.testing.assert_equal(results.load(), whole)

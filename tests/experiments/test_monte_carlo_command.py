@@ -1,7 +1,6 @@
 """``slamgym monte-carlo`` and ``slamgym noise-study --runs``, as a user types them."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -65,6 +64,7 @@ def test_results_summary_and_report_are_written_and_told(here):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_a_world_without_identities_is_scored_by_places(here):
     world = ("hidden_identities", "--steps", 12, "--runs", 2, "--resolution", 100)
     estimator = 'ekf[management={association="joint"}]'
@@ -106,6 +106,7 @@ def test_a_filter_of_ones_own_is_found_and_its_crash_told(here):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_filters_may_be_told_another_noise():
     result = slamgym(
         *("monte-carlo", "six_landmarks", "-e", "invariant", "--runs", 30, "--json"),
@@ -134,6 +135,7 @@ def test_what_cannot_be_done_is_said_in_one_line(here, arguments, message):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_a_folder_of_another_scenario_is_refused(here):
     assert (
         slamgym("monte-carlo", "anchored", "--runs", 2, "--out", "out").exit_code == 0
@@ -158,23 +160,3 @@ def test_a_noise_study_over_many_runs_writes_figure_and_table(here):
     assert "--change must be" in refused(
         "noise-study", "anchored", "--runs", 3, "--change", "filtre"
     )
-
-
-@pytest.mark.slow
-def test_dask_is_asked_for_by_name(here):
-    pytest.importorskip("distributed", reason="needs dask.distributed")
-    script = shutil.which("slamgym", path=Path(sys.executable).parent)
-    done = subprocess.run(
-        [
-            *(script, "monte-carlo", "six_landmarks", "-e", "ekf", "--runs", "6"),
-            *("--backend", "dask", "--jobs", "1", "--block-size", "2", "--out", "out"),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONWARNINGS": "default"},
-    )
-    assert done.returncode == 0, done.stderr
-    with load_results(here / "out") as results:
-        expected = monte_carlo("six_landmarks", "ekf", 6)
-        xr.testing.assert_equal(results.load(), expected)

@@ -2,10 +2,10 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 
+import forked
+import jobs_to_kill
 import psutil
 import pytest
 
@@ -19,30 +19,25 @@ from slamgym.experiments.runs.folder_lock import WRITER, locked_folder
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals are those of POSIX")
 
-PROGRAM = [
-    sys.executable,
-    "-c",
-    # Of a parent in the background a child inherits that interrupts are ignored.
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    "from slamgym.experiments.command_line.app import main; main()",
-]
 JOB = "monte-carlo six_landmarks -e ekf --runs 90000 --block-size 8 --jobs 2 --out out"
 GOES_ON = "the finished runs are in out, and the same command continues"
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+def here(tmp_path):
+    folder = tmp_path / "here"
+    folder.mkdir()
+    return folder
 
 
-def begin(*arguments):
-    return subprocess.Popen(
-        [*PROGRAM, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def begin(here, *arguments):
+    return forked.start(jobs_to_kill.command, here, *arguments)
+
+
+def message_at_the_end(child, here):
+    """Wait for the end of a command, and return what it wrote."""
+    child.join(60)
+    return here.with_suffix(".messages").read_text()
 
 
 def wait_until(happened):
@@ -52,10 +47,14 @@ def wait_until(happened):
         time.sleep(0.05)
 
 
+def blocks_in(here):
+    return len(list(here.glob("out/blocks/runs-*.npz")))
+
+
 def many_runs(here):
     """Return a Monte Carlo on two workers that has results, and its processes."""
-    child = begin(*JOB.split())
-    wait_until(lambda: len(list(here.glob("out/blocks/runs-*.npz"))) > 1)
+    child = begin(here, *JOB.split())
+    wait_until(lambda: blocks_in(here) > 1)
     return child, psutil.Process(child.pid).children(recursive=True)
 
 
@@ -71,10 +70,10 @@ def workers_among(processes):
 def test_an_ended_job_says_that_it_goes_on_and_leaves_no_process(here, number, code):
     child, processes = many_runs(here)
     assert len(workers_among(processes)) == 2
-    child.send_signal(number)
-    _, stderr = child.communicate(timeout=60)
-    assert child.returncode == code
-    assert stderr.endswith(f"slamgym: interrupted; {GOES_ON}\n")
+    os.kill(child.pid, number)
+    message = message_at_the_end(child, here)
+    assert child.exitcode == code
+    assert message.endswith(f"slamgym: interrupted; {GOES_ON}\n")
     _, alive = psutil.wait_procs(processes, timeout=10)
     assert alive == []
 
@@ -83,7 +82,7 @@ def test_an_ended_job_says_that_it_goes_on_and_leaves_no_process(here, number, c
 def test_workers_end_when_the_process_that_engaged_them_is_killed(here):
     child, processes = many_runs(here)
     child.kill()
-    child.communicate()
+    child.join()
     _, alive = psutil.wait_procs(processes, timeout=20)
     assert alive == []
 
@@ -93,13 +92,14 @@ def test_a_killed_worker_is_reported_with_how_to_go_on(here):
     child, processes = many_runs(here)
     first, second = workers_among(processes)
     first.terminate()  # in vain: the job ends its workers
-    time.sleep(1)
-    assert child.poll() is None
+    before = blocks_in(here)
+    wait_until(lambda: blocks_in(here) > before + 8)  # both go on
+    assert first.status() != psutil.STATUS_ZOMBIE
     second.kill()
-    _, stderr = child.communicate(timeout=60)
-    assert child.returncode == 1
-    assert "slamgym: a worker process was killed, perhaps for" in stderr
-    assert stderr.endswith(f"{GOES_ON}\n")
+    message = message_at_the_end(child, here)
+    assert child.exitcode == 1
+    assert "slamgym: a worker process was killed, perhaps for" in message
+    assert message.endswith(f"{GOES_ON}\n")
 
 
 @pytest.mark.slow
@@ -108,18 +108,18 @@ def test_a_run_that_is_ended_leaves_nothing_and_a_killed_one_is_swept(here):
         return list(here.glob(".out.*.partial"))
 
     for number, code in ((signal.SIGKILL, -9), (signal.SIGTERM, 143)):
-        child = begin(*["run", "loop", "--steps", "200000", "--out", "out"])
+        child = begin(here, *["run", "loop", "--steps", "200000", "--out", "out"])
         left = set(unfinished())
         wait_until(
             lambda left=left: any(
                 (f / WRITER).exists() for f in unfinished() if f not in left
             )
         )
-        child.send_signal(number)
-        _, stderr = child.communicate(timeout=60)
-        assert child.returncode == code
+        os.kill(child.pid, number)
+        message = message_at_the_end(child, here)
+        assert child.exitcode == code
         assert len(unfinished()) == (number == signal.SIGKILL)
-    assert stderr == "slamgym: interrupted; nothing was written\n"
+    assert message == "slamgym: interrupted; nothing was written\n"
     assert list(here.iterdir()) == []
 
 

@@ -8,12 +8,47 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+import psutil
 
+from slamgym.experiments.command_line.app import main
 from slamgym.experiments.command_line.cluster import connected
 from slamgym.experiments.monte_carlo import monte_carlo, runner
 from slamgym.experiments.monte_carlo.store import job_folder
 from slamgym.experiments.trajectories.generate import generate_trajectories
 from slamgym.sim_configs import load_scenario
+
+
+def command(folder, *arguments):
+    """Run a command in a folder, with its messages in the file ``messages`` beside."""
+    os.chdir(folder)
+    messages = os.open(f"{folder}.messages", os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
+    for stream in (1, 2):
+        os.dup2(messages, stream)
+    # Of a parent in the background a child inherits that interrupts are ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    main(arguments)
+
+
+def command_that_loses_a_worker(folder, *arguments):
+    """Run a Monte Carlo in a folder; when its first block is there, a worker dies."""
+
+    def savez(file, **arrays):
+        np.savez = write
+        (victim, *_) = (
+            child
+            for child in psutil.Process().children(recursive=True)
+            if "spawn_main" in " ".join(child.cmdline())
+        )
+        victim.kill()
+        Path(f"{folder}.victim").write_text(str(victim.pid))
+        write(file, **arrays)
+
+    # Only this job needs the module, and it loads matplotlib.
+    from slamgym.experiments.monte_carlo.report import html_report
+
+    write, np.savez = np.savez, savez
+    html_report.report_figures = lambda *_: {}
+    command(folder, *arguments)
 
 
 def two_filters(folder):
