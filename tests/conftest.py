@@ -1,5 +1,6 @@
 """What all tests share: one thread a process, bytecode files, the public logs."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -21,6 +22,18 @@ _SUPPORT = str(Path(__file__).parent / "support")
 os.environ["PYTHONPATH"] = os.pathsep.join(
     [_SUPPORT, *filter(None, [os.environ.get("PYTHONPATH")])]
 )
+
+# The many objects of modules and tests live to the end: the search for garbage need not
+# go through them again and again.
+gc.disable()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop():
+    """Search for garbage from here on, in what is made from here on."""
+    gc.freeze()
+    gc.enable()
+
 
 # Where little is compiled.  Of two workers the first begins with the first half of the
 # tests: it goes on there while the other one compiles the filters, else both would.

@@ -52,7 +52,7 @@ def machine(wheel, tmp_path_factory):
     # the editable installation of this checkout.
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     pip = (sys.executable, "-m", "pip", "--python", python, "install", "--quiet")
-    call(*pip, "--no-deps", "--no-index", str(wheel), cwd=folder)
+    call(*pip, "--no-deps", "--no-index", "--no-compile", str(wheel), cwd=folder)
     return programs
 
 

@@ -130,9 +130,11 @@ def test_it_equals_the_full_filter_while_300_landmarks_come_and_go(base):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("base", "count"), [("ekf", 600), ("invariant", 1000)])
-def test_it_equals_the_full_filter_while_many_landmarks_come_and_go(base, count):
-    _, phases = follow_both(base, count, 1000, mapped=True, every=100)
+@pytest.mark.parametrize(
+    ("base", "count", "steps"), [("ekf", 600, 1000), ("invariant", 1000, 400)]
+)
+def test_it_equals_the_full_filter_while_many_landmarks_come_and_go(base, count, steps):
+    _, phases = follow_both(base, count, steps, mapped=True, every=100)
     assert phases > 3
 
 
@@ -174,8 +176,8 @@ def test_it_equals_the_full_filter_at_a_local_size_of_the_users_choice(base):
 
 
 @pytest.mark.slow
-def test_over_20000_steps_it_stays_symmetric_and_positive_definite():
-    slam = run(CompressedEkfSlam(*NOISE), wander(120, 20_000, seen=4))
+def test_over_8000_steps_it_stays_symmetric_and_positive_definite():
+    slam = run(CompressedEkfSlam(*NOISE), wander(120, 8000, seen=4))
     belief = slam.belief()
     assert len(belief.landmark_ids) > 100
     np.testing.assert_array_equal(belief.covariance, belief.covariance.T)

@@ -264,7 +264,7 @@ def test_to_look_around_the_robot_decides_the_same_as_to_look_at_the_whole_map(
     for slam in (near, whole):
         map_all(slam, 300)
     changed = False
-    for odometry, readings, _ in wander(300, 30):
+    for odometry, readings, _ in wander(300, 15):
         for slam in (near, whole):
             slam.predict(odometry)
         one, other = near.update(readings), whole.update(readings)
@@ -407,7 +407,7 @@ def in_band(nees, dof):
     return low < np.mean(nees) < high
 
 
-def merged_runs(name, start_std, runs=150, steps=40):
+def merged_runs(name, start_std, runs=100, steps=40):
     """Drives in which landmark 0 gets another name for the second half."""
     policy = LandmarkPolicy(merge_within=2.0)
     errors, merges = [], 0
@@ -440,7 +440,7 @@ def test_two_neighbours_are_not_merged(name):
     landmarks = np.vstack([SIX, SIX[0] + (0.3, 0.0)])
     policy = LandmarkPolicy(merge_within=0.3)
     nees, worst = [], []
-    for seed in range(100):
+    for seed in range(60):
         slam = make(name, policy)
         steps_of_run = list(drive(seed, 80, landmarks=landmarks))
         for step, (odometry, readings, _) in enumerate(steps_of_run):
@@ -818,7 +818,7 @@ def test_a_saved_run_in_submaps_goes_on_bit_for_bit(tmp_path, folder):
 @pytest.mark.slow
 def test_merging_true_duplicates_keeps_submaps_consistent():
     """Landmark 0 gets another name halfway, after submaps were closed."""
-    errors, merges, runs, steps = [], 0, 30, 40
+    errors, merges, runs, steps = [], 0, 20, 40
     for seed in range(runs):
         slam = make("submaps", LandmarkPolicy(merge_within=2.0), **SMALL)
         steps_of_run = list(drive(seed, steps))

@@ -318,7 +318,7 @@ def test_what_waits_far_from_the_robot_is_within_the_tolerance():
         for tolerance in (0.0, 1e-3, 1e-6)
     )
     worst = {loose: 0.0, tight: 0.0}
-    for step, each in enumerate(wander(6000, 1200, seed=1)):
+    for step, each in enumerate(wander(6000, 900, seed=1)):
         for slam in (exact, loose, tight):
             run(slam, [each])
         if step % 150 == 149:
@@ -466,7 +466,7 @@ def test_in_the_loop_it_errs_like_the_ekf_and_pruning_far_beyond():
     # A handful of landmarks in view and four that may be linked.  All three share the
     # EKF's linearisation, which is overconfident here by itself (benchmarks/
     # sparse_information.py --nees has more runs: 6.2, 7.9 and 92).
-    world, runs = load_scenario("loop"), 3
+    world, runs = load_scenario("loop"), 2
     data = simulate_runs(world, runs, 0)
     start = {"initial_pose_std": world.start.std}
     makers = {

@@ -48,6 +48,7 @@ def test_a_wrong_assumption_is_named_by_its_direction():
     assert causes(found) == {"invariant": "motion noise too large"}
 
 
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_linearisation_is_the_fault_of_one_filter_and_not_of_the_other():
     found = summary_of("six_landmarks", "ekf,invariant", runs=100)
     assert causes(found) == {"ekf": "linearisation", "invariant": "honest"}

@@ -62,6 +62,7 @@ def test_a_smoother_is_bounded_in_its_map_only(summary):
     assert 0.5 < found["map"]["value"] < 1.5
 
 
+@pytest.mark.slow
 def test_table_and_report_show_the_efficiency(results, summary):
     rows = {measure.name: measure.of for measure in measures(summary)}
     cell = rows["efficiency of the position"]

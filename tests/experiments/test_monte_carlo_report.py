@@ -198,7 +198,7 @@ def test_few_runs_of_a_filter_that_is_far_off_are_found(runs):
 def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs, request):
     world = load_scenario("six_landmarks").with_changes(steps=12)
     for seed in (0, 5, 9):
-        if seed:
+        if seed or runs not in (2, 5):  # 5: the first with a bootstrap
             request.getfixturevalue("_figures_in_reports_are_blank")
         dataset = monte_carlo(world, "ekf", runs, seed)
         summary = summarise_monte_carlo(dataset)

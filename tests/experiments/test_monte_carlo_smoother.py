@@ -60,6 +60,7 @@ def test_it_is_more_accurate_than_the_filter_on_the_way(results):
     assert smoothed < filtered
 
 
+@pytest.mark.usefixtures("_figures_in_reports_are_blank")
 def test_the_report_draws_the_nis_of_filters_only(results, tmp_path):
     both, alone = tmp_path / "both.html", tmp_path / "alone.html"
     write_html_report(results, summarise_monte_carlo(results), both)
