@@ -130,19 +130,24 @@ def diagnose(
         return Diagnosis(
             CANNOT_TELL, 1.0, f"{runs} runs are too few; {FEWEST_RUNS} are needed."
         )
-    findings = noise_findings(sums)
-    tests = max(1, len(findings))
-    adjusted = [f._replace(p_value=min(1.0, f.p_value * tests)) for f in findings]
-    guilty = [f for f in adjusted if f.p_value < NOISE_RATE and f.matters]
-    errors = errors_of(pose, heading)
+    errors, guilty = errors_of(pose, heading), _guilty(sums)
     if guilty:
-        return _of_the_noise(sorted(guilty, key=lambda f: -f.impact), errors)
+        return _of_the_noise(guilty, errors)
     known = None if heading_knowledge is None else np.asarray(heading_knowledge, float)
     blame = None
     if mistakes is not None and np.any(mistakes):
         paired = None if known_nees is None else _paired(known_nees, nees, pose)
         blame = blame_association(pose, np.asarray(mistakes, float), paired)
     return _of_the_filter(errors, nis_ratio, known, blame)
+
+
+def _guilty(sums: Array) -> list[Finding]:
+    """Return what is wrong with the noise, the largest effect first."""
+    findings = noise_findings(sums)
+    tests = max(1, len(findings))
+    adjusted = [f._replace(p_value=min(1.0, f.p_value * tests)) for f in findings]
+    guilty = [f for f in adjusted if f.p_value < NOISE_RATE and f.matters]
+    return sorted(guilty, key=lambda f: -f.impact)
 
 
 def _paired(known_nees: ArrayLike, nees: ArrayLike, pose: Array) -> Array:
@@ -198,22 +203,16 @@ def _of_the_filter(
     blame: Blame | None,
 ) -> Diagnosis:
     """Return the answer for a filter that assumes the right noise."""
-    spurious = 1.0 if knowledge is None else spurious_knowledge(knowledge)
-    tests = [errors.p_value]
-    if knowledge is not None:
-        tests.append(spurious)
-    if blame is not None and blame.is_paired:
-        tests.append(blame.p_value)
-    p_value = min(1.0, len(tests) * min(tests))
+    spurious = _p_of_knowledge(knowledge)
+    p_value = _smallest_adjusted(errors, spurious, blame)
     if p_value >= FILTER_RATE:
         sentence = "honest: the noise is what it assumes, and its errors agree."
         return Diagnosis(HONEST, p_value, sentence)
     ratio_text = _ratio_text(errors)
-    is_association = blame is not None and blame.p_value < _ERROR_RATE
-    if errors.ratio < 1 and not (is_association and errors.p_value >= FILTER_RATE):
+    if _is_cautious(errors, blame):
         sentence = f"cannot tell: the noise is what it assumes, but {ratio_text}."
         return Diagnosis(CANNOT_TELL, p_value, sentence)
-    if blame is not None and (is_association or not blame.is_paired):
+    if blame is not None and (blame.p_value < _ERROR_RATE or not blame.is_paired):
         return _of_the_association(blame, errors)
     if (nis_ratio or 0.0) > np.sqrt(errors.ratio):
         sentence = (
@@ -229,9 +228,31 @@ def _of_the_filter(
     return Diagnosis(LINEARISATION, p_value, sentence)
 
 
-def _claims(knowledge: Array | None, spurious: float) -> str:
+def _p_of_knowledge(knowledge: Array | None) -> float | None:
+    return None if knowledge is None else spurious_knowledge(knowledge)
+
+
+def _smallest_adjusted(
+    errors: Errors, spurious: float | None, blame: Blame | None
+) -> float:
+    """Return the smallest p-value of the tests of a filter, times their number."""
+    tests = [errors.p_value]
+    if spurious is not None:
+        tests.append(spurious)
+    if blame is not None and blame.is_paired:
+        tests.append(blame.p_value)
+    return min(1.0, len(tests) * min(tests))
+
+
+def _is_cautious(errors: Errors, blame: Blame | None) -> bool:
+    """Return whether the errors are too small, unless only associations are wrong."""
+    is_association = blame is not None and blame.p_value < _ERROR_RATE
+    return errors.ratio < 1 and not (is_association and errors.p_value >= FILTER_RATE)
+
+
+def _claims(knowledge: Array | None, spurious: float | None) -> str:
     """State the share of the least possible variance, if it is too small."""
-    if knowledge is None or spurious >= _ERROR_RATE:
+    if knowledge is None or spurious is None or spurious >= _ERROR_RATE:
         return ""
     share = knowledge.mean()
     return f"; it claims {share:.2g} of the least possible variance of its heading"

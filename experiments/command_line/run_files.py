@@ -96,26 +96,35 @@ def filter_and_write(
         frames.append(RunFrames(log))
         run = _filtered(log, label, settings, every_step, reporter, frames[-1])
         runs.append(run)
-    first = runs[0]
-    with reporter.progress("drawing") as tick:
-        write_figures(
-            folder, first.trace, every_step=every_step, progress=tick, walls=walls
-        )
-        if len(runs) > 1:
-            compared = figures.comparison_figure([run.trace for run in runs], walls)
-            figures.save_figure(compared, folder / "comparison.png", dpi=150)
+    _draw([run.trace for run in runs], folder, every_step, reporter, walls)
     viewed = [
         ViewedRun(run.trace, kept) for run, kept in zip(runs, frames, strict=True)
     ]
     write_run_page(folder / "run.html", log, viewed, walls=walls)
     if rerun is not None:
         write_rerun(rerun, log, viewed, walls=walls)
-    write_slamlog(first.log, folder / "log.csv")
+    write_slamlog(runs[0].log, folder / "log.csv")
     summaries = [
         summarise(run, settings, resolution=resolution)
         for run, settings in zip(runs, filters.values(), strict=True)
     ]
     return write_summary(folder, {**summaries[0], "others": summaries[1:]})
+
+
+def _draw(
+    traces: Sequence[RunTrace],
+    folder: Path,
+    every_step: bool,
+    reporter: Reporter,
+    walls: Sequence[Sequence[float]],
+) -> None:
+    """Write the figures of the first trace, and one that compares several."""
+    first, *others = traces
+    with reporter.progress("drawing") as tick:
+        write_figures(folder, first, every_step=every_step, progress=tick, walls=walls)
+        if others:
+            compared = figures.comparison_figure(traces, walls)
+            figures.save_figure(compared, folder / "comparison.png", dpi=150)
 
 
 def _filtered(

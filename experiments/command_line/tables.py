@@ -28,10 +28,11 @@ def landmark_table(summary: dict[str, Any]) -> Table:
     known = any(row["euclidean"] is not None for row in rows)
     shown, caption = rows, None
     if len(rows) > _MOST_ROWS:
-        count = _FEWER if summary.get("others") else _WORST
-        shown = sorted(rows, key=_distance, reverse=True)[:count]
-        which = "largest errors" if known else "first"
-        caption = Text(f"the {count} {which} of {len(rows)}; all: summary.json", "dim")
+        shown = _worst_rows(summary)
+        which = ("first", "largest errors")[known]
+        caption = Text(
+            f"the {len(shown)} {which} of {len(rows)}; all: summary.json", "dim"
+        )
     table = Table(
         title="Landmarks, with their distances from the truth" * known or "Landmarks",
         title_justify="left",
@@ -49,6 +50,12 @@ def landmark_table(summary: dict[str, Any]) -> Table:
         distances = [_number(row["euclidean"], 7), _number(row["mahalanobis"], 5)]
         table.add_row(*cells, *(distances if known else []))
     return table
+
+
+def _worst_rows(summary: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return some landmarks with the largest errors, fewer beside other filters."""
+    count = _FEWER if summary.get("others") else _WORST
+    return sorted(summary["landmarks"], key=_distance, reverse=True)[:count]
 
 
 def _distance(row: Mapping[str, float | None]) -> tuple[float, float]:

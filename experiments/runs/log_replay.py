@@ -133,7 +133,7 @@ def replay(
             progress(number + 1, len(steps))
     made = decisions.result() if hides_identities(log) else None
     identities = None if made is None else made.identities()
-    trace = recorder.trace(name or _name_of(estimator), times, log, identities)
+    trace = recorder.trace(_name_of(estimator, name), times, log, identities)
     return Replay(
         log,
         trace,
@@ -157,8 +157,10 @@ def _unwatched(*_: object) -> None:
     """Watch nothing."""
 
 
-def _name_of(estimator: SlamEstimator) -> str:
-    """Return the name of its class; for a managed filter, that of the filter."""
+def _name_of(estimator: SlamEstimator, given: str | None) -> str:
+    """Return a given name, or that of the class; of a managed filter, the filter's."""
+    if given:
+        return given
     if isinstance(estimator, ManagedSlam | HypothesisSlam):
         return type(estimator.filter).__name__
     return type(estimator).__name__

@@ -186,19 +186,23 @@ def _manifest(table: dict[str, Any]) -> Manifest:
     for name in (shard["name"] for shard in table["shards"]):
         if name in ("", "..") or Path(name).name != name:
             raise ValueError(f"a shard must be named without a folder, got {name!r}")
-    scenario = scenario_from_text(_text(table["job"], "scenario"))
-    job = Job(**{**table["job"], "scenario": scenario})
-    for name, least in {"seed": 0, "episodes": 1, "episodes_per_shard": 1}.items():
-        integer(name, getattr(job, name), least)
-    _text(table["job"], "controller")
-    _text(table["job"], "format")
-    if job.estimator is not None:
-        _text(table["job"], "estimator")
     return Manifest(
-        job=job,
+        job=_job(table["job"]),
         versions=dict(table["versions"]),
         shards=tuple(_shard(shard) for shard in table["shards"]),
     )
+
+
+def _job(table: dict[str, Any]) -> Job:
+    scenario = scenario_from_text(_text(table, "scenario"))
+    job = Job(**{**table, "scenario": scenario})
+    for name, least in {"seed": 0, "episodes": 1, "episodes_per_shard": 1}.items():
+        integer(name, getattr(job, name), least)
+    _text(table, "controller")
+    _text(table, "format")
+    if job.estimator is not None:
+        _text(table, "estimator")
+    return job
 
 
 def _shard(table: dict[str, Any]) -> ShardEntry:
