@@ -184,6 +184,7 @@ def test_sightings_count_as_long_as_they_are_recent():
 # --- all of it ---
 
 
+@pytest.mark.slow
 def test_hidden_identities_are_found_out():
     world = load_scenario("hidden_identities")
     wrong = right = 0

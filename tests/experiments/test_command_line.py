@@ -286,6 +286,7 @@ def test_several_filters_share_a_page_and_a_table(log, without_pictures):
     assert alone["others"] == []
 
 
+@pytest.mark.slow
 def test_several_filters_are_compared_in_a_picture_with_the_walls(monkeypatch):
     drawn = {}
 

@@ -176,6 +176,7 @@ def test_range_noise_that_grows_with_range_is_found():
     assert growing.low < 0.03 < growing.high
 
 
+@pytest.mark.slow
 def test_readings_with_correlated_errors_suggest_inflation():
     """A range error of each landmark that stays for many scans, beside a white one."""
     log, rng = a_log(steps=300), np.random.default_rng(1)
@@ -348,6 +349,7 @@ def test_bearing_noise_that_shrinks_with_range_is_found():
     assert f"--option bearing_std_metres={noise.value:.4g}" in options_line(fit.fitted)
 
 
+@pytest.mark.slow
 def test_a_needless_bearing_noise_in_metres_is_zero_in_the_options_too():
     fit = fitted(a_log(steps=60), options={"bearing_std_metres": 0.1})
     assert (fit.noise[6].value, fit.noise[6].verdict) == (0, "zero")
