@@ -16,8 +16,8 @@ loads and evaluates; ``learning_curve.csv`` and ``.png``; ``scores.txt``, the sc
 policy and baselines on held-out maps, with the differences between the policy and each
 baseline on the same maps; and ``trajectories.png``, their paths on one of these maps.
 
-On 100 maps of ``active_medium``, a policy of two million steps earns 15.1 ± 0.6,
-coverage 13.5 ± 0.7 and random -1.6 ± 0.5: see docs/active_slam_scores.md.
+docs/active_slam_scores.md has the scores of five seeds, which ``benchmarks/learning.py``
+trains.
 """
 
 import argparse
