@@ -16,7 +16,7 @@ loads and evaluates; ``learning_curve.csv`` and ``.png``; ``scores.txt``, the sc
 policy and baselines on held-out maps, with the differences between the policy and each
 baseline on the same maps; and ``trajectories.png``, their paths on one of these maps.
 
-docs/active_slam_scores.md has the scores of five seeds, which ``benchmarks/learning.py``
+docs/active_slam_scores.md has the scores of five seeds, which benchmarks/learning.py
 trains.
 """
 

@@ -149,3 +149,11 @@ def test_what_cannot_be_is_refused_before_anything_is_written(job, message, tmp_
     with pytest.raises((ValueError, TypeError), match=message):
         generate_trajectories(KNOWN, tmp_path / "out", episodes=1, **job)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_manifest_with_another_kind_of_estimator_is_refused(tmp_path):
+    generate_trajectories(KNOWN, tmp_path, episodes=1, estimator="ekf")
+    path = tmp_path / "manifest.json"
+    path.write_text(path.read_text().replace('"estimator": "ekf"', '"estimator": 5'))
+    with pytest.raises(ValueError, match="estimator must be text, got 5"):
+        read_manifest(tmp_path)
