@@ -317,7 +317,7 @@ def test_the_landmarks_and_the_pose_are_where_the_covariance_says():
 @pytest.mark.slow
 def test_in_the_loop_it_is_honest_where_the_ekf_is_not():
     world, nees = load_scenario("loop"), {"ekf": [], "submaps": []}
-    data = simulate_runs(world, 5, 0)
+    data = simulate_runs(world, 3, 0)
     for run_, first in enumerate(data.initial_poses):
         start = {"initial_pose": first, "initial_pose_std": world.start.std}
         noise = world.motion.std, world.sensor.std

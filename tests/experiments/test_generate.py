@@ -43,7 +43,7 @@ from slamgym.experiments.trajectories.manifest import (
 from slamgym.sim_configs import load_scenario
 
 LOOP = load_scenario("loop").with_changes(steps=30)
-KILLS = int(os.environ.get("SLAMGYM_TEST_KILLS", "2"))
+KILLS = int(os.environ.get("SLAMGYM_TEST_KILLS", "1"))
 RANGES = {"motion_std": [0.5, 2.0], "landmark_shift": 0.5}
 
 
@@ -242,7 +242,7 @@ def run_until_killed(out, name, delay, kind=jobs_to_kill.episodes):
     before = whole_shards(out)
     job = forked.start(kind, out, name)
     while job.is_alive() and whole_shards(out) == before:
-        time.sleep(0.001)
+        time.sleep(0.005)
     time.sleep(delay)
     job.kill()
     job.join()
