@@ -95,7 +95,7 @@ def blame_association(pose: Array, mistakes: Array, known: Array | None) -> Blam
 
     With known identities for comparison, two tests on the same runs: is the NEES larger
     than with known identities (Wilcoxon's signed-rank test), by a tenth or more on
-    average, and are runs lost that are not with known identities?  Otherwise: do the
+    average, and are more runs lost than with known identities?  Otherwise: do the
     runs with more mistakes than the median have larger errors, and do the lost runs
     have more mistakes than others?
 
@@ -116,11 +116,11 @@ def blame_association(pose: Array, mistakes: Array, known: Array | None) -> Blam
         text = "those with more mistakes err more"
         return Blame(min(1.0, 2 * min(larger, more)), share, text, is_paired=False)
     excess = (pose - known).mean(axis=1) / POSE
-    matters = excess.mean() >= LEAST_RATIO - 1
+    ratio = float(known.mean()) / POSE
+    matters = excess.mean() >= (LEAST_RATIO - 1) * max(1.0, ratio)
     larger = float(wilcoxon(excess, alternative="greater").pvalue) if matters else 1.0
-    only_here = int((lost & ~lost_runs(known)).sum())
-    more = float(binom.sf(only_here - 1, len(pose), LOST_RATE))
-    ratio = known.mean() / POSE
+    more_lost = int(lost.sum()) - int(lost_runs(known).sum())
+    more = float(binom.sf(more_lost - 1, len(pose), LOST_RATE))
     text = f"its NEES would be {ratio:.3g} per degree with known identities"
     return Blame(min(1.0, 2 * min(larger, more)), share, text, is_paired=True)
 

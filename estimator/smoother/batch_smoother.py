@@ -85,7 +85,7 @@ def smooth(
     optimiser = Optimiser(arrays, noise)
     starts = _starts(drive, start, _places(landmarks or {}, order), order)
     found = _best(optimiser, starts, tolerance, iterations)
-    return SmoothedDrive(optimiser.linearised(found), order.tolist(), drive)
+    return SmoothedDrive(optimiser, found, order.tolist(), drive)
 
 
 def robust_kernel(robust: str | None, scale: float | None) -> tuple[float, float]:

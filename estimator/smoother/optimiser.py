@@ -54,6 +54,8 @@ class Solution(NamedTuple):
     first_cost: float
     """Of the start."""
     iterations: int
+    is_damped: bool
+    """Whether the last step was damped, so that its system may be singular."""
 
 
 class Minimum(NamedTuple):
@@ -71,7 +73,7 @@ class _State:
     def __init__(self, estimate: Estimate, stds: Array) -> None:
         self.estimate, self.stds = estimate, stds
         self.cost, self.moved, self.error = np.inf, np.inf, np.inf
-        self.damping, self.searches = 0.0, SEARCHES
+        self.damping, self.is_damped, self.searches = 0.0, False, SEARCHES
 
     def move(self, estimate: Estimate, cost: float) -> None:
         """Take an accepted step; later ones are expected to shrink as this one did."""
@@ -79,6 +81,7 @@ class _State:
         rate = moved / self.moved if 0 < self.moved < np.inf else 1.0
         self.error = moved * (rate / (1 - rate) if rate < SHRINKING else 1.0)
         self.estimate, self.cost, self.moved = estimate, cost, moved
+        self.is_damped = self.damping > 0
         lower = self.damping / 10
         self.damping = lower if lower >= FIRST_DAMPING else 0.0
 
@@ -134,7 +137,9 @@ class Optimiser:
             self._descend(state)
             if self._is_found(state, tolerance, iteration):
                 cost = self.cost(state.estimate, self.reading_stds(state.estimate))
-                return Solution(state.estimate, cost, first_cost, iteration)
+                return Solution(
+                    state.estimate, cost, first_cost, iteration, state.is_damped
+                )
             if self._varies and iteration < REWEIGHTED:
                 self._reweight(state)
         raise np.linalg.LinAlgError(

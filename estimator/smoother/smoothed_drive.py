@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
@@ -13,9 +15,24 @@ from ..models.angles import wrap_angle
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .drive import Drive
-from .optimiser import Minimum, factorised
+from .optimiser import Optimiser, Solution, factorised
 from .path import path_between
 from .substitution import conditionals
+
+
+class _Marginals(NamedTuple):
+    """What the covariances are made of."""
+
+    given_map: Array
+    """Π, shape (N, 3, 3)."""
+    transitions: Array
+    """Φ, shape (N, 3, 3)."""
+    sensitivity: Array
+    """Ψ, shape (N, 3, 2n)."""
+    factor: Array
+    """Lower Cholesky factor of S, shape (2n, 2n)."""
+    landmarks: Array
+    """P_l, shape (2n, 2n)."""
 
 
 class SmoothedDrive:
@@ -31,16 +48,23 @@ class SmoothedDrive:
 
     Parameters
     ----------
-    minimum : Minimum
-        Of the cost.
+    optimiser : Optimiser
+        That found the solution; it linearises it when a covariance is asked for.
+    solution : Solution
+        The minimum of the cost.
     order : sequence of int
         The landmarks in the order of the elimination.
     drive : Drive
         What was smoothed.
     """
 
-    def __init__(self, minimum: Minimum, order: Sequence[int], drive: Drive) -> None:
-        solution, elimination = minimum.solution, minimum.elimination
+    def __init__(
+        self,
+        optimiser: Optimiser,
+        solution: Solution,
+        order: Sequence[int],
+        drive: Drive,
+    ) -> None:
         estimate = solution.estimate
         self.cost = solution.cost
         """Half the sum of the squared, normalised residuals; of a robust kernel, ρ."""
@@ -60,11 +84,21 @@ class SmoothedDrive:
         self._all = estimate.landmarks
         self.landmarks = self._all[self._columns(self.landmark_ids)].reshape(-1, 2)
         """Positions in the order of `landmark_ids`, shape (n, 2) [m]."""
-        self._covariances, self._transitions = conditionals(estimate.poses, elimination)
-        self._sensitivity = elimination.rows
-        self._factor = factorised(minimum.information)
-        identity = np.eye(len(self._all))
-        self._landmark_covariance = cho_solve(self._factor, identity)
+        self._optimiser, self._solution = optimiser, solution
+        if solution.is_damped:
+            _ = self._marginals  # refuses landmarks that are not determined
+
+    @cached_property
+    def _marginals(self) -> _Marginals:
+        minimum = self._optimiser.linearised(self._solution)
+        poses, elimination = self._solution.estimate.poses, minimum.elimination
+        factor = factorised(minimum.information)
+        return _Marginals(
+            *conditionals(poses, elimination),
+            elimination.rows,
+            factor[0],
+            np.asarray(cho_solve(factor, np.eye(len(self._all)))),
+        )
 
     @property
     def readings_until(self) -> IntArray:
@@ -92,16 +126,17 @@ class SmoothedDrive:
     @property
     def pose_covariances(self) -> Array:
         """Marginal covariance of each pose, shape (N, 3, 3)."""
-        rows = self._sensitivity.reshape(-1, len(self._all))
-        root = solve_triangular(self._factor[0], rows.T, lower=True)
-        root = root.T.reshape(self._sensitivity.shape)
-        return np.asarray(self._covariances + root @ root.transpose(0, 2, 1))
+        found = self._marginals
+        rows = found.sensitivity.reshape(-1, len(self._all))
+        root = solve_triangular(found.factor, rows.T, lower=True)
+        root = root.T.reshape(found.sensitivity.shape)
+        return np.asarray(found.given_map + root @ root.transpose(0, 2, 1))
 
     @property
     def landmark_covariances(self) -> Array:
         """Marginal covariance of each landmark, shape (n, 2, 2) [m²]."""
         columns = self._columns(self.landmark_ids).reshape(-1, 2)
-        blocks = self._landmark_covariance[columns[:, :, None], columns[:, None, :]]
+        blocks = self._marginals.landmarks[columns[:, :, None], columns[:, None, :]]
         return np.asarray(blocks)
 
     def covariance(
@@ -128,14 +163,14 @@ class SmoothedDrive:
         """
         chosen = [self._pose(pose) for pose in poses]
         columns = self._columns(self._known(landmark_ids))
-        to_landmarks = self._sensitivity[chosen].reshape(-1, len(self._all))
-        spread = to_landmarks @ self._landmark_covariance
+        to_landmarks = self._marginals.sensitivity[chosen].reshape(-1, len(self._all))
+        spread = to_landmarks @ self._marginals.landmarks
         count = 3 * len(chosen)
         joint = np.empty((count + len(columns),) * 2)
         joint[:count, :count] = spread @ to_landmarks.T + self._given_map(chosen)
         joint[:count, count:] = spread[:, columns]
         joint[count:, :count] = joint[:count, count:].T
-        joint[count:, count:] = self._landmark_covariance[np.ix_(columns, columns)]
+        joint[count:, count:] = self._marginals.landmarks[np.ix_(columns, columns)]
         return (joint + joint.T) / 2
 
     def belief(self, pose: int = -1, landmark_ids: LandmarkIds | None = None) -> Belief:
@@ -159,10 +194,10 @@ class SmoothedDrive:
         blocks = np.empty((len(poses), 3, len(poses), 3))
         for at, first in enumerate(poses):
             later = {pose for pose in poses if pose >= first}
-            moved = self._covariances[first]
+            moved = self._marginals.given_map[first]
             for k in range(first, max(later) + 1):
                 if k > first:
-                    moved = self._transitions[k] @ moved
+                    moved = self._marginals.transitions[k] @ moved
                 for other in [i for i, pose in enumerate(poses) if pose == k]:
                     blocks[other, :, at] = moved
                     blocks[at, :, other] = moved.T

@@ -234,6 +234,8 @@ def test_errors_that_known_identities_share_are_not_of_the_association():
     known = nees * rng.uniform(0.8, 1.25, nees.shape)
     wrong = scores | {"nees": nees, "mistakes": np.ones(RUNS), "known_nees": known}
     assert diagnose(**wrong).cause == "linearisation"
+    both = {"nees": 400 * nees, "known_nees": 400 * known / 1.05}
+    assert diagnose(**wrong | both).cause == "linearisation"  # a tenth of them
     nees[[5, 7]] = 60.0
     assert diagnose(**wrong | {"nees": nees}).cause == "association"
     with pytest.raises(ValueError, match="known_nees must be shape"):
