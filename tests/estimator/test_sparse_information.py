@@ -17,6 +17,7 @@ from slamgym.estimator import (
 )
 from slamgym.estimator.large_maps.sparse_cholesky import landmark_dissection
 from slamgym.estimator.large_maps.sparse_cholesky.coordinates import pairs
+from slamgym.estimator.large_maps.sparse_cholesky.extend_add import add_update
 from slamgym.estimator.large_maps.sparse_cholesky.information_matrix import (
     InformationMatrix,
 )
@@ -757,3 +758,13 @@ def assert_eliminates(elimination, matrix, dense, known, local):
     np.testing.assert_allclose(
         response, T[np.ix_(at, around.border)], rtol=1e-8, atol=1e-8
     )
+
+
+def test_an_update_is_added_to_the_rows_and_columns_of_its_front():
+    rng = np.random.default_rng(4)
+    front, update = rng.standard_normal((9, 9)), rng.standard_normal((4, 4))
+    at = np.array([7, 2, 3, 0])
+    expected = front.copy()
+    expected[np.ix_(at, at)] += update
+    add_update(front, at, update)
+    np.testing.assert_array_equal(front, expected)

@@ -37,7 +37,7 @@ def test_the_size_has_the_p_value_of_the_chi_square_test(scale, cause):
     found = findings_of("bearing", numbers)[f"bearing noise {cause}"]
     law = stats.chi2(n - 1)
     tails = law.cdf((n - 1) * variance), law.sf((n - 1) * variance)
-    assert found.p_value == pytest.approx(2 * min(tails), rel=1e-6)
+    assert found.p_value == pytest.approx(2 * min(tails), rel=1e-6, abs=0)
     assert found.impact == pytest.approx(abs(np.log(variance)))
     assert f"σβ is {np.sqrt(variance):.3g} times" in found.text
 
@@ -77,7 +77,7 @@ def test_a_mean_has_the_p_value_of_students_test_and_its_direction(
     numbers = draw(shift=shift)
     found = findings_of(channel, numbers)[cause]
     test = stats.ttest_1samp(numbers.ravel(), 0.0)
-    assert found.p_value == pytest.approx(test.pvalue, rel=1e-6)
+    assert found.p_value == pytest.approx(test.pvalue, rel=1e-6, abs=0)
     assert found.impact == pytest.approx(test.statistic**2 / RUNS / 3)
     bias = abs(numbers.mean()) / 4.0  # of the lever
     assert words.format(bias, d=np.degrees(bias)) in found.text

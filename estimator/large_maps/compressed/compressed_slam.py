@@ -152,7 +152,7 @@ class CompressedEkfSlam:
         if report.degrees_of_freedom:
             self._age += 1
             if self._age > 1 or not self._rests:
-                self._map.deferred.work(report.degrees_of_freedom + 2)
+                self._map.deferred.work(report.degrees_of_freedom + 1)
         return report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:

@@ -15,6 +15,7 @@ from .row_exchange import read_columns, write_columns
 BLOCK = 128
 # Smallest rank to apply; smaller downdates wait: memory limits thin products.
 WORTHWHILE = 40
+_EVERY_ROW = np.arange(BLOCK)
 
 
 class DeferredCovariance:
@@ -82,12 +83,12 @@ class DeferredCovariance:
             if end > start:
                 rows[start:end, : first + BLOCK] = block[columns[start:end] - first]
             read_columns(block, first, columns[:start], rows)
-        for index, (root, signs) in enumerate(self._pending):
-            missing = (_of(root, columns) * signs) @ root.T
-            if index == 0 and self._done:
-                done = self._done * BLOCK
-                missing[columns < done, :done] = 0.0
-            rows[:, : len(root)] -= missing
+        done = self._done * BLOCK
+        for root, signs in self._pending:
+            weights, split = _of(root, columns) * signs, int(np.sum(columns < done))
+            rows[split:, : len(root)] -= weights[split:] @ root.T
+            rows[:split, done : len(root)] -= weights[:split] @ root[done:].T
+            done = 0  # only the first has been begun
 
     def put(self, columns: IntArray, rows: Array, places: IntArray) -> None:
         """Store the rows of ascending columns (c,), found at ``places`` (c,)."""
@@ -98,7 +99,9 @@ class DeferredCovariance:
             if end > start:
                 own = rows[places[start:end], : first + BLOCK]
                 block[columns[start:end] - first] = own
-            others = np.delete(np.arange(len(block)), columns[start:end] - first)
+            others = _EVERY_ROW
+            if end - start > BLOCK // 4:  # most are written already
+                others = np.delete(_EVERY_ROW, columns[start:end] - first)
             write_columns(block, first, others, columns[:end], rows, places)
         for root, _ in self._pending:  # the rows put are up to date
             root[columns[columns < len(root)]] = 0.0
@@ -108,15 +111,8 @@ class DeferredCovariance:
 
         The stored rows of local landmarks are invalid, and remain so.
         """
-        blocks, pending, progress = (
-            len(self._blocks),
-            list(self._pending),
-            (
-                self._under_way,
-                self._done,
-                self._credit,
-            ),
-        )
+        blocks, pending = len(self._blocks), list(self._pending)
+        progress = self._under_way, self._done, self._credit
 
         def undo() -> None:
             del self._blocks[blocks:]

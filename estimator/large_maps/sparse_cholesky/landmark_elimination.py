@@ -17,6 +17,7 @@ from scipy.sparse import csc_array
 
 from ....arrays import Array, BoolArray, IntArray
 from .coordinates import pairs
+from .extend_add import add_update
 from .information_matrix import InformationMatrix
 from .landmark_dissection import LandmarkDissection, descends, with_ancestors
 from .multifrontal import (
@@ -146,10 +147,12 @@ def _eliminate(
     row = np.repeat(np.arange(len(own)), counts)[here >= 0]
     front.reshape(count, 2, count, 2)[row, :, here[here >= 0], :] = blocks[here >= 0]
     for child, slots in zip(children, inherited, strict=True):
-        at = pairs(place[slots])
-        front[np.ix_(at, at)] += child.update
+        add_update(front, pairs(place[slots]), child.update)
     node, _ = eliminate(front, pairs(own), pairs(rest))
-    update = front[p:, p:] - node.response.T @ node.response if children else None
+    update = None
+    if children:
+        update = node.response.T @ node.response
+        np.subtract(front[p:, p:], update, out=update)
     return _Eliminated(node, update)
 
 
