@@ -27,7 +27,7 @@ from .manifest import (
     read_manifest,
     write_manifest,
 )
-from .shard_folder import claimed, put_in_place, staging_folder
+from .shard_folder import claimed, naming, put_in_place, staging_folder
 from .shard_work import MadeShard, ShardWork, make_shard, versions_of
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def generate_trajectories(
     )
     versions = versions_of(job)
     workers = _engaged(jobs, backend)
-    with claimed(Path(out)):
+    with claimed(Path(out)), naming(Path(out)):
         return _continue(job, Path(out), versions, workers, progress)
 
 

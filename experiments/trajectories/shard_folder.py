@@ -59,6 +59,26 @@ def staging_folder(folder: Path) -> Iterator[Path]:
         _remove(staging)
 
 
+@contextlib.contextmanager
+def naming(folder: Path) -> Iterator[None]:
+    """Name the folder in errors of the system, such as a full disk.
+
+    Raises
+    ------
+    OSError
+        In place of an error of the system.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.strerror is None:
+            raise
+        raise OSError(
+            f"{folder} cannot be written: {error.strerror}; whole shards stay there, "
+            "and the same command continues"
+        ) from error
+
+
 def put_in_place(staged: Path, path: Path) -> None:
     """Move a complete shard, a file or a folder, and replace what is there."""
     _remove(path)

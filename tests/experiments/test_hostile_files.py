@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 
 import matplotlib as mpl
 import pytest
@@ -11,6 +12,8 @@ from slamgym.envs.rendering.artists import _title
 from slamgym.estimator import make_estimator
 from slamgym.experiments.command_line.output_folder import output_folder
 from slamgym.experiments.logs.importers.utias import read_utias
+from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.trajectories import generate_trajectories
 from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
 from slamgym.sim_configs import load_scenario
 from slamgym.sim_configs.scenario_errors import ScenarioError
@@ -91,6 +94,56 @@ def test_a_full_disk_names_the_folder_and_leaves_what_was_there(tmp_path):
     with full, output_folder(out):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert list(tmp_path.iterdir()) == []
+
+
+def small_data_set(out, progress=None):
+    return generate_trajectories(
+        "six_landmarks", out, episodes=6, episodes_per_shard=2, progress=progress
+    )
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits are those of POSIX")
+def test_a_data_set_that_may_not_grow_names_its_folder_and_goes_on(tmp_path):
+    import resource
+
+    small_data_set(tmp_path / "whole")
+    largest = max(file.stat().st_size for file in (tmp_path / "whole").iterdir())
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest // 2, usual[1]))
+    try:
+        with pytest.raises(OSError, match="out cannot be written: File too large; who"):
+            small_data_set(tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+    assert [file.name for file in (tmp_path / "out").iterdir()] == [MANIFEST]
+    small_data_set(tmp_path / "out")
+    same = [digest_of(tmp_path / name) for name in ("whole", "out")]
+    assert same[0] == same[1]
+
+
+def test_a_folder_that_vanishes_under_a_data_set_is_named(tmp_path):
+    out = tmp_path / "out"
+
+    def vanish(*_):
+        shutil.rmtree(out, ignore_errors=True)
+
+    with pytest.raises(OSError, match="out cannot be written: No such file"):
+        small_data_set(out, vanish)
+
+
+def test_a_folder_that_vanishes_under_a_monte_carlo_is_named(tmp_path):
+    out = tmp_path / "out"
+
+    def vanish(*_):
+        shutil.rmtree(out, ignore_errors=True)
+
+    world = load_scenario("six_landmarks")
+    with pytest.raises(OSError, match=r"out.* cannot be written: .*does not exist"):
+        monte_carlo(world, "ekf", 6, out=out, block_size=2, progress=vanish)
+
+
+def digest_of(folder):
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
 def utias_folder(folder, *, last="1.0", landmarks="6 1 1 0 0\n7 2 2 0 0\n"):

@@ -20,6 +20,7 @@ from slamgym.experiments.runs.folder_lock import WRITER, locked_folder
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals are those of POSIX")
 
 JOB = "monte-carlo six_landmarks -e ekf --runs 90000 --block-size 8 --jobs 2 --out out"
+DATA_SET = "generate six_landmarks --episodes 90000 --shard 8 --out out"
 GOES_ON = "the finished runs are in out, and the same command continues"
 
 
@@ -74,6 +75,31 @@ def test_an_ended_job_says_that_it_goes_on_and_leaves_no_process(here, number, c
     message = message_at_the_end(child, here)
     assert child.exitcode == code
     assert message.endswith(f"slamgym: interrupted; {GOES_ON}\n")
+    _, alive = psutil.wait_procs(processes, timeout=10)
+    assert alive == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "made", "goes_on"),
+    [
+        (f"{DATA_SET} --jobs 2", "shard_*.npz", "whole shards stay in out"),
+        (f"{JOB} --backend dask", "blocks/runs-*.npz", GOES_ON),
+    ],
+    ids=["generate", "dask"],
+)
+def test_a_scheduler_ends_workers_of_any_kind(here, command, made, goes_on):
+    if "dask" in command:
+        pytest.importorskip("distributed")
+    child = begin(*command.split())
+    wait_until(lambda: child.poll() or len(list(here.glob(f"out/{made}"))) > 1)
+    processes = psutil.Process(child.pid).children(recursive=True)
+    child.terminate()
+    _, stderr = child.communicate(timeout=60)
+    assert child.returncode == 143
+    last = stderr.splitlines()[-1]
+    assert last.startswith("slamgym: interrupted; ")
+    assert goes_on in last
     _, alive = psutil.wait_procs(processes, timeout=10)
     assert alive == []
 
