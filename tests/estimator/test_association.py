@@ -15,6 +15,8 @@ from slamgym.estimator.association.nearest_neighbour import (
     nearest_neighbours,
 )
 from slamgym.estimator.association.tentative_landmarks import TentativeLandmarks
+from slamgym.estimator.kernels.scan_rows import JACOBIAN, META_WIDTH, VARIANCE
+from slamgym.estimator.kernels.screen import own_covariance
 from slamgym.estimator.models.angles import wrap_angle
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.unicycle_motion import predict_pose
@@ -218,3 +220,19 @@ def test_hidden_identities_are_found_out():
         assert np.abs(belief.landmarks - places).max() < 0.5
     assert right > 5000
     assert wrong < 0.002 * right
+
+
+@pytest.mark.parametrize("column", [3, 5, 7])
+def test_the_covariance_of_one_reading_is_that_of_its_jacobian(column):
+    rng = np.random.default_rng(column)
+    root = rng.standard_normal((9, 9))
+    P, H = root @ root.T, np.zeros((2, 9))
+    h = rng.standard_normal((2, 5))
+    H[:, :3], H[:, column : column + 2] = h[:, :3], h[:, 3:]
+    system = np.zeros((2, 9 + META_WIDTH))
+    system[:, JACOBIAN : JACOBIAN + 5] = h
+    system[:, VARIANCE] = 0.3, 0.7
+    S = H @ P @ H.T + np.diag([0.3, 0.7])
+    plain = getattr(own_covariance, "py_func", own_covariance)  # only kernels call it
+    found = plain(P, system, 0, column)
+    assert found == pytest.approx((S[0, 0], S[1, 0], S[1, 1]))

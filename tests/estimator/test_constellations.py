@@ -260,3 +260,16 @@ def estimate_with(truth, xi):
 def test_bad_rules_are_refused_by_name(field, value):
     with pytest.raises(ValueError, match=f"constellations.{field}"):
         Constellations(**{field: value})
+
+
+@pytest.mark.parametrize("crowded", [None, "local", "older"])
+def test_a_place_is_filled_where_neither_map_has_many_landmarks_more(crowded):
+    square = np.array([[2.0, 2.0], [-2.0, 2.0], [-2.0, -2.0], [2.0, -2.0]])
+    more = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    maps = dict.fromkeys(("local", "older"), square)
+    if crowded:
+        maps[crowded] = np.concatenate([square, more])
+    size = 2 * sum(map(len, maps.values()))
+    places = TwoPlaces(**maps, covariance=np.eye(size), largest_turn=1.0)
+    match = Match(np.arange(4), np.arange(4))
+    assert same_place.is_filled(places, match) == (crowded is None)
