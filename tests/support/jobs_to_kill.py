@@ -1,5 +1,6 @@
 """Jobs that tests kill on their way, as functions for `forked.start`."""
 
+import atexit
 import os
 import signal
 import time
@@ -26,7 +27,10 @@ def command(folder, *arguments):
         os.dup2(messages, stream)
     # Of a parent in the background a child inherits that interrupts are ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    main(arguments)
+    try:
+        main(arguments)
+    finally:
+        atexit._run_exitfuncs()  # as at the end of Python; a forked process has none
 
 
 def command_that_loses_a_worker(folder, *arguments):
