@@ -339,6 +339,16 @@ def test_wrong_isam_line_is_named(file, line, message):
         read_log(file(ISAM + line + "\n"))
 
 
+def test_a_landmark_of_a_graph_that_no_edge_reads_is_named(tmp_path):
+    path = tmp_path / "graph.g2o"
+    path.write_text(
+        "VERTEX_XY 2 3 1\nVERTEX_XY 3 4 1\n"
+        "EDGE_SE2 0 1 1 0 0 100 0 0 100 0 1000\nEDGE_SE2_XY 0 2 3 1 50 0 50\n"
+    )
+    log = read_log(path)
+    assert log.header["left_out"] == "landmark 3, which no edge reads"
+
+
 @pytest.mark.parametrize("edge", ["EDGE2", "EDGE_SE2"])
 def test_loop_closures_between_poses_are_left_out_and_counted(file, edge):
     closed = ISAM.replace("ODOMETRY", edge) + f"{edge} 3 0 9 9 9\n{edge} 0 1 8 8 8\n"

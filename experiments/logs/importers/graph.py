@@ -98,6 +98,16 @@ def chain_of(graph: Graph) -> tuple[list[LogLine], dict[int, int], int]:
     return chain, steps, closures
 
 
+def unread_landmarks(graph: Graph) -> list[int]:
+    """Return the ids of landmarks that have a vertex, but no reading."""
+    lines = [line for lines in graph.readings.values() for line in lines]
+    read = {id_at(line, 2) for line in lines}
+    named = {
+        id_at(line, 1) for line in graph.vertices if line.text.split()[0] == "VERTEX_XY"
+    }
+    return sorted(named - read)
+
+
 def _is_closure(line: LogLine, start: int, end: int, steps: dict[int, int]) -> bool:
     """Whether a line is an edge between two poses that were visited before."""
     is_edge = line.text.split()[0] in EDGE_TAGS

@@ -13,7 +13,7 @@ from pathlib import Path
 from ..events import EventRecorder, OdometryRow, Reading, Scan, wrap_bearing
 from ..lines import LogLine, read_lines
 from ..slamlog import SlamLog
-from .graph import Graph, chain_of, id_at, reals_at, sort_lines
+from .graph import Graph, chain_of, id_at, reals_at, sort_lines, unread_landmarks
 from .graph_noise import noise_header
 from .graph_truth import with_truth
 
@@ -32,7 +32,8 @@ def read_isam(
     d (cos φ, sin φ) = (dx, dy) and φ in [-π/2, π/2]; d < 0 means driving backwards.
 
     Loop closures, edges between two poses that were both visited before, are left out
-    and counted in the header (``left_out``): a filter has no use for them.
+    and counted in the header (``left_out``): a filter has no use for them. Landmarks
+    that have a vertex, but no edge, are named there too.
 
     Parameters
     ----------
@@ -63,14 +64,16 @@ def read_isam(
     graph = sort_lines(read_lines(path))
     chain, steps, closures = chain_of(graph)
     header = {"source": "iSAM or g2o text", "truth": "none"}
-    if closures:
-        header["left_out"] = f"{closures} loop closures between poses"
-        if not graph.readings:
-            raise graph.lines[-1].error(
-                "readings of landmarks, as a filter has no use for loop closures "
-                "between poses",
-                "the end of the file",
-            )
+    if closures and not graph.readings:
+        raise graph.lines[-1].error(
+            "readings of landmarks, as a filter has no use for loop closures "
+            "between poses",
+            "the end of the file",
+        )
+    left_out = [f"{closures} loop closures between poses"] * bool(closures)
+    left_out += [f"landmark {i}, which no edge reads" for i in unread_landmarks(graph)]
+    if left_out:
+        header["left_out"] = "; ".join(left_out)
     if noise_from_file:
         header |= noise_header(graph, chain)
     log = SlamLog(
