@@ -306,7 +306,7 @@ def is_worker(process: psutil.Process) -> bool:
         line = " ".join(process.cmdline())
     except psutil.Error:
         return False
-    if "tracker" in line:
+    if "resource_tracker" in line:  # it serves them
         return False
     return any(word in line for word in ("LokyProcess", "spawn_main", "ray::"))
 
