@@ -33,9 +33,6 @@ from .search import FittedNoise, most_likely_noise
 
 GATE_PROBABILITY = float(-np.expm1(-GATE / 2))
 """Of the gate of the fit, as an option of filters."""
-ASSOCIATIONS = 2
-"""How often the readings of a log without identities are associated at most."""
-ALIKE = 0.2
 
 
 class Fitted(NamedTuple):
@@ -90,8 +87,7 @@ def fit_noise(
     ----------
     log : SlamLog
         With odometry and readings.  If it does not identify all landmarks, the filter
-        of the settings associates its readings, with the noise of the settings, and
-        once more if the fitted noise differs from it.
+        of the settings associates its readings once, with the noise of the settings.
     settings : FilterSettings
         The noise to begin with, and the filter: one that runs in batches.  Without a
         gate they get that of the fit, `GATE_PROBABILITY`.
@@ -129,14 +125,8 @@ def fit_noise(
     if not hides_identities(log):
         options = {"gate_probability": GATE_PROBABILITY, **settings.options}
         return _fit_known(log, replace(settings, options=options), threads)
-    assumed = settings
-    for _ in range(ASSOCIATIONS):
-        known = associated_log(log, assumed, progress)
-        fit = _fit_known(known, settings, threads)
-        before, assumed = assumed, fit.suggested.settings
-        if _is_alike(noise_of(before), noise_of(assumed)):
-            break
-    return replace(fit, is_associated=True)
+    known = associated_log(log, settings, progress)
+    return replace(_fit_known(known, settings, threads), is_associated=True)
 
 
 def _fit_known(log: SlamLog, settings: FilterSettings, threads: int | None) -> NoiseFit:
@@ -168,16 +158,6 @@ def _fit_known(log: SlamLog, settings: FilterSettings, threads: int | None) -> N
         len(timed.events.readings),
         found.passes,
     )
-
-
-def _is_alike(one: Array, other: Array) -> bool:
-    """Whether no standard deviation of two noises differs by more than a fifth.
-
-    One is compared to the largest of its kind: motion, turn, bearing, range.
-    """
-    sizes = np.maximum(one, other)
-    sizes[:2] = sizes[:2].max()
-    return bool((np.abs(one - other) <= ALIKE * sizes).all())
 
 
 def _filter(log: SlamLog, settings: FilterSettings) -> EkfSlam:
