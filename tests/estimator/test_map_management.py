@@ -246,8 +246,8 @@ class WithoutAWindow:
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("compressed", {}),
-        ("compressed", {"base": "invariant"}),
+        ("compressed", {"local_size": 40}),
+        ("compressed", {"base": "invariant", "local_size": 40}),
         ("sparse_information", {}),
     ],
 )

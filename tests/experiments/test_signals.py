@@ -92,15 +92,15 @@ def test_an_ended_job_says_that_it_goes_on_and_leaves_no_process(here, number, c
 def test_a_scheduler_ends_workers_of_any_kind(here, command, made, goes_on):
     if "dask" in command:
         pytest.importorskip("distributed")
-    child = begin(*command.split())
-    wait_until(lambda: child.poll() or len(list(here.glob(f"out/{made}"))) > 1)
+    child = begin(here, *command.split())
+    wait_until(lambda: child.exitcode or len(list(here.glob(f"out/{made}"))) > 1)
     processes = psutil.Process(child.pid).children(recursive=True)
     child.terminate()
-    _, stderr = child.communicate(timeout=60)
-    assert child.returncode == 143
-    last = stderr.splitlines()[-1]
-    assert last.startswith("slamgym: interrupted; ")
-    assert goes_on in last
+    message = message_at_the_end(child, here)
+    assert child.exitcode == 143
+    assert "slamgym: interrupted; " in message
+    assert goes_on in message
+    assert "Traceback" not in message
     _, alive = psutil.wait_procs(processes, timeout=10)
     assert alive == []
 
