@@ -11,6 +11,9 @@ Two commands answer them, and write their files into the folder ``results``:
    slamgym replay data.txt -e ekf
    slamgym noise-study data.txt -e ekf
 
+With ``--landmark-init independent``, ``replay`` gives the numbers of the homework, which adds landmarks without a correlation
+with the pose.
+
 =================================================== ==================================================
 question                                            answer
 =================================================== ==================================================
