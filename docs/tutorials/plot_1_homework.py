@@ -4,7 +4,7 @@ The homework: filter a log, look at the map, change the noise
 
 The EKF-SLAM homework of CMU 16-833 gives a log, ``data.txt``, and asks for four things: the map with its ellipses, the
 distances of the landmarks from their true positions, an explanation of the covariance, and the effect of the noise.
-Two commands answer them, and write their files into the folder ``results``:
+Two commands answer these questions, and write their files into the folder ``results``:
 
 .. code-block:: bash
 
@@ -17,13 +17,13 @@ with the pose.
 =================================================== ==================================================
 question                                            answer
 =================================================== ==================================================
-Map, path and ellipses after each step?             ``map.png``, ``map_steps/``; ``run.html`` plays them
+Map, path and ellipses after each step?             ``map.png``, ``map_steps/``, ``run.html``
 Distance of each landmark from its true position?   printed by ``replay``; ``truth.png``
 Why are the landmarks correlated?                   ``covariance.png``, explained below
 What do the noise settings change?                  printed by ``noise-study``; ``noise_study.png``
 =================================================== ==================================================
 
-This tutorial does the same in Python, with a drive through the same world.
+This tutorial does the same in Python, with a simulated drive through the homework's world.
 """
 
 # %%
@@ -80,7 +80,7 @@ correlations = covariance_figure(run.trace)
 # What does each noise do?
 # ------------------------
 # ``study_log`` filters the log eleven times: with the settings of the log, and with each of the five standard deviations
-# times 10 and divided by 10. NIS and NEES are given per degree of freedom, so 1 is expected. If a σ is too large, the
+# times 10 and divided by 10. NIS and NEES are printed per degree of freedom, so 1 is expected. If a σ is too large, the
 # ellipses are too wide, and both are below 1. If it is too small, the truth lies outside the ellipses, and both are above 1.
 
 from slamgym.experiments.figures import noise_study_figure
@@ -95,4 +95,4 @@ for study in runs:
 maps = noise_study_figure([(study.title, study.trace) for study in runs])
 
 # %%
-# A single drive is no test of a filter. :doc:`plot_2_consistency` tests filters with 100 drives.
+# A single drive is not sufficient to test a filter. :doc:`plot_2_consistency` tests filters with 100 drives.

@@ -2,14 +2,14 @@
 The NEES of a filter of your own
 ================================
 
-A filter is consistent if its errors are as large as its covariance says. This tutorial writes a filter, checks it, and
-tests it with 100 drives beside two filters of the package.
+A filter is consistent if its covariance matches the size of its errors. In this tutorial, you write a filter, check it,
+and compare it with two filters of the package on 100 drives.
 """
 
 # %%
 # Write and check a filter
 # ------------------------
-# A filter is any class with the six methods of ``SlamEstimator``. The shortest way is to change an existing filter.
+# A filter is any class with the six methods of ``SlamEstimator``. The simplest way to write one is to change an existing filter.
 # ``check_estimator`` runs it in a small world and names the first requirement that it violates.
 
 from slamgym import EkfSlam, check_estimator
@@ -28,8 +28,8 @@ check_estimator(CautiousEkf)
 # %%
 # A hundred drives
 # ----------------
-# All filters receive the same readings. The command line does the same with a class in a file ``my_filters.py``, and writes a
-# report: ``slamgym monte-carlo six_landmarks -e ekf,invariant,my_filters:CautiousEkf --runs 100``.
+# All filters receive the same readings. A command does the same for a class in the file ``my_filters.py``,
+# and writes a report: ``slamgym monte-carlo six_landmarks -e ekf,invariant,my_filters:CautiousEkf --runs 100``.
 
 from slamgym import monte_carlo
 from slamgym.experiments.monte_carlo import consistency_of
@@ -56,5 +56,5 @@ axes.set(xlabel="step", ylabel="pose NEES per degree", ylim=(0, None))
 axes.legend(frameon=False)
 
 # %%
-# More motion noise does not make the filter consistent. The problem of ``ekf`` is the heading, which its linearisation
+# A larger motion noise does not make the filter consistent. The problem of ``ekf`` is the heading, which its linearisation
 # treats as observable. :doc:`/filters` explains the mechanism, and :doc:`/consistency` the tests.

@@ -2,7 +2,7 @@
 A world of your own
 ===================
 
-A world is described by data: a TOML file, or a mapping in Python. This tutorial writes one in a dozen lines.
+A TOML file or a mapping in Python describes a world. In this tutorial, you write one in a dozen lines.
 :doc:`/generated/fields` lists every field.
 """
 
@@ -33,7 +33,7 @@ world = load_scenario("my_world.toml")
 print(world)
 
 # %%
-# On the command line: ``slamgym run my_world.toml``. A misspelt field is an error that suggests the right one:
+# On the command line, use ``slamgym run my_world.toml``. A misspelt field causes an error that suggests the right one:
 
 try:
     world.with_changes(sensor={"max_rage": 5.0})

@@ -2,7 +2,7 @@
 A log of your own
 =================
 
-slamgym reads :doc:`several formats of logs </logs>`. This tutorial writes a log, as your own program would, and filters it.
+slamgym reads :doc:`several formats of logs </logs>`. In this tutorial, you write a log and filter it.
 """
 
 # %%
@@ -31,7 +31,7 @@ Path("corner.csv").write_text(LOG)
 # %%
 # Filter it
 # ---------
-# Without a noise in the header, you have to specify it. On the command line:
+# The header of this log contains no noise settings, so you must specify them. On the command line, use
 # ``slamgym replay corner.csv --motion-std .1,.05,.05 --measurement-std .02,.05``.
 
 from slamgym import InvariantEkfSlam, read_log, replay
