@@ -1,9 +1,9 @@
 """
-An agent that knows what it does not know
+An agent that uses the belief of a filter
 =========================================
 
 A wrapper runs a filter on the readings of a world and adds its belief to the observation. The agent of this tutorial
-drives around a square, and returns to the start whenever the standard deviation of its position exceeds 30 cm.
+drives around a square. It returns to the start whenever the standard deviation of its position exceeds 30 cm.
 """
 
 # %%
