@@ -131,6 +131,31 @@ def condition(
             row[b] = old[b] - k0 * cross[0, b] - k1 * cross[1, b]
 
 
+@njit_internal
+def condition_on_all(
+    problem: Problem, marks: IntArray, shifts: Array, joints: Array
+) -> int:
+    """Condition on all pairs of an assignment; return the level of the result, 0 or 1.
+
+    Parameters
+    ----------
+    problem : Problem
+    marks : ndarray, shape (m,)
+        An assignment.
+    shifts, joints : ndarray, shapes (2, J, 2) and (2, 2J, 2J)
+        Overwritten.
+    """
+    here, landmarks = 0, problem.feasible.shape[1]
+    shifts[0] = 0.0
+    joints[0] = problem.joint
+    for i in range(len(marks)):
+        if marks[i] != UNPAIRED:
+            z, q = problem.innovations[i], problem.variances[i]
+            condition(z, q, marks[i], landmarks, shifts, joints, here, 1 - here)
+            here = 1 - here
+    return here
+
+
 @jit
 def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
     """Find the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
@@ -143,30 +168,17 @@ def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
     marks, distances : ndarray, shape (M, m)
         Assignments; the distances are infinite before.
     """
-    innovations, joint, variances = problem[:3]
-    rows, landmarks = problem[3].shape
-    shifts = np.zeros((2, landmarks, 2))
+    innovations, variances = problem.innovations, problem.variances
+    rows, landmarks = problem.feasible.shape
+    shifts = np.empty((2, landmarks, 2))
     joints = np.empty((2, 2 * landmarks, 2 * landmarks))
     taken = np.zeros(landmarks, np.bool_)
     for s in range(len(marks)):
-        here = 0
+        here = condition_on_all(problem, marks[s], shifts, joints)
         taken[:] = False
-        shifts[0] = 0.0
-        joints[0] = joint
         for i in range(rows):
             if marks[s, i] != UNPAIRED:
                 taken[marks[s, i]] = True
-                condition(
-                    innovations[i],
-                    variances[i],
-                    marks[s, i],
-                    landmarks,
-                    shifts,
-                    joints,
-                    here,
-                    1 - here,
-                )
-                here = 1 - here
         for i in range(rows):
             if marks[s, i] == UNPAIRED:
                 for j in range(landmarks):
@@ -200,28 +212,26 @@ def largest_change(problem: Problem, marks: IntArray, fewer: IntArray) -> float:
     float
         Infinite unless ``fewer`` is ``marks`` without some pairs.
     """
-    rows, landmarks = problem.feasible.shape
-    shifts = np.zeros((2, landmarks, 2))
+    for i in range(len(marks)):
+        if fewer[i] != marks[i] and fewer[i] != UNPAIRED:
+            return np.inf
+    landmarks = problem.feasible.shape[1]
+    shifts = np.empty((2, landmarks, 2))
     joints = np.empty((2, 2 * landmarks, 2 * landmarks))
-    joints[0] = problem.joint
-    here, shift, variance = 0, 0.0, 1.0  # in the σ after all pairs
-    for is_extra in (False, True):
-        for i in range(rows):
-            j = marks[i]
-            if fewer[i] != j and fewer[i] != UNPAIRED:
-                return np.inf
-            if j == UNPAIRED or (fewer[i] != j) != is_extra:
-                continue
-            z, q = problem.innovations[i], problem.variances[i]
-            if is_extra:
-                x, determinant = fit(z, q, shifts[here], joints[here], j, 1.0)
-                s00 = joints[here][2 * j, 2 * j] + q[0]
-                s11 = joints[here][2 * j + 1, 2 * j + 1] + q[1]
-                half = (s11 * q[0] + s00 * q[1]) / (2 * determinant)
-                root = np.sqrt(max(half * half - q[0] * q[1] / determinant, 0.0))
-                left = half - root  # 1 − λ
-                shift = (shift + np.sqrt(x * (1 - left))) / np.sqrt(left)
-                variance /= left
-            condition(z, q, j, landmarks, shifts, joints, here, 1 - here)
-            here = 1 - here
+    here = condition_on_all(problem, fewer, shifts, joints)
+    shift, variance = 0.0, 1.0  # in the σ after all pairs
+    for i in range(len(marks)):
+        j = marks[i]
+        if fewer[i] == j:
+            continue
+        z, q, C = problem.innovations[i], problem.variances[i], joints[here]
+        x, determinant = fit(z, q, shifts[here], C, j, 1.0)
+        s00, s11 = C[2 * j, 2 * j] + q[0], C[2 * j + 1, 2 * j + 1] + q[1]
+        half = (s11 * q[0] + s00 * q[1]) / (2 * determinant)
+        root = np.sqrt(max(half * half - q[0] * q[1] / determinant, 0.0))
+        left = half - root  # 1 − λ
+        shift = (shift + np.sqrt(x * (1 - left))) / np.sqrt(left)
+        variance /= left
+        condition(z, q, j, landmarks, shifts, joints, here, 1 - here)
+        here = 1 - here
     return float(np.sqrt(shift * shift + variance - 1))
