@@ -134,7 +134,6 @@ class RecentScans:
     ) -> UpdateReport:
         """Repeat the scans since one until no sighting contradicts those before it."""
         now = self._slam.state_dict()
-        self._editor.expire()
         try:
             reports = self._repeat(scans, first)
             while _drop_contradicted(scans, reports, confirmed, self._gate):
@@ -246,9 +245,14 @@ def _drop_contradicted(
     """
     first = len(scans) - len(reports)
     for k, report in enumerate(reports):
+        if len(report.innovation) != len(report.associated_ids):
+            continue  # of a filter that reports no innovations
         for landmark_id in confirmed.intersection(report.associated_ids):
-            if report.squared_given_others(landmark_id) > gate:
-                for n in range(first, first + k):
-                    scans[n] = scans[n].without(landmark_id)
+            earlier = scans[first : first + k]
+            if (
+                any(landmark_id in scan.row_ids for scan in earlier)
+                and report.squared_given_others(landmark_id) > gate
+            ):
+                scans[first : first + k] = [s.without(landmark_id) for s in earlier]
                 return True
     return False

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.estimator import UpdateReport, make_estimator
+from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.association import scan_assignments
 from slamgym.estimator.interface import MapView
 from slamgym.estimator.map_management.filter_pool import FilterPool
 from slamgym.estimator.map_management.hypotheses import HypothesisSlam
+from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.estimator.map_management.map_view import is_near
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.evaluation import score_association
@@ -403,6 +404,37 @@ def test_a_sighting_of_clutter_does_not_drag_a_new_landmark_along():
         None,
         *[slam.landmark_ids[-1]] * 3,
     ]
+
+
+class WithoutInnovations(EkfSlam):
+    """Reports which landmarks it used, and nothing about them."""
+
+    def update(self, measurements, landmark_ids):
+        report = super().update(measurements, landmark_ids)
+        return report.replace(innovation=np.empty((0, 2)), factor=np.empty((0, 0)))
+
+
+class WithInnovationsOfNewLandmarks(EkfSlam):
+    """Reports new landmarks among those used, far from where they should be."""
+
+    def update(self, measurements, landmark_ids):
+        report = super().update(measurements, landmark_ids)
+        used = report.associated_ids + report.added_ids
+        innovation = np.zeros((len(used), 2))
+        innovation[len(report.associated_ids) :] = 100.0
+        return report.replace(
+            associated_ids=used, innovation=innovation, factor=np.eye(2 * len(used))
+        )
+
+
+@pytest.mark.parametrize("kind", [WithoutInnovations, WithInnovationsOfNewLandmarks])
+def test_earlier_sightings_count_whatever_a_filter_reports(kind):
+    noise = {"motion_std": (0.02, 0.02, 0.06), "measurement_std": (0.02, 0.1)}
+    slam = ManagedSlam(kind, **noise, management={"association": "joint"})
+    for _ in range(3):
+        slam.update([(0.5, 4.0)])
+    assert slam.landmark_ids == (0,)
+    assert [d.row_ids for d in slam.decisions] == [(0,)] * 3
 
 
 def test_the_distance_of_a_reading_given_the_others_is_that_of_the_conditional():
