@@ -8,8 +8,9 @@ The tests answer two questions in this order.
    mean, a wrong deviation the variance, and heavy tails the kurtosis.
 2. If so, do the covariances agree with the errors?  If not, the cause is in the filter:
    its association if identities are hidden, otherwise its linearisation.  Linearisation
-   does not change the size of the innovations.  If the innovations are wrong too, the
-   filter does not use the noise that it is given, and the answer is "cannot tell".
+   does not change the size of the innovations, and its errors accumulate.  If the
+   innovations are wrong too, or the errors are as wrong in the first steps as later,
+   it is not the cause, and the answer is "cannot tell".
 
 The tests of the second question are those of :mod:`.error_findings`.
 """
@@ -25,12 +26,14 @@ from ..arrays import Array
 from ..estimator.support import argument_checks
 from .error_findings import (
     Blame,
+    Early,
     Errors,
     blame_association,
     errors_of,
     spurious_knowledge,
+    wrong_from_the_start,
 )
-from .noise_findings import HEAVY_TAILS, Finding, noise_findings
+from .noise_findings import HEAVY_TAILS, Finding, significant_findings
 from .noise_sums import CHANNELS, MOMENTS
 
 HONEST, CANNOT_TELL = "honest", "cannot tell"
@@ -55,6 +58,8 @@ CAUSES = (
 NOISE_RATE, FILTER_RATE = 0.02, 0.02
 """Probabilities of a false answer about the noise, and about the filter."""
 _ERROR_RATE = 0.05
+LARGEST_NIS = 1.15
+"""NIS per degree from which on a filter does not use the noise that it is given."""
 FEWEST_RUNS = 20
 
 
@@ -64,8 +69,7 @@ class Diagnosis(NamedTuple):
     cause: str
     """One of `CAUSES`."""
     p_value: float
-    """Of the test that points to it, adjusted for the number of tests; for "honest" and
-    "cannot tell" the smallest adjusted one of all tests."""
+    """Of the test that points to it, or the smallest; adjusted for their number."""
     sentence: str
     others: tuple[str, ...] = ()
     """Further causes that the noise shows, the one with the largest effect first."""
@@ -130,7 +134,7 @@ def diagnose(
         return Diagnosis(
             CANNOT_TELL, 1.0, f"{runs} runs are too few; {FEWEST_RUNS} are needed."
         )
-    errors, guilty = errors_of(pose, heading), _guilty(sums)
+    errors, guilty = errors_of(pose, heading), significant_findings(sums, NOISE_RATE)
     if guilty:
         return _of_the_noise(guilty, errors)
     known = None if heading_knowledge is None else np.asarray(heading_knowledge, float)
@@ -138,16 +142,8 @@ def diagnose(
     if mistakes is not None and np.any(mistakes):
         paired = None if known_nees is None else _paired(known_nees, nees, pose)
         blame = blame_association(pose, np.asarray(mistakes, float), paired)
-    return _of_the_filter(errors, nis_ratio, known, blame)
-
-
-def _guilty(sums: Array) -> list[Finding]:
-    """Return what is wrong with the noise, the largest effect first."""
-    findings = noise_findings(sums)
-    tests = max(1, len(findings))
-    adjusted = [f._replace(p_value=min(1.0, f.p_value * tests)) for f in findings]
-    guilty = [f for f in adjusted if f.p_value < NOISE_RATE and f.matters]
-    return sorted(guilty, key=lambda f: -f.impact)
+    early = wrong_from_the_start(pose)
+    return _of_the_filter(errors, nis_ratio or 0.0, known, blame, early)
 
 
 def _paired(known_nees: ArrayLike, nees: ArrayLike, pose: Array) -> Array:
@@ -198,29 +194,27 @@ def _of_the_noise(guilty: list[Finding], errors: Errors) -> Diagnosis:
 
 def _of_the_filter(
     errors: Errors,
-    nis_ratio: float | None,
+    nis_ratio: float,
     knowledge: Array | None,
     blame: Blame | None,
+    early: Early | None,
 ) -> Diagnosis:
     """Return the answer for a filter that assumes the right noise."""
-    spurious = _p_of_knowledge(knowledge)
+    spurious = None if knowledge is None else spurious_knowledge(knowledge)
     p_value = _smallest_adjusted(errors, spurious, blame)
-    if p_value >= FILTER_RATE:
-        sentence = "honest: the noise is what it assumes, and its errors agree."
-        return Diagnosis(HONEST, p_value, sentence)
     ratio_text = _ratio_text(errors)
-    if _is_cautious(errors, blame):
+    if p_value >= FILTER_RATE:
+        return _of_consistent_errors(p_value, nis_ratio, blame)
+    is_association = blame is not None and blame.p_value < _ERROR_RATE
+    if errors.ratio < 1 and not (is_association and errors.p_value >= FILTER_RATE):
         sentence = f"cannot tell: the noise is what it assumes, but {ratio_text}."
         return Diagnosis(CANNOT_TELL, p_value, sentence)
-    if blame is not None and (blame.p_value < _ERROR_RATE or not blame.is_paired):
+    if blame is not None and (is_association or not blame.is_paired):
         return _of_the_association(blame, errors)
-    if (nis_ratio or 0.0) > np.sqrt(errors.ratio):
-        sentence = (
-            f"cannot tell: the noise is what it assumes, but {ratio_text}, and "
-            f"squared innovations are {nis_ratio:.3g} times too large: it may not use "
-            "the noise that it is given."
-        )
-        return Diagnosis(CANNOT_TELL, p_value, sentence)
+    doubt = _doubt(errors, nis_ratio, early)
+    if doubt:
+        what = f"the noise is what it assumes, but {ratio_text}{doubt}"
+        return Diagnosis(CANNOT_TELL, p_value, f"cannot tell: {what}.")
     sentence = (
         f"linearisation: the noise is what it assumes, but {ratio_text} "
         f"({_p_text(p_value)}){_claims(knowledge, spurious)}."
@@ -228,8 +222,38 @@ def _of_the_filter(
     return Diagnosis(LINEARISATION, p_value, sentence)
 
 
-def _p_of_knowledge(knowledge: Array | None) -> float | None:
-    return None if knowledge is None else spurious_knowledge(knowledge)
+def _of_consistent_errors(
+    p_value: float, nis_ratio: float, blame: Blame | None
+) -> Diagnosis:
+    """Return the answer for errors that no test rejects: honest, if the NIS agrees."""
+    if blame is not None or nis_ratio <= LARGEST_NIS:
+        sentence = "honest: the noise is what it assumes, and its errors agree."
+        return Diagnosis(HONEST, p_value, sentence)
+    sentence = (
+        "cannot tell: the noise is what it assumes, and its errors agree, but "
+        f"{_innovations_text(nis_ratio)}."
+    )
+    return Diagnosis(CANNOT_TELL, p_value, sentence)
+
+
+def _doubt(errors: Errors, nis_ratio: float, early: Early | None) -> str:
+    """State what linearisation does not explain; empty if there is nothing."""
+    if nis_ratio > np.sqrt(errors.ratio):
+        return f", and {_innovations_text(nis_ratio)}"
+    if early is None:
+        return ""
+    return (
+        f", and {early.ratio:.3g} times in the first {early.steps} steps, where errors "
+        "of linearisation are small: its covariance may be scaled, or it may not use "
+        "the noise that it is given"
+    )
+
+
+def _innovations_text(nis_ratio: float) -> str:
+    return (
+        f"squared innovations are {nis_ratio:.3g} times too large: it may not use the "
+        "noise that it is given"
+    )
 
 
 def _smallest_adjusted(
@@ -244,18 +268,12 @@ def _smallest_adjusted(
     return min(1.0, len(tests) * min(tests))
 
 
-def _is_cautious(errors: Errors, blame: Blame | None) -> bool:
-    """Return whether the errors are too small, unless only associations are wrong."""
-    is_association = blame is not None and blame.p_value < _ERROR_RATE
-    return errors.ratio < 1 and not (is_association and errors.p_value >= FILTER_RATE)
-
-
 def _claims(knowledge: Array | None, spurious: float | None) -> str:
     """State the share of the least possible variance, if it is too small."""
     if knowledge is None or spurious is None or spurious >= _ERROR_RATE:
         return ""
-    share = knowledge.mean()
-    return f"; it claims {share:.2g} of the least possible variance of its heading"
+    share = f"{knowledge.mean():.2g}"
+    return f"; it claims {share} of the least possible variance of its heading"
 
 
 def _of_the_association(blame: Blame, errors: Errors) -> Diagnosis:

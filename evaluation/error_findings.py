@@ -22,6 +22,10 @@ KNOWABLE = 0.9
 """Share of the least possible variance below which a claim is spurious."""
 LOST_LEVEL, LOST_RATE = 1e-4, 1e-3
 """Quantile of χ²(3) beyond which a run is lost, and its rate that is accepted."""
+EARLY_SHARE, FEWEST_EARLY = 0.1, 5
+"""Which share of all steps is early, and at least how many steps."""
+_EARLY_RATE = 0.01
+_GROWTH = 2.0  # by which linearisation errors grow after the early steps
 _FEWEST_OF_A_KIND = 5
 _FEWEST_LOST = 2
 
@@ -34,6 +38,14 @@ class Errors(NamedTuple):
     """NEES per degree over runs and steps, of pose or heading: farthest from 1."""
     lost: int
     """Number of lost runs."""
+
+
+class Early(NamedTuple):
+    """How far the covariances are from the errors in the early steps."""
+
+    steps: int
+    ratio: float
+    """NEES of the pose per degree."""
 
 
 class Blame(NamedTuple):
@@ -81,6 +93,31 @@ def lost_runs(pose: Array) -> BoolArray:
     are accepted as Gaussian errors would give.
     """
     return np.asarray(pose.mean(axis=1) > chi2.isf(LOST_LEVEL, POSE))
+
+
+def wrong_from_the_start(pose: Array) -> Early | None:
+    """Return the errors of the early steps, if they are as inconsistent as later ones.
+
+    Errors of linearisation accumulate.  If the NEES is significantly above 1 in the
+    first tenth of the steps, and its excess over 1 does not double after them, and not
+    after the first step, the covariance is too small for another reason.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (M, K)
+        NEES of the pose, 3 degrees.
+    """
+    steps = max(int(EARLY_SHARE * pose.shape[1]), FEWEST_EARLY)
+    if steps >= pose.shape[1]:
+        return None
+    averages = pose[:, :steps].mean(axis=1) / POSE
+    early, overall = float(averages.mean()), float(pose.mean()) / POSE
+    least = min(early, float(pose[:, 0].mean()) / POSE)
+    has_grown = overall - 1 >= _GROWTH * (least - 1)
+    if least <= 1 or has_grown:
+        return None
+    is_certain = time_average_test(averages, 1).p_value < _EARLY_RATE
+    return Early(steps, early) if is_certain else None
 
 
 def spurious_knowledge(knowledge: Array) -> float:

@@ -79,6 +79,18 @@ def noise_findings(sums: Array) -> list[Finding]:
     ]
 
 
+def significant_findings(sums: Array, error_rate: float) -> list[Finding]:
+    """Return what is wrong with the noise, the largest effect first.
+
+    The p-values are adjusted for the number of tests.
+    """
+    findings = noise_findings(sums)
+    tests = max(1, len(findings))
+    adjusted = [f._replace(p_value=min(1.0, f.p_value * tests)) for f in findings]
+    guilty = [f for f in adjusted if f.p_value < error_rate and f.matters]
+    return sorted(guilty, key=lambda f: -f.impact)
+
+
 def _tests(channel: str, total: Array, runs: int) -> Iterator[Finding]:
     found = dict(zip(MOMENTS, total.tolist(), strict=True))
     count = found["count"]

@@ -171,11 +171,35 @@ def test_honest_runs_are_called_something_else_in_at_most_five_percent():
     assert causes.count("honest") >= 36  # of 40; fewer in .3 % of cases at 5 %
 
 
-def test_errors_without_a_fault_of_the_noise_are_linearisation():
-    scores = honest(11)
-    wrong = scores | {"nees": 1.8 * scores["nees"]}
+def growing(scores, factor=1.8):
+    """The scores of a filter whose squared errors grow by twice the excess."""
+    growth = np.linspace(1, 2 * factor - 1, STEPS)
+    return scores | {"nees": growth * scores["nees"]}
+
+
+def test_errors_that_grow_without_a_fault_of_the_noise_are_linearisation():
+    wrong = growing(honest(11))
     assert diagnose(**wrong).cause == "linearisation"
     assert diagnose(**wrong, nis_ratio=1.02).cause == "linearisation"
+
+
+def test_errors_that_are_wrong_from_the_start_are_not_of_the_linearisation():
+    for factor in (1.3, 1.8, 4.0):
+        scores = honest(11, runs=100)
+        scaled = scores | {
+            key: factor * scores[key] for key in ("nees", "heading_nees")
+        }
+        found = diagnose(**scaled, nis_ratio=1.0)
+        assert found.cause == "cannot tell"
+        assert "in the first 5 steps" in found.sentence
+
+
+def test_wrong_innovations_are_not_honest_even_if_the_errors_agree():
+    scores = honest(14)
+    assert diagnose(**scores, nis_ratio=1.1).cause == "honest"
+    found = diagnose(**scores, nis_ratio=1.3)
+    assert found.cause == "cannot tell"
+    assert "squared innovations are 1.3 times too large" in found.sentence
 
 
 def test_spurious_knowledge_of_the_heading_makes_small_errors_suffice():
@@ -189,8 +213,7 @@ def test_spurious_knowledge_of_the_heading_makes_small_errors_suffice():
 
 def test_a_filter_that_ignores_the_noise_it_is_given_is_not_explained():
     scores = honest(13)
-    wrong = scores | {"nees": 1.8 * scores["nees"]}
-    assert diagnose(**wrong, nis_ratio=1.7).cause == "cannot tell"
+    assert diagnose(**growing(scores), nis_ratio=1.7).cause == "cannot tell"
     cautious = scores | {"nees": 0.5 * scores["nees"]}
     assert diagnose(**cautious).cause == "cannot tell"
 
@@ -206,7 +229,7 @@ def test_errors_are_compared_with_the_nearer_end_of_a_tenth(factor, margin):
 def test_runs_with_wrong_associations_that_err_more_point_to_the_association():
     scores, mistakes = honest(14), np.zeros(RUNS)
     nees = scores["nees"].copy()
-    nees[:20] *= 4.0
+    nees[:20] *= np.linspace(1, 7, STEPS)
     mistakes[:20] = 3
     wrong = scores | {"nees": nees}
     assert diagnose(**wrong, mistakes=mistakes).cause == "association"
@@ -229,12 +252,13 @@ def test_errors_that_known_identities_remove_are_of_the_association():
 
 def test_errors_that_known_identities_share_are_not_of_the_association():
     scores, rng = honest(18), np.random.default_rng(18)
-    nees = 1.8 * scores["nees"]
+    nees = growing(scores)["nees"]
     nees[3] = 60.0
     known = nees * rng.uniform(0.8, 1.25, nees.shape)
     wrong = scores | {"nees": nees, "mistakes": np.ones(RUNS), "known_nees": known}
     assert diagnose(**wrong).cause == "linearisation"
-    both = {"nees": 400 * nees, "known_nees": 400 * known / 1.05}
+    growth = np.linspace(1, 800, STEPS)
+    both = {"nees": growth * nees, "known_nees": growth * known / 1.05}
     assert diagnose(**wrong | both).cause == "linearisation"  # a tenth of them
     nees[[5, 7]] = 60.0
     assert diagnose(**wrong | {"nees": nees}).cause == "association"
