@@ -150,23 +150,22 @@ def plan_values(
     density = points[kept], counts[kept]
     now = np.linalg.slogdet(knowledge.belief.covariance[3:, 3:])[1]
     steps = plans.shape[1]
-    values = np.zeros(len(plans))
-    for horizon in (steps // 4, steps // 2, steps):
-        after = imagine(
-            slam,
-            plans[:, :horizon],
-            scenario.sensor,
-            walls=scenario.walls,
-            density=density if horizon == steps else None,
-        )
-        known = after.worst_variances[0] <= knowledge.accuracy**2
-        values += (now - after.log_det[0]) / (6.0 * size)
-        values += settings.known_bonus * known.sum(axis=1) / 3.0
+    after = imagine(
+        slam,
+        plans,
+        scenario.sensor,
+        walls=scenario.walls,
+        density=density,
+        horizons=(steps // 4, steps // 2, steps),
+    )
+    known = after.worst_variances[0] <= knowledge.accuracy**2
+    values = np.sum((now - after.log_det[0]) / (6.0 * size), axis=1)
+    values += settings.known_bonus * known.sum(axis=(1, 2)) / 3.0
     found = np.diff(after.new_landmarks[0], axis=1, prepend=0.0)
     values += (_worth(knowledge, after, settings) * found) @ (
         settings.discount ** np.arange(steps)
     )
-    values -= settings.attraction * _distance_to_rest(knowledge, after, known)
+    values -= settings.attraction * _distance_to_rest(knowledge, after, known[:, -1])
     values[~_is_free(knowledge, after.poses[0])] = -math.inf
     return values
 

@@ -74,6 +74,7 @@ TESTS = {
     "evaluation/consistency_report": "consistency_report",
     "evaluation/diagnosis": "diagnosis",
     "evaluation/error_bound": "error_bound",
+    "evaluation/error_findings": "diagnosis noise_findings",
     "evaluation/gospa": "gospa",
     "evaluation/hypothesis_tests": "hypothesis_tests consistency_report",
     "evaluation/nees": "nees consistency_report",

@@ -48,6 +48,7 @@ def imagine(
     *,
     walls: ArrayLike = (),
     density: tuple[ArrayLike, ArrayLike] | None = None,
+    horizons: ArrayLike | None = None,
 ) -> Imagined:
     """Predict the beliefs after given plans, without driving them.
 
@@ -74,6 +75,9 @@ def imagine(
     density : (points, counts), optional
         Points where unmapped landmarks may be, (C, 2) [m], and the expected number of
         them at each point, (C,) or (B, C). A point counts once it is in view.
+    horizons : array_like of int, shape (H,), optional
+        Increasing numbers of steps, from 1 to T. The certainty of the map is then
+        returned after each of them, along an axis that follows that of the plans.
 
     Returns
     -------
@@ -86,7 +90,8 @@ def imagine(
     TypeError
         If the filter is of another kind.
     ValueError
-        If an array has a wrong shape or is not finite, or there is no plan or no step.
+        If an array has a wrong shape or is not finite, there is no plan or no step, or
+        a horizon is not a step of the plans or not after the one before.
 
     Examples
     --------
@@ -116,23 +121,30 @@ def imagine(
     min_range = float(sensor.min_range)
     settings = tuple(view), min_range, dropout, filters.motion_values, rules
     plans_each, steps = driven.shape[1:3]
+    ending = _checked_horizons([steps] if horizons is None else horizons, steps)
     results = Imagined(
         np.full((count, plans_each, steps, 3), np.nan),
         np.full((count, plans_each, steps, 3, 3), np.nan),
-        np.full((count, plans_each), np.nan),
-        np.full((count, plans_each, landmarks), np.nan),
+        np.full((count, plans_each, len(ending)), np.nan),
+        np.full((count, plans_each, len(ending), landmarks), np.nan),
         np.full((count, plans_each, steps), np.nan),
     )
     workspace = workspace_for(filters.rules, landmarks, means.shape[1])
     imagine_plans(
         (means, covariances, references, slots),
         driven,
+        ending,
         _checked_density(density, count),
         settings,
         tuple(workspace),
         tuple(results),
     )
-    return results
+    if horizons is not None:
+        return results
+    return results._replace(
+        log_det=results.log_det[:, :, 0],
+        worst_variances=results.worst_variances[:, :, 0],
+    )
 
 
 def _beliefs(filters: EkfSlam | BatchSlam) -> tuple[Array, Array, Array, IntArray]:
@@ -167,6 +179,19 @@ def _checked_plans(plans: ArrayLike, count: int) -> Array:
     if not np.isfinite(given).all():
         raise ValueError("plans must be finite")
     return np.ascontiguousarray(np.broadcast_to(given, (count, *given.shape[-3:])))
+
+
+def _checked_horizons(horizons: ArrayLike, steps: int) -> IntArray:
+    """Return increasing numbers of steps (H,)."""
+    given = np.asarray(horizons)
+    if given.ndim != 1 or not given.size or given.dtype.kind not in "iu":
+        raise ValueError(f"horizons must be whole numbers of steps, got {horizons!r}")
+    ends = given.astype(np.int64)
+    if ends[0] < 1 or ends[-1] > steps or (np.diff(ends) <= 0).any():
+        raise ValueError(
+            f"horizons must increase from 1 to at most {steps}, got {ends.tolist()}"
+        )
+    return ends
 
 
 def _checked_walls(walls: ArrayLike) -> Array:

@@ -55,10 +55,11 @@ class Imagined(NamedTuple):
     pose_covariances: Array
     """Of the additive error, shape (B, K, T, 3, 3)."""
     log_det: Array
-    """log det of the joint covariance of the mapped landmarks in the end, (B, K)."""
+    """log det of the joint covariance of the mapped landmarks in the end, (B, K); with
+    H horizons after each of them, (B, K, H)."""
     worst_variances: Array
-    """Larger eigenvalue of the covariance of each landmark in the end, (B, K, L) [m²];
-    inf where it is not mapped."""
+    """Larger eigenvalue of the covariance of each landmark in the end, (B, K, L) [m²],
+    or after each horizon, (B, K, H, L); inf where it is not mapped."""
     new_landmarks: Array
     """Expected number of landmarks seen for the first time until each step,
     (B, K, T)."""
@@ -68,6 +69,7 @@ class Imagined(NamedTuple):
 def imagine_plans(
     beliefs: tuple[Array, Array, Array, IntArray],
     plans: Array,
+    horizons: IntArray,
     density: tuple[Array, Array],
     settings: tuple[Any, ...],
     workspace: tuple[Any, ...],
@@ -80,6 +82,8 @@ def imagine_plans(
     beliefs
         Means, covariances, references and slots, as a batch stores them.
     plans : ndarray, shape (B, K, T, 2)
+    horizons : ndarray of int, shape (H,)
+        Steps of which the certainty of the map is wanted, increasing.
     density
         Points where a new landmark may be (2, C), and how many are expected (B, C).
     settings
@@ -109,7 +113,7 @@ def imagine_plans(
         size = 3 + 2 * np.sum(slots[b] >= 0)
         for k in range(plans.shape[1]):
             copy_belief(means[b], covariances[b], references[b], size, room)
-            missed[:], found = 1.0, 0.0
+            missed[:], found, judged = 1.0, 0.0, 0
             for t in range(plans.shape[2]):
                 d, turn = plans[b, k, t, 0], plans[b, k, t, 1]
                 if not imagine_step(room, size, d, turn, sensor):
@@ -121,8 +125,9 @@ def imagine_plans(
                     for j in range(3):
                         variance = room.covariance[i, j]
                         outcome.pose_covariances[b, k, t, i, j] = variance
-                if t == plans.shape[2] - 1:
-                    judge(b, k, room, size, slots[b], outcome)
+                if judged < len(horizons) and t + 1 == horizons[judged]:
+                    judge((b, k, judged), room, size, slots[b], outcome)
+                    judged += 1
 
 
 @njit_internal
@@ -207,13 +212,14 @@ def look_for_new(
 
 @njit_internal
 def judge(
-    b: int, k: int, room: Room, size: int, slots: IntArray, outcome: Imagined
+    at: tuple[int, int, int], room: Room, size: int, slots: IntArray, outcome: Imagined
 ) -> None:
-    """Write what remains uncertain in the end of a plan."""
+    """Write what remains uncertain, ``at`` world, plan and horizon."""
+    b, k, h = at
     joint = room.covariance[3:size, 3:size]
-    outcome.log_det[b, k] = 2.0 * half_log_det(joint, room.factor)
+    outcome.log_det[b, k, h] = 2.0 * half_log_det(joint, room.factor)
     for i in range(len(slots)):
-        outcome.worst_variances[b, k, i] = math.inf
+        outcome.worst_variances[b, k, h, i] = math.inf
         if slots[i] >= 0:
             worst = largest_variance(room.covariance, 3 + 2 * slots[i])
-            outcome.worst_variances[b, k, i] = worst
+            outcome.worst_variances[b, k, h, i] = worst

@@ -175,6 +175,35 @@ def test_new_landmarks_are_expected_where_a_plan_looks_first():
     assert not imagine(slam, [ahead], sight).new_landmarks.any()
 
 
+@pytest.mark.parametrize("name", FAMILY)
+def test_horizons_tell_what_shorter_plans_tell(name):
+    slam = driven(name)
+    several = imagine(slam, PLANS, sensor(), horizons=(1, 4, 7))
+    assert several.worst_variances.shape == (1, 6, 3, len(slam.belief().landmark_ids))
+    for h, steps in enumerate((1, 4, 7)):
+        one = imagine(slam, PLANS[:, :steps], sensor())
+        np.testing.assert_array_equal(several.log_det[:, :, h], one.log_det)
+        worst = several.worst_variances[:, :, h]
+        np.testing.assert_array_equal(worst, one.worst_variances)
+    np.testing.assert_array_equal(several.poses, one.poses)
+
+
+@pytest.mark.parametrize(
+    ("horizons", "message"),
+    [
+        ((), "horizons must be whole numbers of steps"),
+        (3, "horizons must be whole numbers of steps"),
+        ((2.5,), "horizons must be whole numbers of steps"),
+        ((0, 3), "horizons must increase from 1 to at most 7"),
+        ((3, 3), "horizons must increase from 1 to at most 7"),
+        ((5, 8), "horizons must increase from 1 to at most 7"),
+    ],
+)
+def test_wrong_horizons_are_refused(horizons, message):
+    with pytest.raises(ValueError, match=message):
+        imagine(driven("ekf"), PLANS, sensor(), horizons=horizons)
+
+
 def test_a_robot_at_rest_has_noise_as_in_the_filter():
     for at_rest in (True, False):
         slam = driven("ekf", noise_at_rest=at_rest)
