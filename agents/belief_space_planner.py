@@ -196,12 +196,10 @@ def _distance_to_rest(
     away = np.hypot(*(landmarks - ends[:, None]).transpose(2, 0, 1))
     away[known] = math.inf
     if knowledge.missing:
-        seen = knowledge.grid.visible_from(after.poses[0].reshape(-1, 3))
-        shape = *after.poses.shape[1:3], seen.shape[1]
-        found: BoolArray = np.logical_or.reduce(seen.reshape(shape), axis=1)
-        left = ~found[:, ~knowledge.explored]
-        cells = knowledge.grid.routes.to_cells(ends)[:, ~knowledge.explored]
-        away = np.concatenate([away, np.where(left, cells, math.inf)], axis=1)
+        unseen = ~knowledge.explored
+        found = knowledge.grid.visible_from(after.poses[0], unseen)
+        cells = knowledge.grid.routes.to_cells(ends)[:, unseen]
+        away = np.concatenate([away, np.where(found, math.inf, cells)], axis=1)
     nearest = away.min(axis=1, initial=math.inf)
     return np.where(np.isfinite(nearest), nearest, 0.0)
 

@@ -81,14 +81,19 @@ class CoverageGrid:
         """Routes on the floor, around inner walls."""
         return WallRoutes(self._scenario, self.cells)
 
-    def visible_from(self, poses: Array) -> BoolArray:
+    def visible_from(self, poses: Array, chosen: BoolArray | None = None) -> BoolArray:
         """Return which cells are in view from poses, (B, 3) to (B, C).
 
-        Cells nearer than the sensor's smallest range count as seen.
+        Cells nearer than the sensor's smallest range count as seen. With paths
+        (B, T, 3), a cell counts that is in view from any of their poses; with a choice
+        (C,) of cells, only those are returned, in their order.
         """
         cells, _, _, _, view = self.plan
-        seen = np.zeros((len(poses), len(self.cells)), dtype=np.bool_)
-        cells_in_view(np.ascontiguousarray(poses), cells, view, seen)
+        if chosen is not None:
+            cells = np.ascontiguousarray(cells[:, chosen])
+        paths = np.ascontiguousarray(poses).reshape(len(poses), -1, 3)
+        seen = np.zeros((len(poses), cells.shape[1]), dtype=np.bool_)
+        cells_in_view(paths, cells, view, seen)
         return seen
 
     def clearance(self, points: Array) -> Array:

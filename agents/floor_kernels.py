@@ -50,12 +50,13 @@ class Floor(NamedTuple):
 def cells_in_view(
     poses: Array, cells: Array, view: tuple[Any, ...], seen: BoolArray
 ) -> None:
-    """Mark the cells (2, C) that are in view from poses (B, 3), in `seen` (B, C)."""
+    """Mark the cells (2, C) in view from any of poses (B, T, 3), in `seen` (B, C)."""
     points = np.empty((3, cells.shape[1]))
     for b in range(len(poses)):
-        x, y, heading = poses[b, 0], poses[b, 1], poses[b, 2]
-        pose = x, y, math.cos(heading), math.sin(heading)
-        look_around(pose, cells, View(*view), seen[b], points)
+        for t in range(poses.shape[1]):
+            x, y, heading = poses[b, t, 0], poses[b, t, 1], poses[b, t, 2]
+            pose = x, y, math.cos(heading), math.sin(heading)
+            look_around(pose, cells, View(*view), seen[b], points)
 
 
 @njit_internal

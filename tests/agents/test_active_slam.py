@@ -600,6 +600,14 @@ def test_cells_seen_are_those_in_range_and_in_view(grid):
             assert mark == (away <= 4.5 and in_view)
 
 
+def test_paths_see_what_any_of_their_poses_sees(grid):
+    paths, chosen = np.stack([POSES, 0.9 * POSES]), grid.cells.real > 1.0
+    expected = [grid.visible_from(path).any(axis=0) for path in paths]
+    np.testing.assert_array_equal(grid.visible_from(paths), expected)
+    some = grid.visible_from(paths, chosen)
+    np.testing.assert_array_equal(some, np.array(expected)[:, chosen])
+
+
 def test_walls_hide_cells_where_they_hide_landmarks():
     scenario = load_scenario("corridor")
     seen = CoverageGrid(scenario).visible_from(np.zeros((1, 3)))[0]
