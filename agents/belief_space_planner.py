@@ -159,7 +159,7 @@ def plan_values(
         horizons=(steps // 4, steps // 2, steps),
     )
     known = after.worst_variances[0] <= knowledge.accuracy**2
-    values = np.sum((now - after.log_det[0]) / (6.0 * size), axis=1)
+    values: Array = ((now - after.log_det[0]) / (6.0 * size)).sum(axis=1)
     values += settings.known_bonus * known.sum(axis=(1, 2)) / 3.0
     found = np.diff(after.new_landmarks[0], axis=1, prepend=0.0)
     values += (_worth(knowledge, after, settings) * found) @ (

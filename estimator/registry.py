@@ -20,7 +20,7 @@ from .filters.iterated import IteratedEkfSlam
 from .filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from .filters.robocentric import RobocentricEkfSlam
 from .filters.unscented import UnscentedSlam
-from .interface import SlamEstimator
+from .interface import SlamEstimator, refuse_unusable
 from .peers.catalogue import PEERS
 from .support.filter_labels import read_label
 
@@ -220,9 +220,11 @@ def make_batch(
 def _imported(path: str) -> EstimatorFactory:
     module, _, attribute = path.partition(":")
     try:
-        return cast("EstimatorFactory", getattr(import_module(module), attribute))
+        made = getattr(import_module(module), attribute)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"cannot import estimator '{path}': {error}") from error
+    refuse_unusable(made, path)
+    return cast("EstimatorFactory", made)
 
 
 def _unknown_option(

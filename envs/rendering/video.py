@@ -25,7 +25,7 @@ def check_video(path: str | Path, fps: float = 30.0) -> None:
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
-        raise ValueError(f"path must end in .gif or .mp4, got {str(path)!r}")
+        raise ValueError(f"a film's file must end in .gif or .mp4, got {str(path)!r}")
     if not 0 < fps < np.inf:
         raise ValueError(f"fps must be a finite number > 0, got {fps}")
     if suffix == ".mp4":

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..interface import UpdateReport
+from ..interface import UpdateReport, differences_from_interface
 from ..models.angles import wrap_angle
 from .trial_drive import (
     LANDMARKS,
@@ -17,20 +17,10 @@ from .trial_drive import (
 
 
 def check_interface(factory: Factory) -> None:
-    """Check that all methods of the interface exist."""
+    """Check that all methods of the interface exist and accept its arguments."""
     estimator = make(factory, initial_pose=(0, 0, 0), initial_pose_std=(0, 0, 0))
-    for method in (
-        "reset",
-        "predict",
-        "update",
-        "belief",
-        "state_dict",
-        "load_state_dict",
-    ):
-        expect(
-            callable(getattr(estimator, method, None)),
-            f"{type(estimator).__name__} has no method {method}()",
-        )
+    lacks = differences_from_interface(estimator)
+    expect(not lacks, f"{type(estimator).__name__} has {'; '.join(lacks)}")
 
 
 def check_start(factory: Factory) -> None:
@@ -45,7 +35,8 @@ def check_start(factory: Factory) -> None:
     )
     expect(
         np.allclose(belief.pose_covariance, np.diag(np.square(std))),
-        "belief().pose_covariance of a new estimator must be diag(initial_pose_std²)",
+        "belief().pose_covariance of a new estimator must be diag(initial_pose_std²), "
+        f"{np.diag(np.square(std)).tolist()}, got {belief.pose_covariance.tolist()}",
     )
 
 

@@ -83,7 +83,7 @@ def imagine_plans(
         Means, covariances, references and slots, as a batch stores them.
     plans : ndarray, shape (B, K, T, 2)
     horizons : ndarray of int, shape (H,)
-        Steps of which the certainty of the map is wanted, increasing.
+        Steps after which the certainty of the map is wanted, increasing.
     density
         Points where a new landmark may be (2, C), and how many are expected (B, C).
     settings

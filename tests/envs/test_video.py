@@ -85,7 +85,7 @@ def test_unknown_suffix_is_refused_before_any_frame_is_made(tmp_path, name):
         pytest.fail("a frame was made")
         yield
 
-    with pytest.raises(ValueError, match=r"path must end in \.gif or \.mp4, got"):
+    with pytest.raises(ValueError, match=r"file must end in \.gif or \.mp4, got"):
         write_video(never(), tmp_path / name)
 
 

@@ -1,5 +1,7 @@
 import importlib.util
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -137,6 +139,24 @@ class RaisesAtNan(EkfSlam):
         return super().update(measurements, landmark_ids)
 
 
+class LacksMuch:
+    """Without the length of a step, and without most methods."""
+
+    def __init__(self, **_):
+        pass
+
+    def predict(self, odometry):
+        """Ignore a motion."""
+
+    def update(self, measurements, landmark_ids=None):
+        """Ignore a scan."""
+
+
+class StartsTooCertain(EkfSlam):
+    def __init__(self, **settings):
+        super().__init__(**{**settings, "initial_pose_std": (0, 0, 0)})
+
+
 class NeverGrowsCertain(EkfSlam):
     def update(self, measurements, landmark_ids=None):
         n = self.map.size
@@ -150,6 +170,8 @@ class NeverGrowsCertain(EkfSlam):
     ("estimator", "complaint"),
     [
         (LacksUpdate, r"LacksUpdate has no method update\(\)"),
+        (LacksMuch, r"reset\(\); predict\(odometry\) in place of .*belief\(\)"),
+        (StartsTooCertain, r"0\.09\]\], got \[\[0\.0, 0\.0, 0\.0\]"),
         (TurnsBeforeItDrives, "drive d along the old heading"),
         (AnswersWithLiveArrays, "snapshot"),
         (AcceptsNan, r"predict\(\(nan, 0\)\) must raise a ValueError"),
@@ -205,6 +227,13 @@ def test_an_estimator_is_found_by_its_import_path():
     assert isinstance(slam, EkfSlam)
     with pytest.raises(ValueError, match=r"cannot import estimator 'no\.such:Filter'"):
         make_estimator("no.such:Filter", **NOISE)
+
+
+def test_a_class_that_cannot_run_is_refused_when_it_is_imported(monkeypatch):
+    monkeypatch.setitem(sys.modules, "of_a_user", SimpleNamespace(Mine=LacksMuch))
+    complaint = r"'of_a_user:Mine' has predict\(odometry\) in place of.*check_estimator"
+    with pytest.raises(ValueError, match=complaint):
+        make_estimator("of_a_user:Mine", **NOISE)
 
 
 def test_a_registered_estimator_is_made_by_name():

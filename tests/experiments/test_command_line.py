@@ -531,7 +531,7 @@ def test_a_film_of_an_unknown_format_is_refused_before_anything_compiles(monkeyp
 @pytest.mark.parametrize(
     ("out", "message", "code"),
     [
-        ("film.webm", "path must end in .gif or .mp4, got 'film.webm'", 2),
+        ("film.webm", "a film's file must end in .gif or .mp4, got 'film.webm'", 2),
         ("nowhere/film.gif", "the folder of nowhere/film.gif does not exist", 1),
     ],
 )

@@ -610,7 +610,7 @@ def test_memory_grows_with_the_block_and_not_with_the_runs(tmp_path):
         ({"jobs": 0}, "jobs must be an integer >= 1"),
         ({"jobs": 2.5}, "jobs must be an integer >= 1"),
         ({"seed": 2**63}, "seed must be"),
-        ({"estimators": None}, "estimators must be names"),
+        ({"estimators": EkfSlam}, "or labels mapped to classes, got <class"),
         ({"backend": "lokey"}, "did you mean 'loky'"),
         ({"block_size": 0}, "block_size must be"),
         ({"resolution": -1.0}, "resolution must be a number >= 0"),

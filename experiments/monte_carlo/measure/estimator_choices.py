@@ -86,7 +86,10 @@ def estimator_choices(
 options={'iterations': 3})
     """
     if not isinstance(estimators, Iterable):
-        raise ValueError(f"estimators must be names or labels, got {estimators!r}")
+        raise ValueError(
+            "estimators must be names, labels, or labels mapped to classes, "
+            f"got {estimators!r}"
+        )
     choices = _choices(estimators)
     if not choices:
         raise ValueError("estimators must name at least one, got none")
