@@ -12,19 +12,14 @@ import numpy as np
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.kernels.in_view import View
 from ..estimator.kernels.log_det import half_log_det, largest_variance
-from ..estimator.models.bearing_range import wrap_angle_jit
 from ..jit import jit, njit_internal
 from .belief_kernels import FeatureArrays, write_belief_features
 from .floor_kernels import (
     DISTANCE,
-    FAR,
-    NEAR,
-    SECTORS,
     Floor,
     Pose,
     first_smallest,
     look_around,
-    measure_points,
     write_densities,
     write_direction,
     write_point,
@@ -94,7 +89,7 @@ class Scratch(NamedTuple):
     """Room for intermediate results."""
 
     points: Array
-    """Shape (5, max(C, N))."""
+    """Shape (3, max(C, N))."""
     variances: Array
     """Of the landmarks, shape (N,) [m²]."""
     matrix: Array
@@ -136,14 +131,16 @@ def advance_world(
     means, covariances, slots = worlds.beliefs
     explored, steps, uncertainty, known = worlds.episodes
     mean, covariance = means[b], covariances[b]
-    heading = wrap_angle_jit(mean[2])
-    pose = mean[0], mean[1], math.cos(heading), math.sin(heading)
+    features, bounds = worlds.belief_features, floor.bounds
+    write_belief_features(b, mean, covariance, slots[b], bounds, features)
+    directions = features[5]
+    pose = mean[0], mean[1], directions[b, 2], directions[b, 3]
     if not moved:
         explored[b] = False
     points = scratch.points
     unseen = look_around(pose, floor.cells, floor.sight, explored[b], points)
-    describe_points(points, unseen, floor.diagonal, worlds.features[0][b, :3])
-    write_both_densities(points, unseen, CELLS, worlds.features[3][b])
+    write_nearest(points, unseen, floor.diagonal, worlds.features[0][b, :3])
+    write_densities(points, unseen, floor.diagonal, CELLS, worlds.features[3][b])
     accuracy, variances = rules.accuracy, scratch.variances
     mapped = judge_landmarks(covariance, slots[b], accuracy, variances, known[b])
     before = uncertainty[b]
@@ -151,8 +148,6 @@ def advance_world(
     steps[b] = steps[b] + 1 if moved else 0
     if moved:
         reward_step(b, before - uncertainty[b], worlds, rules)
-    features, bounds = worlds.belief_features, floor.bounds
-    write_belief_features(b, mean, covariance, slots[b], bounds, features)
     write_shares(b, unseen, mapped, worlds, rules)
     distances, diagonal = worlds.features[4][b], floor.diagonal
     write_wall_distances(pose, floor.walls, diagonal, rules.longest_step, distances)
@@ -242,12 +237,12 @@ def write_landmark_goals(
     for i in range(len(slots)):
         if slots[i] >= 0 and not worlds.episodes.known[b, i]:
             count = add_landmark(points, count, mean, slots[i], pose)
-    describe_points(points, count, diagonal, goals[b, 3:6])
-    write_both_densities(points, count, 1.0, uncertain[b])
+    write_nearest(points, count, diagonal, goals[b, 3:6])
+    write_densities(points, count, diagonal, 1.0, uncertain[b])
     best, count = first_smallest(scratch.variances, len(slots)), 0
     if slots[best] >= 0:
         count = add_landmark(points, 0, mean, slots[best], pose)
-    describe_points(points, count, diagonal, goals[b, 6:])
+    write_nearest(points, count, diagonal, goals[b, 6:])
 
 
 @njit_internal
@@ -259,17 +254,7 @@ def add_landmark(points: Array, k: int, mean: Array, slot: int, pose: Pose) -> i
 
 
 @njit_internal
-def describe_points(points: Array, count: int, diagonal: float, goal: Array) -> None:
-    """Measure the points, and write the direction to the nearest."""
-    measure_points(points, count, diagonal)
+def write_nearest(points: Array, count: int, diagonal: float, goal: Array) -> None:
+    """Write the direction to the nearest point."""
     nearest = first_smallest(points[DISTANCE], count)
     write_direction(points, nearest, diagonal, goal)
-
-
-@njit_internal
-def write_both_densities(
-    points: Array, count: int, unit: float, densities: Array
-) -> None:
-    """Write near and far densities, (16,)."""
-    write_densities(points, NEAR, count, unit, densities[:SECTORS])
-    write_densities(points, FAR, count, unit, densities[SECTORS:])

@@ -120,7 +120,7 @@ class ActiveSlamTask:
         self._shape = count, landmarks
         self._rules = _rules(scenario, weights, self.prior_std)
         self._scratch = (
-            np.zeros((5, max(cells, landmarks))),
+            np.zeros((3, max(cells, landmarks))),
             np.zeros(landmarks),
             np.zeros((2 * landmarks, 2 * landmarks)),
         )

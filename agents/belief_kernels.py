@@ -18,7 +18,7 @@ FeatureArrays = tuple[Array, Array, Array, Array, BoolArray, Array, Array, Array
 SMALLEST_STD, LARGEST_STD = 1e-3, 10.0
 """Standard deviations [m, rad] that `on_log_scale` maps to 0 and to 1."""
 
-_DECADES = math.log10(LARGEST_STD / SMALLEST_STD)
+_SCALE = 1.0 / math.log(LARGEST_STD / SMALLEST_STD)
 
 
 def clip(value: float, low: float, high: float) -> float:
@@ -45,7 +45,7 @@ def on_log_scale(std: float) -> float:
     """
     bounded = min(max(std, SMALLEST_STD), LARGEST_STD)
     # clipped: a rounded logarithm can leave the interval
-    return min(max(math.log10(bounded / SMALLEST_STD) / _DECADES, 0.0), 1.0)
+    return min(max(math.log(bounded / SMALLEST_STD) * _SCALE, 0.0), 1.0)
 
 
 def correlation(covariance: float, product: float) -> float:

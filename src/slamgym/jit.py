@@ -21,9 +21,9 @@ Kernel = TypeVar("Kernel", bound=Callable[..., object])
 def jit(function: Kernel) -> Kernel:
     """Compile a kernel at its first call and keep it in :mod:`.kernel_cache`.
 
-    ``fastmath`` stays off: a kernel gives the same bits when called from Python, from
-    another kernel, in a thread, or when loaded from the cache.  Where a multiply-add is
-    to be rounded once, the code calls :func:`fma`.
+    ``fastmath`` stays off, except in :func:`njit_reordered`: a kernel gives the same
+    bits when called from Python, from another kernel, in a thread, or when loaded from
+    the cache.  Where a multiply-add is to be rounded once, the code calls :func:`fma`.
     """
     return _compile(function, callable_from_python=True)
 
@@ -36,6 +36,15 @@ def njit_internal(function: Kernel) -> Kernel:
     return _compile(function, callable_from_python=False)
 
 
+def njit_reordered(function: Kernel) -> Kernel:
+    """Compile an internal function whose long sums may be added up in any order.
+
+    They then run on whole vector registers. One kernel alone may call it: the compiler
+    may choose another order in another kernel, and so other last bits.
+    """
+    return _compile(function, callable_from_python=False, reordered=True)
+
+
 def njit_inlined(function: Kernel) -> Kernel:
     """Copy the body of a function into its caller, which compiles it only once.
 
@@ -44,12 +53,15 @@ def njit_inlined(function: Kernel) -> Kernel:
     return cast("Kernel", njit(inline="always", error_model="numpy")(function))
 
 
-def _compile(function: Kernel, *, callable_from_python: bool) -> Kernel:
+def _compile(
+    function: Kernel, *, callable_from_python: bool, reordered: bool = False
+) -> Kernel:
     options: dict[str, Any] = {
         "error_model": "numpy",
         "nogil": True,
         "no_cfunc_wrapper": True,
         "no_cpython_wrapper": not callable_from_python,
+        "fastmath": {"reassoc", "nsz", "contract"} if reordered else False,
     }
     kernel = njit(**options)(function)
     if hasattr(kernel, "py_func"):  # else compilation is turned off
