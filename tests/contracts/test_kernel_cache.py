@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
 
+import forked
 import numpy as np
 import pytest
 
@@ -65,8 +66,18 @@ def python(folder, code=ASK, prefix=(), **environment):
     )
 
 
-def answer(folder, code=ASK, **environment):
-    value, hits = python(folder, code, **environment).stdout.split()
+def forked_script(folder, code=ASK, **environment):
+    """Begin a script in a process that has loaded numba, but not these kernels."""
+    caches = {name: os.environ[name] for name in ("NUMBA_CACHE_DIR", "TMPDIR")}
+    return forked.Script(code, folder, {**caches, **environment})
+
+
+def forked_python(folder, code=ASK, **environment):
+    return forked_script(folder, code, **environment).output()
+
+
+def answer(folder, code=ASK, run=forked_python):
+    value, hits = run(folder, code).stdout.split()
     return float(value), int(hits)
 
 
@@ -106,21 +117,21 @@ def test_an_edit_while_a_process_runs_does_not_reach_the_cache(kernels):
 
 @pytest.mark.slow
 def test_equal_kernels_in_two_checkouts_are_compiled_once(kernels, tmp_path):
-    assert answer(kernels) == (7, 0)
+    assert answer(kernels, run=python) == (7, 0)
     write(tmp_path / "other", caller=CALLER, callee=CALLEE, constants="FACTOR = 2")
     os.utime(tmp_path / "other" / "callee.py")
-    assert answer(tmp_path / "other") == (7, 1)
+    assert answer(tmp_path / "other", run=python) == (7, 1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("where", [UNWRITABLE, {"NUMBA_CACHE_DIR": "/dev/null/x"}])
 def test_where_nothing_can_be_written_one_warning_names_another_folder(kernels, where):
-    done = python(kernels, ASK, **where)
+    done = forked_python(kernels, ASK, **where)
     assert done.stdout.split() == ["7.0", "0"]
     assert done.stderr.count("Warning") == 1
     assert "/dev/null" in done.stderr
     assert str(next(kernels.parent.glob("slamgym-*"))) in done.stderr
-    again = python(kernels, ASK, **where)  # finds them there, and has no complaint
+    again = forked_python(kernels, ASK, **where)  # finds them there: no complaint
     assert (again.stdout.split(), again.stderr) == (["7.0", "1"], "")
 
 
@@ -129,7 +140,7 @@ def test_a_folder_of_somebody_else_is_not_used(kernels):
     private = kernels.parent / kernel_cache._private_path().name
     private.mkdir(mode=0o777)
     private.chmod(0o777)
-    done = python(kernels, ASK, **UNWRITABLE)
+    done = forked_python(kernels, ASK, **UNWRITABLE)
     assert done.stdout.split() == ["7.0", "0"]
     assert done.stderr.count("Warning") == 1
     assert "every process compiles anew" in done.stderr
@@ -176,15 +187,12 @@ def test_processes_that_compile_for_other_types_at_once_keep_all_of_it(kernels):
             pass
         print(answer({call}))
     """
-    start = time.time() + 3
-    children = [
-        subprocess.Popen(
-            [sys.executable, "-c", textwrap.dedent(code.format(start=start, call=x))],
-            cwd=kernels,
-        )
-        for x in calls
+    start = time.time() + 0.5
+    scripts = [
+        forked_script(kernels, code.format(start=start, call=call)) for call in calls
     ]
-    assert [child.wait() for child in children] == [0] * 4
+    values = {complex(script.output().stdout) for script in scripts}
+    assert values == {7}
     hits = f"""
         import numpy as np
         from caller import answer
