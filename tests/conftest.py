@@ -95,6 +95,17 @@ def public_logs():
 
 
 @pytest.fixture(scope="session")
+def browser():
+    """Return a page in Chromium, which tests open their files in one by one."""
+    from browser import find_chromium, open_browser
+
+    if find_chromium() is None:
+        pytest.skip("no chromium here (SLAMGYM_CHROMIUM may name one)")
+    with open_browser() as page:
+        yield page
+
+
+@pytest.fixture(scope="session")
 def sb3():
     """Return Stable-Baselines3, which is slow to load, on one thread."""
     library = pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")

@@ -10,7 +10,6 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import xarray as xr
-from chromium import find_chromium, requests_of, run_chromium, screenshot
 from monte_carlo_dataset import typical, with_failures
 from PIL import Image
 
@@ -25,9 +24,6 @@ from slamgym.experiments.monte_carlo.report.summary import summarise_monte_carlo
 from slamgym.experiments.noise_study.variations import scaled_scenario
 from slamgym.sim_configs import load_scenario
 
-needs_chromium = pytest.mark.skipif(
-    find_chromium() is None, reason="no chromium here (SLAMGYM_CHROMIUM may name one)"
-)
 HOSTILE = "</title></pre><script>alert(\"1\")</script> & '$x$' 100 %"
 
 
@@ -274,46 +270,41 @@ def test_long_runs_of_several_estimators_stay_below_2_megabytes():
 
 
 @pytest.mark.slow
-@needs_chromium
-def test_chromium_has_nothing_to_complain_of(report, tmp_path):
-    _, messages = run_chromium(report, "--dump-dom")
-    assert messages == []
+def test_chromium_has_nothing_to_complain_of(report, tmp_path, browser):
+    browser.open(report)
+    assert browser.messages == []
     broken = tmp_path / "broken.html"
     broken.write_text("<script>undefined_function()</script>")
-    _, messages = run_chromium(broken, "--dump-dom")
-    assert any("undefined_function" in message for message in messages)
+    browser.open(broken)
+    assert any("undefined_function" in message for message in browser.messages)
 
 
 @pytest.mark.slow
-@needs_chromium
-def test_chromium_asks_the_network_for_nothing(report, tmp_path):
+def test_chromium_asks_the_network_for_nothing(report, tmp_path, browser):
     asking = tmp_path / "asking.html"
     asking.write_text('<img src="http://127.0.0.1:9/picture.png">')
-    assert requests_of(report, tmp_path) == []
-    assert requests_of(asking, tmp_path) == ["http://127.0.0.1:9/picture.png"]
+    browser.open(report)
+    assert browser.requests == []
+    browser.open(asking)
+    assert browser.requests == ["http://127.0.0.1:9/picture.png"]
 
 
 @pytest.mark.slow
-@needs_chromium
-def test_chromium_runs_no_script_of_hostile_results(hostile_page, tmp_path):
+def test_chromium_runs_no_script_of_hostile_results(hostile_page, tmp_path, browser):
     path = tmp_path / "report.html"
     path.write_text(hostile_page, encoding="utf-8")
-    dom, messages = run_chromium(path, "--dump-dom")
-    assert "<script" not in dom
-    assert messages == []
+    browser.open(path)
+    assert "<script" not in browser.evaluate("document.documentElement.outerHTML")
+    assert browser.messages == []
 
 
 @pytest.mark.slow
-@needs_chromium
 @pytest.mark.parametrize("dark", [False, True])
-def test_chromium_shows_every_figure_in_light_and_dark(report, tmp_path, dark):
-    boxes = figure_boxes(report, tmp_path, width=1280)
+def test_chromium_shows_every_figure_in_light_and_dark(report, tmp_path, dark, browser):
+    browser.open(report, dark=dark)
+    boxes = figure_boxes(browser)
     assert len(boxes) == 5
-    path = tmp_path / "screen.png"
-    height = int(max(top + high for _, top, _, high in boxes)) + 50
-    screenshot(report, path, size=(1280, height), dark=dark)
-    with Image.open(path) as picture:
-        pixels = np.asarray(picture.convert("RGB")).astype(float)
+    pixels = pixels_of(browser, tmp_path / "screen.png", "RGB")
     paper = pixels[2, 2]
     assert (paper.mean() < 60) == dark
     for left, top, wide, high in boxes:
@@ -324,84 +315,58 @@ def test_chromium_shows_every_figure_in_light_and_dark(report, tmp_path, dark):
 
 
 @pytest.mark.slow
-@needs_chromium
 @pytest.mark.parametrize("width", [390, 1280])
-def test_the_page_does_not_scroll_sideways(report, tmp_path, width):
-    dom, _ = run_chromium(framed(report, tmp_path, width), "--dump-dom")
-    widths = json.loads(re.search(r"<pre>(.*?)</pre>", dom)[1])["scroll"]
-    assert widths == width
-    boxes = figure_boxes(report, tmp_path, width)
+def test_the_page_does_not_scroll_sideways(report, width, browser):
+    browser.open(report, size=(width, 900))
+    assert browser.evaluate("document.documentElement.scrollWidth") == width
+    boxes = figure_boxes(browser)
     assert all(wide >= min(0.9 * (width - 32), 400) for _, _, wide, _ in boxes)
 
 
 @pytest.mark.slow
-@needs_chromium
 @pytest.mark.usefixtures("_no_figures_in_reports")
 def test_two_estimators_fit_a_telephone_and_more_of_them_show_that_they_scroll(
-    report, tmp_path
+    report, tmp_path, browser
 ):
-    two = number_table(report, tmp_path)
-    assert two["scroll"] <= two["client"]
-    assert shade_beside_the_table(two, tmp_path) < 20
     four = typical().isel(estimator=[0, 1, 0, 1]).assign_coords(estimator=list("abcd"))
     four.attrs["estimators"] = "{}"
     path = tmp_path / "four.html"
     path.write_text(page_of(four), encoding="utf-8")
-    more = number_table(path, tmp_path)
-    assert more["scroll"] > more["client"]
-    assert shade_beside_the_table(more, tmp_path) > 60
+    browser.open(report, size=(390, 900))
+    assert hidden_width_of_the_table(browser) <= 0
+    assert shade_beside_the_table(browser, tmp_path) < 20
+    browser.open(path, size=(390, 900))
+    assert hidden_width_of_the_table(browser) > 0
+    assert shade_beside_the_table(browser, tmp_path) > 60
 
 
-def number_table(report, folder):
-    """Width and place of the main table, and the room that it has [px]."""
-    dom, _ = run_chromium(framed(report, folder, 390), "--dump-dom")
-    return json.loads(re.search(r"<pre>(.*?)</pre>", dom)[1])["table"]
+TABLE = "document.querySelector('.wide')"
 
 
-def shade_beside_the_table(table, folder):
+def hidden_width_of_the_table(browser):
+    """How much wider the main table is than the room that it has [px]."""
+    return browser.evaluate(f"{TABLE}.scrollWidth - {TABLE}.clientWidth")
+
+
+def shade_beside_the_table(browser, folder):
     """How much darker than the paper the table's right end is, where it is empty."""
-    screenshot(folder / "framed.html", folder / "table.png", size=(500, 3000))
-    with Image.open(folder / "table.png") as picture:
-        pixels = np.asarray(picture.convert("L")).astype(float)
-    top, right = int(table["top"]), int(table["left"] + table["client"])
-    column = pixels[top + 50 : top + 400, right - 3]
-    return pixels[2, 2] - np.median(column)
+    place = f"{TABLE}.getBoundingClientRect()"
+    top = int(browser.evaluate(f"{place}.top"))
+    right = int(browser.evaluate(f"{place}.left + {TABLE}.clientWidth"))
+    pixels = pixels_of(browser, folder / "table.png", "L")
+    return pixels[2, 2] - np.median(pixels[top + 50 : top + 400, right - 3])
 
 
-def figure_boxes(report, folder, width):
-    """Place of every figure on a page so wide: (left, top, width, height) [px]."""
-    dom, _ = run_chromium(framed(report, folder, width), "--dump-dom")
-    return json.loads(re.search(r"<pre>(.*?)</pre>", dom)[1])["boxes"]
-
-
-def framed(report, folder, width):
-    """Put the page into a frame, which may be narrower than any window, and ask it."""
-    page = html.escape(report.read_text(encoding="utf-8"))
-    path = folder / "framed.html"
-    path.write_text(
-        f"""<!DOCTYPE html><meta charset="utf-8"><pre></pre>
-<iframe style="width:{width}px;height:9000px;border:0" srcdoc="{page}"></iframe>
-<script>
-const frame = document.querySelector("iframe");
-frame.onload = () => {{
-  const inner = frame.contentDocument;
-  const boxes = [...inner.querySelectorAll("figure svg")].map((svg) => {{
-    const box = svg.getBoundingClientRect();
-    return [box.left, box.top, box.width, box.height];
-  }});
-  const scroll = inner.documentElement.scrollWidth;
-  const wide = inner.querySelector(".wide"), place = wide.getBoundingClientRect();
-  const outer = frame.getBoundingClientRect();
-  const table = {{
-    client: wide.clientWidth,
-    scroll: wide.scrollWidth,
-    left: place.left + outer.left,
-    top: place.top + outer.top,
-  }};
-  document.querySelector("pre").textContent =
-    JSON.stringify({{ boxes, scroll, table }});
-}};
-</script>""",
-        encoding="utf-8",
+def figure_boxes(browser):
+    """Place of every figure on the page: (left, top, width, height) [px]."""
+    return browser.evaluate(
+        "[...document.querySelectorAll('figure svg')]"
+        ".map((svg) => svg.getBoundingClientRect())"
+        ".map((box) => [box.left, box.top, box.width, box.height])"
     )
-    return path
+
+
+def pixels_of(browser, path, mode):
+    browser.screenshot(path)
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert(mode)).astype(float)

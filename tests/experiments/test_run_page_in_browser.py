@@ -4,8 +4,6 @@ import re
 
 import numpy as np
 import pytest
-from browser import open_browser
-from chromium import find_chromium
 from PIL import Image
 
 from slamgym.envs.controllers import make_controller
@@ -15,12 +13,7 @@ from slamgym.experiments.runs import replay
 from slamgym.experiments.viewers import RunFrames, ViewedRun, write_run_page
 from slamgym.sim_configs import load_scenario
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        find_chromium() is None, reason="no chromium here (see SLAMGYM_CHROMIUM)"
-    ),
-]
+pytestmark = pytest.mark.slow
 STEPS = 120
 HOSTILE = "<script>document.title = 'taken'</script><img src='http://127.0.0.1:9/'>"
 
@@ -48,12 +41,6 @@ def written_page(path, preset="loop", filters=("ekf", "invariant"), **options):
 def file(tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "run.html"
     return path, written_page(path)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with open_browser() as page:
-        yield page
 
 
 @pytest.fixture

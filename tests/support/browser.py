@@ -10,18 +10,36 @@ import fcntl
 import json
 import os
 import select
+import shutil
 import subprocess
 import tempfile
 import time
 from pathlib import Path
 
-from chromium import QUIET_FLAGS, find_chromium
-
+_NAMES = ("chromium", "chromium-browser", "google-chrome")
+_FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--hide-scrollbars",
+    "--host-resolver-rules=MAP * ~NOTFOUND",  # nor does the browser ask anybody
+)
 _PATIENCE = 60.0  # [s]
 _SETTLED = (  # the page's script has ended, well or with a message
     "document.readyState === 'complete' && (!document.querySelector('#failure') ||"
     " document.documentElement.dataset.ready || !failure.hidden)"
 )
+
+
+def find_chromium():
+    """Path of a Chromium, or None; the variable SLAMGYM_CHROMIUM goes before."""
+    named = os.environ.get("SLAMGYM_CHROMIUM")
+    return named or next(filter(None, map(shutil.which, _NAMES)), None)
 
 
 class BrowserError(Exception):
@@ -192,7 +210,7 @@ def _pipe():
 def open_browser():
     """Start Chromium for the block; its only page is the value."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        command = [find_chromium(), *QUIET_FLAGS, f"--user-data-dir={profile}"]
+        command = [find_chromium(), *_FLAGS, f"--user-data-dir={profile}"]
         command += ["--remote-debugging-pipe", "about:blank"]
         to_browser, from_browser = _pipe(), _pipe()
         # Chromium reads descriptor 3 and writes descriptor 4.
