@@ -72,8 +72,8 @@ def forked_script(folder, code=ASK, **environment):
     return forked.Script(code, folder, {**caches, **environment})
 
 
-def forked_python(folder, code=ASK, **environment):
-    return forked_script(folder, code, **environment).output()
+def forked_python(*arguments, **environment):
+    return forked_script(*arguments, **environment).output()
 
 
 def answer(folder, code=ASK, run=forked_python):

@@ -1,9 +1,8 @@
 import copy
 import pickle
-import subprocess
-import sys
 import time
 
+import forked
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -391,10 +390,7 @@ def test_window_that_its_user_closed_stays_closed(screen, pyplot):
 
 def loaded_modules(program):
     code = f"{program}\nimport sys\nprint(*sys.modules)"
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    return set(result.stdout.split())
+    return set(forked.run(code).stdout.split())
 
 
 def test_environments_are_imported_without_matplotlib():

@@ -1,8 +1,7 @@
 import functools
 import itertools
-import subprocess
-import sys
 
+import forked
 import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection, LineCollection
@@ -129,11 +128,9 @@ def test_errors_and_time_have_units():
 def test_figures_are_made_without_pyplot():
     code = "import slamgym.experiments.figures as figures, sys; figures.map_figure; "
     code += "print(*sys.modules)"
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert "matplotlib.figure" in result.stdout.split()
-    assert "matplotlib.pyplot" not in result.stdout.split()
+    modules = forked.run(code).stdout.split()
+    assert "matplotlib.figure" in modules
+    assert "matplotlib.pyplot" not in modules
 
 
 @pytest.mark.parametrize("figure_of", FIGURES)

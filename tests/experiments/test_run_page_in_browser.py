@@ -108,6 +108,7 @@ def test_play_runs_to_the_end_and_pause_stops(page):
     stopped = step_of(page)
     page.evaluate("new Promise(r => setTimeout(r, 200))")
     assert 5 < step_of(page) == stopped < STEPS
+    page.evaluate("player.show(110)")
     page.click_on("#play")
     page.wait_for("player.place === 120")
     page.wait_for("!player.isPlaying")

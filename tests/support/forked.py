@@ -82,9 +82,12 @@ class Script:
         return Output(*texts)
 
 
-def _run(
-    code: str, folder: str, environment: dict[str, str], files: list[str]
-) -> None:
+def run(code: str, folder: Path | None = None, **environment: str) -> Output:
+    """Run lines of Python as a `Script`, by default in the present folder."""
+    return Script(code, folder or Path.cwd(), environment).output()
+
+
+def _run(code: str, folder: str, environment: dict[str, str], files: list[str]) -> None:
     from numba import config
 
     for descriptor, name in enumerate(files, start=1):
