@@ -14,8 +14,8 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ..belief import MapView
+from .association_memory import Candidates, Sensor
 from .association_policy import AssociationPolicy
-from .candidates import Candidates, Sensor
 from .missed_detections import Detections
 from .nearest_neighbour import AMBIGUOUS, NEW, Noise
 from .scan_assignments import assign_nearest, assign_scan

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ..kernels.covariance_update import BLOCK
+from ..kernels.kalman_gain import BLOCK
 from ..kernels.rules import Rules
 from ..kernels.scan_record import copy_scan
 from ..kernels.scan_rows import (

@@ -3,7 +3,7 @@
 from ...arrays import Array, IntArray
 from ...jit import njit_inlined, njit_internal
 from .belief_arrays import BeliefArrays
-from .covariance_update import absorb, block_of, mirror, times
+from .kalman_gain import absorb, block_of, mirror, times
 from .linearise import linearise
 from .retract import retract, transport
 from .rules import INVARIANT, Rules

@@ -5,7 +5,7 @@ from ...jit import jit
 from .add_landmark import add_landmark
 from .belief_arrays import BeliefArrays
 from .correct import copy_covariance, correct
-from .covariance_update import block_of
+from .kalman_gain import block_of
 from .rules import as_rules
 from .scan_rows import (
     ADDED,

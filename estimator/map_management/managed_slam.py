@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
-from ..association.candidates import Candidates, Sensor
+from ..association.association_memory import Candidates, Sensor
 from ..association.scan_association import Option, ScanAssociation, associate
 from ..filters.motion_noise import MotionNoise
 from ..interface import (
