@@ -30,8 +30,9 @@ def code_fingerprint(kernel: Any) -> str:
     """Return a hash of all that decides which machine code a kernel becomes.
 
     It covers the byte code of the kernel, of every function that it calls, however
-    deep, and the constants they read, with the versions of Python, numba and numpy,
-    the options of the compiler and numba's environment variables.
+    deep, the names of their modules and the constants they read, with the versions of
+    Python, numba and numpy, the options of the compiler and numba's environment
+    variables.
 
     Parameters
     ----------
@@ -89,7 +90,7 @@ class _Description:
         if known is not None:  # above, or around this: a function may call itself
             yield f"as number {known}"
         elif hasattr(value, "py_func"):  # a numba dispatcher
-            yield f"kernel {sorted(value.targetoptions.items(), key=repr)!r}"
+            yield f"kernel {_options(value)}"
             yield from self.of(value.py_func)
         elif _library(value) in LIBRARIES:
             yield f"{type(value).__name__} {_name(value)}"
@@ -108,7 +109,7 @@ class _Description:
         yield from self.of(getattr(value, "_field_defaults", {}))
 
     def _function(self, function: FunctionType) -> Iterator[str]:
-        yield f"function {function.__qualname__}"
+        yield f"function {_name(function)}"  # compiled code imports the module again
         yield from self.of(function.__defaults__)
         yield from self.of(function.__kwdefaults__)
         for cell in function.__closure__ or ():
@@ -148,6 +149,12 @@ def _with_inner(code: CodeType) -> Iterator[CodeType]:
 
 def _is_code(constant: object) -> bool:
     return isinstance(constant, CodeType)
+
+
+def _options(kernel: Any) -> str:
+    """Return the options of the compiler in one order; ``fastmath`` may be a set."""
+    options = sorted(kernel.targetoptions.items())
+    return repr([(k, sorted(v) if isinstance(v, set) else v) for k, v in options])
 
 
 def _library(value: Any) -> str:

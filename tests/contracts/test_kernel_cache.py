@@ -116,6 +116,14 @@ def test_an_edit_while_a_process_runs_does_not_reach_the_cache(kernels):
 
 
 @pytest.mark.slow
+def test_a_callee_that_moves_to_another_module_is_compiled_anew(kernels):
+    assert answer(kernels) == (7, 0)
+    write(kernels, renamed=CALLEE, caller=CALLER.replace("callee", "renamed"))
+    (kernels / "callee.py").unlink()
+    assert answer(kernels) == (7, 0)
+
+
+@pytest.mark.slow
 def test_equal_kernels_in_two_checkouts_are_compiled_once(kernels, tmp_path):
     assert answer(kernels, run=python) == (7, 0)
     write(tmp_path / "other", caller=CALLER, callee=CALLEE, constants="FACTOR = 2")
