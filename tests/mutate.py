@@ -217,7 +217,7 @@ def explained() -> dict[str, str]:
     pairs = {}
     for line in EXPLAINED.read_text().splitlines():
         if line and not line.startswith("#"):
-            name, _, reason = line.partition(" | ")
+            name, _, reason = line.rpartition(" | ")
             pairs[name.strip()] = reason.strip()
     return pairs
 

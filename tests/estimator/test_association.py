@@ -15,8 +15,21 @@ from slamgym.estimator.association.nearest_neighbour import (
     nearest_neighbours,
 )
 from slamgym.estimator.association.tentative_landmarks import TentativeLandmarks
-from slamgym.estimator.kernels.scan_rows import JACOBIAN, META_WIDTH, VARIANCE
-from slamgym.estimator.kernels.screen import own_covariance
+from slamgym.estimator.kernels import screen as screening
+from slamgym.estimator.kernels.belief_arrays import BeliefArrays
+from slamgym.estimator.kernels.rules import Rules
+from slamgym.estimator.kernels.scan_rows import (
+    ADDED,
+    FIRST,
+    JACOBIAN,
+    LEDGER_HEIGHT,
+    META_WIDTH,
+    NEAR,
+    OUTCOME,
+    SLOT,
+    USED,
+    VARIANCE,
+)
 from slamgym.estimator.models.angles import wrap_angle
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.unicycle_motion import predict_pose
@@ -233,6 +246,45 @@ def test_the_covariance_of_one_reading_is_that_of_its_jacobian(column):
     system[:, JACOBIAN : JACOBIAN + 5] = h
     system[:, VARIANCE] = 0.3, 0.7
     S = H @ P @ H.T + np.diag([0.3, 0.7])
-    plain = getattr(own_covariance, "py_func", own_covariance)  # only kernels call it
-    found = plain(P, system, 0, column)
+    found = plain(screening.own_covariance)(P, system, 0, column)
     assert found == pytest.approx((S[0, 0], S[1, 0], S[1, 1]))
+
+
+def plain(kernel):
+    """Return the Python function of a kernel that only kernels call."""
+    return getattr(kernel, "py_func", kernel)
+
+
+@pytest.mark.parametrize("share", [0.98, 1.02])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_landmark_is_too_near_within_ten_standard_deviations(seed, share):
+    rng, column = np.random.default_rng(seed), 5
+    root = rng.standard_normal((7, 7))
+    P, mean = root @ root.T, np.zeros(7)
+    angle = rng.uniform(-np.pi, np.pi)
+    ahead = np.array([np.cos(angle), np.sin(angle)])
+    # e_l - e_p - J δ e_θ grows with the distance along δ: no heading error here
+    P[2], P[:, 2] = 0.0, 0.0
+    block = np.array([[1, 0, 0, 0, 0, -1, 0], [0, 1, 0, 0, 0, 0, -1]], float)
+    widest = np.linalg.eigvalsh(block @ P @ block.T)[-1]
+    mean[column:] = share * 10 * np.sqrt(widest) * ahead
+    assert plain(screening.is_too_near)(mean, P, column) == (share < 1)
+
+
+def test_a_reading_is_screened_at_the_expected_distance(monkeypatch):
+    for name in ("is_too_near", "bearing_variance", "range_variance"):
+        monkeypatch.setattr(screening, name, plain(getattr(screening, name)))
+    rules = Rules(
+        bearing_std=0.1, range_std=0.2, range_std_per_metre=0.1, bearing_std_metres=0.3
+    )
+    mean = np.array([1.0, 2.0, 0.5, 9.0, 9.0, 4.0, 6.0])  # 5 m from the second landmark
+    belief = BeliefArrays(mean, 1e-4 * np.eye(7), np.zeros(7))
+    rows = np.zeros((FIRST + 4, 7 + META_WIDTH))
+    ledger = np.full((LEDGER_HEIGHT, 2), 7)
+    ledger[SLOT] = 1, -1
+    readings = np.array([(0.2, 4.0), (0.1, 3.0)])
+    assert plain(screening.screen)(belief, readings, 2, rules, rows, ledger) == 1
+    found = rows[FIRST : FIRST + 2, VARIANCE]
+    np.testing.assert_allclose(found, ((0.1 + 0.3 / 5) ** 2, (0.2 + 0.1 * 5) ** 2))
+    assert ledger[OUTCOME].tolist() == [USED, ADDED]
+    assert ledger[NEAR].tolist() == [0, 0]

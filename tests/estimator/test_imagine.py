@@ -14,6 +14,7 @@ from slamgym.estimator import (
     make_batch,
     make_estimator,
 )
+from slamgym.estimator.kernels.in_view import is_hidden
 from slamgym.estimator.models.bearing_range import predict_measurement
 
 FAMILY = ("ekf", "invariant", "first_estimates", "observability_constrained")
@@ -202,6 +203,18 @@ def test_horizons_tell_what_shorter_plans_tell(name):
 def test_wrong_horizons_are_refused(horizons, message):
     with pytest.raises(ValueError, match=message):
         imagine(driven("ekf"), PLANS, sensor(), horizons=horizons)
+
+
+def test_a_point_is_hidden_as_in_the_world():
+    rng, hidden = np.random.default_rng(4), 0
+    kernel = getattr(is_hidden, "py_func", is_hidden)  # only kernels call it
+    for wall in rng.uniform(-1.0, 1.0, (300, 4)):
+        (x, y), (dx, dy) = rng.uniform(-1.0, 1.0, (2, 2))
+        point, robot = np.array([complex(x + dx, y + dy)]), np.array(complex(x, y))
+        expected = bool(LineOfSight([tuple(wall)]).blocked(point, robot)[0])
+        assert kernel(x, y, dx, dy, wall[None]) == expected
+        hidden += expected
+    assert 20 < hidden < 280
 
 
 def test_a_robot_at_rest_has_noise_as_in_the_filter():

@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import kurtosistest
 
 from slamgym.evaluation import CAUSES, diagnose, noise_sums
+from slamgym.evaluation.error_findings import errors_of
 from slamgym.evaluation.noise_findings import _kurtosis_score, noise_findings
 from slamgym.evaluation.noise_sums import CHANNELS, MOMENTS
 from slamgym.evaluation.time_average_tests import time_average_test
@@ -283,6 +284,21 @@ def test_a_few_lost_runs_are_not_called_honest():
 def test_a_heading_known_for_certain_has_no_part_in_the_answer():
     certain = honest(15) | {"heading_nees": np.full((RUNS, STEPS), np.nan)}
     assert diagnose(**certain).cause == "honest"
+
+
+def test_steps_at_which_a_run_knows_its_heading_for_certain_are_left_out():
+    scores = honest(15)
+    heading = scores["heading_nees"].copy()
+    heading[:, 5:] = 40.0
+    heading[3, 5], heading[7, 6:] = np.nan, np.nan
+    assert diagnose(**scores | {"heading_nees": heading}).cause == "honest"
+
+
+def test_the_ratio_named_is_farthest_from_one_as_a_factor():
+    scores = honest(16)
+    too_small, too_large = 0.4 * scores["nees"], 1.5 * scores["heading_nees"]
+    ratio = errors_of(too_small, too_large).ratio
+    assert ratio == pytest.approx(too_small.mean() / 3)
 
 
 def test_few_runs_decide_nothing():

@@ -62,6 +62,10 @@ def test_a_place_is_as_far_as_its_nearest_landmark():
     )
     assert (apart.missed_count, together.missed_count) == (2, 1)
     np.testing.assert_allclose(together.localisation, 0.01)
+    estimates = [(0.5, 0), (9.2, 0), (5.0, 0)]
+    all_three = gospa(estimates, truth, cutoff=1.0, places=[3, 3, 4])
+    np.testing.assert_allclose(all_three.localisation, 0.1**2 + 0.2**2)
+    assert (all_three.missed_count, all_three.false_count) == (0, 1)
     with pytest.raises(ValueError, match="places must have one entry per"):
         gospa([(0.5, 0)], truth, places=[3, 3])
 

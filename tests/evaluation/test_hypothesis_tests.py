@@ -166,6 +166,11 @@ def test_the_bootstrap_of_few_runs_is_finite_or_decides_nothing(runs):
             assert np.abs(decision.interval).max() < 1e6
 
 
+def test_the_bootstrap_of_runs_around_the_expected_mean_has_p_one():
+    averages = DOF * np.array([0.5, 0.8, 1.0, 1.2, 1.5])
+    assert bootstrap_test(averages, DOF, rng=np.random.default_rng(3)).p_value == 1
+
+
 def test_the_bootstrap_of_runs_that_are_all_equal_decides_nothing():
     averages = np.full(7, 0.1)  # whose mean is not 0.1 to the last bit
     decision = bootstrap_test(averages, DOF, rng=np.random.default_rng(9))

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from slamgym.evaluation.trajectory_error import (
     Alignment,
     align_positions,
+    ellipse_areas,
     landmark_covariances,
     landmark_distances,
     poses_at,
@@ -216,3 +217,7 @@ def test_a_true_path_must_have_a_time_and_a_pose_in_each_row(path):
 def test_error_speaks_of_landmarks_where_the_caller_does():
     with pytest.raises(ValueError, match="landmarks must be finite"):
         landmark_distances([[math.inf, 0]], [np.eye(2)], [[0, 0]])
+
+
+def test_an_ellipse_of_three_deviations_has_the_area_of_its_axes():
+    assert ellipse_areas(np.diag([4.0, 9.0])[None])[0] == pytest.approx(54 * math.pi)

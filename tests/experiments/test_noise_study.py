@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from slamgym.envs.controllers import OpenLoop
-from slamgym.evaluation.trajectory_error import ellipse_areas
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import Scan
 from slamgym.experiments.noise_study.one_run import study_log, study_scenario
@@ -93,7 +92,6 @@ def test_areas_are_those_of_the_final_3_sigma_ellipses(of_log):
     assert reference.row.pose_area == pytest.approx(
         math.pi * math.prod(3 * np.sqrt(np.linalg.eigvalsh(P)))
     )
-    assert ellipse_areas(np.diag([4.0, 9.0])[None])[0] == pytest.approx(54 * math.pi)
 
 
 def scans(log):
