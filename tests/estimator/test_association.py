@@ -263,11 +263,14 @@ def test_a_landmark_is_too_near_within_ten_standard_deviations(seed, share):
     P, mean = root @ root.T, np.zeros(7)
     angle = rng.uniform(-np.pi, np.pi)
     ahead = np.array([np.cos(angle), np.sin(angle)])
-    # e_l - e_p - J δ e_θ grows with the distance along δ: no heading error here
-    P[2], P[:, 2] = 0.0, 0.0
-    block = np.array([[1, 0, 0, 0, 0, -1, 0], [0, 1, 0, 0, 0, 0, -1]], float)
-    widest = np.linalg.eigvalsh(block @ P @ block.T)[-1]
-    mean[column:] = share * 10 * np.sqrt(widest) * ahead
+    delta = 3.0 * ahead  # the error in the robot's frame is e_l - e_p - J δ e_θ
+    B = np.zeros((2, 7))
+    B[:, :2], B[:, column:] = -np.eye(2), np.eye(2)
+    B[:, 2] = delta[1], -delta[0]
+    widest = np.linalg.eigvalsh(B @ P @ B.T)[-1]
+    P *= (3.0 / (10 * share)) ** 2 / widest
+    mean[:2] = rng.standard_normal(2)
+    mean[column:] = mean[:2] + delta
     assert plain(screening.is_too_near)(mean, P, column) == (share < 1)
 
 

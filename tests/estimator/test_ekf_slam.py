@@ -482,3 +482,16 @@ def test_a_report_keeps_the_innovation_covariance_of_its_own_prior(name, seen):
     slam.update(steps[-1][1], range(40))
     np.testing.assert_allclose(report.innovation, expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(report.innovation_covariance, S, rtol=0, atol=1e-12)
+
+
+def test_an_update_that_fails_in_a_later_block_of_readings_is_taken_back():
+    slam = EkfSlam((0.1, 0.1, 0.1), (0.02, 0.1))
+    readings = np.column_stack([np.linspace(-2, 2, 9), np.full(9, 3.0)])
+    slam.update(readings, range(9))
+    slam.predict((0.1, 0.1))
+    slam.map.covariance[19:21, 19:21] = -5 * np.eye(2)  # of the last landmark
+    mean, covariance = slam.map.mean.copy(), slam.map.covariance.copy()
+    with pytest.raises(np.linalg.LinAlgError):
+        slam.update(readings, range(9))
+    np.testing.assert_array_equal(slam.map.mean, mean)
+    np.testing.assert_array_equal(slam.map.covariance, covariance)

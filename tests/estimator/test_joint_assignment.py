@@ -243,6 +243,16 @@ def test_the_bound_on_the_change_by_some_pairs_holds_and_is_not_far_off():
     assert max(ratios) > 0.5
 
 
+def test_the_bound_on_the_change_by_one_pair_is_that_of_its_equation():
+    _, _, problem = linear_problem(np.random.default_rng(3), rows=1, landmarks=1)
+    nu, Q = problem.innovations[0, 0], np.diag(problem.variances[0])
+    S = problem.joint + Q
+    left = np.linalg.eigvals(np.linalg.solve(S, Q)).real.min()  # 1 − λ
+    shift = np.sqrt((1 - left) * (nu @ np.linalg.solve(S, nu)) / left)
+    found = largest_change(problem, np.array([0]), np.array([UNPAIRED]))
+    assert found == pytest.approx(np.sqrt(shift**2 + 1 / left - 1))
+
+
 def test_only_pairs_that_are_left_out_have_a_bound():
     *_, problem = linear_problem(np.random.default_rng(2), rows=2, landmarks=3)
     marks, other = np.array([0, 1]), np.array([0, 2])

@@ -84,3 +84,12 @@ def test_the_error_is_normalised_over_all_leading_axes_and_at_any_scale(size, sc
     solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
     found = normalised_squared_error(scale * errors, scale**2 * covariances)
     np.testing.assert_allclose(found, (errors * solved).sum(axis=-1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("size", [3, 12])
+def test_a_covariance_singular_within_rounding_has_no_nees(size):
+    covariance = np.tile(np.eye(size), (2, 1, 1))
+    covariance[1, 0, 1] = covariance[1, 1, 0] = 1 - 1e-12
+    nees = normalised_squared_error(np.ones((2, size)), covariance)
+    assert nees[0] == pytest.approx(size)
+    assert np.isnan(nees[1])
