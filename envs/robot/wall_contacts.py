@@ -1,17 +1,19 @@
 """Contacts of a round body with straight walls, by queries of the physics engine."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pymunk
 
-from ...arrays import Array, ComplexArray
+from ...arrays import Array, ComplexArray, IntArray
+from ...jit import jit, njit_internal
 
 Wall = tuple[float, float, float, float]
 
 _SKIN = 1e-6  # distance kept from every wall [m]
-_NEAR = 1e-3  # walls farther away than this after a step are not queried [m]
+_NEAR = 1e-3  # walls farther away than this on the whole way are not queried [m]
 _ANYTHING = pymunk.ShapeFilter()
 
 
@@ -62,9 +64,7 @@ class WallContacts:
         self._space = pymunk.Space()
         for wall in self._walls:
             self._space.add(*_inflated(wall, radius, self._space.static_body))
-        ends = np.array(self._walls, dtype=np.float64).reshape(-1, 4)
-        self._start = ends[:, 0] + 1j * ends[:, 1]
-        self._along = ends[:, 2] + 1j * ends[:, 3] - self._start
+        self._ends = np.array(self._walls, dtype=np.float64).reshape(-1, 4)
 
     def free_share(self, x: float, y: float, dx: float, dy: float) -> float:
         """Return the share of a displacement up to 1 µm before the first contact.
@@ -93,10 +93,10 @@ class WallContacts:
     def free_shares(self, x: Array, y: Array, dx: Array, dy: Array) -> Array:
         """Return the shares of B displacements, arrays of shape (B,) [m]."""
         shares = np.ones(len(x))
-        gaps = wall_distances(x + 1j * y, self._start, self._along).min(axis=1)
-        near = np.flatnonzero(gaps <= self._radius + np.hypot(dx, dy) + _NEAR)
-        moves = np.stack([x, y, dx, dy], axis=1)[near].tolist()
-        shares[near] = [self.free_share(*move) for move in moves]
+        near = np.empty(len(x), dtype=np.int64)
+        count = _find_near((x, y, dx, dy), self._ends, self._radius + _NEAR, near)
+        for k in near[:count].tolist():
+            shares[k] = self.free_share(x.item(k), y.item(k), dx.item(k), dy.item(k))
         return shares
 
     def __getstate__(self) -> dict[str, Any]:
@@ -123,3 +123,58 @@ def _outward(
     if hit.alpha > 0.0 or hit.shape is None:
         return hit.normal
     return hit.shape.point_query(start).gradient
+
+
+@jit
+def _find_near(
+    moves: tuple[Array, Array, Array, Array],
+    walls: Array,
+    reach: float,
+    near: IntArray,
+) -> int:
+    """List the moves (x, y, dx, dy) that come within reach of a wall; return how many.
+
+    A wall beyond the length of the move from its start is out of reach at once.
+    """
+    x, y, dx, dy = moves
+    count = 0
+    for k in range(len(x)):
+        way = x[k], y[k], x[k] + dx[k], y[k] + dy[k]
+        length = math.sqrt(dx[k] * dx[k] + dy[k] * dy[k])
+        for w in range(len(walls)):
+            wall = walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
+            if _gap(way[0], way[1], wall) <= reach + length and _meet(way, wall, reach):
+                near[count] = k
+                count += 1
+                break
+    return count
+
+
+@njit_internal
+def _meet(way: Wall, wall: Wall, reach: float) -> bool:
+    """Return whether two segments come within reach of each other."""
+    if _has_ends_apart(way, wall) and _has_ends_apart(wall, way):
+        return True
+    gap = min(_gap(way[0], way[1], wall), _gap(way[2], way[3], wall))
+    return min(gap, _gap(wall[0], wall[1], way), _gap(wall[2], wall[3], way)) <= reach
+
+
+@njit_internal
+def _gap(x: float, y: float, segment: Wall) -> float:
+    """Compute the distance of a point from a segment."""
+    ax, ay, bx, by = segment
+    along_x, along_y, apart_x, apart_y = bx - ax, by - ay, x - ax, y - ay
+    squared = along_x * along_x + along_y * along_y
+    share = (apart_x * along_x + apart_y * along_y) / squared if squared > 0.0 else 0.0
+    share = min(max(share, 0.0), 1.0)
+    apart_x, apart_y = apart_x - share * along_x, apart_y - share * along_y
+    return math.sqrt(apart_x * apart_x + apart_y * apart_y)
+
+
+@njit_internal
+def _has_ends_apart(segment: Wall, other: Wall) -> bool:
+    """Return whether the ends of a segment lie on both sides of another, or on it."""
+    ax, ay, bx, by = other
+    first = (segment[0] - ax) * (by - ay) - (segment[1] - ay) * (bx - ax)
+    last = (segment[2] - ax) * (by - ay) - (segment[3] - ay) * (bx - ax)
+    return first * last <= 0.0
