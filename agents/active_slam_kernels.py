@@ -99,7 +99,7 @@ class Scratch(NamedTuple):
 @jit
 def advance(
     chosen: BoolArray,
-    moved: bool,
+    moving: BoolArray,
     worlds: tuple[Any, ...],
     plan: tuple[Any, ...],
     rules: tuple[Any, ...],
@@ -107,9 +107,10 @@ def advance(
 ) -> None:
     """Take the chosen worlds (B,) through a step, or begin their episodes.
 
-    The others do not change. The arrays come as plain tuples, the entries of `Worlds`,
-    `Floor`, `Rules` and `Scratch`: numba takes microseconds to recognise a NamedTuple.
-    With `moved` False progress starts from nothing, and there is no outcome.
+    Of the chosen worlds, those that move take a step. The progress of the others starts
+    from nothing, and they have no outcome. Worlds not chosen stay. The arrays come as
+    plain tuples, the entries of `Worlds`, `Floor`, `Rules` and `Scratch`: numba takes
+    microseconds to recognise a NamedTuple.
     """
     beliefs, actions, collisions, episodes, outcome, belief_features, features = worlds
     now, result = Episodes(*episodes), StepOutcome(*outcome)
@@ -120,7 +121,9 @@ def advance(
     floor = Floor(cells, walls, bounds, diagonal, View(*view))
     for b in range(len(chosen)):
         if chosen[b]:
-            advance_world(b, moved, everything, floor, Rules(*rules), Scratch(*scratch))
+            advance_world(
+                b, moving[b], everything, floor, Rules(*rules), Scratch(*scratch)
+            )
 
 
 @njit_internal

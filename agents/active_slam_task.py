@@ -131,6 +131,7 @@ class ActiveSlamTask:
             },
             **{key: ((count, size), np.dtype(float)) for key, size in _SIZES.items()},
         }
+        self._all = np.ones(count, dtype=np.bool_)
         self._rows: dict[str, AnyArray] = {}
         self._sets: dict[str, AnyArray] = {}
         self.episodes = Episodes(
@@ -153,22 +154,22 @@ class ActiveSlamTask:
         sets = self._sets or self._empty_sets()
         self._sets = {key: row.copy() for key, row in sets.items()}
         self.outcome.success[worlds] = False
-        self._advance(beliefs, worlds, moved=False)
+        self._advance(beliefs, worlds, ~worlds)
 
     def proceed(
         self,
         beliefs: BatchStorage,
-        worlds: BoolArray,
+        moving: BoolArray,
         actions: ArrayLike,
         collisions: BoolArray,
     ) -> StepOutcome:
-        """Take some worlds, (B,), through a step and its scan.
+        """Take moving worlds, (B,), through a step and its scan.
 
-        The observations of other worlds are undefined until `begin`.
+        The others begin episodes, after their first scan.
         """
         self._rows, self._sets = self._empty_rows(), self._empty_sets()
         self.outcome = _no_outcome(self._shape[0])
-        self._advance(beliefs, worlds, actions, collisions, moved=True)
+        self._advance(beliefs, self._all, moving, actions, collisions)
         return self.outcome
 
     def observations(self) -> dict[str, AnyArray]:
@@ -184,10 +185,9 @@ class ActiveSlamTask:
         self,
         beliefs: BatchStorage,
         worlds: BoolArray,
+        moving: BoolArray,
         actions: ArrayLike = ((0.0, 0.0),),
         collisions: BoolArray | None = None,
-        *,
-        moved: bool,
     ) -> None:
         rows = tuple(self._rows.values())
         first = len(rows) - len(_SIZES)
@@ -201,7 +201,7 @@ class ActiveSlamTask:
             rows[first:],
         )
         plan = self.grid.plan
-        advance(worlds, moved, worlds_now, plan, self._rules, self._scratch)
+        advance(worlds, moving, worlds_now, plan, self._rules, self._scratch)
         if self._sets:
             write_landmark_sets(worlds, beliefs, self.episodes.known, self._sets)
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -81,6 +82,7 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
             estimator, self.scenario, num_envs, count, estimator_options
         )
         by_id = self.scenario.sensor.identities
+        self._all = np.ones(num_envs, dtype=np.bool_)
         self._record = None if by_id else AssociationRecord(num_envs)
 
     def beliefs(self) -> BatchBeliefs:
@@ -90,7 +92,9 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         return self._filters.beliefs()
 
     def _reward(self, actions: ArrayLike, moving: BoolArray) -> tuple[Array, BoolArray]:
-        self._filter(moving, moved=True)
+        if np.count_nonzero(moving) < self.num_envs:
+            self._begin_filters(~moving)
+        self._filter(self._all, moving)
         outcome = self.task.proceed(
             self._filters.storage(), moving, actions, self._worlds.collisions
         )
@@ -99,14 +103,17 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
     def _begin(self, worlds: BoolArray, seeds: Sequence[int | None] = ()) -> None:
         """Start episodes in some worlds, each with its first scan."""
         super()._begin(worlds, seeds)
+        self._begin_filters(worlds)
+        self._filter(worlds, ~worlds)
+        self.task.begin(self._filters.storage(), worlds)
+
+    def _begin_filters(self, worlds: BoolArray) -> None:
         if self._record is not None:
             self._record.begin(worlds)
         estimates = self._worlds.start_estimates
         self._filters.reset(estimates, self.scenario.start.std, runs=worlds)
-        self._filter(worlds, moved=False)
-        self.task.begin(self._filters.storage(), worlds)
 
-    def _filter(self, worlds: BoolArray, *, moved: bool) -> None:
+    def _filter(self, worlds: BoolArray, moved: BoolArray) -> None:
         observations = super()._observations()
         if self._record is not None:
             true_ids: Any = self._worlds.landmark_ids

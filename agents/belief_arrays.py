@@ -70,7 +70,7 @@ def update_batch(
     observations: Mapping[str, AnyArray],
     worlds: BoolArray,
     *,
-    moved: bool,
+    moved: BoolArray,
 ) -> None:
     """Update the filters of some worlds with one observation each.
 
@@ -82,23 +82,23 @@ def update_batch(
         The batched observation of a landmark world, each key with a leading axis B.
     worlds : bool ndarray, shape (B,)
         Worlds whose filters are updated.
-    moved : bool
-        Whether the worlds have moved. False for the scan from the start.
+    moved : bool ndarray, shape (B,)
+        Which of them have moved; the others take the scan from their start.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         If a filter fails; the message names its world.
     """
-    filters.run(
-        observations["odometry"][:, None],
-        observations["landmarks"][:, None],
-        observations["mask"][:, None],
-        float(moved),
+    filters.step(
+        observations["odometry"],
+        observations["landmarks"],
+        observations["mask"],
+        moved.astype(np.float64),
         runs=worlds,
     )
     failed = filters.failed_at >= 0
-    if failed.any():
+    if np.count_nonzero(failed):
         raise np.linalg.LinAlgError(
             f"the filter of world {int(np.argmax(failed))} has failed: its belief or "
             "measurement_std is degenerate, or its observation is not finite"

@@ -85,6 +85,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         self.single_observation_space = single
         self.observation_space = batch_space(single, self.num_envs)
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        self._all = np.ones(self.num_envs, dtype=np.bool_)
         self._begun = False
 
     @property
@@ -116,9 +117,9 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
             self._finish(observations, ended, infos)
         else:
             begun = self._ended & (self._mode == AutoresetMode.NEXT_STEP)
-            self._update(observations, ~begun, moved=True)
-            if begun.any():
-                self._begin(observations, begun)
+            if np.count_nonzero(begun):
+                self._restart(begun)
+            self._update(observations, self._all, moved=~begun)
             self._ended = ended
         return self._with_beliefs(observations), rewards, terminated, truncated, infos
 
@@ -130,7 +131,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         for world in np.flatnonzero(ended).tolist():
             for key, rows in last.items():
                 rows[world] = infos["final_obs"][world][key]
-        self._update(last, np.ones(self.num_envs, dtype=np.bool_), moved=True)
+        self._update(last, self._all, moved=self._all)
         if not ended.any():
             return
         shown = self._with_beliefs(last)
@@ -138,13 +139,16 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
         self._begin(observations, ended)
 
     def _begin(self, observations: Observation, worlds: BoolArray) -> None:
+        self._restart(worlds)
+        self._update(observations, worlds, moved=~worlds)
+
+    def _restart(self, worlds: BoolArray) -> None:
         worlds_of: Any = self.env.unwrapped
         estimates = worlds_of.start_estimates
         self._filters.reset(estimates, self.scenario.start.std, runs=worlds)
-        self._update(observations, worlds, moved=False)
 
     def _update(
-        self, observations: Observation, worlds: BoolArray, *, moved: bool
+        self, observations: Observation, worlds: BoolArray, *, moved: BoolArray
     ) -> None:
         if self._missing_rows:
             longer = {

@@ -75,7 +75,11 @@ class SeparateFilters:
             self._steps[run] = 0
 
     def update(
-        self, observations: Mapping[str, AnyArray], worlds: BoolArray, *, moved: bool
+        self,
+        observations: Mapping[str, AnyArray],
+        worlds: BoolArray,
+        *,
+        moved: BoolArray,
     ) -> None:
         """Update the filters of some worlds with an observation, batched along B.
 
@@ -85,12 +89,12 @@ class SeparateFilters:
             Batched observations of a landmark world.
         worlds : bool ndarray, shape (B,)
             Worlds whose filters are updated.
-        moved : bool
-            Whether the worlds have moved. False for the scan from the start.
+        moved : bool ndarray, shape (B,)
+            Which of them have moved; the others take the scan from their start.
         """
         for run in np.flatnonzero(worlds).tolist():
             slam = self.filters[run]
-            if moved:
+            if moved[run]:
                 slam.predict(observations["odometry"][run])
                 self._steps[run] += 1
             seen = np.flatnonzero(observations["mask"][run])
@@ -142,7 +146,7 @@ def update_filters(
     observations: Mapping[str, AnyArray],
     worlds: BoolArray,
     *,
-    moved: bool,
+    moved: BoolArray,
 ) -> None:
     """Update the filters of some worlds; see `SeparateFilters.update`."""
     if isinstance(filters, SeparateFilters):

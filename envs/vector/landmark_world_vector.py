@@ -151,17 +151,19 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
         gymnasium.error.ResetNeeded
             Before `reset`. Without autoreset also for worlds that have ended.
         """
-        resetting, moving = self._ended, None
+        resetting = self._ended
+        moving = ~resetting
         if np.count_nonzero(resetting):
             self._refuse_without_autoreset(resetting)
-            moving = ~resetting
-        self._worlds.step(actions, moving)
+            self._worlds.step(actions, moving, self._generators())
+        else:
+            self._worlds.step(actions)
         self._steps_left -= 1
         if self._renderer is not None:
-            self._renderer.add(self._worlds, ~resetting)
-        rewards, terminated = self._reward(actions, ~resetting)
-        if moving is not None:
-            self._begin(resetting)
+            self._renderer.add(self._worlds, moving)
+        if np.count_nonzero(resetting):
+            self._note_begun(resetting)
+        rewards, terminated = self._reward(actions, moving)
         truncated = ~terminated & (self._steps_left <= 0)
         ended, final = terminated | truncated, {}
         self._ended = ended
@@ -241,13 +243,19 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
         for world, (rng, used) in fresh.items():
             self._rngs[world], self._seeds[world] = rng, used
         self._worlds.reset(self._generators(), worlds)
+        self._note_begun(worlds)
+
+    def _note_begun(self, worlds: BoolArray) -> None:
         self._steps_left[worlds] = self._steps
         self._ended = self._ended & ~worlds
         if self._renderer is not None:
             self._renderer.begin(self._worlds, worlds)
 
     def _reward(self, actions: ArrayLike, moving: BoolArray) -> tuple[Array, BoolArray]:
-        """Return the rewards of a step, and which episodes it terminates."""
+        """Return the rewards of a step, and which episodes it terminates.
+
+        Worlds that do not move begin an episode.
+        """
         return np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
 
     def _observations(self) -> Observations:

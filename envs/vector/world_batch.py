@@ -29,6 +29,7 @@ from ..spaces import count_rows
 from ..streams.episodes import EpisodeStarts, episode_keys
 from .drawn_worlds import DrawnWorlds
 
+Generators = Sequence[np.random.Generator]
 Scan = tuple[Array, BoolArray, IntArray | None]
 
 _READINGS_AT_ONCE = 8192
@@ -37,8 +38,7 @@ _READINGS_AT_ONCE = 8192
 class WorldBatch:
     """B independent worlds of one scenario.
 
-    World i equals, to the bit, a single `LandmarkWorldEnv` whose ``np_random`` is the
-    generator i.
+    World i equals, to the bit, a `LandmarkWorldEnv` whose ``np_random`` is generator i.
 
     Parameters
     ----------
@@ -136,11 +136,7 @@ class WorldBatch:
         """Start poses for filters, shape (B, 3) [m, m, rad], a copy."""
         return self._start_estimates.copy()
 
-    def reset(
-        self,
-        generators: Sequence[np.random.Generator],
-        worlds: BoolArray | None = None,
-    ) -> None:
+    def reset(self, generators: Generators, worlds: BoolArray | None = None) -> None:
         """Start an episode in some worlds, and measure from its start.
 
         Parameters
@@ -159,10 +155,12 @@ class WorldBatch:
             If a world that has never been reset is not chosen.
         """
         chosen = self._chosen(worlds)
-        if len(generators) != self.count:
-            raise ValueError(
-                f"generators must be {self.count}, one per world, got {len(generators)}"
-            )
+        self._begin(chosen, generators)
+        self._measure_some(chosen)
+
+    def _begin(self, chosen: IndexArray, generators: Generators) -> None:
+        """Start an episode in some worlds, without a scan."""
+        self._check_number(generators)
         keys = episode_keys([generators[world] for world in chosen.tolist()])
         poses, estimates = self._start(chosen, keys)
         self._noise.begin(chosen, keys)
@@ -172,7 +170,6 @@ class WorldBatch:
         self.odometry = _replaced(self.odometry, chosen, 0.0)
         self.collisions = _replaced(self.collisions, chosen, False)
         self.begun = True
-        self._measure_some(chosen)
 
     def _start(self, chosen: IndexArray, keys: WordArray) -> tuple[Array, Array]:
         """Place landmarks; return true and estimated start poses, each (b, 3)."""
@@ -183,7 +180,12 @@ class WorldBatch:
             self._landmarks[chosen] = self._starts.landmarks(keys)
         return self._starts.poses(keys)
 
-    def step(self, actions: ArrayLike, moving: BoolArray | None = None) -> None:
+    def step(
+        self,
+        actions: ArrayLike,
+        moving: BoolArray | None = None,
+        generators: Generators | None = None,
+    ) -> None:
         """Drive and turn for one step, then measure.
 
         Parameters
@@ -191,8 +193,9 @@ class WorldBatch:
         actions : array_like, shape (B, 2)
             (v, ω) [m/s, rad/s], clipped to the limits of the robot.
         moving : bool ndarray, shape (B,), optional
-            Worlds that take the step (None: all). The others do not change, and their
-            actions are ignored.
+            Worlds that take the step (None: all); actions of others are ignored.
+        generators : sequence of numpy.random.Generator, length B, optional
+            With them, the other worlds start an episode, as in `reset`.
 
         Raises
         ------
@@ -207,9 +210,13 @@ class WorldBatch:
             moving = self._truth_values(moving, "moving")
             if np.count_nonzero(moving) == self.count:
                 moving = None
+        if generators is not None:
+            self._check_number(generators)
         clipped = clipped_actions(actions, self._limits, moving)
         self._noise.advance(moving)
         self._drive(clipped * self.scenario.dt, moving)
+        if moving is not None and generators is not None:
+            self._begin(np.flatnonzero(~moving), generators)
         self.measurements, self.mask, self.landmark_ids = self._scan_all()
 
     def _truth_values(self, value: BoolArray, name: str) -> BoolArray:
@@ -220,6 +227,12 @@ class WorldBatch:
                 f"got {array.dtype} of shape {array.shape}"
             )
         return array
+
+    def _check_number(self, generators: Generators) -> None:
+        if len(generators) != self.count:
+            raise ValueError(
+                f"generators must be {self.count}, one per world, got {len(generators)}"
+            )
 
     def _chosen(self, worlds: BoolArray | None) -> IndexArray:
         if worlds is None:
@@ -234,9 +247,7 @@ class WorldBatch:
         slip, error = self._odometer.split_noise(commands, self._noise.motion(std))
         share = self._bodies.drive(commands, slip, moving)
         odometry = self._odometer.read(commands, share, error)
-        collisions = np.zeros(self.count, dtype=np.bool_)
-        if share is not None:
-            np.less(share, 1.0, out=collisions)
+        collisions = np.zeros(self.count, np.bool_) if share is None else share < 1.0
         if moving is not None:
             odometry = np.where(moving[:, None], odometry, self.odometry)
             collisions = np.where(moving, collisions, self.collisions)

@@ -8,23 +8,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array, IntArray
-from ..interface import Belief
-from ..kernels.batch import NEVER, RunArrays, StepData, drive_runs
-from ..kernels.belief_arrays import aligned_zeros
+from ...arrays import Array, BoolArray, IntArray
+from ..kernels.batch import (
+    NEVER,
+    StepData,
+    drive_runs,
+    step_runs,
+)
 from ..kernels.scan_rows import Workspace
 from ..models.angles import wrap_angle
 from ..support import argument_checks
 from ..support.threads import share_out, usable_cores
-from .batch_arguments import checked_beliefs, chosen_runs, first_poses, step_data
-from .batch_results import BatchBeliefs, BatchStorage, BatchTrace
+from .batch_arguments import (
+    chosen_runs,
+    first_poses,
+    step_data,
+    step_scans,
+)
+from .batch_beliefs import BatchOfBeliefs
+from .batch_results import BatchTrace
 from .ekf import EkfSlam
-from .gaussian_map import GaussianMap
 from .map_filter import FRAMES
 from .scan_workspace import workspace_for
 
 
-class BatchSlam:
+class BatchSlam(BatchOfBeliefs):
     """B runs of one filter, each with its own data, visibility and map.
 
     Run i has the same bits as a single filter with the data of run i.  Landmark ids
@@ -90,20 +98,8 @@ class BatchSlam:
             "initial_pose_std", initial_pose_std, 3
         )
         first = first_poses("initial_poses", initial_poses, self.runs)
-        capacity = GaussianMap.capacity_for(self.landmarks)
-        self._means = np.zeros((self.runs, capacity))
-        self._references = np.zeros((self.runs, capacity))
-        self._covariances = aligned_zeros(self.runs, capacity, capacity)
-        self._means[:, :3] = self._references[:, :3] = first
-        self._covariances[:, range(3), range(3)] = std**2
-        self._slots = np.full((self.runs, self.landmarks), -1, dtype=np.int64)
-        self._mapped = np.zeros(self.runs, dtype=np.int64)
+        super().__init__(first, std, self.landmarks, FRAMES[self.rules.frame])
         self._kept_room: Workspace | None = None
-        self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
-        """Step of the last :meth:`run` at which a run stopped, -1 if it did not.
-
-        A stopped run remains stopped, at step 0 of every later :meth:`run`.
-        """
 
     def run(
         self,
@@ -138,13 +134,7 @@ class BatchSlam:
         data, durations = step_data(
             odometry, measurements, visible, dt, (self.runs, self.landmarks)
         )
-        count, steps = data.odometry.shape[:2]
-        trace = BatchTrace(
-            np.full((count, steps, 3), np.nan),
-            np.full((count, steps, 3, 3), np.nan),
-            np.full((count, steps), np.nan),
-            np.zeros((count, steps), dtype=np.int64),
-        )
+        trace = BatchTrace.empty(*data.odometry.shape[:2])
         chosen = chosen_runs(runs, self.runs)
         failed_at = np.where(chosen, self.failed_at, 0)  # the kernel passes these over
         drive = partial(self._drive, data, durations, trace, failed_at)
@@ -153,97 +143,28 @@ class BatchSlam:
         trace.poses[..., 2] = wrap_angle(trace.poses[..., 2])
         return trace
 
-    def reset(
+    def step(
         self,
-        poses: ArrayLike,
-        pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        odometry: ArrayLike,
+        measurements: ArrayLike,
+        visible: ArrayLike,
+        dt: ArrayLike,
         *,
         runs: ArrayLike | None = None,
     ) -> None:
-        """Restart runs with empty maps, also those that had stopped.
+        """Run one step, without a trace; :attr:`failed_at` is 0 for runs that fail.
 
         Parameters
         ----------
-        poses : array_like, shape (3,) or (B, 3)
-            Means of the first poses [m, m, rad].
-        pose_std : array_like, shape (3,)
-            Their standard deviation.
-        runs : array_like of bool, shape (B,), optional
-            The runs that start anew; by default all; the others continue.
+        odometry, measurements, visible, runs
+            As in :meth:`run`, without the axis of steps.
+        dt : array_like, shape (B,)
+            Duration of the step of each run.
         """
-        std = argument_checks.standard_deviations("pose_std", pose_std, 3)
-        first = first_poses("poses", poses, self.runs)
-        chosen = chosen_runs(runs, self.runs)
-        self._means[chosen] = self._references[chosen] = 0.0
-        self._covariances[chosen] = 0.0
-        at = np.flatnonzero(chosen)
-        self._means[at, :3] = self._references[at, :3] = first[at]
-        self._covariances[at[:, None], range(3), range(3)] = std**2
-        self._slots[chosen] = -1
-        self._mapped[chosen] = 0
-        self.failed_at[chosen] = NEVER
-
-    def beliefs(self) -> BatchBeliefs:
-        """Return a snapshot of all beliefs; a run that stopped has its last."""
-        return self.storage().beliefs()
-
-    def storage(self) -> BatchStorage:
-        """Return the arrays that the runs work on, without a copy.
-
-        They change with the next :meth:`run` or :meth:`reset`.
-        """
-        return BatchStorage.of(self._means, self._covariances, self._slots)
-
-    @property
-    def references(self) -> Array:
-        """Linearisation points, stored like the means, for filters that fix them."""
-        return BatchStorage.of(self._references, self._covariances, self._slots).means
-
-    def load(
-        self,
-        beliefs: BatchBeliefs,
-        *,
-        references: ArrayLike | None = None,
-        runs: ArrayLike | None = None,
-    ) -> None:
-        """Continue runs from given beliefs, also those that had stopped.
-
-        Parameters
-        ----------
-        beliefs : BatchBeliefs
-            Of B runs, as :meth:`beliefs` returns them, or `BatchBeliefs.of` makes them.
-        references : array_like, shape (B, 3 + 2L), optional
-            Linearisation points of filters that fix them; the means by default.
-        runs : array_like of bool, shape (B,), optional
-            All by default.
-
-        Raises
-        ------
-        ValueError
-            If a shape is wrong, or a belief cannot be; nothing is loaded.
-        """
-        chosen = chosen_runs(runs, self.runs)
-        loaded = checked_beliefs(beliefs, references, chosen, self.landmarks)
-        for run in np.flatnonzero(chosen).tolist():
-            loaded.write(run, self._arrays())
-        self.failed_at[chosen] = NEVER
-
-    def belief(self, run: int) -> Belief:
-        """Return the belief of one run as a snapshot."""
-        n = 3 + 2 * int(self._mapped[run])
-        slots = self._slots[run]
-        order = np.argsort(slots[slots >= 0])
-        return Belief(
-            self._means[run, :n],
-            self._covariances[run, :n, :n],
-            tuple(np.flatnonzero(slots >= 0)[order].tolist()),
-            FRAMES[self.rules.frame],
-        )
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the beliefs of all runs [bytes]."""
-        return sum(array.nbytes for array in self._arrays())
+        shape = self.runs, self.landmarks
+        scans = step_scans(odometry, measurements, visible, dt, shape)
+        drive = partial(self._step, scans, chosen_runs(runs, self.runs))
+        share_out(drive, self.runs, self._threads)
 
     def __repr__(self) -> str:
         few, most = self._mapped.min(), self._mapped.max()
@@ -270,9 +191,15 @@ class BatchSlam:
             _of(slice(None), self._room()),
         )
 
-    def _arrays(self) -> RunArrays:
-        return RunArrays(
-            self._means, self._covariances, self._references, self._slots, self._mapped
+    def _step(self, scans: tuple[Any, ...], chosen: BoolArray, part: slice) -> None:
+        step_runs(
+            _of(part, self._arrays()),
+            _of(part, scans),
+            chosen[part],
+            self.failed_at[part],
+            self.motion_values,
+            self.rule_values,
+            tuple(self._room()),
         )
 
     def _room(self) -> Workspace:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, BoolArray
+from ...magnitudes import LARGEST
 from ..kernels.batch import RunArrays, StepData
 from ..support import argument_checks, saved_states
 from .batch_results import BatchBeliefs
@@ -45,6 +46,36 @@ def step_data(
         raise ValueError(f"dt must be finite numbers >= 0, got {dt!r}")
     argument_checks.refuse_beyond("dt", durations, dt)
     return StepData(u, z, seen), durations
+
+
+def step_scans(
+    odometry: ArrayLike,
+    measurements: ArrayLike,
+    visible: ArrayLike,
+    dt: ArrayLike,
+    shape: tuple[int, int],
+) -> tuple[Array, Array, BoolArray, Array]:
+    """Return the data of one step and its durations, or refuse them.
+
+    ``shape`` is (B, L), the numbers of runs and landmarks.
+    """
+    (count, landmarks), u = shape, argument_checks.as_floats("odometry", odometry)
+    z = argument_checks.as_floats("measurements", measurements)
+    seen = np.ascontiguousarray(visible, dtype=np.bool_)
+    durations = argument_checks.as_floats("dt", dt)
+    for name, array, expected in (
+        ("odometry", u, (count, 2)),
+        ("measurements", z, (count, landmarks, 2)),
+        ("visible", seen, (count, landmarks)),
+        ("dt", durations, (count,)),
+    ):
+        if array.shape != expected:
+            raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+    if not (durations.min() >= 0.0 and durations.max() <= LARGEST):
+        raise ValueError(
+            f"dt must be finite numbers >= 0 and at most {LARGEST:g}, got {dt!r}"
+        )
+    return u, z, seen, durations
 
 
 def chosen_runs(runs: ArrayLike | None, count: int) -> BoolArray:

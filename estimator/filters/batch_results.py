@@ -24,6 +24,16 @@ class BatchTrace(NamedTuple):
     degrees_of_freedom: IntArray
     """Of the NIS, shape (B, T)."""
 
+    @classmethod
+    def empty(cls, runs: int, steps: int) -> BatchTrace:
+        """Return a trace of runs that have not begun: nan, and zero degrees."""
+        return cls(
+            np.full((runs, steps, 3), np.nan),
+            np.full((runs, steps, 3, 3), np.nan),
+            np.full((runs, steps), np.nan),
+            np.zeros((runs, steps), dtype=np.int64),
+        )
+
 
 class BatchBeliefs(NamedTuple):
     """The present belief of every run; the states are (x, y, θ, l0x, l0y, …)."""

@@ -1,6 +1,6 @@
 """Loop over runs and steps, compiled, with the kernels of a single filter."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -69,60 +69,152 @@ def drive_runs(
     """
     runs, data = RunArrays(*run_arrays), StepData(*step_data)
     poses, pose_covariances, nis, degrees_of_freedom = trace
-    rows, before, prior = workspace_arrays
-    linearisation = as_rules(rule_values).linearisation
-    landmarks = runs.slots.shape[1]
-    ledger = np.zeros((LEDGER_HEIGHT, landmarks), np.int64)
-    readings = np.empty((landmarks, 2))
-    ids = np.empty(landmarks, np.int64)
-    variance = np.empty(3)
+    room = new_room(runs.slots.shape[1], workspace_arrays)
     for b in range(len(failed_at)):
         if failed_at[b] != NEVER:
             failed_at[b] = 0
             continue
         mean, covariance = runs.means[b], runs.covariances[b]
-        reference, slots = runs.references[b], runs.slots[b]
         for t in range(len(dt)):
-            d, turn = data.odometry[b, t, 0], data.odometry[b, t, 1]
-            m = gather(
-                data.measurements[b, t],
-                data.visible[b, t],
-                slots,
-                readings,
-                ids,
-                ledger,
+            odometry, visible = data.odometry[b, t], data.visible[b, t]
+            scan = odometry, data.measurements[b, t], visible
+            used, nis[b, t] = step_run(
+                b, runs, scan, dt[t], motion_values, rule_values, room
             )
-            if not (usable(d) and usable(turn) and m >= 0):
-                failed_at[b] = t
-                break
-            share = dt[t] if motion_values[3] > 0 or d != 0 or turn != 0 else 0.0
-            for i in range(3):
-                variance[i] = motion_values[i] * share
-            size = 3 + 2 * runs.mapped[b]
-            predict(mean, covariance, reference, size, d, turn, variance, linearisation)
-            status, used, nis[b, t] = update_belief(
-                mean,
-                covariance,
-                reference,
-                size,
-                readings,
-                m,
-                ledger,
-                rows,
-                before,
-                prior,
-                rule_values,
-            )
-            if status != DONE:
-                nis[b, t] = np.nan
+            if used < 0:
                 failed_at[b] = t
                 break
             degrees_of_freedom[b, t] = 2 * used
-            runs.mapped[b] += note_new(m, ids, ledger, slots, runs.mapped[b])
             for i in range(3):
                 poses[b, t, i] = mean[i]
                 for j in range(3):
                     pose_covariances[b, t, i, j] = covariance[i, j]
+
+
+@jit
+def step_runs(
+    run_arrays: tuple[Any, ...],
+    scans: tuple[Any, ...],
+    chosen: Bool,
+    failed_at: IntArray,
+    motion_values: Array,
+    rule_values: Array,
+    workspace_arrays: tuple[Any, ...],
+) -> None:
+    """Take each chosen run, (B,), through one step, in place.
+
+    Parameters
+    ----------
+    scans
+        Odometry (B, 2), measurements (B, L, 2), which are visible (B, L), and the
+        duration of the step of each run (B,).
+    failed_at : ndarray, shape (B,)
+        On return 0 for a chosen run that failed, now or before.
+
+    See Also
+    --------
+    drive_runs : The other parameters.
+    """
+    runs = RunArrays(*run_arrays)
+    odometry, measurements, visible, dt = scans
+    room = new_room(runs.slots.shape[1], workspace_arrays)
+    for b in range(len(chosen)):
+        if not chosen[b]:
+            continue
+        used = -1
+        if failed_at[b] == NEVER:
+            scan = odometry[b], measurements[b], visible[b]
+            used, _ = step_run(b, runs, scan, dt[b], motion_values, rule_values, room)
+        if used < 0:
+            failed_at[b] = 0
+
+
+@jit
+def begin_runs(
+    run_arrays: tuple[Any, ...],
+    chosen: Bool,
+    poses: Array,
+    variances: Array,
+) -> None:
+    """Restart the chosen runs, (B,), at poses (B, 3) with variances (3,)."""
+    runs = RunArrays(*run_arrays)
+    for b in range(len(chosen)):
+        if chosen[b]:
+            runs.means[b], runs.references[b], runs.covariances[b] = 0.0, 0.0, 0.0
+            runs.slots[b], runs.mapped[b] = NEVER, 0
+            for i in range(3):
+                runs.means[b, i] = runs.references[b, i] = poses[b, i]
+                runs.covariances[b, i, i] = variances[i]
+
+
+class StepRoom(NamedTuple):
+    """Room for one step of one run."""
+
+    ledger: IntArray
+    readings: Array
+    ids: IntArray
+    variance: Array
+    workspace: tuple[Any, ...]
+
+
+@njit_internal
+def new_room(landmarks: int, workspace_arrays: tuple[Any, ...]) -> StepRoom:
+    """Allocate room for scans of so many landmarks."""
+    return StepRoom(
+        np.zeros((LEDGER_HEIGHT, landmarks), np.int64),
+        np.empty((landmarks, 2)),
+        np.empty(landmarks, np.int64),
+        np.empty(3),
+        workspace_arrays,
+    )
+
+
+@njit_internal
+def step_run(
+    b: int,
+    runs: RunArrays,
+    scan: tuple[Array, Array, Bool],
+    dt: float,
+    motion_values: Array,
+    rule_values: Array,
+    room: StepRoom,
+) -> tuple[int, float]:
+    """Take one run through a step: one predict and one update.
+
+    Returns the number of readings of mapped landmarks in use, and their NIS; -1 and nan
+    where the run fails.
+    """
+    mean, covariance = runs.means[b], runs.covariances[b]
+    reference, slots = runs.references[b], runs.slots[b]
+    ledger, readings, ids, variance, workspace = room
+    rows, before, prior = workspace
+    odometry, measurements, visible = scan
+    d, turn = odometry[0], odometry[1]
+    m = gather(measurements, visible, slots, readings, ids, ledger)
+    if not (usable(d) and usable(turn) and m >= 0):
+        return -1, np.nan
+    share = dt if motion_values[3] > 0 or d != 0 or turn != 0 else 0.0
+    for i in range(3):
+        variance[i] = motion_values[i] * share
+    size, linearisation = 3 + 2 * runs.mapped[b], as_rules(rule_values).linearisation
+    predict(mean, covariance, reference, size, d, turn, variance, linearisation)
+    status, used, nis = update_belief(
+        mean,
+        covariance,
+        reference,
+        size,
+        readings,
+        m,
+        ledger,
+        rows,
+        before,
+        prior,
+        rule_values,
+    )
+    if status != DONE:
+        return -1, np.nan
+    runs.mapped[b] += note_new(m, ids, ledger, slots, runs.mapped[b])
+    return used, nis
 
 
 @njit_internal

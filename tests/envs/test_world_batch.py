@@ -252,6 +252,24 @@ def test_free_shares_are_the_single_ones_near_and_far_from_walls():
     assert bits(contacts.free_shares(x, y, dx, dy)) == bits(expected)
 
 
+# --- steps in which some worlds begin ---
+
+
+@pytest.mark.parametrize("name", ["drawn anew, by id", "everything", "map shifted"])
+def test_worlds_that_begin_in_a_step_are_those_of_a_step_and_a_reset(name):
+    scenario, rng = SCENARIOS[name], np.random.default_rng(3)
+    once, twice = begun(scenario), begun(scenario)
+    ours, theirs = generators(seed=70), generators(seed=70)
+    for _ in range(12):
+        wanted, moving = actions(rng), rng.random(WORLDS) < 0.7
+        once.step(wanted, moving, ours)
+        twice.step(wanted, moving)
+        if not moving.all():
+            twice.reset(theirs, ~moving)
+        for part in NAMES:
+            assert bits(getattr(once, part)) == bits(getattr(twice, part)), part
+
+
 # --- bad input ---
 
 
@@ -298,5 +316,9 @@ def test_choices_and_generators_of_another_form_are_refused():
         batch.step(np.zeros((WORLDS, 2)), np.ones(4, dtype=bool))
     with pytest.raises(ValueError, match=r"generators must be 5.* got 4"):
         batch.reset(generators(4))
+    before = batch.poses.copy()
+    with pytest.raises(ValueError, match=r"generators must be 5.* got 4"):
+        batch.step(np.ones((WORLDS, 2)), np.arange(WORLDS) > 0, generators(4))
+    np.testing.assert_array_equal(batch.poses, before)
     with pytest.raises(ValueError, match="count must be >= 1, got 0"):
         WorldBatch(ROAMING, 0)

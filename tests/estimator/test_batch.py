@@ -357,3 +357,56 @@ def test_runs_that_are_taken_up_again_do_not_notice_the_room_of_earlier_ones(
             run_some(batch, data, slice(step, step + 1))
     for ours, theirs in zip(one.beliefs(), two.beliefs(), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+# --- step by step ---
+
+
+@pytest.mark.parametrize("case", ["ekf", "iterated", "first_estimates"])
+def test_runs_taken_step_by_step_have_the_bits_of_a_run_and_their_own_durations(
+    case, data
+):
+    name, options = CASES[case]
+    settings = {"runs": RUNS, "landmarks": LANDMARKS, **NOISE, **options}
+    batch, durations = make_batch(name, **settings), np.linspace(0.0, 2.0, RUNS)
+    for step in range(8):
+        batch.step(*(array[:, step] for array in data), durations)
+    for run, dt in enumerate(durations):
+        whole = make_batch(name, **settings)
+        whole.run(*(array[:, :8] for array in data), dt)
+        for part in ("mean", "covariance"):
+            expected = getattr(whole.belief(run), part)
+            np.testing.assert_array_equal(getattr(batch.belief(run), part), expected)
+
+
+def test_a_step_stops_runs_that_fail_and_passes_over_those_not_chosen(data):
+    odometry, measurements, visible = (array[:, 0].copy() for array in data)
+    odometry[1], odometry[3] = np.nan, np.inf
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    chosen = np.arange(RUNS) != 3
+    batch.step(odometry, measurements, visible, np.ones(RUNS), runs=chosen)
+    assert batch.failed_at.tolist() == [-1, 0, -1, -1, -1]
+    before = batch.belief(1)
+    batch.step(np.ones((RUNS, 2)), measurements, visible, np.ones(RUNS))
+    assert batch.failed_at.tolist() == [-1, 0, -1, -1, -1]
+    np.testing.assert_array_equal(batch.belief(1).mean, before.mean)
+    assert batch.belief(3).mean[0] == 1.0
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_a_step_of_another_shape_is_refused_by_name(index, data):
+    names = ("odometry", "measurements", "visible", "dt")
+    parts = [*(array[:, 0] for array in data), np.ones(RUNS)]
+    parts[index] = parts[index][:-1]
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    with pytest.raises(ValueError, match=f"{names[index]} must have shape"):
+        batch.step(*parts)
+
+
+@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf, 1e13])
+def test_a_step_of_an_odd_duration_is_refused(bad, data):
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    durations = np.ones(RUNS)
+    durations[2] = bad
+    with pytest.raises(ValueError, match="dt must be finite numbers >= 0"):
+        batch.step(*(array[:, 0] for array in data), durations)
