@@ -12,11 +12,17 @@ from bisect import bisect_left
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtrc
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.support import argument_checks
-from .chi_square import Band, chi_square_limits, family_band, to_band
+from .chi_square import (
+    Band,
+    chi_square_limits,
+    chi_square_quantile,
+    family_band,
+    to_band,
+)
 from .whiteness import ljung_box, normal_scores
 
 
@@ -123,7 +129,7 @@ def family_test(
     values = argument_checks.as_floats("nees", nees)
     runs, times = values.shape
     freedom, totals = runs * degrees_of_freedom, values.sum(axis=0)
-    p = 2 * np.minimum(chi2.cdf(totals, freedom), chi2.sf(totals, freedom))
+    p = 2 * np.minimum(chdtr(freedom, totals), chdtrc(freedom, totals))
     order = np.argsort(p)
     holm = np.maximum.accumulate(p[order] * np.arange(times, 0, -1))
     rejected = np.zeros(times, dtype=np.bool_)
@@ -161,7 +167,7 @@ def whiteness_test(
         Probability of rejecting a white series.
     """
     test = ljung_box(normal_scores(nis, degrees_of_freedom), lags=lags)
-    limit = float(chi2.ppf(1 - error_rate, lags))
+    limit = float(chi_square_quantile(1 - error_rate, lags))
     return HypothesisTest(test.statistic, Band(0.0, limit), test.p_value, error_rate)
 
 
@@ -196,7 +202,7 @@ def runs_to_detect(
     def found(runs: int) -> bool:
         freedom = runs * degrees_of_freedom
         low, high = chi_square_limits(freedom, error_rate / 2) / factor
-        return bool(chi2.cdf(low, freedom) + chi2.sf(high, freedom) >= power)
+        return bool(chdtr(freedom, low) + chdtrc(freedom, high) >= power)
 
     most = 1
     while not found(most):
@@ -216,6 +222,6 @@ def one_per_run(name: str, values: Array, least: int) -> Array:
 
 
 def _chi_square_test(total: float, freedom: int, error_rate: float) -> HypothesisTest:
-    p_value = float(2 * min(chi2.cdf(total, freedom), chi2.sf(total, freedom)))
+    p_value = float(2 * min(chdtr(freedom, total), chdtrc(freedom, total)))
     interval = to_band(chi_square_limits(freedom, error_rate / 2) / freedom)
     return HypothesisTest(total / freedom, interval, p_value, error_rate)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from ..arrays import Array
 
@@ -69,7 +69,7 @@ def ljung_box(series: Array, *, lags: int = 10) -> LjungBox:
         raise ValueError(f"lags must be in [1, {series.shape[-1]}), got {lags}")
     correlations, pairs = autocorrelation(series, lags=lags)
     statistic = float((pairs * correlations**2).sum())
-    return LjungBox(statistic, float(chi2.sf(statistic, lags)))
+    return LjungBox(statistic, float(chdtrc(lags, statistic)))
 
 
 def normal_scores(chi_squares: ArrayLike, degrees_of_freedom: ArrayLike) -> Array:

@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from ...arrays import Array
 from ...estimator.error_frames import ErrorFrame
+from ...evaluation.chi_square import chi_square_quantile
 from ...evaluation.nees import pose_nees
 from ..logs.ground_truth import true_poses_of
 from ..logs.slamlog import SlamLog
@@ -110,7 +110,7 @@ def nees_bounds(nees: Array) -> tuple[float, float]:
     products = np.fft.irfft(spectrum, 2 * len(nees))[1 : len(nees) // 2]
     together = 1 + 2 * positive_sum(products / (6 * len(nees)))
     degrees = max(3.0, 3 * len(nees) / together)
-    low, high = chi2.ppf(TAILS, degrees) / degrees
+    low, high = chi_square_quantile(TAILS, degrees) / degrees
     return float(low), float(high)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from ...arrays import Array, IntArray
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
@@ -98,7 +98,7 @@ def _judged(series: Array, together: float = 1.0) -> Whiteness:
         return Whiteness(np.nan, np.nan, 1.0)
     correlations, _ = autocorrelation(series, lags=min(LONGEST, steps // 2))
     statistic = ljung_box(series, lags=LAGS).statistic / together
-    p_value = float(chi2.sf(statistic, LAGS))
+    p_value = float(chdtrc(LAGS, statistic))
     factor = 1.0
     if p_value < SIGNIFICANT:
         factor = max(1.0, float(np.sqrt(1 + 2 * positive_sum(correlations))))

@@ -5,12 +5,12 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from ... import __version__
 from ...arrays import Array
 from ...estimator.error_frames import ErrorFrame
 from ...evaluation import nees
+from ...evaluation.chi_square import chi_square_quantile
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
 from ..logs.anonymous import hides_identities
 from ..logs.ground_truth import path_accuracy
@@ -152,7 +152,9 @@ def nis_summary(trace: RunTrace) -> dict[str, Any] | None:
         return None
     nis, dof = trace.nis[used], trace.nis_dof[used]
     tail = (1 - _SHARE) / 2
-    inside = (nis >= chi2.ppf(tail, dof)) & (nis <= chi2.ppf(1 - tail, dof))
+    inside = (nis >= chi_square_quantile(tail, dof)) & (
+        nis <= chi_square_quantile(1 - tail, dof)
+    )
     return {
         "mean": finite(nis.mean()),
         "total": finite(nis.sum()),

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from scipy.stats import chi2
 
 from ...arrays import Array, IntArray
+from ...evaluation.chi_square import chi_square_limits
 from ...sim_configs.atomic_file import replace_when_written
 from ..figures.consistency import nis_band
 from ..figures.web_style import page_template
@@ -82,7 +82,7 @@ def _page(log: SlamLog, runs: Sequence[ViewedRun], walls: list[list[float]]) -> 
         "last": runs[0].trace.last_step,
         "outcomes": OUTCOMES,
         "walls": walls,
-        "bands": {"nees": [q / 3 for q in chi2.interval(_SHARE, 3)]},
+        "bands": {"nees": [q / 3 for q in chi_square_limits(3, (1 - _SHARE) / 2)]},
         "arrays": packed.table,
     }
     return page_template(_PARTS, "page.html").render(

@@ -89,11 +89,14 @@ def test_coverage_acts_where_all_its_points_are_within_a_step():
     assert np.isfinite(baseline.act(env.knowledge)).all()
 
 
-@pytest.mark.parametrize(("name", "rooms"), [("coverage", 4), ("mpc", 2)])
+@pytest.mark.parametrize(
+    ("name", "rooms", "steps"), [("coverage", 4, ROOMS.steps), ("mpc", 3, 60)]
+)
 @pytest.mark.slow
-def test_baselines_find_their_way_through_doors(name, rooms):
-    env = ActiveSlamEnv(ROOMS)
-    baseline = make_baseline(name, ROOMS, np.random.default_rng(0))
+def test_baselines_find_their_way_through_doors(name, rooms, steps):
+    world = ROOMS.with_changes(steps=steps)
+    env = ActiveSlamEnv(world)
+    baseline = make_baseline(name, world, np.random.default_rng(0))
     seed = VALIDATION + 2  # on one map in six, mpc touches a wall
     episode = run_episode(env, baseline_policy(baseline), seed)
     assert len(np.unique((episode.path > 0) @ [1, 2])) >= rooms

@@ -16,7 +16,7 @@ from slamgym.envs.vector.landmark_world_vector import LandmarkWorldVectorEnv
 from slamgym.sim_configs import list_presets, load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
-WORLDS, STEPS, SEED = 5, 400, 3
+WORLDS, STEPS, SEED = 5, 200, 3
 WALLS = [[5.0, -2.0, 5.0, 2.0], [-4.0, 4.0, 9.0, 4.5], [1.0, -3.0, 3.0, -3.0]]
 EVERYTHING = {
     "scenario": "hidden_identities",
@@ -91,7 +91,7 @@ def reset_some(vectors, mask):
 def test_it_gives_what_gymnasiums_vector_of_single_worlds_gives(name, mode):
     """All of it: observations, rewards, ends, infos with their masks, final ones."""
     changes = WORLDS_TO_TEST[name]
-    steps = min(load_scenario(changes["scenario"]).steps, changes.get("steps", 150))
+    steps = min(load_scenario(changes["scenario"]).steps, changes.get("steps", 75))
     changes = {**changes, "steps": steps}
     pair = [native(mode=mode, **changes), sync(mode=mode, **changes)]
     same(*(vec.reset(seed=SEED) for vec in pair))

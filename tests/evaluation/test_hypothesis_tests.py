@@ -6,7 +6,11 @@ from linear_filter import kalman_scores
 from scipy.stats import chi2, norm, skew
 from scipy.stats import t as student
 
-from slamgym.evaluation.chi_square import average_band, family_band
+from slamgym.evaluation.chi_square import (
+    average_band,
+    chi_square_quantile,
+    family_band,
+)
 from slamgym.evaluation.hypothesis_tests import (
     family_test,
     final_step_test,
@@ -47,6 +51,14 @@ DECISIONS = {
     "nis": lambda _, nis: nis_test(nis, ONES),
     "whiteness": lambda _, nis: whiteness_test(nis, ONES),
 }
+
+
+def test_quantiles_are_those_of_scipy_to_the_bit():
+    rng = np.random.default_rng(0)
+    degrees, shares = rng.integers(1, 500, 999), rng.random(999)
+    np.testing.assert_array_equal(
+        chi_square_quantile(shares, degrees), chi2.ppf(shares, degrees)
+    )
 
 
 @pytest.mark.slow

@@ -4,9 +4,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from scipy.stats import chi2
 
 from ....arrays import Array
+from ....evaluation.chi_square import chi_square_quantile
 from ....evaluation.whiteness import autocorrelation, normal_scores
 from ...figures.style import GREY, dress, new_figure
 from .estimator_lines import EstimatorLook, legend_above, plain
@@ -81,7 +81,9 @@ def nis_autocorrelation(scores: EstimatorScores) -> tuple[Array, Array]:
 
 def _draw_band(axes: Axes, scores: EstimatorScores) -> None:
     steps, _, freedom = pooled_nis(scores)
-    low, high = (chi2.ppf(tail, freedom) / freedom for tail in (_TAIL, 1 - _TAIL))
+    low, high = (
+        chi_square_quantile(tail, freedom) / freedom for tail in (_TAIL, 1 - _TAIL)
+    )
     axes.fill_between(steps, low, high, color=GREY, alpha=0.25, lw=0, label="95 % band")
     axes.axhline(1, color=GREY, lw=0.8)
     axes.margins(x=0.01)
