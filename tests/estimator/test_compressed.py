@@ -131,11 +131,11 @@ def test_it_equals_the_full_filter_while_300_landmarks_come_and_go(base):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("base", "count", "steps"), [("ekf", 600, 1000), ("invariant", 1000, 400)]
+    ("base", "count", "steps"), [("ekf", 600, 500), ("invariant", 1000, 200)]
 )
 def test_it_equals_the_full_filter_while_many_landmarks_come_and_go(base, count, steps):
     _, phases = follow_both(base, count, steps, mapped=True, every=100)
-    assert phases > 3
+    assert phases > 9
 
 
 @pytest.mark.slow
