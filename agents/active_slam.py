@@ -239,8 +239,8 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         rmse = float(error(beliefs, self._landmarks[None])[0])
         success = bool(self.task.outcome.success[0])
         counts: dict[str, Any] = {
-            "mapped": int((beliefs.slots >= 0).sum()),
-            "known": int(self.task.episodes.known.sum()),
+            "mapped": int(self.task.mapped[0]),
+            "known": int(self.task.known[0]),
             "success": success,
             "true_rmse": rmse,
             "honest_success": success and rmse <= self.task.weights.accuracy,

@@ -61,6 +61,8 @@ class Worlds(NamedTuple):
     collisions: BoolArray
     episodes: Episodes
     outcome: StepOutcome
+    counts: tuple[IntArray, IntArray]
+    """Landmarks mapped and known, (B,)."""
     belief_features: FeatureArrays
     features: tuple[Array, Array, Array, Array, Array]
     """Goals, progress, uncertain, unexplored and walls, see `ActiveSlamTask`."""
@@ -112,10 +114,10 @@ def advance(
     plain tuples, the entries of `Worlds`, `Floor`, `Rules` and `Scratch`: numba takes
     microseconds to recognise a NamedTuple.
     """
-    beliefs, actions, collisions, episodes, outcome, belief_features, features = worlds
+    beliefs, actions, collisions, episodes, outcome, counts, of_belief, more = worlds
     now, result = Episodes(*episodes), StepOutcome(*outcome)
     everything = Worlds(
-        beliefs, actions, collisions, now, result, belief_features, features
+        beliefs, actions, collisions, now, result, counts, of_belief, more
     )
     cells, walls, bounds, diagonal, view = plan
     floor = Floor(cells, walls, bounds, diagonal, View(*view))
@@ -221,11 +223,13 @@ def reward_step(b: int, gain: float, worlds: Worlds, rules: Rules) -> None:
 def write_shares(
     b: int, unseen: int, mapped: int, worlds: Worlds, rules: Rules
 ) -> None:
-    """Write the shares explored, mapped, known, and of time left."""
+    """Write the shares explored, mapped, known, and of time left, and the counts."""
     shares, episodes = worlds.features[1][b], worlds.episodes
     cells, known = episodes.explored.shape[1], episodes.known[b]
+    counts = worlds.counts
+    counts[0][b], counts[1][b] = mapped, known.sum()
     shares[0] = (cells - unseen) / cells
-    shares[1], shares[2] = mapped / len(known), known.sum() / len(known)
+    shares[1], shares[2] = mapped / len(known), counts[1][b] / len(known)
     shares[3] = 1.0 - min(episodes.steps[b] / rules.steps, 1.0)
 
 

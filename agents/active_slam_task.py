@@ -94,6 +94,8 @@ class ActiveSlamTask:
         Their progress.
     outcome : StepOutcome
         Of the last step.
+    mapped, known : ndarray, shape (B,)
+        Numbers of landmarks in the present map, and of those known accurately.
     """
 
     def __init__(
@@ -141,6 +143,7 @@ class ActiveSlamTask:
             np.zeros(self._shape, dtype=np.bool_),
         )
         self.outcome = _no_outcome(count)
+        self.mapped, self.known = np.zeros((2, count), dtype=np.int64)
 
     @property
     def begun(self) -> bool:
@@ -154,6 +157,7 @@ class ActiveSlamTask:
         sets = self._sets or self._empty_sets()
         self._sets = {key: row.copy() for key, row in sets.items()}
         self.outcome.success[worlds] = False
+        self.mapped, self.known = self.mapped.copy(), self.known.copy()
         self._advance(beliefs, worlds, ~worlds)
 
     def proceed(
@@ -169,6 +173,7 @@ class ActiveSlamTask:
         """
         self._rows, self._sets = self._empty_rows(), self._empty_sets()
         self.outcome = _no_outcome(self._shape[0])
+        self.mapped, self.known = np.empty((2, self._shape[0]), dtype=np.int64)
         self._advance(beliefs, self._all, moving, actions, collisions)
         return self.outcome
 
@@ -197,6 +202,7 @@ class ActiveSlamTask:
             worlds if collisions is None else collisions,
             tuple(self.episodes),
             tuple(self.outcome),
+            (self.mapped, self.known),
             rows[:first],
             rows[first:],
         )

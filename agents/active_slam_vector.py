@@ -135,8 +135,8 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         rmse = error(beliefs, self._worlds.complex_landmarks)
         infos = {
             **super()._infos(),
-            "mapped": (beliefs.slots >= 0).sum(axis=1),
-            "known": self.task.episodes.known.sum(axis=1),
+            "mapped": self.task.mapped,
+            "known": self.task.known,
             "success": success,
             "true_rmse": rmse,
             "honest_success": success & (rmse <= self.task.weights.accuracy),

@@ -141,6 +141,9 @@ def write_densities(
     add up to one. Opposite directions have the same square of the cosine, so one sum
     over all points and one over those ahead serve both.
     """
+    if count == 0:
+        densities[:] = 0.0
+        return
     far, near = sum_lobes(points, count, diagonal)
     write_lobes(near, unit, densities[:SECTORS])
     write_lobes(far, unit, densities[SECTORS:])

@@ -72,9 +72,10 @@ def with_masks(infos: Infos, worlds: BoolArray | None, count: int) -> Infos:
     {'collision': array([ True, False]), '_collision': array([ True, False])}
     """
     masked = {}
-    for key, value in infos.items():
+    masks = np.ones((len(infos), count), dtype=np.bool_)
+    for row, (key, value) in enumerate(infos.items()):
         if worlds is None:
-            masked[key], masked[f"_{key}"] = value, ~np.zeros(count, np.bool_)
+            masked[key], masked[f"_{key}"] = value, masks[row]
         else:
             chosen = np.zeros_like(value)
             chosen[worlds] = value[worlds]

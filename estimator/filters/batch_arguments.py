@@ -168,6 +168,8 @@ def _problem(mean: Array, covariance: Array, reference: Array) -> str | None:
 def first_poses(name: str, poses: ArrayLike, count: int) -> Array:
     """Return the first pose of every run, shape (B, 3), or refuse them."""
     first = argument_checks.as_floats(name, poses)
+    if first.shape == (count, 3) and np.abs(first).max() <= LARGEST:
+        return first
     if first.shape not in ((3,), (count, 3)) or not np.isfinite(first).all():
         raise ValueError(
             f"{name} must be finite with shape (3,) or ({count}, 3), "

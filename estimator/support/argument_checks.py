@@ -36,6 +36,8 @@ def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
 def standard_deviations(name: str, value: ArrayLike, size: int) -> Array:
     """Return ``value`` as float64 (size,), from 0 to the largest, or refuse it."""
     std = as_floats(name, value)
+    if std.shape == (size,) and all(0.0 <= each <= LARGEST for each in std.tolist()):
+        return std
     if std.shape != (size,) or not (np.isfinite(std) & (std >= 0)).all():
         raise ValueError(f"{name} must be {size} finite numbers >= 0, got {value!r}")
     refuse_beyond(name, std, value)
