@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false
-"""What runs on Ray: PPO of RLlib on every environment, a Monte Carlo, trajectories.
+"""What runs on Ray: PPO of RLlib on every environment, Monte Carlos, trajectories.
 
 Not part of the suite, as Ray asks for an older Gymnasium and for two gigabytes; in an
 environment of its own::
@@ -13,8 +13,15 @@ makes one world, already flat, which RLlib puts side by side; the id alone, flat
 a connector of RLlib's; and a function that makes the native vector of worlds.
 """
 
+import os
+import signal
+import subprocess
+import sys
+import time
+
 import gymnasium as gym
 import numpy as np
+import psutil
 import pytest
 
 import slamgym  # noqa: F401 (registers the environments)
@@ -129,3 +136,34 @@ def test_trajectories_have_the_bytes_of_one_process(cluster, tmp_path):
     for file in files:
         other = tmp_path / "ray" / file.relative_to(tmp_path / "here")
         assert file.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+)
+def test_an_ended_job_says_how_to_go_on_and_leaves_no_process(tmp_path, number, code):
+    job = "monte-carlo six_landmarks -e ekf --runs 90000 --block-size 8 --jobs 2"
+    main = "from slamgym.experiments.command_line.app import main; main()"
+    command = [sys.executable, "-c", main, *job.split(), "--backend", "ray"]
+    environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0"}
+    with subprocess.Popen(
+        [*command, "--out", "out"],
+        cwd=tmp_path,
+        env=environment,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    ) as child:
+        deadline = time.monotonic() + 240
+        while len(list(tmp_path.glob("out/blocks/runs-*.npz"))) < 2:
+            assert child.poll() is None, child.communicate()[1]
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        processes = psutil.Process(child.pid).children(recursive=True)
+        child.send_signal(number)
+        message = child.communicate(timeout=60)[1]
+    assert child.returncode == code, message
+    assert "the finished runs are in out, and the same command continues" in message
+    assert "Traceback" not in message
+    _, alive = psutil.wait_procs(processes, timeout=30)
+    assert alive == []

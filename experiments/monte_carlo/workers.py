@@ -104,10 +104,17 @@ def _ray_workers(jobs: int | None) -> Workers:
         raise ValueError("backend 'ray' needs ray: pip install ray") from None
 
     def compute(calls: Iterable[Call]) -> Iterator[Any]:
+        handler = signal.getsignal(signal.SIGTERM)
         with Pool(jobs) as pool:
+            _handle_sigterm(handler)  # Ray replaces it by one that aborts
             yield from pool.imap_unordered(_call, calls)
 
     return compute
+
+
+def _handle_sigterm(handler: Any) -> None:
+    if callable(handler) and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
 
 
 def _call(call: Call) -> Any:
