@@ -145,6 +145,14 @@ InitialPoseStd = Annotated[
         "A,B,C", "σx,σy,σθ of the first pose [m, m, rad].", "from the log, else 0,0,0"
     ),
 ]
+GateProbability = Annotated[
+    float | None,
+    option(
+        "P",
+        "Reject readings outside this probability region of their innovation.",
+        "none rejected",
+    ),
+]
 RangeStdPerMetre = Annotated[
     float | None,
     option(

@@ -35,14 +35,7 @@ def replay(
             "full",
         ),
     ] = None,
-    gate_probability: Annotated[
-        float | None,
-        options.option(
-            "P",
-            "Reject readings outside this probability region of their innovation.",
-            "none rejected",
-        ),
-    ] = None,
+    gate_probability: options.GateProbability = None,
     range_std_per_metre: options.RangeStdPerMetre = None,
     noise_at_rest: options.NoiseAtRest = None,
     option: options.EstimatorOptions = None,
@@ -80,7 +73,7 @@ def replay(
     from ..logs.anonymous import without_identities
     from ..runs.filter_settings import settings_for
     from .chosen_filters import chosen_filters
-    from .log_files import note_choices, read_any_log
+    from .log_files import note_choices, note_noise, read_any_log
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
     from .run_files import check_rerun, filter_and_write, show_run
@@ -117,4 +110,5 @@ def replay(
             resolution=resolution,
             rerun=rerun,
         )
+    note_noise(drive, next(iter(filters.values())), {*stds, *given}, reporter)
     show_run(summary, place, reporter)

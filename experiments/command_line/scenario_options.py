@@ -1,12 +1,13 @@
 """Scenarios and controllers by the names that the user gives."""
 
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...envs.controllers import CONTROLLERS, Controller, make_controller
-from ...sim_configs import Scenario, load_scenario
+from ...sim_configs import Scenario, list_presets, load_scenario
 from ...suggestions import closest
 from .errors import BadInputError
 from .option_values import changes
@@ -23,12 +24,24 @@ def chosen_scenario(
     Raises
     ------
     ValueError
-        If there is no such scenario, or a change does not fit.
+        If there is no such scenario, it is a log, or a change does not fit.
     """
     changed = changes("--set", sets)
     if steps is not None:
         changed["steps"] = steps
+    _refuse_log(name)
     return load_scenario(name).with_changes(**changed)
+
+
+def _refuse_log(name: str) -> None:
+    """Refuse a file or folder that is no scenario, and name the command for logs."""
+    path = Path(name)
+    if name in list_presets() or path.suffix == ".toml" or not path.exists():
+        return
+    raise BadInputError(
+        f"{name} is no scenario (a preset or a .toml file); to filter a log: slamgym "
+        f"replay {name}"
+    )
 
 
 def chosen_controller(name: str, scenario: Scenario, seed: int) -> Controller:

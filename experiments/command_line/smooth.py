@@ -23,9 +23,13 @@ def smooth(
             "all weigh the same",
         ),
     ] = None,
+    gate_probability: options.GateProbability = None,
+    range_std_per_metre: options.RangeStdPerMetre = None,
+    noise_at_rest: options.NoiseAtRest = None,
     option: options.EstimatorOptions = None,
     robot: options.RobotNumber = None,
     truth: options.TruthFile = None,
+    noise_from_file: options.NoiseFromFile = False,
     out: options.OutFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
@@ -46,17 +50,22 @@ def smooth(
     from ..figures import save_figure, smoothed_figure
     from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
     from ..runs.log_smoothing import smooth_log, summarise_smoothing
-    from .log_files import note_choices, read_any_log
+    from .log_files import note_choices, note_noise, read_any_log
     from .output_folder import default_folder, output_folder, write_summary
     from .reporter import Reporter
     from .tables import heading, smoothing_figures, smoothing_table, written
 
     name, own = read_label(estimator)
-    given = assignments("--option", option) | own | {"follow": name}
-    if robust is not None:
-        given["robust"] = robust
+    named = {
+        "gate_probability": gate_probability,
+        "range_std_per_metre": range_std_per_metre,
+        "noise_at_rest": noise_at_rest,
+        "robust": robust,
+    }
+    given = {key: value for key, value in named.items() if value is not None}
+    given |= assignments("--option", option) | own | {"follow": name}
     reporter = Reporter(as_json=as_json)
-    drive = read_any_log(log, robot, truth=truth)
+    drive = read_any_log(log, robot, truth=truth, noise_from_file=noise_from_file)
     note_choices(drive, reporter)
     stated = standard_deviations(motion_std, measurement_std, initial_pose_std)
     with reporter.warnings():
@@ -71,8 +80,11 @@ def smooth(
             smoothed = smooth_log(drive, settings, progress=tick)
         save_figure(smoothed_figure(smoothed), folder / "map.png")
         summary = write_summary(folder, summarise_smoothing(smoothed, settings))
+    note_noise(drive, settings, {*stds, *given}, reporter)
     title = heading("", summary["log"], " smoothed, following ", estimator)
     files = written(str(place), summary["files"])
     figures = smoothing_figures(summary)
-    reporter.show(title, smoothing_table(summary), "", figures, "", files)
+    is_compared = any(summary[key]["filter"] for key in ("ate", "landmark_rmse"))
+    compared = (smoothing_table(summary), "") if is_compared else ()
+    reporter.show(title, *compared, figures, "", files)
     reporter.finish({**summary, "out": str(place)})

@@ -13,6 +13,7 @@ from ...estimator import registry
 from ...estimator.interface import SlamEstimator
 from ...estimator.support.filter_labels import read_label
 from ...sim_configs import Scenario
+from ...suggestions import closest
 from ..logs.events import Scan
 from ..logs.lines import LogError
 from ..logs.recording import log_header
@@ -32,6 +33,16 @@ _COURSE_NOISE = {  # as the homework publishes it
     "measurement_std": "0.01,0.08",
     "start_sigma": "0.02,0.02,0.1",
 }
+
+NOISE_KEYS = (
+    "motion_std",
+    "measurement_std",
+    "start_sigma",
+    "range_std_per_metre",
+    "bearing_std_metres",
+    "noise_at_rest",
+)
+"""Keys of a log's header that :func:`settings_for` reads."""
 
 _ASSUMED_NOISE = {
     "motion_std": (0.1, 0.1, 0.03),
@@ -172,7 +183,9 @@ def noise_or_assumed(
     for key, std in missing.items():
         values = ",".join(map(str, std))
         warnings.warn(
-            f"{log.name} does not specify its {key}: {values} is assumed", stacklevel=2
+            f"{log.name} does not specify its {key}: {values} is assumed"
+            f"{_meant(log.header, key)}",
+            stacklevel=2,
         )
     return {**missing, **stds}
 
@@ -215,8 +228,24 @@ def _std(
         return tuple(_number(name, key, part) for part in header[key].split(","))
     example = "0.1,0.1,0.05" if key == "motion_std" else "0.02,0.1"
     raise ValueError(
-        f"{name} does not specify its {key}: give it, "
-        f"for example --{key.replace('_', '-')} {example}"
+        f"{name} does not specify its {key}: give it, for example "
+        f"--{key.replace('_', '-')} {example}, or estimate it by slamgym fit-noise"
+        f"{_meant(header, key)}"
+    )
+
+
+def _meant(header: Mapping[str, str], key: str) -> str:
+    """Name the known keys, if another key of a header seems to hold a noise."""
+    others = [
+        other
+        for other in header
+        if other not in NOISE_KEYS and ("noise" in other or closest(other, [key]))
+    ]
+    if not others:
+        return ""
+    return (
+        f" (of its header, {', '.join(map(repr, others))} is not read; known keys are "
+        f"{', '.join(NOISE_KEYS)})"
     )
 
 

@@ -6,7 +6,6 @@ from ...estimator.models.angles import wrap_angle
 from ..logs.anonymous import hides_identities
 from ..logs.events import Scan
 from .log_replay import Replay
-from .trace import RunTrace
 
 MOST_REJECTED = 0.05
 """Share of rejected readings above which a filter may diverge."""
@@ -29,7 +28,7 @@ def run_warnings(replay: Replay) -> list[str]:
     list of str
         Sentences of one line.
     """
-    found = [_rejections(replay), _nis(replay.trace), _crowded_map(replay)]
+    found = [_rejections(replay), _nis(replay), _crowded_map(replay)]
     return [sentence for sentence in found if sentence]
 
 
@@ -44,7 +43,8 @@ def _rejections(replay: Replay) -> str:
     )
 
 
-def _nis(trace: RunTrace) -> str:
+def _nis(replay: Replay) -> str:
+    trace = replay.trace
     freedom = trace.nis_dof.sum()
     if not freedom:
         return ""
@@ -52,10 +52,29 @@ def _nis(trace: RunTrace) -> str:
     low, high = NIS_RANGE
     if low <= ratio <= high:
         return ""
-    amount = "too much" if ratio < low else "too little"
+    return f"The {nis_suspicion(ratio, associates=hides_identities(replay.log))}"
+
+
+def nis_suspicion(ratio: float, *, associates: bool) -> str:
+    """Write what a NIS per degree of freedom far from 1 means.
+
+    Parameters
+    ----------
+    ratio : float
+        NIS per degree of freedom.
+    associates : bool
+        Whether the filter associates readings without identity.
+
+    Examples
+    --------
+    >>> nis_suspicion(3.0, associates=False)
+    'NIS is 3 per degree of freedom, where 1 is expected: the filter assumes too ...
+    """
+    amount = "too much" if ratio < 1 else "too little"
+    other = ", or associates wrongly" * associates
     return (
-        f"The NIS is {ratio:.3g} per degree of freedom, where 1 is expected: the "
-        f"filter assumes {amount} noise, or associates wrongly."
+        f"NIS is {ratio:.3g} per degree of freedom, where 1 is expected: the filter "
+        f"assumes {amount} noise{other}."
     )
 
 

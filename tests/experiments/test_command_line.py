@@ -388,10 +388,28 @@ def test_a_log_that_is_not_there_is_refused():
 def test_a_log_of_unknown_noise_asks_for_it(log):
     log.write_text(LOG.replace("# motion_std", "# other_std"))
     message = refused("replay", log)
-    assert message == (
-        "little does not specify its motion_std: give it, "
-        "for example --motion-std 0.1,0.1,0.05"
+    assert message.startswith(
+        "little does not specify its motion_std: give it, for example --motion-std "
+        "0.1,0.1,0.05, or estimate it by slamgym fit-noise"
     )
+    assert "'other_std' is not read; known keys are motion_std," in message
+    log.write_text(LOG.replace("# motion_std", "# licence"))
+    assert "known keys" not in refused("replay", log)
+
+
+def test_the_noise_of_a_log_is_noted_unless_it_is_given(log, without_pictures):
+    noise = "note: noise of little: motion_std 0.1"
+    assert noise in slamgym("replay", log).stderr.replace("\n", " ")
+    given = slamgym("replay", log, "--motion-std", "1,1,1").stderr
+    assert "motion_std" not in given
+    assert "measurement_std" in given
+
+
+def test_a_log_is_no_scenario_and_a_scenario_no_log(log):
+    message = refused("run", log)
+    assert message.endswith(f"to filter a log: slamgym replay {log}")
+    message = refused("replay", "loop")
+    assert message.endswith("; loop is a scenario: slamgym run loop")
 
 
 @pytest.mark.parametrize(

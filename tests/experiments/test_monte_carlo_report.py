@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from slamgym.evaluation.chi_square import family_band
 from slamgym.evaluation.consistency_report import evaluate_consistency
+from slamgym.evaluation.time_average_tests import equivalence_test
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES
 from slamgym.experiments.monte_carlo.report.estimator_lines import look_of, thinned
@@ -168,6 +169,19 @@ def test_verdicts_on_white_nees(factor, runs, word, said):
     verdict = judge(white_report(factor, runs), 0, runs)
     assert verdict.word == word
     assert said in verdict.reason
+
+
+def test_the_number_of_runs_that_a_verdict_names_suffices():
+    reason = judge(white_report(1.0, 15, steps=2), 0, 15).reason
+    named = int(re.search(r"about ([\d,]+) in total", reason)[1].replace(",", ""))
+    rng = np.random.default_rng(2)
+
+    def power(runs):
+        averages = rng.chisquare(6, (100, runs)) / 2  # of two steps, 3 degrees each
+        return np.mean([equivalence_test(one, 3).accepted for one in averages])
+
+    assert power(2 * named) >= 0.8
+    assert power(named // 2) <= 0.4
 
 
 @pytest.mark.slow

@@ -52,7 +52,14 @@ def test_innovations_of_another_size_than_claimed_are_told(factor, words):
     log = standing([PLACES] * 40, ids=[1, 2, 3])
     noise = {key: np.array(std) * factor for key, std in NOISE.items()}
     (warning,) = run_warnings(replay(log, make_estimator("ekf", **noise)))
-    assert f"assumes {words} noise" in warning
+    assert warning.endswith(f"assumes {words} noise.")  # it associates nothing
+
+
+def test_innovations_of_a_filter_that_associates_may_be_of_wrong_landmarks():
+    noise = {key: np.array(std) * 10 for key, std in NOISE.items()}
+    slam = make_estimator("ekf", **noise, management=True)
+    warnings = run_warnings(replay(standing([PLACES] * 40), slam))
+    assert any("too much noise, or associates wrongly." in w for w in warnings)
 
 
 def test_landmarks_that_are_seen_no_longer_are_told():

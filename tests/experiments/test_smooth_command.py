@@ -189,6 +189,22 @@ def test_a_log_without_noise_is_smoothed_with_an_assumed_one_and_says_so(here):
     assert json.loads(result.stdout)["settings"]["motion_std"] == [0.1, 0.1, 0.03]
 
 
+def test_a_log_without_truth_has_no_empty_table(here):
+    lines = (here / "little.csv").read_text().splitlines()
+    kept = [line for line in lines if not line.startswith(("landmark,", "groundtruth"))]
+    (here / "blank.csv").write_text("\n".join(kept) + "\n")
+    shown = slamgym("smooth", "blank.csv", "-e", "ekf").stdout
+    assert "smoother" not in shown.partition("readings")[0].partition("\n")[2]
+
+
+def test_the_options_of_a_noise_fit_can_be_pasted(here):
+    options = ("--range-std-per-metre", "0.02", "--gate-probability", "0.999")
+    result = slamgym("smooth", "little.csv", *options, "--json")
+    found = json.loads(result.stdout)["settings"]["options"]
+    assert found["range_std_per_metre"] == 0.02
+    assert found["gate_probability"] == 0.999
+
+
 def test_a_graph_is_smoothed_against_the_truth_of_another_file(here):
     edges = [f"EDGE2 {k} {k + 1} 1 0 0\nLANDMARK {k} 9 {4 - k} 4\n" for k in range(3)]
     (here / "graph.txt").write_text("".join([*edges, "EDGE2 3 0 -3 0 0\n"]))

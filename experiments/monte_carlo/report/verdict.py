@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ....evaluation.consistency_report import ConsistencyReport
+from ....evaluation.consistency_report import FEW_AVERAGES, ConsistencyReport
 from ....evaluation.time_average_tests import EQUIVALENCE_MARGIN
 
 CONSISTENT = "consistent"
@@ -142,7 +142,28 @@ def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
         lies = f"{interval}, lies outside {_MARGIN}"
     else:
         kept, lies = f"{_NOT_REFUSED}, but", f"{interval}, is not inside {_MARGIN}"
-    return Verdict(NOT_SHOWN, f"{kept} {lies}: more runs are needed")
+    needed = _runs_needed(report)
+    many = f", about {needed:,} in total if its ratio is 1" if needed else ""
+    return Verdict(NOT_SHOWN, f"{kept} {lies}: more runs are needed{many}")
+
+
+def _runs_needed(report: ConsistencyReport) -> int:
+    """Return with how many runs a filter of ratio 1 is accepted in 90 % of cases.
+
+    Its 90 % interval must then be about half as wide as the margin.  Its width is in
+    proportion to the ratio, and to one over the square root of the number of runs.  0
+    if there are too few runs now.
+    """
+    ratio, (low, high) = report.equivalence.statistic, report.equivalence.interval
+    runs = report.runs - len(report.failed_runs)
+    if runs < FEW_AVERAGES:
+        return 0
+    least, most = EQUIVALENCE_MARGIN
+    below, above = 1 - low / ratio, high / ratio - 1
+    width = max(below / (1 - least), above / (most - 1))
+    needed = max(runs * (2 * width) ** 2, runs + 1)
+    digit: float = 10.0 ** (math.floor(math.log10(needed)) - 1)
+    return int(math.ceil(needed / digit) * digit)
 
 
 def _refusal(report: ConsistencyReport) -> str:

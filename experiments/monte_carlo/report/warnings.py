@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from ....evaluation.consistency_report import FEW_RUNS
-from ...runs.run_warnings import MOST_REJECTED, NIS_RANGE
+from ...runs.run_warnings import MOST_REJECTED, NIS_RANGE, nis_suspicion
 from .scores import FailedRun
 
 LARGE_MAP = 1.2
@@ -88,11 +88,8 @@ def _suspicions(entry: Mapping[str, Any]) -> Iterator[str]:
             "too near: the filter may diverge."
         )
     if nis is not None and not NIS_RANGE[0] <= nis <= NIS_RANGE[1]:
-        amount = "too much" if nis < 1 else "too little"
-        yield (
-            f"the NIS is {nis:.3g} per degree of freedom, where 1 is expected: the "
-            f"filter assumes {amount} noise, or associates wrongly."
-        )
+        associates = is_managed or bool(entry.get("association"))
+        yield f"the {nis_suspicion(nis, associates=associates)}"
     yield from _split_map(entry.get("association") or {})
 
 
