@@ -21,6 +21,7 @@ KINDS = {None: SQUARED, "huber": HUBER, "cauchy": CAUCHY}
 SLACK = 1e-12  # of the cost, in rounding
 REWEIGHTED = 30  # iterations; from then on the noise is fixed
 SHRINKING = 0.5  # steps that shrink by this factor converge linearly
+NOTHING = 0.02  # of the cost; further steps then move less than a fifth of a σ
 SEARCHES = 5  # for better places of landmarks
 RELOCATED = 5  # iterations from one to the next
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
@@ -74,13 +75,17 @@ class _State:
         self.estimate, self.stds = estimate, stds
         self.cost, self.moved, self.error = np.inf, np.inf, np.inf
         self.damping, self.is_damped, self.searches = 0.0, False, SEARCHES
+        self.fall, self.remaining = np.inf, np.inf
 
     def move(self, estimate: Estimate, cost: float) -> None:
         """Take an accepted step; later ones are expected to shrink as this one did."""
         moved = _distance(self.estimate, estimate)
         rate = moved / self.moved if 0 < self.moved < np.inf else 1.0
         self.error = moved * (rate / (1 - rate) if rate < SHRINKING else 1.0)
-        self.estimate, self.cost, self.moved = estimate, cost, moved
+        fall = self.cost - cost
+        shrinks = fall / self.fall if 0 < self.fall < np.inf else 1.0
+        self.remaining = fall * shrinks / (1 - shrinks) if shrinks < 1 else np.inf
+        self.estimate, self.cost, self.moved, self.fall = estimate, cost, moved, fall
         self.is_damped = self.damping > 0
         lower = self.damping / 10
         self.damping = lower if lower >= FIRST_DAMPING else 0.0
@@ -123,10 +128,14 @@ class Optimiser:
     def minimise(self, start: Estimate, tolerance: float, most: int) -> Solution:
         """Iterate until no pose or landmark will move more than the tolerance [m, rad].
 
+        If readings contradict each other, the steps may shrink slowly.  After ``most``
+        iterations, the estimate is also a solution if the further decrease of its cost,
+        by the last two decreases, is insignificant.
+
         Raises
         ------
         numpy.linalg.LinAlgError
-            If that takes more than ``most`` iterations, or no step lowers the cost.
+            If that takes more iterations, or no step lowers the cost.
         """
         state = _State(start, self.reading_stds(start))
         state.cost = first_cost = self.cost(start, state.stds)
@@ -136,18 +145,21 @@ class Optimiser:
         for iteration in range(1, most + 1):
             self._descend(state)
             if self._is_found(state, tolerance, iteration):
-                cost = self.cost(state.estimate, self.reading_stds(state.estimate))
-                return Solution(
-                    state.estimate, cost, first_cost, iteration, state.is_damped
-                )
+                return self._solution(state, first_cost, iteration)
             if self._varies and iteration < REWEIGHTED:
                 self._reweight(state)
+        if state.remaining < NOTHING:
+            return self._solution(state, first_cost, most)
         raise np.linalg.LinAlgError(
             f"smoothing did not converge in {most} iterations: the last one moved a "
             f"pose or landmark by {state.moved:.3g}, the cost fell from "
             f"{first_cost:.4g} to {state.cost:.4g}; a better start, another noise or a "
             "robust kernel may help"
         )
+
+    def _solution(self, state: _State, first_cost: float, iterations: int) -> Solution:
+        cost = self.cost(state.estimate, self.reading_stds(state.estimate))
+        return Solution(state.estimate, cost, first_cost, iterations, state.is_damped)
 
     def _is_found(self, state: _State, tolerance: float, iteration: int) -> bool:
         """Whether the last step was small, and no landmark belongs elsewhere."""

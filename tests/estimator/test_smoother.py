@@ -334,6 +334,16 @@ def test_a_solution_that_is_not_found_is_an_error():
         smooth(made, iterations=1)
 
 
+def test_a_cost_that_no_longer_falls_significantly_is_a_solution():
+    made, *_ = recorded()
+    exact, enough = smooth(made), smooth(made, iterations=3)
+    assert exact.iterations > enough.iterations == 3
+    assert exact.cost < enough.cost < exact.cost + 0.02
+    gaps = enough.landmarks - exact.landmarks
+    stds = np.sqrt(np.diagonal(exact.landmark_covariances, axis1=1, axis2=2))
+    assert (abs(gaps) < 0.2 * stds).all()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
