@@ -12,7 +12,7 @@ from presets import PRESETS
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.sim_configs import action_sequence, load_scenario
+from slamgym.sim_configs import action_sequence, list_presets, load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
 HIDDEN = {"scenario": "hidden_identities"}
@@ -24,7 +24,14 @@ def same(observation, other):
         np.testing.assert_array_equal(observation[key], other[key])
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+FEW = {"six_landmarks", "hidden_identities", "active_rooms"}
+CHECKED = [
+    pytest.param(name, marks=() if name in FEW else pytest.mark.slow)
+    for name in list_presets()
+]
+
+
+@pytest.mark.parametrize("preset", CHECKED)
 def test_gymnasiums_checker_finds_nothing_to_warn_of(preset):
     env = gym.make(ID, scenario=preset).unwrapped
     check_env(env)  # pytest makes an error of a warning

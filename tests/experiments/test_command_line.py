@@ -102,6 +102,7 @@ def finished_run(tmp_path_factory):
     return folder / "out", summary
 
 
+@pytest.mark.slow
 def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
     folder, summary = finished_run
     steps = [f"map_steps/step_{k:03d}.png" for k in range(3)]
@@ -114,6 +115,7 @@ def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
     assert sorted(found) == sorted(names + texts) == summary["files"]
 
 
+@pytest.mark.slow
 def test_a_run_answers_with_the_numbers_of_its_summary_file(finished_run):
     folder, summary = finished_run
     saved = json.loads((folder / "summary.json").read_text())
@@ -175,12 +177,14 @@ def test_a_graph_is_replayed_against_the_truth_of_another_file(here, without_pic
     assert message == "cannot read the log nowhere.g2o: No such file or directory"
 
 
+@pytest.mark.slow
 def test_the_scenario_of_a_run_is_saved_with_its_changes(finished_run):
     folder, _ = finished_run
     expected = load_scenario("six_landmarks").with_changes(steps=2)
     assert load_scenario(folder / "scenario.toml") == expected
 
 
+@pytest.mark.slow
 def test_the_log_of_a_run_replays_to_the_same_numbers(finished_run, without_pictures):
     folder, summary = finished_run
     again = answered("replay", folder / "log.csv", "--out", "again")
