@@ -84,6 +84,7 @@ def answer(folder, code=ASK, run=forked_python):
 @pytest.fixture
 def kernels(tmp_path, monkeypatch):
     """Return a folder with two kernels and a constant, and a cache of their own."""
+    forked.start_server()  # with the usual cache
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     write(tmp_path / "k", caller=CALLER, callee=CALLEE, constants="FACTOR = 2")

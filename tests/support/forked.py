@@ -12,6 +12,7 @@ import tempfile
 import textwrap
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import forkserver
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +21,11 @@ KILLED = -signal.SIGKILL
 
 _CONTEXT = multiprocessing.get_context("forkserver")
 _CONTEXT.set_forkserver_preload(["forked_preload"])
+
+
+def start_server() -> None:
+    """Start the server now, with the present environment, if it is not there yet."""
+    forkserver.ensure_running()
 
 
 def start(job: Callable[..., object], *arguments: object) -> BaseProcess:
