@@ -7,7 +7,8 @@ step. The cases run interleaved in one process, in CPU time of this thread; a ra
 the median over the rounds. Stable-Baselines3 and, as peers of a single world, ir-sim
 and the Robotics Toolbox are timed where they are installed.
 
-A second table lists the cost of observing beliefs, see `agents_beliefs`.
+A second table lists the cost of observing beliefs, see `agents_beliefs`. The last line
+is the rate of films, see `agents_frames`.
 """
 
 import importlib.util
@@ -18,6 +19,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 from agents_beliefs import belief_table, imagine_line
+from agents_frames import frames_line
 from agents_peers import peer_calls
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import FlattenObservation
@@ -198,7 +200,9 @@ def main() -> int:
     console.print(beliefs)
     line, of_plans = imagine_line()
     console.print(line)
-    return missed + of_beliefs + of_plans
+    line, of_frames = frames_line()
+    console.print(line)
+    return missed + of_beliefs + of_plans + of_frames
 
 
 def _against_bare(times: dict[str, list[float]], name: str, case: Case) -> list[str]:
