@@ -78,12 +78,14 @@ class UnicycleBodies:
         Returns
         -------
         ndarray, shape (B,), or None
-            Shares of the displacements, in [0, 1], that the walls allowed; None without
-            walls.
+            Shares of the displacements, in [0, 1], that the walls allowed, 1 for bodies
+            that do not move; None without walls.
         """
         change = np.empty(self._pose.shape)
         forward, sideways = commands[:, 0] + slip[:, 0], slip[:, 1]
         change[0], change[1] = displacement(forward, sideways, self._cos, self._sin)
+        if moving is not None:
+            change[:2] *= moving  # no wall is asked about those that stay
         share = None
         if self._contacts is not None:
             share = self._contacts.free_shares(*self._pose[:2], *change[:2])

@@ -141,6 +141,8 @@ def _find_near(
     for k in range(len(x)):
         way = x[k], y[k], x[k] + dx[k], y[k] + dy[k]
         length = math.sqrt(dx[k] * dx[k] + dy[k] * dy[k])
+        if length == 0.0:  # a wall stops only approaches
+            continue
         for w in range(len(walls)):
             wall = walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
             if _gap(way[0], way[1], wall) <= reach + length and _meet(way, wall, reach):

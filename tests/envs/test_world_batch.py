@@ -246,7 +246,7 @@ def test_free_shares_are_the_single_ones_near_and_far_from_walls():
     contacts = WallContacts(0.2, WALLS)
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-8, 10, (2, 3000))
-    dx, dy = rng.normal(0.0, 1.0, (2, 3000)) * rng.choice([0.01, 0.3, 3.0], 3000)
+    dx, dy = rng.normal(0.0, 1.0, (2, 3000)) * rng.choice([0.0, 0.01, 0.3, 3.0], 3000)
     expected = [contacts.free_share(*each) for each in zip(x, y, dx, dy, strict=True)]
     assert 50 < np.count_nonzero(np.less(expected, 1.0)) < 2500
     assert bits(contacts.free_shares(x, y, dx, dy)) == bits(expected)
