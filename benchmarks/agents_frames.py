@@ -7,6 +7,7 @@ runs in a process of its own.
 import importlib.util
 import os
 import tempfile
+from typing import Any
 
 import gymnasium
 from gymnasium.wrappers import RecordVideo
@@ -32,7 +33,7 @@ def frames_line() -> tuple[str, int]:
 def _rate() -> float:
     """Film one episode of many steps; return frames per second."""
     with tempfile.TemporaryDirectory() as folder:
-        env = RecordVideo(
+        env: gymnasium.Env[Any, Any] = RecordVideo(
             gymnasium.make(ID, render_mode="rgb_array", steps=STEPS, accuracy=1e-3),
             f"{folder}/films",
             episode_trigger=lambda _: True,
