@@ -75,7 +75,7 @@ def known_map(landmarks: Array) -> SparseInformationSlam:
     anchored[1::2] += 1
     fixed = np.full(len(anchored), 1e4)
     total = total + csr_array((fixed, (anchored, anchored)), shape=total.shape)
-    total = total.tobsr(blocksize=(2, 2))
+    total = ((total + total.T) / 2).tobsr(blocksize=(2, 2))
     slam = SparseInformationSlam(
         MOTION_STD, MEASUREMENT_STD, initial_pose_std=(0.1, 0.1, 0.1)
     )

@@ -5,12 +5,19 @@ from ....jit import jit
 
 
 @jit
-def add_update(front: Array, at: IntArray, update: Array) -> None:
+def add_update(top: Array, rest: Array, at: IntArray, update: Array) -> None:
     """Add a child's update (r, r) to the rows and columns ``at`` (r,) of a front.
 
-    The sum is that of ``front[np.ix_(at, at)] += update``, without its three copies.
+    The front is ``top`` (p, n), its first rows, above ``rest`` (n - p, n - p), the
+    other rows without their first columns.  Only upper triangles are read and written.
     """
+    p = len(top)
     for i in range(len(at)):
-        row, values = front[at[i]], update[i]
-        for j in range(len(at)):
-            row[at[j]] += values[j]
+        for j in range(i, len(at)):
+            row, column = at[i], at[j]
+            if row > column:
+                row, column = column, row
+            if row < p:
+                top[row, column] += update[i, j]
+            else:
+                rest[row - p, column - p] += update[i, j]

@@ -13,7 +13,7 @@ import numpy as np
 from ....arrays import Array, BoolArray, IntArray
 from .information_matrix import InformationMatrix
 
-LEAF = 150
+LEAF = 75
 """Largest number of landmarks in a leaf."""
 EXTRA_LEVELS = 6
 """Levels by which a branch may exceed the depth of a balanced tree."""

@@ -22,7 +22,7 @@ from .information_matrix import InformationMatrix
 from .landmark_dissection import LandmarkDissection, descends, with_ancestors
 from .multifrontal import (
     Node,
-    eliminate,
+    eliminate_in_place,
     marginal_covariance,
     substitute_back,
     substitute_forward,
@@ -38,7 +38,7 @@ class _Eliminated(NamedTuple):
 
     @property
     def update(self) -> Array:
-        """Update of the parent's front, shape (r, r)."""
+        """Upper triangle of the update of the parent's front, shape (r, r)."""
         if self.stored_update is None:
             return -(self.node.response.T @ self.node.response)
         return self.stored_update
@@ -117,7 +117,9 @@ class LandmarkElimination:
                 if node not in affected:
                     self._cache[node] = part
             done[node] = part
-        return [part.node for part in done.values()], done[1].update, slots
+        upper = np.triu(done[1].update)
+        update = upper + np.triu(upper, 1).T
+        return [part.node for part in done.values()], update, slots
 
 
 def _by_node(slots: IntArray, nodes: IntArray) -> dict[int, IntArray]:
@@ -137,23 +139,24 @@ def _eliminate(
     """Eliminate a node's own landmarks; ``beyond`` marks those not below the node."""
     counts, links, blocks = matrix.rows(own)
     inherited = [child.node.rest[::2] // 2 for child in children]
-    rest = np.setdiff1d(np.concatenate([links[beyond[links]], *inherited]), own)
+    is_rest = np.zeros(len(beyond), dtype=bool)
+    for slots in (links[beyond[links]], *inherited):
+        is_rest[slots] = True
+    is_rest[own] = False
+    rest = np.flatnonzero(is_rest)
     place = np.full(len(beyond), -1)
     place[own] = np.arange(len(own))
     place[rest] = np.arange(len(own), len(own) + len(rest))
-    count, p = len(own) + len(rest), 2 * len(own)
-    front = np.zeros((2 * count, 2 * count))
+    p, r = 2 * len(own), 2 * len(rest)
+    top, remainder = np.zeros((p, p + r)), np.zeros((r, r))
     here = place[links]
     row = np.repeat(np.arange(len(own)), counts)[here >= 0]
-    front.reshape(count, 2, count, 2)[row, :, here[here >= 0], :] = blocks[here >= 0]
+    quads = top.reshape(len(own), 2, len(own) + len(rest), 2)
+    quads[row, :, here[here >= 0], :] = blocks[here >= 0]
     for child, slots in zip(children, inherited, strict=True):
-        add_update(front, pairs(place[slots]), child.update)
-    node, _ = eliminate(front, pairs(own), pairs(rest))
-    update = None
-    if children:
-        update = node.response.T @ node.response
-        np.subtract(front[p:, p:], update, out=update)
-    return _Eliminated(node, update)
+        add_update(top, remainder, pairs(place[slots]), child.update)
+    node = eliminate_in_place(top, remainder, pairs(own), pairs(rest))
+    return _Eliminated(node, remainder if children else None)
 
 
 class RestFactor:

@@ -62,15 +62,53 @@ def eliminate(front: Array, own: IntArray, rest: IntArray) -> tuple[Node, Array]
         If H_pp is not positive definite.
     """
     p, r = len(own), len(rest)
+    lower = _cholesky(front[:p, :p])
+    solved = _solve(lower, front[:p, p:])
+    response = np.ascontiguousarray(solved[:, :r])
+    return Node(own, rest, lower, response), solved
+
+
+def eliminate_in_place(
+    top: Array, remainder: Array, own: IntArray, rest: IntArray
+) -> Node:
+    """Eliminate the first unknowns of a front, which becomes the update.
+
+    This takes half the work of :func:`eliminate` followed by the product Xᵀ X.
+
+    Parameters
+    ----------
+    top : ndarray, shape (p, p + r)
+        Upper triangle of [H_pp H_pr].
+    remainder : ndarray, shape (r, r)
+        Upper triangle of H_rr; then that of the update.
+    own, rest : ndarray
+        The unknowns of a :class:`Node`.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If H_pp is not positive definite.
+    """
+    from scipy.linalg.blas import dsyrk, dtrsm  # noqa: PLC0415 (slow to import)
+
+    p = len(own)
+    lower = _cholesky(top[:, :p].T)
+    response = top[:, p:].copy()
+    if response.size:
+        # The transposes are contiguous in Fortran order: nothing is copied.
+        dtrsm(1.0, lower.T, response.T, side=1, overwrite_b=1)
+        dsyrk(-1.0, response.T, 1.0, remainder.T, lower=1, overwrite_c=1)
+    return Node(own, rest, lower, response)
+
+
+def _cholesky(matrix: Array) -> Array:
+    """Factorise the lower triangle of a matrix."""
     try:
-        lower = np.linalg.cholesky(front[:p, :p]).astype(np.float64, copy=False)
+        return np.linalg.cholesky(matrix).astype(np.float64, copy=False)
     except np.linalg.LinAlgError as error:
         raise np.linalg.LinAlgError(
             "the information matrix is not positive definite"
         ) from error
-    solved = _solve(lower, front[:p, p:])
-    response = np.ascontiguousarray(solved[:, :r])
-    return Node(own, rest, lower, response), solved
 
 
 def substitute_forward(nodes: Sequence[Node], values: Array) -> None:
@@ -85,7 +123,10 @@ def substitute_forward(nodes: Sequence[Node], values: Array) -> None:
     values : ndarray, shape (N,) or (N, k)
     """
     for node in nodes:
-        solved = _solve(node.lower, values[node.own])
+        right = values[node.own]
+        if not right.any():
+            continue
+        solved = _solve(node.lower, right)
         values[node.own] = solved
         values[node.rest] -= node.response.T @ solved
 

@@ -175,7 +175,9 @@ def begin_local_map(
     matrix = map_.information
     eliminated = _eliminate(map_, slots, count)
     columns = pairs(eliminated.slots)
-    fixed = np.setdiff1d(matrix.neighbours(eliminated.slots), slots)
+    fixed = np.empty(0, dtype=np.int64)
+    if not isinstance(eliminated.factor, RestFactor):  # which leaves no others
+        fixed = np.setdiff1d(matrix.neighbours(eliminated.slots), slots)
     pending = map_.residual[columns]
     if pending.any():
         pending = eliminated.factor.solve(pending)

@@ -112,7 +112,7 @@ class SparseBelief:
 
     def enlarge_elimination(self) -> None:
         """Keep the local map, and eliminate more landmarks around it."""
-        self._change_local_map(self.local.slots, larger_elimination_count(self.count))
+        self._change_local_map(self.local.slots, self._larger_count())
         self.enlarged = True
 
     def remove(self, ids: Sequence[int], *, exact: bool) -> None:
@@ -186,7 +186,12 @@ class SparseBelief:
     def _first_count(self, *, exact: bool) -> float:
         if exact:
             return inf
-        return first_elimination_count(self.count, enlarged=self.enlarged)
+        return first_elimination_count(
+            self.count, len(self.slots), enlarged=self.enlarged
+        )
+
+    def _larger_count(self) -> float:
+        return larger_elimination_count(self.count, len(self.slots))
 
     def _change_local_map(self, slots: IntArray, count: float) -> None:
         """Write the local map back, and begin another one."""
