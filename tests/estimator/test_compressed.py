@@ -24,6 +24,7 @@ from slamgym.estimator.large_maps.compressed.deferred_covariance import (
     BLOCK,
     DeferredCovariance,
 )
+from slamgym.estimator.large_maps.compressed.handover import Handover
 from slamgym.estimator.map_management.map_editor import edit_map
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
@@ -360,6 +361,26 @@ def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
     assert max(waiting) < 150  # and nothing piles up
 
 
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_a_change_of_the_local_map_is_spread_over_steps(base, monkeypatch):
+    """After a long phase, no step exchanges more than a quarter of the blocks."""
+    exchange, done = Handover._exchange, []
+
+    def counted(self, stored, blocks):
+        done[-1] += len(blocks)
+        exchange(self, stored, blocks)
+
+    slam = map_all(CompressedEkfSlam(*NOISE, base=base, local_size=40), 600)
+    monkeypatch.setattr(Handover, "_exchange", counted)
+    for odometry, readings, ids in wander(600, 80):
+        slam.predict(odometry)
+        done.append(0)
+        slam.update(readings, ids)
+    blocks = 1200 // BLOCK + 1
+    assert max(done[10:]) <= blocks // 4
+    assert sum(done[10:]) >= 2 * blocks
+
+
 def test_what_it_stores_is_about_half_a_covariance():
     slam = map_all(CompressedEkfSlam(*NOISE), 1000)
     run(slam, wander(1000, 20))
@@ -468,10 +489,13 @@ def test_the_stored_covariance_is_that_of_a_dense_matrix(seed):
             rows[:, taken] += rows[:, taken].T
             dense[taken], dense[:, taken] = rows, rows.T
             places = rng.permutation(len(taken))
-            store.put(taken, rows[np.argsort(places)], places)
+            store.forget(taken)
+            for blocks in (range(1), range(1, 3)):
+                store.put(blocks, taken, rows[np.argsort(places)], places)
         taken = np.sort(rng.choice(width, rng.integers(1, 9), replace=False))
         rows = np.empty((len(taken), width))
-        store.read(taken, rows)
+        for blocks in (range(2), range(2, 3)):
+            store.read(blocks, taken, rows)
         np.testing.assert_allclose(rows, dense[taken], atol=1e-10)
         root = rng.standard_normal((width, rng.integers(1, 60)))
         signs = rng.choice([-1.0, 1.0], root.shape[1])

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from slamgym.estimator import list_estimators, make_estimator
+from slamgym.estimator.large_maps.submaps import gauss_newton
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
 from slamgym.estimator.smoother.smoothing_slam import SmoothingSlam
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
@@ -169,6 +172,35 @@ def test_a_refused_scan_of_managed_submaps_keeps_the_neighbourhood():
     with pytest.raises(ValueError, match="submap_size must be >= 7"):
         slam.update(many, range(7))
     assert digest(slam) == before
+
+
+def around_a_ring(slam, steps):
+    """Drive a filter over hidden identities around a ring of landmarks."""
+    angles = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+    landmarks = 9.0 * np.column_stack([np.cos(angles), np.sin(angles)]) + (0.0, 5.0)
+    pose = np.zeros(3)
+    for _ in range(steps):
+        pose = predict_pose(pose, np.array([0.5, 0.1])).pose
+        near = np.hypot(*(landmarks - pose[:2]).T) < 6
+        slam.predict((0.5, 0.1))
+        slam.update(predict_measurement(pose, landmarks[near]).measurement)
+
+
+def test_a_join_that_fails_leaves_managed_submaps_as_they_were(monkeypatch):
+    slam = make("submaps", True)
+    around_a_ring(slam, 40)
+
+    def state():
+        return {key: np.asarray(v).tobytes() for key, v in slam.state_dict().items()}
+
+    with monkeypatch.context() as changed:
+        changed.setattr(gauss_newton, "ITERATIONS", 0)
+        around_a_ring(slam, 8)
+        before = state()
+        with pytest.raises(np.linalg.LinAlgError, match="did not converge"):
+            slam.belief()
+        assert state() == before
+    assert np.isfinite(slam.belief().covariance).all()
 
 
 @pytest.mark.parametrize("seed", [0, 8, 9, 10, 11])

@@ -5,6 +5,6 @@
 map.  ``phase_update`` runs an ordinary filter on the local map, extended by virtual
 landmarks that record the effect on all others, and splits the result at the end of a
 phase.  ``deferred_covariance`` stores the large covariance in blocks and applies its
-downdates step by step; ``row_exchange`` copies rows between both.  ``saved_state``
-checks saved states.
+downdates step by step; ``handover`` exchanges rows between both, block by block, by the
+kernels in ``row_exchange``.  ``saved_state`` checks saved states.
 """

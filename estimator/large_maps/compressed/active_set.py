@@ -6,12 +6,12 @@ import numpy as np
 
 from ....arrays import Array
 
-LARGEST_WHOLE_MAP = 500
+LARGEST_WHOLE_MAP = 350
 """Up to this many landmarks, the local map is the whole map.
 
 The end of a phase has a cost of its own.  In smaller maps it exceeds two full updates.
 """
-LARGEST_WHOLE_INVARIANT = 700
+LARGEST_WHOLE_INVARIANT = 400
 """The same in the invariant frame, where phases end at twice the cost."""
 SMALLEST_LOCAL_MAP = 30
 """Smallest number of landmarks at which a local map may be too large."""

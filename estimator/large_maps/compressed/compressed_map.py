@@ -17,10 +17,13 @@ from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ..sparse_cholesky.coordinates import pairs
 from ..undo import Undo
 from .active_set import choose_local, largest_whole_map
-from .deferred_covariance import DeferredCovariance, subtract, symmetric
+from .deferred_covariance import BLOCK, DeferredCovariance
+from .downdate import subtract, symmetric
+from .handover import Handover, begin_handover, blocks_in_a_step, exchanged_rows
 from .phase_update import (
     Phase,
     begin_phase,
+    checkpoint_filter,
     combine,
     end_phase,
     roots,
@@ -53,7 +56,8 @@ class CompressedMap:
         self.deferred = DeferredCovariance()
         self.local: dict[int, None] = {}  # the local landmarks, in their order
         self._virtual = 0
-        self._strip = np.zeros((3, 0))  # covariance of local and all other coordinates
+        self._handover: Handover | None = None  # the last change of the local map
+        self._strip = np.zeros((0, 0))  # covariance of local and all other coordinates
         self._origin = self.filter.map.mean[:2].copy()  # start of the phase
 
     def add(self, ids: Sequence[int]) -> None:
@@ -91,6 +95,7 @@ class CompressedMap:
         mean[inside] = now.mean[local]
         covariance[np.ix_(inside, inside)] = now.covariance[np.ix_(local, local)]
         if not is_local.all():
+            self.finish_handover()
             outside = 3 + pairs(np.flatnonzero(~is_local))
             columns = self._columns([i for i in ids if i not in order])
             strip = np.ascontiguousarray(self._strip[:, columns])
@@ -111,6 +116,7 @@ class CompressedMap:
 
         The distance is extended by 5 standard deviations.
         """
+        self.finish_handover()
         others = [i for i in self.slots if i not in self.local]
         columns = self._columns(others)
         away = np.hypot(*(self._points[columns].reshape(-1, 2) - pose.pose[:2]).T)
@@ -119,7 +125,9 @@ class CompressedMap:
         too_far = {others[k] for k in np.flatnonzero(away > within + 5 * std)}
         return [i for i in self.slots if i not in too_far]
 
-    def change_local_map(self, required: Sequence[int], size: int) -> None:
+    def change_local_map(
+        self, required: Sequence[int], size: int, *, hurried: bool
+    ) -> None:
         """End the phase, and begin another one with a new local map.
 
         Parameters
@@ -128,45 +136,75 @@ class CompressedMap:
             Landmarks that the local map must hold.
         size : int
             Number of its landmarks.
+        hurried : bool
+            Whether the change must not take several steps.
         """
         refuse_beyond_memory(
             f"a local map of {size} landmarks",
             covariance_bytes(3 * size),  # including virtual landmarks
             "take a smaller local_size",
         )
+        self.finish_handover()
         self.undo.save(self._checkpoint)
-        now = self._phase()
-        rows = self._apply(now)
+        now, whole = self._phase(), not self._virtual
+        own = self._columns(list(self.local))
+        self._make_room()
+        if not whole:
+            self._points += self._combine(now.shift, self._strip)[0]
+        self._points[own] = now.mean[3:]
+        self._references[own] = now.reference[3:]
         ahead = now.mean[:2] + (now.mean[:2] - self._origin) / 2  # likely direction
         points = self._points.reshape(-1, 2)
         chosen = choose_local(ahead, required, self.slots, points, size)
-        old, slot = list(self.local), self.slots.__getitem__
-        staying = [k for k, i in enumerate(old) if i in chosen]
-        places = {slot(i): k for k, i in enumerate(old) if i not in chosen}
-        leaving = sorted(places)
-        entering = sorted((i for i in chosen if i not in self.local), key=slot)
-        self.deferred.put(pairs(leaving), rows, 3 + pairs([places[s] for s in leaving]))
-        columns = self._columns(entering)
-        kept = np.r_[0:3, 3 + pairs(staying)]
-        staying_ids = [old[k] for k in staying]
-        self.local = dict.fromkeys(staying_ids + entering)
-        self._strip = np.empty((len(kept) + len(columns), self.deferred.width))
-        self._strip[: len(kept)] = rows[kept]
-        fresh = self._strip[len(kept) :]
-        self.deferred.read(columns, fresh)
-        fresh[:, self._columns(staying_ids)] = rows[kept[3:, None], columns].T
         self._origin = now.mean[:2].copy()
-        self._begin()
+        rows, self.local = exchanged_rows(self.slots, self.local, chosen)
+        self._handover, covariance = begin_handover(
+            self.deferred,
+            self._strip,
+            now,
+            rows,
+            invariant=self.is_invariant,
+            hurried=hurried,
+        )
+        self._strip = self._handover.next_strip
+        self._begin(covariance, in_place=not whole)
+
+    def work(self, rank: int, age: int, *, hurried: bool) -> None:
+        """Do a part of the deferred work.
+
+        Parameters
+        ----------
+        rank : int
+            The work is at most that of a full downdate of this rank.
+        age : int
+            Steps since the local map changed, including this one.
+        hurried : bool
+            Whether the change of the local map must not take several steps.
+        """
+        width = self.deferred.width
+        share = blocks_in_a_step(width, hurried=hurried)
+        if self._handover is not None:
+            self._handover.advance(self.deferred, age * share)
+        if hurried or (age - 1) * share * BLOCK >= width:
+            self.finish_handover()
+            self.deferred.work(rank)
+
+    def finish_handover(self) -> None:
+        """Finish the change of the local map now."""
+        if self._handover is not None:
+            self._handover.advance(self.deferred, self.deferred.width // BLOCK)
+            self._handover = None
 
     def _checkpoint(self) -> Callable[[], None]:
         """Return what takes back a change of the local map."""
         own = {k: v for k, v in vars(self).items() if k not in ("filter", "undo")}
         own |= {"_points": self._points.copy(), "_references": self._references.copy()}
-        saved, undo_deferred = self.filter.state_dict(), self.deferred.checkpoint()
+        undo_deferred = self.deferred.checkpoint()
+        undo_filter = checkpoint_filter(self.filter, in_place=bool(self._virtual))
 
         def undo() -> None:
             vars(self).update(own)
-            self.filter.restore(saved)
+            undo_filter()
             undo_deferred()
 
         return undo
@@ -181,10 +219,12 @@ class CompressedMap:
         """Memory of the belief [bytes]."""
         local = covariance_bytes(len(self.local) + self._virtual)
         others = self.deferred.nbytes + self._strip.nbytes + 2 * self._points.nbytes
-        return local + others
+        waiting = 0 if self._handover is None else self._handover.nbytes
+        return local + others + waiting
 
     def state_dict(self, numbers: Sequence[int]) -> dict[str, Any]:
         """Return copies of the whole state as arrays, with numbers of the caller."""
+        self.finish_handover()
         near = [self.slots[i] for i in self.local]
         invalid = pairs([*near, *self.free])  # arrays hold rests of these
         arrays = {
@@ -211,6 +251,7 @@ class CompressedMap:
         self.filter.restore(saved.local)
         self.deferred, self.slots, self.local = saved.far, saved.slots, saved.near
         self._points, self._references, self._strip, self._origin = saved.arrays
+        self._handover = None
         self._virtual, *numbers = saved.numbers[:4]
         self.free = saved.numbers[4:]
         return numbers
@@ -219,44 +260,21 @@ class CompressedMap:
         self.local.pop(landmark_id, None)
         self.free.append(self.slots.pop(landmark_id))
 
-    def _begin(self) -> None:
-        """Load the local map into the filter."""
+    def _begin(self, rows: Array, *, in_place: bool) -> None:
+        """Load the local map with these covariance rows (a, a - 3) into the filter."""
         columns = self._columns(list(self.local))
         whole = len(self.local) == len(self.slots)
-        size = 3 + len(columns)
-        self._virtual = 0 if whole else virtual_landmarks(size, self.is_invariant)
+        self._virtual = 0 if whole else virtual_landmarks(len(rows), self.is_invariant)
+        if whole:
+            self._strip, self._handover = self._strip[:0], None
         begin_phase(
             self.filter,
             self._points[columns],
-            self._strip[:, columns],
+            rows,
             self._references[columns],
             [*range(LOWEST_ID, LOWEST_ID + self._virtual), *self.local],
+            in_place=in_place,
         )
-
-    def _apply(self, now: Phase) -> Array:
-        """Apply a phase to the map; return the covariance rows of the local map.
-
-        The rows have shape (a, width).  The downdate of all other rows is deferred.
-        """
-        columns = self._columns(list(self.local))
-        self._make_room()
-        a = len(now.mean)
-        if self._virtual:
-            root, signs = roots(now.loss, self.is_invariant)
-            coefficients = np.concatenate([now.gain, now.shift, root])
-            product = self._combine(coefficients, self._strip)
-            rows, shift, lost = product[:a], product[a], product[a + 1 :].T.copy()
-            self._points += shift
-            self.deferred.defer(lost, signs)
-        else:
-            rows = np.zeros((a, self.deferred.width))
-        if np.array_equal(columns, np.arange(len(columns))):  # far faster in large maps
-            rows[:, : len(columns)] = now.covariance[:, 3:]
-        else:
-            rows[:, columns] = now.covariance[:, 3:]
-        self._points[columns] = now.mean[3:]
-        self._references[columns] = now.reference[3:]
-        return rows
 
     def _make_room(self) -> None:
         """Extend the arrays to all landmarks."""

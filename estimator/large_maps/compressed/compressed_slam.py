@@ -46,10 +46,9 @@ class CompressedEkfSlam:
     approximated: means and covariances equal those of the full filter, up to rounding,
     also for ``invariant``.
 
-    The update of the large covariance is spread over the steps that follow, so that no
-    step does more of it than a step of the full filter.  Up to 500 landmarks (700 with
-    ``base="invariant"``) the local map is the whole map, and a step is a step of the
-    full filter.  No step then takes longer than two steps of the full filter.
+    The update of the large covariance and the change of the local map are spread over
+    the steps that follow.  Up to 350 landmarks (400 with ``base="invariant"``) the
+    local map is the whole map, and a step is a step of the full filter.
 
     Parameters
     ----------
@@ -63,7 +62,7 @@ class CompressedEkfSlam:
         found later join it until it is half as large again.  By default, the filter
         chooses the number: all landmarks of a small map; in a large map a few times the
         number of landmarks in a scan, and fewer if consecutive scans have few landmarks
-        in common.  A number makes the mean step faster in maps of 250 to 700 landmarks,
+        in common.  A number makes the mean step faster in maps of 250 to 400 landmarks,
         and the slowest step slower.
     **settings
         Other options of the base filter.
@@ -114,7 +113,7 @@ class CompressedEkfSlam:
         self._map.reset(pose, pose_std)
         self._extra = 0  # landmarks of the local map beyond those of a scan
         self._age = 0  # scans in this phase
-        self._rests = False  # whether the first scan of the phase does no deferred work
+        self._rests = 0  # how many phases may still spread their beginning over steps
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
@@ -151,8 +150,8 @@ class CompressedEkfSlam:
         self._map.add(report.added_ids)
         if report.degrees_of_freedom:
             self._age += 1
-            if self._age > 1 or not self._rests:
-                self._map.deferred.work(report.degrees_of_freedom + 1)
+            rank = report.degrees_of_freedom + 1
+            self._map.work(rank, self._age, hurried=not self._rests)
         return report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
@@ -195,7 +194,7 @@ class CompressedEkfSlam:
         with self._map.undo.on_error():
             if not all(i in local for i in ids):
                 size = max(self._local_size or 0, len(local), len(ids))
-                self._map.change_local_map(ids, size)
+                self._map.change_local_map(ids, size, hurried=not self._rests)
             self._map.merge_pairs(list(zip(kept, gone, strict=True)))
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
@@ -265,10 +264,9 @@ class CompressedEkfSlam:
         extra, age, rests = loaded.load(saved)
         some = loaded.belief(list(loaded.slots)[:CHECKED_LANDMARKS])
         saved_states.refuse_indefinite("the covariance of state", some.covariance)
-        self._map, self._extra, self._age = loaded, extra, age
-        self._rests = bool(rests)
+        self._map, self._extra, self._age, self._rests = loaded, extra, age, rests
 
-    def _choose_local_map(self, required: Sequence[int]) -> tuple[int, int, bool]:
+    def _choose_local_map(self, required: Sequence[int]) -> tuple[int, int, int]:
         """Begin a new phase if the scan needs it or the local map is too large.
 
         Return the counters ``_extra``, ``_age`` and ``_rests`` after it.
@@ -280,13 +278,15 @@ class CompressedEkfSlam:
             )
         if self._is_adequate(required):
             return self._extra, self._age, self._rests
-        rests, extra = self._age >= active_set.SHORT_PHASE, self._extra
+        rests, extra = max(self._rests - 1, 0), self._extra
+        if self._age >= active_set.SHORT_PHASE and self._map.deferred.is_up_to_date:
+            rests = 2  # one short phase does not matter, several leave too much work
         size, mapped = self._local_size, len(self._map.slots)
         if size is None:
             extra = extra_landmarks(extra, len(required), mapped, self._age)
             small = self._map.is_small
             size = mapped if small else max(len(required), 4) + extra
-        self._map.change_local_map(required, size)
+        self._map.change_local_map(required, size, hurried=not rests)
         return extra, 0, rests
 
     def _is_adequate(self, required: Sequence[int]) -> bool:

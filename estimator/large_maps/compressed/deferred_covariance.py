@@ -8,13 +8,15 @@ import numpy as np
 from ....arrays import Array, IntArray
 from ...support import saved_states
 from ...support.memory_limit import refuse_beyond_memory
-from .downdate import Downdate, saved_downdates
-from .row_exchange import read_columns, write_columns
+from .downdate import Downdate, rows_of, saved_downdates, symmetric
+from .row_exchange import read_columns, read_marginal, write_columns
 
 # Rows of one block: 64 landmarks.
 BLOCK = 128
 # Smallest rank to apply; smaller downdates wait: memory limits thin products.
 WORTHWHILE = 40
+# Larger pending ranks must not wait for the exchange of rows.
+LARGEST_BACKLOG = 400
 _EVERY_ROW = np.arange(BLOCK)
 
 
@@ -29,7 +31,8 @@ class DeferredCovariance:
 
     W is small.  Reading subtracts its product, and :meth:`work` applies it to one block
     after the other.  A local map may read the rows of its landmarks and update its
-    copy; the stored rows of these landmarks are invalid until it puts them back.
+    copy; the stored rows of these landmarks are invalid until it puts them back.  Rows
+    are read and put block by block, between which :meth:`work` must not be called.
     """
 
     def __init__(self) -> None:
@@ -48,6 +51,11 @@ class DeferredCovariance:
     def pending_rank(self) -> int:
         """Rank of all pending downdates."""
         return sum(len(downdate.signs) for downdate in self._pending)
+
+    @property
+    def is_up_to_date(self) -> bool:
+        """Whether the pending downdates may wait longer."""
+        return self.pending_rank <= LARGEST_BACKLOG
 
     @property
     def nbytes(self) -> int:
@@ -74,36 +82,56 @@ class DeferredCovariance:
         while self.width < columns:
             self._blocks.append(np.zeros((BLOCK, self.width + BLOCK)))
 
-    def read(self, columns: IntArray, rows: Array) -> None:
-        """Fill rows (c, width) of P at ascending columns (c,), downdates subtracted."""
-        bounds = self._bounds(columns)
-        for (first, block), start, end in zip(
-            self._enumerate(), bounds, bounds[1:], strict=False
-        ):
+    def read(self, blocks: range, columns: IntArray, rows: Array) -> None:
+        """Fill the part of rows (c, width) of P that some blocks store.
+
+        Pending downdates are subtracted; the columns (c,) are ascending.
+        """
+        bounds = _bounds(columns, blocks)
+        for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
+            block, first = self._blocks[k], k * BLOCK
             if end > start:
                 rows[start:end, : first + BLOCK] = block[columns[start:end] - first]
             read_columns(block, first, columns[:start], rows)
-        done = self._done * BLOCK
-        for root, signs in self._pending:
-            weights, split = _of(root, columns) * signs, int(np.sum(columns < done))
-            rows[split:, : len(root)] -= weights[split:] @ root.T
-            rows[:split, done : len(root)] -= weights[:split] @ root[done:].T
-            done = 0  # only the first has been begun
+        for index, (root, signs) in enumerate(self._pending):
+            applied = self._done if index == 0 else 0  # only the first has been begun
+            left = range(max(blocks.start, applied), blocks.stop)
+            first, last = left.start * BLOCK, left.stop * BLOCK
+            if last > first:
+                start, end = _bounds(columns, range(left.start, left.stop))[
+                    :: len(left)
+                ]
+                weights, before = rows_of(root, columns[:end]) * signs, root[:last]
+                rows[start:end, : len(before)] -= weights[start:] @ before.T
+                rows[:start, first : len(before)] -= weights[:start] @ before[first:].T
 
-    def put(self, columns: IntArray, rows: Array, places: IntArray) -> None:
-        """Store the rows of ascending columns (c,), found at ``places`` (c,)."""
-        bounds = self._bounds(columns)
-        for (first, block), start, end in zip(
-            self._enumerate(), bounds, bounds[1:], strict=False
-        ):
+    def put(
+        self, blocks: range, columns: IntArray, rows: Array, places: IntArray
+    ) -> None:
+        """Store the part of rows that belongs to some blocks.
+
+        Parameters
+        ----------
+        blocks : range
+        columns : ndarray, shape (c,)
+            Ascending.
+        rows : ndarray, shape (·, width)
+        places : ndarray, shape (c,)
+            The rows of these columns.
+        """
+        bounds = _bounds(columns, blocks)
+        for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
+            block, first, others = self._blocks[k], k * BLOCK, _EVERY_ROW
             if end > start:
                 own = rows[places[start:end], : first + BLOCK]
                 block[columns[start:end] - first] = own
-            others = _EVERY_ROW
             if end - start > BLOCK // 4:  # most are written already
                 others = np.delete(_EVERY_ROW, columns[start:end] - first)
             write_columns(block, first, others, columns[:end], rows, places)
-        for root, _ in self._pending:  # the rows put are up to date
+
+    def forget(self, columns: IntArray) -> None:
+        """Drop the pending downdates of rows that are about to be put."""
+        for root, _ in self._pending:
             root[columns[columns < len(root)]] = 0.0
 
     def checkpoint(self) -> Callable[[], None]:
@@ -148,18 +176,16 @@ class DeferredCovariance:
     def marginal(self, columns: IntArray) -> Array:
         """Return the covariance (c, c) of some columns; exactly symmetric."""
         covariance = np.empty((len(columns), len(columns)))
-        for first, block in self._enumerate():
-            own = np.flatnonzero((columns >= first) & (columns < first + BLOCK))
-            upto = np.flatnonzero(columns < first + BLOCK)
-            if not len(own):
-                continue
-            part = block[np.ix_(columns[own] - first, columns[upto])]
-            for index, (root, signs) in enumerate(self._pending):
-                if index == 0 and first < self._done * BLOCK:
-                    continue
-                part -= (_of(root, columns[own]) * signs) @ _of(root, columns[upto]).T
-            covariance[np.ix_(upto, own)] = part.T
-            covariance[np.ix_(own, upto)] = part
+        holding = set((columns // BLOCK).tolist())
+        for k in holding:
+            read_marginal(self._blocks[k], k * BLOCK, columns, covariance)
+        applied = columns < self._done * BLOCK
+        for index, (root, signs) in enumerate(self._pending):
+            rows = rows_of(root, columns)
+            change = (rows * signs) @ rows.T
+            if index == 0 and self._done:
+                change[applied[:, None] & applied] = 0.0
+            covariance -= change
         return symmetric(covariance)
 
     def diagonal(self) -> Array:
@@ -223,12 +249,6 @@ class DeferredCovariance:
         """Return the first row and the array of each block."""
         return [(k * BLOCK, block) for k, block in enumerate(self._blocks)]
 
-    def _bounds(self, columns: IntArray) -> list[int]:
-        """Return how many of ascending columns lie before each block, and in all."""
-        starts = np.arange(0, self.width + 1, BLOCK)
-        bounds: list[int] = np.searchsorted(columns, starts).tolist()
-        return bounds
-
     def _begin(self) -> bool:
         """Return whether a downdate is under way; join the pending ones to start it."""
         if not self._under_way and self.pending_rank >= WORTHWHILE:
@@ -267,30 +287,8 @@ def stored_bytes(landmarks: int) -> int:
     return 8 * BLOCK**2 * blocks * (blocks + 1) // 2
 
 
-def _of(root: Array, columns: IntArray) -> Array:
-    """Return rows of W; columns newer than W have zeros."""
-    if len(root) > columns.max(initial=0):
-        chosen: Array = root[columns]
-        return chosen
-    rows = np.zeros((len(columns), root.shape[1]))
-    inside = columns < len(root)
-    rows[inside] = root[columns[inside]]
-    return rows
-
-
-def subtract(covariance: Array, root: Array, signs: Array) -> None:
-    """P ← P − W diag(s) Wᵀ in place, a few rows at a time, without a second matrix."""
-    for first in range(0, len(covariance), BLOCK):
-        own = slice(first, first + BLOCK)
-        covariance[own] -= (root[own] * signs) @ root.T
-
-
-def symmetric(covariance: Array) -> Array:
-    """Copy the lower half into the upper one, in place."""
-    n = len(covariance)
-    for first in range(0, n, BLOCK):
-        last = min(first + BLOCK, n)
-        own = covariance[first:last, first:last]
-        own[:] = np.tril(own) + np.tril(own, -1).T
-        covariance[first:last, last:] = covariance[last:, first:last].T
-    return covariance
+def _bounds(columns: IntArray, blocks: range) -> list[int]:
+    """Return how many of ascending columns lie before each block and the last's end."""
+    starts = BLOCK * np.arange(blocks.start, blocks.stop + 1)
+    bounds: list[int] = columns.searchsorted(starts).tolist()
+    return bounds

@@ -20,6 +20,8 @@ number for each of the s coordinates, a *virtual landmark* at the origin.  With 
 the rows of S read as complex numbers, the equations above hold unchanged.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +51,13 @@ def virtual_landmarks(coordinates: int, invariant: bool) -> int:
 
 
 def begin_phase(
-    slam: EkfSlam, mean: Array, rows: Array, reference: Array, ids: list[int]
+    slam: EkfSlam,
+    mean: Array,
+    rows: Array,
+    reference: Array,
+    ids: list[int],
+    *,
+    in_place: bool,
 ) -> None:
     """Replace the map of a filter by the extension, followed by a local map.
 
@@ -63,12 +71,14 @@ def begin_phase(
         Covariance of pose and local landmarks with these; the lower half is used.
     ids : list of int
         Identities of the virtual landmarks, if any, then of the local ones.
+    in_place : bool
+        Whether the old arrays may be overwritten.
     """
     gaussian, size = slam.map, 3 + 2 * len(ids)
     before = gaussian.size
     pose, pose_mean = gaussian.covariance[:3, :3].copy(), gaussian.mean[:3].copy()
     fixed = gaussian.reference[:3].copy()
-    if not size < gaussian.capacity <= _ROOMY * size:
+    if not (in_place and size < gaussian.capacity <= _ROOMY * size):
         gaussian.allocate(len(ids), more=len(ids) // 2)
         before = 0
     virtual = size - len(rows)
@@ -81,6 +91,19 @@ def begin_phase(
         array[:3], array[3 + virtual : size] = head, tail
     fill_extended(gaussian.covariance, before, pose, rows, virtual, step)
     gaussian.relabel(ids)
+
+
+def checkpoint_filter(slam: EkfSlam, *, in_place: bool) -> Callable[[], None]:
+    """Return what takes back :func:`begin_phase`."""
+    if in_place:
+        return partial(slam.restore, slam.state_dict())
+    gaussian, arrays, ids = slam.map, slam.map.arrays, list(slam.map.slots)
+
+    def undo() -> None:
+        gaussian.arrays = arrays
+        gaussian.relabel(ids)
+
+    return undo
 
 
 def end_phase(slam: EkfSlam, virtual: int) -> Phase:

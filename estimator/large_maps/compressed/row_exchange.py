@@ -16,6 +16,22 @@ def read_columns(block: Array, first: int, columns: IntArray, rows: Array) -> No
 
 
 @jit
+def read_marginal(
+    block: Array, first: int, columns: IntArray, covariance: Array
+) -> None:
+    """Copy what a block holds of the covariance (c, c) of some columns, lower half."""
+    last = first + len(block)
+    for i in range(len(columns)):
+        row = columns[i]
+        if first <= row < last:
+            for j in range(len(columns)):
+                column = columns[j]
+                if column <= row:
+                    value = block[row - first, column]
+                    covariance[i, j] = covariance[j, i] = value
+
+
+@jit
 def write_columns(
     block: Array,
     first: int,
