@@ -54,7 +54,8 @@ def profile_crossing(
     Returns
     -------
     float
-        By Newton's method; 0 or infinity where it leaves what parameters can be.
+        By Newton's method; 0 or infinity where it leaves what parameters can be, or
+        does not find the crossing on this side.
     """
     here, up = parameters.copy(), start > parameters[i]
     here[i] = start
@@ -68,7 +69,7 @@ def profile_crossing(
         inverse = np.linalg.inv(information[np.ix_(o, o)])
         rise = 0.5 * float(g[o] @ inverse @ g[o])
         slope = float(g[at] - information[at, o] @ inverse @ g[o])
-        if (slope >= 0) == up:  # not yet beyond the maximum
+        if slope == 0 or (slope > 0) == up:  # not yet beyond the maximum
             step = FARTHEST if up else -FARTHEST
         else:
             step = (level - found.value - rise) / slope
@@ -80,4 +81,7 @@ def profile_crossing(
             return np.inf if up else 0.0
         if abs(step) < CLOSE and rise < CLOSE:
             break
-    return float(np.exp(theta[at]))
+    end = float(np.exp(theta[at]))
+    if (end > parameters[i]) == up:
+        return end
+    return np.inf if up else 0.0  # few readings: it ends on the wrong side
