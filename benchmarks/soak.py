@@ -271,7 +271,7 @@ def digest_of_runs(
     if backend == "dask":
         distributed: Any = import_module("distributed")  # optional
         with distributed.Client(
-            n_workers=2, threads_per_worker=1, dashboard_address=None
+            n_workers=2, threads_per_worker=1, dashboard_address=":0"
         ):
             results = monte_carlo(world, "ekf,invariant", runs, out=target, **options)
     else:

@@ -46,7 +46,7 @@ def _dask_client(scheduler: str | None, jobs: int | None) -> Any:
     client: Any = distributed.Client
     if scheduler is not None:
         return client(scheduler)
-    return client(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
+    return client(n_workers=jobs, threads_per_worker=1, dashboard_address=":0")
 
 
 def _join_ray(backend: str | None, scheduler: str) -> None:

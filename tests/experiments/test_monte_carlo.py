@@ -4,6 +4,7 @@ import errno
 import json
 import resource
 import signal
+import socket
 import sys
 import time
 import tracemalloc
@@ -20,6 +21,7 @@ from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, make_estimator, registry
 from slamgym.evaluation import AssociationScores, Gospa
 from slamgym.evaluation.nees import pose_nees, state_nees
+from slamgym.experiments.command_line.cluster import connected
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
 from slamgym.experiments.monte_carlo.measure.bounds import bound_runs, noise_of_runs
@@ -669,3 +671,14 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(whole, tmp_path)
     assert (tmp_path / "here.victim").exists()
     with load_results(out) as results:
         xr.testing.assert_equal(results.load(), whole)
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_starts_beside_another_without_a_warning():
+    pytest.importorskip("distributed", reason="needs dask.distributed")
+    with socket.socket() as other:
+        if other.connect_ex(("127.0.0.1", 8787)):
+            other.bind(("", 8787))  # Dask's usual port
+            other.listen()
+        with connected("dask", None, 1):
+            pass
