@@ -29,7 +29,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,6 +43,7 @@ from slamgym.estimator import list_estimators, make_estimator
 from slamgym.estimator.interface import restore
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.experiments.command_line.cluster import connected
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.sim_configs import load_scenario
 
@@ -268,13 +268,7 @@ def digest_of_runs(
     """Compute or load the runs of a Monte Carlo; return the digest of its results."""
     world = load_scenario("six_landmarks")
     options: dict[str, Any] = {"jobs": jobs, "backend": backend, "block_size": 8}
-    if backend == "dask":
-        distributed: Any = import_module("distributed")  # optional
-        with distributed.Client(
-            n_workers=2, threads_per_worker=1, dashboard_address=":0"
-        ):
-            results = monte_carlo(world, "ekf,invariant", runs, out=target, **options)
-    else:
+    with connected(backend, None, 2):
         results = monte_carlo(world, "ekf,invariant", runs, out=target, **options)
     with results:
         return digest({str(n): v.to_numpy() for n, v in results.data_vars.items()})

@@ -1,10 +1,13 @@
 """The clusters that may do the work of a command: Dask and Ray."""
 
 import contextlib
+import threading
 from collections.abc import Iterator
 from typing import Any
 
 from .errors import BadInputError
+
+_INTERVAL = 1.0  # between looks at the workers of a local cluster [s]
 
 
 @contextlib.contextmanager
@@ -46,7 +49,33 @@ def _dask_client(scheduler: str | None, jobs: int | None) -> Any:
     client: Any = distributed.Client
     if scheduler is not None:
         return client(scheduler)
-    return client(n_workers=jobs, threads_per_worker=1, dashboard_address=":0")
+    return _with_new_workers(
+        client(n_workers=jobs, threads_per_worker=1, dashboard_address=":0")
+    )
+
+
+@contextlib.contextmanager
+def _with_new_workers(client: Any) -> Iterator[None]:
+    """Replace workers of a local cluster that are gone.
+
+    Dask restarts a worker that was killed, but not one that was killed as it started.
+    """
+    over, cluster = threading.Event(), client.cluster
+    wanted = len(cluster.worker_spec)
+
+    def replace() -> None:
+        while not over.wait(_INTERVAL):
+            if len(cluster.workers) < wanted:
+                cluster.scale(wanted)
+
+    with client:
+        watch = threading.Thread(target=replace, daemon=True)
+        watch.start()
+        try:
+            yield
+        finally:
+            over.set()
+            watch.join()
 
 
 def _join_ray(backend: str | None, scheduler: str) -> None:

@@ -682,3 +682,18 @@ def test_a_dask_cluster_starts_beside_another_without_a_warning():
             other.listen()
         with connected("dask", None, 1):
             pass
+
+
+@pytest.mark.slow
+def test_a_dask_worker_that_dask_does_not_restart_is_replaced():
+    distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
+    import dask
+
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "100ms"}),
+        connected("dask", None, 1),
+    ):
+        client = distributed.default_client()
+        (nanny,) = client.cluster.workers.values()
+        client.sync(nanny.close)
+        assert client.submit(abs, -3).result(timeout=60) == 3
