@@ -116,10 +116,17 @@ def dsyrk_floor(count: int) -> Step:
 def compare(count: int, steps: int, *, jumping: bool = False) -> dict[str, Costs]:
     """Measure every filter in a map with this number of landmarks."""
     drives = 3 if count <= REPEATED else 1
-    return least([compare_once(count, steps, jumping=jumping) for _ in range(drives)])
+    return least(
+        [
+            compare_once(count, steps, jumping=jumping, backwards=k % 2 == 1)
+            for k in range(drives)
+        ]
+    )
 
 
-def compare_once(count: int, steps: int, *, jumping: bool) -> dict[str, Costs]:
+def compare_once(
+    count: int, steps: int, *, jumping: bool, backwards: bool
+) -> dict[str, Costs]:
     """Measure every filter on one drive."""
     data = list(drive(count, steps, jumping=jumping))
     few = steps if count <= 500 else 3 * STRETCH
@@ -141,7 +148,7 @@ def compare_once(count: int, steps: int, *, jumping: bool) -> dict[str, Costs]:
             for readings, ids in first_look(count):
                 isam.update(readings, ids)
             cases["GTSAM iSAM2"] = (step_of(isam), steps)
-    costs = measure(cases, data)
+    costs = measure(cases, data, backwards=backwards)
     for name, each in (("compressed", slam), ("compressed invariant", invariant)):
         costs[name] = Costs(costs[name].steps, each.nbytes)
     return costs

@@ -41,12 +41,20 @@ def step_of(slam: Any) -> Step:
 
 
 def measure(
-    cases: dict[str, tuple[Step, int]], data: Sequence[Reading]
+    cases: dict[str, tuple[Step, int]],
+    data: Sequence[Reading],
+    *,
+    backwards: bool = False,
 ) -> dict[str, Costs]:
-    """Time stretches of steps of all cases in turn, each up to its number of steps."""
+    """Time stretches of steps of all cases in turn, each up to its number of steps.
+
+    The first step of a stretch finds the processor's caches full of the case before,
+    which is another one ``backwards``.
+    """
     costs: dict[str, list[float]] = {name: [] for name in cases}
+    order = [*cases.items()][:: -1 if backwards else 1]
     for first in range(0, len(data), STRETCH):
-        for name, (step, most) in cases.items():
+        for name, (step, most) in order:
             for now in data[first : first + STRETCH]:
                 if len(costs[name]) < most:
                     began = time.thread_time()
