@@ -30,6 +30,7 @@ from .error_findings import (
     Errors,
     blame_association,
     errors_of,
+    smallest_adjusted,
     spurious_knowledge,
     wrong_from_the_start,
 )
@@ -186,8 +187,7 @@ def _of_the_noise(guilty: list[Finding], errors: Errors) -> Diagnosis:
     others = dict.fromkeys(f.cause for f in guilty[1:] if f.cause != first.cause)
     also = f"; also {', '.join(others)}" if others else ""
     sentence = (
-        f"{first.cause}: {first.text} ({_p_text(first.p_value)}){also}; "
-        f"{_ratio_text(errors)}."
+        f"{first.cause}: {first.text} ({_p_text(first.p_value)}){also}; {errors.text}."
     )
     return Diagnosis(first.cause, first.p_value, sentence, tuple(others))
 
@@ -201,24 +201,33 @@ def _of_the_filter(
 ) -> Diagnosis:
     """Return the answer for a filter that assumes the right noise."""
     spurious = None if knowledge is None else spurious_knowledge(knowledge)
-    p_value = _smallest_adjusted(errors, spurious, blame)
-    ratio_text = _ratio_text(errors)
+    p_value = smallest_adjusted(errors, spurious, blame)
+    ratio_text = errors.text
     if p_value >= FILTER_RATE:
         return _of_consistent_errors(p_value, nis_ratio, blame)
     is_association = blame is not None and blame.p_value < _ERROR_RATE
-    if errors.ratio < 1 and not (is_association and errors.p_value >= FILTER_RATE):
+    if _is_cautious(errors, is_association=is_association):
         sentence = f"cannot tell: the noise is what it assumes, but {ratio_text}."
         return Diagnosis(CANNOT_TELL, p_value, sentence)
     if blame is not None and (is_association or not blame.is_paired):
         return _of_the_association(blame, errors)
     doubt = _doubt(errors, nis_ratio, early)
+    return _of_large_errors(p_value, ratio_text, doubt, _claims(knowledge, spurious))
+
+
+def _is_cautious(errors: Errors, *, is_association: bool) -> bool:
+    """Whether the errors are too small, and not only compared with known identities."""
+    return errors.ratio < 1 and not (is_association and errors.p_value >= FILTER_RATE)
+
+
+def _of_large_errors(
+    p_value: float, ratio_text: str, doubt: str, claims: str
+) -> Diagnosis:
+    """Return the answer for errors too large: linearisation, unless in doubt."""
+    what = f"the noise is what it assumes, but {ratio_text}"
     if doubt:
-        what = f"the noise is what it assumes, but {ratio_text}{doubt}"
-        return Diagnosis(CANNOT_TELL, p_value, f"cannot tell: {what}.")
-    sentence = (
-        f"linearisation: the noise is what it assumes, but {ratio_text} "
-        f"({_p_text(p_value)}){_claims(knowledge, spurious)}."
-    )
+        return Diagnosis(CANNOT_TELL, p_value, f"cannot tell: {what}{doubt}.")
+    sentence = f"linearisation: {what} ({_p_text(p_value)}){claims}."
     return Diagnosis(LINEARISATION, p_value, sentence)
 
 
@@ -256,18 +265,6 @@ def _innovations_text(nis_ratio: float) -> str:
     )
 
 
-def _smallest_adjusted(
-    errors: Errors, spurious: float | None, blame: Blame | None
-) -> float:
-    """Return the smallest p-value of the tests of a filter, times their number."""
-    tests = [errors.p_value]
-    if spurious is not None:
-        tests.append(spurious)
-    if blame is not None and blame.is_paired:
-        tests.append(blame.p_value)
-    return min(1.0, len(tests) * min(tests))
-
-
 def _claims(knowledge: Array | None, spurious: float | None) -> str:
     """State the share of the least possible variance, if it is too small."""
     if knowledge is None or spurious is None or spurious >= _ERROR_RATE:
@@ -277,7 +274,7 @@ def _claims(knowledge: Array | None, spurious: float | None) -> str:
 
 
 def _of_the_association(blame: Blame, errors: Errors) -> Diagnosis:
-    ratio_text = _ratio_text(errors)
+    ratio_text = errors.text
     if blame.p_value < _ERROR_RATE:
         sentence = (
             f"association: {blame.share:.0%} of the runs give readings to wrong "
@@ -289,11 +286,6 @@ def _of_the_association(blame: Blame, errors: Errors) -> Diagnosis:
         "more wrong associations err no more than others."
     )
     return Diagnosis(CANNOT_TELL, errors.p_value, sentence)
-
-
-def _ratio_text(errors: Errors) -> str:
-    lost = f", and {errors.lost} runs are lost" if errors.lost > 1 else ""
-    return f"its squared errors are {errors.ratio:.3g} times what it claims{lost}"
 
 
 def _p_text(p_value: float) -> str:

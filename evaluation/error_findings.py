@@ -39,6 +39,12 @@ class Errors(NamedTuple):
     lost: int
     """Number of lost runs."""
 
+    @property
+    def text(self) -> str:
+        """The finding, for a sentence."""
+        lost = f", and {self.lost} runs are lost" if self.lost > 1 else ""
+        return f"its squared errors are {self.ratio:.3g} times what it claims{lost}"
+
 
 class Early(NamedTuple):
     """How far the covariances are from the errors in the early steps."""
@@ -177,3 +183,15 @@ def _beyond_margin(averages: Array) -> float:
         return 1.0
     nearest = LEAST_RATIO if mean > 1 else 1 / LEAST_RATIO
     return time_average_test(averages / nearest, 1).p_value
+
+
+def smallest_adjusted(
+    errors: Errors, spurious: float | None, blame: Blame | None
+) -> float:
+    """Return the smallest p-value of the tests of a filter, times their number."""
+    tests = [errors.p_value]
+    if spurious is not None:
+        tests.append(spurious)
+    if blame is not None and blame.is_paired:
+        tests.append(blame.p_value)
+    return min(1.0, len(tests) * min(tests))

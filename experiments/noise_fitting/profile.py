@@ -69,11 +69,7 @@ def profile_crossing(
         inverse = np.linalg.inv(information[np.ix_(o, o)])
         rise = 0.5 * float(g[o] @ inverse @ g[o])
         slope = float(g[at] - information[at, o] @ inverse @ g[o])
-        if slope == 0 or (slope > 0) == up:  # not yet beyond the maximum
-            step = FARTHEST if up else -FARTHEST
-        else:
-            step = (level - found.value - rise) / slope
-        step = float(np.clip(step, -FARTHEST, FARTHEST))
+        step = _newton_step(level - found.value - rise, slope, up=up)
         change = inverse @ (g[o] - information[o, at] * step)
         theta[o] += np.clip(change, -FARTHEST, FARTHEST)
         theta[at] += step
@@ -85,3 +81,10 @@ def profile_crossing(
     if (end > parameters[i]) == up:
         return end
     return np.inf if up else 0.0  # few readings: it ends on the wrong side
+
+
+def _newton_step(fall: float, slope: float, *, up: bool) -> float:
+    """Return a step of θ towards a level, or outwards before the maximum is passed."""
+    if slope == 0 or (slope > 0) == up:
+        return FARTHEST if up else -FARTHEST
+    return float(np.clip(fall / slope, -FARTHEST, FARTHEST))
