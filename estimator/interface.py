@@ -237,18 +237,11 @@ def restore(estimator: SlamEstimator, state: Mapping[str, Any]) -> None:
         estimator.load_state_dict(state)
 
 
-_CALLS: dict[str, tuple[str, ...]] = {
-    "reset": ("pose", "pose_std"),
-    "predict": ("odometry", "dt"),
-    "update": ("measurements", "landmark_ids"),
-    "belief": (),
-    "state_dict": (),
-    "load_state_dict": ("state",),
-}
+_METHODS = ("reset", "predict", "update", "belief", "state_dict", "load_state_dict")
 
 
 def differences_from_interface(
-    estimator: object, methods: Sequence[str] = tuple(_CALLS)
+    estimator: object, methods: Sequence[str] = _METHODS
 ) -> list[str]:
     """Return what methods an estimator or its class lacks, or what they do not accept.
 
@@ -280,7 +273,7 @@ def _difference(estimator: object, name: str) -> str:
     if not callable(method):
         return f"no method {name}()"
     own = () if not isinstance(estimator, type) else (None,)
-    call = _CALLS[name]
+    _self, *call = inspect.signature(getattr(SlamEstimator, name)).parameters
     try:
         signature = inspect.signature(method)
     except (TypeError, ValueError):  # compiled

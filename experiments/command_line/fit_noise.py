@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from . import options
-from .option_values import assignments, standard_deviations
+from .option_values import assignments, given_options, standard_deviations
 from .program import command
 
 if TYPE_CHECKING:
@@ -76,8 +76,9 @@ def fit_noise(
     stated = standard_deviations(motion_std, measurement_std, initial_pose_std)
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)
-    named = {"range_std_per_metre": range_std_per_metre, "noise_at_rest": noise_at_rest}
-    given = {name: value for name, value in named.items() if value is not None}
+    given = given_options(
+        range_std_per_metre=range_std_per_metre, noise_at_rest=noise_at_rest
+    )
     settings = settings_for(
         drive,
         estimator=estimator,

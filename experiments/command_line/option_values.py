@@ -8,6 +8,17 @@ from typing import Any
 from .errors import BadInputError
 
 
+def given_options(**values: Any) -> dict[str, Any]:
+    """Return the options that the user gave.
+
+    Examples
+    --------
+    >>> given_options(gate_probability=0.99, noise_at_rest=None)
+    {'gate_probability': 0.99}
+    """
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def standard_deviations(
     motion_std: str | None, measurement_std: str | None, initial_pose_std: str | None
 ) -> dict[str, tuple[float, ...]]:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from . import options
-from .option_values import assignments, standard_deviations
+from .option_values import assignments, given_options, standard_deviations
 from .program import command
 
 
@@ -78,13 +78,12 @@ def replay(
     from .reporter import Reporter
     from .run_files import check_rerun, filter_and_write, show_run
 
-    named = {
-        "landmark_init": landmark_init,
-        "gate_probability": gate_probability,
-        "range_std_per_metre": range_std_per_metre,
-        "noise_at_rest": noise_at_rest,
-    }
-    given = {name: value for name, value in named.items() if value is not None}
+    given = given_options(
+        landmark_init=landmark_init,
+        gate_probability=gate_probability,
+        range_std_per_metre=range_std_per_metre,
+        noise_at_rest=noise_at_rest,
+    )
     reporter = Reporter(as_json=as_json)
     check_rerun(rerun)
     drive = read_any_log(log, robot, truth=truth, noise_from_file=noise_from_file)

@@ -3,7 +3,7 @@
 from typing import Annotated
 
 from . import options
-from .option_values import assignments, standard_deviations
+from .option_values import assignments, given_options, standard_deviations
 from .program import command
 
 
@@ -56,13 +56,12 @@ def smooth(
     from .tables import heading, smoothing_figures, smoothing_table, written
 
     name, own = read_label(estimator)
-    named = {
-        "gate_probability": gate_probability,
-        "range_std_per_metre": range_std_per_metre,
-        "noise_at_rest": noise_at_rest,
-        "robust": robust,
-    }
-    given = {key: value for key, value in named.items() if value is not None}
+    given = given_options(
+        gate_probability=gate_probability,
+        range_std_per_metre=range_std_per_metre,
+        noise_at_rest=noise_at_rest,
+        robust=robust,
+    )
     given |= assignments("--option", option) | own | {"follow": name}
     reporter = Reporter(as_json=as_json)
     drive = read_any_log(log, robot, truth=truth, noise_from_file=noise_from_file)
