@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,16 +31,20 @@ class Belief:
     covariance: Array
     """Shape (3 + 2n, 3 + 2n), of the additive error."""
     landmark_ids: tuple[int, ...]
+    """Given as any sequence or array, kept as a tuple."""
     frame: ErrorFrame = "additive"
     """Coordinates in which the filter takes its error to be Gaussian."""
 
     def __post_init__(self) -> None:
         mean = np.array(self.mean, dtype=np.float64)
         covariance = np.array(self.covariance, dtype=np.float64)
-        size = 3 + 2 * len(self.landmark_ids)
+        ids: Any = self.landmark_ids
+        ids = tuple(ids.tolist() if isinstance(ids, np.ndarray) else ids)
+        object.__setattr__(self, "landmark_ids", ids)
+        size = 3 + 2 * len(ids)
         if mean.shape != (size,) or covariance.shape != (size, size):
             raise ValueError(
-                f"a belief with {len(self.landmark_ids)} landmarks has mean ({size},) "
+                f"a belief with {len(ids)} landmarks has mean ({size},) "
                 f"and covariance ({size}, {size}), got {mean.shape} and "
                 f"{covariance.shape}"
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -33,9 +32,7 @@ __all__ = [
     "SupportsTruth",
     "SupportsViewCheckpoint",
     "UpdateReport",
-    "differences_from_interface",
     "optional_members",
-    "refuse_unusable",
     "restore",
 ]
 
@@ -235,52 +232,3 @@ def restore(estimator: SlamEstimator, state: Mapping[str, Any]) -> None:
         estimator.restore(state)
     else:
         estimator.load_state_dict(state)
-
-
-_METHODS = ("reset", "predict", "update", "belief", "state_dict", "load_state_dict")
-
-
-def differences_from_interface(
-    estimator: object, methods: Sequence[str] = _METHODS
-) -> list[str]:
-    """Return what methods an estimator or its class lacks, or what they do not accept.
-
-    Examples
-    --------
-    >>> class Still:
-    ...     def predict(self, odometry): ...
-    >>> differences_from_interface(Still(), ("predict", "belief"))
-    ['predict(odometry) in place of predict(odometry, dt)', 'no method belief()']
-    """
-    found = (_difference(estimator, name) for name in methods)
-    return [difference for difference in found if difference]
-
-
-def refuse_unusable(factory: object, name: str) -> None:
-    """Raise a `ValueError` if a class lacks what every run of an estimator needs."""
-    methods = ("predict", "update", "belief")
-    if not isinstance(factory, type):
-        return
-    if lacks := differences_from_interface(factory, methods):
-        raise ValueError(
-            f"estimator '{name}' has {'; '.join(lacks)} "
-            "(slamgym.check_estimator checks the whole interface)"
-        )
-
-
-def _difference(estimator: object, name: str) -> str:
-    method = getattr(estimator, name, None)
-    if not callable(method):
-        return f"no method {name}()"
-    own = () if not isinstance(estimator, type) else (None,)
-    _self, *call = inspect.signature(getattr(SlamEstimator, name)).parameters
-    try:
-        signature = inspect.signature(method)
-    except (TypeError, ValueError):  # compiled
-        return ""
-    try:
-        signature.bind(*own, *call)
-    except TypeError:
-        named = ", ".join(list(signature.parameters)[len(own) :])
-        return f"{name}({named}) in place of {name}({', '.join(call)})"
-    return ""

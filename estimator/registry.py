@@ -20,7 +20,7 @@ from .filters.iterated import IteratedEkfSlam
 from .filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from .filters.robocentric import RobocentricEkfSlam
 from .filters.unscented import UnscentedSlam
-from .interface import SlamEstimator, refuse_unusable
+from .interface import SlamEstimator
 from .peers.catalogue import PEERS
 from .support.filter_labels import read_label
 
@@ -221,9 +221,11 @@ def _imported(path: str) -> EstimatorFactory:
     module, _, attribute = path.partition(":")
     try:
         made = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"cannot import estimator '{path}': {error}") from error
-    refuse_unusable(made, path)
+    except Exception as error:
+        kind = type(error).__name__
+        raise ValueError(
+            f"cannot import estimator '{path}', {kind}: {error}"
+        ) from error
     return cast("EstimatorFactory", made)
 
 

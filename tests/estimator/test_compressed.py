@@ -119,7 +119,7 @@ def follow_both(
 
 @pytest.mark.parametrize("base", BASES)
 def test_it_keeps_the_contract(base):
-    check_estimator(lambda **noise: CompressedEkfSlam(base=base, **noise))
+    assert check_estimator(lambda **noise: CompressedEkfSlam(base=base, **noise)) == ()
 
 
 @pytest.mark.slow

@@ -113,7 +113,7 @@ def test_no_management_is_the_bare_filter():
 @pytest.mark.parametrize("management", [True, TIDY], ids=["default", "all"])
 @pytest.mark.parametrize("name", MANAGEABLE)
 def test_every_managed_filter_keeps_the_contract(name, management):
-    check_estimator(partial(make_estimator, name, management=management))
+    assert check_estimator(partial(make_estimator, name, management=management)) == ()
 
 
 @pytest.mark.parametrize("name", MANAGEABLE)
@@ -750,7 +750,7 @@ SMALL = {"submap_size": 9, "extent_limit": 2.0}  # many submaps in a short drive
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_managed_submaps_keep_the_contract_also_when_they_are_closed(base):
     options = {"base": base, "management": TIDY, **SMALL}
-    check_estimator(partial(make_estimator, "submaps", **options))
+    assert check_estimator(partial(make_estimator, "submaps", **options)) == ()
 
 
 def test_with_identities_the_default_policy_changes_nothing_in_closed_submaps():

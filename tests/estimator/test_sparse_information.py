@@ -80,7 +80,9 @@ def assert_same_bits(one, other):
     ids=str,
 )
 def test_it_keeps_the_contract(options):
-    check_estimator(lambda **noise: SparseInformationSlam(**noise, **options))
+    assert (
+        check_estimator(lambda **noise: SparseInformationSlam(**noise, **options)) == ()
+    )
 
 
 @pytest.mark.slow

@@ -75,7 +75,9 @@ def assert_same_bits(one, other):
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("limits", [{}, {"submap_size": 5}, {"extent_limit": 2.5}])
 def test_it_keeps_the_contract(base, limits):
-    check_estimator(lambda **noise: SubmapSlam(base=base, **limits, **noise))
+    assert (
+        check_estimator(lambda **noise: SubmapSlam(base=base, **limits, **noise)) == ()
+    )
 
 
 # --- the joined map against the full filter, and against a dense solution -------------
