@@ -27,7 +27,7 @@ class Belief:
     """
 
     mean: Array
-    """Shape (3 + 2n,), heading in [-π, π)."""
+    """Shape (3 + 2n,), heading in [-π, π); a column may be given."""
     covariance: Array
     """Shape (3 + 2n, 3 + 2n), of the additive error."""
     landmark_ids: tuple[int, ...]
@@ -36,7 +36,7 @@ class Belief:
     """Coordinates in which the filter takes its error to be Gaussian."""
 
     def __post_init__(self) -> None:
-        mean = np.array(self.mean, dtype=np.float64)
+        mean = np.array(self.mean, dtype=np.float64).ravel()
         covariance = np.array(self.covariance, dtype=np.float64)
         ids: Any = self.landmark_ids
         ids = tuple(ids.tolist() if isinstance(ids, np.ndarray) else ids)

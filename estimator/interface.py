@@ -62,7 +62,7 @@ class SlamEstimator(Protocol):
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that :meth:`load_state_dict` needs, as arrays."""
+        """Return everything that load_state_dict() needs, as arrays."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

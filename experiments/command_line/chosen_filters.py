@@ -2,11 +2,15 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
+from ...estimator.check_estimator import find_breaches, listed
+from ...estimator.registry import find_estimator
 from ...estimator.support.filter_labels import read_label
 from ..monte_carlo.measure.estimator_choices import estimator_choices
 from ..runs.filter_settings import FilterSettings
+from .errors import BrokenFilterError
 from .option_values import assignments
 
 
@@ -29,7 +33,7 @@ def chosen_filters(
     Raises
     ------
     ValueError
-        If there is none, or one is unknown, malformed, or named twice.
+        If there is none, or one is unknown, malformed, named twice, or cannot run.
 
     Examples
     --------
@@ -40,12 +44,39 @@ def chosen_filters(
     >>> list(chosen_filters("ekf,invariant[iterations=3]", {}, set_up))
     ['ekf', 'invariant[iterations=3]']
     """
+    refuse_broken(estimators, options)
     return {
         choice.label: settings(
             estimator=choice.name, options={**options, **choice.options}
         )
         for choice in estimator_choices(estimators)
     }
+
+
+def refuse_broken(estimators: str, options: Mapping[str, Any] | None = None) -> None:
+    """Check the user's own filters among some labels, before any work.
+
+    Parameters
+    ----------
+    estimators : str
+        Labels separated by commas.
+    options : mapping, optional
+        Options of all of them.
+
+    Raises
+    ------
+    BrokenFilterError
+        If a filter cannot run, with all reasons.
+    ValueError
+        If a label is unknown or malformed.
+    """
+    for _, name, own in estimator_choices(estimators):
+        if ":" in name and not name.startswith("slamgym."):
+            given = {**(options or {}), **own}
+            given.pop("management", None)  # it is around the filter
+            factory = partial(find_estimator(name), **given)
+            if findings := find_breaches(factory, ("required",)):
+                raise BrokenFilterError(listed(factory, findings))
 
 
 def with_options(label: str, texts: Sequence[str]) -> str:

@@ -25,6 +25,10 @@ class BadInputError(ValueError):
     """The user's input cannot be used; the message gives the reason in one line."""
 
 
+class BrokenFilterError(ValueError):
+    """A filter of the user's own cannot run; the message lists why, one a line."""
+
+
 class TerminationError(KeyboardInterrupt):
     """A scheduler or ``kill`` sent SIGTERM; it is handled like Ctrl-C."""
 
@@ -63,7 +67,7 @@ def _terminate(_number: int, _frame: object) -> NoReturn:
 
 
 class OneLineErrors(TyperGroup):
-    """A group of commands that reports an error in one line.
+    """A group of commands that reports an error in one line, or in a list.
 
     Bad input ends with exit code 2, a failure with 1, Ctrl-C with 130, SIGTERM with
     143. The traceback is shown when the environment variable ``SLAMGYM_TRACEBACK`` is
@@ -95,13 +99,15 @@ class OneLineErrors(TyperGroup):
 
 
 def message_of(error: Exception) -> str:
-    r"""Return the message of an error as one line.
+    r"""Return the message of an error as one line, or the list of a broken filter.
 
     Examples
     --------
     >>> message_of(ValueError("dt must be > 0, got 0\n steps must be >= 2, got 1"))
     'dt must be > 0, got 0; steps must be >= 2, got 1'
     """
+    if isinstance(error, BrokenFilterError):
+        return str(error)
     if isinstance(error, InterruptedRunError):
         return str(error) or "interrupted; nothing was written"
     if hasattr(error, "format_message"):  # of the command line itself

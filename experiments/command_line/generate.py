@@ -87,12 +87,15 @@ def generate(
     slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]
     """
     from ..trajectories import generate_trajectories
+    from .chosen_filters import refuse_broken
     from .cluster import connected
     from .output_folder import default_folder
     from .reporter import Reporter
     from .scenario_options import chosen_scenario
 
     world = chosen_scenario(scenario, steps, set_)
+    if estimator is not None:
+        refuse_broken(estimator)
     place = out or default_folder(world.name, controller, format_)
     reporter = Reporter(as_json=as_json)
     stopped = f"interrupted; whole shards stay in {place}, the same command continues"

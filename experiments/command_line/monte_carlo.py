@@ -97,8 +97,8 @@ def monte_carlo(
     """  # noqa: D400 (the list of commands shows the question)
     from ...sim_configs.atomic_file import replace_when_written
     from .. import monte_carlo
-    from ..monte_carlo.measure.estimator_choices import estimator_choices
     from ..monte_carlo.report.html_report import write_html_report
+    from .chosen_filters import refuse_broken
     from .cluster import connected
     from .output_folder import as_json_text, default_folder
     from .reporter import Reporter
@@ -107,7 +107,7 @@ def monte_carlo(
     world = chosen_scenario(scenario, steps, set_)
     assumed = changes("--assume", assume)
     reporter = Reporter(as_json=as_json)
-    estimator_choices(estimators)  # refuses a wrong name before any work
+    refuse_broken(estimators)
     place = out or default_folder("monte-carlo", world.name)
     told = world.with_changes(**assumed) if assumed else world
     with reporter.note_if_compiling("the filters"):

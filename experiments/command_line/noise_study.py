@@ -77,11 +77,13 @@ def noise_study(
     """
     from ..noise_study.one_run import study_log, study_scenario
     from ..runs.filter_settings import settings_for, settings_for_scenario
+    from .chosen_filters import refuse_broken
     from .log_files import read_any_log
     from .reporter import Reporter
     from .scenario_options import chosen_controller, chosen_scenario, recorded
 
     chosen = assignments("--option", option)
+    refuse_broken(estimator, chosen)
     stds = standard_deviations(motion_std, measurement_std, initial_pose_std)
     if not _is_scenario(source):
         _refuse({"steps": steps, "set": set_}, "a scenario, not of a log")

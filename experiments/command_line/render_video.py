@@ -56,6 +56,7 @@ def render(
     """
     from ...envs.rendering import check_video, write_video
     from ..runs.filter_settings import settings_for_scenario
+    from .chosen_filters import refuse_broken
     from .reporter import Reporter
     from .scenario_options import chosen_controller, chosen_scenario
     from .warm_up import warm_up
@@ -65,6 +66,7 @@ def render(
     chosen = assignments("--option", option)
     settings = None
     if shown != "none":
+        refuse_broken(shown, chosen)
         settings = settings_for_scenario(world, estimator=shown, options=chosen)
     reporter = Reporter(as_json=as_json)
     driver = chosen_controller(controller, world, seed)
