@@ -608,14 +608,14 @@ def check_save_and_restore(factory: Factory) -> Iterator[str]:
         trial.drive(steps=5)
         state = trial.state_dict()
         try:
-            other.load_state_dict(carried(state))
+            state = carried(state)
         except Exception as error:
-            error = error.__cause__ if isinstance(error, CallError) else error
             yield (
-                f"load_state_dict() must take what state_dict() returned, after {way}, "
-                f"got {type(error).__name__}: {error}"
+                f"state_dict() must return what {way} saves and loads, got "
+                f"{type(error).__name__}: {error}"
             )
-            continue
+            return
+        other.load_state_dict(state)
         for each in (trial, other):
             each.drive(steps=3, seed=1)
         if not same_beliefs(trial.belief(), other.belief()):

@@ -1,7 +1,7 @@
 import importlib.util
-import sys
+import re
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +11,13 @@ from slamgym.estimator import (
     EkfSlam,
     EstimatorContractError,
     SlamEstimator,
+    UpdateReport,
     check_estimator,
     list_estimators,
     make_estimator,
     register_estimator,
 )
+from slamgym.estimator.check_estimator import find_breaches
 
 TEXTBOOK = Path(__file__).parents[2] / "examples" / "05_your_own_estimator.py"
 NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
@@ -23,7 +25,7 @@ NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
 
 @pytest.mark.parametrize("name", list_estimators())
 def test_every_registered_estimator_keeps_the_contract(name):
-    check_estimator(lambda **settings: make_estimator(name, **settings))
+    assert check_estimator(lambda **settings: make_estimator(name, **settings)) == ()
     assert isinstance(make_estimator(name, **NOISE), SlamEstimator)
 
 
@@ -152,6 +154,55 @@ class LacksMuch:
         """Ignore a scan."""
 
 
+class CountsItsLandmarks(EkfSlam):
+    def belief(self):
+        belief = super().belief()
+        ids = tuple(range(len(belief.landmark_ids)))
+        return Belief(belief.mean, belief.covariance, ids)
+
+
+class IsSkewed(EkfSlam):
+    def belief(self):
+        belief = super().belief()
+        skew = np.zeros_like(belief.covariance)
+        skew[0, 1] = 1e-3
+        return Belief(belief.mean, belief.covariance + skew, belief.landmark_ids)
+
+
+class IsNegative(EkfSlam):
+    def belief(self):
+        belief = super().belief()
+        less = belief.covariance - 0.05 * np.eye(len(belief.mean))
+        return Belief(belief.mean, less, belief.landmark_ids)
+
+
+class ReportsNothing(EkfSlam):
+    def update(self, measurements, landmark_ids=None):
+        super().update(measurements, landmark_ids)
+        return UpdateReport()
+
+
+class RemembersItsRuns(EkfSlam):
+    runs = 0
+
+    def reset(self, pose, pose_std):
+        super().reset(pose, pose_std)
+        self.runs += 1
+
+    def predict(self, odometry, dt=1.0):
+        super().predict(odometry, dt + 1e-9 * self.runs)
+
+
+class NeedsAStart(EkfSlam):
+    def __init__(self, *, initial_pose, **settings):
+        super().__init__(initial_pose=initial_pose, **settings)
+
+
+class NeedsIds(EkfSlam):
+    def update(self, measurements, landmark_ids):
+        return super().update(measurements, list(landmark_ids))
+
+
 class StartsTooCertain(EkfSlam):
     def __init__(self, **settings):
         super().__init__(**{**settings, "initial_pose_std": (0, 0, 0)})
@@ -169,30 +220,253 @@ class NeverGrowsCertain(EkfSlam):
 @pytest.mark.parametrize(
     ("estimator", "complaint"),
     [
-        (LacksUpdate, r"LacksUpdate has no method update\(\)"),
-        (LacksMuch, r"reset\(\); predict\(odometry\) in place of .*belief\(\)"),
+        (
+            LacksUpdate,
+            r"LacksUpdate has no method update\(measurements, landmark_ids\)",
+        ),
+        (
+            LacksMuch,
+            r"no method reset\((?s:.*)predict\(odometry\) in place of(?s:.*)bel",
+        ),
         (StartsTooCertain, r"0\.09\]\], got \[\[0\.0, 0\.0, 0\.0\]"),
         (TurnsBeforeItDrives, "drive d along the old heading"),
         (AnswersWithLiveArrays, "snapshot"),
-        (AcceptsNan, r"predict\(\(nan, 0\)\) must raise a ValueError"),
-        (ForgetsItsMap, "bit for bit"),
         (IgnoresBearings, "must be mapped where it is"),
         (Overconfident, "must fit its covariance"),
         (NeverGrowsCertain, "a second reading of a landmark must shrink"),
         (AddsNoNoise, "noise"),
-        (KeepsItsMapOnReset, "reset"),
+        (KeepsItsMapOnReset, r"after reset\(pose, pose_std\) must have no landmarks"),
         (ReturnsNothing, "must return an UpdateReport, got NoneType"),
-        (SavesLiveArrays, r"state_dict\(\) must return copies"),
-        (SavesALiveReference, r"state_dict\(\) must return copies"),
-        (LoadsTheMeanItself, r"load_state_dict\(\) must copy"),
-        (SavesADictionary, r"after numpy\.savez, got ValueError: Object arrays"),
-        (RaisesAtNan, r"a NaN must raise a ValueError, got RuntimeError: this cannot"),
-        (lambda: None, "the factory must accept the keywords"),
+        (CountsItsLandmarks, r"ids given to update\(\), here 9 and 4, got \(0, 1\)"),
+        (IsSkewed, "must be symmetric, got elements that differ by 0.001"),
+        (IsNegative, "must be positive semidefinite, got the eigenvalue -0.0"),
+        (
+            lambda: None,
+            r"<lambda>\(motion_std=.* raised TypeError: .* unexpected",
+        ),
+        (3, r"raised TypeError: 'int' object is not callable"),
     ],
 )
 def test_a_breach_of_the_contract_is_named(estimator, complaint):
     with pytest.raises(EstimatorContractError, match=complaint):
         check_estimator(estimator)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "complaint"),
+    [
+        (
+            AcceptsNan,
+            r"should raise a ValueError .* predict\(\(nan, 0\)\) raised nothing",
+        ),
+        (RaisesAtNan, r"but update\(\) with a NaN raised RuntimeError: this cannot be"),
+        (ForgetsItsMap, "bit for bit"),
+        (SavesLiveArrays, r"state_dict\(\) must return copies"),
+        (SavesALiveReference, r"state_dict\(\) must return copies"),
+        (LoadsTheMeanItself, r"load_state_dict\(\) must copy"),
+        (
+            SavesADictionary,
+            r"what numpy\.savez saves and loads, got ValueError: Ob arrays",
+        ),
+        (ReportsNothing, r"new landmarks in added_ids, got UpdateReport: NIS 0"),
+        (ReportsNothing, r"the 4 readings used: .*, got \(\) and 0"),
+        (RemembersItsRuns, r"reset\(\) should forget the run"),
+        (NeedsAStart, r"raised TypeError: .*missing .*'initial_pose'"),
+        (NeedsIds, r"update\(np\.empty\(\(0, 2\)\), None\) raised TypeError"),
+    ],
+)
+def test_a_recommendation_is_returned_and_raises_nothing(estimator, complaint):
+    findings = check_estimator(estimator)
+    assert {finding.level for finding in findings} == {"recommended"}
+    assert any(re.search(complaint, finding.message) for finding in findings)
+
+
+class Plain:
+    """EKF-SLAM as people write it: plain numpy, ids in a list, no slamgym."""
+
+    def __init__(self, motion_std, measurement_std, initial_pose, initial_pose_std):
+        self.R, self.Q = np.diag(motion_std) ** 2, np.diag(measurement_std) ** 2
+        self.start(initial_pose, initial_pose_std)
+
+    def start(self, pose, std):
+        self.x, self.P, self.ids = np.array(pose, float), np.diag(std) ** 2, []
+
+    def predict(self, odometry):
+        d, turn = odometry
+        c, s = np.cos(self.x[2]), np.sin(self.x[2])
+        self.x[:3] += d * c, d * s, turn
+        G = np.eye(len(self.x))
+        G[:2, 2] = -d * s, d * c
+        F = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        self.P = G @ self.P @ G.T
+        self.P[:3, :3] += F @ self.R @ F.T
+
+    def update(self, measurements, landmark_ids):
+        for (bearing, r), i in zip(measurements, landmark_ids, strict=True):
+            if i not in self.ids:
+                self.add(i, bearing, r)
+            self.correct(3 + 2 * self.ids.index(i), bearing, r)
+
+    def add(self, i, bearing, r):
+        angle = self.x[2] + bearing
+        position = self.x[:2] + r * np.array([np.cos(angle), np.sin(angle)])
+        self.x = np.append(self.x, position)
+        P, n = np.eye(len(self.x)) * 1e4, len(self.P)
+        P[:n, :n] = self.P
+        self.P = P
+        self.ids.append(i)
+
+    def correct(self, k, bearing, r):
+        dx, dy = self.x[k : k + 2] - self.x[:2]
+        distance = np.hypot(dx, dy)
+        H = np.zeros((2, len(self.x)))
+        H[0, [0, 1, 2, k, k + 1]] = *np.array([dy, -dx]) / distance**2, -1, 0, 0
+        H[1, [0, 1]] = -dx / distance, -dy / distance
+        H[:, k : k + 2] = -H[:, :2]
+        nu = np.array([bearing - np.arctan2(dy, dx) + self.x[2], r - distance])
+        nu[0] = (nu[0] + np.pi) % (2 * np.pi) - np.pi
+        S = H @ self.P @ H.T + self.Q
+        K = self.P @ H.T @ np.linalg.inv(S)
+        self.x = self.x + K @ nu
+        self.P = self.P - K @ H @ self.P
+
+    def belief(self):
+        return {"pose": self.x[:3], "covariance": self.P, "landmarks": self.ids}
+
+
+class PlainForSlamgym(Plain):
+    """The same after one round of findings."""
+
+    def reset(self, pose, pose_std):
+        self.start(pose, pose_std)
+
+    def predict(self, odometry, dt=1.0):
+        R, self.R = self.R, self.R * dt
+        super().predict(odometry)
+        self.R = R
+
+    def update(self, measurements, landmark_ids):
+        super().update(measurements, landmark_ids)
+        return UpdateReport()
+
+    def belief(self):
+        return Belief(self.x[:, None], self.P, self.ids)
+
+    def state_dict(self):
+        return {"x": self.x.copy()}
+
+
+def test_a_plain_filter_learns_in_one_round_all_that_it_needs():
+    with pytest.raises(EstimatorContractError) as caught:
+        check_estimator(Plain)
+    required = [f.message for f in caught.value.findings if f.level == "required"]
+    assert required == [
+        "Plain has no method reset(pose, pose_std)",
+        "Plain has predict(odometry) in place of predict(odometry, dt)",
+        "belief() must return a Belief(mean, covariance, landmark_ids), got dict",
+        "update() must return an UpdateReport, got NoneType; UpdateReport() will do if "
+        "the estimator computes no NIS",
+    ]
+    message = str(caught.value)
+    assert message.startswith("Plain cannot run in slamgym:\n- Plain has no method")
+    assert "\nRecommended, but not needed to run:\n- " in message
+    assert "belief()                              returns Belief(mean" in message
+    findings = check_estimator(PlainForSlamgym)
+    assert {finding.level for finding in findings} == {"recommended"}
+
+
+def test_a_class_with_another_constructor_learns_what_its_methods_lack():
+    class Other(Plain):
+        def __init__(self, Q, R):
+            pass
+
+    with pytest.raises(EstimatorContractError) as caught:
+        check_estimator(Other)
+    constructor, reset, predict = caught.value.findings
+    assert "raised TypeError" in constructor.message
+    assert reset.message == "Other has no method reset(pose, pose_std)"
+    assert predict.message.startswith("Other has predict(odometry) in place of")
+    with pytest.raises(EstimatorContractError, match="Other cannot run in slamgym"):
+        check_estimator(partial(Other, Q=1))
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array, dict.fromkeys])
+def test_landmark_ids_may_come_in_any_sequence(kind):
+    class Mine(PlainForSlamgym):
+        def belief(self):
+            return Belief(self.x, self.P, kind(self.ids))
+
+    assert {finding.level for finding in check_estimator(Mine)} == {"recommended"}
+
+
+CALLS = {
+    "__init__": r"Stumbles\(motion_std=\(0.05, 0.02, 0.02\), .* raised ",
+    "reset": r"reset\(\[0.0, 0.0, 0.0\], \[0.0, 0.0, 0.0\]\) raised ",
+    "predict": r"predict\(\[0.3, 0.1\], 1.0\) raised ",
+    "update": r"update\(\[\[0.24, 4.12\], .*\], \[0, 1, 2, 3\]\) raised ",
+    "belief": r"belief\(\) raised ",
+    "state_dict": r"state_dict\(\) raised ",
+    "load_state_dict": r"load_state_dict\(state\) raised ",
+}
+
+
+@pytest.mark.parametrize("error", [TypeError, KeyError, np.linalg.LinAlgError])
+@pytest.mark.parametrize("method", CALLS)
+def test_an_exception_is_one_finding_with_call_and_line(method, error):
+    def stumble(self, *arguments, **keywords):
+        raise error("oops")  # here
+
+    class Stumbles(PlainForSlamgym):
+        pass
+
+    setattr(Stumbles, method, stumble)
+    found = [each for each in find_breaches(Stumbles) if "oops" in each.message]
+    assert len(found) == 1
+    assert re.match(CALLS[method] + error.__name__, found[0].message)
+    line = stumble.__code__.co_firstlineno + 1
+    place = f'(test_check_estimator.py, line {line}: raise error("oops")  # here)'
+    assert found[0].message.endswith(place)
+    is_required = "state_dict" not in method
+    assert found[0].level == ("required" if is_required else "recommended")
+
+
+def test_the_line_of_an_error_inside_a_library_is_that_of_the_caller():
+    class Mine(PlainForSlamgym):
+        def belief(self):
+            return Belief(self.x, self.P, [1, 2, 3, 4, 5, 6])
+
+    message = str(find_breaches(Mine)[0])
+    assert message.startswith("required: belief() raised ValueError: a belief with 6")
+    assert message.endswith("return Belief(self.x, self.P, [1, 2, 3, 4, 5, 6]))")
+
+
+@pytest.mark.parametrize(
+    ("parts", "complaint"),
+    [
+        ({"nis": np.eye(1)}, r"nis must be a finite number, got array"),
+        ({"nis": np.nan}, r"nis must be a finite number, got nan"),
+        ({"degrees_of_freedom": 2.0}, "must be an integer, got 2.0"),
+        ({"associated_ids": None}, r"associated_ids must be a tuple of .*, got None"),
+        ({"added_ids": (7,)}, r"added_ids must be a tuple of given ids, got \(7,\)"),
+        ({"added_ids": ([],)}, r"check_reports\(\) cannot use .* unhashable"),
+    ],
+)
+def test_a_report_that_no_run_can_use_is_a_finding(parts, complaint):
+    class Mine(PlainForSlamgym):
+        def update(self, measurements, landmark_ids):
+            super().update(measurements, landmark_ids)
+            return UpdateReport(**parts)
+
+    assert re.search(complaint, find_breaches(Mine, ("required",))[0].message)
+
+
+def test_a_belief_that_is_not_finite_is_a_finding():
+    class Mine(PlainForSlamgym):
+        def belief(self):
+            return Belief(self.x, self.P * np.nan, self.ids)
+
+    messages = [finding.message for finding in find_breaches(Mine, ("required",))]
+    assert messages[0].startswith("belief() must be finite, got the mean [0.3,")
 
 
 @pytest.mark.parametrize(
@@ -210,7 +484,7 @@ def test_a_filter_that_forgets_to_wrap_the_innovation_is_named(
     spec = importlib.util.spec_from_file_location("textbook", TEXTBOOK)
     textbook = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(textbook)
-    check_estimator(textbook.TextbookEkf)
+    assert check_estimator(textbook.TextbookEkf) == ()
     monkeypatch.setattr(textbook, "wrap_angle", wrap)
     complaint = rf"bearings {bearings}.* wrap the innovation to .* NIS 4\.9e\+04"
     with pytest.raises(EstimatorContractError, match=complaint):
@@ -229,11 +503,12 @@ def test_an_estimator_is_found_by_its_import_path():
         make_estimator("no.such:Filter", **NOISE)
 
 
-def test_a_class_that_cannot_run_is_refused_when_it_is_imported(monkeypatch):
-    monkeypatch.setitem(sys.modules, "of_a_user", SimpleNamespace(Mine=LacksMuch))
-    complaint = r"'of_a_user:Mine' has predict\(odometry\) in place of.*check_estimator"
+def test_a_module_that_fails_at_its_import_is_named(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "fails_at_import.py").write_text("Mine = no_such_name")
+    complaint = "'fails_at_import:Mine', NameError: name 'no_such_name' is not defined"
     with pytest.raises(ValueError, match=complaint):
-        make_estimator("of_a_user:Mine", **NOISE)
+        make_estimator("fails_at_import:Mine", **NOISE)
 
 
 def test_a_registered_estimator_is_made_by_name():

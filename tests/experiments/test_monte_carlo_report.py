@@ -497,6 +497,8 @@ def test_warnings_name_unused_readings_and_innovations_of_another_size():
     first, second = run_warnings({"ekf": entry}, 40)
     assert first.startswith("ekf: 12% of the readings corrected nothing")
     assert "NIS is 3 per degree of freedom" in second
+    (warning,) = run_warnings({"mine": entry | {"nis": None}}, 40)
+    assert warning.startswith("mine: its reports list no reading that corrected")
     managed = entry | {"options": {"management": True}, "nis": 1.0}
     assert run_warnings({"ekf": managed}, 40) == []
     split = {"map_size": 25.0, "true_map_size": 20.0}

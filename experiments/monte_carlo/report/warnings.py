@@ -82,7 +82,9 @@ def _suspicions(entry: Mapping[str, Any]) -> Iterator[str]:
     """Yield suspicions from the numbers of an estimator, empty for none."""
     unused, nis = entry.get("unused_readings") or 0.0, entry.get("nis")
     is_managed = "management" in entry.get("options", {})  # it may leave readings out
-    if unused > MOST_REJECTED and not is_managed:
+    if unused > MOST_REJECTED and not is_managed and nis is None:
+        yield "its reports list no reading that corrected the belief: it has no NIS."
+    elif unused > MOST_REJECTED and not is_managed:
         yield (
             f"{unused:.0%} of the readings corrected nothing, rejected by a gate or "
             "too near: the filter may diverge."
