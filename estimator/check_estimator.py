@@ -48,7 +48,7 @@ The methods of an estimator (state_dict and load_state_dict are recommended):
   predict(odometry, dt=1.0)             odometry (d, α)
   update(measurements, landmark_ids)    rows (bearing, range); returns UpdateReport()
   belief()                              returns Belief(mean, covariance, landmark_ids)
-  state_dict(), load_state_dict(state)  save and restore, as arrays by name
+  state_dict(), load_state_dict(state)  arrays by name; landmark management needs them
 Belief and UpdateReport are in slamgym.estimator; the mean is (x, y, θ, l1x, l1y, …)."""
 
 
@@ -215,9 +215,8 @@ def lack(estimator: object, name: str) -> str:
     Still has predict(odometry) in place of predict(odometry, dt)
     """
     method, wanted = getattr(estimator, name, None), getattr(SlamEstimator, name)
-    kind, unbound = type(estimator), ()
-    if isinstance(estimator, type):
-        kind, unbound = estimator, (None,)
+    unbound = (None,) if isinstance(estimator, type) else ()
+    kind = estimator if isinstance(estimator, type) else type(estimator)
     _self, *call = inspect.signature(wanted).parameters
     interface = f"{name}({', '.join(call)})"
     if not callable(method):
@@ -401,7 +400,7 @@ def _start_findings(
     if not np.allclose(belief.pose, pose):
         yield (
             f"belief().pose after {whose} must be the initial pose {pose}, got "
-            f"{belief.pose.tolist()}"
+            f"{belief.pose.round(6).tolist()}"
         )
     if belief.landmark_ids:
         yield (
@@ -413,7 +412,7 @@ def _start_findings(
         yield (
             f"belief().pose_covariance after {whose} must be the diagonal of the "
             f"squared initial std, {wanted.round(6).tolist()}, got "
-            f"{belief.pose_covariance.tolist()}"
+            f"{belief.pose_covariance.round(6).tolist()}"
         )
 
 
@@ -425,7 +424,8 @@ def check_motion(factory: Factory) -> Iterator[str]:
     if not np.allclose(pose, (0, 2, np.pi / 2 + 0.5), atol=1e-6):
         yield (
             "predict((d, α)) must drive d along the old heading, then turn by α: from "
-            f"(0, 0, π/2), (2, 0.5) leads to (0, 2, π/2 + 0.5), got {pose.tolist()}"
+            f"(0, 0, π/2), (2, 0.5) leads to (0, 2, π/2 + 0.5), got "
+            f"{pose.round(6).tolist()}"
         )
 
 
@@ -454,7 +454,7 @@ def check_mapping(factory: Factory) -> Iterator[str]:
         yield (
             "a landmark read exactly from a known pose must be mapped where it is: l = "
             f"(x + r cos(θ + β), y + r sin(θ + β)) = {LANDMARKS[[2, 0]].tolist()}, got "
-            f"{belief.landmarks[order].tolist()}"
+            f"{belief.landmarks[order].round(6).tolist()}"
         )
 
 

@@ -1,13 +1,13 @@
 """Write a filter of your own, and check it against the interface.
 
-slamgym accepts any class with the six methods of `SlamEstimator`; there is no base
-class. This example is a textbook EKF-SLAM with dense matrices. The filter itself is the
-twenty lines of ``predict``, ``_correct`` and ``_add``. The other methods start it, save
-it and return its belief.
+slamgym accepts any class with the methods of `SlamEstimator`; there is no base class.
+This example is a textbook EKF-SLAM with dense matrices. The filter itself is the twenty
+lines of ``predict``, ``_correct`` and ``_add``. The other methods start it, save it and
+return its belief.
 
-`check_estimator` runs a filter in a small known world and names the first requirement
-that it violates, like Gymnasium's ``check_env`` for environments. The second class of
-this example violates one: it turns before it drives.
+`check_estimator` runs a filter in a small known world and lists what it lacks to run
+and where it computes wrong beliefs, like Gymnasium's ``check_env`` for environments. It
+returns recommendations. The second class of this example turns before it drives.
 
 Run it::
 
@@ -154,7 +154,7 @@ def main() -> None:
         try:
             check_estimator(estimator)
         except EstimatorContractError as error:
-            print(f"{estimator.__name__} breaks the contract:\n  {error}")
+            print(error)
         else:
             print(f"{estimator.__name__} keeps the contract")
 

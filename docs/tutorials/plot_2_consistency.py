@@ -10,7 +10,7 @@ and compare it with two filters of the package on 100 drives.
 # Write and check a filter
 # ------------------------
 # A filter is any class with the six methods of ``SlamEstimator``. The simplest way to write one is to change an existing filter.
-# ``check_estimator`` runs it in a small world and names the first requirement that it violates.
+# ``check_estimator`` runs it in a small world and lists what it lacks to run, wrong beliefs, and recommendations.
 
 from slamgym import EkfSlam, check_estimator
 

@@ -78,13 +78,13 @@ def edit_map(slam: SlamEstimator, *, merging: bool = True) -> MapEditor:
     )
     if can_remove and (can_merge or not merging):
         return _MethodEditor(slam)
-    missing = {"mean", "covariance", "landmark_ids"} - set(slam.state_dict())
-    if missing:
-        wanted = "remove and merge" if merging else "remove"
+    can_save = hasattr(slam, "state_dict") and hasattr(slam, "load_state_dict")
+    needed = ("mean", "covariance", "landmark_ids")
+    if not can_save or not set(needed) <= set(slam.state_dict()):
+        wanted = "methods remove and merge" if merging else "method remove"
         raise TypeError(
-            f"{type(slam).__name__} cannot be managed so: it has no method "
-            f"{wanted}, and its state_dict() holds no "
-            f"{sorted(missing)[0]!r}"
+            f"{type(slam).__name__} cannot be managed so: it needs the {wanted}, or "
+            f"state_dict() and load_state_dict() with {', '.join(needed)}"
         )
     return _StateEditor(slam)
 

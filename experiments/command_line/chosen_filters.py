@@ -12,6 +12,7 @@ from ..monte_carlo.measure.estimator_choices import estimator_choices
 from ..runs.filter_settings import FilterSettings
 from .errors import BrokenFilterError
 from .option_values import assignments
+from .reporter import Reporter
 
 
 def chosen_filters(
@@ -75,7 +76,9 @@ def refuse_broken(estimators: str, options: Mapping[str, Any] | None = None) -> 
             given = {**(options or {}), **own}
             given.pop("management", None)  # it is around the filter
             factory = partial(find_estimator(name), **given)
-            if findings := find_breaches(factory, ("required",)):
+            with Reporter(as_json=False).note_if_compiling("the filter"):
+                findings = find_breaches(factory, ("required",))
+            if findings:
                 raise BrokenFilterError(listed(factory, findings))
 
 

@@ -32,7 +32,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         filters
         map_management
         large_maps peers
-        registry contract
+        registry
         smoother
         check_estimator
     """,

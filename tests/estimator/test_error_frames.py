@@ -80,6 +80,14 @@ def test_a_belief_gives_its_error_and_the_covariance_of_it(frame):
     np.testing.assert_allclose(other, additive_error(TRUTH, MEAN))
 
 
+@pytest.mark.parametrize("kind", [list, np.array, dict.fromkeys, tuple])
+def test_a_belief_keeps_ids_of_any_kind_as_a_tuple_and_a_column_as_a_row(kind):
+    belief = Belief(np.arange(7.0)[:, None], np.eye(7), kind([9, 4]))
+    assert belief.landmark_ids == (9, 4)
+    assert {type(i) for i in belief.landmark_ids} == {int}
+    assert belief.landmarks.tolist() == [[3, 4], [5, 6]]
+
+
 def test_a_belief_refuses_what_does_not_fit():
     belief = Belief(np.zeros(5), np.eye(5), (3,))
     with pytest.raises(ValueError, match="the truth must be a pose"):

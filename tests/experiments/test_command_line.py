@@ -328,6 +328,98 @@ def test_malformed_lists_of_filters_are_refused(log, names):
     assert message.startswith(("estimators must", "an estimator must be like ekf or"))
 
 
+PLAIN = """
+import numpy as np
+from slamgym.estimator import Belief, EkfSlam, UpdateReport
+
+class Broken:
+    def __init__(self, motion_std, measurement_std, initial_pose, initial_pose_std):
+        self.pose = initial_pose
+
+    def predict(self, odometry):
+        return self.speed
+
+    def update(self, measurements, landmark_ids):
+        return None
+
+    def belief(self):
+        return {"pose": self.pose}
+
+class Plain:
+    def __init__(self, ekf=EkfSlam, **settings):
+        self.ekf = ekf(**settings)
+
+    def reset(self, pose, pose_std):
+        self.ekf.reset(pose, pose_std)
+
+    def predict(self, odometry, dt=1.0):
+        self.ekf.predict(odometry, dt)
+
+    def update(self, measurements, landmark_ids):
+        self.ekf.update(measurements, landmark_ids)
+        return UpdateReport()
+
+    def belief(self):
+        belief = self.ekf.belief()
+        ids = list(belief.landmark_ids)
+        return Belief(belief.mean[:, None], belief.covariance, ids)
+"""
+
+
+@pytest.fixture
+def of_a_user(here, monkeypatch):
+    (here / "of_a_user.py").write_text(PLAIN)
+    monkeypatch.syspath_prepend(here)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    yield "of_a_user:Plain"
+    sys.modules.pop("of_a_user", None)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("run", "six_landmarks"),
+        ("replay", "little.csv"),
+        ("monte-carlo", "six_landmarks"),
+        ("noise-study", "six_landmarks"),
+        ("render", "six_landmarks", "--out", "film.mp4"),
+        ("generate", "six_landmarks", "--episodes", 2),
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_filter_of_the_user_that_cannot_run_is_refused_with_all_that_it_lacks(
+    log, of_a_user, command
+):
+    before = sorted(os.walk("."))
+    option = "--estimator" if command[0] != "monte-carlo" else "--estimators"
+    result = slamgym(*command, option, "of_a_user:Broken")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert sorted(os.walk(".")) == before
+    first, *breaches = result.stderr.splitlines()[:6]
+    assert first == "slamgym: Broken cannot run in slamgym:"
+    assert [line.split(",")[0] for line in breaches] == [
+        "- Broken has no method reset(pose",
+        "- Broken has predict(odometry) in place of predict(odometry",
+        "- belief() must return a Belief(mean",
+        "- update() must return an UpdateReport",
+        "- predict((0.3",
+    ]
+    expected = "has no attribute 'speed' (of_a_user.py, line 10: return self.speed)"
+    assert breaches[-1].endswith(expected)
+
+
+def test_a_filter_of_the_user_without_reports_and_saving_runs(
+    log, of_a_user, without_pictures
+):
+    pose = answered("replay", log, "-e", f"{of_a_user},ekf")["others"][0]["pose"]
+    assert answered("replay", log, "-e", of_a_user)["pose"] == pose
+    world = ("six_landmarks", "--steps", 3)
+    summary = answered("monte-carlo", *world, "-e", of_a_user, "--runs", 2)
+    message = refused("run", "hidden_identities", "-e", of_a_user)
+    assert "needs the method remove, or state_dict() and load" in message
+    assert summary["estimators"][of_a_user]["good_runs"] == 2
+
+
 def test_an_older_output_is_replaced_as_a_whole(log, without_pictures):
     first = answered("replay", log, "--out", "out")
     (log.parent / "out" / "map.png").write_text("old")
