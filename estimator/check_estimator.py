@@ -193,7 +193,7 @@ class Trial:
         return pose
 
     def _call(self, name: str, *arguments: Any, **keywords: Any) -> Any:
-        method = getattr(self.estimator, name, None)
+        method: Any = getattr(self.estimator, name, None)
         if lacks := lack(self.estimator, name):
             try:
                 inspect.signature(method).bind(*arguments, **keywords)
