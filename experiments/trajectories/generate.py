@@ -54,9 +54,10 @@ def generate_trajectories(
     """Drive episodes and write them to a folder, or write those that it lacks.
 
     Every shard and the manifest appear complete or not at all. The same call on the
-    same folder keeps complete shards, replaces damaged ones, and ends with the same
-    bytes, whatever happened before. A call with more episodes adds them to those there
-    are, and ends with the bytes of one call.
+    same folder keeps complete shards, makes damaged ones again, and ends with the same
+    bytes, whatever happened before. A damaged shard, or another file under the name of
+    a shard, is set aside with a warning. A call with more episodes adds them to those
+    there are, and ends with the bytes of one call.
 
     Parameters
     ----------
