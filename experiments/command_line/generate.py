@@ -101,6 +101,7 @@ def generate(
     stopped = f"interrupted; whole shards stay in {place}, the same command continues"
     with (
         connected(backend, scheduler, jobs),
+        reporter.warnings(),
         reporter.progress("driving", unit="steps") as tick,
         interruptible(stopped),
     ):

@@ -14,8 +14,6 @@ from .program import command
 if TYPE_CHECKING:
     from .reporter import Reporter
 
-REPORT, SUMMARY = "report.html", "summary.json"
-
 
 @command
 def monte_carlo(
@@ -95,9 +93,10 @@ def monte_carlo(
     slamgym monte-carlo hidden_identities -e 'ekf[management={backdate=true}]'
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
-    from ...sim_configs.atomic_file import replace_when_written
     from .. import monte_carlo
     from ..monte_carlo.report.html_report import write_html_report
+    from ..monte_carlo.store.job_folder import REPORT, RESULTS, SUMMARY
+    from ..runs.own_files import replace_own
     from .chosen_filters import refuse_broken
     from .cluster import connected
     from .output_folder import as_json_text, default_folder
@@ -140,10 +139,11 @@ def monte_carlo(
         ) as results,
     ):
         summary = monte_carlo.summarise_monte_carlo(results)
-        summary["files"] = ["results.nc", SUMMARY, REPORT]
-        write_html_report(results, summary, place / REPORT)
-    with replace_when_written(place / SUMMARY) as partial:
-        partial.write_text(as_json_text(summary), encoding="utf-8")
+        summary["files"] = [RESULTS, SUMMARY, REPORT]
+        with replace_own(place / REPORT) as partial:
+            write_html_report(results, summary, partial)
+        with replace_own(place / SUMMARY) as partial:
+            partial.write_text(as_json_text(summary), encoding="utf-8")
     _show(summary, place, reporter)
     went_well = any(entry["good_runs"] for entry in summary["estimators"].values())
     return 0 if went_well else FAILURE

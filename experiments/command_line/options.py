@@ -104,7 +104,8 @@ OutFolder = Annotated[
     Path | None,
     option(
         "DIR",
-        "The folder to write. It replaces earlier output of slamgym there.",
+        "The folder to write: new, empty, or with earlier output of slamgym, which is "
+        "replaced unless you changed it.",
         "results/<name>-<estimator>",
     ),
 ]

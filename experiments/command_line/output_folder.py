@@ -1,67 +1,96 @@
-"""The folder that a command writes: it appears complete or not at all."""
+"""The folder that a command writes: its files appear together or not at all."""
 
 import contextlib
 import errno
-import glob
 import json
 import os
 import re
-import secrets
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ..runs.folder_lock import WRITER, locked_folder, naming_folder
+from ..runs.folder_lock import locked_folder, naming_folder
+from ..runs.own_files import (
+    MANIFEST,
+    OwnFile,
+    files_below,
+    measured,
+    own_entry,
+    own_files,
+    write_own_files,
+)
 from .errors import BadInputError
 
-_HOUR = 3600.0
 SUMMARY = "summary.json"
-"""Every output folder holds it; its ``files`` lists what slamgym wrote there."""
+"""Every output folder holds it; its ``files`` lists the files of the command."""
+STAGING = ".slamgym_partial"
+"""The folder of unfinished output, inside the output folder."""
 
 
 @contextlib.contextmanager
 def output_folder(path: Path) -> Iterator[Path]:
-    """Provide a new folder, and move it to `path` when the block ends without error.
+    """Provide a folder for new files, which move to `path` at the end of the block.
 
-    It replaces what slamgym wrote to `path` earlier; a folder that holds anything else
-    is refused at once. An error or Ctrl-C leaves everything as it was.
+    They replace what slamgym wrote to `path` earlier. A folder that holds anything else
+    is refused at once, also a file that was changed since. An error or Ctrl-C in the
+    block leaves everything as it was. The next command completes a move that was cut
+    short.
 
     Parameters
     ----------
     path : Path
-        Where the folder appears; missing folders above it are made.
+        The folder of the output; it is made if it does not exist.
 
     Yields
     ------
     Path
-        An empty folder beside `path`.
+        An empty folder inside `path`.
 
     Raises
     ------
     BadInputError
         If `path` is a file, or a folder that holds what slamgym did not write.
+    ValueError
+        If another process writes to the folder.
     OSError
         If the folder cannot be written.
     """
-    path = Path(os.path.realpath(path))  # a link stays, and names the folder to write
-    _refuse_foreign_files(path)
-    with _parents(path):
-        partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-        with naming_folder(path):
-            sweep(path)
-            partial.mkdir()
+    folder = Path(os.path.realpath(path))  # a link stays, and names the folder to write
+    if folder.exists() and not folder.is_dir():
+        raise BadInputError(f"--out must be a folder, got the file {path}")
+    staging = folder / STAGING
+    with _made(folder), locked_folder(folder), _naming_where_full(folder):
+        _publish(folder)  # what a killed command left
+        with naming_folder(folder):
+            staging.mkdir()
         try:
-            with _in_use(partial), _naming_where_full(path):
-                yield partial
-            _swap(partial, path)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            yield staging
+            new = {measured(staging / name, name) for name in files_below(staging)}
+            write_own_files(staging, new)  # from here on the new files are complete
+        except BaseException:
+            shutil.rmtree(staging, ignore_errors=True)
+            raise
+        _publish(folder)
 
 
 @contextlib.contextmanager
-def _naming_where_full(path: Path) -> Iterator[None]:
+def _made(folder: Path) -> Iterator[None]:
+    """Make a folder and those above it; after an error, remove those that are empty."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        with naming_folder(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for place in missing:
+                place.rmdir()
+        raise
+
+
+@contextlib.contextmanager
+def _naming_where_full(folder: Path) -> Iterator[None]:
     """Name the folder in errors of a full disk, which name no file themselves."""
     try:
         yield
@@ -69,42 +98,58 @@ def _naming_where_full(path: Path) -> Iterator[None]:
         if error.filename or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
             raise
         raise OSError(
-            f"the folder {path} cannot be written: {error.strerror}"
+            f"the folder {folder} cannot be written: {error.strerror}"
         ) from error
 
 
-@contextlib.contextmanager
-def _in_use(folder: Path) -> Iterator[None]:
-    """Lock a folder during the block, where the file system has locks."""
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError, NotImplementedError):
-            stack.enter_context(locked_folder(folder))
-        yield
+def _publish(folder: Path) -> None:
+    """Move complete new files into a folder, and discard incomplete ones.
 
-
-def sweep(path: Path) -> None:
-    """Remove unfinished folders that killed commands left beside a folder.
-
-    A living process holds a lock in its unfinished folder.  One without a lock is left
-    alone for an hour, and an older output if it is the only one.
+    Nothing happens if the folder holds a file that the manifests of the old and of the
+    new files do not prove to be slamgym's.
     """
-    leftover = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}\.(partial|old)")
-    for folder in path.parent.glob(f".{glob.escape(path.name)}.*"):
-        kind = leftover.fullmatch(folder.name)
-        needed = kind is None or (kind[1] == "old" and not path.exists())
-        if not needed and _is_abandoned(folder):
-            shutil.rmtree(folder, ignore_errors=True)
+    staging = folder / STAGING
+    old, new = own_files(folder), own_files(staging)
+    present = set()
+    for name in files_below(folder):
+        if _is_staged(folder, name):
+            continue
+        if own_entry(folder, name, old | new) is None:
+            raise BadInputError(_in_the_way(folder, name, old | new))
+        present.add(name)
+    if (staging / MANIFEST).exists():
+        names = {entry.name for entry in new}
+        for name in names.intersection(files_below(staging)):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (staging / name).replace(folder / name)
+        for name in present - names:
+            _remove(folder, name)
+        (staging / MANIFEST).replace(folder / MANIFEST)
+    shutil.rmtree(staging, ignore_errors=True)
 
 
-def _is_abandoned(folder: Path) -> bool:
-    """Return whether no process writes to a folder any more."""
-    try:
-        if (folder / WRITER).exists():
-            with locked_folder(folder):
-                return True
-        return time.time() - folder.stat().st_ctime > _HOUR
-    except (OSError, NotImplementedError, ValueError):  # ValueError: it is in use
-        return False
+def _is_staged(folder: Path, name: str) -> bool:
+    return name.startswith(f"{STAGING}/") and not (folder / STAGING).is_symlink()
+
+
+def _in_the_way(folder: Path, name: str, own: set[OwnFile]) -> str:
+    """Describe a file that keeps a folder from being written, and the way out."""
+    known = any(name == entry.name for entry in own)
+    what = "was changed since" if known else "slamgym did not write there"
+    kept = folder / STAGING
+    waiting = f"; the new files stay in {kept}" if (kept / MANIFEST).exists() else ""
+    return (
+        f"{folder} holds {name}, which {what}: move it away, or choose another --out"
+        f"{waiting}"
+    )
+
+
+def _remove(folder: Path, name: str) -> None:
+    """Remove a file of a folder, and the folders in it that are empty then."""
+    (folder / name).unlink()
+    with contextlib.suppress(OSError):
+        for place in Path(name).parents[:-1]:
+            (folder / place).rmdir()
 
 
 def default_folder(*names: str) -> Path:
@@ -118,18 +163,6 @@ def default_folder(*names: str) -> Path:
     return Path("results") / re.sub(r"[^\w.-]+", "_", "-".join(names))
 
 
-def files_in(folder: Path) -> list[str]:
-    """List the files below a folder but its lock, by their relative paths, sorted."""
-    return sorted(set(_files_below(folder)) - {WRITER})
-
-
-def _files_below(folder: Path) -> Iterator[str]:
-    """Yield the relative paths of the files below a folder, its lock among them."""
-    for entry in folder.rglob("*"):
-        if not entry.is_dir():
-            yield entry.relative_to(folder).as_posix()
-
-
 def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     """Write summary.json with the list of all files in the folder.
 
@@ -138,7 +171,7 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     dict
         The summary with ``files``.
     """
-    complete = {**summary, "files": sorted([*files_in(folder), SUMMARY])}
+    complete = {**summary, "files": sorted([*files_below(folder), SUMMARY])}
     (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
     return complete
 
@@ -146,59 +179,3 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
 def as_json_text(summary: dict[str, Any]) -> str:
     """Write a summary as indented JSON."""
     return json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _refuse_foreign_files(path: Path) -> None:
-    if not path.exists():
-        return
-    if not path.is_dir():
-        raise BadInputError(f"--out must be a folder, got the file {path}")
-    own = {*_listed_in_summary(path), WRITER}
-    files = _files_below(path)  # perhaps very many
-    foreign = next((name for name in files if name not in own), None)
-    if foreign is not None:
-        raise BadInputError(
-            f"{path} holds {foreign}, which slamgym did not write there: "
-            "choose another --out"
-        )
-
-
-def _listed_in_summary(folder: Path) -> set[str]:
-    """Return the files that slamgym wrote to a folder according to its summary."""
-    try:
-        summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return set()
-    files = summary.get("files") if isinstance(summary, dict) else None
-    return {str(file) for file in files} if isinstance(files, list) else set()
-
-
-@contextlib.contextmanager
-def _parents(path: Path) -> Iterator[None]:
-    """Make the folders above a path; after an error, remove those that are empty."""
-    missing = [folder for folder in path.parents if not folder.exists()]
-    try:
-        with naming_folder(path):
-            for folder in reversed(missing):
-                folder.mkdir()
-        yield
-    except BaseException:
-        with contextlib.suppress(OSError):
-            for folder in missing:
-                folder.rmdir()
-        raise
-
-
-def _swap(partial: Path, path: Path) -> None:
-    """Move the new folder to `path`, and remove the old one."""
-    if not path.exists():
-        partial.replace(path)
-        return
-    old = partial.with_suffix(".old")
-    path.replace(old)
-    try:
-        partial.replace(path)
-    except BaseException:
-        old.replace(path)
-        raise
-    shutil.rmtree(old, ignore_errors=True)

@@ -114,7 +114,8 @@ def monte_carlo(
         The scenario whose noise the estimators assume; the world's by default.
     out : str or Path, optional
         A folder for the results. Blocks are written there as they come, and a stopped
-        job continues after the last complete one.
+        job continues after the last complete one. A file that was changed since is set
+        aside with a warning.
     jobs : int, optional
         Number of workers; by default one process with all its cores.
     backend : {"loky", "threading", "dask", "ray"}, optional

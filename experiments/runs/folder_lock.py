@@ -8,7 +8,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-WRITER = ".writer"
+WRITER = ".slamgym_writer"
 """The lock file; it names the process that writes to the folder."""
 
 

@@ -54,9 +54,10 @@ def generate_trajectories(
     """Drive episodes and write them to a folder, or write those that it lacks.
 
     Every shard and the manifest appear complete or not at all. The same call on the
-    same folder keeps complete shards, replaces damaged ones, and ends with the same
-    bytes, whatever happened before. A call with more episodes adds them to those there
-    are, and ends with the bytes of one call.
+    same folder keeps complete shards, makes damaged ones again, and ends with the same
+    bytes, whatever happened before. A damaged shard, or another file under the name of
+    a shard, is set aside with a warning. A call with more episodes adds them to those
+    there are, and ends with the bytes of one call.
 
     Parameters
     ----------
@@ -155,16 +156,18 @@ def _continue(
     entries = {job.shard_of(entry.first_episode): entry for entry in manifest.shards}
     missing = []
     for number in range(job.shards):
-        if number in entries and is_whole(out, entries[number]):
-            bar.skip(len(job.episodes_of(number)))
+        entry, episodes = entries.get(number), len(job.episodes_of(number))
+        if entry and entry.episodes == episodes and is_whole(out, entry):
+            bar.skip(episodes)
         else:
             missing.append(number)
     with staging_folder(out) as staging:
         work = ShardWork(job, manifest.versions, staging)
         with closing(_made(work, missing, workers, bar)) as made:  # ends the workers
             for shard in made:
-                _check_promise(out, entries.get(shard.number), shard.entry)
-                put_in_place(work.fetch(shard), out / shard.entry.name)
+                promised = entries.get(shard.number)
+                _check_promise(out, promised, shard.entry)
+                put_in_place(work.fetch(shard), out, {promised, shard.entry})
                 entries[shard.number] = shard.entry
                 manifest = manifest.with_shards(entries[k] for k in sorted(entries))
                 write_manifest(manifest, out)
@@ -188,7 +191,7 @@ def _made(
 
 
 def _check_promise(out: Path, promised: ShardEntry | None, made: ShardEntry) -> None:
-    if promised is not None and promised != made:
+    if promised and promised.episodes == made.episodes and promised != made:
         raise OSError(
             f"{out / made.name} was damaged, and generated again it differs from "
             f"{MANIFEST}: this machine does not make the same bits"
@@ -205,24 +208,10 @@ def _begun(job: Job, out: Path, versions: dict[str, str]) -> Manifest:
     there = manifest.job
     _refuse_other(out, "scenario.", vars(there.scenario), vars(job.scenario))
     _refuse_other(out, "the version of ", manifest.versions, versions)
-    if there.episodes < job.episodes:
-        manifest = _extended(manifest, job.episodes)
+    if there.episodes < job.episodes:  # a last shard that is not full is made again
+        manifest = replace(manifest, job=replace(there, episodes=job.episodes))
     _refuse_other(out, "", vars(manifest.job), vars(job))
     return manifest
-
-
-def _extended(manifest: Manifest, episodes: int) -> Manifest:
-    """Return the manifest of a job with more episodes.
-
-    A last shard that is not full is left out: it is written again with more episodes.
-    """
-    job = replace(manifest.job, episodes=episodes)
-    full = [
-        shard
-        for shard in manifest.shards
-        if shard.episodes == len(job.episodes_of(job.shard_of(shard.first_episode)))
-    ]
-    return replace(manifest, job=job, shards=tuple(full))
 
 
 def _refuse_other(

@@ -122,8 +122,8 @@ class Manifest:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all shards are written."""
-        return len(self.shards) == self.job.shards
+        """Whether all episodes are written."""
+        return sum(shard.episodes for shard in self.shards) == self.job.episodes
 
     def with_shards(self, shards: Iterable[ShardEntry]) -> "Manifest":
         """Return the manifest with other shards."""

@@ -1,6 +1,7 @@
 """The folder of a data set while it is written: one writer, only complete shards."""
 
 import contextlib
+import os
 import re
 import secrets
 import shutil
@@ -8,8 +9,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..runs.folder_lock import WRITER, locked_folder
-from .manifest import MANIFEST
+from ..runs.folder_lock import locked_folder
+from ..runs.own_files import files_below, set_aside
+from .dataset import is_whole
+from .manifest import MANIFEST, ShardEntry
 
 _WRITING = ".writing-"
 _ATTEMPTS, _BETWEEN = 20, 0.1  # [s]
@@ -32,16 +35,16 @@ def claimed(folder: Path) -> Iterator[None]:
         raise ValueError(f"out must be a folder, got the file {folder}")
     folder.mkdir(parents=True, exist_ok=True)
     with locked_folder(folder):
-        names = {entry.name for entry in folder.iterdir()} - {WRITER}
-        leftovers = set(filter(_LEFTOVERS.fullmatch, names))
-        foreign = sorted(names - leftovers)
-        if foreign and MANIFEST not in foreign:
+        leftovers = [e for e in folder.iterdir() if _LEFTOVERS.fullmatch(e.name)]
+        names = (Path(name).parts[0] for name in files_below(folder))
+        foreign = next((name for name in names if not _LEFTOVERS.fullmatch(name)), None)
+        if foreign and not (folder / MANIFEST).exists():
             raise ValueError(
                 f"out must be a new or empty folder, or hold a {MANIFEST}: "
-                f"{folder} holds {foreign[0]}"
+                f"{folder} holds {foreign}"
             )
-        for name in leftovers:
-            _remove(folder / name)
+        for leftover in leftovers:
+            _remove(leftover)
         yield
 
 
@@ -79,15 +82,23 @@ def naming(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def put_in_place(staged: Path, path: Path) -> None:
-    """Move a complete shard, a file or a folder, and replace what is there."""
-    _remove(path)
+def put_in_place(staged: Path, folder: Path, own: set[ShardEntry | None]) -> None:
+    """Move a complete shard, a file or a folder, and replace the shard that is there.
+
+    What is there is set aside with a warning, if it is none of our own shards.
+    """
+    path = folder / staged.name
+    if os.path.lexists(path):
+        if path.is_symlink() or not any(is_whole(folder, each) for each in own if each):
+            set_aside(path, f"does not match its checksum in {MANIFEST}")
+        else:
+            _remove(path)
     staged.replace(path)
 
 
 def _remove(path: Path) -> None:
     """Remove a file or a folder, to which a worker that is ending may still write."""
-    if not path.is_dir():
+    if path.is_symlink() or not path.is_dir():
         path.unlink(missing_ok=True)
         return
     for _ in range(_ATTEMPTS):

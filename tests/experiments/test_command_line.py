@@ -2,6 +2,7 @@ import csv
 import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 
@@ -16,6 +17,7 @@ from slamgym.experiments import figures
 from slamgym.experiments.command_line import reporter, run_files, tables, warm_up
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
+from slamgym.experiments.runs.own_files import MANIFEST
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
 
@@ -112,7 +114,8 @@ def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
             assert min(picture.size) > 300
     texts = ["log.csv", "run.html", "scenario.toml", "summary.json"]
     found = [p.relative_to(folder).as_posix() for p in folder.rglob("*.*")]
-    assert sorted(found) == sorted(names + texts) == summary["files"]
+    assert summary["files"] == sorted(names + texts)
+    assert sorted(found) == sorted([MANIFEST, *summary["files"]])
 
 
 @pytest.mark.slow
@@ -420,13 +423,117 @@ def test_a_filter_of_the_user_without_reports_and_saving_runs(
     assert summary["estimators"][of_a_user]["good_runs"] == 2
 
 
-def test_an_older_output_is_replaced_as_a_whole(log, without_pictures):
-    first = answered("replay", log, "--out", "out")
-    (log.parent / "out" / "map.png").write_text("old")
+def test_an_older_output_is_replaced_as_a_whole(log, without_pictures, monkeypatch):
+    def other_pictures(folder, trace, **_):
+        (folder / "map_steps" / "deep").mkdir(parents=True)
+        (folder / "map_steps" / "deep" / "step.png").write_text("an old picture")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_files, "write_figures", other_pictures)
+        first = answered("replay", log, "--out", "out")
     second = answered("replay", log, "--out", "out", "--measurement-std", "1,1")
     assert first["pose_covariance"] != second["pose_covariance"]
-    assert (log.parent / "out" / "map.png").read_text() == "a picture"
+    assert "map_steps/deep/step.png" in first["files"]
+    assert sorted(os.listdir("out")) == [MANIFEST, *second["files"]]
     assert sorted(os.listdir()) == ["little.csv", "out"]
+
+
+@pytest.fixture
+def no_work(monkeypatch):
+    """Let the work of a command fail the test: it must be refused before."""
+
+    def work(*_, **__):
+        raise AssertionError("the command began its work")
+
+    monkeypatch.setattr(run_files, "filter_and_write", work)
+
+
+def test_a_file_that_was_changed_since_is_refused_at_once(log, here, request):
+    request.getfixturevalue("without_pictures")
+    answered("replay", log, "--out", "out")
+    (here / "out" / "map.png").write_text("my picture")  # as long as before
+    request.getfixturevalue("no_work")
+    message = refused("replay", log, "--out", "out")
+    assert message == (
+        f"{here / 'out'} holds map.png, which was changed since: "
+        "move it away, or choose another --out"
+    )
+    assert (here / "out" / "map.png").read_text() == "my picture"
+
+
+def test_a_summary_does_not_decide_what_may_be_removed(log, here, no_work):
+    (here / "out").mkdir()
+    (here / "out" / "thesis.tex").write_text("years of work")
+    files = json.dumps({"files": ["thesis.tex", "summary.json"]})
+    (here / "out" / "summary.json").write_text(files)
+    assert "which slamgym did not write there" in refused("replay", log, "--out", "out")
+    (here / "out" / "summary.json").unlink()
+    assert "holds thesis.tex, which slamg" in refused("replay", log, "--out", "out")
+
+
+@pytest.mark.parametrize("out", [".", "..", "link"])
+def test_the_folder_itself_stays(out, log, here, without_pictures, monkeypatch):
+    for folder in ("deep/inner", "target"):
+        (here / folder).mkdir(parents=True)
+    if out == "link":
+        (here / "deep" / "inner" / "link").symlink_to(here / "target")
+    place = {".": "deep/inner", "..": "deep", "link": "target"}[out]
+    before = (here / place).stat().st_ino
+    monkeypatch.chdir(here / "deep" / "inner")
+    for _ in range(2):
+        files = answered("replay", log, "--out", out)["files"]
+    assert (here / place).stat().st_ino == before
+    there = {name for name in os.listdir(here / place) if name != "inner"}
+    assert there == {MANIFEST, *files}
+    assert os.path.samefile(".", here / "deep" / "inner")
+
+
+def mounted(folder, *options):
+    """Mount a file system of its own at a folder, or skip the test."""
+    folder.mkdir()
+    command = ["mount", *options, "-t", "tmpfs", "slamgym-test", str(folder)]
+    if not shutil.which("mount") or subprocess.run(command, check=False).returncode:
+        pytest.skip("this user or system cannot mount a file system")
+    return folder
+
+
+@pytest.fixture
+def mount(here):
+    folder = mounted(here / "mount")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+@pytest.fixture
+def read_only_mount(here):
+    folder = mounted(here / "mount", "-o", "ro")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("replay", "little.csv"),
+        ("monte-carlo", "six_landmarks", "-e", "ekf", "--runs", 2),
+        ("generate", "six_landmarks", "--episodes", 2),
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_mount_point_is_written(command, mount, log, without_pictures):
+    (mount / "lost+found").mkdir()
+    answered(*command, "--out", mount)
+    first = sorted(os.listdir(mount))
+    answered(*command, "--out", mount)
+    assert sorted(os.listdir(mount)) == first
+    assert len(first) > 2
+
+
+@pytest.mark.parametrize("out", ["", "new", "deep/new"])
+def test_a_read_only_folder_is_refused_at_once(out, read_only_mount, log, no_work):
+    message = refused("replay", log, "--out", read_only_mount / out, code=1)
+    expected = f"the folder {read_only_mount / out} cannot be written: Read-only file s"
+    assert message.startswith(expected)
 
 
 def test_a_belief_that_degenerates_is_a_failure_and_no_wrong_input(log):

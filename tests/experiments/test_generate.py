@@ -25,7 +25,12 @@ from slamgym.experiments.command_line.errors import InterruptedRunError
 from slamgym.experiments.command_line.generate import generate as generate_command
 from slamgym.experiments.command_line.scenario_options import recorded
 from slamgym.experiments.logs.slamlog import write_slamlog
-from slamgym.experiments.trajectories import driven_episodes, shard_folder, shard_work
+from slamgym.experiments.trajectories import (
+    driven_episodes,
+    generate,
+    shard_folder,
+    shard_work,
+)
 from slamgym.experiments.trajectories.dataset import (
     DamagedShardError,
     load_trajectories,
@@ -365,8 +370,46 @@ def test_a_damaged_shard_is_named_and_the_others_are_usable(name, tmp_path):
         assert [drive.seed for drive in skipping] == [5, 6, 7, 11]
     assert skipping.damaged_shards() == [shards[1].name]
     assert [drive.seed for drive in skipping.shard(2)] == [11]
-    small(out, format=name)  # repairs
+    damaged = checksum(out / shards[1].name)
+    with pytest.warns(UserWarning, match=rf"{shards[1].name} does not .*\.aside"):
+        small(out, format=name)  # repairs
+    aside = out / f"{shards[1].name}.aside"
+    assert checksum(aside) == damaged
+    aside.rename(tmp_path / "aside")
     assert tree(out) == before
+
+
+def test_a_file_of_somebody_else_under_the_name_of_a_shard_is_set_aside(tmp_path):
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "thesis.tex").write_text("years of work")
+    small(out, episodes=3, format="slamlog")
+    (out / "shard_00001").write_text("mine")
+    (out / "shard_00002").symlink_to(elsewhere)
+    with pytest.warns(UserWarning, match=r"shard_0000[12] does not match"):
+        small(out, format="slamlog")
+    assert (out / "shard_00001.aside").read_text() == "mine"
+    assert (out / "shard_00002.aside").readlink() == elsewhere
+    assert (elsewhere / "thesis.tex").read_text() == "years of work"
+
+
+@pytest.mark.parametrize("format", ["npz", "slamlog"])
+def test_an_extension_killed_before_the_shard_is_listed_goes_on(
+    format, tmp_path, monkeypatch
+):
+    small(tmp_path / "whole", format=format)
+    small(tmp_path / "out", episodes=4, format=format)
+
+    def die(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(generate, "write_manifest", die)
+        with pytest.raises(KeyboardInterrupt):
+            small(tmp_path / "out", format=format)
+    assert read_manifest(tmp_path / "out").shards[1].episodes == 1  # as before
+    small(tmp_path / "out", format=format)
+    assert tree(tmp_path / "out") == tree(tmp_path / "whole")
 
 
 def test_a_shard_that_is_gone_counts_as_damaged(tmp_path):

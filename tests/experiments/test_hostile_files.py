@@ -1,18 +1,25 @@
 """Files and folders that no honest program writes end in one line."""
 
+import contextlib
 import errno
 import json
 import os
+import re
 import shutil
 
+import forked
+import jobs_to_kill
 import matplotlib as mpl
 import pytest
 
 from slamgym.envs.rendering.artists import _title
 from slamgym.estimator import make_estimator
+from slamgym.experiments.command_line.errors import BadInputError
 from slamgym.experiments.command_line.output_folder import output_folder
 from slamgym.experiments.logs.importers.utias import read_utias
 from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.runs.own_files import MANIFEST as OWN_FILES
+from slamgym.experiments.runs.own_files import files_below
 from slamgym.experiments.trajectories import generate_trajectories
 from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
 from slamgym.sim_configs import load_scenario
@@ -77,15 +84,101 @@ def test_a_name_with_broken_mathematics_is_drawn():
     figure.canvas.draw()
 
 
+def write_output(out, files):
+    with output_folder(out) as folder:
+        for name, text in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text)
+
+
 def test_a_link_as_out_stays_a_link(tmp_path):
     target, link = tmp_path / "target", tmp_path / "link"
     target.mkdir()
     link.symlink_to(target)
-    with output_folder(link) as partial:
-        (partial / "result.txt").write_text("new")
+    write_output(link, {"result.txt": "new"})
     assert link.is_symlink()
     assert (target / "result.txt").read_text() == "new"
     assert sorted(os.listdir(tmp_path)) == ["link", "target"]
+
+
+@pytest.mark.parametrize("name", ["log.csv", "steps", "other", ".slamgym_partial"])
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_a_link_in_an_output_leads_to_no_change_elsewhere(name, kind, tmp_path):
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    files = {"log.csv": "a log", "steps/0.png": "a picture"}
+    write_output(out, files)
+    shutil.copytree(out, elsewhere)
+    if name == "steps":
+        shutil.rmtree(out / name)
+    else:
+        (out / name).unlink(missing_ok=True)
+    target = {"file": elsewhere / "log.csv", "folder": elsewhere}[kind]
+    (out / name).symlink_to(target)
+    with pytest.raises(BadInputError, match=f"holds {re.escape(name)}, which"):
+        write_output(out, files)
+    assert (out / name).is_symlink()
+    assert (elsewhere / "log.csv").read_text() == "a log"
+    assert (elsewhere / "steps" / "0.png").read_text() == "a picture"
+
+
+OLD = {"same": "1", "changed": "2", "gone/a": "3", "gone/b": "4"}
+NEW = {"same": "1", "changed": "20", "added/a": "5", "b": "6"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are those of POSIX")
+@pytest.mark.parametrize("calls", range(12))
+def test_an_output_killed_at_any_move_is_complete_the_next_time(calls, tmp_path):
+    out = tmp_path / "out"
+    write_output(out, OLD)
+    child = forked.start(jobs_to_kill.output_of, out, NEW, calls)
+    child.join()
+    assert child.exitcode == (forked.KILLED if calls < 10 else 0)
+    with contextlib.suppress(KeyboardInterrupt), output_folder(out):
+        before = digest_of_files(out)
+        raise KeyboardInterrupt
+    assert before == (OLD if calls < 1 else NEW)
+    write_output(out, {"last": "7"})
+    assert digest_of_files(out) == {"last": "7"}
+    assert sorted(os.listdir(out)) == [OWN_FILES, "last"]
+
+
+def digest_of_files(folder):
+    return {name: (folder / name).read_text() for name in files_below(folder)}
+
+
+@pytest.mark.parametrize("name", ["log.csv", "new.csv", "other.txt"])
+def test_a_file_that_appears_meanwhile_is_kept_and_so_are_the_new_ones(name, tmp_path):
+    out = tmp_path / "out"
+    write_output(out, {"log.csv": "old"})
+    foreign = f"../{name}"
+    with pytest.raises(BadInputError, match=rf"{name}, which .* stay in .*_partial$"):
+        write_output(out, {"new.csv": "new", foreign: "mine"})
+    with pytest.raises(BadInputError, match=f"{name}, which .*: move it away"):
+        write_output(out, {})
+    assert (out / ".slamgym_partial" / "new.csv").read_text() == "new"
+    (out / name).rename(tmp_path / "mine")
+    with contextlib.suppress(KeyboardInterrupt), output_folder(out):
+        raise KeyboardInterrupt
+    assert digest_of_files(out) == {"new.csv": "new"}
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_manifest_that_is_damaged_proves_nothing(tmp_path):
+    for text in ("", "[" * DEEP, "[]", '{"files": [3]}', '{"files": [{"name": "a"}]}'):
+        write_output(tmp_path / "out", {"a": "1"})
+        (tmp_path / "out" / OWN_FILES).write_text(text)
+        with pytest.raises(BadInputError, match="which slamgym did not write there"):
+            write_output(tmp_path / "out", {"a": "2"})
+        (tmp_path / "out" / "a").unlink()
+
+
+def test_a_second_command_into_the_same_folder_is_refused(tmp_path):
+    with (
+        output_folder(tmp_path / "out") as folder,
+        pytest.raises(ValueError, match="another process is writing to"),
+    ):
+        write_output(tmp_path / "out", {})
+    assert folder.parent == tmp_path / "out"
 
 
 def test_a_full_disk_names_the_folder_and_leaves_what_was_there(tmp_path):

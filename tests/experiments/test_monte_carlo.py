@@ -563,7 +563,10 @@ def test_a_truncated_results_file_is_named_and_made_anew(whole, tmp_path):
     results.write_bytes(results.read_bytes()[:5000])
     with pytest.raises(ValueError, match=r"results\.nc is truncated"):
         load_results(tmp_path)
-    with monte_carlo("six_landmarks", runs=RUNS, **job) as anew:
+    with (
+        pytest.warns(UserWarning, match=r"it is moved to results\.nc\.aside"),
+        monte_carlo("six_landmarks", runs=RUNS, **job) as anew,
+    ):
         xr.testing.assert_equal(anew.load(), whole)
 
 

@@ -19,6 +19,8 @@ from slamgym.experiments.command_line.reporter import Reporter
 from slamgym.experiments.command_line.warm_up import warm_up
 from slamgym.experiments.monte_carlo import merge_blocks, monte_carlo
 from slamgym.experiments.runs.filter_settings import FilterSettings
+from slamgym.experiments.runs.folder_lock import WRITER
+from slamgym.experiments.runs.own_files import MANIFEST, replace_own
 
 RUNS = 12
 JOB = {"scenario": "six_landmarks", "estimators": "ekf", "block_size": 4}
@@ -66,7 +68,8 @@ def names(folder):
 
 
 def finished():
-    return sorted(["job.json", "results.nc", *(f"blocks/{name}" for name in BLOCKS)])
+    written = [MANIFEST, "job.json", "results.nc"]
+    return sorted([*written, *(f"blocks/{name}" for name in BLOCKS)])
 
 
 # one writer
@@ -187,7 +190,7 @@ def test_what_a_killed_writer_left_is_gone_after_the_next_run(
 ):
     killed(tmp_path, dies_at)
     left = names(tmp_path)
-    assert ".writer" in left
+    assert WRITER in left
     assert [name for name in left if re.fullmatch(rest, name)]
     with monte_carlo(**JOB, runs=RUNS, out=tmp_path) as resumed:
         xr.testing.assert_equal(resumed.load(), whole)
@@ -225,6 +228,40 @@ def test_only_what_slamgym_began_is_removed(tmp_path):
     assert not set(rests) & set(names(tmp_path))
 
 
+@pytest.mark.parametrize("fresh", [False, True])
+def test_what_was_changed_since_is_set_aside_and_not_lost(fresh, tmp_path, whole):
+    first = f"blocks/{BLOCKS[0]}"
+    monte_carlo(**JOB, runs=RUNS, out=tmp_path).close()
+    for name in (first, "results.nc"):
+        (tmp_path / name).write_text("mine")
+    for times in (1, 2):
+        if times == 2:
+            (tmp_path / "results.nc").write_text("mine again")
+        with (
+            pytest.warns(UserWarning, match=r"is moved to r.*\.aside"),
+            monte_carlo(**JOB, runs=RUNS, out=tmp_path, fresh=fresh) as anew,
+        ):
+            xr.testing.assert_equal(anew.load(), whole)
+    aside = {name: data for name, data in tree(tmp_path).items() if "aside" in name}
+    assert aside == {
+        f"{first}.aside": b"mine",
+        "results.nc.aside": b"mine",
+        "results.nc.aside2": b"mine again",
+    }
+    assert names(tmp_path) == sorted([*finished(), *aside])
+
+
+def test_a_fresh_job_removes_what_the_earlier_one_wrote_and_nothing_else(tmp_path):
+    monte_carlo(**JOB, runs=4, out=tmp_path).close()
+    with replace_own(tmp_path / "report.html") as partial:
+        partial.write_text("of the earlier job")
+    (tmp_path / "summary.json").write_text("mine")
+    with pytest.warns(UserWarning, match=r"summary\.json is not as slamgym wrote it"):
+        monte_carlo(**JOB, runs=4, seed=9, out=tmp_path, fresh=True).close()
+    assert not (tmp_path / "report.html").exists()
+    assert (tmp_path / "summary.json.aside").read_text() == "mine"
+
+
 def test_a_folder_with_something_else_stays_as_it_is(tmp_path):
     (tmp_path / ".job.0123abcd.json").write_text("{}")
     (tmp_path / "thesis.tex").write_text("years of work")
@@ -245,7 +282,7 @@ def test_parts_of_two_machines_are_merged_without_their_rests(tmp_path, whole):
     ignored = shutil.ignore_patterns("runs-*")
     shutil.copytree(one, both, ignore=ignored)  # but its rests
     merge_blocks([one, two], both)
-    assert names(both) == sorted({*finished()} - {"results.nc"})
+    assert names(both) == sorted({*finished()} - {"results.nc", MANIFEST})
     done = []
     with monte_carlo(
         **JOB, runs=RUNS, out=both, progress=lambda runs, of: done.append(runs)

@@ -14,8 +14,7 @@ from slamgym.experiments.command_line.errors import (
     interruptible,
     terminable,
 )
-from slamgym.experiments.command_line.output_folder import output_folder, sweep
-from slamgym.experiments.runs.folder_lock import WRITER, locked_folder
+from slamgym.experiments.command_line.output_folder import STAGING
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals are those of POSIX")
 
@@ -130,65 +129,25 @@ def test_a_killed_worker_is_reported_with_how_to_go_on(here):
     assert "Traceback" not in message
 
 
+def time_of(folder):
+    """Return the time of the last change in a folder; None if there is none."""
+    return folder.stat().st_ctime_ns if folder.exists() else None
+
+
 @pytest.mark.slow
 def test_a_run_that_is_ended_leaves_nothing_and_a_killed_one_is_swept(here):
-    def unfinished():
-        return list(here.glob(".out.*.partial"))
-
+    unfinished = here / "out" / STAGING
+    left = None
     for number, code in ((signal.SIGKILL, -9), (signal.SIGTERM, 143)):
         child = begin(here, *["run", "loop", "--steps", "200000", "--out", "out"])
-        left = set(unfinished())
-        wait_until(
-            lambda left=left: any(
-                (f / WRITER).exists() for f in unfinished() if f not in left
-            )
-        )
+        wait_until(lambda left=left: time_of(unfinished) not in (None, left))
         os.kill(child.pid, number)
         message = message_at_the_end(child, here)
         assert child.exitcode == code
-        assert len(unfinished()) == (number == signal.SIGKILL)
+        left = time_of(unfinished)
+        assert (left is not None) == (number == signal.SIGKILL)
     assert message == "slamgym: interrupted; nothing was written\n"
-    assert list(here.iterdir()) == []
-
-
-def test_what_a_living_process_writes_is_not_swept(tmp_path):
-    names = {
-        "lives": ".out.00000001.partial",
-        "dead": ".out.00000002.partial",
-        "young": ".out.00000003.partial",
-        "foreign": ".out.mine.partial",
-        "of_another": ".outer.00000004.partial",
-        "only_output": ".out.00000005.old",
-    }
-    folders = {name: tmp_path / file for name, file in names.items()}
-    for folder in folders.values():
-        (folder / "deep").mkdir(parents=True)
-    (folders["dead"] / WRITER).write_text("process 1")
-    with locked_folder(folders["lives"]):
-        sweep(tmp_path / "out")
-    assert {name for name, folder in folders.items() if folder.exists()} == {
-        "lives",
-        "young",
-        "foreign",
-        "of_another",
-        "only_output",
-    }
-
-
-def test_old_folders_without_a_lock_are_swept(tmp_path, monkeypatch):
-    (tmp_path / ".out.00000001.partial").mkdir()
-    (tmp_path / ".out.00000002.old").mkdir()
-    (tmp_path / "out").mkdir()
-    now = time.time()
-    monkeypatch.setattr(time, "time", lambda: now + 3700)
-    sweep(tmp_path / "out")
-    assert [file.name for file in tmp_path.iterdir()] == ["out"]
-
-
-def test_the_lock_of_a_folder_does_not_appear_in_it(tmp_path):
-    with output_folder(tmp_path / "out") as folder:
-        assert (folder / WRITER).exists()
-    assert list((tmp_path / "out").iterdir()) == []
+    assert list(here.rglob("*")) == [here / "out"]
 
 
 def test_only_the_first_sigterm_raises_and_the_usual_handler_comes_back():

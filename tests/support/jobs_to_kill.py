@@ -1,6 +1,7 @@
 """Jobs that tests kill on their way, as functions for `forked.start`."""
 
 import atexit
+import itertools
 import os
 import signal
 import time
@@ -13,6 +14,7 @@ import psutil
 
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.command_line.cluster import connected
+from slamgym.experiments.command_line.output_folder import output_folder
 from slamgym.experiments.monte_carlo import monte_carlo, runner
 from slamgym.experiments.monte_carlo.store import job_folder
 from slamgym.experiments.trajectories.generate import generate_trajectories
@@ -53,6 +55,26 @@ def command_that_loses_a_worker(folder, *arguments):
     write, np.savez = np.savez, savez
     html_report.report_figures = lambda *_: {}
     command(folder, *arguments)
+
+
+def output_of(folder, files, calls):
+    """Write an output folder, and die after some moves and removals of files."""
+    done = itertools.count()
+
+    def counted(call):
+        def instead(*arguments, **options):
+            if next(done) == calls:
+                _die()
+            return call(*arguments, **options)
+
+        return instead
+
+    with output_folder(folder) as staging:
+        for name, text in files.items():
+            (staging / name).parent.mkdir(exist_ok=True)
+            (staging / name).write_text(text)
+        for name in ("replace", "unlink"):
+            setattr(Path, name, counted(getattr(Path, name)))
 
 
 def two_filters(folder):

@@ -3,19 +3,25 @@
 import contextlib
 import hashlib
 import json
+import os
 import re
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ....sim_configs.atomic_file import replace_when_written
-from ...runs.folder_lock import WRITER, locked_folder, naming_folder
+from ...runs.folder_lock import locked_folder, naming_folder
+from ...runs.own_files import files_below, own_entry, own_files, set_aside
 
 FORMAT = "slamgym monte carlo 3"
 JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
+REPORT, SUMMARY = "report.html", "summary.json"
 _PARTIAL = re.compile(
-    r"\.(job\.[0-9a-f]{8}\.json|results\.[0-9a-f]{8}\.nc"
-    r"|runs-\d{7,}-\d{7,}\.[0-9a-f]{8}\.npz)"
+    r"\.{1,2}(job|results|report|summary|slamgym_files|runs-\d{7,}-\d{7,})"
+    r"(\.[0-9a-f]{8}){1,2}\.(json|nc|html|npz)"
 )
 
 
@@ -34,7 +40,8 @@ def claimed(
     identity : dict
         The job in plain values.
     fresh : bool
-        Whether to remove the blocks of an earlier job, this one or another.
+        Whether to remove the results of an earlier job, this one or another. Files
+        that were changed since are set aside with a warning.
 
     Raises
     ------
@@ -47,16 +54,17 @@ def claimed(
     with naming_folder(path):
         path.mkdir(parents=True, exist_ok=True)
     with locked_folder(path):
-        if any(not _is_leftover(entry) for entry in path.iterdir()):
+        found = None
+        if any(not _is_leftover(Path(name)) for name in files_below(path)):
             found = identity_in(path)
             if not fresh:
                 refuse_other(path, found, identity)
         with naming_folder(path):
-            for leftover in (*path.iterdir(), *(path / BLOCKS).glob(".*")):
-                if _PARTIAL.fullmatch(leftover.name):
-                    leftover.unlink()
-            for old in (*blocks_in(path), path / RESULTS) if fresh else ():
-                old.unlink(missing_ok=True)
+            for file in (*path.iterdir(), *(path / BLOCKS).glob(".*")):
+                if _is_leftover(file):
+                    file.unlink()
+            if fresh and found:
+                _clear(path, found)
             with replace_when_written(path / JOB) as partial:
                 text = json.dumps(identity, indent=2, ensure_ascii=False)
                 partial.write_text(text + "\n", encoding="utf-8")
@@ -64,9 +72,48 @@ def claimed(
         yield
 
 
+def _clear(path: Path, identity: dict[str, Any]) -> None:
+    """Remove the results of a job, and set aside what is not proven to be one."""
+    digest, own = digest_of(identity), own_files(path)
+    for block in blocks_in(path):
+        problem = problem_with(block, digest)
+        if problem:
+            set_aside(block, problem)
+        else:
+            block.unlink()
+    for name in (RESULTS, REPORT, SUMMARY):
+        if not os.path.lexists(path / name):
+            continue
+        if own_entry(path, name, own):
+            (path / name).unlink()
+        else:
+            set_aside(path / name, "is not as slamgym wrote it")
+
+
 def blocks_in(path: Path) -> list[Path]:
     """List the whole blocks of a folder, in order."""
     return sorted((path / BLOCKS).glob("runs-*.npz"))
+
+
+def problem_with(block: Path, digest: str) -> str:
+    """Return what is wrong with a block of a job; empty if it is complete.
+
+    Raises
+    ------
+    ValueError
+        If it is of another job.
+    """
+    try:
+        with zipfile.ZipFile(block) as archive:
+            if archive.testzip() is not None:
+                return "is damaged"
+        with np.load(block, allow_pickle=False) as arrays:
+            job = str(arrays["job"])
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        return f"is truncated or damaged ({error})"
+    if job != digest:
+        raise ValueError(f"{block} is of another job than its folder: move it away")
+    return ""
 
 
 def digest_of(identity: dict[str, Any]) -> str:
@@ -112,9 +159,9 @@ def refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> No
             )
 
 
-def _is_leftover(entry: Path) -> bool:
+def _is_leftover(file: Path) -> bool:
     """Whether a writer that was killed at once may have left this file."""
-    return entry.name == WRITER or _PARTIAL.fullmatch(entry.name) is not None
+    return _PARTIAL.fullmatch(file.name) is not None
 
 
 def _described(key: str, value: Any) -> str:

@@ -7,8 +7,6 @@ put into one folder.
 """
 
 import contextlib
-import warnings
-import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +17,7 @@ from .... import __version__
 from ....sim_configs import Scenario
 from ....sim_configs.atomic_file import replace_when_written
 from ....sim_configs.scenario_files import scenario_text
+from ...runs.own_files import set_aside
 from ..measure.estimator_choices import EstimatorChoice
 from ..measure.run_measures import Block, Variable, variables_of
 from . import job_folder
@@ -164,14 +163,9 @@ class BlockFolder:
         if self._path is None:
             return False
         for file in self._files_from(span.first):
-            problem = _problem(file, self._digest)
+            problem = job_folder.problem_with(file, self._digest)
             if problem:
-                aside = file.replace(file.with_suffix(".broken"))
-                warnings.warn(
-                    f"{file} {problem}; it is moved to {aside.name}, and its "
-                    "runs are repeated",
-                    stacklevel=5,
-                )
+                set_aside(file, f"{problem}, and its runs are repeated")
             elif _stop_of(file) >= span.stop:
                 return True
         return False
@@ -230,27 +224,12 @@ def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
 
 def _copy_block(file: Path, copy: Path, digest: str) -> None:
     """Copy a block of a job, if the copy does not exist."""
-    problem = _problem(file, digest)
+    problem = job_folder.problem_with(file, digest)
     if problem:
         raise ValueError(f"{file} {problem}")
     if not copy.exists():
         with replace_when_written(copy) as partial:
             partial.write_bytes(file.read_bytes())
-
-
-def _problem(file: Path, digest: str) -> str:
-    """Return what is wrong with a block; empty if it is complete."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            if archive.testzip() is not None:
-                return "is damaged"
-        with np.load(file, allow_pickle=False) as arrays:
-            job = str(arrays["job"])
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        return f"is truncated or damaged ({error})"
-    if job != digest:
-        raise ValueError(f"{file} is of another job than its folder: move it away")
-    return ""
 
 
 def _stop_of(file: Path) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 
 from .... import __version__
 from ....evaluation.noise_sums import CHANNELS, MOMENTS
-from ....sim_configs.atomic_file import replace_when_written
+from ...runs.own_files import replace_own
 from ..measure.run_measures import NOISE_SIZES, VARIABLES, Block, Variable
 from .job_folder import RESULTS
 from .result_blocks import Job, Span
@@ -78,7 +78,7 @@ def write_results(
         As in :func:`dataset_of`.
     """
     try:
-        with replace_when_written(path) as partial:
+        with replace_own(path) as partial:
             _write(partial, job, blocks, runs, command)
     except (OSError, RuntimeError) as error:  # netCDF raises the second on a full disk
         raise OSError(
