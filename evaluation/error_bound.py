@@ -246,14 +246,15 @@ def _follow(
 ) -> None:
     """Take the bound P of one run through all its scans, in place.
 
-    Landmark i is the (i + 1)-th to be read. A scan is subtracted from P in one pass,
+    The first `size` rows and columns of P are those of the pose and of the landmarks
+    read so far. Landmark i is the (i + 1)-th to be read. A scan is subtracted from P in one pass,
     from its pending rows and shares: P −= Σ share rowᵀ.
     """
     entry = np.zeros((len(P), 3))
     size = 3
     for t in range(len(poses)):
         if t > 0 and dt[t] > 0:
-            _move(poses, landmarks, t, motion * dt[t], entry, P[:size, :size])
+            _move(poses, landmarks, t, motion * dt[t], entry, P, size)
         x, y = poses[t, 0], poses[t, 1]
         count = 0
         for i in by_row:
@@ -265,17 +266,16 @@ def _follow(
             across = noise[0] ** 2
             along = (noise[1] + noise[2] * distance) ** 2
             c = 3 + 2 * i
-            known = P[:size, :size]
             if c < size:
-                _read(known, pending, count, c, bx, by, across)
-                _read(known, pending, count + 1, c, rx, ry, along)
+                _read(P, size, pending, count, c, bx, by, across)
+                _read(P, size, pending, count + 1, c, rx, ry, along)
                 count += 2
             else:
-                _subtract(known, pending, count)
+                _subtract(P, size, pending, count)
                 count = 0
                 size += 2
                 _add(P, c, size, rx, ry, across * distance * distance, along)
-        _subtract(P[:size, :size], pending, count)
+        _subtract(P, size, pending, count)
         out[0][t], out[1][t] = P[0, 0] + P[1, 1], P[2, 2]
         lever = 2 * (x * P[1, 2] - y * P[0, 2]) + (x * x + y * y) * P[2, 2]
         out[2][t] = out[0][t] + lever
@@ -289,27 +289,30 @@ def _move(
     variance: Array,
     entry: Array,
     P: Array,
+    size: int,
 ) -> None:
     """Add the noise of the motion to scan t."""
     cos, sin = np.cos(poses[t - 1, 2]), np.sin(poses[t - 1, 2])
     entry[0, 0], entry[1, 0] = cos, sin
     entry[0, 1], entry[1, 1] = -sin, cos
     entry[0, 2], entry[1, 2], entry[2, 2] = poses[t, 1], -poses[t, 0], 1.0
-    for i in range(len(P) // 2 - 1):
+    for i in range(size // 2 - 1):
         entry[3 + 2 * i, 2], entry[4 + 2 * i, 2] = landmarks[i, 1], -landmarks[i, 0]
     for i in range(2):
         for j in range(2):
             for k in range(2):
                 P[i, j] += entry[i, k] * entry[j, k] * variance[k]
-    for i in range(len(P)):
-        turned = entry[i, 2] * variance[2]
-        for j in range(len(P)):
-            P[i, j] += turned * entry[j, 2]
+    turn = entry[:, 2].copy()
+    for i in range(size):
+        turned, row = turn[i] * variance[2], P[i]
+        for j in range(size):
+            row[j] += turned * turn[j]
 
 
 @njit_internal
 def _read(
     P: Array,
+    size: int,
     pending: Array,
     count: int,
     c: int,
@@ -321,30 +324,29 @@ def _read(
 
     It becomes pending, after ``count`` others.
     """
-    rows, shares = pending[0], pending[1]
-    row = rows[count]
-    for j in range(len(P)):
-        lx, ly, px, py = P[c, j], P[c + 1, j], P[0, j], P[1, j]
+    now = np.empty((4, size))  # rows of P after what is pending
+    for n, at in enumerate((c, c + 1, 0, 1)):
+        now[n] = P[at, :size]
         for k in range(count):
-            lx -= shares[k, c] * rows[k, j]
-            ly -= shares[k, c + 1] * rows[k, j]
-            px -= shares[k, 0] * rows[k, j]
-            py -= shares[k, 1] * rows[k, j]
-        row[j] = gx * (lx - px) + gy * (ly - py)
+            now[n] -= pending[1, k, at] * pending[0, k, :size]
+    row, share = pending[0, count], pending[1, count]
+    for j in range(size):
+        row[j] = gx * (now[0, j] - now[2, j]) + gy * (now[1, j] - now[3, j])
     total = gx * (row[c] - row[0]) + gy * (row[c + 1] - row[1]) + variance
-    for i in range(len(P)):
-        shares[count, i] = row[i] / total
+    for i in range(size):
+        share[i] = row[i] / total
 
 
 @njit_internal
-def _subtract(P: Array, pending: Array, count: int) -> None:
-    """Subtract what is pending."""
-    rows, shares = pending[0], pending[1]
-    for i in range(len(P)):
-        for k in range(count):
-            share = shares[k, i]
-            for j in range(len(P)):
-                P[i, j] -= share * rows[k, j]
+def _subtract(P: Array, size: int, pending: Array, count: int) -> None:
+    """Subtract what is pending, the two numbers of each reading together."""
+    for i in range(size):
+        target = P[i]
+        for k in range(0, count, 2):
+            first, second = pending[0, k], pending[0, k + 1]
+            share, other = pending[1, k, i], pending[1, k + 1, i]
+            for j in range(size):
+                target[j] = target[j] - share * first[j] - other * second[j]
 
 
 @njit_internal

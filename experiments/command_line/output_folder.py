@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ...sim_configs.atomic_file import unfinished
 from ..runs.folder_lock import WRITER, locked_folder, naming_folder
 from .errors import BadInputError
 
@@ -52,11 +53,14 @@ def output_folder(path: Path) -> Iterator[Path]:
         with naming_folder(path):
             sweep(path)
             partial.mkdir()
+        unfinished.add(partial)
         try:
             with _in_use(partial), _naming_where_full(path):
                 yield partial
+            unfinished.discard(partial)
             _swap(partial, path)
         finally:
+            unfinished.discard(partial)
             shutil.rmtree(partial, ignore_errors=True)
 
 
