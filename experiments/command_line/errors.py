@@ -117,7 +117,7 @@ def _end_after_a_signal(reader: socket.socket, line: threading.Lock) -> None:
         else:
             return
     deadline = time.monotonic() + _PATIENCE
-    import psutil  # noqa: PLC0415 (only here, where it delays nothing)
+    import psutil
 
     time.sleep(max(deadline - time.monotonic(), 0))
     message = _remaining[-1] if _remaining else _NOTHING_WRITTEN

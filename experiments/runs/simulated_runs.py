@@ -120,6 +120,7 @@ def simulate_runs(
         take(record, step, batch)
         readings.take(batch)
     rows, found = readings.joined()
+    named = batch.landmark_ids is None and len(rows) < batch.mask.shape[1]
     return SimulatedRuns(
         odometry=record["odometry"],
         measurements=found["measurements"],
@@ -128,7 +129,9 @@ def simulate_runs(
         landmarks=batch.landmarks,
         initial_poses=batch.start_estimates,
         true_ids=found.get("landmark_ids"),
-        ids=None if len(rows) == batch.mask.shape[1] or batch.landmark_ids is not None else rows,
+        ids=None
+        if len(rows) == batch.mask.shape[1] or batch.landmark_ids is not None
+        else rows,
     )
 
 

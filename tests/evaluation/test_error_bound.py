@@ -164,9 +164,7 @@ def test_the_map_is_bounded_about_its_centre():
     )
     P, centre = bound.covariances[0], np.eye(3) - 1 / 3
     assert len(P) == 3 + 2 * 3
-    about = [
-        np.trace(centre @ P[axis::2, axis::2] @ centre) / 3 for axis in (3, 4)
-    ]
+    about = [np.trace(centre @ P[axis::2, axis::2] @ centre) / 3 for axis in (3, 4)]
     assert bound.map[0] == pytest.approx(sum(about))
 
 

@@ -108,7 +108,6 @@ def test_a_scheduler_ends_workers_of_any_kind(here, command, made, goes_on):
     assert alive == []
 
 
-TICK = 0.01
 IMPORTS = 6.0  # [s] more than any command takes to load what it needs
 LONG = {
     "run": "run city --out out",
@@ -141,11 +140,10 @@ def seconds_until(happened, limit):
 
     On a busy machine, a process waits for a core as long as another one.
     """
-    seconds = 0.0
-    while not happened() and seconds < limit:
-        time.sleep(TICK)
-        seconds += TICK
-    return seconds
+    begin = time.process_time()
+    while not happened() and time.process_time() - begin < limit:
+        pass  # computes, and so gets the share of a core that the command gets
+    return time.process_time() - begin
 
 
 def assert_ends_in_time(child, number, here, message):
