@@ -247,8 +247,8 @@ def _follow(
     """Take the bound P of one run through all its scans, in place.
 
     The first `size` rows and columns of P are those of the pose and of the landmarks
-    read so far. Landmark i is the (i + 1)-th to be read. A scan is subtracted from P in one pass,
-    from its pending rows and shares: P −= Σ share rowᵀ.
+    read so far. Landmark i is the (i + 1)-th to be read. A scan is subtracted from P in
+    one pass, from its pending rows and shares: P −= Σ share rowᵀ.
     """
     entry = np.zeros((len(P), 3))
     size = 3

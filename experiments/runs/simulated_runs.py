@@ -129,9 +129,7 @@ def simulate_runs(
         landmarks=batch.landmarks,
         initial_poses=batch.start_estimates,
         true_ids=found.get("landmark_ids"),
-        ids=None
-        if len(rows) == batch.mask.shape[1] or batch.landmark_ids is not None
-        else rows,
+        ids=rows if named else None,
     )
 
 
