@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from ..arrays import Array, BoolArray
+from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.bearing_range import reading_slopes_jit
 from ..estimator.support import argument_checks
 from ..jit import jit, njit_internal
@@ -41,8 +41,9 @@ class PosteriorBound(NamedTuple):
     """Of the position in the additive frame, to first order, shape (B, T) [m²]."""
     map: Array
     """At the end: of a landmark about the centre of the map, shape (B,) [m²]."""
-    covariances: Array
-    """Of (x, y, θ, l0x, …) at the end, shape (B, 3 + 2L, 3 + 2L); 0 where not read."""
+    covariances: tuple[Array, ...]
+    """Of (x, y, θ, l1x, …) at the end of each run, shape (3 + 2n, 3 + 2n) for the n
+    landmarks that it read, in the order of their rows."""
 
 
 class Efficiency(NamedTuple):
@@ -73,7 +74,7 @@ def posterior_bound(
     landmarks : array_like, shape (B, L, 2)
         True positions [m].
     visible : array_like of bool, shape (B, T, L)
-        Which landmarks each scan reads.
+        Which landmarks each scan reads; the others take no part.
     dt : array_like, shape (T,) or (B, T)
         Duration that the motion noise before each scan counts.
     motion_std, start_std : array_like, shape (3,)
@@ -107,23 +108,21 @@ def posterior_bound(
     start = check("start_std", start_std, 3)
     durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps)).copy()
     position, heading, raw = (np.empty((count, steps)) for _ in range(3))
-    covariances = np.zeros((count, 3 + 2 * points, 3 + 2 * points))
-    covariances[:, :3, :3] = _invariant_start(poses[:, :1], start)
-    known = np.zeros((count, points), dtype=np.bool_)
-    for b in range(count):
-        _follow(
+    starts = _invariant_start(poses[:, :1], start)
+    covariances = tuple(
+        _of_one_run(
             poses[b],
             places[b],
             seen[b],
             durations[b],
             motion,
             noise,
-            known[b],
-            covariances[b],
+            starts[b],
             (position[b], heading[b], raw[b]),
         )
-    pairs = zip(covariances, known, strict=True)
-    spread = np.array([_about_centre(*pair) for pair in pairs])
+        for b in range(count)
+    )
+    spread = np.array([_about_centre(covariance) for covariance in covariances])
     return PosteriorBound(position, heading, raw, spread, covariances)
 
 
@@ -183,15 +182,52 @@ def _invariant_start(first: Array, std: Array) -> Array:
     return np.asarray(lever * std**2 @ lever.mT)
 
 
-def _about_centre(covariance: Array, known: BoolArray) -> float:
-    """Return the mean variance of the known landmarks about their centre."""
-    at = 3 + 2 * np.flatnonzero(known)
-    if not len(at):
+def _of_one_run(
+    poses: Array,
+    landmarks: Array,
+    visible: BoolArray,
+    dt: Array,
+    motion: Array,
+    noise: Array,
+    start: Array,
+    out: tuple[Array, Array, Array],
+) -> Array:
+    """Fill in the bounds of a run, and return the covariance at its end.
+
+    Landmarks enter in the order in which they are read, so that those still unread
+    cost nothing.
+    """
+    rows = np.flatnonzero(visible.any(axis=0))
+    rows = rows[np.argsort(visible[:, rows].argmax(axis=0), kind="stable")]
+    P = np.zeros((3 + 2 * len(rows), 3 + 2 * len(rows)))
+    P[:3, :3] = start
+    most = int(visible.sum(axis=1).max(initial=0))  # readings of a scan
+    _follow(
+        poses,
+        landmarks[rows],
+        visible[:, rows],
+        np.argsort(rows),  # the order within a scan
+        dt,
+        motion,
+        noise,
+        np.empty((2, 2 * most, len(P))),
+        P,
+        out,
+    )
+    at = 3 + 2 * np.argsort(rows)
+    columns = np.concatenate([np.arange(3), np.stack([at, at + 1], axis=1).ravel()])
+    return P[np.ix_(columns, columns)]
+
+
+def _about_centre(covariance: Array) -> float:
+    """Return the mean variance of the landmarks about their centre."""
+    count = len(covariance) // 2 - 1
+    if not count:
         return float("nan")
     total = 0.0
-    for axis in (0, 1):
-        block = covariance[np.ix_(at + axis, at + axis)]
-        total += block.trace() / len(at) - block.mean()
+    for axis in (3, 4):
+        block = covariance[axis::2, axis::2].copy()
+        total += block.trace() / count - block.mean()
     return float(total)
 
 
@@ -200,21 +236,28 @@ def _follow(
     poses: Array,
     landmarks: Array,
     visible: BoolArray,
+    by_row: IntArray,
     dt: Array,
     motion: Array,
     noise: Array,
-    known: BoolArray,
+    pending: Array,
     P: Array,
     out: tuple[Array, Array, Array],
 ) -> None:
-    """Take the bound P of one run through all its scans, in place."""
-    size = len(P)
-    entry, row = np.zeros((size, 3)), np.empty(size)
+    """Take the bound P of one run through all its scans, in place.
+
+    The first `size` rows and columns of P are those of the pose and of the landmarks
+    read so far. Landmark i is the (i + 1)-th to be read. A scan is subtracted from P in
+    one pass, from its pending rows and shares: P −= Σ share rowᵀ.
+    """
+    entry = np.zeros((len(P), 3))
+    size = 3
     for t in range(len(poses)):
         if t > 0 and dt[t] > 0:
-            _move(poses, landmarks, known, t, motion * dt[t], entry, P)
+            _move(poses, landmarks, t, motion * dt[t], entry, P, size)
         x, y = poses[t, 0], poses[t, 1]
-        for i in range(len(landmarks)):
+        count = 0
+        for i in by_row:
             if not visible[t, i]:
                 continue
             dx, dy = landmarks[i, 0] - x, landmarks[i, 1] - y
@@ -223,12 +266,16 @@ def _follow(
             across = noise[0] ** 2
             along = (noise[1] + noise[2] * distance) ** 2
             c = 3 + 2 * i
-            if known[i]:
-                _read(P, row, c, bx, by, across)
-                _read(P, row, c, rx, ry, along)
+            if c < size:
+                _read(P, size, pending, count, c, bx, by, across)
+                _read(P, size, pending, count + 1, c, rx, ry, along)
+                count += 2
             else:
-                known[i] = True
-                _add(P, c, rx, ry, across * distance * distance, along)
+                _subtract(P, size, pending, count)
+                count = 0
+                size += 2
+                _add(P, c, size, rx, ry, across * distance * distance, along)
+        _subtract(P, size, pending, count)
         out[0][t], out[1][t] = P[0, 0] + P[1, 1], P[2, 2]
         lever = 2 * (x * P[1, 2] - y * P[0, 2]) + (x * x + y * y) * P[2, 2]
         out[2][t] = out[0][t] + lever
@@ -238,46 +285,76 @@ def _follow(
 def _move(
     poses: Array,
     landmarks: Array,
-    known: BoolArray,
     t: int,
     variance: Array,
     entry: Array,
     P: Array,
+    size: int,
 ) -> None:
     """Add the noise of the motion to scan t."""
     cos, sin = np.cos(poses[t - 1, 2]), np.sin(poses[t - 1, 2])
     entry[0, 0], entry[1, 0] = cos, sin
     entry[0, 1], entry[1, 1] = -sin, cos
     entry[0, 2], entry[1, 2], entry[2, 2] = poses[t, 1], -poses[t, 0], 1.0
-    for i in range(len(landmarks)):
-        entry[3 + 2 * i, 2] = landmarks[i, 1] if known[i] else 0.0
-        entry[4 + 2 * i, 2] = -landmarks[i, 0] if known[i] else 0.0
+    for i in range(size // 2 - 1):
+        entry[3 + 2 * i, 2], entry[4 + 2 * i, 2] = landmarks[i, 1], -landmarks[i, 0]
     for i in range(2):
         for j in range(2):
             for k in range(2):
                 P[i, j] += entry[i, k] * entry[j, k] * variance[k]
-    for i in range(len(P)):
-        turned = entry[i, 2] * variance[2]
-        for j in range(len(P)):
-            P[i, j] += turned * entry[j, 2]
+    turn = entry[:, 2].copy()
+    for i in range(size):
+        turned, row = turn[i] * variance[2], P[i]
+        for j in range(size):
+            row[j] += turned * turn[j]
 
 
 @njit_internal
-def _read(P: Array, row: Array, c: int, gx: float, gy: float, variance: float) -> None:
-    """Take in one number, (gx, gy) (ξ_l − ξ_p) plus noise, of the landmark at c."""
-    for j in range(len(P)):
-        row[j] = gx * (P[c, j] - P[0, j]) + gy * (P[c + 1, j] - P[1, j])
+def _read(
+    P: Array,
+    size: int,
+    pending: Array,
+    count: int,
+    c: int,
+    gx: float,
+    gy: float,
+    variance: float,
+) -> None:
+    """Take in one number, (gx, gy) (ξ_l − ξ_p) plus noise, of the landmark at c.
+
+    It becomes pending, after ``count`` others.
+    """
+    now = np.empty((4, size))  # rows of P after what is pending
+    for n, at in enumerate((c, c + 1, 0, 1)):
+        now[n] = P[at, :size]
+        for k in range(count):
+            now[n] -= pending[1, k, at] * pending[0, k, :size]
+    row, share = pending[0, count], pending[1, count]
+    for j in range(size):
+        row[j] = gx * (now[0, j] - now[2, j]) + gy * (now[1, j] - now[3, j])
     total = gx * (row[c] - row[0]) + gy * (row[c + 1] - row[1]) + variance
-    for i in range(len(P)):
-        share = row[i] / total
-        for j in range(len(P)):
-            P[i, j] -= share * row[j]
+    for i in range(size):
+        share[i] = row[i] / total
 
 
 @njit_internal
-def _add(P: Array, c: int, rx: float, ry: float, across: float, along: float) -> None:
+def _subtract(P: Array, size: int, pending: Array, count: int) -> None:
+    """Subtract what is pending, the two numbers of each reading together."""
+    for i in range(size):
+        target = P[i]
+        for k in range(0, count, 2):
+            first, second = pending[0, k], pending[0, k + 1]
+            share, other = pending[1, k, i], pending[1, k + 1, i]
+            for j in range(size):
+                target[j] = target[j] - share * first[j] - other * second[j]
+
+
+@njit_internal
+def _add(
+    P: Array, c: int, size: int, rx: float, ry: float, across: float, along: float
+) -> None:
     """Add the landmark at c, read in the direction (rx, ry), ξ_l = ξ_p + noise."""
-    for j in range(len(P)):
+    for j in range(size):
         P[c, j], P[c + 1, j] = P[0, j], P[1, j]
         P[j, c], P[j, c + 1] = P[0, j], P[1, j]
     P[c, c] = P[0, 0] + rx * rx * along + ry * ry * across

@@ -5,6 +5,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+unfinished: set[Path] = set()
+"""Files and folders that this process is writing, to be removed if it must end."""
+
 
 @contextmanager
 def replace_when_written(path: str | Path) -> Iterator[Path]:
@@ -32,8 +35,10 @@ def replace_when_written(path: str | Path) -> Iterator[Path]:
     if not target.parent.is_dir():
         raise FileNotFoundError(f"the folder of {target} does not exist")
     partial = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    unfinished.add(partial)
     try:
         yield partial
         partial.replace(target)
     finally:
         partial.unlink(missing_ok=True)
+        unfinished.discard(partial)

@@ -2,14 +2,19 @@
 
 import contextlib
 import os
+import shutil
 import signal
+import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any, NoReturn
 
 import numpy as np
 from typer.core import TyperGroup
+
+from ...sim_configs.atomic_file import unfinished
 
 _OF_SCENARIOS = {
     "--motion-std": "motion.std=[0.1,0.1,0.05]",
@@ -19,6 +24,14 @@ _OF_SCENARIOS = {
     "--noise-at-rest": "motion.noise_at_rest=true",
 }
 FAILURE, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+_CODES = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED}
+_NOTHING_WRITTEN = "interrupted; nothing was written"
+_PATIENCE = 1.0
+"""How long a command may clean up after a signal before it is ended [s]."""
+_SHOW_CURSOR = b"\r\x1b[K\x1b[?25h"  # and clear the line of the progress bar
+
+_remaining: list[str] = []
+"""Messages of the blocks that can be interrupted, the innermost last."""
 
 
 class BadInputError(ValueError):
@@ -40,10 +53,12 @@ class InterruptedRunError(Exception):
 @contextlib.contextmanager
 def interruptible(message: str) -> Iterator[None]:
     """Report Ctrl-C and SIGTERM in the block with a message about what remains."""
+    _remaining.append(message)
     try:
         yield
-    except KeyboardInterrupt as error:
+    except KeyboardInterrupt as error:  # the message stays, for `ending_in_time`
         raise InterruptedRunError(message) from error
+    _remaining.remove(message)
 
 
 @contextlib.contextmanager
@@ -66,6 +81,65 @@ def _terminate(_number: int, _frame: object) -> NoReturn:
     raise TerminationError
 
 
+@contextlib.contextmanager
+def ending_in_time(line: threading.Lock) -> Iterator[None]:
+    """End this process soon after a SIGINT or SIGTERM in the block, whatever it does.
+
+    Python runs signal handlers in its main thread, and only between two steps of Python
+    code: a kernel, or a decomposition of a large matrix, may delay them for minutes.
+    The system's own handler also writes to a socket, where a thread waits. If the
+    process still exists `_PATIENCE` later, the thread ends it, also outside the block.
+
+    Parameters
+    ----------
+    line : threading.Lock
+        Taken for good by the thread that writes the line about the end.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _remaining.clear()
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    former = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    threading.Thread(
+        target=_end_after_a_signal, args=(reader, line), daemon=True
+    ).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(former)
+        writer.close()
+
+
+def _end_after_a_signal(reader: socket.socket, line: threading.Lock) -> None:
+    """Wait for a signal, give the main thread some time, and end the process."""
+    with reader:
+        while received := reader.recv(1):
+            if received[0] in _CODES:
+                break
+        else:
+            return
+    deadline = time.monotonic() + _PATIENCE
+    import psutil
+
+    time.sleep(max(deadline - time.monotonic(), 0))
+    message = _remaining[-1] if _remaining else _NOTHING_WRITTEN
+    if line.acquire(blocking=False):
+        shown = _SHOW_CURSOR if os.isatty(2) else b""
+        os.write(2, shown + f"slamgym: {message}\n".encode())
+    with contextlib.suppress(psutil.Error):
+        for process in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                # That of joblib cleans up, and then ends by itself.
+                if "resource_tracker" not in " ".join(process.cmdline()):
+                    process.kill()
+    for path in tuple(unfinished):
+        with contextlib.suppress(OSError):
+            path.unlink() if path.is_file() else shutil.rmtree(path)
+    os._exit(_CODES[signal.Signals(received[0])])
+
+
 class OneLineErrors(TyperGroup):
     """A group of commands that reports an error in one line, or in a list.
 
@@ -78,14 +152,16 @@ class OneLineErrors(TyperGroup):
         """Run a command, and exit the program unless in another one."""
         stands_alone = kwargs.pop("standalone_mode", True)
         kwargs["standalone_mode"] = False
+        line = threading.Lock()
         if not stands_alone:
             return super().main(*args, **kwargs)
         try:
-            with terminable():
+            with ending_in_time(line), terminable():
                 result = super().main(*args, **kwargs)
         except Exception as error:
             if "SLAMGYM_TRACEBACK" in os.environ:
                 raise
+            line.acquire()  # waits for the end where another thread has taken it
             sys.stderr.write(f"slamgym: {message_of(error)}\n")
             sys.exit(exit_code_of(error))
         sys.exit(result if isinstance(result, int) else 0)
@@ -109,7 +185,7 @@ def message_of(error: Exception) -> str:
     if isinstance(error, BrokenFilterError):
         return str(error)
     if isinstance(error, InterruptedRunError):
-        return str(error) or "interrupted; nothing was written"
+        return str(error) or _NOTHING_WRITTEN
     if hasattr(error, "format_message"):  # of the command line itself
         return _one_line(error.format_message()) + _way_to_set(error)
     if isinstance(error, OSError) and error.filename and error.strerror:

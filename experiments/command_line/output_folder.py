@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ...sim_configs.atomic_file import unfinished
 from ..runs.folder_lock import locked_folder, naming_folder
 from ..runs.own_files import (
     MANIFEST,
@@ -64,6 +65,7 @@ def output_folder(path: Path) -> Iterator[Path]:
         _publish(folder)  # what a killed command left
         with naming_folder(folder):
             staging.mkdir()
+        unfinished.add(staging)
         try:
             yield staging
             new = {measured(staging / name, name) for name in files_below(staging)}
@@ -71,6 +73,8 @@ def output_folder(path: Path) -> Iterator[Path]:
         except BaseException:
             shutil.rmtree(staging, ignore_errors=True)
             raise
+        finally:
+            unfinished.discard(staging)
         _publish(folder)
 
 

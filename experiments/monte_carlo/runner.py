@@ -57,7 +57,8 @@ class _Work:
         for name, factory in self.factories.items():
             if ":" not in name and not registry.is_registered(name):
                 registry.register_estimator(name, factory)
-        runs = simulate_runs(self.scenario, span.size, self.seed + span.first)
+        first = self.seed + span.first
+        runs = simulate_runs(self.scenario, span.size, first, only_read=True)
         bound = bound_runs(self.scenario, runs)
         noise = noise_of_runs(self.scenario, self.assumed, runs)
         return [

@@ -13,13 +13,15 @@ from ...estimator.support.memory_limit import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
 from ...sim_configs.drawn_scenarios import refuse_ranges
 
-_EACH_SCAN = ("odometry", "measurements", "mask", "poses", "landmark_ids")
+_EACH_SCAN = ("odometry", "poses")
+_READINGS = ("measurements", "mask", "landmark_ids")
 
 
 class SimulatedRuns(NamedTuple):
     """B runs of T = steps + 1 scans, the first before any motion, and L landmarks.
 
-    A scan has M rows: one for each landmark, or more where identities are hidden.
+    A scan has M rows: one for each landmark, or for each that `ids` names; those of a
+    world that hides identities are of no landmark.
     """
 
     odometry: Array
@@ -37,6 +39,8 @@ class SimulatedRuns(NamedTuple):
     true_ids: IntArray | None = None
     """The true landmark of each row of a world that hides identities, -1 for clutter
     and empty rows, shape (B, T, M); the rows are then not those of the landmarks."""
+    ids: IntArray | None = None
+    """The landmark of each row, ascending, shape (M,); None if row i is landmark i."""
 
     @property
     def dt(self) -> Array:
@@ -45,21 +49,40 @@ class SimulatedRuns(NamedTuple):
         durations[0] = 0.0
         return durations
 
+    @property
+    def landmarks_of_rows(self) -> Array:
+        """True positions of the landmark of each row, shape (B, M, 2) [m]."""
+        return self.landmarks if self.ids is None else self.landmarks[:, self.ids]
+
+    def ids_of(self, rows: IntArray) -> list[int]:
+        """Return the landmarks of rows."""
+        names: list[int] = (rows if self.ids is None else self.ids[rows]).tolist()
+        return names
+
     def identified(self) -> "SimulatedRuns":
-        """Return the same readings by landmark, without the clutter."""
+        """Return the same readings by landmark, without the clutter.
+
+        Where identities are hidden, only landmarks that some run reads have rows.
+        """
         if self.true_ids is None:
             return self
         run, scan, row = np.nonzero(self.visible & (self.true_ids >= 0))
-        landmark = self.true_ids[run, scan, row]
-        shape = (*self.visible.shape[:2], self.landmarks.shape[1])
+        ids, column = np.unique(self.true_ids[run, scan, row], return_inverse=True)
+        shape = (*self.visible.shape[:2], len(ids))
         measurements, visible = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.bool_)
-        measurements[run, scan, landmark] = self.measurements[run, scan, row]
-        visible[run, scan, landmark] = True
-        return self._replace(measurements=measurements, visible=visible, true_ids=None)
+        measurements[run, scan, column] = self.measurements[run, scan, row]
+        visible[run, scan, column] = True
+        return self._replace(
+            measurements=measurements, visible=visible, true_ids=None, ids=ids
+        )
 
 
 def simulate_runs(
-    scenario: Scenario | Mapping[str, object] | str | Path, runs: int, seed: int
+    scenario: Scenario | Mapping[str, object] | str | Path,
+    runs: int,
+    seed: int,
+    *,
+    only_read: bool = False,
 ) -> SimulatedRuns:
     """Drive the scenario's controls in ``runs`` worlds; run i has seed ``seed + i``.
 
@@ -69,11 +92,16 @@ def simulate_runs(
         The world.
     runs, seed : int
         Number of runs, and the seed of the first; run i depends on seed + i alone.
+    only_read : bool
+        Whether to leave out rows without a reading in any run, such as those of the
+        distant landmarks of a large world.
 
     Raises
     ------
     ValueError
         If ``runs`` is below 1.
+    MemoryError
+        If the readings do not fit into memory.
     """
     world = load_scenario(scenario)
     refuse_ranges(world)
@@ -81,27 +109,86 @@ def simulate_runs(
         raise ValueError(f"runs must be >= 1, got {runs}")
     actions, batch = action_sequence(world), WorldBatch(world, runs)
     batch.reset([seeding.np_random(seed + i)[0] for i in range(runs)])
-    scans, rows = len(actions) + 1, batch.mask.shape[1]
-    refuse_beyond_memory(
-        f"a block of {runs} runs of {scans} scans of {rows} landmarks",
-        # a reading, whether there is one, and where it is hidden, of what
-        (17 if batch.landmark_ids is None else 25) * runs * scans * rows,
-        "take fewer runs at a time (block_size), or fewer steps",
-    )
-    record = empty_record(batch, _EACH_SCAN, scans)
+    scans = len(actions) + 1
+    record, readings = empty_record(batch, _EACH_SCAN, scans), _Readings(batch, scans)
+    if not only_read:
+        readings.keep(slice(None))
     take(record, 0, batch)
+    readings.take(batch)
     for step, action in enumerate(actions, start=1):
         batch.step(np.tile(action, (runs, 1)))
         take(record, step, batch)
+        readings.take(batch)
+    rows, found = readings.joined()
+    named = batch.landmark_ids is None and len(rows) < batch.mask.shape[1]
     return SimulatedRuns(
         odometry=record["odometry"],
-        measurements=record["measurements"],
-        visible=record["mask"],
+        measurements=found["measurements"],
+        visible=found["mask"],
         true_poses=record["poses"],
         landmarks=batch.landmarks,
         initial_poses=batch.start_estimates,
-        true_ids=record.get("landmark_ids"),
+        true_ids=found.get("landmark_ids"),
+        ids=rows if named else None,
     )
+
+
+class _Readings:
+    """The readings of B runs, of the rows that hold one in any run.
+
+    Parameters
+    ----------
+    worlds : WorldBatch
+        The runs.
+    scans : int
+        T.
+    """
+
+    def __init__(self, worlds: WorldBatch, scans: int) -> None:
+        now = {name: getattr(worlds, name) for name in _READINGS}
+        self._blank = {  # an empty row
+            name: (array.dtype, array.shape[2:], -1 if name == "landmark_ids" else 0)
+            for name, array in now.items()
+            if array is not None
+        }
+        self._kept = np.zeros(worlds.mask.shape[1], dtype=np.bool_)
+        self._shape = len(worlds.mask), scans
+        self._scans: list[tuple[IntArray, dict[str, AnyArray]]] = []
+
+    def keep(self, rows: slice | IntArray) -> None:
+        """Keep rows from now on; refuse those that will not fit into memory."""
+        if self._kept[rows].all():
+            return
+        self._kept[rows] = True
+        (runs, scans), count = self._shape, int(self._kept.sum())
+        refuse_beyond_memory(
+            f"a block of {runs} runs of {scans} scans of {count} landmarks",
+            # a reading, whether there is one, and where it is hidden, of what
+            (25 if "landmark_ids" in self._blank else 17) * runs * scans * count,
+            "take fewer runs at a time (block_size), or fewer steps",
+        )
+
+    def take(self, worlds: WorldBatch) -> None:
+        """Take the present scan of the worlds."""
+        rows = np.flatnonzero(worlds.mask.any(axis=0))
+        self.keep(rows)
+        scan = {name: getattr(worlds, name)[:, rows] for name in self._blank}
+        self._scans.append((rows, scan))
+
+    def joined(self) -> tuple[IntArray, dict[str, AnyArray]]:
+        """Return the kept rows, and the arrays (B, T, M, …) of all scans, once."""
+        kept = np.flatnonzero(self._kept)
+        shape = (*self._shape, len(kept))
+        arrays = {
+            name: np.full((*shape, *rest), blank, dtype)
+            for name, (dtype, rest, blank) in self._blank.items()
+        }
+        for place in reversed(range(shape[1])):
+            rows, scan = self._scans.pop()
+            columns = np.searchsorted(kept, rows)
+            for name, array in scan.items():
+                arrays[name][:, place, columns] = array
+        return kept, arrays
 
 
 def empty_record(

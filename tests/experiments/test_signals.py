@@ -15,6 +15,9 @@ from slamgym.experiments.command_line.errors import (
     terminable,
 )
 from slamgym.experiments.command_line.output_folder import STAGING
+from slamgym.experiments.command_line.scenario_options import recorded
+from slamgym.experiments.logs.slamlog import write_slamlog
+from slamgym.sim_configs import load_scenario
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals are those of POSIX")
 
@@ -102,6 +105,108 @@ def test_a_scheduler_ends_workers_of_any_kind(here, command, made, goes_on):
     assert "Traceback" not in message
     _, alive = psutil.wait_procs(processes, timeout=10)
     assert alive == []
+
+
+IMPORTS = 6.0  # [s] more than any command takes to load what it needs
+LONG = {
+    "run": "run city --out out",
+    "render": "render city --out out.gif",
+    "generate": "generate city --episodes 9 --estimator ekf --out out",
+    "generate by workers": "generate city --episodes 9 --shard 1 --jobs 2 --out out",
+    "replay": "replay ../city.csv --out out",
+    "smooth": "smooth ../city.csv --out out",
+    "fit-noise": "fit-noise ../city.csv --out out",
+    "noise-study": "noise-study ../city.csv --out out",
+    "noise-study of runs": "noise-study city --runs 4 --out out",
+    "monte-carlo": "monte-carlo city --runs 4 --out out",
+    "monte-carlo by workers": "monte-carlo city --runs 4 --block-size 1 --jobs 2 "
+    "--out out",
+}
+
+
+@pytest.fixture(scope="module")
+def city_log(tmp_path_factory):
+    """Return a log that takes every command a minute or more."""
+    world = load_scenario("city").with_changes(steps=2000)
+    log = recorded(world, "open_loop", 0, lambda *_: None)
+    file = tmp_path_factory.mktemp("logs") / "city.csv"
+    write_slamlog(log, file)
+    return file
+
+
+def seconds_until(happened, limit):
+    """Return how long it takes, by a clock that stands while this process has to wait.
+
+    On a busy machine, a process waits for a core as long as another one.
+    """
+    begin = time.process_time()
+    while not happened() and time.process_time() - begin < limit:
+        pass  # computes, and so gets the share of a core that the command gets
+    return time.process_time() - begin
+
+
+def assert_ends_in_time(child, number, here, message):
+    """Send a signal, and check all that a user sees of the end."""
+    processes = psutil.Process(child.pid).children(recursive=True)
+    os.kill(child.pid, number)
+    lasted = seconds_until(lambda: not child.is_alive(), 30)
+    said = message_at_the_end(child, here)
+    assert lasted < 2
+    assert child.exitcode == {signal.SIGINT: 130, signal.SIGTERM: 143}[number]
+    lines = [line for line in said.splitlines() if not line.startswith("note: ")]
+    assert lines == [f"slamgym: interrupted; {message}"]
+    _, alive = psutil.wait_procs(processes, timeout=10)
+    assert alive == []
+
+
+def message_of(command):
+    if command.startswith("monte-carlo"):
+        return GOES_ON
+    if command.startswith("generate"):
+        return "whole shards stay in out, the same command continues"
+    return "nothing was written"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("command", LONG)
+def test_a_command_that_computes_ends_in_time(here, city_log, command, number):
+    here.with_name("city.csv").symlink_to(city_log)
+    child = begin(here, *LONG[command].split())
+    of_child = psutil.Process(child.pid)
+
+    def computed():
+        assert child.is_alive()
+        workers = of_child.children(recursive=True)
+        if "workers" in command:
+            of_workers = [worker.cpu_times().user for worker in workers]
+            return sum(seconds > IMPORTS for seconds in of_workers) == 2
+        return of_child.cpu_times().user > IMPORTS
+
+    wait_until(computed)
+    assert_ends_in_time(child, number, here, message_of(command))
+    assert list(here.glob(".*")) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "run six_landmarks -e ekf --out out",
+        "render six_landmarks -e ekf --out out.gif",
+        "generate six_landmarks --episodes 9 -e ekf --out out",
+        "noise-study six_landmarks --out out",
+        "monte-carlo hidden_identities --out out",
+    ],
+)
+def test_a_call_that_python_cannot_interrupt_delays_no_end(here, command, number):
+    child = forked.start(jobs_to_kill.command_in_a_kernel, here, *command.split())
+    wait_until((here / "began").exists)
+    compiles = command.startswith("monte-carlo")  # its job has not begun
+    message = "nothing was written" if compiles else message_of(command)
+    assert_ends_in_time(child, number, here, message)
+    assert list(here.glob(".*")) == []
 
 
 @pytest.mark.slow

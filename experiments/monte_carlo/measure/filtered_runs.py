@@ -1,6 +1,7 @@
 """Run one filter over many simulated runs: in a batch if possible, else one by one."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -99,7 +100,9 @@ def _in_a_batch(
     )
     trace = batch.run(runs.odometry, runs.measurements, runs.visible, runs.dt)
     finite = _finite(trace)
-    beliefs: list[Belief | None] = [batch.belief(run) for run in range(count)]
+    beliefs: list[Belief | None] = [
+        _renamed(batch.belief(run), runs) for run in range(count)
+    ]
     finite[:, -1] &= [belief is None or _is_finite_map(belief) for belief in beliefs]
     failures = {}
     for run in np.flatnonzero(~finite.all(axis=1)).tolist():
@@ -107,6 +110,14 @@ def _in_a_batch(
         _erase(trace, run, failures[run].step)
         beliefs[run] = None
     return FilteredRuns(trace, beliefs, failures)
+
+
+def _renamed(belief: Belief, runs: SimulatedRuns) -> Belief:
+    """Return a belief of a batch, which names landmarks by their rows, by their ids."""
+    if runs.ids is None:
+        return belief
+    rows = np.array(belief.landmark_ids, dtype=np.int64)
+    return replace(belief, landmark_ids=tuple(runs.ids_of(rows)))
 
 
 def _why(settings: FilterSettings, runs: SimulatedRuns, run: int, step: int) -> Failure:
@@ -174,7 +185,7 @@ def _step(
     seen = np.flatnonzero(runs.visible[run, step])
     readings = runs.measurements[run, step, seen]
     if runs.true_ids is None:
-        report = slam.update(readings, seen.tolist())
+        report = slam.update(readings, runs.ids_of(seen))
     else:
         report = slam.update(readings)
         recorder.add(report, runs.true_ids[run, step, seen])
