@@ -115,11 +115,23 @@ def message_of(error: Exception) -> str:
 
 
 def _way_to_set(error: Any) -> str:
-    """Return how a command for scenarios sets a noise that has an option for logs."""
-    change = _OF_SCENARIOS.get(getattr(error, "option_name", None) or "")
+    """Return the way to set what a command for scenarios has no option for."""
     taken = getattr(getattr(error, "ctx", None), "command", None)
     options = [name for option in getattr(taken, "params", ()) for name in option.opts]
-    return f"; for the world: --set {change}" if change and "--set" in options else ""
+    option = getattr(error, "option_name", None) or ""
+    return way_to_set(option) if "--set" in options else ""
+
+
+def way_to_set(option: str) -> str:
+    """Return how to set a noise of a world that has an option for logs, else nothing.
+
+    Examples
+    --------
+    >>> way_to_set("--noise-at-rest"), way_to_set("--robot")
+    ('; for the world: --set motion.noise_at_rest=true', '')
+    """
+    change = _OF_SCENARIOS.get(option)
+    return f"; for the world: --set {change}" if change else ""
 
 
 def exit_code_of(error: Exception) -> int:
