@@ -1,6 +1,7 @@
 """Errors of the command line: one line on standard error, and an exit code."""
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -76,6 +77,7 @@ class OneLineErrors(TyperGroup):
         kwargs["standalone_mode"] = False
         if not stands_alone:
             return super().main(*args, **kwargs)
+        _replace_unknown_characters()
         try:
             with terminable():
                 result = super().main(*args, **kwargs)
@@ -94,6 +96,13 @@ class OneLineErrors(TyperGroup):
             raise InterruptedRunError from error
 
 
+def _replace_unknown_characters() -> None:
+    """Print a question mark for each character that a terminal's encoding lacks."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
 def message_of(error: Exception) -> str:
     r"""Return the message of an error as one line.
 
@@ -108,6 +117,8 @@ def message_of(error: Exception) -> str:
         return _one_line(error.format_message()) + _way_to_set(error)
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
+    if isinstance(error, MemoryError) and not str(error):
+        return "there is not enough memory"
     if isinstance(error, ValueError | OSError | ImportError | MemoryError):
         return _one_line(str(error))
     what = f"{type(error).__name__}: {_one_line(str(error))}"

@@ -27,7 +27,7 @@ def read_any_log(
     Raises
     ------
     BadInputError
-        If a file cannot be opened.
+        If a file cannot be opened, or does not fit into memory.
     LogError
         If one is malformed.
     """
@@ -39,6 +39,8 @@ def read_any_log(
         if str(path) in list_presets():
             hint = f"; {path} is a scenario: slamgym run {path}"
         raise BadInputError(f"cannot read the log {file}: {reason}{hint}") from error
+    except MemoryError as error:
+        raise BadInputError(f"the log {path} does not fit into memory") from error
     return without_identities(log) if hide_identities else log
 
 

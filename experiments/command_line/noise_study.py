@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from ...estimator.support.filter_labels import split_labels
+from ...sim_configs.atomic_file import naming_file
 from . import options
 from .errors import BadInputError, way_to_set
 from .option_values import assignments, given_options, standard_deviations
@@ -273,7 +274,7 @@ def _write_table(
     path: Path, rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]"
 ) -> None:
     """Write rows as CSV below the names of their columns, empty where None."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
+    with naming_file(path), path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(rows[0]._fields)
         writer.writerows(rows)

@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ...sim_configs.atomic_file import naming_file
+from ..logs.lines import LogError
 from ..runs.folder_lock import WRITER, locked_folder, naming_folder
 from .errors import BadInputError
 
@@ -53,7 +55,7 @@ def output_folder(path: Path) -> Iterator[Path]:
             sweep(path)
             partial.mkdir()
         try:
-            with _in_use(partial), _naming_where_full(path):
+            with _in_use(partial), _naming_in_place(partial, path):
                 yield partial
             _swap(partial, path)
         finally:
@@ -61,12 +63,17 @@ def output_folder(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _naming_where_full(path: Path) -> Iterator[None]:
-    """Name the folder in errors of a full disk, which name no file themselves."""
+def _naming_in_place(partial: Path, path: Path) -> Iterator[None]:
+    """Name files as in the final folder, and the folder where an error names none."""
     try:
         yield
+    except LogError as error:
+        raise LogError(str(error).replace(str(partial), str(path))) from error
     except OSError as error:
-        if error.filename or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+        if error.filename:
+            file = str(error.filename).replace(str(partial), str(path))
+            raise OSError(error.errno, error.strerror, file) from error
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
             raise
         raise OSError(
             f"the folder {path} cannot be written: {error.strerror}"
@@ -139,7 +146,8 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
         The summary with ``files``.
     """
     complete = {**summary, "files": sorted([*files_in(folder), SUMMARY])}
-    (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
+    with naming_file(folder / SUMMARY):
+        (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
     return complete
 
 

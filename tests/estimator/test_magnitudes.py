@@ -20,6 +20,7 @@ NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
         {"motion_std": (0.1, 0.1, 1e13)},
         {"measurement_std": (1e200, 0.1)},
         {"range_std_per_metre": 1e13},
+        {"range_std_per_metre": 1e9},
     ],
 )
 def test_a_setting_beyond_the_bound_is_refused_by_name(name, argument):
