@@ -177,9 +177,12 @@ def test_a_landmark_given_twice_is_refused_with_its_line(tmp_path):
 def test_a_size_limit_names_the_file_in_its_final_folder(tmp_path):
     out, limit = tmp_path / "out", (errno.EFBIG, os.strerror(errno.EFBIG))
     limited = pytest.raises(OSError, match="File too large")
-    with limited as caught, output_folder(out) as partial:
-        with replace_when_written(partial / "map.png"):
-            raise OSError(*limit)
+    with (
+        limited as caught,
+        output_folder(out) as partial,
+        replace_when_written(partial / "map.png"),
+    ):
+        raise OSError(*limit)
     assert caught.value.filename == str(out / "map.png")
     unnamed = pytest.raises(OSError, match="out cannot be written: File too large")
     with unnamed, output_folder(out):
