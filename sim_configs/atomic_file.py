@@ -1,4 +1,4 @@
-"""Atomic replacement of files: a reader sees the old file or the complete new one."""
+"""Atomic replacement of files, and errors that name the file."""
 
 import secrets
 from collections.abc import Iterator
@@ -30,6 +30,8 @@ def replace_when_written(path: str | Path) -> Iterator[Path]:
     ------
     FileNotFoundError
         If the folder does not exist.
+    OSError
+        If the file cannot be written; it names `path`.
     """
     target = Path(path)
     if not target.parent.is_dir():
@@ -37,8 +39,29 @@ def replace_when_written(path: str | Path) -> Iterator[Path]:
     partial = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     unfinished.add(partial)
     try:
-        yield partial
-        partial.replace(target)
+        with naming_file(target, partial):
+            yield partial
+            partial.replace(target)
     finally:
         partial.unlink(missing_ok=True)
         unfinished.discard(partial)
+
+
+@contextmanager
+def naming_file(path: Path, written: Path | None = None) -> Iterator[None]:
+    """Name a file in errors of the system that name none, such as a size limit's.
+
+    Parameters
+    ----------
+    path : Path
+        The file to name.
+    written : Path, optional
+        A temporary file in its place, whose name errors do not repeat.
+    """
+    try:
+        yield
+    except OSError as error:
+        named = error.filename
+        if error.errno is None or (named and str(named) != str(written)):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..suggestions import closest
+from .atomic_file import naming_file
 from .scenario import Scenario
 from .scenario_errors import ScenarioError
 
@@ -72,7 +73,9 @@ def load_scenario(source: Scenario | Mapping[str, object] | str | Path) -> Scena
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
     """Write a scenario to a TOML file; `load_scenario` reads an equal one from it."""
-    Path(path).write_text(scenario_text(scenario), encoding="utf-8")
+    target = Path(path)
+    with naming_file(target):
+        target.write_text(scenario_text(scenario), encoding="utf-8")
 
 
 def scenario_text(scenario: Scenario) -> str:

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from ..magnitudes import LARGEST_RANGE_GROWTH
 from .field_types import (
     BOUNDED,
     CountOrZero,
@@ -30,6 +31,11 @@ _Degrees = Annotated[
     BOUNDED,
 ]
 _Angle = Annotated[Positive, Field(le=2 * math.pi), expect("a number in (0, 2π] [rad]")]
+_RangeGrowth = Annotated[
+    NotNegative,
+    Field(le=LARGEST_RANGE_GROWTH),
+    expect(f"a number from 0 to {LARGEST_RANGE_GROWTH:g}"),
+]
 
 
 def _leave_out_default(schema: dict[str, Any]) -> None:
@@ -96,7 +102,7 @@ class Sensor(Part):
     """The bearing-range sensor: its noise, its field of view and its failures."""
 
     std: MeasurementStd = Field(description="(σβ, σr) of one reading [rad, m]")
-    range_std_per_metre: NotNegative = Field(
+    range_std_per_metre: _RangeGrowth = Field(
         default=0.0, description="k in σr(r) = σr + k r [m/m]"
     )
     min_range: NotNegative = Field(

@@ -8,11 +8,10 @@ Two commands answer these questions, and write their files into the folder ``res
 
 .. code-block:: bash
 
-   slamgym replay data.txt -e ekf
-   slamgym noise-study data.txt -e ekf
+   slamgym replay data.txt -e ekf --landmark-init independent
+   slamgym noise-study data.txt -e ekf --landmark-init independent
 
-With ``--landmark-init independent``, ``replay`` gives the numbers of the homework, which adds landmarks without a correlation
-with the pose.
+With ``--landmark-init independent``, the filter adds landmarks without a correlation with the pose, as in the homework.
 
 =================================================== ==================================================
 question                                            answer

@@ -1,8 +1,9 @@
 """The matplotlib artists of a scene, each created once."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
@@ -23,6 +24,23 @@ RAY, ALARM, POSE, MAP = "#e69f00", "#d55e00", "#0072b2", "#009e73"  # Okabe and 
 AXES_BOX = (0.105, 0.165, 0.87, 0.775)  # left, bottom, width, height of the figure
 _TITLE_HEIGHT = 0.957  # of the figure
 NO_POINT = np.full((1, 2), np.nan)
+_PLAIN: dict[Any, Any] = {"text.usetex": False}
+
+
+class PlainTextFigure(Figure):
+    """A figure that never needs LaTeX, even where matplotlibrc sets text.usetex."""
+
+    def draw(self, renderer: Any) -> None:
+        """Draw the figure."""
+        for text in self.findobj(Text):
+            text.set_usetex(False)
+        with rc_context(_PLAIN):  # for the labels that matplotlib makes meanwhile
+            super().draw(renderer)
+
+    def savefig(self, *args: Any, **kwargs: Any) -> None:
+        """Write the figure to a file."""
+        with rc_context(_PLAIN):
+            super().savefig(*args, **kwargs)
 
 
 class MovingArtists(NamedTuple):

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from ...arrays import Array, ImageArray
 from ...sim_configs import Scenario
+from .artists import PlainTextFigure
 from .blitting import BlittedFigure
 from .render_state import RENDER_MODES, RenderMode, RenderState
 from .scene import Scene
@@ -114,7 +115,8 @@ class WorldRenderer:
         return {**self.__dict__, "_drawing": None}
 
     def _make_drawing(self) -> _Drawing:
-        figure, window = Figure(), None
+        figure: Figure = PlainTextFigure()
+        window = None
         if self._mode == "human":
             from .window import Window  # noqa: PLC0415 (pyplot, for windows only)
 

@@ -6,6 +6,7 @@ import time
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
+from .artists import PlainTextFigure
 from .blitting import BlittedFigure
 
 
@@ -17,7 +18,7 @@ class Window:
     """
 
     def __init__(self, fps: float) -> None:
-        self.figure: Figure = pyplot.figure()
+        self.figure: Figure = pyplot.figure(FigureClass=PlainTextFigure)
         self._seconds_per_frame = 1 / fps
         self._due = time.monotonic()
         self._has_screen = bool(self.figure.canvas.required_interactive_framework)

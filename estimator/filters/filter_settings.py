@@ -34,9 +34,7 @@ def checked_rules(
         correlated=landmark_init == "full",
         bearing_std=float(sensor[0]),
         range_std=float(sensor[1]),
-        range_std_per_metre=argument_checks.at_least(
-            "range_std_per_metre", range_std_per_metre, 0.0
-        ),
+        range_std_per_metre=argument_checks.range_growth(range_std_per_metre),
         min_range=argument_checks.positive("min_range", min_range),
         gate=_gate(gate_probability),
         noise_as_read=range_noise_at == "reading",

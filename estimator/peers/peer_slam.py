@@ -72,7 +72,7 @@ class PeerSlam(ABC):
     ) -> None:
         self._noise = MotionNoise.checked(motion_std, noise_at_rest)
         std = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
-        growth = argument_checks.at_least("range_std_per_metre", range_std_per_metre, 0)
+        growth = argument_checks.range_growth(range_std_per_metre)
         self._sensor = Noise(float(std[0]), float(std[1]), growth)
         self._min_range = argument_checks.above("min_range", min_range, 0)
         self._slots: dict[int, int] = {}

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import AnyArray, Array
-from ...magnitudes import LARGEST, SMALLEST
+from ...magnitudes import LARGEST, LARGEST_RANGE_GROWTH, SMALLEST
 from .memory_limit import covariance_bytes
 
 LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
@@ -223,13 +223,18 @@ def _not_a_pair(name: str, value: ArrayLike) -> ValueError:
     return ValueError(f"{name} must be 2 finite numbers, got {value!r}")
 
 
-def at_least(name: str, value: float, least: float) -> float:
+def at_least(name: str, value: float, least: float, largest: float = LARGEST) -> float:
     """Return a number from ``least`` to the largest, or refuse it."""
     if not (_is_finite(value) and value >= least):
         raise ValueError(f"{name} must be a finite number >= {least:g}, got {value!r}")
-    if value > LARGEST:
-        raise ValueError(f"{name} must not exceed {LARGEST:g}, got {value!r}")
+    if value > largest:
+        raise ValueError(f"{name} must not exceed {largest:g}, got {value!r}")
     return float(value)
+
+
+def range_growth(value: float) -> float:
+    """Return ``range_std_per_metre``, or refuse it."""
+    return at_least("range_std_per_metre", value, 0.0, LARGEST_RANGE_GROWTH)
 
 
 def above(name: str, value: float, least: float) -> float:

@@ -1,6 +1,7 @@
 """Errors of the command line: one line on standard error, and an exit code."""
 
 import contextlib
+import io
 import os
 import shutil
 import signal
@@ -155,6 +156,7 @@ class OneLineErrors(TyperGroup):
         line = threading.Lock()
         if not stands_alone:
             return super().main(*args, **kwargs)
+        _replace_unknown_characters()
         try:
             with ending_in_time(line), terminable():
                 result = super().main(*args, **kwargs)
@@ -174,6 +176,13 @@ class OneLineErrors(TyperGroup):
             raise InterruptedRunError from error
 
 
+def _replace_unknown_characters() -> None:
+    """Print a question mark for each character that a terminal's encoding lacks."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
 def message_of(error: Exception) -> str:
     r"""Return the message of an error as one line, or the list of a broken filter.
 
@@ -182,26 +191,38 @@ def message_of(error: Exception) -> str:
     >>> message_of(ValueError("dt must be > 0, got 0\n steps must be >= 2, got 1"))
     'dt must be > 0, got 0; steps must be >= 2, got 1'
     """
-    if isinstance(error, BrokenFilterError):
-        return str(error)
-    if isinstance(error, InterruptedRunError):
+    if isinstance(error, BrokenFilterError | InterruptedRunError):
         return str(error) or _NOTHING_WRITTEN
     if hasattr(error, "format_message"):  # of the command line itself
         return _one_line(error.format_message()) + _way_to_set(error)
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    if isinstance(error, ValueError | OSError | ImportError | MemoryError):
+    if isinstance(error, MemoryError):
+        return _one_line(str(error)) or "there is not enough memory"
+    if isinstance(error, ValueError | OSError | ImportError):
         return _one_line(str(error))
     what = f"{type(error).__name__}: {_one_line(str(error))}"
     return f"internal error, {what} (SLAMGYM_TRACEBACK=1 shows where)"
 
 
 def _way_to_set(error: Any) -> str:
-    """Return how a command for scenarios sets a noise that has an option for logs."""
-    change = _OF_SCENARIOS.get(getattr(error, "option_name", None) or "")
+    """Return the way to set what a command for scenarios has no option for."""
     taken = getattr(getattr(error, "ctx", None), "command", None)
     options = [name for option in getattr(taken, "params", ()) for name in option.opts]
-    return f"; for the world: --set {change}" if change and "--set" in options else ""
+    option = getattr(error, "option_name", None) or ""
+    return way_to_set(option) if "--set" in options else ""
+
+
+def way_to_set(option: str) -> str:
+    """Return how to set a noise of a world that has an option for logs, else nothing.
+
+    Examples
+    --------
+    >>> way_to_set("--noise-at-rest"), way_to_set("--robot")
+    ('; for the world: --set motion.noise_at_rest=true', '')
+    """
+    change = _OF_SCENARIOS.get(option)
+    return f"; for the world: --set {change}" if change else ""
 
 
 def exit_code_of(error: Exception) -> int:

@@ -25,13 +25,7 @@ def fit_noise(
     option: options.EstimatorOptions = None,
     range_std_per_metre: options.RangeStdPerMetre = None,
     noise_at_rest: options.NoiseAtRest = None,
-    hide_identities: Annotated[
-        bool,
-        options.option(
-            "--hide-identities",
-            "Let the filter associate the readings of a log that identifies them.",
-        ),
-    ] = False,
+    hide_identities: options.HideIdentities = False,
     robot: options.RobotNumber = None,
     truth: options.TruthFile = None,
     noise_from_file: options.NoiseFromFile = False,
@@ -59,7 +53,6 @@ def fit_noise(
     slamgym fit-noise log.csv --write
     slamgym fit-noise MRCLAM_Dataset6 --robot 3 --estimator ekf
     """
-    from ..logs.anonymous import without_identities
     from ..noise_fitting.header import refuse_other_formats, write_noise
     from ..runs.filter_settings import noise_or_assumed, settings_for
     from .log_files import note_choices, read_any_log
@@ -67,12 +60,16 @@ def fit_noise(
     from .reporter import Reporter
 
     reporter = Reporter(as_json=as_json)
-    drive = read_any_log(log, robot, truth=truth, noise_from_file=noise_from_file)
+    drive = read_any_log(
+        log,
+        robot,
+        truth=truth,
+        noise_from_file=noise_from_file,
+        hide_identities=hide_identities,
+    )
     if write:
         refuse_other_formats(log)
     note_choices(drive, reporter)
-    if hide_identities:
-        drive = without_identities(drive)
     stated = standard_deviations(motion_std, measurement_std, initial_pose_std)
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)

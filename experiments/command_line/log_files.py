@@ -4,6 +4,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from ...sim_configs import list_presets
+from ..logs.anonymous import without_identities
 from ..logs.importers import read_log
 from ..logs.slamlog import SlamLog
 from ..runs.filter_settings import FilterSettings
@@ -17,24 +18,30 @@ def read_any_log(
     *,
     truth: Path | None = None,
     noise_from_file: bool = False,
+    hide_identities: bool = False,
 ) -> SlamLog:
     """Read a log of any known format, with its truth if that is in another file.
+
+    ``hide_identities`` keeps the identities of its readings for scores alone.
 
     Raises
     ------
     BadInputError
-        If a file cannot be opened.
+        If a file cannot be opened, or does not fit into memory.
     LogError
         If one is malformed.
     """
     try:
-        return read_log(path, robot=robot, truth=truth, noise_from_file=noise_from_file)
+        log = read_log(path, robot=robot, truth=truth, noise_from_file=noise_from_file)
     except OSError as error:
         reason, file = error.strerror or error, error.filename or path
         hint = ""
         if str(path) in list_presets():
             hint = f"; {path} is a scenario: slamgym run {path}"
         raise BadInputError(f"cannot read the log {file}: {reason}{hint}") from error
+    except MemoryError as error:
+        raise BadInputError(f"the log {path} does not fit into memory") from error
+    return without_identities(log) if hide_identities else log
 
 
 def note_choices(log: SlamLog, reporter: Reporter) -> None:

@@ -2,16 +2,18 @@
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from ...estimator.support.filter_labels import split_labels
+from ...sim_configs.atomic_file import naming_file
 from . import options
-from .errors import BadInputError
-from .option_values import assignments, standard_deviations
+from .errors import BadInputError, way_to_set
+from .option_values import assignments, given_options, standard_deviations
 from .program import command
 
 if TYPE_CHECKING:
@@ -23,6 +25,20 @@ if TYPE_CHECKING:
     from ..runs.filter_settings import FilterSettings
     from .reporter import Reporter
 
+_LOG, _SCENARIO = "a log", "a scenario"
+_ONE_RUN, _MANY_RUNS = "one run of a scenario", "a scenario with --runs above 1"
+_ONLY_FOR = {
+    _LOG: (
+        *("motion_std", "measurement_std", "initial_pose_std"),
+        *("range_std_per_metre", "noise_at_rest", "hide_identities"),
+        *("robot", "truth", "noise_from_file"),
+    ),
+    _SCENARIO: ("seed", "steps", "set_", "runs"),
+    _ONE_RUN: ("controller",),
+    _MANY_RUNS: ("change", "jobs"),
+}
+"""Parameters that have an effect on one kind of study alone."""
+
 
 @command
 def noise_study(
@@ -33,11 +49,26 @@ def noise_study(
         ),
     ],
     *,
-    estimator: options.EstimatorName = "invariant",
+    context: typer.Context,
+    estimator: Annotated[
+        str,
+        options.option(
+            "--estimator -e NAME",
+            "A filter, as for replay; with --runs, several with commas between.",
+        ),
+    ] = "invariant",
     motion_std: options.MotionStd = None,
     measurement_std: options.MeasurementStd = None,
     initial_pose_std: options.InitialPoseStd = None,
+    landmark_init: options.LandmarkInit = None,
+    gate_probability: options.GateProbability = None,
+    range_std_per_metre: options.RangeStdPerMetre = None,
+    noise_at_rest: options.NoiseAtRest = None,
     option: options.EstimatorOptions = None,
+    hide_identities: options.HideIdentities = False,
+    robot: options.RobotNumber = None,
+    truth: options.TruthFile = None,
+    noise_from_file: options.NoiseFromFile = False,
     seed: options.Seed = 0,
     steps: options.Steps = None,
     controller: options.ControllerName = "open_loop",
@@ -63,53 +94,74 @@ def noise_study(
     """Every noise times 10 and divided by 10.
 
     Multiply and divide each of σx, σy, σα, σβ, σr by 10, one by one. For a log, only
-    the filter's assumed noise changes; for a scenario, world and filter change
-    together, with the same random numbers. Draws all maps in one figure, and lists
+    the filter's assumed noise changes, and the row "unchanged" is what replay reports
+    with the same options; for a scenario, world and filter change together, with the
+    same random numbers. Draws all maps in one figure, and lists
     the areas of the final 3σ ellipses, the errors, and the NEES and NIS, which are 1
     per degree of freedom for a consistent filter.
 
     Examples
     --------
     slamgym noise-study data.txt
+    slamgym noise-study data.txt -e ekf --landmark-init independent
     slamgym noise-study six_landmarks --seed 3 --out study
     slamgym noise-study loop -e 'invariant[iterations=3]'
     slamgym noise-study six_landmarks --runs 100 -e ekf,invariant
     """
     from ..noise_study.one_run import study_log, study_scenario
     from ..runs.filter_settings import settings_for, settings_for_scenario
-    from .chosen_filters import refuse_broken
-    from .log_files import read_any_log
+    from .chosen_filters import refuse_broken, with_options
+    from .log_files import note_choices, note_noise, read_any_log
     from .reporter import Reporter
     from .scenario_options import chosen_controller, chosen_scenario, recorded
 
-    chosen = assignments("--option", option)
+    is_scenario = _is_scenario(source)
+    kinds = (_SCENARIO, _ONE_RUN if runs == 1 else _MANY_RUNS)
+    _refuse_without_effect(context, *(kinds if is_scenario else (_LOG,)))
+    given = given_options(
+        landmark_init=landmark_init,
+        gate_probability=gate_probability,
+        range_std_per_metre=range_std_per_metre,
+        noise_at_rest=noise_at_rest,
+    )
+    chosen = given | assignments("--option", option)
     refuse_broken(estimator, chosen)
-    stds = standard_deviations(motion_std, measurement_std, initial_pose_std)
-    if not _is_scenario(source):
-        _refuse({"steps": steps, "set": set_}, "a scenario, not of a log")
-        log = read_any_log(Path(source))
+    reporter = Reporter(as_json=as_json)
+    if not is_scenario:
+        log = read_any_log(
+            Path(source),
+            robot,
+            truth=truth,
+            noise_from_file=noise_from_file,
+            hide_identities=hide_identities,
+        )
+        note_choices(log, reporter)
+        stds: dict[str, Any] = standard_deviations(
+            motion_std, measurement_std, initial_pose_std
+        )
         settings = settings_for(log, estimator=estimator, options=chosen, **stds)
         study = one_run_study(
             log.name, estimator, settings, partial(study_log, log, settings)
         )
+        write_study(study, out, reporter)
+        note_noise(log, settings, {*stds, *given}, reporter)
+        return
+    world = chosen_scenario(source, steps, set_)
+    if runs == 1:
+        settings = settings_for_scenario(world, estimator=estimator, options=chosen)
+        chosen_controller(controller, world, seed)  # refuses a wrong name
+        record = partial(recorded, controller=controller, seed=seed)
+        study = one_run_study(
+            world.name,
+            estimator,
+            settings,
+            partial(study_scenario, world, record, estimator=estimator, options=chosen),
+        )
     else:
-        _refuse(stds, "a log; the filter knows the noise of a scenario")
-        world = chosen_scenario(source, steps, set_)
-        if runs == 1:
-            settings = settings_for_scenario(world, estimator=estimator, options=chosen)
-            chosen_controller(controller, world, seed)  # refuses a wrong name
-            record = partial(recorded, controller=controller, seed=seed)
-            study = one_run_study(
-                world.name,
-                estimator,
-                settings,
-                partial(
-                    study_scenario, world, record, estimator=estimator, options=chosen
-                ),
-            )
-        else:
-            study = effects_study(world, estimator, runs, seed, change, jobs)
-    write_study(study, out, Reporter(as_json=as_json))
+        texts = [f"{key}={value}" for key, value in given.items()] + (option or [])
+        labels = [with_options(label, texts) for label in split_labels(estimator)]
+        study = effects_study(world, ",".join(labels), runs, seed, change, jobs)
+    write_study(study, out, reporter)
 
 
 class Results(NamedTuple):
@@ -223,7 +275,7 @@ def _write_table(
     path: Path, rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]"
 ) -> None:
     """Write rows as CSV below the names of their columns, empty where None."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
+    with naming_file(path), path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(rows[0]._fields)
         writer.writerows(rows)
@@ -252,9 +304,13 @@ def _is_scenario(source: str) -> bool:
     )
 
 
-def _refuse(options: Mapping[str, object], meant_for: str) -> None:
-    """Refuse options that have no meaning here."""
-    for name, value in options.items():
-        if value is not None:
-            option = f"--{name.replace('_', '-')}"
-            raise BadInputError(f"{option} is for the noise study of {meant_for}")
+def _refuse_without_effect(context: typer.Context, *kinds: str) -> None:
+    """Refuse the options that the user gave and a study of these kinds ignores."""
+    for kind, names in _ONLY_FOR.items():
+        for name in names if kind not in kinds else ():
+            source = context.get_parameter_source(name)
+            if source is not None and source.name == "COMMANDLINE":
+                option = f"--{name.strip('_').replace('_', '-')}"
+                raise BadInputError(
+                    f"{option} is for the noise study of {kind}{way_to_set(option)}"
+                )

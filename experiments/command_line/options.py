@@ -146,6 +146,15 @@ InitialPoseStd = Annotated[
         "A,B,C", "σx,σy,σθ of the first pose [m, m, rad].", "from the log, else 0,0,0"
     ),
 ]
+LandmarkInit = Annotated[
+    str | None,
+    option(
+        "full|independent",
+        "How a landmark enters the map: full correlates it with the pose; "
+        "independent, as in the homework, does not.",
+        "full",
+    ),
+]
 GateProbability = Annotated[
     float | None,
     option(
@@ -168,6 +177,13 @@ NoiseAtRest = Annotated[
         "--noise-at-rest/--no-noise-at-rest",
         "Whether there is motion noise while the odometry reports no motion.",
         "from the log, else not",
+    ),
+]
+HideIdentities = Annotated[
+    bool,
+    option(
+        "--hide-identities",
+        "Let the filter associate the readings of a log that identifies them.",
     ),
 ]
 Resolution = Annotated[

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ...sim_configs.atomic_file import unfinished
+from ...sim_configs.atomic_file import naming_file, unfinished
+from ..logs.lines import LogError
 from ..runs.folder_lock import locked_folder, naming_folder
 from ..runs.own_files import (
     MANIFEST,
@@ -61,7 +62,7 @@ def output_folder(path: Path) -> Iterator[Path]:
     if folder.exists() and not folder.is_dir():
         raise BadInputError(f"--out must be a folder, got the file {path}")
     staging = folder / STAGING
-    with _made(folder), locked_folder(folder), _naming_where_full(folder):
+    with _made(folder), locked_folder(folder), _naming_in_place(staging, folder):
         _publish(folder)  # what a killed command left
         with naming_folder(folder):
             staging.mkdir()
@@ -94,12 +95,17 @@ def _made(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _naming_where_full(folder: Path) -> Iterator[None]:
-    """Name the folder in errors of a full disk, which name no file themselves."""
+def _naming_in_place(staging: Path, folder: Path) -> Iterator[None]:
+    """Name files as in the final folder, and the folder where an error names none."""
     try:
         yield
+    except LogError as error:
+        raise LogError(str(error).replace(str(staging), str(folder))) from error
     except OSError as error:
-        if error.filename or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+        if error.filename:
+            file = str(error.filename).replace(str(staging), str(folder))
+            raise OSError(error.errno, error.strerror, file) from error
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
             raise
         raise OSError(
             f"the folder {folder} cannot be written: {error.strerror}"
@@ -176,7 +182,8 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
         The summary with ``files``.
     """
     complete = {**summary, "files": sorted([*files_below(folder), SUMMARY])}
-    (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
+    with naming_file(folder / SUMMARY):
+        (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
     return complete
 
 

@@ -26,15 +26,7 @@ def replay(
     motion_std: options.MotionStd = None,
     measurement_std: options.MeasurementStd = None,
     initial_pose_std: options.InitialPoseStd = None,
-    landmark_init: Annotated[
-        str | None,
-        options.option(
-            "full|independent",
-            "How a landmark enters the map: full correlates it with the pose; "
-            "independent, as in the homework, does not.",
-            "full",
-        ),
-    ] = None,
+    landmark_init: options.LandmarkInit = None,
     gate_probability: options.GateProbability = None,
     range_std_per_metre: options.RangeStdPerMetre = None,
     noise_at_rest: options.NoiseAtRest = None,
@@ -70,7 +62,6 @@ def replay(
     slamgym replay results/loop-invariant/log.csv --estimator ekf,invariant
     slamgym replay graph.txt --truth true.g2o --noise-from-file
     """
-    from ..logs.anonymous import without_identities
     from ..runs.filter_settings import settings_for
     from .chosen_filters import chosen_filters
     from .log_files import note_choices, note_noise, read_any_log
@@ -86,10 +77,14 @@ def replay(
     )
     reporter = Reporter(as_json=as_json)
     check_rerun(rerun)
-    drive = read_any_log(log, robot, truth=truth, noise_from_file=noise_from_file)
+    drive = read_any_log(
+        log,
+        robot,
+        truth=truth,
+        noise_from_file=noise_from_file,
+        hide_identities=hide_identities,
+    )
     note_choices(drive, reporter)
-    if hide_identities:
-        drive = without_identities(drive)
     stds: dict[str, Any] = standard_deviations(
         motion_std, measurement_std, initial_pose_std
     )

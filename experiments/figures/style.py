@@ -17,7 +17,7 @@ from matplotlib.text import Text
 
 from ...arrays import Array
 from ...envs.rendering import covariance_ellipses
-from ...envs.rendering.artists import ELLIPSE_HANDLER
+from ...envs.rendering.artists import ELLIPSE_HANDLER, PlainTextFigure
 from ...sim_configs.atomic_file import replace_when_written
 
 INK, GREY, PALE = "#1b1f24", "#6b737c", "#e8eaed"
@@ -28,7 +28,7 @@ _METADATA = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure [inches] with constrained layout, outside pyplot."""
-    figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
+    figure = PlainTextFigure(figsize=(width, height), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     layout = figure.get_layout_engine()
     if layout is not None:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import stat
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -105,17 +106,42 @@ def to_lines(text: str, file: str) -> list[LogLine]:
     return lines
 
 
+class ReadFile(PathLike[str]):
+    """The path of a file with its content, which a pipe gives only once.
+
+    Raises
+    ------
+    LogError
+        If it is a device, such as /dev/zero, whose content may have no end.
+    OSError
+        If it cannot be opened.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self._path = os.fspath(path)
+        mode = os.stat(self._path).st_mode
+        if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+            raise LogError(f"{path} must be a file or a pipe, got a device")
+        self.content = Path(path).read_bytes()
+
+    def __fspath__(self) -> str:
+        return self._path
+
+    def __str__(self) -> str:
+        return self._path
+
+
 def read_lines(path: str | PathLike[str]) -> list[LogLine]:
     """Read the lines of a UTF-8 text file that are not blank.
 
     Raises
     ------
     LogError
-        If the file is no UTF-8 text, or empty.
+        If the file is no UTF-8 text, empty, or a device.
     OSError
         If the file cannot be opened.
     """
-    data = Path(path).read_bytes()
+    data = (path if isinstance(path, ReadFile) else ReadFile(path)).content
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -81,7 +81,7 @@ class _Work:
 
 def monte_carlo(
     scenario: Scenario | Mapping[str, object] | str | Path,
-    estimators: str | Iterable[str] | Mapping[str, Any],
+    estimators: str | Iterable[str | registry.EstimatorFactory] | Mapping[str, Any],
     runs: int,
     seed: int = 0,
     *,
@@ -102,10 +102,10 @@ def monte_carlo(
     ----------
     scenario : Scenario, mapping, str or Path
         The world; its own controls drive the robot.
-    estimators : str, iterable of str, or mapping
+    estimators : str, iterable of str or class, or mapping
         Names separated by commas, such as ``"ekf,invariant[iterations=3]"`` or
-        ``"mypackage.filters:MyFilter"``; or a mapping from labels to a class or to a
-        pair (name or class, options).
+        ``"mypackage.filters:MyFilter"``; or a list of names and classes; or a mapping
+        from labels to a class or to a pair (name or class, options).
     runs : int
         Number of runs, at least 1; more than 20 are recommended.
     seed : int

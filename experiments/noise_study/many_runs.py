@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from ...estimator.registry import EstimatorFactory
 from ...sim_configs import Scenario, load_scenario
 from ...suggestions import closest
 from ..monte_carlo import monte_carlo
@@ -62,7 +63,7 @@ class NoiseEffect(NamedTuple):
 
 def noise_effects(
     scenario: Scenario | Mapping[str, object] | str | Path,
-    estimators: str | Iterable[str] | Mapping[str, Any],
+    estimators: str | Iterable[str | EstimatorFactory] | Mapping[str, Any],
     runs: int,
     seed: int = 0,
     *,

@@ -9,6 +9,12 @@ within this bound lead to no infinity, and so to no NaN.
 """
 SMALLEST = 1e-12
 """Smallest number where a number must be > 0; quotients then stay finite, too."""
+LARGEST_RANGE_GROWTH = 1000.0
+"""Largest ``range_std_per_metre`` [m/m]: σr is then a thousand times the range.
+
+Such a reading contains no information; with larger values, roundings are as large as
+the map.
+"""
 LARGEST_IN_STATE = LARGEST**6
 """Largest number of a saved state.
 

@@ -1,18 +1,24 @@
 """Suggest the name that was meant, for error messages."""
 
 from collections.abc import Iterable
-from difflib import get_close_matches
+from difflib import SequenceMatcher
+from itertools import islice
+
+_SIMILAR = 0.6  # of at most 1
 
 
 def closest(word: str, words: Iterable[str]) -> str:
     """Return the suggestion that ends an error message, empty if no word is similar.
 
-    Upper and lower case count as equal, and a word is similar to what it begins.
+    Upper and lower case count as equal, and a word is similar to what it begins. Words
+    that are equally similar are all suggested.
 
     Examples
     --------
     >>> closest("max_rage", ["min_range", "max_range"])
     "; did you mean 'max_range'?"
+    >>> closest("range", ["min_range", "max_range"])
+    "; did you mean 'min_range' or 'max_range'?"
     >>> closest("EKF", ["ekf", "invariant"])
     "; did you mean 'ekf'?"
     >>> closest("gate", ["range", "gate_probability"])
@@ -21,7 +27,16 @@ def closest(word: str, words: Iterable[str]) -> str:
     ''
     """
     known = {name.lower(): name for name in words}
-    nearest = get_close_matches(word.lower(), list(known), n=1)
-    if not nearest and word:
-        nearest = [name for name in known if name.startswith(word.lower())]
-    return f"; did you mean '{known[nearest[0]]}'?" if nearest else ""
+    matcher = SequenceMatcher(b=word.lower())
+    likeness = {}
+    for name in known:
+        matcher.set_seq1(name)
+        likeness[name] = matcher.ratio()
+    best = max(likeness.values(), default=0.0)
+    if best >= _SIMILAR:
+        nearest = [name for name in known if likeness[name] == best]
+    else:
+        beginning = (name for name in known if word and name.startswith(word.lower()))
+        nearest = list(islice(beginning, 1))
+    suggested = " or ".join(f"'{known[name]}'" for name in nearest)
+    return f"; did you mean {suggested}?" if nearest else ""

@@ -14,7 +14,13 @@ from typer.testing import CliRunner
 from slamgym import kernel_cache
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments import figures
-from slamgym.experiments.command_line import reporter, run_files, tables, warm_up
+from slamgym.experiments.command_line import (
+    errors,
+    reporter,
+    run_files,
+    tables,
+    warm_up,
+)
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
 from slamgym.experiments.runs.own_files import MANIFEST
@@ -700,12 +706,38 @@ def test_a_noise_study_draws_one_figure_and_tables_eleven_runs(log):
         assert saved["ate"] == ""
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--landmark-init", "independent", "--initial-pose-std", "1,1,1"),
+        ("--gate-probability", "0.5", "--motion-std", "0.3,0.1,0.05"),
+        ("--range-std-per-metre", "0.5", "--noise-at-rest"),
+    ],
+)
+def test_a_noise_study_begins_with_what_replay_reports(options, log, without_pictures):
+    reported = answered("replay", log, "-e", "ekf", *options)
+    plain = answered("replay", log, "-e", "ekf")
+    unchanged = answered("noise-study", log, "-e", "ekf", *options)["rows"][0]
+    assert unchanged["landmark_rmse"] == reported["landmark_rmse"]["raw"]
+    assert unchanged["nis_per_degree"] == reported["nis"]["per_degree"]
+    assert reported["nis"] != plain["nis"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("lop",), "no log and no scenario 'lop'; did you mean 'loop'?"),
         (("loop", "--motion-std", "1,1,1"), "--motion-std is for the noise study of"),
         (("little.csv", "--set", "steps=3"), "--set is for the noise study of"),
+        (("little.csv", "--runs", "1"), "--runs is for the noise study of a scenario"),
+        (("little.csv", "--seed", "0"), "--seed is for the noise study of a scenario"),
+        (("little.csv", "--change", "all"), "--change is for the noise study of a sc"),
+        (("little.csv", "--jobs", "1"), "--jobs is for the noise study of a scenario"),
+        (("little.csv", "--controller", "random"), "--controller is for the noise st"),
+        (("loop", "--change", "world"), "--change is for the noise study of a scenar"),
+        (("loop", "--runs", "3", "--controller", "random"), "--controller is for the"),
+        (("loop", "--noise-at-rest"), "of a log; for the world: --set motion.noise_at"),
     ],
 )
 def test_a_noise_study_refuses_what_has_no_meaning(log, arguments, message):
@@ -886,3 +918,40 @@ def test_submaps_may_lie_in_a_folder(here, without_pictures):
     )
     assert len(summary["landmarks"]) == 6
     assert (here / "maps" / "submaps.txt").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+@pytest.mark.parametrize("form", [(), ("--json",)])
+def test_a_command_works_in_any_encoding(encoding, form, log):
+    code = "from slamgym.experiments.command_line.app import main; main()"
+    command = ["noise-study", log, "--out", "study", *form]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command],
+        env=os.environ | {"PYTHONIOENCODING": encoding},
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    if form:
+        assert json.loads(done.stdout.decode(encoding))["rows"][1]["sigma"] == "σx"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there is no such device")
+def test_a_device_is_no_log(here):
+    assert refused("replay", "/dev/zero") == (
+        "/dev/zero must be a file or a pipe, got a device"
+    )
+
+
+def test_a_log_too_large_for_memory_is_named(log, monkeypatch):
+    def fail(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr("slamgym.experiments.logs.lines.Path.read_bytes", fail)
+    message = refused("replay", log)
+    assert message == f"the log {log} does not fit into memory"
+
+
+def test_an_error_without_text_has_a_message():
+    assert errors.message_of(MemoryError()) == "there is not enough memory"

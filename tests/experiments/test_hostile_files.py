@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import threading
 
 import forked
 import jobs_to_kill
@@ -16,6 +17,8 @@ from slamgym.envs.rendering.artists import _title
 from slamgym.estimator import make_estimator
 from slamgym.experiments.command_line.errors import BadInputError
 from slamgym.experiments.command_line.output_folder import output_folder
+from slamgym.experiments.figures.style import new_figure
+from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.importers.utias import read_utias
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.runs.own_files import MANIFEST as OWN_FILES
@@ -23,6 +26,7 @@ from slamgym.experiments.runs.own_files import files_below
 from slamgym.experiments.trajectories import generate_trajectories
 from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
 from slamgym.sim_configs import load_scenario
+from slamgym.sim_configs.atomic_file import replace_when_written
 from slamgym.sim_configs.scenario_errors import ScenarioError
 from slamgym.sim_configs.scenario_files import scenario_text
 
@@ -261,3 +265,39 @@ def test_a_landmark_given_twice_is_refused_with_its_line(tmp_path):
     folder = utias_folder(tmp_path, landmarks="6 1 1 0 0\n7 2 2 0 0\n6 3 3 0 0\n")
     with pytest.raises(ValueError, match=r"Landmark_Groundtruth\.dat.*3.*once"):
         read_utias(folder)
+
+
+def test_a_size_limit_names_the_file_in_its_final_folder(tmp_path):
+    out, limit = tmp_path / "out", (errno.EFBIG, os.strerror(errno.EFBIG))
+    limited = pytest.raises(OSError, match="File too large")
+    with (
+        limited as caught,
+        output_folder(out) as partial,
+        replace_when_written(partial / "map.png"),
+    ):
+        raise OSError(*limit)
+    assert caught.value.filename == str(out / "map.png")
+    unnamed = pytest.raises(OSError, match="out cannot be written: File too large")
+    with unnamed, output_folder(out):
+        raise OSError(*limit)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no such pipes")
+def test_a_log_is_read_from_a_pipe(tmp_path):
+    pipe, text = tmp_path / "log", "# format: slamlog 1\nodometry,1,1,0,1\n"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_text, args=(text,))
+    writer.start()
+    log = read_log(pipe)
+    writer.join()
+    assert len(log.events) == 1
+
+
+def test_figures_need_no_latex(monkeypatch):
+    monkeypatch.setitem(mpl.rcParams, "text.usetex", True)
+    figure = new_figure(3, 2)
+    axes = figure.add_subplot(title="3σ [m²]")
+    figure.draw_without_rendering()
+    assert not any(text.get_usetex() for text in figure.findobj(mpl.text.Text))
+    assert axes.get_title()
+    assert mpl.rcParams["text.usetex"]

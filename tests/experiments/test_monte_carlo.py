@@ -700,3 +700,19 @@ def test_a_dask_worker_that_dask_does_not_restart_is_replaced():
         (nanny,) = client.cluster.workers.values()
         client.sync(nanny.close)
         assert client.submit(abs, -3).result(timeout=60) == 3
+
+
+class MyEkf(EkfSlam):
+    """A filter of the user."""
+
+
+def test_estimators_may_be_names_and_classes():
+    results = monte_carlo("six_landmarks", ["ekf", MyEkf], 2)
+    assert results.estimator.values.tolist() == ["ekf", "MyEkf"]
+    same = results.pose_nees_invariant.sel(estimator=["ekf", "MyEkf"]).values
+    assert (same[0] == same[1]).all()
+
+
+def test_estimators_that_are_neither_names_nor_classes_are_refused():
+    with pytest.raises(ValueError, match="must be names or classes, got 3"):
+        monte_carlo("six_landmarks", ["ekf", 3], 2)

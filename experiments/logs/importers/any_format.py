@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..events import float_array
-from ..lines import LogLine, read_lines, shown
+from ..lines import LogLine, ReadFile, read_lines, shown
 from ..slamlog import SlamLog, read_slamlog
 from .course import read_course
 from .freiburg import read_freiburg
@@ -74,7 +74,11 @@ def read_log(
         ``noise_from_file`` for a log that is no graph.
     """
     source = Path(path)
-    kind = "utias" if source.is_dir() else _format_of(read_lines(path)[0])
+    if source.is_dir():
+        kind = "utias"
+    else:
+        path = ReadFile(path)
+        kind = _format_of(read_lines(path)[0])
     if robot is not None and kind != "utias":
         raise ValueError(f"robot must be None for a log in one file, got {robot}")
     if kind != "isam":

@@ -8,7 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ....estimator import registry
-from ....estimator.registry import find_estimator, list_estimators, register_estimator
+from ....estimator.registry import (
+    EstimatorFactory,
+    find_estimator,
+    list_estimators,
+    register_estimator,
+)
 from ....estimator.support.filter_labels import read_label, split_labels
 from ....sim_configs import Scenario
 from ...runs.filter_settings import OFFLINE, FilterSettings, settings_for_scenario
@@ -62,7 +67,7 @@ def _code_of_methods(estimator: object) -> bytes:
 
 
 def estimator_choices(
-    estimators: str | Iterable[str] | Mapping[str, Any],
+    estimators: str | Iterable[str | EstimatorFactory] | Mapping[str, Any],
 ) -> tuple[EstimatorChoice, ...]:
     """Parse estimators from names, classes or labels.
 
@@ -70,7 +75,8 @@ def estimator_choices(
     ----------
     estimators : str, iterable of str, or mapping
         Names separated by commas, with optional options in brackets; or several such
-        texts; or a mapping from labels to a name, a class, or a pair (name, options).
+        texts or classes; or a mapping from labels to a name, a class, or a pair (name,
+        options).
 
     Raises
     ------
@@ -103,12 +109,22 @@ options={'iterations': 3})
 
 
 def _choices(
-    estimators: str | Iterable[str] | Mapping[str, Any],
+    estimators: str | Iterable[str | EstimatorFactory] | Mapping[str, Any],
 ) -> list[EstimatorChoice]:
     if isinstance(estimators, Mapping):
         return [_labelled(label, what) for label, what in estimators.items()]
-    texts = [estimators] if isinstance(estimators, str) else estimators
-    return [_read(label) for text in texts for label in split_labels(text)]
+    several = [estimators] if isinstance(estimators, str) else estimators
+    return [choice for one in several for choice in _unlabelled(one)]
+
+
+def _unlabelled(what: Any) -> list[EstimatorChoice]:
+    """Read names separated by commas, or a class, whose name is then its label."""
+    if isinstance(what, str):
+        return [_read(label) for label in split_labels(what)]
+    label = getattr(what, "__name__", None)
+    if not (callable(what) and label):
+        raise ValueError(f"estimators must be names or classes, got {what!r}")
+    return [_labelled(label, what)]
 
 
 def _read(label: str) -> EstimatorChoice:

@@ -81,8 +81,9 @@ def write_results(
         with replace_own(path) as partial:
             _write(partial, job, blocks, runs, command)
     except (OSError, RuntimeError) as error:  # netCDF raises the second on a full disk
+        reason = getattr(error, "strerror", None) or error
         raise OSError(
-            f"{path} cannot be written: {error}; its blocks stay, to continue from"
+            f"{path} cannot be written: {reason}; its blocks stay, to continue from"
         ) from error
 
 
