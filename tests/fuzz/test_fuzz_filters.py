@@ -242,7 +242,7 @@ KINDS = [
     for policy in (MANAGED if name not in FILTERS[-2:] else MANAGED[:1])
 ]
 NEAREST = np.array([(2.0, 1.0), (3.0, -2.0), (0.5, 3.0), (5.0, 1.5), (7.0, -1.0)])
-PLACES = np.concatenate([NEAREST + (x, y) for x in (0, 6) for y in (0, 5)])
+PLACES = np.concatenate([np.add(NEAREST, (x, y)) for x in (0, 6) for y in (0, 5)])
 
 
 def made(name, policy):
@@ -264,7 +264,9 @@ def a_scan(step, named):
     seen = np.flatnonzero(distance < 5.0)[:5]
     bearing = np.arctan2(dy, dx)[seen] - pose[2]
     bearing += 0.05 * np.sin(7.0 * step + seen)
-    readings = np.column_stack([(bearing + np.pi) % (2 * np.pi) - np.pi, distance[seen]])
+    readings = np.column_stack(
+        [(bearing + np.pi) % (2 * np.pi) - np.pi, distance[seen]]
+    )
     return readings, seen if named else None
 
 
