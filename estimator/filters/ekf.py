@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, NoReturn
 
 import numpy as np
@@ -25,6 +26,8 @@ from .scan_workspace import (
     covariances_for,
     not_positive_definite,
 )
+
+UpdateKernel = Callable[..., tuple[int, int, float]]
 
 
 class EkfSlam(MapFilter):
@@ -99,7 +102,7 @@ class EkfSlam(MapFilter):
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
 
-    _update_belief = staticmethod(update_belief)
+    _update_belief: ClassVar[UpdateKernel] = staticmethod(update_belief)
     """The kernel: screen, correct, add new landmarks."""
 
     rule_values: Array

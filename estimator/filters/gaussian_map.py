@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from itertools import repeat
 from typing import Any
 
@@ -50,10 +50,6 @@ class GaussianMap:
 
     arrays: BeliefArrays
     """Mean, covariance and linearisation points, as kernels take them."""
-    size: int
-    """Length of the state, 3 + 2n."""
-    slots: dict[int, int]
-    """Place of each landmark in the state: column 3 + 2 slot."""
 
     def __init__(self, copies: int = 1) -> None:
         self.copies = copies
@@ -64,14 +60,17 @@ class GaussianMap:
         arrays = self._zeros(FIRST_ALLOCATION)
         self._become(_filled(arrays, (pose, pose_covariance, pose)), {})
 
-    def __getattr__(self, name: str) -> Any:
-        """Find out the slots and the size, once a kernel may have added landmarks."""
-        if name not in ("slots", "size"):
-            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
-        slots, ids, places = self._expected
+    @cached_property
+    def slots(self) -> dict[int, int]:
+        """Place of each landmark in the state: column 3 + 2 slot."""
+        before, ids, places = self._expected
         pairs = zip(ids, places.tolist(), strict=True)
-        self._become(self.arrays, slots | {i: slot for i, slot in pairs if slot >= 0})
-        return vars(self)[name]
+        return before | {i: slot for i, slot in pairs if slot >= 0}
+
+    @cached_property
+    def size(self) -> int:
+        """Length of the state, 3 + 2n."""
+        return 3 + 2 * len(self.slots)
 
     @property
     def mean(self) -> Array:
@@ -133,7 +132,7 @@ class GaussianMap:
             the slots of those that it adds.
         """
         self._expected = self.slots, ids, places
-        del self.size, self.slots  # __getattr__ finds them out
+        del self.size, self.slots  # they follow from what the kernel writes
 
     def relabel(self, ids: Iterable[int]) -> None:
         """Take the arrays to hold these landmarks instead, in this order."""
