@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
 from .belief import Belief, MapView
+from .support.undo import Undo
 from .update_report import ScanDecisions, UpdateReport
 
 __all__ = [
@@ -18,6 +20,7 @@ __all__ = [
     "SlamEstimator",
     "SmoothedPath",
     "SupportsBeliefLimit",
+    "SupportsCheckpoint",
     "SupportsDecisions",
     "SupportsJoin",
     "SupportsJointMerging",
@@ -30,7 +33,6 @@ __all__ = [
     "SupportsRestore",
     "SupportsSmoothing",
     "SupportsTruth",
-    "SupportsViewCheckpoint",
     "UpdateReport",
     "optional_members",
     "restore",
@@ -131,15 +133,6 @@ class SupportsJoin(SupportsLocalView, Protocol):
 
 
 @runtime_checkable
-class SupportsViewCheckpoint(SupportsLocalView, Protocol):
-    """An estimator whose local views change what it keeps for later ones."""
-
-    def view_checkpoint(self) -> Callable[[], None]:
-        """Return a function that reverts the effects of later local views."""
-        ...
-
-
-@runtime_checkable
 class SupportsMapView(Protocol):
     """An estimator that shows its whole map without a copy."""
 
@@ -199,6 +192,15 @@ class SupportsRestore(Protocol):
 
 
 @runtime_checkable
+class SupportsCheckpoint(Protocol):
+    """An estimator that can take back its own calls."""
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        ...
+
+
+@runtime_checkable
 class SupportsBeliefLimit(Protocol):
     """An estimator that refuses a dense belief of too many landmarks."""
 
@@ -224,6 +226,13 @@ def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
         if isinstance(estimator, ability)
         for name in names
     }
+
+
+def checkpoint(estimator: SlamEstimator, *, motion: bool = False) -> Undo:
+    """Return what takes back later calls; ``motion``: only those of predict."""
+    if isinstance(estimator, SupportsCheckpoint):
+        return estimator.checkpoint(motion=motion)
+    return partial(restore, estimator, estimator.state_dict())
 
 
 def restore(estimator: SlamEstimator, state: Mapping[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, NoReturn
 
 import numpy as np
@@ -25,6 +26,8 @@ from .scan_workspace import (
     covariances_for,
     not_positive_definite,
 )
+
+UpdateKernel = Callable[..., tuple[int, int, float]]
 
 
 class EkfSlam(MapFilter):
@@ -98,6 +101,9 @@ class EkfSlam(MapFilter):
 
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
+
+    _update_belief: ClassVar[UpdateKernel] = staticmethod(update_belief)
+    """The kernel: screen, correct, add new landmarks."""
 
     rule_values: Array
     """The rules as the kernels take them."""
@@ -182,12 +188,15 @@ class EkfSlam(MapFilter):
         count = len(readings)
         ids = argument_checks.given_identities(landmark_ids, count, self)
         slots = self.map.slots_of(ids)
-        self._make_room(count, slots.count(-1))
+        new, size = slots.count(-1), self.map.size
+        self._make_room(count, new)
         ledger = self._workspace.ledger
         ledger[SLOT, :count] = slots
-        status, used, nis = update_belief(  # screen, correct, add new landmarks
+        if new:
+            self.map.expect(ids, ledger[SLOT, :count])
+        status, used, nis = self._update_belief(  # the only change of the belief
             *self.map.arrays,
-            self.map.size,
+            size,
             readings,
             count,
             ledger,
@@ -197,10 +206,7 @@ class EkfSlam(MapFilter):
         if status != DONE:
             self._refuse(status, readings, ids)
         left = self._workspace.copies(used, count)
-        report = ScanReport(nis, ids, left, sequential=self.rules.sequential)
-        if used < count:
-            self.map.add(report.added_ids)
-        return report
+        return ScanReport(nis, ids, left, sequential=self.rules.sequential)
 
     @property
     def motion_values(self) -> Array:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property, partial
 from itertools import repeat
 from typing import Any
 
 import numpy as np
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 from ..belief import Belief, MapView
 from ..error_frames import ErrorFrame
 from ..kernels.belief_arrays import BeliefArrays, aligned_zeros
 from ..support import saved_states
 from ..support.memory_limit import landmarks_that_fit
+from ..support.undo import Undo
 from .landmark_merging import coincide
 
 FIRST_ALLOCATION = 8  # landmarks
@@ -25,6 +27,10 @@ class GaussianMap:
     The state is (x, y, θ, l1x, l1y, …), landmarks in the order of ``slots``.  The first
     ``size`` entries of every array are in use; the others are zero, room for more.
 
+    Arrays, ``slots`` and ``size`` are replaced at once, so that an interrupt finds the
+    map before a change or after it.  Kernels change the arrays in place, each in one
+    call; the landmarks that a kernel adds follow from the places that it has written.
+
     Parameters
     ----------
     copies : int
@@ -35,27 +41,36 @@ class GaussianMap:
     --------
     >>> gaussian = GaussianMap()
     >>> gaussian.reset(np.zeros(3), np.eye(3))
-    >>> gaussian.add([7])
+    >>> places = np.array([-1])
+    >>> gaussian.expect([7], places)
+    >>> places[0] = 0  # by a kernel that adds the landmark
     >>> gaussian.size, gaussian.slots
     (5, {7: 0})
     """
 
     arrays: BeliefArrays
     """Mean, covariance and linearisation points, as kernels take them."""
-    size: int
-    """Length of the state, 3 + 2n."""
-    slots: dict[int, int]
-    """Place of each landmark in the state: column 3 + 2 slot."""
 
     def __init__(self, copies: int = 1) -> None:
         self.copies = copies
+        self.reset(np.zeros(3), np.zeros((3, 3)))
 
     def reset(self, pose: Array, pose_covariance: Array) -> None:
         """Start with an empty map at a pose (3,)."""
-        self.allocate(FIRST_ALLOCATION)
-        self.relabel(())
-        self.mean[:3] = self.reference[:3] = pose
-        self.covariance[:3, :3] = pose_covariance
+        arrays = self._zeros(FIRST_ALLOCATION)
+        self._become(_filled(arrays, (pose, pose_covariance, pose)), {})
+
+    @cached_property
+    def slots(self) -> dict[int, int]:
+        """Place of each landmark in the state: column 3 + 2 slot."""
+        before, ids, places = self._expected
+        pairs = zip(ids, places.tolist(), strict=True)
+        return before | {i: slot for i, slot in pairs if slot >= 0}
+
+    @cached_property
+    def size(self) -> int:
+        """Length of the state, 3 + 2n."""
+        return 3 + 2 * len(self.slots)
 
     @property
     def mean(self) -> Array:
@@ -95,39 +110,79 @@ class GaussianMap:
         more : int
             Landmarks to come, as far as memory allows.
         """
-        fitting = landmarks_that_fit(landmarks, landmarks + more, self.copies)
-        capacity = self.capacity_for(fitting)
-        covariance = aligned_zeros(capacity, capacity)  # it may raise: first
-        self.arrays = BeliefArrays(np.zeros(capacity), covariance, np.zeros(capacity))
+        self.arrays = self._zeros(landmarks, more)
 
     def make_room(self, landmarks: int) -> None:
         """Grow the arrays if this many more landmarks do not fit."""
         n = self.size
         if n + 2 * landmarks < len(self.arrays.mean):
             return
-        mean, covariance, reference = self.arrays
-        self.allocate(len(self.slots) + landmarks, more=len(self.slots))
-        self.mean[:n], self.reference[:n] = mean[:n], reference[:n]
-        self.covariance[:n, :n] = covariance[:n, :n]
+        grown = self._zeros(len(self.slots) + landmarks, more=len(self.slots))
+        self.arrays = _filled(grown, self.used)
 
-    def add(self, ids: Iterable[int]) -> None:
-        """Add landmarks that a kernel has written behind the state to the map."""
-        for i in ids:
-            self.slots[i] = len(self.slots)
-        self.size = 3 + 2 * len(self.slots)
+    def expect(self, ids: Sequence[int], places: IntArray) -> None:
+        """Let the next kernel add landmarks.
+
+        Parameters
+        ----------
+        ids : sequence of int, length m
+            The landmarks of a scan.
+        places : ndarray, shape (m,)
+            Their slots, negative for landmarks that are not mapped.  The kernel writes
+            the slots of those that it adds.
+        """
+        self._expected = self.slots, ids, places
+        del self.size, self.slots  # they follow from what the kernel writes
 
     def relabel(self, ids: Iterable[int]) -> None:
         """Take the arrays to hold these landmarks instead, in this order."""
-        self.slots = {i: slot for slot, i in enumerate(ids)}
-        self.size = 3 + 2 * len(self.slots)
+        self._become(self.arrays, {i: slot for slot, i in enumerate(ids)})
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks; all other numbers keep their last bit."""
-        n, slots = self.size, [self.slots[i] for i in ids]
-        for array in self.arrays:
-            _refill(array, without_landmarks(array[(slice(n),) * array.ndim], slots))
-        gone = set(ids)
-        self.relabel(i for i in self.slots if i not in gone)
+        self._keep_without(self.used, ids)
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later changes; ``motion``: only those of the pose."""
+        arrays, slots = self.arrays, self.slots
+        mean, P, reference = self.used
+        if not motion:
+            copies = BeliefArrays(mean.copy(), P.copy(), reference.copy())
+            return partial(self._refill, self.capacity, copies, slots)
+        parts = mean[:3], reference[:3], P[:3], P[:, :3]
+        saved = [part.copy() for part in parts]
+
+        def undo() -> None:
+            self._become(arrays, slots)
+            for part, before in zip(parts, saved, strict=True):
+                part[...] = before
+
+        return undo
+
+    @property
+    def used(self) -> BeliefArrays:
+        """The part of the arrays that is in use."""
+        n = self.size
+        mean, covariance, reference = self.arrays
+        return BeliefArrays(mean[:n], covariance[:n, :n], reference[:n])
+
+    def _refill(self, capacity: int, used: BeliefArrays, slots: dict[int, int]) -> None:
+        """Continue with new arrays of this capacity."""
+        self._become(_filled(_zeros(capacity), used), slots)
+
+    def _keep_without(self, used: BeliefArrays, ids: Sequence[int]) -> None:
+        gone, slots = set(ids), [self.slots[i] for i in ids]
+        kept = BeliefArrays(*(without_landmarks(array, slots) for array in used))
+        left = [i for i in self.slots if i not in gone]
+        self._refill(self.capacity, kept, {i: slot for slot, i in enumerate(left)})
+
+    def _zeros(self, landmarks: int, more: int = 0) -> BeliefArrays:
+        fitting = landmarks_that_fit(landmarks, landmarks + more, self.copies)
+        return _zeros(self.capacity_for(fitting))
+
+    def _become(self, arrays: BeliefArrays, slots: dict[int, int]) -> None:
+        """Replace all at once."""
+        vars(self).update(arrays=arrays, slots=slots, size=3 + 2 * len(slots))
 
     def merge(
         self,
@@ -148,16 +203,16 @@ class GaussianMap:
         at_reference : bool
             Whether the filter linearises at its reference points.
         """
-        n = self.size
-        self.mean[:n], self.covariance[:n, :n] = coincide(
-            self.mean[:n],
-            self.covariance[:n, :n],
+        mean, covariance, reference = self.used
+        merged = coincide(
+            mean,
+            covariance,
             [self.slots[i] for i in kept],
             [self.slots[i] for i in gone],
             frame=frame,
-            reference=self.reference[:n] if at_reference else None,
+            reference=reference if at_reference else None,
         )
-        self.remove(gone)
+        self._keep_without(BeliefArrays(*merged, reference), gone)
 
     def slots_of(self, ids: Iterable[int]) -> list[int]:
         """Return the places of landmarks, -1 for those not in the map."""
@@ -203,11 +258,9 @@ class GaussianMap:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned, without checks."""
         ids: list[int] = state["landmark_ids"].tolist()
-        size = 3 + 2 * len(ids)
-        self.allocate(max(FIRST_ALLOCATION, len(ids)))
-        self.relabel(ids)
-        self.mean[:size], self.reference[:size] = state["mean"], state["reference"]
-        self.covariance[:size, :size] = state["covariance"]
+        saved = state["mean"], state["covariance"], state["reference"]
+        arrays = _filled(self._zeros(max(FIRST_ALLOCATION, len(ids))), saved)
+        self._become(arrays, {i: slot for slot, i in enumerate(ids)})
 
 
 def checked_map(
@@ -249,7 +302,14 @@ def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
     return array
 
 
-def _refill(array: Array, content: Array) -> None:
-    """Put a smaller array into a larger one, zeros behind it."""
-    array[...] = 0.0
-    array[tuple(slice(size) for size in content.shape)] = content
+def _zeros(capacity: int) -> BeliefArrays:
+    """Return arrays of zeros of this length."""
+    covariance = aligned_zeros(capacity, capacity)
+    return BeliefArrays(np.zeros(capacity), covariance, np.zeros(capacity))
+
+
+def _filled(arrays: BeliefArrays, contents: Sequence[Array]) -> BeliefArrays:
+    """Put smaller arrays into zeros, and return these."""
+    for array, content in zip(arrays, contents, strict=True):
+        array[tuple(slice(size) for size in content.shape)] = content
+    return arrays

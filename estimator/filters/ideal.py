@@ -10,11 +10,13 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array
 from ..interface import UpdateReport
+from ..kernels.belief_arrays import BeliefArrays
 from ..kernels.rules import AT_ESTIMATE, AT_TRUTH
 from ..models.rigid_motion import pose_rotation
 from ..models.unicycle_motion import drive
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
+from ..support.undo import Undo, undone_on_error
 from .ekf import EkfSlam
 
 
@@ -37,8 +39,9 @@ class IdealEkfSlam(EkfSlam):
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run; it linearises at the estimate until the truth is given."""
-        super().reset(pose, pose_std)
-        self._adopt(self.rules._replace(linearisation=AT_ESTIMATE))
+        with undone_on_error(self.checkpoint()):
+            super().reset(pose, pose_std)
+            self._linearise_at(AT_ESTIMATE)
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the state, and whether the truth has been given."""
@@ -49,13 +52,24 @@ class IdealEkfSlam(EkfSlam):
         """Continue from a saved state; the truth of each further step must be given."""
         saved_states.refuse_other_state(state, ())
         at_truth = saved_states.flag("at_truth", state.get("at_truth", False))
-        super().load_state_dict(state)
-        self._linearise_at(AT_TRUTH if at_truth else AT_ESTIMATE)
+        with undone_on_error(self.checkpoint()):
+            super().load_state_dict(state)
+            self._linearise_at(AT_TRUTH if at_truth else AT_ESTIMATE)
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that this process has saved, without checks."""
         super().restore(state)
         self._linearise_at(AT_TRUTH if state["at_truth"] else AT_ESTIMATE)
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls."""
+        undo_map, where = super().checkpoint(), self.rules.linearisation
+
+        def undo() -> None:
+            undo_map()
+            self._linearise_at(where)
+
+        return undo
 
     def _linearise_at(self, where: int) -> None:
         self._adopt(self.rules._replace(linearisation=where))
@@ -91,13 +105,13 @@ class IdealEkfSlam(EkfSlam):
             for i, xy in landmarks.items()
         }
         self._check_told(self.map.slots, told)
-        self._true_landmarks = told
-        if self.rules.linearisation != AT_TRUTH:
-            self._adopt(self.rules._replace(linearisation=AT_TRUTH))
-            self.map.reference[:3] = truth
-        for i, slot in self.map.slots.items():
-            self.map.reference[3 + 2 * slot : 5 + 2 * slot] = self._true_landmarks[i]
-        self._true_pose = truth
+        with undone_on_error(self.checkpoint()):
+            if self.rules.linearisation != AT_TRUTH:
+                self._linearise_at(AT_TRUTH)
+                self.map.reference[:3] = truth
+            for i, slot in self.map.slots.items():
+                self.map.reference[3 + 2 * slot : 5 + 2 * slot] = told[i]
+            self._true_pose, self._true_landmarks = truth, told
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad]; the covariance follows the true motion."""
@@ -106,7 +120,7 @@ class IdealEkfSlam(EkfSlam):
             return
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._motion_noise.over(distance, turn, dt)
-        mean, covariance, reference = self.map.arrays
+        mean, covariance, reference = (each.copy() for each in self.map.arrays)
         mean[:3] = drive(mean[0], mean[1], mean[2], distance, turn)[:3]
         n, heading = self.map.size, reference[2]
         dx, dy = self._true_pose[:2] - reference[:2]
@@ -117,6 +131,7 @@ class IdealEkfSlam(EkfSlam):
         moved[:3, :3] += F @ np.diag(variance) @ F.T
         covariance[:n, :n] = (moved + moved.T) / 2
         reference[:3] = self._true_pose
+        self.map.arrays = BeliefArrays(mean, covariance, reference)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None

@@ -14,6 +14,7 @@ from ..kernels.rules import ADDITIVE, AT_ESTIMATE, INVARIANT, Rules
 from ..support import argument_checks, pair_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.memory_limit import covariance_bytes
+from ..support.undo import Undo
 from .gaussian_map import GaussianMap
 
 FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
@@ -132,6 +133,10 @@ class MapFilter:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that this process has saved, without checks."""
         self.map.restore(state)
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        return self.map.checkpoint(motion=motion)
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""

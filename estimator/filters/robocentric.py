@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from ...arrays import Array
 from ...jit import jit, njit_internal
 from ..belief import Belief, MapView
+from ..kernels.scan_rows import SLOT
+from ..kernels.scan_update import DONE, update_belief
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.symmetric import as_covariance
@@ -22,6 +24,19 @@ from .ekf import EkfSlam
 # zero in place of the first two landmarks; then the landmarks.
 ORIGIN, HEADING, FIRST_LANDMARK = 3, 5, 7
 RESERVED = (-(2**63), 1 - 2**63)  # ids of these two places
+
+
+@jit
+def update_and_move(*arguments: Any) -> tuple[int, int, float]:
+    """Update a belief with a scan as `update_belief`, then move the frame."""
+    mean, covariance, size = arguments[0], arguments[1], arguments[3]
+    count, ledger = arguments[5], arguments[6]
+    status, used, nis = update_belief(*arguments)
+    if status == DONE and count > 0:
+        for k in range(count):
+            size = max(size, 5 + 2 * ledger[SLOT, k])
+        move_frame(mean, covariance, size)
+    return status, used, nis
 
 
 class RobocentricEkfSlam(EkfSlam):
@@ -48,18 +63,21 @@ class RobocentricEkfSlam(EkfSlam):
        55(1), 2007.
     """
 
+    _update_belief = staticmethod(update_and_move)
+
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
-        super().reset(pose, pose_std)
-        mean, covariance = self.map.mean, self.map.covariance
-        first, variance = mean[:3].copy(), covariance.diagonal()[:3].copy()
-        mean[:3] = covariance[:3, :3] = 0.0
-        self.map.add(RESERVED)
+        first = argument_checks.finite_vector("pose", pose, 3)
+        std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         origin, jacobian = _inverse_pose(first)
+        mean, reference = np.zeros(FIRST_LANDMARK), np.zeros(FIRST_LANDMARK)
+        covariance = np.zeros((FIRST_LANDMARK, FIRST_LANDMARK))
         world = slice(ORIGIN, HEADING + 1)
-        mean[world] = origin
-        moved = as_covariance(jacobian @ np.diag(variance) @ jacobian.T)
+        mean[world], reference[:3] = origin, first
+        moved = as_covariance(jacobian @ np.diag(std**2) @ jacobian.T)
         covariance[world, world] = moved
+        state = {"mean": mean, "covariance": covariance, "reference": reference}
+        self.map.restore(state | {"landmark_ids": np.array(RESERVED)})
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -69,10 +87,7 @@ class RobocentricEkfSlam(EkfSlam):
         given = argument_checks.given_identities(landmark_ids, len(readings), self)
         if not set(RESERVED).isdisjoint(given):
             raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
-        report = super().update(readings, given)
-        if len(readings):
-            move_frame(self.map.mean, self.map.covariance, self.map.size)
-        return report
+        return super().update(readings, given)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit in a filter of the same settings."""

@@ -13,6 +13,7 @@ from ..models.angles import wrap_angle
 from ..models.unicycle_motion import drive
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
+from ..support.undo import undone_on_error
 from .ekf import EkfSlam
 from .filter_settings import reading_variances
 from .scan_workspace import not_positive_definite
@@ -39,7 +40,8 @@ class UnscentedSlam(EkfSlam):
         """Move by odometry (d, α) [m, rad], through the cubature points."""
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._motion_noise.over(distance, turn, dt)
-        n, mean, P = self.map.size, self.map.mean, self.map.covariance
+        n, arrays = self.map.size, self.map.arrays
+        mean, P = arrays.mean.copy(), arrays.covariance.copy()
         root = np.zeros((n + 3, n + 3))
         root[:n, :n] = _square_root(P[:n, :n])
         root[n:, n:] = np.diag(np.sqrt(variance))
@@ -54,6 +56,7 @@ class UnscentedSlam(EkfSlam):
         P[:3, :3] = moved @ moved.T / share
         P[:3, 3:n] = moved @ deviations[3:n].T / share
         P[3:n, :3] = P[:3, 3:n].T
+        self.map.arrays = arrays._replace(mean=mean, covariance=P)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -72,13 +75,11 @@ class UnscentedSlam(EkfSlam):
         mapped = np.array([i in self.map.slots for i in ids], dtype=bool)
         known, skipped = mapped & usable, mapped & ~usable
         self._make_room(len(ids), len(ids))  # it may raise: before anything changes
-        corrected = UpdateReport()
-        if known.any():
-            corrected = self._correct(
-                readings[known], [i for i, k in zip(ids, known, strict=True) if k]
-            )
-        others = list(compress(ids, ~mapped))
-        added = super().update(readings[~mapped], others)
+        corrected, others = UpdateReport(), list(compress(ids, ~mapped))
+        with undone_on_error(self.checkpoint()):
+            if known.any():
+                corrected = self._correct(readings[known], list(compress(ids, known)))
+            added = super().update(readings[~mapped], others)
         return corrected.replace(
             added_ids=added.added_ids,
             skipped_ids=(*compress(ids, skipped), *added.skipped_ids),

@@ -11,6 +11,7 @@ from .scan_rows import (
     ADDED,
     MEAN_BEFORE,
     OUTCOME,
+    SLOT,
     WHITE,
     Workspace,
     prior_system_jit,
@@ -50,7 +51,8 @@ def update_belief(
         Rows (β, r) [rad, m].
     ledger
         A :func:`.scan_rows.new_ledger` whose row SLOT holds the place of each reading's
-        landmark in the map.  On return its other rows are filled.
+        landmark in the map.  On return its other rows are filled, and SLOT holds the
+        places of added landmarks, too.
     rows, before, prior
         A :class:`.scan_rows.Workspace`.  On return :func:`.scan_record.record` reads
         the rows.
@@ -105,5 +107,6 @@ def update_belief(
                 rules.linearisation,
                 rules.correlated,
             )
+            ledger[SLOT, k] = (size - 3) // 2
             size += 2
     return DONE, used, nis

@@ -17,6 +17,7 @@ from ..interface import Belief, MapView, ScanDecisions, SlamEstimator, UpdateRep
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.nested_state import with_prefix, without_prefix
+from ..support.undo import Undo, undo_all, undone_on_error
 from .filter_pool import FilterPool
 from .managed_slam import ManagedSlam
 from .policy import LandmarkPolicy, as_policy
@@ -146,14 +147,16 @@ class HypothesisSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
-        self.best.reset(pose, pose_std)
-        self._keep([Hypothesis(0.0, self.best)])
+        with undone_on_error(self.checkpoint()):
+            self.best.reset(pose, pose_std)
+            self._keep([Hypothesis(0.0, self.best)])
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
         motion = argument_checks.pair("odometry", odometry)
-        for hypothesis in self.hypotheses:
-            hypothesis.slam.predict(motion, dt)
+        with undone_on_error(self.checkpoint(motion=True)):
+            for hypothesis in self.hypotheses:
+                hypothesis.slam.predict(motion, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -169,25 +172,28 @@ class HypothesisSlam:
             That of the most probable hypothesis.
         """
         readings = argument_checks.scan(measurements)
-        if landmark_ids is None:
-            options = self._options(readings)
-        else:
-            argument_checks.identities(landmark_ids, len(readings))
-            options = [
-                (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
-                for k, h in enumerate(self.hypotheses)
-            ]
-        return self._advance(readings, options)
+        with undone_on_error(self.checkpoint()):
+            if landmark_ids is None:
+                options = self._options(readings)
+            else:
+                argument_checks.identities(landmark_ids, len(readings))
+                options = [
+                    (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
+                    for k, h in enumerate(self.hypotheses)
+                ]
+            return self._advance(readings, options)
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise landmarks on request; only the best hypothesis continues."""
-        self.best.remove(landmark_ids)
-        self._keep(self.hypotheses[:1])
+        with undone_on_error(self.checkpoint()):
+            self.best.remove(landmark_ids)
+            self._keep(self.hypotheses[:1])
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two landmarks on request; only the best hypothesis continues."""
-        self.best.merge(kept, gone)
-        self._keep(self.hypotheses[:1])
+        with undone_on_error(self.checkpoint()):
+            self.best.merge(kept, gone)
+            self._keep(self.hypotheses[:1])
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
         """Return the belief of the most probable hypothesis."""
@@ -221,14 +227,23 @@ class HypothesisSlam:
         costs = saved_states.array("costs", state["costs"], (-1,)).tolist()
         if not costs or min(costs) < 0:
             raise ValueError(f"state['costs'] must be numbers >= 0, got {costs}")
-        loaded = [Hypothesis(cost, self._pool.fresh()) for cost in costs]
-        try:
+        with undone_on_error(self.checkpoint()):
+            loaded = [Hypothesis(cost, self._pool.fresh()) for cost in costs]
             for k, hypothesis in enumerate(loaded):
                 hypothesis.slam.load_state_dict(without_prefix(state, str(k)))
-        except Exception:
-            self._pool.free(h.slam for h in loaded)
-            raise
-        self._keep(loaded)
+            self._keep(loaded)
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        hypotheses = self.hypotheses
+        undo_slams = [h.slam.checkpoint(motion=motion) for h in hypotheses]
+        undo_parts = undo_all(*undo_slams, self._pool.checkpoint())
+
+        def undo() -> None:
+            undo_parts()
+            self.hypotheses = hypotheses
+
+        return undo
 
     def _options(self, readings: Array) -> list[Option]:
         """Return cost, hypothesis and association of the best, the cheapest first."""
@@ -265,7 +280,6 @@ class HypothesisSlam:
             except (np.linalg.LinAlgError, MemoryError) as error:
                 errors.append(error)
         if not kept:
-            self._keep(self.hypotheses, slams)
             raise errors[0]
         kept = distinct(kept)
         least = kept[0].cost

@@ -18,6 +18,7 @@ from ..interface import (
     MapView,
     SlamEstimator,
     UpdateReport,
+    checkpoint,
     optional_members,
     restore,
 )
@@ -25,6 +26,7 @@ from ..models.rigid_motion import rotation
 from ..support import argument_checks, pair_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.nested_state import with_prefix, without_prefix
+from ..support.undo import Undo, undo_all, undone_on_error
 from ..update_report import ScanDecisions
 from .map_editor import CachedEditor, edit_map
 from .map_view import is_near, mapped_ids, marginal, view_map
@@ -131,21 +133,23 @@ class ManagedSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
-        self._filter.reset(pose, pose_std)
-        self._editor.expire()
-        self._pruner.forget()
-        self._candidates = Candidates()
-        self._recent.forget()
+        with undone_on_error(self.checkpoint()):
+            self._filter.reset(pose, pose_std)
+            self._editor.expire()
+            self._pruner.forget()
+            self._candidates = Candidates()
+            self._recent.forget()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._motion_noise.over(distance, turn, dt)
-        self._filter.predict((distance, turn), dt)
-        self._editor.expire()
-        moved = self._candidates.tentative.moved(distance, turn, variance)
-        self._candidates = replace(self._candidates, tentative=moved)
-        self._recent.note_motion(distance, turn, dt)
+        with undone_on_error(self.checkpoint(motion=True)):
+            self._filter.predict((distance, turn), dt)
+            self._editor.expire()
+            moved = self._candidates.tentative.moved(distance, turn, variance)
+            self._candidates = replace(self._candidates, tentative=moved)
+            self._recent.note_motion(distance, turn, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -171,7 +175,7 @@ class ManagedSlam:
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
-        with self._editor.views_undone_on_error():
+        with undone_on_error(self.checkpoint()):
             if landmark_ids is None:
                 return self.take(readings, self.alternatives(readings)[0][1]())
             return self.take(readings, self.as_given(readings, landmark_ids))
@@ -222,13 +226,15 @@ class ManagedSlam:
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise mapped landmarks by hand, shape (n,); all else stays."""
         ids = argument_checks.mapped_identities(landmark_ids, self._slots)
-        self._recent.note_edits(self._pruner.remove(ids), ())
+        with undone_on_error(self.checkpoint()):
+            self._recent.note_edits(self._pruner.remove(ids), ())
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two mapped landmarks by hand; both identities then name the first."""
         pair_checks.two_landmarks(kept, gone, self._slots)
-        self._pruner.merger.join([(kept, gone)])
-        self._recent.note_edits((), [(kept, gone)])
+        with undone_on_error(self.checkpoint()):
+            self._pruner.merger.join([(kept, gone)])
+            self._recent.note_edits((), [(kept, gone)])
 
     @property
     def _slots(self) -> dict[int, int]:
@@ -261,18 +267,28 @@ class ManagedSlam:
         entries = [k for k in self._remembered() if k.count(".") < 2]
         saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
-        before = self._pruner.state_dict(), self._recent.state_dict(), self.decisions
-        try:
+        with undone_on_error(self.checkpoint()):
             self._pruner.load_state_dict(without_prefix(state, "landmarks"))
             self._recent.load_state_dict(without_prefix(state, "recent"))
             self._filter.load_state_dict(without_prefix(state, "filter"))
-        except Exception:
-            self._pruner.load_state_dict(before[0])
-            self._recent.load_state_dict(before[1])
-            self._recent.decisions = before[2]
-            raise
-        self._editor.expire()
-        self._candidates = candidates
+            self._editor.expire()
+            self._candidates = candidates
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        candidates = self._candidates
+        undo_parts = undo_all(
+            checkpoint(self._filter, motion=motion),
+            *(() if motion else (self._pruner.checkpoint(),)),
+            self._recent.checkpoint(),
+            self._editor.checkpoint(),
+        )
+
+        def undo() -> None:
+            undo_parts()
+            self._candidates = candidates
+
+        return undo
 
     def copy_from(self, other: ManagedSlam) -> None:
         """Continue as another filter of the same settings, decisions included."""

@@ -17,8 +17,7 @@ What a filter lacks goes through ``belief()``, ``state_dict()`` and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -32,8 +31,8 @@ from ..interface import (
     SupportsLocalView,
     SupportsMerging,
     SupportsRemoval,
-    SupportsViewCheckpoint,
 )
+from ..support.undo import Undo
 from .map_view import hides_its_belief, view_map
 
 
@@ -45,10 +44,6 @@ class MapEditor(Protocol):
 
         Landmarks farther away than ``within`` [m] may be left out.
         """
-        ...
-
-    def view_checkpoint(self) -> Callable[[], None]:
-        """Return what takes back the effects of later views."""
         ...
 
     def remove(self, ids: Sequence[int]) -> None:
@@ -105,20 +100,14 @@ class CachedEditor:
         self._within = reach
         return self._view
 
-    def view_checkpoint(self) -> Callable[[], None]:
-        """Return what takes back the effects of later views."""
-        return self._editor.view_checkpoint()
+    def checkpoint(self) -> Undo:
+        """Return what takes back later views, but for those of the filter."""
+        within = self._within
 
-    @contextmanager
-    def views_undone_on_error(self) -> Iterator[None]:
-        """Take back what views have changed if an error follows them."""
-        before, undo = (self._view, self._within), self.view_checkpoint()
-        try:
-            yield
-        except Exception:
-            self._view, self._within = before
-            undo()
-            raise
+        def undo() -> None:
+            self._view, self._within = None, within
+
+        return undo
 
     def expire(self) -> None:
         """Forget the view, since the filter has taken a step."""
@@ -141,16 +130,9 @@ class _MethodEditor:
     def __init__(self, slam: Any) -> None:
         self._slam = slam
         self._is_local = isinstance(slam, SupportsLocalView)
-        has_checkpoint = isinstance(slam, SupportsViewCheckpoint)
-        self._view_checkpoint: Callable[[], Callable[[], None]] = (
-            slam.view_checkpoint if has_checkpoint else lambda: _nothing
-        )
 
     def map_view(self, within: float = 0.0) -> MapView:
         return self._slam.local_view(within) if self._is_local else view_map(self._slam)
-
-    def view_checkpoint(self) -> Callable[[], None]:
-        return self._view_checkpoint()
 
     def remove(self, ids: Sequence[int]) -> None:
         self._slam.remove(ids)
@@ -171,9 +153,6 @@ class _StateEditor:
 
     def map_view(self, within: float = 0.0) -> MapView:
         return view_map(self._slam)
-
-    def view_checkpoint(self) -> Callable[[], None]:
-        return _nothing
 
     def remove(self, ids: Sequence[int]) -> None:
         self._load_without(self._slam.state_dict(), ids)
@@ -197,7 +176,3 @@ class _StateEditor:
             state[key] = without_landmarks(np.asarray(state[key]), slots)
         state["landmark_ids"] = np.delete(np.asarray(state["landmark_ids"]), slots)
         self._slam.load_state_dict(state)
-
-
-def _nothing() -> None:
-    """Take back nothing."""

@@ -9,6 +9,7 @@ from ...arrays import Array
 from ..association.nearest_neighbour import Noise
 from ..association.scan_association import ScanAssociation
 from ..interface import MapView
+from ..support.undo import Undo, contents
 from .landmark_records import LandmarkRecords
 from .loop_closing import LoopCloser, Pairs
 from .map_editor import MapEditor
@@ -146,6 +147,10 @@ class MapPruner:
             self._records.follow(self._editor.map_view().mapped)
             self.merger.forget(ids)
         return ids
+
+    def checkpoint(self) -> Undo:
+        """Return what takes back later changes of what is remembered."""
+        return contents(self, self._records, self.merger, self._closer)
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all records, as arrays."""

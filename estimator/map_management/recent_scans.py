@@ -27,6 +27,7 @@ from ..interface import (
 )
 from ..support import saved_states
 from ..support.nested_state import with_prefix, without_prefix
+from ..support.undo import Undo
 from .map_editor import CachedEditor
 from .recent_scan import Motion, RecentScan, motion_array, motions_of
 
@@ -71,6 +72,17 @@ class RecentScans:
         self.scans, self.motions = list(other.scans), other.motions
         self.decisions = list(other.decisions)
 
+    def checkpoint(self) -> Undo:
+        """Return what takes back later changes of what is remembered."""
+        scans, motions, decisions = list(self.scans), self.motions, self.decisions
+        count, newest = len(decisions), decisions[-self._window - 1 :]
+
+        def undo() -> None:
+            decisions[count - len(newest) :] = newest
+            self.scans, self.motions, self.decisions = list(scans), motions, decisions
+
+        return undo
+
     def note_motion(self, distance: float, turn: float, dt: float) -> None:
         """Remember a motion since the last scan."""
         if self._window:
@@ -94,10 +106,7 @@ class RecentScans:
             )
 
     def update(self, readings: Array, plan: ScanAssociation) -> UpdateReport:
-        """Update the filter with a scan, and with earlier sightings if there are any.
-
-        An error leaves the filter and the scans as they were.
-        """
+        """Update the filter with a scan, and with earlier sightings if any."""
         row_ids, labels = tuple(plan.row_ids), tuple(plan.labels)
         scan = RecentScan(plan.scan, self.motions, readings, row_ids, labels)
         if not self._window:
@@ -133,15 +142,9 @@ class RecentScans:
         self, scans: list[RecentScan], first: int, confirmed: set[int]
     ) -> UpdateReport:
         """Repeat the scans since one until no sighting contradicts those before it."""
-        now = self._slam.state_dict()
-        try:
+        reports = self._repeat(scans, first)
+        while _drop_contradicted(scans, reports, confirmed, self._gate):
             reports = self._repeat(scans, first)
-            while _drop_contradicted(scans, reports, confirmed, self._gate):
-                reports = self._repeat(scans, first)
-        except Exception:
-            restore(self._slam, now)
-            self._editor.expire()
-            raise
         return reports[-1]
 
     def _repeat(self, scans: list[RecentScan], first: int) -> list[UpdateReport]:

@@ -8,10 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..interface import Belief, MapView, SlamEstimator, UpdateReport, optional_members
+from ..interface import (
+    Belief,
+    MapView,
+    SlamEstimator,
+    UpdateReport,
+    checkpoint,
+    optional_members,
+)
 from ..map_management.map_editor import edit_map
 from ..map_management.map_view import mapped_ids, marginal, view_map
 from ..support import argument_checks, saved_states
+from ..support.undo import Undo, contents, undo_all, undone_on_error
 from .drive import Drive
 
 HISTORY = "recorded_events"
@@ -71,22 +79,34 @@ class RecordedSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run and a new drive, at a pose (3,) known to (3,) [m, m, rad]."""
-        self._slam.reset(pose, pose_std)
-        first, std = np.array(pose, dtype=float), np.array(pose_std, dtype=float)
-        self._noise |= {"initial_pose": first, "initial_pose_std": std}
-        self._last = None
+        with undone_on_error(self.checkpoint()):
+            self._slam.reset(pose, pose_std)
+            first, std = np.array(pose, dtype=float), np.array(pose_std, dtype=float)
+            self._noise |= {"initial_pose": first, "initial_pose_std": std}
+            self._last = None
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
         motion = argument_checks.pair("odometry", odometry)
-        self._slam.predict(motion, dt)
-        self._record("predict", motion, dt)
+        with undone_on_error(self.checkpoint(motion=True)):
+            self._slam.predict(motion, dt)
+            self._record("predict", motion, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
     ) -> UpdateReport:
         """Update the filter with one scan, and record the readings that it used."""
-        report = self._slam.update(measurements, landmark_ids)
+        with undone_on_error(self.checkpoint()):
+            report = self._slam.update(measurements, landmark_ids)
+            self._record_scan(measurements, landmark_ids, report)
+        return report
+
+    def _record_scan(
+        self,
+        measurements: ArrayLike,
+        landmark_ids: Sequence[int] | None,
+        report: UpdateReport,
+    ) -> None:
         decided = report.row_ids or (() if landmark_ids is None else landmark_ids)
         unused = {*report.rejected_ids, *report.skipped_ids}
         used = {
@@ -98,12 +118,12 @@ class RecordedSlam:
             self._record("merge", kept, gone)
         if report.removed_ids:
             self._record("forget", report.removed_ids)
-        return report
 
     def remove(self, landmark_ids: Sequence[int]) -> None:
         """Marginalise landmarks, and drop their readings from the drive."""
-        self._editor.remove(landmark_ids)
-        self._record("forget", tuple(landmark_ids))
+        with undone_on_error(self.checkpoint()):
+            self._editor.remove(landmark_ids)
+            self._record("forget", tuple(landmark_ids))
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two landmarks, in the filter and in the drive."""
@@ -111,9 +131,10 @@ class RecordedSlam:
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Merge pairs (kept, gone) of landmarks, in the filter and in the drive."""
-        self._editor.merge_pairs(pairs)
-        for kept, gone in pairs:
-            self._record("merge", kept, gone)
+        with undone_on_error(self.checkpoint()):
+            self._editor.merge_pairs(pairs)
+            for kept, gone in pairs:
+                self._record("merge", kept, gone)
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
         """Return the filter's belief."""
@@ -150,8 +171,13 @@ class RecordedSlam:
             raise ValueError(
                 f"state['{HISTORY}'] must be the events of a drive, got {history!r}"
             )
-        self._slam.load_state_dict(state)
-        self._last = history.item()
+        with undone_on_error(self.checkpoint()):
+            self._slam.load_state_dict(state)
+            self._last = history.item()
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        return undo_all(checkpoint(self._slam, motion=motion), contents(self))
 
     def __repr__(self) -> str:
         return f"Recorded {self._slam!r}"

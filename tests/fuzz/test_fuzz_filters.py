@@ -7,8 +7,10 @@ import pytest
 from fuzzing import STRANGE, numbers, sane, strange_values
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
+from interrupts import is_interrupted, lines_of
 
 from slamgym.estimator import list_estimators, make_estimator
+from slamgym.estimator.smoother.recorded_slam import HISTORY, RecordedSlam
 from slamgym.estimator.smoother.smoothing_slam import SmoothingSlam
 
 NOISES = [
@@ -228,3 +230,126 @@ class CallsOfLargeMaps(Calls):
 @pytest.mark.parametrize("machine", [Calls, CallsOfLargeMaps])
 def test_filters_stay_sound_and_errors_change_nothing(fuzzer, machine):
     fuzzer.check_machine(machine, few=8)
+
+
+LOOPS = {"constellations": True, "merge_within": 0.3, "confirm": (1, 1)}
+MANAGED = [None, {"association": "nearest"}, *POLICIES[2:], LOOPS]
+MANAGED += [{"association": "hypotheses", "confirm": (1, 2)}]
+FILTERS = (*list_estimators(), "ideal with truth", "smoother")
+KINDS = [
+    (name, policy)
+    for name in FILTERS
+    for policy in (MANAGED if name not in FILTERS[-2:] else MANAGED[:1])
+]
+NEAREST = np.array([(2.0, 1.0), (3.0, -2.0), (0.5, 3.0), (5.0, 1.5), (7.0, -1.0)])
+PLACES = np.concatenate([np.add(NEAREST, (x, y)) for x in (0, 6) for y in (0, 5)])
+
+
+def made(name, policy):
+    if name == "smoother":
+        return SmoothingSlam(**NOISES[0])
+    name = name.partition(" ")[0]
+    options = OPTIONS.get(name, {})
+    return make_estimator(name, **NOISES[0], management=policy, **options)
+
+
+def a_scan(step, named):
+    """The readings of a drive on a circle, and their identities where these are named.
+
+    The managed filters get no identities in most steps.
+    """
+    pose = 3 * np.sin(0.3 * step), 3 - 3 * np.cos(0.3 * step), 0.3 * step
+    dx, dy = (PLACES - pose[:2]).T
+    distance = np.hypot(dx, dy)
+    seen = np.flatnonzero(distance < 5.0)[:5]
+    bearing = np.arctan2(dy, dx)[seen] - pose[2]
+    bearing += 0.05 * np.sin(7.0 * step + seen)
+    readings = np.column_stack(
+        [(bearing + np.pi) % (2 * np.pi) - np.pi, distance[seen]]
+    )
+    return readings, seen if named else None
+
+
+def calls_at(name, policy, step, saved):
+    """The calls that a drive makes in one step, by name."""
+    readings, ids = a_scan(step, policy is None or step % 5 == 4)
+    truth = (3 * np.sin(0.3 * step), 3 - 3 * np.cos(0.3 * step), 0.3 * step)
+    calls = {"predict": lambda s: s.predict((0.9, 0.3))}
+    if name == "ideal with truth":
+        told = dict(enumerate(PLACES))
+        calls = {"observe_truth": lambda s: s.observe_truth(truth, told)} | calls
+    calls |= {
+        "belief": lambda s: s.belief(),
+        "update": lambda s: s.update(readings, ids),
+        "state_dict": lambda s: s.state_dict(),
+    }
+    if hasattr(saved, "local_view"):
+        calls["local_view"] = lambda s: s.local_view(4.0)
+    if step % 7 == 6 and (policy is None or name not in LARGE):
+        calls["remove"] = lambda s: s.remove(s.landmark_ids[:1])
+        calls["merge"] = lambda s: s.merge(*s.landmark_ids[-2:])
+    return calls
+
+
+def look(slam):
+    """The state and the belief, to the bit."""
+    belief = slam.belief()
+    parts = {k: v for k, v in digest(slam).items() if k != HISTORY}
+    drive = repr(list(slam._events())) if isinstance(slam, RecordedSlam) else ""
+    return parts, belief.mean.tobytes(), belief.covariance.tobytes(), drive
+
+
+def interrupt(name, policy, lines, *, steps=12):
+    """Interrupt calls of a drive; each changes all or nothing, and the drive goes on.
+
+    Parameters
+    ----------
+    name, policy
+        The filter and its management.
+    lines : callable
+        Returns the lines at which to interrupt a call of so many lines.
+
+    Returns
+    -------
+    int
+        How many calls were interrupted.
+    """
+    slam, twin, count = made(name, policy), made(name, policy), 0
+    start = slam.state_dict()
+    for step in range(steps):
+        calls = calls_at(name, policy, step, slam)
+        if step == steps - 1:
+            calls["load_state_dict"] = lambda s: s.load_state_dict(start)
+            calls["reset"] = lambda s: s.reset((1.0, 2.0, 0.5), (0.1, 0.1, 0.1))
+        for label, call in calls.items():
+            before = look(slam)
+            total = lines_of(lambda: call(twin))  # noqa: B023
+            after = look(twin)
+            is_new = False
+            for line in lines(total):
+                count += 1
+                if not is_interrupted(lambda: call(slam), line):  # noqa: B023
+                    is_new = True
+                    break
+                now = look(slam)
+                assert now in (before, after), (name, policy, step, label, line, total)
+                if now != before:
+                    is_new = True
+                    break
+            if not is_new:
+                call(slam)
+            assert look(slam) == after, (name, policy, step, label)
+    return count
+
+
+def test_an_interrupted_call_changes_all_or_nothing(fuzzer):
+    def once(kind, seed):
+        rng = np.random.default_rng(seed)
+
+        def one_line(total):
+            return [int(rng.integers(total))] if total else []
+
+        fuzzer.inputs += interrupt(*KINDS[kind], one_line, steps=9) - 1
+
+    kinds = st.integers(0, len(KINDS) - 1)
+    fuzzer.check(once, kinds, st.integers(0, 10**9), few=4)

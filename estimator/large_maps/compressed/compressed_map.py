@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,8 @@ from ...filters.invariant import InvariantEkfSlam
 from ...interface import Belief
 from ...support.argument_checks import LOWEST_ID
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
+from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from ..sparse_cholesky.coordinates import pairs
-from ..undo import Undo
 from .active_set import choose_local, largest_whole_map
 from .deferred_covariance import BLOCK, DeferredCovariance
 from .downdate import subtract, symmetric
@@ -23,7 +23,6 @@ from .handover import Handover, begin_handover, blocks_in_a_step, exchanged_rows
 from .phase_update import (
     Phase,
     begin_phase,
-    checkpoint_filter,
     combine,
     end_phase,
     roots,
@@ -44,7 +43,7 @@ class CompressedMap:
     def __init__(self, local_filter: EkfSlam) -> None:
         self.filter = local_filter
         self.is_invariant = type(local_filter) is InvariantEkfSlam
-        self.undo = Undo()
+        self.reset(np.zeros(3), np.zeros(3))
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map."""
@@ -62,21 +61,24 @@ class CompressedMap:
 
     def add(self, ids: Sequence[int]) -> None:
         """Assign slots to landmarks that the filter has added."""
-        for i in ids:
-            self.slots[i] = self.free.pop() if self.free else len(self.slots)
-            self.local[i] = None
+        if not ids:
+            return
+        count, reused = len(self.slots), self.free[: -len(ids) - 1 : -1]
+        fresh = range(count, count + len(ids) - len(reused))
+        self.slots = self.slots | dict(zip(ids, [*reused, *fresh], strict=True))
+        self.free = self.free[: len(self.free) - len(reused)]
+        self.local = self.local | dict.fromkeys(ids)
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks."""
-        self.filter.remove([i for i in ids if i in self.local])
-        for i in ids:
-            self._drop(i)
+        with undone_on_error(self.checkpoint()):
+            self.filter.remove([i for i in ids if i in self.local])
+            self._drop(ids)
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Condition on local landmarks being the same; drop the second of each pair."""
         self.filter.merge_pairs(pairs)
-        for _, gone in pairs:
-            self._drop(gone)
+        self._drop([gone for _, gone in pairs])
 
     def belief(self, ids: Sequence[int]) -> Belief:
         """Return the marginal of the pose and some landmarks."""
@@ -145,10 +147,10 @@ class CompressedMap:
             "take a smaller local_size",
         )
         self.finish_handover()
-        self.undo.save(self._checkpoint)
         now, whole = self._phase(), not self._virtual
         own = self._columns(list(self.local))
         self._make_room()
+        self._points, self._references = self._points.copy(), self._references.copy()
         if not whole:
             self._points += self._combine(now.shift, self._strip)[0]
         self._points[own] = now.mean[3:]
@@ -195,19 +197,15 @@ class CompressedMap:
             self._handover.advance(self.deferred, self.deferred.width // BLOCK)
             self._handover = None
 
-    def _checkpoint(self) -> Callable[[], None]:
-        """Return what takes back a change of the local map."""
-        own = {k: v for k, v in vars(self).items() if k not in ("filter", "undo")}
-        own |= {"_points": self._points.copy(), "_references": self._references.copy()}
-        undo_deferred = self.deferred.checkpoint()
-        undo_filter = checkpoint_filter(self.filter, in_place=bool(self._virtual))
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later changes; ``motion``: only those of the pose.
 
-        def undo() -> None:
-            vars(self).update(own)
-            undo_filter()
-            undo_deferred()
-
-        return undo
+        A handover may be further than before: its results do not depend on the time.
+        """
+        undo_filter = self.filter.checkpoint(motion=motion)
+        if motion:
+            return undo_filter
+        return undo_all(undo_filter, self.deferred.checkpoint(), attributes(self))
 
     @property
     def is_small(self) -> bool:
@@ -256,9 +254,11 @@ class CompressedMap:
         self.free = saved.numbers[4:]
         return numbers
 
-    def _drop(self, landmark_id: int) -> None:
-        self.local.pop(landmark_id, None)
-        self.free.append(self.slots.pop(landmark_id))
+    def _drop(self, ids: Sequence[int]) -> None:
+        gone = set(ids)
+        self.free = self.free + [self.slots[i] for i in ids]
+        self.slots = {i: slot for i, slot in self.slots.items() if i not in gone}
+        self.local = {i: None for i in self.local if i not in gone}
 
     def _begin(self, rows: Array, *, in_place: bool) -> None:
         """Load the local map with these covariance rows (a, a - 3) into the filter."""

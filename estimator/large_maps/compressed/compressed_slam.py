@@ -20,6 +20,7 @@ from ...interface import Belief, MapView, UpdateReport
 from ...support import argument_checks, pair_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
+from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from . import active_set
 from .active_set import extra_landmarks
 from .compressed_map import CompressedMap
@@ -110,10 +111,11 @@ class CompressedEkfSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map, as `EkfSlam.reset`."""
-        self._map.reset(pose, pose_std)
-        self._extra = 0  # landmarks of the local map beyond those of a scan
-        self._age = 0  # scans in this phase
-        self._rests = 0  # how many phases may still spread their beginning over steps
+        loaded = CompressedMap(self._make())
+        loaded.reset(pose, pose_std)
+        # The numbers: landmarks of the local map beyond those of a scan, scans in this
+        # phase, how many phases may still spread their beginning over steps.
+        self._map, self._extra, self._age, self._rests = loaded, 0, 0, 0
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
@@ -141,17 +143,17 @@ class CompressedEkfSlam:
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_reserved(ids)
         counters = self._extra, self._age, self._rests
-        with self._map.undo.on_error():
+        with undone_on_error(self.checkpoint()):
             if (np.abs(readings) <= LARGEST).all():  # otherwise refused
                 mapped = [i for i in ids if i in self._map.slots]
                 counters = self._choose_local_map(mapped)
             report = self._map.filter.update(readings, ids)
-        self._extra, self._age, self._rests = counters
-        self._map.add(report.added_ids)
-        if report.degrees_of_freedom:
-            self._age += 1
-            rank = report.degrees_of_freedom + 1
-            self._map.work(rank, self._age, hurried=not self._rests)
+            self._extra, self._age, self._rests = counters
+            self._map.add(report.added_ids)
+            if report.degrees_of_freedom:
+                self._age += 1
+                rank = report.degrees_of_freedom + 1
+                self._map.work(rank, self._age, hurried=not self._rests)
         return report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
@@ -191,7 +193,7 @@ class CompressedEkfSlam:
         """
         kept, gone = pair_checks.landmark_pairs(pairs, self._map.slots)
         ids, local = [*kept, *gone], self._map.local
-        with self._map.undo.on_error():
+        with undone_on_error(self.checkpoint()):
             if not all(i in local for i in ids):
                 size = max(self._local_size or 0, len(local), len(ids))
                 self._map.change_local_map(ids, size, hurried=not self._rests)
@@ -265,6 +267,10 @@ class CompressedEkfSlam:
         some = loaded.belief(list(loaded.slots)[:CHECKED_LANDMARKS])
         saved_states.refuse_indefinite("the covariance of state", some.covariance)
         self._map, self._extra, self._age, self._rests = loaded, extra, age, rests
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        return undo_all(self._map.checkpoint(motion=motion), attributes(self))
 
     def _choose_local_map(self, required: Sequence[int]) -> tuple[int, int, int]:
         """Begin a new phase if the scan needs it or the local map is too large.

@@ -1,6 +1,6 @@
 """Covariance between the landmarks of a large map, with deferred downdates."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from ....arrays import Array, IntArray
 from ...support import saved_states
 from ...support.memory_limit import refuse_beyond_memory
+from ...support.undo import Undo, contents
 from .downdate import Downdate, rows_of, saved_downdates, symmetric
 from .row_exchange import read_columns, read_marginal, write_columns
 
@@ -134,20 +135,12 @@ class DeferredCovariance:
         for root, _ in self._pending:
             root[columns[columns < len(root)]] = 0.0
 
-    def checkpoint(self) -> Callable[[], None]:
-        """Return what takes back later calls of all methods but :meth:`work`.
+    def checkpoint(self) -> Undo:
+        """Return what takes back later calls.
 
         The stored rows of local landmarks are invalid, and remain so.
         """
-        blocks, pending = len(self._blocks), list(self._pending)
-        progress = self._under_way, self._done, self._credit
-
-        def undo() -> None:
-            del self._blocks[blocks:]
-            self._pending = pending
-            self._under_way, self._done, self._credit = progress
-
-        return undo
+        return contents(self)
 
     def defer(self, root: Array, signs: Array) -> None:
         """Subtract W diag(s) Wᵀ later, W of shape (width, rank)."""
@@ -264,21 +257,20 @@ class DeferredCovariance:
         return self._under_way
 
     def _apply(self, k: int) -> None:
-        """Apply the downdate under way to one block."""
+        """Apply the downdate under way to a copy of one block, which replaces it."""
         from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
 
         root, signs = self._pending[0]
         first, last = k * BLOCK, (k + 1) * BLOCK
         # The transposes are contiguous in Fortran order: dgemm copies none of them.
-        dgemm(
+        self._blocks[k] = dgemm(
             -1.0,
             root[:last].T,
             (root[first:last] * signs).T,
             1.0,
             self._blocks[k].T,
             trans_a=True,
-            overwrite_c=True,
-        )
+        ).T
 
 
 def stored_bytes(landmarks: int) -> int:

@@ -20,8 +20,6 @@ number for each of the s coordinates, a *virtual landmark* at the origin.  With 
 the rows of S read as complex numbers, the equations above hold unchanged.
 """
 
-from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -91,19 +89,6 @@ def begin_phase(
         array[:3], array[3 + virtual : size] = head, tail
     fill_extended(gaussian.covariance, before, pose, rows, virtual, step)
     gaussian.relabel(ids)
-
-
-def checkpoint_filter(slam: EkfSlam, *, in_place: bool) -> Callable[[], None]:
-    """Return what takes back :func:`begin_phase`."""
-    if in_place:
-        return partial(slam.restore, slam.state_dict())
-    gaussian, arrays, ids = slam.map, slam.map.arrays, list(slam.map.slots)
-
-    def undo() -> None:
-        gaussian.arrays = arrays
-        gaussian.relabel(ids)
-
-    return undo
 
 
 def end_phase(slam: EkfSlam, virtual: int) -> Phase:

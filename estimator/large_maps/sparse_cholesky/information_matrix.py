@@ -24,7 +24,7 @@ class InformationMatrix:
     def __init__(self) -> None:
         self._links: list[IntArray] = []
         self._blocks: list[Array] = []
-        self._place = np.zeros(0, dtype=np.int64)  # scratch; -1 between calls
+        self._place = np.zeros(0, dtype=np.int64)  # scratch, see _found
 
     def __len__(self) -> int:
         return len(self._links)
@@ -34,7 +34,7 @@ class InformationMatrix:
         links, blocks = list(self._links), list(self._blocks)
 
         def undo() -> None:
-            self._links, self._blocks = links, blocks
+            self._links, self._blocks = list(links), list(blocks)
 
         return undo
 
@@ -57,7 +57,7 @@ class InformationMatrix:
             self._links.append(np.empty(0, dtype=np.int64))
             self._blocks.append(np.empty((0, 2, 2)))
         if len(self._place) < count:
-            self._place = np.full(2 * count, -1, dtype=np.int64)
+            self._place = np.zeros(2 * count, dtype=np.int64)
 
     def dense(self, slots: IntArray) -> Array:
         """Return the rows and columns of a few landmarks, shape (2k, 2k)."""
@@ -74,10 +74,7 @@ class InformationMatrix:
         if not (len(rows) and len(columns)):
             return bsr_array(shape)
         counts, links, blocks = self.rows(rows)
-        self._place[columns] = np.arange(len(columns))
-        place = self._place[links]
-        self._place[columns] = -1
-        wanted = place >= 0
+        place, wanted = self._found(columns, links)
         owner = np.repeat(np.arange(len(rows)), counts)[wanted]
         starts = np.searchsorted(owner, np.arange(len(rows) + 1))
         return bsr_array((blocks[wanted], place[wanted], starts), shape=shape)
@@ -87,32 +84,38 @@ class InformationMatrix:
         k = len(slots)
         blocks = dense.reshape(k, 2, k, 2).transpose(0, 2, 1, 3)
         linked = np.asarray(blocks.any(axis=(2, 3)))
-        inside = self._place
-        inside[slots] = 0
         for i, slot in enumerate(slots.tolist()):
             links = self._links[slot]
-            kept = inside[links] < 0
+            kept = ~self._found(slots, links)[1]
             new = linked[i]
             self._links[slot] = np.concatenate([links[kept], slots[new]])
             self._blocks[slot] = np.concatenate(
                 [self._blocks[slot][kept], blocks[i, new]]
             )
-        inside[slots] = -1
 
     def nearest_by_links(self, slots: IntArray, count: int) -> IntArray:
         """Return up to ``count`` other landmarks, fewest links away first."""
         found: list[IntArray] = []
-        missing, front, place = count, slots, self._place
-        place[slots] = 0
+        missing, front = count, slots
+        is_found = np.zeros(len(self), dtype=bool)
+        is_found[slots] = True
         while missing > 0 and len(front):
             front = np.unique(self.rows(front)[1])
-            front = front[place[front] < 0][:missing]
-            place[front] = 0
+            front = front[~is_found[front]][:missing]
+            is_found[front] = True
             found.append(front)
             missing -= len(front)
-        result = np.concatenate([*found, np.empty(0, dtype=np.int64)])
-        place[slots] = place[result] = -1
-        return result
+        return np.concatenate([*found, np.empty(0, dtype=np.int64)])
+
+    def _found(self, slots: IntArray, links: IntArray) -> tuple[IntArray, BoolArray]:
+        """Return the places of links among slots, and which of them are among these.
+
+        The scratch array needs no clearing: a place that an earlier call has left
+        there does not lead to the link.
+        """
+        self._place[slots] = np.arange(len(slots))
+        place = self._place[links]
+        return place, slots.take(place, mode="clip") == links
 
     def links(self, slot: int) -> IntArray:
         """Return the landmarks linked with a landmark, including itself."""
@@ -161,7 +164,7 @@ class InformationMatrix:
         ends = np.cumsum(counts)[:-1]
         self._links = [part.copy() for part in np.split(links, ends)][: len(counts)]
         self._blocks = [part.copy() for part in np.split(blocks, ends)][: len(counts)]
-        self._place = np.full(2 * len(counts), -1, dtype=np.int64)
+        self._place = np.zeros(2 * len(counts), dtype=np.int64)
 
 
 def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:

@@ -1,15 +1,15 @@
 """The belief of the sparse information filter: map, local map and pose."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
 
 from ....arrays import Array, BoolArray, IntArray
+from ...support.undo import Undo, contents, undone_on_error
 from ..sparse_cholesky.coordinates import pairs
 from ..sparse_cholesky.landmark_elimination import RestFactor
-from ..undo import Undo
 from .active_set import (
     FIRST_COUNT,
     choose_local,
@@ -49,8 +49,6 @@ class SparseBelief:
     rest: RestFactor | None = field(default=None, repr=False)
     """Factor of all landmarks except the local ones, if known."""
 
-    undo: Undo = field(default_factory=Undo, repr=False)
-
     @classmethod
     def empty(cls, pose: Array, std: Array) -> "SparseBelief":
         """Return the belief of a robot at this pose, shape (3,), without a map."""
@@ -74,15 +72,14 @@ class SparseBelief:
         self.free = [slot for slot in self.free if slot not in slots]
         self.map_.grow(len(self.slots) + len(self.free))
 
-    def _checkpoint(self) -> Callable[[], None]:
-        """Return what takes back changes of the local map."""
-        names = ("local", "pose", "origin", "count", "enlarged")
-        own = {name: getattr(self, name) for name in names}
-        undo_map = self.map_.checkpoint()
+    def checkpoint(self) -> Undo:
+        """Return what takes back later changes."""
+        undo_own, undo_map = contents(self), self.map_.checkpoint()
 
         def undo() -> None:
             undo_map()
-            vars(self).update(own, rest=None)
+            undo_own()
+            self.rest = None  # the map no longer keeps the nodes of a factor
 
         return undo
 
@@ -117,19 +114,19 @@ class SparseBelief:
 
     def remove(self, ids: Sequence[int], *, exact: bool) -> None:
         """Marginalise landmarks."""
-        with self.undo.on_error():
+        with undone_on_error(self.checkpoint()):
             gone = self._include_links(ids, exact=exact)
             rest = marginalise(self.local, self.pose, gone)
-        self._drop(ids, gone, rest)
+            self._drop(ids, gone, rest)
 
     def merge(self, kept: int, gone: int, *, exact: bool) -> None:
         """Condition on two landmarks being the same, and drop the second."""
-        with self.undo.on_error():
+        with undone_on_error(self.checkpoint()):
             dropped = self._include_links([gone, kept], exact=exact)
             place = int(np.flatnonzero(self.local.slots == self.slots[kept])[0])
             dropped[place] = False
             merged = merge_landmarks(self.local, self.pose, place, dropped)
-        self._drop([gone], dropped, merged)
+            self._drop([gone], dropped, merged)
 
     def marginal(self, ids: Sequence[int]) -> Marginal:
         """Return the marginal of the pose and some landmarks."""
@@ -195,7 +192,6 @@ class SparseBelief:
 
     def _change_local_map(self, slots: IntArray, count: float) -> None:
         """Write the local map back, and begin another one."""
-        self.undo.save(self._checkpoint)
         old, pose = self.local.slots, self.pose
         write_back(self.map_, self.local)
         self.rest = None

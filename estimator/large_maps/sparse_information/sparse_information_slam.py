@@ -15,6 +15,7 @@ from ...interface import UpdateReport
 from ...models.angles import wrap_angle
 from ...support import argument_checks, pair_checks
 from ...support.argument_checks import LandmarkIds
+from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from .conditional_pose import move
 from .linearisation import ESTIMATE
 from .local_information import link_count
@@ -152,14 +153,14 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         argument_checks.refuse_unusable(readings, ids)
         if not ids:
             return UpdateReport()
-        with self._belief.undo.on_error():
+        with undone_on_error(self._belief.checkpoint()):
             self._belief.choose_local_map(ids, exact=self._is_exact)
             result = self._process(readings, ids)
             while result.largest_residual > self._tolerance:
                 self._belief.enlarge_elimination()
                 result = self._process(readings, ids)
-        self._belief.add(result.report.added_ids, result.added_slots)
-        self._belief.pose, self._belief.local = result.pose, result.local
+            self._belief.add(result.report.added_ids, result.added_slots)
+            self._belief.pose, self._belief.local = result.pose, result.local
         return result.report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
@@ -278,6 +279,11 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         """Continue from a saved state, as `EkfSlam.load_state_dict`."""
         name, base = type(self).__name__, self._scan_rules.base
         self._belief = checked_state(state, name, base)
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        undo_belief = attributes(self._belief) if motion else self._belief.checkpoint()
+        return undo_all(undo_belief, attributes(self))
 
     @property
     def _is_exact(self) -> bool:

@@ -1,11 +1,13 @@
 """The closed submaps of a run, joined when a belief asks for them."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from ....arrays import Array, IntArray
 from ...error_frames import ErrorFrame
+from ...support.undo import Undo
 from .frame_initialisation import (
     FrameInitialisation,
     SubmapSummary,
@@ -68,12 +70,17 @@ class ClosedSubmaps:
         submap = self.store.load(index)
         return merged(submap, self.renamed, self._frame) if self.renamed else submap
 
-    def append(self, submap: Submap) -> None:
-        """Append a submap."""
+    def with_appended(self, submap: Submap) -> "ClosedSubmaps":
+        """Return the same submaps with one more, which is stored."""
         self.store.append(submap)
-        self.summaries.append(summarise(submap))
-        self.slots.update(submap.slots.tolist())
-        self._joined = self._whole = None
+        summaries = [*self.summaries, summarise(submap)]
+        longer = ClosedSubmaps(self.store, self._frame, self.renamed, summaries)
+        longer._initialisation = self._initialisation.copy()
+        return longer
+
+    def checkpoint(self) -> Undo:
+        """Return what takes back which submaps are stored."""
+        return partial(self.store.truncate, len(self))
 
     def with_merged(self, kept: int, gone: int) -> "ClosedSubmaps":
         """Return the same submaps with one slot replaced by another.

@@ -54,6 +54,12 @@ class FrameInitialisation:
     def __init__(self) -> None:
         self._blocks: dict[tuple[int, int], Array] = {}
 
+    def copy(self) -> "FrameInitialisation":
+        """Return one with the same cache, for more submaps."""
+        copied = FrameInitialisation()
+        copied._blocks = dict(self._blocks)
+        return copied
+
     def frames(
         self, summaries: Sequence[SubmapSummary], known: Array, refine: Refine
     ) -> Array:

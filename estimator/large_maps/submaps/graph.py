@@ -8,6 +8,7 @@ from ....arrays import Array, IntArray
 from ...interface import Belief
 from ...models.angles import wrap_angle
 from ...models.rigid_motion import compose
+from ...support.undo import Undo, attributes, undo_all
 from .active_submap import ActiveSubmap
 from .chain import Chain
 from .closed_submaps import ClosedSubmaps
@@ -117,10 +118,19 @@ class SubmapGraph:
         """
         mean, covariance = self.active.gaussian()
         self.is_overdue = True
-        self.closed.append(Submap(self._active_slots, mean, covariance))
+        submap = Submap(self._active_slots, mean, covariance)
+        self.closed = self.closed.with_appended(submap)
         self.is_overdue = False
         self.chain.extend(mean[:3], self.active.pose_covariance)
         self.active.begin()
+
+    def checkpoint(self) -> Undo:
+        """Return what takes back later changes, but for those of the active submap."""
+        return undo_all(
+            self.index.checkpoint(),
+            self.closed.checkpoint(),
+            attributes(self, self.chain),
+        )
 
     def remove(self, ids: list[int]) -> None:
         """Remove mapped landmarks; those of several submaps remain as links."""

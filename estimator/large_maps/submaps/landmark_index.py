@@ -11,6 +11,7 @@ import numpy as np
 
 from ....arrays import IntArray
 from ...support.argument_checks import LOWEST_ID, LandmarkIds, refuse_reserved
+from ...support.undo import Undo
 
 
 class LandmarkIndex(Mapping[int, int]):
@@ -57,7 +58,21 @@ class LandmarkIndex(Mapping[int, int]):
 
     def remove(self, landmark_id: int) -> int:
         """Remove a landmark; return its slot, which is not used again."""
-        return self._slots.pop(landmark_id)
+        slots = dict(self._slots)
+        slot = slots.pop(landmark_id)
+        self._slots = slots
+        return slot
+
+    def checkpoint(self) -> Undo:
+        """Return what takes back later changes, at a cost of the landmarks added."""
+        slots, count = self._slots, self.count
+
+        def undo() -> None:
+            while slots and slots[next(reversed(slots))] >= count:
+                slots.popitem()
+            self._slots, self.count = slots, count
+
+        return undo
 
     def slots_of(self, names: Sequence[int]) -> IntArray:
         """Return the slots of landmarks and links by their names, shape (n,)."""

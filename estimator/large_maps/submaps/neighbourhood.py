@@ -20,6 +20,7 @@ from ...filters.invariant import InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
+from ...support.undo import Undo, contents, undo_all
 from .store import LostSubmapError
 
 LARGEST_COUNT = 1000
@@ -130,14 +131,11 @@ class Neighbourhood:
         self._reaches[-1] = max(within, self._reaches[-1])
         return copy.slam.map_view()
 
-    def checkpoint(self) -> Callable[[], None]:
-        """Return what takes back later calls of :meth:`view`."""
-        copy, reaches = self._copy, list(self._reaches)
-
-        def undo() -> None:
-            self._copy, self._reaches = copy, reaches
-
-        return undo
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        if self._copy is None:
+            return contents(self)
+        return undo_all(self._copy.slam.checkpoint(motion=motion), contents(self))
 
     def renew(self) -> None:
         """Replace the copy, if there is one and the submaps can be joined."""

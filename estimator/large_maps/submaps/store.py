@@ -42,6 +42,9 @@ class SubmapStore(Protocol):
     def append(self, submap: Submap) -> None:
         """Append a submap."""
 
+    def truncate(self, count: int) -> None:
+        """Forget all submaps but the first ``count``."""
+
     def load(self, index: int) -> Submap:
         """Return a submap; its arrays must not be modified."""
         ...
@@ -64,6 +67,10 @@ class MemoryStore:
     def append(self, submap: Submap) -> None:
         """Append a submap."""
         self._submaps.append(submap)
+
+    def truncate(self, count: int) -> None:
+        """Forget all submaps but the first ``count``."""
+        del self._submaps[count:]
 
     def load(self, index: int) -> Submap:
         """Return a submap."""
@@ -177,6 +184,12 @@ class FolderStore:
         part.replace(path)
         self._cache_submap(len(self), submap)
         self.digests.append(zlib.crc32(content))
+
+    def truncate(self, count: int) -> None:
+        """Forget all but the first ``count``; later ones replace the files."""
+        for index in [index for index in self._cache if index >= count]:
+            self._cache.pop(index, None)
+        del self.digests[count:]
 
     def load(self, index: int) -> Submap:
         """Return a submap, from the cache or its file.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ....arrays import Array
 from ...filters.ekf import EkfSlam
 from ...filters.invariant import InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport
 from ...support import argument_checks, pair_checks
 from ...support.argument_checks import LandmarkIds
+from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from .active_submap import ORIGIN, ActiveSubmap
 from .chain import Chain
 from .closed_submaps import ClosedSubmaps
@@ -116,10 +118,14 @@ class SubmapSlam(SubmapQueries):
         self._rule = ClosingRule.checked(submap_size, heading_limit, extent_limit)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self._folder = None if folder is None else FolderStore(folder)
-        self.reset(initial_pose, initial_pose_std)
+        self._begin(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map, as `EkfSlam.reset`."""
+        with undone_on_error(self.checkpoint()):
+            self._begin(pose, pose_std)
+
+    def _begin(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         if self._folder is not None:
@@ -137,8 +143,9 @@ class SubmapSlam(SubmapQueries):
         motion = argument_checks.pair("odometry", odometry)
         argument_checks.duration(dt)
         self._claim_folder()
-        self._active.filter.predict(motion, dt)
-        self._neighbourhood.predict(motion, dt)
+        with undone_on_error(self.checkpoint(motion=True)):
+            self._active.filter.predict(motion, dt)
+            self._neighbourhood.predict(motion, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -172,6 +179,10 @@ class SubmapSlam(SubmapQueries):
         refuse_link_names(ids)
         argument_checks.refuse_unusable(readings, ids)
         self._claim_folder()
+        with undone_on_error(self.checkpoint()):
+            return self._take(readings, ids)
+
+    def _take(self, readings: Array, ids: list[int]) -> UpdateReport:
         if self._graph.is_overdue:
             self._close()
         report = self._active.filter.update(readings, ids)
@@ -199,8 +210,9 @@ class SubmapSlam(SubmapQueries):
         """
         ids = argument_checks.mapped_identities(landmark_ids, self._graph.index)
         self._claim_folder()
-        self._graph.remove(ids)
-        self._neighbourhood.remove(ids)
+        with undone_on_error(self.checkpoint()):
+            self._graph.remove(ids)
+            self._neighbourhood.remove(ids)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two mapped landmarks being the same, and remove the second.
@@ -223,8 +235,9 @@ class SubmapSlam(SubmapQueries):
         kept, gone = pair_checks.landmark_pairs(pairs, self._graph.index)
         pairs = list(zip(kept, gone, strict=True))
         self._claim_folder()
-        self._graph.merge_pairs(pairs)
-        self._neighbourhood.merge_pairs(pairs)
+        with undone_on_error(self.checkpoint()):
+            self._graph.merge_pairs(pairs)
+            self._neighbourhood.merge_pairs(pairs)
 
     def join(self) -> None:
         """Join the closed submaps, and continue from the result.
@@ -233,7 +246,8 @@ class SubmapSlam(SubmapQueries):
         include all loops closed so far, and later joins begin here.
         """
         if self.closed_count:
-            self._graph.join()
+            with undone_on_error(self._graph.checkpoint()):
+                self._graph.join()
 
     def local_view(self, within: float = 0.0) -> MapView:
         """Return pose and near landmarks of the joined map, at a low cost per step.
@@ -258,9 +272,14 @@ class SubmapSlam(SubmapQueries):
         reach = argument_checks.distance("within", within)
         return self._neighbourhood.view(reach)._replace(whole=self.landmark_ids)
 
-    def view_checkpoint(self) -> Callable[[], None]:
-        """Return what takes back the effects of later calls of :meth:`local_view`."""
-        return self._neighbourhood.checkpoint()
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        return undo_all(
+            self._active.filter.checkpoint(motion=motion),
+            self._neighbourhood.checkpoint(motion=motion),
+            *(() if motion else (self._graph.checkpoint(),)),
+            attributes(self),
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state as arrays, without submaps in a folder.
@@ -281,12 +300,13 @@ class SubmapSlam(SubmapQueries):
         """
         saved = checked_state(state, type(self).__name__, self._active, self._folder)
         neighbourhood = self._neighbourhood.restored(saved.neighbourhood)
-        self._active.filter.load_state_dict(saved.local)
         landmarks, chain, closed = saved.landmarks, saved.chain, saved.closed
-        self._graph = SubmapGraph(landmarks, chain, closed, self._active)
-        self._neighbourhood = neighbourhood
-        if isinstance(closed.store, FolderStore):
-            self._folder = closed.store
+        with undone_on_error(self.checkpoint()):
+            self._active.filter.load_state_dict(saved.local)
+            self._graph = SubmapGraph(landmarks, chain, closed, self._active)
+            self._neighbourhood = neighbourhood
+            if isinstance(closed.store, FolderStore):
+                self._folder = closed.store
 
     def _claim_folder(self) -> None:
         if self._folder is not None:
