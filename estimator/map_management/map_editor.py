@@ -141,16 +141,16 @@ class _MethodEditor:
     def __init__(self, slam: Any) -> None:
         self._slam = slam
         self._is_local = isinstance(slam, SupportsLocalView)
-        has_checkpoint = isinstance(slam, SupportsViewCheckpoint)
-        self._view_checkpoint: Callable[[], Callable[[], None]] = (
-            slam.view_checkpoint if has_checkpoint else lambda: _nothing
-        )
+        self._has_checkpoint = isinstance(slam, SupportsViewCheckpoint)
 
     def map_view(self, within: float = 0.0) -> MapView:
         return self._slam.local_view(within) if self._is_local else view_map(self._slam)
 
     def view_checkpoint(self) -> Callable[[], None]:
-        return self._view_checkpoint()
+        if not self._has_checkpoint:
+            return _nothing
+        undo: Callable[[], None] = self._slam.view_checkpoint()
+        return undo
 
     def remove(self, ids: Sequence[int]) -> None:
         self._slam.remove(ids)
