@@ -104,8 +104,9 @@ class Revisit:
     """Explores while the pose is certain, else returns to the best known landmark.
 
     The return starts when the worst standard deviation of the position exceeds 0.8 of
-    the required accuracy. It ends below half of it, or after 25 steps; then the robot
-    explores for 25 steps in any case. Exploration drives to the nearest goal.
+    the required accuracy. It ends below half of it. After 26 steps it ends in any case:
+    then the robot explores for 26 steps, or until the deviation is below half of the
+    accuracy. Exploration drives to the nearest goal.
     """
 
     def __init__(self) -> None:
@@ -122,8 +123,10 @@ class Revisit:
 
     def _is_uncertain(self, knowledge: AgentKnowledge) -> bool:
         std = math.sqrt(largest_variances(knowledge.belief.pose_covariance[:2, :2]))
-        if std < 0.5 * knowledge.accuracy or self._returning > _PATIENCE:
-            self._returning = 0 if std < 0.5 * knowledge.accuracy else -_PATIENCE
+        if std < 0.5 * knowledge.accuracy:
+            self._returning = 0
+        elif self._returning == _PATIENCE:
+            self._returning = 1 - _PATIENCE
         elif std > 0.8 * knowledge.accuracy or self._returning != 0:
             self._returning += 1
         return self._returning > 0
@@ -152,7 +155,7 @@ class Frontier:
         return _steer_around(knowledge, _nearest(knowledge, unseen))
 
 
-_PATIENCE = 25  # largest number of steps of a return, then steps of exploration
+_PATIENCE = 26  # largest number of steps of a return, then steps of exploration
 
 
 def make_baseline(name: str, scenario: Scenario, rng: np.random.Generator) -> Baseline:

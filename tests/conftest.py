@@ -40,13 +40,47 @@ def pytest_runtestloop():
 _FIRST = ("tests/envs/", "tests/sim_configs/", "src/", "tests/experiments/")
 
 
-def pytest_collection_modifyitems(items):
-    """Move the tests that compile much behind the others."""
+def pytest_collection_modifyitems(config, items):
+    """Move the tests that compile much behind the others; keep the remaining ones."""
     items.sort(key=lambda item: not item.nodeid.startswith(_FIRST))
+    if config.getoption("--remaining"):
+        passed = set(config.cache.get(_PASSED, []))
+        config.hook.pytest_deselected(items=[i for i in items if i.nodeid in passed])
+        items[:] = [item for item in items if item.nodeid not in passed]
+
+
+class Passed:
+    """Write which tests have passed into pytest's cache, for the option --remaining."""
+
+    def __init__(self, config):
+        self.config, self.names = config, []
+
+    def pytest_runtest_logreport(self, report):
+        if report.when == "call" and report.passed:
+            self.names.append(report.nodeid)
+
+    def pytest_sessionfinish(self):
+        self.config.cache.set(_PASSED, self.names)
+
+
+_PASSED = "slamgym/passed"
+
+
+def pytest_configure(config):
+    """Note in the main process what passes, unless only the remaining tests run."""
+    is_worker, has_cache = hasattr(config, "workerinput"), hasattr(config, "cache")
+    if has_cache and not is_worker and not config.getoption("--remaining"):
+        config.pluginmanager.register(Passed(config))
 
 
 def pytest_addoption(parser):
-    """Add how long tests/fuzz goes on."""
+    """Add the choice of the remaining tests, and how long tests/fuzz goes on."""
+    parser.addoption(
+        "--remaining",
+        action="store_true",
+        help="run the tests that have not passed in the last run without this option, "
+        "as those skipped for want of a library that has been installed since",
+    )
     parser.addoption(
         "--fuzz-seconds",
         type=float,

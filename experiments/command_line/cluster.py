@@ -7,6 +7,7 @@ from typing import Any
 
 from .errors import BadInputError
 
+_HERE = "127.0.0.1"  # what starts here listens to this machine only
 _INTERVAL = 1.0  # between looks at the workers of a local cluster [s]
 
 
@@ -50,7 +51,12 @@ def _dask_client(scheduler: str | None, jobs: int | None) -> Any:
     if scheduler is not None:
         return client(scheduler)
     return _with_new_workers(
-        client(n_workers=jobs, threads_per_worker=1, dashboard_address=":0")
+        client(
+            n_workers=jobs,
+            threads_per_worker=1,
+            host=_HERE,
+            dashboard_address=f"{_HERE}:0",
+        )
     )
 
 

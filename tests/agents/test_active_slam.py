@@ -38,7 +38,7 @@ from slamgym.agents.belief_arrays import belief_storage
 from slamgym.agents.coverage_grid import SECTORS, CoverageGrid
 from slamgym.agents.information_reward import effort, map_covariances
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.estimator import EkfSlam, list_estimators
+from slamgym.estimator import Belief, EkfSlam, list_estimators
 from slamgym.sim_configs import drawn_scenario, load_scenario
 
 ID = "slamgym/ActiveSlam-v0"
@@ -150,6 +150,19 @@ def test_touching_a_wall_ends_the_episode():
     assert [step[2] for step in steps] == [False] * 5 + [True]
     assert steps[-1][4]["collision"]
     assert not steps[-1][4]["success"]
+
+
+@pytest.mark.parametrize("steps", [5, 6, 7])
+def test_an_episode_that_ends_by_a_crash_is_not_truncated(steps):
+    env = ActiveSlamEnv("active_easy", steps=steps)
+    many = ActiveSlamVectorEnv(2, "active_easy", steps=steps)
+    env.reset(seed=0)
+    many.reset(seed=[0, 0])
+    for _ in range(min(steps, 6)):  # the robot touches the wall in step 6
+        _, _, *ends, _ = env.step([1.0, 0.0])
+        _, _, *of_many, _ = many.step([(1.0, 0.0)] * 2)
+    assert ends == [steps > 5, steps == 5]
+    assert [each.tolist() for each in of_many] == [[end, end] for end in ends]
 
 
 def test_knowing_every_landmark_ends_the_episode_with_a_reward():
@@ -781,6 +794,61 @@ def test_revisiting_goes_back_to_the_best_landmark_when_unsure():
     action = baseline.act(env.knowledge)
     assert action[0] == 0  # turns round on the spot
     assert abs(action[1]) == 1
+
+
+@pytest.fixture
+def returns():
+    """Return what tells of each step whether a new `Revisit` returns to a landmark.
+
+    The best known landmark is behind the robot, and the only goal ahead of it. The
+    steps are given by the worst standard deviation of the position, as a share of the
+    required accuracy.
+    """
+    env = ActiveSlamEnv("active_easy")
+    env.reset(seed=0)
+    mean = np.array([0.0, 0.0, 0.0, -2.0, 0.0, 3.0, 0.0])
+    known = np.array([True, False])
+    explored = np.ones(len(env.task.grid.cells), dtype=bool)
+    baseline = make_baseline("revisit", env.scenario, np.random.default_rng(0))
+    count = iter(range(1000))
+
+    def steps(*shares):
+        for share in shares:
+            spread = np.diag([0.01, share**2, 4.0, 0.01, 0.01, 1.0, 1.0])
+            belief = Belief(mean, spread, (0, 1))
+            speed, turn = baseline.act(
+                env.knowledge._replace(
+                    belief=belief,
+                    known=known,
+                    explored=explored,
+                    accuracy=1.0,
+                    step=next(count),
+                )
+            )
+            assert (speed > 0) != (turn != 0)  # ahead, or round on the spot
+            yield bool(turn)
+
+    return lambda *shares: list(steps(*shares))
+
+
+def test_a_return_begins_above_four_fifths_of_the_accuracy_and_ends_below_half(returns):
+    assert returns(0.0, 0.6, 0.79, 0.8) == [False] * 4
+    assert returns(0.81, 0.6, 0.51, 0.5) == [True] * 4
+    assert returns(0.49, 0.6, 0.79) == [False] * 3
+    assert returns(0.81, 0.49, 0.81) == [True, False, True]
+
+
+@pytest.mark.parametrize("share", [0.6, 0.9])
+def test_a_return_in_vain_ends_and_the_robot_explores_for_a_while(returns, share):
+    assert returns(0.9, *[share] * 25) == [True] * 26
+    assert returns(*[share] * 26) == [False] * 26
+    assert returns(share) == [share > 0.8]
+    assert returns(0.9, *[0.9] * 24) == [True] * 25
+
+
+def test_certainty_ends_the_exploration_that_follows_a_return_in_vain(returns):
+    assert returns(*[0.9] * 28) == [True] * 26 + [False] * 2
+    assert returns(0.49, 0.9) == [False, True]
 
 
 def test_an_unknown_baseline_is_refused_with_the_nearest_name():

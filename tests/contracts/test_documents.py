@@ -1,8 +1,11 @@
 """What the documents say is so: their code runs, their commands work, links resolve."""
 
+import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -185,14 +188,57 @@ def test_pictures_in_documents_are_small():
         assert picture.stat().st_size < limit, picture.name
 
 
-def test_ci_types_the_commands_of_the_readme():
-    ci = (ROOT / ".ci" / "run").read_text().splitlines()
-    set_up = README.split("## Set-up")[1].split("\n## ")[0]
-    test = README.split("## Test")[1].split("\n## ")[0]
-    typed = [*commands(set_up), *commands(test)]
-    assert len(typed) == 2
-    for line in typed:  # "set -e" overlooks a failure before the last "&&"
-        assert f"{line} || exit 1" in ci
+def test_ci_types_the_lines_of_the_readme_before_all_else():
+    ci = (ROOT / ".ci" / "run").read_text()
+    function = re.search(r"^readme_line\(\) .*?^}$", ci, re.M | re.S)[0]
+    for section in ("Set-up", "Test"):
+        (line,) = commands(README.split(f"\n## {section}\n")[1].split("\n## ")[0])
+        read = f"{function}\nreadme_line {section}"
+        typed = subprocess.run(["bash", "-c", read], cwd=ROOT, stdout=-1, check=True)
+        assert typed.stdout.decode().splitlines() == [line]
+    step = r'step "the README\'s \w+ line: [^"]+"\n'
+    first, second = (
+        re.escape(f'eval "$(readme_line {s})" || exit 1\n') for s in ("Set-up", "Test")
+    )
+    check = r"\[\[ .* \]\]\n"
+    both = re.search(rf"{step}{first}{check}\n{step}{second}", ci)
+    before = ci[: both.start()]
+    assert not re.search(r"\bpip3? |\buv |apt-get|export", before)
+    assert re.search(r"^unset .*\bPIP_CONSTRAINT\b", before, re.M)
+
+
+TESTS_OF_A_LIBRARY = """
+import os
+import pytest
+
+def test_always(): pass
+
+@pytest.mark.skipif("LIBRARY" not in os.environ, reason="needs a library")
+def test_with_the_library(): pass
+
+def test_that_fails(): assert "MENDED" in os.environ
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", ["0", "2"])
+def test_the_remaining_tests_are_those_that_have_not_passed(workers, tmp_path):
+    def passed(*options, **environment):
+        command = [sys.executable, "-m", "pytest", "-v", "-n", workers, *options]
+        options = {"cwd": tmp_path, "env": {**os.environ, **environment}}
+        done = subprocess.run(command, **options, stdout=-1, check=False)
+        tests = r"PASSED.* test_it.py::(\w+)|test_it.py::(\w+) PASSED"
+        return {"".join(names) for names in re.findall(tests, done.stdout.decode())}
+
+    shutil.copy(ROOT / "tests" / "conftest.py", tmp_path)
+    (tmp_path / "test_it.py").write_text(TESTS_OF_A_LIBRARY)
+    assert passed() == {"test_always"}
+    assert passed("--remaining") == set()
+    assert passed("--remaining", LIBRARY="1") == {"test_with_the_library"}
+    both = {"test_with_the_library", "test_that_fails"}
+    assert passed("--remaining", LIBRARY="1", MENDED="1") == both
+    assert passed(LIBRARY="1", MENDED="1") == {"test_always", *both}
+    assert passed("--remaining") == set()
 
 
 def test_contributing_lists_the_checks_of_ci():

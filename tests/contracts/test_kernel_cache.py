@@ -20,6 +20,7 @@ from slamgym.code_fingerprint import (
     UnknownValueError,
     code_fingerprint,
 )
+from slamgym.estimator import list_peers
 from slamgym.jit import fma, jit
 
 CALLER = """
@@ -319,18 +320,29 @@ def test_a_kernel_with_a_value_of_an_unknown_kind_is_not_kept(tmp_path, monkeypa
     assert [file.suffix for file in tmp_path.iterdir()] == [".nbc"]
 
 
-def kernels_of_the_package():
+def modules_of_the_package():
+    """Yield the modules of the package, without those of libraries not installed."""
+    optional = {peer.library for peer in list_peers()}
     for module in walk_packages(slamgym.__path__, "slamgym."):
         if module.name.startswith(
             tuple(
                 f"slamgym.{p}." for p in ("envs", "estimator", "evaluation", "agents")
             )
         ):
-            for value in vars(import_module(module.name)).values():
-                if getattr(getattr(value, "py_func", None), "__module__", "") == (
-                    module.name
-                ):
-                    yield value
+            try:
+                yield import_module(module.name)
+            except ModuleNotFoundError as missing:
+                if missing.name not in optional:
+                    raise
+
+
+def kernels_of_the_package():
+    for module in modules_of_the_package():
+        for value in vars(module).values():
+            if getattr(getattr(value, "py_func", None), "__module__", "") == (
+                module.__name__
+            ):
+                yield value
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, VectorWrapper
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import slamgym  # noqa: F401 (registers the environments)
@@ -95,6 +95,25 @@ def test_flat_worlds_have_flat_terminal_observations(sb3):
     for info in infos:
         assert info["terminal_observation"].shape == (20,)
         assert info["TimeLimit.truncated"] is True
+
+
+class Ending(VectorWrapper):
+    """Says of three worlds, when they are cut off, that two of them terminate."""
+
+    def step(self, actions):
+        observations, rewards, _, truncated, infos = self.env.step(actions)
+        terminated = truncated & [False, True, True]
+        return observations, rewards, terminated, truncated & [True, False, True], infos
+
+
+@pytest.mark.slow
+def test_a_world_that_terminates_in_its_last_step_is_not_truncated(sb3):
+    vector = to_stable_baselines(Ending(native(steps=2)))
+    vector.reset()
+    vector.step(np.zeros((3, 2)))
+    _, _, dones, infos = vector.step(np.zeros((3, 2)))
+    assert dones.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == [True, False, False]
 
 
 @pytest.mark.slow

@@ -1,16 +1,48 @@
 """A saved state that cannot be is refused, and leaves the filter as it was."""
 
 import copy
+import pickle
 
+import forked
 import numpy as np
 import pytest
+from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator import list_estimators, make_estimator
+from slamgym.estimator.map_management.field_of_view import FieldOfView
 from slamgym.estimator.smoother.smoothing_slam import SmoothingSlam
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
 READINGS = np.array([[0.1, 4.0], [-0.7, 3.0], [1.4, 5.0], [-2.0, 2.0]])
 KINDS = [*list_estimators(), "smoother"]
+
+
+CIRCLE = np.array([[0.0, 6.25]])  # the middle of the drive
+RING = CIRCLE + [
+    (r * np.cos(a), r * np.sin(a))
+    for r, count in ((4.0, 7), (8.5, 12))
+    for a in 2 * np.pi * np.arange(count) / count
+]
+TIDY = {
+    "confirm": (2, 4),
+    "view": FieldOfView(5.0),
+    "remove_after": 2,
+    "merge_within": 3.0,
+    "merge_gate": 50.0,
+    "capacity": 9,
+}
+POLICIES = {
+    "none": None,
+    "default": True,
+    "nearest": {"association": "nearest", "backdate": False},
+    "joint": {"association": "joint"},
+    "compatibility": {"association": "compatibility"},
+    "hypotheses": {"association": "hypotheses", "hypotheses": 3},
+    "known_density": {"density": 0.02, "trust_ids": False},
+    "constellations": {"association": "joint", "constellations": True},
+    "tidy": {"association": "nearest", **TIDY},
+    "tidy_hypotheses": {"association": "hypotheses", "hypotheses": 3, **TIDY},
+}
 
 
 def make(name, managed):
@@ -60,6 +92,67 @@ def broken(value):
     if array.ndim == 2 and array.size and array.shape[0] == array.shape[1]:
         yield -np.eye(len(array))
         yield array + np.triu(np.ones_like(array), 1)
+
+
+def scans(steps):
+    """Yield odometry, readings (m, 2) of what is near, and their identities."""
+    rng = np.random.default_rng(1)
+    for odometry, readings, _ in drive(2, steps, landmarks=RING):
+        seen = np.flatnonzero((readings[:, 1] < 5.0) & (rng.random(len(RING)) < 0.8))
+        yield odometry, readings[seen], seen.tolist()
+
+
+def bits(value):
+    array = np.asarray(value)
+    return repr(value) if array.dtype == object else array.tobytes()
+
+
+def follow(slam, some_scans):
+    """Return what a filter reports and remembers step by step, as bytes."""
+    found = []
+    for odometry, readings, ids in some_scans:
+        slam.predict(odometry)
+        report = slam.update(readings, None if hasattr(slam, "policy") else ids)
+        belief = slam.belief()
+        state = {key: bits(value) for key, value in slam.state_dict().items()}
+        found.append((repr(report), belief.mean.tobytes(), state))
+        found.append((belief.covariance.tobytes(), belief.landmark_ids))
+    return found
+
+
+def settled(name, policy):
+    """Return a filter in the middle of a drive, and the rest of its scans."""
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    options = {"submaps": {"submap_size": 6}, "compressed": {"local_size": 4}}
+    if name == "smoother":
+        slam = SmoothingSlam(**noise)
+    else:
+        changes = options.get(name, {})
+        slam = make_estimator(name, **noise, management=policy, **changes)
+    scans_of_all = list(scans(34))
+    follow(slam, scans_of_all[:22])
+    return slam, scans_of_all[22:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "policy"),
+    [*((n, p) for n in list_estimators() for p in POLICIES), ("smoother", "none")],
+)
+def test_a_pickled_filter_continues_bit_for_bit(name, policy):
+    slam, rest = settled(name, POLICIES[policy])
+    twin = pickle.loads(pickle.dumps(slam))
+    assert len(slam.belief().landmark_ids) > 2
+    expected = follow(slam, rest)
+    assert follow(twin, rest) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ekf", "submaps"])
+def test_a_managed_filter_continues_in_another_process(name):
+    slam, rest = settled(name, True)
+    there = forked.result_of(follow, slam, rest)
+    assert there == follow(slam, rest)
 
 
 @pytest.mark.parametrize("managed", [False, True], ids=["plain", "managed"])

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import threading
+from pathlib import Path
 
 import forked
 import jobs_to_kill
@@ -16,7 +17,7 @@ import pytest
 from slamgym.envs.rendering.artists import _title
 from slamgym.estimator import make_estimator
 from slamgym.experiments.command_line.errors import BadInputError
-from slamgym.experiments.command_line.output_folder import output_folder
+from slamgym.experiments.command_line.output_folder import output_folder, write_summary
 from slamgym.experiments.figures.style import new_figure
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.importers.utias import read_utias
@@ -191,6 +192,32 @@ def test_a_full_disk_names_the_folder_and_leaves_what_was_there(tmp_path):
     with full, output_folder(out):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("error", [PermissionError("no"), KeyboardInterrupt()])
+def test_a_folder_that_cannot_be_replaced_is_put_back(error, tmp_path, monkeypatch):
+    out, replace = tmp_path / "out", Path.replace
+
+    def write(text):
+        with output_folder(out) as folder:
+            (folder / "result.txt").write_text(text)
+            write_summary(folder, {})
+
+    def refuse(source, target):
+        if source.suffix == ".partial":
+            raise error
+        return replace(source, target)
+
+    write("old")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", refuse)
+        with pytest.raises(type(error)):
+            write("new")
+    assert (out / "result.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["out"]
+    write("new")
+    assert (out / "result.txt").read_text() == "new"
+    assert os.listdir(tmp_path) == ["out"]
 
 
 def small_data_set(out, progress=None):

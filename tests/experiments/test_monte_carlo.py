@@ -14,6 +14,7 @@ import forked
 import jobs_to_kill
 import netCDF4
 import numpy as np
+import psutil
 import pytest
 import xarray as xr
 
@@ -685,6 +686,25 @@ def test_a_dask_cluster_starts_beside_another_without_a_warning():
             other.listen()
         with connected("dask", None, 1):
             pass
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_listens_to_this_machine_only():
+    distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
+    me = psutil.Process()
+    before = {each.laddr for each in me.net_connections("tcp")}
+    with connected("dask", None, 1):
+        processes = [me, *me.children(recursive=True)]
+        sockets = {
+            each.laddr
+            for process in processes
+            for each in process.net_connections("tcp")
+            if each.status == psutil.CONN_LISTEN
+        } - before
+        link = distributed.default_client().dashboard_link
+    assert any(f":{address.port}/" in link for address in sockets)  # of the dashboard
+    assert len(sockets) >= 4  # and of scheduler and worker
+    assert {address.ip for address in sockets} == {"127.0.0.1"}
 
 
 @pytest.mark.slow
