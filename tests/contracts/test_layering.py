@@ -37,7 +37,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         check_estimator
     """,
     "estimator.large_maps": """
-        sparse_cholesky undo
+        sparse_cholesky
         compressed sparse_information submaps
     """,
     "evaluation": """
