@@ -21,7 +21,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from ..magnitudes import LARGEST, SMALLEST
+from ..arrays import LARGEST, SMALLEST
 from ..suggestions import closest
 
 

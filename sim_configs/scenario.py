@@ -6,8 +6,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from ..arrays import Array
-from ..magnitudes import LARGEST, LARGEST_EPISODE, LARGEST_MAP
+from ..arrays import LARGEST, LARGEST_EPISODE, LARGEST_MAP, Array
 from ..suggestions import closest
 from .controls import CircleSequence, ControlSequence, command_cycle
 from .field_types import Name, Part, Positive, Text, Wall, broken_rule, expect

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from ..magnitudes import LARGEST_RANGE_GROWTH
+from ..arrays import LARGEST_RANGE_GROWTH
 from .field_types import (
     BOUNDED,
     CountOrZero,

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array, BoolArray
-from ...magnitudes import LARGEST
+from ...arrays import LARGEST, Array, BoolArray
 from ..kernels.batch import RunArrays, StepData
 from ..support import argument_checks, saved_states
 from .batch_results import BatchBeliefs

@@ -7,8 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array, IntArray
-from ...magnitudes import LARGEST
+from ...arrays import LARGEST, Array, IntArray
 from ..kernels.belief_arrays import aligned_zeros
 from ..kernels.drive_likelihood import (
     NOISE_WIDTH,

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from ...arrays import Array, IntArray
+from ...arrays import LARGEST, Array, IntArray
 from ...jit import njit_internal
-from ...magnitudes import LARGEST
 from .belief_arrays import BeliefArrays
 from .linearise import linearise
 from .rules import Rules

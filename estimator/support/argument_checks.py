@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...arrays import AnyArray, Array
-from ...magnitudes import LARGEST, LARGEST_RANGE_GROWTH, SMALLEST
+from ...arrays import LARGEST, LARGEST_RANGE_GROWTH, SMALLEST, AnyArray, Array
 from .memory_limit import covariance_bytes
 
 LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]

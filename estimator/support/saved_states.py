@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Array, IntArray
-from ...magnitudes import LARGEST_IN_STATE
+from ...arrays import LARGEST_IN_STATE, Array, IntArray
 from .argument_checks import as_floats, identities
 
 ROUNDING = 1e-9

@@ -114,7 +114,8 @@ def _fit_and_write(
 
 
 def _show(summary: dict[str, Any], place: Path, reporter: "Reporter") -> None:
-    from .noise_fit_tables import advice, comparison_table, noise_table
+    from .noise_fit_tables import advice, noise_table
+    from .noise_fit_tables import noise_comparison_table as comparison_table
     from .tables import heading, written
 
     title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])

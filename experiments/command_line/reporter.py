@@ -113,7 +113,7 @@ class Reporter:
     @contextlib.contextmanager
     def note_if_compiling(self, what: str) -> Iterator[None]:
         """Print a note to standard error, once, if the block compiles kernels."""
-        from ...kernel_cache import on_compilation
+        from ...jit import on_compilation
 
         is_noted = False
 

@@ -15,13 +15,9 @@ import numpy as np
 import pytest
 
 import slamgym
-from slamgym import kernel_cache
-from slamgym.code_fingerprint import (
-    UnknownValueError,
-    code_fingerprint,
-)
+from slamgym import jit as kernel_cache
 from slamgym.estimator import list_peers
-from slamgym.jit import fma, jit
+from slamgym.jit import UnknownValueError, code_fingerprint, fma, jit
 
 CALLER = """
     from callee import twice

@@ -5,8 +5,8 @@ import warnings
 import numpy as np
 import pytest
 
+from slamgym.arrays import LARGEST
 from slamgym.estimator import list_estimators, make_batch, make_estimator
-from slamgym.magnitudes import LARGEST
 
 NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
 

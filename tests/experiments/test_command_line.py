@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from slamgym import kernel_cache
+from slamgym import jit as kernel_cache
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments import figures
 from slamgym.experiments.command_line import (

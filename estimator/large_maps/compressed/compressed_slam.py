@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ....magnitudes import LARGEST
+from ....arrays import LARGEST
 from ...belief import describe_filter
 from ...filters.ekf import EkfSlam
 from ...filters.first_estimates import FirstEstimatesEkfSlam
