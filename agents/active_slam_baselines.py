@@ -24,7 +24,7 @@ from ..arrays import Array
 from ..envs.angles import wrap_angle
 from ..envs.controllers import Waypoints
 from ..sim_configs import Robot, Scenario
-from ..sim_configs.scenario_errors import unknown_choice
+from ..sim_configs.field_types import unknown_choice
 from .agent_knowledge import AgentKnowledge
 from .belief_features import largest_variances, world_bounds
 from .belief_space_planner import GREEDY, MPC, BeliefSpacePlanner

@@ -22,7 +22,7 @@ from ..arrays import AnyArray, Array, BoolArray, IntArray
 from ..estimator.filters.batch_results import BatchStorage
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..jit import jit, njit_internal
-from ..sim_configs.scenario_errors import unknown_choice
+from ..sim_configs.field_types import unknown_choice
 from .belief_kernels import (
     correlation_jit,
     on_log_scale_jit,

@@ -6,8 +6,8 @@ import numpy as np
 from gymnasium import spaces
 
 from ..sim_configs import Scenario
-from ..sim_configs.drawn_scenarios import widest_scenario
 from ..sim_configs.layouts import possible_positions
+from ..sim_configs.scenario_files import widest_scenario
 from .sensors.heavy_tails import MANY_STD, largest_noise
 
 

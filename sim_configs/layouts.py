@@ -13,10 +13,10 @@ from .field_types import (
     Part,
     Point,
     Positive,
+    ScenarioError,
     Seed,
     broken_rule,
 )
-from .scenario_errors import ScenarioError
 
 TRIES_PER_LANDMARK = 2000
 

@@ -1,23 +1,91 @@
 """The complete description of a simulated world, as one immutable value."""
 
+import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from ..arrays import LARGEST, LARGEST_EPISODE, LARGEST_MAP, Array
+from ..arrays import LARGEST, LARGEST_EPISODE, LARGEST_MAP, LARGEST_RANGE_GROWTH, Array
 from ..suggestions import closest
 from .controls import CircleSequence, ControlSequence, command_cycle
-from .field_types import Name, Part, Positive, Text, Wall, broken_rule, expect
-from .layouts import LandmarkLayout
-from .randomisation import RANGES, Randomise
-from .scenario_errors import (
+from .field_types import (
+    BOUNDED,
+    CountOrZero,
+    Finite,
+    Flag,
+    MeasurementStd,
+    MotionStd,
+    Name,
+    NotNegative,
+    Part,
+    Pose,
+    PoseStd,
+    Positive,
+    PositiveOrInfinite,
+    Probability,
     ScenarioError,
+    Text,
     UnknownKeywordError,
+    Wall,
+    broken_rule,
     error_lines,
+    expect,
 )
-from .scenario_parts import Faults, Motion, Robot, Sensor, Start
+from .layouts import LandmarkLayout, place_landmarks
+
+# --------------------------------------------------------------------------------------
+# Tables of a scenario: start, robot, motion noise, sensor and faults.
+
+_Degrees = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=True, gt=2),
+    expect("a number > 2, or inf"),
+    BOUNDED,
+]
+
+
+def _leave_out_default(schema: dict[str, Any]) -> None:
+    del schema["default"]  # JSON has no inf
+
+
+class Faults(Part):
+    """Deviations of the world from its other tables; no filter knows of them.
+
+    A scenario without this table has no faults. No other setting changes, so filters
+    assume the nominal noise. Odometry faults act on motion only, not on a robot
+    that is commanded to rest.
+    """
+
+    odometry_scale: Annotated[
+        float,
+        Field(strict=True, allow_inf_nan=False, gt=-1),
+        expect("a finite number > -1"),
+        BOUNDED,
+    ] = Field(
+        default=0.0, description="s: odometry reads (1 + s) d for a distance d [1]"
+    )
+    odometry_turn: Finite = Field(
+        default=0.0, description="added to every turn of the odometry [rad per step]"
+    )
+    bearing_bias: Finite = Field(
+        default=0.0, description="added to every bearing [rad]"
+    )
+    range_bias: Finite = Field(default=0.0, description="added to every range [m]")
+    motion_dof: _Degrees = Field(
+        default=math.inf,
+        description="degrees of freedom of the motion noise, Student's t with scale "
+        "motion.std; inf (the default) for normal noise",
+        json_schema_extra=_leave_out_default,
+    )
+    sensor_dof: _Degrees = Field(
+        default=math.inf,
+        description="degrees of freedom of the sensor noise, Student's t with scale "
+        "sensor.std; inf (the default) for normal noise",
+        json_schema_extra=_leave_out_default,
+    )
+
 
 _NO_FAULTS = Faults()
 _Steps = Annotated[
@@ -25,6 +93,237 @@ _Steps = Annotated[
     Field(strict=True, ge=2),
     expect("an integer >= 2"),
 ]  # Gymnasium's checker refuses an episode that ends at its first step
+
+
+class Motion(Part):
+    """The noise of the motion.
+
+    With ``noise_in = "motion"`` the robot slips and the odometry reports the command.
+    With ``"odometry"`` the robot follows the command and the encoders have the noise.
+    """
+
+    std: MotionStd = Field(
+        description="(σx, σy, σα) per step in the robot's frame [m, m, rad]"
+    )
+    noise_in: Annotated[
+        Literal["motion", "odometry"], expect("'motion' or 'odometry'")
+    ] = Field(default="motion", description="what the noise disturbs")
+    noise_at_rest: Flag = Field(
+        default=True, description="whether a step with the command (0, 0) has noise too"
+    )
+
+    @model_validator(mode="after")
+    def _check_encoders(self) -> Self:
+        if self.noise_in == "odometry" and self.std[1] != 0:
+            raise broken_rule(
+                "std must have σy = 0 with noise_in = 'odometry', since encoders read "
+                f"no sideways motion, got {self.std}"
+            )
+        return self
+
+
+# --------------------------------------------------------------------------------------
+# Ranges in a scenario from which every episode draws a world of its own.
+#
+# Noise is multiplied by factors that are uniform in their logarithm. All other settings
+# are uniform between two ends. The number of landmarks never changes.
+
+_Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+
+Ends = Annotated[
+    tuple[_Finite, _Finite], expect("2 finite numbers, low and high"), BOUNDED
+]
+
+Factors = Annotated[
+    tuple[Positive, Positive], expect("2 finite factors > 0, low and high")
+]
+
+
+_Angle = Annotated[Positive, Field(le=2 * math.pi), expect("a number in (0, 2π] [rad]")]
+_RangeGrowth = Annotated[
+    NotNegative,
+    Field(le=LARGEST_RANGE_GROWTH),
+    expect(f"a number from 0 to {LARGEST_RANGE_GROWTH:g}"),
+]
+
+
+class Sensor(Part):
+    """The bearing-range sensor: its noise, its field of view and its failures."""
+
+    std: MeasurementStd = Field(description="(σβ, σr) of one reading [rad, m]")
+    range_std_per_metre: _RangeGrowth = Field(
+        default=0.0, description="k in σr(r) = σr + k r [m/m]"
+    )
+    min_range: NotNegative = Field(
+        default=0.05, description="nearest visible landmark [m]"
+    )
+    max_range: PositiveOrInfinite = Field(
+        default=math.inf,
+        description="farthest visible landmark [m]; inf (the default) for all",
+        json_schema_extra=_leave_out_default,
+    )
+    field_of_view: _Angle = Field(
+        default=2 * math.pi,
+        description="full angle of view, centred on the heading [rad]",
+    )
+    occlusion: Flag = Field(default=False, description="whether walls hide landmarks")
+    dropout: Probability = Field(
+        default=0.0, description="probability of losing a reading"
+    )
+    clutter: NotNegative = Field(
+        default=0.0, description="mean number of false measurements per step (Poisson)"
+    )
+    max_clutter: CountOrZero = Field(
+        default=0,
+        description="rows reserved for false measurements when identities are hidden",
+    )
+    identities: Flag = Field(
+        default=True,
+        description="whether readings carry landmark identities",
+    )
+
+    @model_validator(mode="after")
+    def _check_reach(self) -> Self:
+        if self.min_range >= self.max_range:
+            raise broken_rule(
+                f"min_range must be < max_range = {self.max_range}, "
+                f"got {self.min_range}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_clutter(self) -> Self:
+        if self.clutter == 0:
+            return self
+        if self.identities or math.isinf(self.max_range):
+            raise broken_rule(
+                "clutter must be 0 unless identities = false and max_range is finite, "
+                f"got {self.clutter}"
+            )
+        if self.max_clutter < self.clutter:
+            raise broken_rule(
+                f"max_clutter must be >= clutter = {self.clutter} "
+                f"(better mean + 4 √mean), got {self.max_clutter}"
+            )
+        return self
+
+
+class Start(Part):
+    """The start pose of the robot and its uncertainty.
+
+    With ``drawn = "truth"`` the true start is drawn around `pose` and a filter starts
+    from `pose`. With ``"estimate"`` the true start is `pose` and the filter's first
+    pose is drawn around it.
+    """
+
+    pose: Pose = Field(default=(0.0, 0.0, 0.0), description="(x, y, θ) [m, m, rad]")
+    std: PoseStd = Field(
+        default=(0.0, 0.0, 0.0),
+        description="standard deviations (σx, σy, σθ) [m, m, rad]",
+    )
+    drawn: Annotated[Literal["truth", "estimate"], expect("'truth' or 'estimate'")] = (
+        Field(
+            default="truth",
+            description="which of the two starts is drawn around `pose`",
+        )
+    )
+
+
+class Tables(Protocol):
+    """The tables of a scenario to which ranges apply."""
+
+    motion: Motion
+    sensor: Sensor
+    start: Start
+    landmarks: LandmarkLayout
+
+
+class Randomise(Part):
+    """The settings that differ from episode to episode, and their ranges.
+
+    A setting without a range keeps its value. `drawn_scenario` draws the scenario of
+    one episode.
+    """
+
+    motion_std: Factors | None = Field(default=None, description="factor on motion.std")
+    measurement_std: Factors | None = Field(
+        default=None, description="factor on sensor.std and sensor.range_std_per_metre"
+    )
+    start_std: Factors | None = Field(default=None, description="factor on start.std")
+    dropout: Ends | None = Field(default=None, description="sensor.dropout")
+    clutter: Ends | None = Field(default=None, description="sensor.clutter")
+    max_range: Ends | None = Field(default=None, description="sensor.max_range [m]")
+    field_of_view: Ends | None = Field(
+        default=None, description="sensor.field_of_view [rad]"
+    )
+    start_x: Ends | None = Field(default=None, description="x of start.pose [m]")
+    start_y: Ends | None = Field(default=None, description="y of start.pose [m]")
+    start_heading: Ends | None = Field(
+        default=None, description="θ of start.pose [rad]"
+    )
+    map_scale: Factors | None = Field(
+        default=None, description="factor that scales the map about its mean"
+    )
+    landmark_shift: NotNegative = Field(
+        default=0.0,
+        description="largest shift of each landmark along x and along y [m]",
+    )
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        for name, ends in self:
+            if isinstance(ends, tuple) and ends[0] > ends[1]:
+                raise broken_rule(f"{name} must have low <= high, got {ends}")
+        return self
+
+    def changes(
+        self,
+        scenario: Tables,
+        shares: Mapping[str, float],
+        directions: Array,
+    ) -> dict[str, Any]:
+        """Compute the changes of a scenario for one point of the ranges.
+
+        Parameters
+        ----------
+        scenario : Scenario
+            The scenario with these ranges.
+        shares : mapping of str to float
+            u in [0, 1] for each of `RANGES`: 0 is the low end, 1 the high end.
+        directions : ndarray, shape (N, 2)
+            Shift of each landmark, in [-1, 1] per axis.
+
+        Returns
+        -------
+        dict
+            For `Scenario.with_changes`.
+        """
+        drawn = {
+            name: _between(ends, share, is_factor=name in _FACTORS)
+            for name, share in shares.items()
+            if (ends := getattr(self, name)) is not None
+        }
+        scale, shift = drawn.get("map_scale", 1.0), self.landmark_shift
+        changes: dict[str, Any] = {
+            "randomise": None,
+            "motion": {
+                "std": _times(scenario.motion.std, drawn.get("motion_std", 1.0))
+            },
+            "sensor": _sensor_changes(scenario.sensor, drawn),
+            "start": _start_changes(scenario.start, drawn),
+        }
+        if scale != 1.0 or shift != 0.0:
+            shifts = shift * directions
+            changes["landmarks"] = _map_changes(scenario.landmarks, scale, shifts)
+        return changes
+
+
+class Robot(Part):
+    """The body of the robot and the limits of its actions."""
+
+    radius: Positive = Field(default=0.2, description="radius of the round body [m]")
+    max_speed: Positive = Field(default=1.0, description="limit of |v| [m/s]")
+    max_turn_rate: Positive = Field(default=1.0, description="limit of |ω| [rad/s]")
 
 
 class Scenario(Part):
@@ -238,3 +537,54 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     return value
+
+
+_FACTORS = ("motion_std", "measurement_std", "start_std", "map_scale")
+
+
+def _between(ends: tuple[float, float], share: float, *, is_factor: bool) -> float:
+    low, high = ends
+    if share in (0.0, 1.0):
+        return high if share else low  # exact
+    if is_factor:
+        return float(low * (high / low) ** share)
+    return low + share * (high - low)
+
+
+def _map_changes(layout: LandmarkLayout, scale: float, shifts: Array) -> dict[str, Any]:
+    if layout.layout == "random" and layout.is_redrawn:
+        corners = np.reshape(layout.bounds, (2, 2))
+        bounds = _scaled(corners, scale).ravel().tolist()
+        return {"bounds": bounds, "min_distance": scale * layout.min_distance}
+    positions = place_landmarks(layout, np.random.default_rng(0))  # draws nothing
+    points = _scaled(positions, scale) + shifts
+    return {"layout": "points", "points": points.tolist()}
+
+
+def _scaled(points: Array, factor: float) -> Array:
+    mean = points.mean(axis=0)
+    scaled: Array = mean + factor * (points - mean)
+    return scaled
+
+
+def _sensor_changes(sensor: Sensor, drawn: dict[str, float]) -> dict[str, Any]:
+    names = ("dropout", "clutter", "max_range", "field_of_view")
+    changes: dict[str, Any] = {name: drawn[name] for name in names if name in drawn}
+    factor = drawn.get("measurement_std", 1.0)
+    growth = factor * sensor.range_std_per_metre
+    return {**changes, "std": _times(sensor.std, factor), "range_std_per_metre": growth}
+
+
+def _start_changes(start: Start, drawn: dict[str, float]) -> dict[str, Any]:
+    names = ("start_x", "start_y", "start_heading")
+    pose = [
+        drawn.get(name, value) for name, value in zip(names, start.pose, strict=True)
+    ]
+    return {"pose": pose, "std": _times(start.std, drawn.get("start_std", 1.0))}
+
+
+def _times(stds: tuple[float, ...], factor: float) -> list[float]:
+    return [factor * std for std in stds]
+
+
+RANGES = tuple(name for name in Randomise.model_fields if name != "landmark_shift")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...sim_configs import Scenario
-from ...sim_configs.scenario_errors import unknown_choice
+from ...sim_configs.field_types import unknown_choice
 from .interface import Controller, VectorController
 from .open_loop import OpenLoop, VectorOpenLoop
 from .planned_path import planned_path

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ...sim_configs import Scenario
-from ...sim_configs.scenario_parts import Sensor
+from ...sim_configs.scenario import Sensor
 from ..angles import wrap_bearings
 from .heavy_tails import largest_noise
 from .line_of_sight import LineOfSight

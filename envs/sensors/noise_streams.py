@@ -14,7 +14,7 @@ import numpy as np
 
 from ...arrays import Array, IntArray, WordArray
 from ...sim_configs import Scenario
-from ...sim_configs.scenario_parts import Sensor
+from ...sim_configs.scenario import Sensor
 from ..streams.draws import draw_normals, draw_uniforms
 from ..streams.episodes import CLUTTER, DROPOUT, MEASUREMENT, MOTION, ORDER
 from .heavy_tails import heavy_tails

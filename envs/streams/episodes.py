@@ -6,9 +6,9 @@ import numpy as np
 
 from ...arrays import Array, ComplexArray, WordArray
 from ...sim_configs import Scenario, place_landmarks
-from ...sim_configs.drawn_scenarios import copied_draw
 from ...sim_configs.layouts import TRIES_PER_LANDMARK, RandomLayout
-from ...sim_configs.randomisation import RANGES
+from ...sim_configs.scenario import RANGES
+from ...sim_configs.scenario_files import copied_draw
 from .draws import draw_normals, draw_uniforms, throw_darts
 
 # the independent streams of an episode: plain integers, which numba takes quickly

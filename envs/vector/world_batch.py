@@ -19,7 +19,7 @@ from ...arrays import (
     WordArray,
 )
 from ...sim_configs import Scenario
-from ...sim_configs.drawn_scenarios import widest_scenario
+from ...sim_configs.scenario_files import widest_scenario
 from ..actions import clipped_actions
 from ..robot.vector_bodies import UnicycleBodies
 from ..sensors.bearing_range import BearingRangeSensor, hide_identities

@@ -11,7 +11,7 @@ from ...arrays import Array
 from ...envs.controllers import Controller
 from ...envs.landmark_world import LandmarkWorldEnv, Observation
 from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.drawn_scenarios import refuse_ranges
+from ...sim_configs.scenario_files import refuse_ranges
 from .events import OdometryRow, Scan
 from .slamlog import SlamLog, numbers
 

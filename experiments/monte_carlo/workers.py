@@ -14,7 +14,7 @@ from joblib import Parallel, effective_n_jobs, parallel_config
 from joblib.parallel import BACKENDS as KNOWN_BACKENDS
 from joblib.parallel import get_active_backend
 
-from ...sim_configs.scenario_errors import unknown_choice
+from ...sim_configs.field_types import unknown_choice
 from ..runs.integers import integer
 
 Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed

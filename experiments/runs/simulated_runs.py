@@ -11,7 +11,7 @@ from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...envs.vector import MixedWorlds, WorldBatch
 from ...estimator.support.memory_limit import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
-from ...sim_configs.drawn_scenarios import refuse_ranges
+from ...sim_configs.scenario_files import refuse_ranges
 
 _EACH_SCAN = ("odometry", "poses")
 _READINGS = ("measurements", "mask", "landmark_ids")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ...envs.controllers import CONTROLLERS
 from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.scenario_errors import unknown_choice
+from ...sim_configs.field_types import unknown_choice
 from ..runs.integers import integer
 from .dataset import is_whole
 from .formats import trajectory_format

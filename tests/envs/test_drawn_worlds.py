@@ -14,8 +14,8 @@ from slamgym.envs.vector import LandmarkWorldVectorEnv
 from slamgym.experiments.logs import record_episode
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import ScenarioError, load_scenario
-from slamgym.sim_configs.drawn_scenarios import copied_draw
-from slamgym.sim_configs.randomisation import RANGES
+from slamgym.sim_configs.scenario import RANGES
+from slamgym.sim_configs.scenario_files import copied_draw
 
 RANGED = {
     "motion_std": [0.5, 2.0],

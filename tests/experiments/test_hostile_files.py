@@ -28,7 +28,7 @@ from slamgym.experiments.trajectories import generate_trajectories
 from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
 from slamgym.sim_configs import load_scenario
 from slamgym.sim_configs.atomic_file import replace_when_written
-from slamgym.sim_configs.scenario_errors import ScenarioError
+from slamgym.sim_configs.field_types import ScenarioError
 from slamgym.sim_configs.scenario_files import scenario_text
 
 DEEP = 100_000

@@ -3,7 +3,7 @@
 import pytest
 
 from slamgym.sim_configs import load_scenario
-from slamgym.sim_configs.scenario_errors import ScenarioError
+from slamgym.sim_configs.field_types import ScenarioError
 
 GRID = {"layout": "grid", "rows": 3, "columns": 2, "spacing": 1.0}
 

@@ -12,7 +12,7 @@ from slamgym.sim_configs import (
     place_landmarks,
     save_scenario,
 )
-from slamgym.sim_configs.randomisation import Randomise
+from slamgym.sim_configs.scenario import Randomise
 
 BASE = load_scenario("dropout")  # a random layout with a seed of its own, finite range
 FACTORS = {

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ....sim_configs import Scenario
-from ....sim_configs.scenario_errors import unknown_choice
+from ....sim_configs.field_types import unknown_choice
 from ..trajectory import Trajectory
 
 FORMATS = {
