@@ -21,8 +21,8 @@ from typing import Protocol
 import numpy as np
 
 from ..arrays import Array
-from ..envs.angles import wrap_angle
 from ..envs.controllers import Waypoints
+from ..envs.robot import wrap_angle
 from ..sim_configs import Robot, Scenario
 from ..sim_configs.field_types import unknown_choice
 from .agent_knowledge import AgentKnowledge

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ..arrays import AnyArray, BoolArray
-from ..envs.vector.episodes import final_infos
+from ..envs.vector.landmark_world_vector import final_infos
 from ..estimator.filters.batch_results import BatchBeliefs
 from .belief_features import belief_features, world_bounds
 from .belief_observation import (

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Array, BoolArray, IndexArray
-from ..envs.angles import wrap_angle
+from ..envs.robot import wrap_angle
 from ..estimator.filters.imagine import imagine
 from ..estimator.kernels.imagine import Imagined
 from .agent_knowledge import AgentKnowledge

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse.csgraph import shortest_path
 
 from ..arrays import Array, BoolArray, ComplexArray
-from ..envs.robot.wall_contacts import wall_distances
+from ..envs.robot import wall_distances
 from ..sim_configs import Scenario
 from .belief_features import world_bounds
 

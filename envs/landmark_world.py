@@ -15,15 +15,13 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, ComplexArray, ImageArray
 from ..sim_configs import Scenario, load_scenario
-from .actions import clipped_action
+from .bearing_range import BearingRangeSensor, hide_identities
+from .noise_streams import NoiseRows, WorldNoise
 from .rendering.episode_renderer import EpisodeRenderer
 from .rendering.render_state import RENDER_MODES, BeliefLike
-from .robot.unicycle_body import UnicycleBody
-from .sensors.bearing_range import BearingRangeSensor, hide_identities
-from .sensors.noise_streams import NoiseRows, WorldNoise
-from .sensors.odometry import OdometrySensor
-from .spaces import action_space, observation_space
-from .streams.episodes import EpisodeStarts, drawn_scenarios, episode_keys
+from .robot import OdometrySensor, UnicycleBody
+from .spaces import action_space, clipped_action, observation_space
+from .streams import EpisodeStarts, drawn_scenarios, episode_keys
 
 Observation = dict[str, Any]
 

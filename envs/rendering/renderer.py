@@ -3,22 +3,24 @@
 The first frame draws everything, later ones only the moving artists (blitting).
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import pyplot
+from matplotlib.artist import Artist
+from matplotlib.backend_bases import Event
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ...arrays import Array, ImageArray
 from ...sim_configs import Scenario
-from .artists import PlainTextFigure
-from .blitting import BlittedFigure
 from .render_state import RENDER_MODES, RenderMode, RenderState
-from .scene import Scene
-
-if TYPE_CHECKING:
-    from .window import Window
-
+from .scene import PlainTextFigure, Scene
 
 _INCHES = 6.0  # side of the figure; its pixels come from the resolution
 
@@ -118,7 +120,7 @@ class WorldRenderer:
         figure: Figure = PlainTextFigure()
         window = None
         if self._mode == "human":
-            from .window import Window  # noqa: PLC0415 (pyplot, for windows only)
+            # MERGED-EMPTY  # noqa: PLC0415 (pyplot, for windows only)
 
             window = Window(self._fps)
             figure = window.figure
@@ -128,3 +130,104 @@ class WorldRenderer:
         figure.set_size_inches(_INCHES, _INCHES)
         scene = Scene(figure, self._scenario, self._landmarks)
         return _Drawing(scene, BlittedFigure(figure, scene.moving), window)
+
+
+# --------------------------------------------------------------------------------------
+# Fast frames of a figure in which only some artists move.
+
+
+class BlittedFigure:
+    """Draws a figure once, then only its moving artists over a copy of the rest.
+
+    Parameters
+    ----------
+    figure : Figure
+        With an Agg canvas, possibly that of a window. On other canvases every frame
+        redraws everything.
+    moving : sequence of Artist
+        Artists that change between frames, drawn in this order above all others.
+    """
+
+    def __init__(self, figure: Figure, moving: Sequence[Artist]) -> None:
+        self._figure = figure
+        self._canvas: Any = figure.canvas  # matplotlib leaves Agg's methods untyped
+        self._moving = tuple(moving)
+        self._still: Any = None
+        self._blits = bool(figure.canvas.supports_blit)
+        for artist in self._moving:
+            artist.set_animated(self._blits)
+        if self._blits:
+            self._canvas.mpl_connect("draw_event", self._keep_still_part)
+
+    def draw(self) -> None:
+        """Draw the present frame, and the still part too if it is outdated."""
+        if self._still is None:
+            self._canvas.draw()  # ends in _keep_still_part
+        else:
+            self._canvas.restore_region(self._still)
+            self._draw_moving()
+
+    def frame(self) -> ImageArray:
+        """Draw and copy the present frame, uint8 (H, W, 3)."""
+        self.draw()
+        pixels = np.asarray(self._canvas.buffer_rgba())
+        copy = np.empty((*pixels.shape[:2], 3), dtype=np.uint8)
+        for colour in range(3):  # six times faster than slicing the three at once
+            copy[..., colour] = pixels[..., colour]
+        return copy
+
+    def outdate(self) -> None:
+        """Redraw the still part in the next frame: a limit or a legend has changed."""
+        self._still = None
+
+    def _keep_still_part(self, event: Event) -> None:
+        ours = event.canvas is self._canvas  # not the canvas of a saved file
+        if ours:
+            self._still = self._canvas.copy_from_bbox(self._figure.bbox)
+            self._draw_moving()
+
+    def _draw_moving(self) -> None:
+        for artist in self._moving:
+            self._figure.draw_artist(artist)
+
+
+# --------------------------------------------------------------------------------------
+# A window of matplotlib that shows an episode.
+
+
+class Window:
+    """A figure on the screen with a limited number of frames per second.
+
+    If matplotlib's backend has no windows, the log has a warning and nothing is shown.
+    A window that the user has closed stays closed.
+    """
+
+    def __init__(self, fps: float) -> None:
+        self.figure: Figure = pyplot.figure(FigureClass=PlainTextFigure)
+        self._seconds_per_frame = 1 / fps
+        self._due = time.monotonic()
+        self._has_screen = bool(self.figure.canvas.required_interactive_framework)
+        if self._has_screen:
+            self.figure.show()
+        else:
+            logging.getLogger(__name__).warning(
+                "matplotlib's backend %r has no windows: mode 'human' shows nothing",
+                pyplot.get_backend(),
+            )
+
+    def refresh(self, blitted: BlittedFigure) -> None:
+        """Show the present frame, then run the event loop until the next one is due."""
+        if not pyplot.fignum_exists(self.figure.number):
+            return
+        blitted.draw()
+        if not self._has_screen:
+            return
+        canvas = self.figure.canvas
+        canvas.blit(self.figure.bbox)
+        now = time.monotonic()
+        self._due = max(self._due + self._seconds_per_frame, now)
+        canvas.start_event_loop(max(self._due - now, 0.001))
+
+    def close(self) -> None:
+        """Close the window and free the figure in pyplot."""
+        pyplot.close(self.figure)

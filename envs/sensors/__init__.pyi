@@ -1,4 +1,4 @@
-from .bearing_range import BearingRangeSensor as BearingRangeSensor
-from .line_of_sight import LineOfSight as LineOfSight
-from .noise_streams import SensorNoiseModel as SensorNoiseModel
-from .odometry import OdometrySensor as OdometrySensor
+from ..bearing_range import BearingRangeSensor as BearingRangeSensor
+from ..bearing_range import LineOfSight as LineOfSight
+from ..noise_streams import SensorNoiseModel as SensorNoiseModel
+from ..robot import OdometrySensor as OdometrySensor

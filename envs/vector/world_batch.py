@@ -20,14 +20,12 @@ from ...arrays import (
 )
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import widest_scenario
-from ..actions import clipped_actions
-from ..robot.vector_bodies import UnicycleBodies
-from ..sensors.bearing_range import BearingRangeSensor, hide_identities
-from ..sensors.odometry import VectorOdometrySensor
-from ..sensors.vector_noise import VectorNoise
-from ..spaces import count_rows
-from ..streams.episodes import EpisodeStarts, episode_keys
-from .drawn_worlds import DrawnWorlds
+from ..bearing_range import BearingRangeSensor, Reach, hide_identities
+from ..landmark_world import LandmarkWorldEnv, Observation
+from ..noise_streams import SensorScales, VectorNoise
+from ..robot import UnicycleBodies, VectorOdometrySensor
+from ..spaces import clipped_actions, count_rows
+from ..streams import EpisodeStarts, drawn_scenarios, episode_keys
 
 Generators = Sequence[np.random.Generator]
 Scan = tuple[Array, BoolArray, IntArray | None]
@@ -297,3 +295,168 @@ def _replaced(old: AnyArray, worlds: IndexArray, value: Any) -> AnyArray:
     new = old.copy()
     new[worlds] = value
     return new
+
+
+# --------------------------------------------------------------------------------------
+# The settings of worlds that draw their own from ranges, as arrays.
+
+Rows = IndexArray | slice | None
+
+
+class DrawnWorlds:
+    """The scenarios that B worlds drew for their episodes.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With ranges.
+    count : int
+        B.
+
+    Attributes
+    ----------
+    scenarios : list of Scenario, length B
+        The present draws.
+    """
+
+    def __init__(self, scenario: Scenario, count: int) -> None:
+        self._family = scenario
+        self.scenarios = [scenario] * count
+        self._motion_std = np.zeros((count, 3))
+        self._reach = Reach(*(np.zeros((count, 1)) for _ in Reach._fields))
+        clutter = np.zeros((count, scenario.sensor.max_clutter))
+        numbers = {name: np.zeros((count, 1)) for name in SensorScales._fields}
+        arrays = {"scale": np.zeros((2, count, 1)), "counts_below": clutter}
+        self._scales = SensorScales(**{**numbers, **arrays})
+
+    def begin(
+        self, worlds: IndexArray, keys: WordArray
+    ) -> tuple[ComplexArray, Array, Array]:
+        """Draw the scenarios of the episodes with these keys, (b, 2), in some worlds.
+
+        Returns
+        -------
+        landmarks, poses, estimates : ndarray, shapes (b, N), (b, 3), (b, 3)
+            See `EpisodeStarts`.
+        """
+        drawn = drawn_scenarios(self._family, keys)
+        for world, scenario in zip(worlds.tolist(), drawn, strict=True):
+            self.scenarios[world] = scenario
+            self._motion_std[world] = scenario.motion.std
+            _set_rows(self._reach, Reach.of(scenario.sensor), world)
+            scales = SensorScales.of(scenario.sensor)
+            self._scales.scale[:, world, 0] = scales.scale[:, 0, 0]
+            below = scales.counts_below if scenario.sensor.clutter else np.inf
+            self._scales.counts_below[world] = below
+            _set_rows(self._scales[1:4], scales[1:4], world)
+            _set_rows(self._scales[5:], scales[5:], world)
+        return _starts(drawn, keys)
+
+    def motion_std(self) -> Array:
+        """Return (σx, σy, σα) of every world, (B, 3) [m, m, rad]."""
+        return self._motion_std
+
+    def sensor_scales(self, worlds: Rows) -> SensorScales:
+        """Return the scales of the noise of some worlds (None: all)."""
+        if worlds is None:
+            return self._scales
+        scale, *others = map(np.asarray, self._scales)
+        return SensorScales(scale[:, worlds], *(array[worlds] for array in others))
+
+    def reach(self, worlds: Rows) -> Reach:
+        """Return the reach of the sensors of some worlds (None: all)."""
+        if worlds is None:
+            return self._reach
+        return Reach(*(np.asarray(array)[worlds] for array in self._reach))
+
+
+def _set_rows(arrays: Sequence[object], values: Sequence[object], world: int) -> None:
+    """Write the values of a world; no limit is an infinite one."""
+    for array, value in zip(arrays, values, strict=True):
+        assert isinstance(array, np.ndarray)
+        array[world] = np.inf if value is None else value
+
+
+def _starts(
+    scenarios: list[Scenario], keys: WordArray
+) -> tuple[ComplexArray, Array, Array]:
+    landmarks, poses, estimates = [], [], []
+    for row, scenario in enumerate(scenarios):
+        starts, key = EpisodeStarts(scenario), keys[row : row + 1]
+        landmarks.append(starts.landmarks(key)[0])
+        pose, estimate = starts.poses(key)
+        poses.append(pose[0])
+        estimates.append(estimate[0])
+    return np.array(landmarks), np.array(poses), np.array(estimates)
+
+
+# --------------------------------------------------------------------------------------
+# Worlds of different scenarios with the interface of `WorldBatch`.
+
+
+class MixedWorlds:
+    """B single worlds of different scenarios, stepped one after the other.
+
+    All have equally many landmarks. Either all hide identities or none.
+
+    Parameters
+    ----------
+    scenarios : sequence of Scenario, length B
+        The scenario of each world.
+
+    Attributes
+    ----------
+    measurements, mask, odometry, poses, collisions, landmark_ids : ndarray
+        As in `WorldBatch`, new arrays after every step.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> scenario = load_scenario("six_landmarks")
+    >>> other = scenario.with_changes(start={"pose": [1.0, 0.0, 0.0]})
+    >>> worlds = MixedWorlds([scenario, other])
+    >>> worlds.reset([np.random.default_rng(seed) for seed in (0, 1)])
+    >>> worlds.start_estimates[:, 0]
+    array([0., 1.])
+    """
+
+    def __init__(self, scenarios: Sequence[Scenario]) -> None:
+        self._worlds = [LandmarkWorldEnv(scenario) for scenario in scenarios]
+
+    @property
+    def landmarks(self) -> Array:
+        """True positions, shape (B, N, 2) [m], a copy."""
+        return np.array([world.landmarks for world in self._worlds])
+
+    @property
+    def start_estimates(self) -> Array:
+        """Start poses for filters, shape (B, 3) [m, m, rad], a copy."""
+        return np.array([world.start_estimate for world in self._worlds])
+
+    def reset(self, generators: Sequence[np.random.Generator]) -> None:
+        """Start an episode in every world; see `WorldBatch.reset`."""
+        outputs = []
+        for world, generator in zip(self._worlds, generators, strict=True):
+            world.np_random = generator
+            outputs.append(world.reset())
+        self._stack(outputs)
+
+    def step(self, actions: Array) -> None:
+        """Drive and turn for one step; see `WorldBatch.step`."""
+        outputs = []
+        for world, action in zip(self._worlds, actions, strict=True):
+            observation, *_, info = world.step(action)
+            outputs.append((observation, info))
+        self._stack(outputs)
+
+    def _stack(self, outputs: list[tuple[Observation, dict[str, object]]]) -> None:
+        """Stack the observations and infos of the worlds."""
+        seen, infos = zip(*outputs, strict=True)
+        self.measurements = np.array([each["landmarks"] for each in seen])
+        self.mask = np.array([each["mask"] for each in seen])
+        self.odometry = np.array([each["odometry"] for each in seen])
+        self.poses = np.array([each["pose"] for each in infos])
+        self.collisions = np.array([each["collision"] for each in infos])
+        self.landmark_ids: IntArray | None = None
+        if "landmark_ids" in infos[0]:
+            self.landmark_ids = np.array([each["landmark_ids"] for each in infos])

@@ -13,7 +13,7 @@ from PIL import Image
 
 from ...arrays import Array
 from ...envs.rendering import BlittedFigure
-from ...envs.rendering.artists import ELLIPSE_HANDLER
+from ...envs.rendering.scene import ELLIPSE_HANDLER
 from ...sim_configs.atomic_file import replace_when_written
 from ..runs.trace import RunTrace
 from .map_picture import MapPicture, map_limits, pose_stride

@@ -17,7 +17,7 @@ from matplotlib.text import Text
 
 from ...arrays import Array
 from ...envs.rendering import covariance_ellipses
-from ...envs.rendering.artists import ELLIPSE_HANDLER, PlainTextFigure
+from ...envs.rendering.scene import ELLIPSE_HANDLER, PlainTextFigure
 from ...sim_configs.atomic_file import replace_when_written
 
 INK, GREY, PALE = "#1b1f24", "#6b737c", "#e8eaed"

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from ...arrays import Array
-from ...envs.rendering.artists import WALL
+from ...envs.rendering.scene import WALL
 
 Walls = Sequence[Sequence[float]]
 """Rows (x0, y0, x1, y1) [m]."""

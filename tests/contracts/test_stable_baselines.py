@@ -27,7 +27,7 @@ def native(count=3, mode=AutoresetMode.SAME_STEP, **changes):
 
 def test_without_stable_baselines_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "stable_baselines3.common.vec_env", None)
-    module = importlib.import_module("slamgym.envs.vector.stable_baselines")
+    module = importlib.import_module("slamgym.envs.vector.wrappers")
     module._adapter_class.cache_clear()
     with pytest.raises(ImportError, match="pip install stable-baselines3"):
         to_stable_baselines(native())

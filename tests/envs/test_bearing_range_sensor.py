@@ -4,16 +4,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from slamgym.envs.angles import wrap_bearings
-from slamgym.envs.sensors.bearing_range import (
-    BearingRangeSensor,
-    hide_identities,
-)
-from slamgym.envs.sensors.line_of_sight import LineOfSight
-from slamgym.envs.sensors.noise_streams import (
-    WorldNoise,
-)
-from slamgym.envs.streams.episodes import episode_keys
+from slamgym.envs.bearing_range import BearingRangeSensor, LineOfSight, hide_identities
+from slamgym.envs.noise_streams import WorldNoise
+from slamgym.envs.robot import wrap_bearings
+from slamgym.envs.streams import episode_keys
 from slamgym.sim_configs import load_scenario
 
 BASE = load_scenario("six_landmarks").with_changes(
@@ -359,7 +353,7 @@ def test_hidden_identities_without_clutter_reserve_no_rows():
 
 def test_the_length_of_a_block_changes_nothing(monkeypatch):
     def rows(steps):
-        monkeypatch.setattr("slamgym.envs.sensors.noise_streams._FIRST_BLOCK", steps)
+        monkeypatch.setattr("slamgym.envs.noise_streams._FIRST_BLOCK", steps)
         scenario = HIDDEN.with_changes(sensor={"dropout": 0.2})
         noise = WorldNoise(scenario).sensor_rows(key_of(0))
         return [next(noise) for _ in range(40)]

@@ -9,7 +9,7 @@ import pytest
 
 from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.streams.episodes import drawn_scenarios, episode_keys
+from slamgym.envs.streams import drawn_scenarios, episode_keys
 from slamgym.envs.vector import LandmarkWorldVectorEnv
 from slamgym.experiments.logs import record_episode
 from slamgym.experiments.runs.simulated_runs import simulate_runs

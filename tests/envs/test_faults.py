@@ -6,7 +6,7 @@ from gymnasium.utils import seeding
 from scipy.stats import norm, t
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.sensors.heavy_tails import heavy_tails, largest_noise
+from slamgym.envs.noise_streams import heavy_tails, largest_noise
 from slamgym.envs.vector import WorldBatch
 from slamgym.sim_configs import action_sequence, load_scenario
 

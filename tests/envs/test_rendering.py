@@ -11,11 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 
+from slamgym.envs.bearing_range import LineOfSight
 from slamgym.envs.rendering import RenderState, WorldRenderer
-from slamgym.envs.rendering.axes_limits import AxesLimits
-from slamgym.envs.rendering.clock import Clock
-from slamgym.envs.rendering.visible_area import visible_area
-from slamgym.envs.sensors.line_of_sight import LineOfSight
+from slamgym.envs.rendering.render_state import AxesLimits, visible_area
+from slamgym.envs.rendering.scene import Clock
 from slamgym.sim_configs import action_sequence, load_scenario
 
 LANDMARKS = np.array([[3.0, 6.0], [3.0, 12.0], [7.0, 8.0], [7.0, 14.0], [11.0, 6.0]])

@@ -9,9 +9,13 @@ import pytest
 from numpy_streams import NAMES, normals, philox, uniforms
 from scipy import stats
 
-from slamgym.envs.streams import episodes
-from slamgym.envs.streams.draws import draw_normals, draw_uniforms
-from slamgym.envs.streams.episodes import EpisodeStarts, episode_keys
+from slamgym.envs import streams as episodes
+from slamgym.envs.streams import (
+    EpisodeStarts,
+    draw_normals,
+    draw_uniforms,
+    episode_keys,
+)
 from slamgym.sim_configs import load_scenario, place_landmarks
 
 CROWDED = load_scenario("active_medium").with_changes(

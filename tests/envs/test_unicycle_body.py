@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from slamgym.envs.robot.unicycle_body import UnicycleBody
+from slamgym.envs.robot import UnicycleBody
 
 SKIN = 1e-6
 RADIUS = 0.3

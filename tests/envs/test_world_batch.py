@@ -9,7 +9,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.robot.wall_contacts import WallContacts
+from slamgym.envs.robot import WallContacts
 from slamgym.envs.vector import WorldBatch
 from slamgym.sim_configs import list_presets, load_scenario
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from slamgym.envs.sensors.line_of_sight import LineOfSight
+from slamgym.envs.bearing_range import LineOfSight
 from slamgym.estimator import (
     BatchBeliefs,
     RobocentricEkfSlam,

@@ -14,7 +14,7 @@ import jobs_to_kill
 import matplotlib as mpl
 import pytest
 
-from slamgym.envs.rendering.artists import _title
+from slamgym.envs.rendering.scene import _title
 from slamgym.estimator import make_estimator
 from slamgym.experiments.command_line.errors import BadInputError
 from slamgym.experiments.command_line.output_folder import output_folder, write_summary

@@ -7,7 +7,7 @@ from numpy_belief_features import belief_features, marginals_of
 
 from slamgym.agents.coverage_grid import SECTORS, CoverageGrid
 from slamgym.agents.information_reward import effort, landmark_prior_std, uncertainty
-from slamgym.envs.sensors.bearing_range import BearingRangeSensor
+from slamgym.envs.bearing_range import BearingRangeSensor
 
 DIRECTIONS = np.exp(2j * np.pi * np.arange(SECTORS) / SECTORS)
 TIE = 1e-9  # distances [m] and variances [m²] no farther apart count as equal

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ....arrays import Array, BoolArray
-from ....envs.robot.wall_contacts import wall_distances
+from ....envs.robot import wall_distances
 from ....evaluation.error_bound import PosteriorBound, posterior_bound
 from ....evaluation.noise_sums import noise_sums
 from ....sim_configs import Scenario

@@ -12,12 +12,18 @@ from typing import Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from ...arrays import Array, IntArray, WordArray
-from ...sim_configs import Scenario
-from ...sim_configs.scenario import Sensor
-from ..streams.draws import draw_normals, draw_uniforms
-from ..streams.episodes import CLUTTER, DROPOUT, MEASUREMENT, MOTION, ORDER
-from .heavy_tails import heavy_tails
+from ..arrays import Array, BoolArray, IndexArray, IntArray, WordArray
+from ..sim_configs import Scenario
+from ..sim_configs.scenario import Sensor
+from .streams import (
+    CLUTTER,
+    DROPOUT,
+    MEASUREMENT,
+    MOTION,
+    ORDER,
+    draw_normals,
+    draw_uniforms,
+)
 
 Row = TypeVar("Row")
 
@@ -294,3 +300,104 @@ def _poisson_cdf(mean: float, largest: int) -> Array:
         return np.empty(0)
     logs = [k * math.log(mean) - mean - math.lgamma(k + 1) for k in range(largest)]
     return np.cumsum(np.exp(logs))
+
+
+# --------------------------------------------------------------------------------------
+# Noise of many worlds, each with the numbers of a single world with its key.
+
+
+class VectorNoise:
+    """Draws the noise of B worlds, step by step.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario of every world.
+    count : int
+        B.
+    """
+
+    def __init__(self, scenario: Scenario, count: int) -> None:
+        self._noise = WorldNoise(scenario)
+        self._keys = np.zeros((count, 2), dtype=np.uint64)
+        self._steps = np.zeros(count, dtype=np.int64)
+
+    def begin(self, worlds: IndexArray, keys: WordArray) -> None:
+        """Begin the episodes with these keys, (b, 2), in some worlds, (b,).
+
+        The start, step 0, has sensor noise but no motion noise.
+        """
+        self._keys[worlds] = keys
+        self._steps[worlds] = 0
+
+    def advance(self, moving: BoolArray | None) -> None:
+        """Go to the next step in the worlds that move (None: all)."""
+        self._steps += 1 if moving is None else moving
+
+    def motion(self, std: Array | None = None) -> Array:
+        """Return (εx, εy, εα) of this step, shape (B, 3) [m, m, rad].
+
+        `std`, (B, 3), holds where worlds differ.
+        """
+        return self._noise.motion(self._keys, self._steps, std)
+
+    def sensor(
+        self, worlds: IndexArray | slice | None, scales: SensorScales | None = None
+    ) -> SensorNoise:
+        """Return the sensor noise of this step in some worlds (None: all)."""
+        keys, steps = self._keys, self._steps
+        if worlds is not None:
+            keys, steps = keys[worlds], steps[worlds]
+        return self._noise.sensor(keys, steps, scales)
+
+
+# --------------------------------------------------------------------------------------
+# Heavy tails: normal noise turned into Student's t, number by number.
+#
+# The transformation keeps the rank of every number, so a world with heavy tails uses
+# the random numbers of the same world without them.
+
+MANY_STD = 10.0
+"""Bound of normal noise in standard deviations; the probability beyond is 1e-23."""
+
+
+def heavy_tails(unit: Array, degrees: float) -> Array:
+    """Turn standard normal numbers into numbers of Student's t distribution.
+
+    ::
+
+        t = F⁻¹(Φ(u)),   F the distribution function of Student's t
+
+    The core keeps the scale of u, so the variance is degrees / (degrees - 2).
+
+    Parameters
+    ----------
+    unit : ndarray
+        u, standard normal.
+    degrees : float
+        Degrees of freedom, > 2; inf returns `unit` unchanged.
+
+    Examples
+    --------
+    >>> heavy_tails(np.array([-1.0, 0.0, 3.0]), 4.0).round(3)
+    array([-1.142,  0.   ,  6.62 ])
+    >>> heavy_tails(np.array([3.0]), np.inf)
+    array([3.])
+    """
+    if math.isinf(degrees):
+        return unit
+    from scipy.special import ndtr, stdtrit  # noqa: PLC0415 (slow to import)
+
+    tail: Array = stdtrit(degrees, ndtr(-np.abs(unit)))  # exact far out, unlike 1 - p
+    return np.copysign(tail, unit)
+
+
+def largest_noise(degrees: float) -> float:
+    """Return the bound of such noise, in the units of `unit`.
+
+    Examples
+    --------
+    >>> largest_noise(np.inf)
+    10.0
+    """
+    return float(heavy_tails(np.array(MANY_STD), degrees))

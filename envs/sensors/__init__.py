@@ -1,5 +1,0 @@
-"""What the robot measures: odometry, bearings and ranges, and their noise."""
-
-from lazy_loader import attach_stub
-
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -1,1 +1,0 @@
-"""Random numbers by position: any number of any stream of an episode, in any order."""
