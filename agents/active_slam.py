@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 from ..arrays import BoolArray
 from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
-from ..estimator.filters.batch import can_batch
-from ..estimator.filters.batch_results import BatchStorage
+from ..estimator.filters.batch import BatchStorage, can_batch
 from ..estimator.filters.ekf import EkfSlam
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, split_settings

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.kernels.in_view import View
-from ..estimator.kernels.log_det import half_log_det, largest_variance
+from ..estimator.kernels.imagine import View
+from ..estimator.kernels.kalman_gain import half_log_det, largest_variance
 from ..jit import jit, njit_internal
 from .belief_kernels import FeatureArrays, write_belief_features
 from .floor_kernels import (

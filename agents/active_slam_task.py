@@ -11,7 +11,7 @@ from gymnasium.spaces.utils import flatten_space
 from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, BoolArray
-from ..estimator.filters.batch_results import BatchStorage
+from ..estimator.filters.batch import BatchStorage
 from ..sim_configs import Scenario
 from .active_slam_kernels import Episodes, StepOutcome, advance
 from .belief_features import belief_space, empty_features

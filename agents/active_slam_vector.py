@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, BoolArray
 from ..envs.vector import LandmarkWorldVectorEnv
-from ..estimator.filters.batch_results import BatchBeliefs
+from ..estimator.filters.batch import BatchBeliefs
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, split_settings
 from .association_record import AssociationRecord

@@ -5,8 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..arrays import AnyArray, BoolArray
-from ..estimator.filters.batch import BatchSlam
-from ..estimator.filters.batch_results import BatchStorage
+from ..estimator.filters.batch import BatchSlam, BatchStorage
 from ..estimator.filters.ekf import EkfSlam
 from .estimator_choice import BeliefOfMap
 

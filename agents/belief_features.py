@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array
 from ..envs.controllers import planned_path
-from ..estimator.filters.batch_results import BatchStorage
+from ..estimator.filters.batch import BatchStorage
 from ..sim_configs import Scenario
 from ..sim_configs.layouts import possible_positions
 from .belief_kernels import write_features

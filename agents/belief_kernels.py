@@ -6,7 +6,7 @@ Symbols are those of `belief_features`.
 import math
 
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.kernels.log_det import largest_variance
+from ..estimator.kernels.kalman_gain import largest_variance
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..jit import jit, njit_internal
 

@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from ..arrays import AnyArray
 from ..envs import LandmarkWorldEnv
-from ..estimator.filters.batch_results import BatchBeliefs, BatchStorage
+from ..estimator.filters.batch import BatchBeliefs, BatchStorage
 from ..estimator.support import argument_checks
 from ..sim_configs import Scenario
 from .belief_arrays import belief_storage

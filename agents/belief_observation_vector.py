@@ -10,7 +10,7 @@ from gymnasium.vector.utils import batch_space
 
 from ..arrays import AnyArray, BoolArray
 from ..envs.vector.landmark_world_vector import final_infos
-from ..estimator.filters.batch_results import BatchBeliefs
+from ..estimator.filters.batch import BatchBeliefs
 from .belief_features import belief_features, world_bounds
 from .belief_observation import (
     count_landmark_rows,

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import Array, BoolArray, ComplexArray
-from ..estimator.kernels.in_view import as_view
+from ..estimator.kernels.imagine import as_view
 from ..sim_configs import Scenario
 from .belief_features import Bounds, world_bounds
 from .floor_kernels import SECTORS, cells_in_view

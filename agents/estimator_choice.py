@@ -20,8 +20,8 @@ from ..estimator.registry import (
     find_estimator,
     make_batch,
     make_estimator,
+    read_label,
 )
-from ..estimator.support.filter_labels import read_label
 from ..sim_configs import Scenario
 
 

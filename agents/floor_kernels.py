@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Array, BoolArray
-from ..estimator.kernels.in_view import View, is_hidden, is_in_view
+from ..estimator.kernels.imagine import View, is_hidden, is_in_view
 from ..jit import fma, jit, njit_internal, njit_reordered
 from .belief_kernels import Rectangle
 

@@ -25,7 +25,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
-from ..estimator.filters.batch_results import BatchBeliefs
+from ..estimator.filters.batch import BatchBeliefs
 from ..sim_configs import Scenario
 from .belief_features import world_bounds
 from .belief_observation import BeliefObservation

@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
-from ..estimator.filters.batch_results import BatchStorage
+from ..estimator.filters.batch import BatchStorage
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..jit import jit, njit_internal
 from ..sim_configs.field_types import unknown_choice

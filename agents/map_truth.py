@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ..arrays import Array, ComplexArray, IntArray
-from ..estimator.filters.batch_results import BatchStorage
+from ..estimator.filters.batch import BatchStorage
 from ..jit import jit
 
 

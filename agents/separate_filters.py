@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import AnyArray, Array, BoolArray
-from ..estimator.filters.batch import BatchSlam
-from ..estimator.filters.batch_results import BatchBeliefs, BatchStorage
+from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage
 from ..sim_configs import Scenario
 from .belief_arrays import belief_storage, update_batch
 from .estimator_choice import (

@@ -27,7 +27,7 @@ from slamgym.estimator import (
 )
 from slamgym.estimator.association.nearest_neighbour import Noise
 from slamgym.estimator.association.scan_assignments import assign_scan
-from slamgym.estimator.belief import MapView
+from slamgym.estimator.interface import MapView
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.evaluation import AssociationScores, score_association
 from slamgym.sim_configs import Scenario, action_sequence, load_scenario

@@ -25,12 +25,14 @@ from rich.table import Table
 from second_core import two_processes
 
 from slamgym.estimator import EkfSlam, make_batch, make_estimator
-from slamgym.estimator.filters.gaussian_map import GaussianMap
-from slamgym.estimator.filters.scan_workspace import workspace_for
-from slamgym.estimator.kernels.belief_arrays import BeliefArrays, aligned_zeros
-from slamgym.estimator.kernels.predict import predict
-from slamgym.estimator.kernels.scan_rows import SLOT, new_ledger
-from slamgym.estimator.kernels.scan_update import update_belief
+from slamgym.estimator.filters.gaussian_map import GaussianMap, workspace_for
+from slamgym.estimator.kernels.kalman_gain import (
+    SLOT,
+    BeliefArrays,
+    aligned_zeros,
+    new_ledger,
+)
+from slamgym.estimator.kernels.scan_update import predict, update_belief
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.05, 0.02, 0.02]), np.array([0.02, 0.08])
 NOISE: dict[str, Any] = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}

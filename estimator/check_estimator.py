@@ -18,8 +18,7 @@ import numpy as np
 
 from ..arrays import Array
 from .interface import Belief, SlamEstimator, UpdateReport
-from .models.angles import wrap_angle
-from .models.bearing_range import predict_measurement
+from .models.bearing_range import predict_measurement, wrap_angle
 from .models.unicycle_motion import predict_pose
 
 __all__ = ["EstimatorContractError", "Finding", "check_estimator"]

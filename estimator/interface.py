@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
-from .belief import Belief, MapView
+from .models.bearing_range import wrap_angle
+from .models.rigid_motion import (
+    ErrorFrame,
+    additive_error,
+    invariant_covariance,
+    invariant_error,
+)
 from .support.undo import Undo
-from .update_report import ScanDecisions, UpdateReport
 
 __all__ = [
     "Belief",
@@ -208,6 +215,184 @@ class SupportsBeliefLimit(Protocol):
     """Largest number of landmarks of a dense belief."""
 
 
+# --------------------------------------------------------------------------------------
+# Beliefs over robot pose and map: a snapshot to keep, and a view to look at.
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Belief:
+    """A Gaussian belief over robot pose and map: a snapshot, safe to keep.
+
+    The state is (x, y, θ, l1x, l1y, …), landmarks in the order of ``landmark_ids``.
+    """
+
+    mean: Array
+    """Shape (3 + 2n,), heading in [-π, π); a column may be given."""
+    covariance: Array
+    """Shape (3 + 2n, 3 + 2n), of the additive error."""
+    landmark_ids: tuple[int, ...]
+    """Given as any sequence or array, kept as a tuple."""
+    frame: ErrorFrame = "additive"
+    """Coordinates in which the filter takes its error to be Gaussian."""
+
+    def __post_init__(self) -> None:
+        mean = np.array(self.mean, dtype=np.float64).ravel()
+        covariance = np.array(self.covariance, dtype=np.float64)
+        ids: Any = self.landmark_ids
+        ids = tuple(ids.tolist() if isinstance(ids, np.ndarray) else ids)
+        object.__setattr__(self, "landmark_ids", ids)
+        size = 3 + 2 * len(ids)
+        if mean.shape != (size,) or covariance.shape != (size, size):
+            raise ValueError(
+                f"a belief with {len(ids)} landmarks has mean ({size},) "
+                f"and covariance ({size}, {size}), got {mean.shape} and "
+                f"{covariance.shape}"
+            )
+        self._chosen(self.frame)
+        mean[2] = wrap_angle(float(mean[2]))
+        mean.flags.writeable = covariance.flags.writeable = False
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "covariance", covariance)
+
+    @classmethod
+    def marginal(
+        cls,
+        mean: Array,
+        covariance: Array,
+        slots: Mapping[int, int],
+        landmark_ids: Sequence[int],
+        frame: ErrorFrame = "additive",
+    ) -> Belief:
+        """Return the belief over the pose and some landmarks of a larger state.
+
+        Parameters
+        ----------
+        mean, covariance : ndarray
+            The state; there may be room behind it.
+        slots : mapping from id to int
+            Place of each landmark in the state: column 3 + 2 slot.
+        landmark_ids : sequence of int
+            The landmarks of the belief, in its order.
+        frame : {"additive", "invariant"}
+            Coordinates in which the filter takes its error to be Gaussian.
+        """
+        firsts = [3 + 2 * slots[i] for i in landmark_ids]
+        columns = [0, 1, 2, *(first + axis for first in firsts for axis in (0, 1))]
+        P = covariance[np.ix_(columns, columns)]
+        return cls(mean[columns], P, tuple(landmark_ids), frame)
+
+    @property
+    def pose(self) -> Array:
+        """(x, y, θ), shape (3,) [m, m, rad]."""
+        return self.mean[:3]
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Shape (3, 3)."""
+        return self.covariance[:3, :3]
+
+    @property
+    def landmarks(self) -> Array:
+        """Positions, shape (n, 2) [m]."""
+        return self.mean[3:].reshape(-1, 2)
+
+    @property
+    def landmark_covariances(self) -> Array:
+        """Marginal covariance of each landmark, shape (n, 2, 2) [m²]."""
+        n = len(self.landmark_ids)
+        blocks = self.covariance[3:, 3:].reshape(n, 2, n, 2)
+        return blocks[np.arange(n), :, np.arange(n), :]
+
+    def error(
+        self, true_pose: ArrayLike, true_landmarks: ArrayLike, frame: str | None = None
+    ) -> Array:
+        """Return the error of this belief against the truth.
+
+        Parameters
+        ----------
+        true_pose : array_like, shape (3,)
+            (x, y, θ) [m, m, rad].
+        true_landmarks : array_like, shape (n, 2)
+            In the order of ``landmark_ids`` [m].
+        frame : {"additive", "invariant"}, optional
+            Error coordinates; the filter's own where not given.
+
+        Returns
+        -------
+        ndarray, shape (3 + 2n,)
+            In the order of the state; its covariance is :meth:`error_covariance` of
+            the same frame.
+        """
+        truth = np.concatenate([np.ravel(true_pose), np.ravel(true_landmarks)])
+        if truth.shape != self.mean.shape:
+            raise ValueError(
+                f"the truth must be a pose (3,) and {len(self.landmark_ids)} landmarks "
+                f"(n, 2), got {np.shape(true_pose)} and {np.shape(true_landmarks)}"
+            )
+        if self._chosen(frame) == "invariant":
+            return invariant_error(truth, self.mean)
+        return additive_error(truth, self.mean)
+
+    def error_covariance(self, frame: str | None = None) -> Array:
+        """Return the covariance (3 + 2n, 3 + 2n) that belongs to :meth:`error`."""
+        if self._chosen(frame) == "invariant":
+            return invariant_covariance(self.mean, self.covariance)
+        return self.covariance
+
+    def __repr__(self) -> str:
+        n = len(self.landmark_ids)
+        return f"Belief of {describe_map(n, self.pose, self.pose_covariance)}"
+
+    def _chosen(self, frame: str | None) -> str:
+        chosen = self.frame if frame is None else frame
+        if chosen not in ("additive", "invariant"):
+            raise ValueError(f"frame must be 'additive' or 'invariant', got {chosen!r}")
+        return chosen
+
+
+class MapView(NamedTuple):
+    """The present belief of a filter, without a copy: not to keep or to change."""
+
+    mean: Array
+    """In the order of the state; there may be room behind it."""
+    covariance: Array
+    """Of the additive error; there may be room behind it."""
+    ids: Sequence[int]
+    """Landmarks in the order of the state."""
+    whole: Sequence[int] | None = None
+    """All landmarks in the map, where the view holds only those around the robot."""
+
+    @property
+    def mapped(self) -> Sequence[int]:
+        """All landmarks in the map, in its order."""
+        return self.ids if self.whole is None else self.whole
+
+    @property
+    def landmarks(self) -> Array:
+        """Positions, shape (n, 2) [m]."""
+        return self.mean[3 : 3 + 2 * len(self.ids)].reshape(-1, 2)
+
+    @property
+    def landmark_covariances(self) -> Array:
+        """Marginal covariance of each landmark, shape (n, 2, 2) [m²]."""
+        columns = np.arange(3, 3 + 2 * len(self.ids)).reshape(-1, 2)
+        return self.covariance[columns[:, :, None], columns[:, None, :]]
+
+
+def describe_map(landmarks: int, pose: Array, pose_covariance: Array) -> str:
+    """Return a pose with its standard deviations and a number of landmarks in words.
+
+    Examples
+    --------
+    >>> describe_map(6, np.array([1.0, 2.0, 0.5]), np.diag([0.01, 0.04, 0.0004]))
+    '6 landmarks, pose (1.000 ± 0.100 m, 2.000 ± 0.200 m, 0.500 ± 0.020 rad)'
+    """
+    std = np.sqrt(pose_covariance.diagonal().clip(0.0))
+    x, y, heading = (f"{p:.3f} ± {s:.3f}" for p, s in zip(pose, std, strict=True))
+    noun = "landmark" if landmarks == 1 else "landmarks"
+    return f"{landmarks} {noun}, pose ({x} m, {y} m, {heading} rad)"
+
+
 _MEMBERS: dict[type, tuple[str, ...]] = {
     SupportsTruth: ("observe_truth",),
     SupportsLocalView: ("local_view",),
@@ -241,3 +426,152 @@ def restore(estimator: SlamEstimator, state: Mapping[str, Any]) -> None:
         estimator.restore(state)
     else:
         estimator.load_state_dict(state)
+
+
+class _HasMarginals(Protocol):
+    @property
+    def landmark_ids(self) -> Sequence[int]: ...
+
+    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief: ...
+
+
+def describe_filter(slam: _HasMarginals) -> str:
+    """Return class, number of landmarks and pose of a filter: its ``__repr__``."""
+    pose = slam.belief([])
+    found = describe_map(len(slam.landmark_ids), pose.pose, pose.pose_covariance)
+    return f"{type(slam).__name__} of {found}"
+
+
+# --------------------------------------------------------------------------------------
+# The report of one update: innovations, NIS, and the outcome of each reading.
+
+
+class ScanDecisions(NamedTuple):
+    """Which landmark each reading of one scan was given to, as decided in the end."""
+
+    row_ids: tuple[int | None, ...]
+    """The landmark of each row; None where the filter did not use the row."""
+    added: tuple[int, ...] = ()
+    """Landmarks that entered the map with this scan; the row of each confirmed it."""
+    removed: tuple[int, ...] = ()
+    """Landmarks that left the map after it."""
+    merged: tuple[tuple[int, int], ...] = ()
+    """Landmarks merged after it, (kept, gone); the second ones left the map."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class UpdateReport:
+    """What one call of :meth:`SlamEstimator.update` did: a snapshot, safe to keep.
+
+    ``innovation`` rows belong to ``associated_ids``; ν and S are those at the prior.
+    """
+
+    nis: float = 0.0
+    """νᵀ S⁻¹ ν, χ² distributed when the filter is consistent."""
+    degrees_of_freedom: int = 0
+    """Of the NIS: twice the number of associated readings."""
+    associated_ids: tuple[int, ...] = ()
+    """Mapped landmarks whose readings corrected the belief."""
+    added_ids: tuple[int, ...] = ()
+    """Landmarks that entered the map."""
+    rejected_ids: tuple[int, ...] = ()
+    """Mapped landmarks whose readings the chi-square gate rejected."""
+    skipped_ids: tuple[int, ...] = ()
+    """Landmarks whose readings are too close to use (range below ``min_range``)."""
+    near_ids: tuple[int, ...] = ()
+    """Mapped landmarks within 10 σ of the robot, where linearising is unsafe."""
+    innovation: Array = field(default_factory=lambda: np.empty((0, 2)))
+    """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
+    factor: Array | Callable[[], Array] = field(
+        default_factory=lambda: np.empty((0, 0))
+    )
+    """L, shape (2m, 2m), lower triangular, L Lᵀ = S; or a function that returns it."""
+    confirmed_ids: tuple[int, ...] = ()
+    """Landmarks that were tentative before: among ``added_ids``, or among those
+    associated where the filter has applied their earlier sightings."""
+    removed_ids: tuple[int, ...] = ()
+    """Landmarks marginalised: missed too often, or beyond the map's capacity."""
+    merged_ids: tuple[tuple[int, int], ...] = ()
+    """Pairs (kept, gone) of landmarks that were merged."""
+    row_ids: tuple[int | None, ...] = ()
+    """The landmark associated with each row of the scan, None for a row without one;
+    empty without landmark management."""
+    tentative_rows: tuple[int, ...] = ()
+    """Rows of the scan associated with a landmark that is not confirmed yet."""
+    ambiguous_rows: tuple[int, ...] = ()
+    """Rows left out: they fit more than one landmark, or their range is too short."""
+
+    @property
+    def innovation_factor(self) -> Array:
+        """L, shape (2m, 2m): L⁻¹ ν is white, in the order β1, r1, β2, r2."""
+        return self.factor() if callable(self.factor) else self.factor
+
+    @property
+    def innovation_covariance(self) -> Array:
+        """S, shape (2m, 2m), of the innovations in the order β1, r1, β2, r2."""
+        factor = self.innovation_factor
+        return factor @ factor.T
+
+    def squared_given_others(self, landmark_id: int) -> float:
+        """Return νᵀ S⁻¹ ν of the reading of a landmark, given the other readings.
+
+        With Λ = S⁻¹ it is (Λν)ᵢᵀ Λᵢᵢ⁻¹ (Λν)ᵢ, i the two rows of the reading.
+
+        Raises
+        ------
+        ValueError
+            If the landmark is not among ``associated_ids``.
+
+        Examples
+        --------
+        >>> report = UpdateReport(
+        ...     associated_ids=(7,), innovation=np.array([[0.2, 1.0]]), factor=np.eye(2)
+        ... )
+        >>> round(report.squared_given_others(7), 2)
+        1.04
+        """
+        place = 2 * self.associated_ids.index(landmark_id)
+        sides = np.zeros((self.innovation.size, 3))
+        sides[:, 0] = self.innovation.ravel()
+        sides[place, 1] = sides[place + 1, 2] = 1.0
+        white = np.linalg.solve(self.innovation_factor, sides)
+        root = white[:, 1:]
+        weighted = root.T @ white[:, 0]
+        return float(weighted @ np.linalg.solve(root.T @ root, weighted))
+
+    def replace(self, **changes: Any) -> UpdateReport:
+        """Return a report with some parts changed.
+
+        Examples
+        --------
+        >>> UpdateReport(nis=1.5, degrees_of_freedom=2).replace(added_ids=(7,))
+        UpdateReport: NIS 1.5 of 2 degrees of freedom, 1 added
+        """
+        parts = {name: getattr(self, name) for name in _PARTS}
+        return UpdateReport(**parts | changes)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, UpdateReport):
+            return NotImplemented
+        return np.array_equal(self.innovation_factor, other.innovation_factor) and all(
+            np.array_equal(getattr(self, name), getattr(other, name))
+            if name == "innovation"
+            else getattr(self, name) == getattr(other, name)
+            for name in _PARTS
+            if name != "factor"
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        counts = {
+            name.partition("_")[0]: len(getattr(self, name))
+            for name in _PARTS
+            if name.endswith(("_ids", "_rows")) and name != "row_ids"
+        }
+        parts = [f"{count} {name}" for name, count in counts.items() if count]
+        nis = f"NIS {self.nis:.3g} of {self.degrees_of_freedom} degrees of freedom"
+        return f"UpdateReport: {', '.join([nis, *parts])}"
+
+
+_PARTS = tuple(part.name for part in fields(UpdateReport))

@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import inspect
 import re
+import tomllib
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from numpy.typing import ArrayLike
 
 from ..suggestions import closest
 from .filters.batch import BatchSlam
-from .filters.ekf import EkfSlam
-from .filters.first_estimates import FirstEstimatesEkfSlam
+from .filters.ekf import (
+    EkfSlam,
+    FirstEstimatesEkfSlam,
+    InvariantEkfSlam,
+    IteratedEkfSlam,
+    ObservabilityConstrainedEkfSlam,
+)
 from .filters.ideal import IdealEkfSlam
-from .filters.invariant import InvariantEkfSlam
-from .filters.iterated import IteratedEkfSlam
-from .filters.observability_constrained import ObservabilityConstrainedEkfSlam
 from .filters.robocentric import RobocentricEkfSlam
 from .filters.unscented import UnscentedSlam
 from .interface import SlamEstimator
 from .peers.catalogue import PEERS
-from .support.filter_labels import read_label
 
 if TYPE_CHECKING:
     from .map_management.policy import LandmarkPolicy
+
 
 EstimatorFactory = Callable[..., SlamEstimator]
 _NOISE = ("motion_std", "measurement_std", "initial_pose", "initial_pose_std")
@@ -299,3 +302,67 @@ _factories |= {
     "submaps": f"{_LARGE}.submaps.submap_slam:SubmapSlam",
 }
 _factories |= {name: peer.path for name, peer in PEERS.items()}
+
+
+# --------------------------------------------------------------------------------------
+# The text that names a filter and its options, as "invariant[iterations=3]".
+
+_LABEL = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>.*)\])?", re.DOTALL)
+_BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")
+
+
+class FilterLabel(NamedTuple):
+    """A filter and its options."""
+
+    name: str
+    """Registered name or "module:Class"."""
+    options: dict[str, Any]
+    """Arguments of its constructor other than the noise."""
+
+
+def read_label(label: str) -> FilterLabel:
+    """Read one filter: a name, and perhaps options as in TOML in brackets.
+
+    A bare word is a string.
+
+    Raises
+    ------
+    ValueError
+        If the text is malformed or names several filters.
+
+    Examples
+    --------
+    >>> read_label("invariant[iterations=3, landmark_init=full]")
+    FilterLabel(name='invariant', options={'iterations': 3, 'landmark_init': 'full'})
+    """
+    match = _LABEL.fullmatch(label.strip())
+    if match is None:
+        raise ValueError(
+            f"an estimator must be like ekf or invariant[iterations=3], got '{label}'"
+        )
+    options = _BARE_WORD.sub(r'\1"\2"', match["options"] or "")
+    try:
+        table = tomllib.loads(f"options = {{ {options} }}")["options"]
+    except (tomllib.TOMLDecodeError, RecursionError):
+        raise ValueError(
+            f"options must be like [iterations=3,sequential=true], got '{label}'"
+        ) from None
+    return FilterLabel(match["name"].strip(), table)
+
+
+def split_labels(labels: str) -> list[str]:
+    """Split a text at its commas outside brackets; empty parts are left out.
+
+    Examples
+    --------
+    >>> split_labels("ekf, invariant[iterations=3,sequential=true]")
+    ['ekf', 'invariant[iterations=3,sequential=true]']
+    """
+    parts, depth = [""], 0
+    for character in labels:
+        depth += {"[": 1, "]": -1}.get(character, 0)
+        if character == "," and depth <= 0:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return [part.strip() for part in parts if part.strip()]

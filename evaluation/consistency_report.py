@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.error_frames import ErrorFrame
+from ..estimator.models.rigid_motion import ErrorFrame
 from ..estimator.support import argument_checks
 from .chi_square import Band
 from .hypothesis_tests import (

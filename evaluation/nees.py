@@ -3,7 +3,7 @@
 NEES = eᵀ P⁻¹ e of an error e with claimed covariance P.  If P is correct, NEES is
 chi-square with as many degrees of freedom as e has entries.  Averages over runs (ANEES)
 are not divided by the dimension unless the name says so.  Every function names the
-frame of its error, additive or invariant (:mod:`slamgym.estimator.error_frames`),
+frame of its error, additive or invariant (:mod:`slamgym.estimator.models.rigid_motion`),
 because the additive NEES rejects even a consistent filter if the heading is uncertain.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from ..arrays import Array
-from ..estimator.error_frames import (
+from ..estimator.models.rigid_motion import (
     ErrorFrame,
     additive_error,
     invariant_covariance,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.models.angles import wrap_angle
+from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.support import argument_checks
 
 CHANNELS = ("along", "sideways", "turn", "bearing", "range")

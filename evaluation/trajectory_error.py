@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
-from ..estimator.models.angles import wrap_angle
+from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.support.argument_checks import as_floats
 
 

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ..kernels.clique_search import compare_pairs, search_clique
+from ..kernels.assignment_search import compare_pairs, search_clique
 from ..support import argument_checks
 from .same_place import Match, TwoPlaces, extended, is_same_place, moved_gaps
 

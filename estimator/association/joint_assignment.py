@@ -25,9 +25,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ..kernels.assignment_search import search_assignments
-from ..kernels.joint_readings import UNPAIRED, Problem, fill_distances, fill_expected
-from ..models.angles import wrap_angle
+from ..kernels.assignment_search import (
+    UNPAIRED,
+    Problem,
+    fill_distances,
+    fill_expected,
+    search_assignments,
+)
+from ..models.bearing_range import wrap_angle
 
 
 class Solutions(NamedTuple):

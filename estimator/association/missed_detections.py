@@ -20,7 +20,7 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit
-from ..belief import MapView
+from ..interface import MapView
 from ..models.bearing_range import reading_slopes_jit, wrap_angle_jit
 from ..support import saved_states
 

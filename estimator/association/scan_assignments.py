@@ -8,8 +8,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from ...arrays import Array, IntArray
-from ..belief import MapView
-from ..kernels.joint_readings import UNPAIRED, Problem, largest_change
+from ..interface import MapView
+from ..kernels.assignment_search import UNPAIRED, Problem, largest_change
 from .association_policy import AssociationPolicy
 from .joint_assignment import best_assignments, innovations_of, predicted_readings
 from .nearest_neighbour import (

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ..belief import MapView
+from ..interface import MapView
 from .association_memory import Candidates, Sensor
 from .association_policy import AssociationPolicy
 from .missed_detections import Detections

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array, BoolArray, IntArray
-from ..models.angles import wrap_angle
+from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import rotation
 from ..support import saved_states
 from .nearest_neighbour import Distances, Noise, innovation_distances

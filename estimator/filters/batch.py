@@ -2,34 +2,157 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array, BoolArray, IntArray
+from ...arrays import LARGEST, Array, BoolArray, IntArray
+from ..interface import Belief
 from ..kernels.batch import (
     NEVER,
+    RunArrays,
     StepData,
+    begin_runs,
     drive_runs,
     step_runs,
 )
-from ..kernels.scan_rows import Workspace
-from ..models.angles import wrap_angle
-from ..support import argument_checks
-from ..support.threads import share_out, usable_cores
-from .batch_arguments import (
-    chosen_runs,
-    first_poses,
-    step_data,
-    step_scans,
-)
-from .batch_beliefs import BatchOfBeliefs
-from .batch_results import BatchTrace
-from .ekf import EkfSlam
-from .map_filter import FRAMES
-from .scan_workspace import workspace_for
+from ..kernels.kalman_gain import Workspace, aligned_zeros
+from ..models.bearing_range import wrap_angle
+from ..models.rigid_motion import ErrorFrame
+from ..support import argument_checks, saved_states
+from ..support.memory_limit import share_out, usable_cores
+from .ekf import FRAMES, EkfSlam
+from .gaussian_map import GaussianMap, workspace_for
+
+# --------------------------------------------------------------------------------------
+# The beliefs of many runs, side by side.
+
+
+class BatchOfBeliefs:
+    """The beliefs of B runs about their poses and up to L landmarks.
+
+    Parameters
+    ----------
+    poses : ndarray, shape (B, 3)
+        Means of the first poses [m, m, rad].
+    std : ndarray, shape (3,)
+        Their standard deviation.
+    landmarks : int
+        L.
+    frame : ErrorFrame
+        Of the filters.
+    """
+
+    def __init__(
+        self, poses: Array, std: Array, landmarks: int, frame: ErrorFrame
+    ) -> None:
+        self.runs, self.landmarks, self._frame = len(poses), landmarks, frame
+        capacity = GaussianMap.capacity_for(landmarks)
+        self._means = np.zeros((self.runs, capacity))
+        self._references = np.zeros((self.runs, capacity))
+        self._covariances = aligned_zeros(self.runs, capacity, capacity)
+        self._slots = np.full((self.runs, landmarks), -1, dtype=np.int64)
+        self._mapped = np.zeros(self.runs, dtype=np.int64)
+        self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
+        """Step of the last :meth:`run` at which a run stopped, -1 if it did not.
+
+        A stopped run remains stopped, at step 0 of every later :meth:`run`.
+        """
+        begin_runs(tuple(self._arrays()), self.failed_at == NEVER, poses.copy(), std**2)
+
+    def reset(
+        self,
+        poses: ArrayLike,
+        pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        runs: ArrayLike | None = None,
+    ) -> None:
+        """Restart runs with empty maps, also those that had stopped.
+
+        Parameters
+        ----------
+        poses : array_like, shape (3,) or (B, 3)
+            Means of the first poses [m, m, rad].
+        pose_std : array_like, shape (3,)
+            Their standard deviation.
+        runs : array_like of bool, shape (B,), optional
+            The runs that start anew; by default all; the others continue.
+        """
+        std = argument_checks.standard_deviations("pose_std", pose_std, 3)
+        first = first_poses("poses", poses, self.runs)
+        chosen = chosen_runs(runs, self.runs)
+        begin_runs(tuple(self._arrays()), chosen, np.array(first), std**2)
+        self.failed_at[chosen] = NEVER
+
+    def beliefs(self) -> BatchBeliefs:
+        """Return a snapshot of all beliefs; a run that stopped has its last."""
+        return self.storage().beliefs()
+
+    def storage(self) -> BatchStorage:
+        """Return the arrays that the runs work on, without a copy.
+
+        They change with the next :meth:`run` or :meth:`reset`.
+        """
+        return BatchStorage.of(self._means, self._covariances, self._slots)
+
+    @property
+    def references(self) -> Array:
+        """Linearisation points, stored like the means, for filters that fix them."""
+        return BatchStorage.of(self._references, self._covariances, self._slots).means
+
+    def load(
+        self,
+        beliefs: BatchBeliefs,
+        *,
+        references: ArrayLike | None = None,
+        runs: ArrayLike | None = None,
+    ) -> None:
+        """Continue runs from given beliefs, also those that had stopped.
+
+        Parameters
+        ----------
+        beliefs : BatchBeliefs
+            Of B runs, as :meth:`beliefs` returns them, or `BatchBeliefs.of` makes them.
+        references : array_like, shape (B, 3 + 2L), optional
+            Linearisation points of filters that fix them; the means by default.
+        runs : array_like of bool, shape (B,), optional
+            All by default.
+
+        Raises
+        ------
+        ValueError
+            If a shape is wrong, or a belief cannot be; nothing is loaded.
+        """
+        chosen = chosen_runs(runs, self.runs)
+        loaded = checked_beliefs(beliefs, references, chosen, self.landmarks)
+        for run in np.flatnonzero(chosen).tolist():
+            loaded.write(run, self._arrays())
+        self.failed_at[chosen] = NEVER
+
+    def belief(self, run: int) -> Belief:
+        """Return the belief of one run as a snapshot."""
+        n = 3 + 2 * int(self._mapped[run])
+        slots = self._slots[run]
+        order = np.argsort(slots[slots >= 0])
+        return Belief(
+            self._means[run, :n],
+            self._covariances[run, :n, :n],
+            tuple(np.flatnonzero(slots >= 0)[order].tolist()),
+            self._frame,
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the beliefs of all runs [bytes]."""
+        return sum(array.nbytes for array in self._arrays())
+
+    def _arrays(self) -> RunArrays:
+        return RunArrays(
+            self._means, self._covariances, self._references, self._slots, self._mapped
+        )
 
 
 class BatchSlam(BatchOfBeliefs):
@@ -224,3 +347,289 @@ def can_batch(estimator: object) -> bool:
 def _of(part: slice, arrays: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return views on some of the runs; a plain tuple, as kernels take it."""
     return tuple(array[part] for array in arrays)
+
+
+# --------------------------------------------------------------------------------------
+# Checks of the arguments of a batch of runs.
+
+
+def step_data(
+    odometry: ArrayLike,
+    measurements: ArrayLike,
+    visible: ArrayLike,
+    dt: ArrayLike,
+    shape: tuple[int, int],
+) -> tuple[StepData, Array]:
+    """Return the data of T steps and their durations (T,), or refuse them.
+
+    ``shape`` is (B, L), the numbers of runs and landmarks.
+    """
+    (count, landmarks), u = shape, argument_checks.as_floats("odometry", odometry)
+    steps = u.shape[1] if u.ndim == 3 else 0
+    z = argument_checks.as_floats("measurements", measurements)
+    seen = np.ascontiguousarray(visible, dtype=np.bool_)
+    for name, array, expected in (
+        ("odometry", u, (count, steps, 2)),
+        ("measurements", z, (count, steps, landmarks, 2)),
+        ("visible", seen, (count, steps, landmarks)),
+    ):
+        if array.shape != expected:
+            raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+    durations = argument_checks.as_floats("dt", dt)
+    if durations.shape not in ((), (1,), (steps,)):
+        raise ValueError(
+            f"dt must be one number or {steps}, got shape {durations.shape}"
+        )
+    durations = np.ascontiguousarray(np.broadcast_to(durations, (steps,)))
+    if not (np.isfinite(durations) & (durations >= 0)).all():
+        raise ValueError(f"dt must be finite numbers >= 0, got {dt!r}")
+    argument_checks.refuse_beyond("dt", durations, dt)
+    return StepData(u, z, seen), durations
+
+
+def step_scans(
+    odometry: ArrayLike,
+    measurements: ArrayLike,
+    visible: ArrayLike,
+    dt: ArrayLike,
+    shape: tuple[int, int],
+) -> tuple[Array, Array, BoolArray, Array]:
+    """Return the data of one step and its durations, or refuse them.
+
+    ``shape`` is (B, L), the numbers of runs and landmarks.
+    """
+    (count, landmarks), u = shape, argument_checks.as_floats("odometry", odometry)
+    z = argument_checks.as_floats("measurements", measurements)
+    seen = np.ascontiguousarray(visible, dtype=np.bool_)
+    durations = argument_checks.as_floats("dt", dt)
+    for name, array, expected in (
+        ("odometry", u, (count, 2)),
+        ("measurements", z, (count, landmarks, 2)),
+        ("visible", seen, (count, landmarks)),
+        ("dt", durations, (count,)),
+    ):
+        if array.shape != expected:
+            raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+    if not (durations.min() >= 0.0 and durations.max() <= LARGEST):
+        raise ValueError(
+            f"dt must be finite numbers >= 0 and at most {LARGEST:g}, got {dt!r}"
+        )
+    return u, z, seen, durations
+
+
+def chosen_runs(runs: ArrayLike | None, count: int) -> BoolArray:
+    """Return which of the runs are chosen, shape (B,); all for None."""
+    if runs is None:
+        return np.ones(count, dtype=np.bool_)
+    chosen = np.asarray(runs)
+    if chosen.shape != (count,) or chosen.dtype != np.bool_:
+        raise ValueError(
+            f"runs must be {count} booleans, got {chosen.dtype} with shape "
+            f"{chosen.shape}"
+        )
+    return chosen
+
+
+class LoadedBeliefs(NamedTuple):
+    """Beliefs that have been checked; arrays as in `BatchBeliefs`."""
+
+    means: Array
+    covariances: Array
+    references: Array
+    mapped: BoolArray
+
+    def write(self, run: int, arrays: RunArrays) -> None:
+        """Replace the belief of a run; its landmarks are stored in order of id."""
+        ids = np.flatnonzero(self.mapped[run])
+        at = [0, 1, 2, *(3 + 2 * i + axis for i in ids.tolist() for axis in (0, 1))]
+        size = len(at)
+        for array in arrays[:3]:
+            array[run] = 0.0
+        arrays.means[run, :size] = self.means[run, at]
+        arrays.references[run, :size] = self.references[run, at]
+        arrays.covariances[run, :size, :size] = self.covariances[run][np.ix_(at, at)]
+        arrays.slots[run] = -1
+        arrays.slots[run, ids] = np.arange(len(ids))
+        arrays.mapped[run] = len(ids)
+
+
+def checked_beliefs(
+    beliefs: BatchBeliefs,
+    references: ArrayLike | None,
+    runs: BoolArray,
+    landmarks: int,
+) -> LoadedBeliefs:
+    """Return beliefs of B runs over L landmarks, or refuse those of the chosen runs."""
+    count, size = len(runs), 3 + 2 * landmarks
+    means = argument_checks.as_floats("beliefs.means", beliefs.means)
+    covariances = argument_checks.as_floats("beliefs.covariances", beliefs.covariances)
+    points = means
+    if references is not None:
+        points = argument_checks.as_floats("references", references)
+    mapped = np.asarray(beliefs.mapped)
+    for name, array, shape in (
+        ("beliefs.means", means, (count, size)),
+        ("beliefs.covariances", covariances, (count, size, size)),
+        ("beliefs.mapped", mapped, (count, landmarks)),
+        ("references", points, (count, size)),
+    ):
+        if array.shape != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    if mapped.dtype != np.bool_:
+        raise ValueError(f"beliefs.mapped must be booleans, got {mapped.dtype}")
+    for run in np.flatnonzero(runs).tolist():
+        problem = _problem(means[run], covariances[run], points[run])
+        if problem:
+            raise ValueError(f"{problem} in run {run}")
+    return LoadedBeliefs(means, covariances, points, mapped)
+
+
+def _problem(mean: Array, covariance: Array, reference: Array) -> str | None:
+    """Return the error of a belief, or None."""
+    for name, array in (
+        ("beliefs.means", mean),
+        ("beliefs.covariances", covariance),
+        ("references", reference),
+    ):
+        if not np.isfinite(array).all():
+            return f"{name} must be finite, but is not"
+    if not np.array_equal(covariance, covariance.T):
+        return "beliefs.covariances must be symmetric, but is not"
+    if not saved_states.is_semidefinite(covariance):
+        least = float(np.linalg.eigvalsh(covariance)[0])
+        return (
+            "beliefs.covariances must be positive semidefinite, but has the "
+            f"eigenvalue {least:.3g}"
+        )
+    return None
+
+
+def first_poses(name: str, poses: ArrayLike, count: int) -> Array:
+    """Return the first pose of every run, shape (B, 3), or refuse them."""
+    first = argument_checks.as_floats(name, poses)
+    if first.shape == (count, 3) and np.abs(first).max() <= LARGEST:
+        return first
+    if first.shape not in ((3,), (count, 3)) or not np.isfinite(first).all():
+        raise ValueError(
+            f"{name} must be finite with shape (3,) or ({count}, 3), "
+            f"got shape {first.shape}"
+        )
+    argument_checks.refuse_beyond(name, first, poses)
+    return np.broadcast_to(first, (count, 3))
+
+
+# --------------------------------------------------------------------------------------
+# What a batch of runs returns: traces, beliefs and views of its arrays.
+
+
+class BatchTrace(NamedTuple):
+    """The belief of every run about its pose, after every step; B runs, T steps."""
+
+    poses: Array
+    """(x, y, θ), shape (B, T, 3) [m, m, rad], heading in [-π, π)."""
+    pose_covariances: Array
+    """Shape (B, T, 3, 3)."""
+    nis: Array
+    """νᵀ S⁻¹ ν of each scan, shape (B, T)."""
+    degrees_of_freedom: IntArray
+    """Of the NIS, shape (B, T)."""
+
+    @classmethod
+    def empty(cls, runs: int, steps: int) -> BatchTrace:
+        """Return a trace of runs that have not begun: nan, and zero degrees."""
+        return cls(
+            np.full((runs, steps, 3), np.nan),
+            np.full((runs, steps, 3, 3), np.nan),
+            np.full((runs, steps), np.nan),
+            np.zeros((runs, steps), dtype=np.int64),
+        )
+
+
+class BatchBeliefs(NamedTuple):
+    """The present belief of every run; the states are (x, y, θ, l0x, l0y, …)."""
+
+    means: Array
+    """Shape (B, 3 + 2L), landmarks by id, zeros where not mapped; θ in [-π, π)."""
+    covariances: Array
+    """Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped."""
+    mapped: BoolArray
+    """Which landmarks are in the map, shape (B, L)."""
+
+    @classmethod
+    def of(cls, beliefs: Sequence[Belief], landmarks: int) -> BatchBeliefs:
+        """Return beliefs of single filters with L landmarks, whose ids are 0 … L−1.
+
+        Raises
+        ------
+        ValueError
+            If a belief has a landmark with another id.
+        """
+        count, size = len(beliefs), 3 + 2 * landmarks
+        means, covariances = np.zeros((count, size)), np.zeros((count, size, size))
+        mapped = np.zeros((count, landmarks), dtype=np.bool_)
+        for run, belief in enumerate(beliefs):
+            ids = belief.landmark_ids
+            if not all(0 <= i < landmarks for i in ids):
+                raise ValueError(
+                    f"landmark ids must be below landmarks = {landmarks}, got {ids}"
+                )
+            at = [0, 1, 2, *(3 + 2 * i + axis for i in ids for axis in (0, 1))]
+            means[run, at], mapped[run, list(ids)] = belief.mean, True
+            covariances[run][np.ix_(at, at)] = belief.covariance
+        return cls(means, covariances, mapped)
+
+    @property
+    def poses(self) -> Array:
+        """(x, y, θ), shape (B, 3) [m, m, rad]."""
+        return self.means[:, :3]
+
+    @property
+    def landmarks(self) -> Array:
+        """Positions, shape (B, L, 2) [m], zeros where not mapped."""
+        return self.means[:, 3:].reshape(len(self.means), -1, 2)
+
+    @property
+    def landmark_covariances(self) -> Array:
+        """Marginal covariance of each landmark, shape (B, L, 2, 2) [m²]."""
+        count = self.mapped.shape[1]
+        blocks = self.covariances[:, 3:, 3:].reshape(-1, count, 2, count, 2)
+        each = np.arange(count)
+        return np.moveaxis(blocks[:, each, :, each, :], 0, 1)
+
+
+class BatchStorage(NamedTuple):
+    """The arrays that hold the beliefs of all runs: live and read-only.
+
+    Entries beyond the mapped landmarks are arbitrary.
+    """
+
+    means: Array
+    """Shape (B, capacity): (x, y, θ), then the landmarks by slot; θ is not wrapped."""
+    covariances: Array
+    """Of the additive error, shape (B, capacity, capacity)."""
+    slots: IntArray
+    """Shape (B, L): landmark i has column 3 + 2 slots[i]; -1 where not mapped."""
+
+    @classmethod
+    def of(cls, means: Array, covariances: Array, slots: IntArray) -> BatchStorage:
+        """Return read-only views of the arrays."""
+        views = means.view(), covariances.view(), slots.view()
+        for view in views:
+            view.flags.writeable = False
+        return cls(*views)
+
+    def beliefs(self) -> BatchBeliefs:
+        """Return the beliefs with the landmarks by id, as a snapshot."""
+        runs, mapped = len(self.slots), self.slots >= 0
+        places = 3 + 2 * np.where(mapped, self.slots, 0)
+        pose = np.broadcast_to(np.arange(3), (runs, 3))
+        pairs = (places[:, :, None] + np.arange(2)).reshape(runs, -1)
+        at = np.concatenate([pose, pairs], axis=1)
+        held = np.ones(at.shape, dtype=np.bool_)
+        held[:, 3:] = np.repeat(mapped, 2, axis=1)
+        row = np.arange(runs)[:, None]
+        means = self.means[row, at] * held
+        covariances = self.covariances[row[:, :, None], at[:, :, None], at[:, None]]
+        covariances *= held[:, :, None] & held[:, None]
+        means[:, 2] = wrap_angle(means[:, 2])
+        return BatchBeliefs(means, covariances, mapped)

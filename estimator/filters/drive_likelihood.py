@@ -8,21 +8,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, Array, IntArray
-from ..kernels.belief_arrays import aligned_zeros
 from ..kernels.drive_likelihood import (
     NOISE_WIDTH,
     DriveEvents,
     DriveRecord,
     follow_drive,
 )
-from ..kernels.scan_rows import SKIPPED
-from ..models.angles import wrap_angle
+from ..kernels.kalman_gain import SKIPPED, aligned_zeros
+from ..models.bearing_range import wrap_angle
 from ..support import argument_checks
-from ..support.threads import share_out, usable_cores
+from ..support.memory_limit import share_out, usable_cores
 from .batch import can_batch
 from .ekf import EkfSlam
-from .gaussian_map import GaussianMap
-from .scan_workspace import workspace_for
+from .gaussian_map import GaussianMap, workspace_for
 
 GATE = 30.0
 """NIS beyond which a reading is rejected: a share e⁻¹⁵ of them if the noise is right.

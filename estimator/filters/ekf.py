@@ -2,32 +2,173 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import ClassVar, NoReturn
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
+from itertools import compress
+from math import inf, log1p
+from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
-from ..kernels.predict import predict
-from ..kernels.rules import ADDITIVE, AT_ESTIMATE, Rules
-from ..kernels.scan_rows import SLOT
-from ..kernels.scan_update import DONE, NOT_USABLE, update_belief
-from ..support import argument_checks
-from ..support.argument_checks import LandmarkIds
-from ..update_report import UpdateReport
-from .filter_settings import checked_rules
-from .gaussian_map import GaussianMap
-from .map_filter import MapFilter
-from .motion_noise import MotionNoise
-from .scan_report import ScanReport
-from .scan_workspace import (
+from ...arrays import Array, IntArray
+from ..interface import Belief, MapView, UpdateReport, describe_filter
+from ..kernels.kalman_gain import (
+    ADDED,
+    ADDITIVE,
+    AT_ESTIMATE,
+    AT_REFERENCE,
+    GATED,
+    INVARIANT,
+    NEAR,
+    OUTCOME,
+    PROJECTED,
+    SKIPPED,
+    SLOT,
+    USED,
+    Rules,
+)
+from ..kernels.scan_update import DONE, NOT_USABLE, ScanRecord, predict, update_belief
+from ..models.rigid_motion import ErrorFrame
+from ..support import argument_checks, saved_states
+from ..support.argument_checks import LandmarkIds, landmark_pairs
+from ..support.memory_limit import covariance_bytes
+from ..support.undo import Undo
+from .gaussian_map import (
+    GaussianMap,
     ScanWorkspace,
     covariances_for,
     not_positive_definite,
 )
 
 UpdateKernel = Callable[..., tuple[int, int, float]]
+
+
+# --------------------------------------------------------------------------------------
+# A filter that keeps its belief in a Gaussian map: belief, saved state, editing.
+
+
+class MapFilter:
+    """A filter without its steps: reset, belief, saved state, map editing."""
+
+    map: GaussianMap
+    """The belief, in the arrays that steps change."""
+    rules: Rules
+    """What distinguishes this filter's updates from another's."""
+
+    __repr__ = describe_filter
+
+    @property
+    def frame(self) -> ErrorFrame:
+        """Coordinates in which the filter takes its error to be Gaussian."""
+        return FRAMES[self.rules.frame]
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run with an empty map.
+
+        Parameters
+        ----------
+        pose : array_like, shape (3,)
+            Mean of the first pose (x, y, θ) [m, m, rad].
+        pose_std : array_like, shape (3,)
+            Its standard deviation.
+        """
+        first = argument_checks.finite_vector("pose", pose, 3)
+        std = argument_checks.standard_deviations("pose_std", pose_std, 3)
+        self.map.reset(first, np.diag(std**2))
+
+    def remove(self, landmark_ids: LandmarkIds) -> None:
+        """Marginalise landmarks; the remaining belief is unchanged to the last bit.
+
+        Raises
+        ------
+        ValueError
+            If one is not in the map; nothing is removed.
+        """
+        self.map.remove(argument_checks.mapped_identities(landmark_ids, self.map.slots))
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Condition on two mapped landmarks being one, and remove the second.
+
+        Raises
+        ------
+        ValueError
+            If one is not in the map, or they are the same.
+        numpy.linalg.LinAlgError
+            If their distance has no uncertainty; nothing is merged.
+        """
+        self.merge_pairs([(kept, gone)])
+
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Merge several pairs (kept, gone) at once, as one measurement.
+
+        Raises
+        ------
+        ValueError
+            If a landmark is not in the map, or in two pairs.
+        numpy.linalg.LinAlgError
+            If a distance has no uncertainty; nothing is merged.
+        """
+        kept, gone = landmark_pairs(pairs, self.map.slots)
+        at_reference = self.rules.linearisation != AT_ESTIMATE
+        self.map.merge(kept, gone, frame=self.frame, at_reference=at_reference)
+
+    def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
+        """Return the belief as a snapshot, of the whole map or of a part of it.
+
+        Parameters
+        ----------
+        landmark_ids : sequence of int, optional
+            Return the marginal of the pose and these landmarks only, in this order.
+        """
+        if landmark_ids is not None:
+            landmark_ids = argument_checks.mapped_identities(
+                landmark_ids, self.map.slots
+            )
+        return self.map.belief(self.frame, landmark_ids)
+
+    def map_view(self) -> MapView:
+        """Return pose and map without a copy; it is valid until the next step."""
+        return self.map.view()
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return tuple(self.map.slots)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of mean, covariance, ids and linearisation points."""
+        return {"estimator": np.array(type(self).__name__), **self.map.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state, bit for bit in a filter of the same settings.
+
+        Parameters
+        ----------
+        state : mapping
+            What :meth:`state_dict` returned, also after a trip through ``numpy.savez``.
+
+        Raises
+        ------
+        ValueError
+            If the state lacks an entry, is of another estimator, or does not fit
+            together; the belief is then as before.
+        """
+        entries = ("covariance", "landmark_ids", "mean", "reference")
+        saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
+        self.map.load_state_dict(state)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that this process has saved, without checks."""
+        self.map.restore(state)
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        return self.map.checkpoint(motion=motion)
+
+    def memory_for(self, landmarks: int) -> int:
+        """Return the least memory of a map with this many landmarks [bytes]."""
+        return self.map.copies * covariance_bytes(landmarks)
 
 
 class EkfSlam(MapFilter):
@@ -230,3 +371,348 @@ class EkfSlam(MapFilter):
             argument_checks.refuse_unusable(readings, ids)
         failed = self._workspace.failed_reading(status, len(ids))
         raise not_positive_definite(ids[failed])
+
+
+# --------------------------------------------------------------------------------------
+# The right-invariant EKF-SLAM, which stays consistent if the heading is uncertain.
+
+
+class InvariantEkfSlam(EkfSlam):
+    """Right-invariant EKF, the recommended filter.
+
+    The error ξ = Log(χ χ̂⁻¹) is on SE_{1+n}(2).  A rotation of the whole map is a
+    straight line in it, so the filter gains no information about its absolute heading,
+    however often it linearises [1]_ [2]_.  Mean and covariance are stored in ordinary
+    coordinates.  Up to the gain, the filter equals the standard one.  With
+    δ = Aᵀ L⁻¹ ν, t = δθ and J = [0 −1; 1 0], for the position and every landmark q::
+
+        retraction   q ← R(t) q + V(t) (δq − t J q),   θ ← θ + t
+        transport    P ← P + v cᵀ + c vᵀ + c_θ v vᵀ,   v = J (q⁺ − q), c = P e_θ
+
+    Propagation costs O(n), and the additive covariance is always available.
+
+    Parameters
+    ----------
+    motion_std, measurement_std
+        As in :class:`EkfSlam`.
+    iterations : int
+        Number of linearisations of a scan, with the same prior; more than one for
+        coarse sensors.  The heading column of H remains that of the prior, because the
+        exact Gauss-Newton column would make the heading observable.
+    sequential : bool
+        Process one landmark after the other instead of the whole scan at once, for
+        heading errors of half a radian and more.  The order of readings then matters.
+    **settings
+        The other keywords of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] A. Barrau, S. Bonnabel, An EKF-SLAM algorithm with consistency properties,
+       arXiv 1510.06263, 2015.
+    .. [2] T. Zhang, K. Wu, J. Song, S. Huang, G. Dissanayake, Convergence and
+       consistency analysis for a 3-D invariant-EKF SLAM, RA-L 2017.
+
+    Examples
+    --------
+    A robot at rest gains no information about its heading:
+
+    >>> slam = InvariantEkfSlam((0, 0, 0), (0.03, 0.1), initial_pose_std=(0, 0, 0.3))
+    >>> for _ in range(100):
+    ...     _ = slam.update([(0.5, 4.0)], [0])
+    >>> round(float(slam.belief().pose_covariance[2, 2]) ** 0.5, 12)
+    0.3
+    """
+
+    _frame: ClassVar[int] = INVARIANT
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        iterations: int = 1,
+        sequential: bool = False,
+        **settings: Any,
+    ) -> None:
+        super().__init__(motion_std, measurement_std, **settings)
+        rules = self.rules._replace(
+            iterations=argument_checks.whole("iterations", iterations, 1),
+            sequential=argument_checks.flag("sequential", sequential),
+        )
+        self._adopt(rules)
+
+
+# --------------------------------------------------------------------------------------
+# The first-estimates EKF-SLAM: Jacobians at fixed linearisation points.
+
+
+class FirstEstimatesEkfSlam(EkfSlam):
+    """First-estimates-Jacobian EKF: the standard filter, linearised at fixed points.
+
+    The Jacobians are evaluated at the first estimate of each landmark and at the
+    predicted pose, even if later estimates are better [1]_::
+
+        G = I + (−(ŷ⁻ₖ₊₁ − ŷ⁻ₖ), x̂⁻ₖ₊₁ − x̂⁻ₖ, 0, …) e_θᵀ,   x̂⁻ predicted
+        H = ∂h at (x̂⁻ₖ, first l̂)
+
+    No row of the stacked observability matrix then observes the rotation of the whole
+    map, and the heading gains no spurious information.  Poor first estimates are kept,
+    so some runs diverge with coarse sensors.
+
+    Parameters are those of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] G. Huang, A. Mourikis, S. Roumeliotis, Observability-based rules for
+       designing consistent EKF SLAM estimators, IJRR 29(5), 2010.
+    """
+
+    _linearisation: ClassVar[int] = AT_REFERENCE
+
+
+# --------------------------------------------------------------------------------------
+# The observability-constrained EKF-SLAM: projected Jacobians.
+
+
+class ObservabilityConstrainedEkfSlam(EkfSlam):
+    """Observability-constrained EKF: Jacobians at the latest estimate, projected.
+
+    H is evaluated at the latest estimate.  The projection removes its component along
+    w, the rotation of the whole map at the first estimates of the landmarks [1]_ [2]_::
+
+        H ← H − (H w) wᵀ / wᵀw
+
+    G is that of :class:`FirstEstimatesEkfSlam`.
+
+    Parameters are those of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] G. Huang, A. Mourikis, S. Roumeliotis, Observability-based rules for
+       designing consistent EKF SLAM estimators, IJRR 29(5), 2010.
+    .. [2] J. Hesch, D. Kottas, S. Bowman, S. Roumeliotis, Consistency analysis and
+       improvement of vision-aided inertial navigation, IEEE T-RO 30(1), 2014.
+    """
+
+    _linearisation: ClassVar[int] = PROJECTED
+
+
+# --------------------------------------------------------------------------------------
+# The iterated EKF-SLAM: Gauss-Newton inside the update.
+
+
+class IteratedEkfSlam(EkfSlam):
+    """Iterated EKF: linearise again at each iterate, condition once.
+
+    The update is the Gauss-Newton method on one scan and its prior [1]_::
+
+        x_{i+1} = x_0 + K_i (z − h(x_i) − H_i (x_0 − x_i)),   x_0, P the prior
+        P ← (I − K H) P with the last H
+
+    Every iteration uses the same prior, so the result of a linear problem is exact
+    for any number of iterations.  The filter suits precise sensors with strongly
+    nonlinear measurements.  Its heading is as overconfident as that of ``ekf``.
+
+    Parameters
+    ----------
+    motion_std, measurement_std
+        As in :class:`EkfSlam`.
+    iterations : int
+        Linearisations per scan; 1 is the standard filter.
+    **settings
+        The other keywords of :class:`EkfSlam`.
+
+    References
+    ----------
+    .. [1] B. Bell, F. Cathey, The iterated Kalman filter update as a Gauss-Newton
+       method, IEEE TAC 38(2), 1993.
+    """
+
+    def __init__(
+        self,
+        motion_std: ArrayLike,
+        measurement_std: ArrayLike,
+        *,
+        iterations: int = 3,
+        **settings: Any,
+    ) -> None:
+        super().__init__(motion_std, measurement_std, **settings)
+        count = argument_checks.whole("iterations", iterations, 1)
+        self._adopt(self.rules._replace(iterations=count))
+
+
+FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
+
+
+# --------------------------------------------------------------------------------------
+# The settings of a filter, checked and converted to rules for kernels.
+
+
+def checked_rules(
+    measurement_std: ArrayLike,
+    *,
+    linearisation: int,
+    frame: int,
+    landmark_init: str,
+    range_std_per_metre: float,
+    bearing_std_metres: float = 0.0,
+    range_noise_at: str,
+    gate_probability: float | None,
+    min_range: float,
+) -> Rules:
+    """Return the rules of an update, from the arguments of :class:`.ekf.EkfSlam`."""
+    sensor = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
+    argument_checks.one_of("landmark_init", landmark_init, ("full", "independent"))
+    argument_checks.one_of("range_noise_at", range_noise_at, ("expected", "reading"))
+    return Rules(
+        linearisation=linearisation,
+        frame=frame,
+        correlated=landmark_init == "full",
+        bearing_std=float(sensor[0]),
+        range_std=float(sensor[1]),
+        range_std_per_metre=argument_checks.range_growth(range_std_per_metre),
+        min_range=argument_checks.positive("min_range", min_range),
+        gate=_gate(gate_probability),
+        noise_as_read=range_noise_at == "reading",
+        bearing_std_metres=argument_checks.at_least(
+            "bearing_std_metres", bearing_std_metres, 0.0
+        ),
+    )
+
+
+def reading_variances(rules: Rules, ranges: Array) -> Array:
+    """Return (σβ², σr²) of readings at these ranges [m], shape (m, 2)."""
+    range_std = rules.range_std + rules.range_std_per_metre * ranges
+    away = np.maximum(ranges, rules.min_range)
+    bearing_std = rules.bearing_std + rules.bearing_std_metres / away
+    return np.column_stack([bearing_std, range_std]) ** 2
+
+
+def _gate(probability: float | None) -> float:
+    """Return the χ²(2) quantile of the gate."""
+    if probability is None:
+        return inf
+    if not (isinstance(probability, float) and 0 < probability < 1):
+        raise ValueError(
+            f"gate_probability must lie between 0 and 1, got {probability!r}"
+        )
+    return -2 * log1p(-probability)  # P(χ²₂ > g) = e^{−g/2}
+
+
+# --------------------------------------------------------------------------------------
+# The motion noise of a filter, which may depend on whether the robot moves.
+
+
+class MotionNoise(NamedTuple):
+    """Variances of the motion noise, and whether it acts on a robot at rest."""
+
+    variance: Array
+    """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
+    at_rest: bool = True
+    """False: odometry of exactly (0, 0) adds no noise."""
+
+    @classmethod
+    def checked(cls, motion_std: ArrayLike, noise_at_rest: bool) -> MotionNoise:
+        """Return the noise of these standard deviations (3,), or refuse them."""
+        std = argument_checks.standard_deviations("motion_std", motion_std, 3)
+        at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
+        return cls(std**2, at_rest)
+
+    def over(self, distance: float, turn: float, dt: float) -> Array:
+        """Return the variances (3,) of one odometry reading over dt steps.
+
+        Raises
+        ------
+        ValueError
+            If dt is no number, negative, or too large.
+        """
+        if type(dt) is float and dt == 1.0 and self.at_rest:
+            return self.variance
+        dt = argument_checks.duration(dt)
+        if not (self.at_rest or distance or turn):
+            return self.variance * 0.0
+        return self.variance * dt
+
+
+# --------------------------------------------------------------------------------------
+# The report of an update on the shared kernels; its parts are computed on request.
+
+
+class ScanReport(UpdateReport):
+    """The results of one scan, from the arrays that its kernel has left; a snapshot.
+
+    Parameters
+    ----------
+    nis : float
+        νᵀ S⁻¹ ν.
+    ids : list of int
+        Landmark of each reading.
+    copies : tuple of ndarray
+        The parts of a :class:`ScanRecord`.
+    sequential : bool
+        Whether readings were linearised one after the other.
+    """
+
+    _ids: list[int]
+    _copies: tuple[Array, IntArray]
+    _sequential: bool
+
+    def __init__(
+        self,
+        nis: float,
+        ids: list[int],
+        copies: tuple[Array, IntArray],
+        *,
+        sequential: bool,
+    ) -> None:
+        parts = self.__dict__
+        parts["nis"], parts["_ids"] = nis, ids
+        parts["_copies"], parts["_sequential"] = copies, sequential
+
+    @property
+    def _record(self) -> ScanRecord:
+        return ScanRecord(*self._copies)
+
+    @cached_property
+    def degrees_of_freedom(self) -> int:
+        """Of the NIS: twice the number of associated readings."""
+        return len(self._record.rows)
+
+    @cached_property
+    def associated_ids(self) -> tuple[int, ...]:
+        """Mapped landmarks whose readings corrected the belief."""
+        return self._with_outcome(USED)
+
+    @cached_property
+    def added_ids(self) -> tuple[int, ...]:
+        """Landmarks that entered the map."""
+        return self._with_outcome(ADDED)
+
+    @cached_property
+    def rejected_ids(self) -> tuple[int, ...]:
+        """Mapped landmarks whose readings the chi-square gate rejected."""
+        return self._with_outcome(GATED)
+
+    @cached_property
+    def skipped_ids(self) -> tuple[int, ...]:
+        """Landmarks whose readings are too close to use."""
+        return self._with_outcome(SKIPPED)
+
+    @cached_property
+    def near_ids(self) -> tuple[int, ...]:
+        """Mapped landmarks within 10 σ of the robot."""
+        return tuple(compress(self._ids, self._record.ledger[NEAR].tolist()))
+
+    @cached_property
+    def innovation(self) -> Array:
+        """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
+        return self._record.innovation
+
+    @property
+    def factor(self) -> Callable[[], Array]:
+        """The function that returns L, shape (2m, 2m), L Lᵀ = S."""
+        return partial(self._record.joint_factor, sequential=self._sequential)
+
+    def _with_outcome(self, outcome: int) -> tuple[int, ...]:
+        chosen = self._record.ledger[OUTCOME] == outcome
+        return tuple(compress(self._ids, chosen.tolist()))

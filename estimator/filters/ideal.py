@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array
 from ..interface import UpdateReport
-from ..kernels.belief_arrays import BeliefArrays
-from ..kernels.rules import AT_ESTIMATE, AT_TRUTH
+from ..kernels.kalman_gain import AT_ESTIMATE, AT_TRUTH, BeliefArrays
 from ..models.rigid_motion import pose_rotation
 from ..models.unicycle_motion import drive
 from ..support import argument_checks, saved_states

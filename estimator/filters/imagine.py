@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ..kernels.imagine import Imagined, imagine_plans
-from ..kernels.in_view import as_view
-from ..kernels.rules import AFTER_STDS, FIRST_STD
+from ..kernels.imagine import Imagined, as_view, imagine_plans
+from ..kernels.kalman_gain import AFTER_STDS, FIRST_STD
 from ..support import argument_checks
 from .batch import BatchSlam, can_batch
 from .ekf import EkfSlam
-from .scan_workspace import workspace_for
+from .gaussian_map import workspace_for
 
 
 class SensorLimits(Protocol):

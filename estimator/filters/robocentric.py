@@ -10,13 +10,12 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array
 from ...jit import jit, njit_internal
-from ..belief import Belief, MapView
-from ..kernels.scan_rows import SLOT
+from ..interface import Belief, MapView, UpdateReport
+from ..kernels.kalman_gain import SLOT
 from ..kernels.scan_update import DONE, update_belief
+from ..models.rigid_motion import as_covariance
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
-from ..support.symmetric import as_covariance
-from ..update_report import UpdateReport
 from .ekf import EkfSlam
 
 # The state that the kernels see, in the robot's frame at the last scan: the motion

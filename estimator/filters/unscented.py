@@ -9,14 +9,13 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, BoolArray, IntArray
 from ..interface import UpdateReport
-from ..models.angles import wrap_angle
+from ..models.bearing_range import wrap_angle
 from ..models.unicycle_motion import drive
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.undo import undone_on_error
-from .ekf import EkfSlam
-from .filter_settings import reading_variances
-from .scan_workspace import not_positive_definite
+from .ekf import EkfSlam, reading_variances
+from .gaussian_map import not_positive_definite
 
 
 class UnscentedSlam(EkfSlam):

@@ -5,11 +5,20 @@ search tree decides the reading ``order[d]``.  The expected readings given the p
 far stand at ``level[d]`` of ``shifts`` and ``joints``.
 """
 
+from __future__ import annotations
+
+from typing import NamedTuple
+
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
-from .joint_readings import PAIR_BONUS, UNPAIRED, Problem, condition, fit
+from ..models.bearing_range import (
+    expected_reading_jit,
+    reading_slopes_jit,
+    wrap_angle_jit,
+)
+from ..models.bearing_range import wrap_angle_jit as wrap
 
 
 @njit_internal
@@ -235,3 +244,363 @@ def search_assignments(
         depth += 1
         is_new = True
     return visited
+
+
+# --------------------------------------------------------------------------------------
+# Expected readings of several landmarks, conditioned on pairs of a scan, compiled.
+#
+# ``shifts[d]`` is h minus h(x) and ``joints[d]`` is C after some pairs, its lower half
+# only; :mod:`slamgym.estimator.association.joint_assignment` has the equations.
+
+UNPAIRED = -1
+
+PAIR_BONUS = 1e6
+"""Cost that a pair saves where the number of pairs counts before all else."""
+
+
+class Problem(NamedTuple):
+    """Readings of one scan and the landmarks that they may belong to."""
+
+    innovations: Array
+    """ν = z − h(x), shape (m, J, 2), bearings in [-π, π)."""
+    joint: Array
+    """C = H P Hᵀ of all expected readings, shape (2J, 2J)."""
+    variances: Array
+    """Diagonal of Q for each reading, shape (m, 2)."""
+    feasible: BoolArray
+    """Pairs to consider, shape (m, J)."""
+    missing: Array
+    """λ of each reading, shape (m,)."""
+    gate: float
+    """Largest νᵀ S⁻¹ ν of a pair, given the pairs before it."""
+    limits: Array
+    """Largest νᵀ S⁻¹ ν of 0 … m pairs together, shape (m + 1,)."""
+    pairs_first: bool
+    """Most pairs first, then the least νᵀ S⁻¹ ν, in place of the likelihood."""
+
+
+@jit
+def fill_expected(
+    mean: Array, P: Array, slots: IntArray, expected: Array, joint: Array
+) -> None:
+    """Fill h(x), shape (J, 2), and C = H P Hᵀ, shape (2J, 2J), of some landmarks.
+
+    Parameters
+    ----------
+    mean, P : ndarray
+        (x, y, θ, l1x, …) and its covariance; there may be more behind the landmarks.
+    slots : ndarray of int64, shape (J,)
+        Places of the landmarks in the map.
+    """
+    H, columns = np.empty((2 * len(slots), 5)), np.empty((len(slots), 5), np.int64)
+    columns[:, :3] = np.arange(3)
+    for j in range(len(slots)):
+        c = 3 + 2 * slots[j]
+        columns[j, 3], columns[j, 4] = c, c + 1
+        dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+        bearing, expected[j, 1] = expected_reading_jit(dx, dy, mean[2])
+        expected[j, 0] = wrap(bearing)
+        slopes = reading_slopes_jit(dx, dy)
+        for i in range(2):
+            x, y = slopes[2 * i], slopes[2 * i + 1]
+            row = H[2 * j + i]
+            row[0], row[1], row[2], row[3], row[4] = -x, -y, i - 1.0, x, y
+    left = np.empty(5)
+    for a in range(2 * len(slots)):
+        for j in range(a // 2 + 1):
+            for n in range(5):
+                left[n] = 0.0
+                for k in range(5):
+                    left[n] += H[a, k] * P[columns[a // 2, k], columns[j, n]]
+            for b in (2 * j, 2 * j + 1):
+                value = 0.0
+                for n in range(5):
+                    value += left[n] * H[b, n]
+                joint[a, b] = joint[b, a] = value
+
+
+@njit_internal
+def fit(
+    innovation: Array, variance: Array, shift: Array, C: Array, j: int, inflation: float
+) -> tuple[float, float]:
+    """Return νᵀ S⁻¹ ν and det S of a reading at landmark j, with C times inflation."""
+    s00 = inflation * C[2 * j, 2 * j] + variance[0]
+    s10 = inflation * C[2 * j + 1, 2 * j]
+    s11 = inflation * C[2 * j + 1, 2 * j + 1] + variance[1]
+    n0, n1 = innovation[j, 0] - shift[j, 0], innovation[j, 1] - shift[j, 1]
+    determinant = s00 * s11 - s10 * s10
+    squared = n0 * n0 * s11 - 2 * n0 * n1 * s10 + n1 * n1 * s00
+    return squared / determinant, determinant
+
+
+@njit_internal
+def condition(
+    innovation: Array,
+    variance: Array,
+    j: int,
+    count: int,
+    shifts: Array,
+    joints: Array,
+    here: int,
+    to: int,
+) -> None:
+    """Condition the expected readings of the first ``count`` landmarks on one pair.
+
+    ::
+
+        h ← h + K (z − h),  C ← C − K C
+    """
+    C, shift, after, moved = joints[here], shifts[here], joints[to], shifts[to]
+    s00 = C[2 * j, 2 * j] + variance[0]
+    s10 = C[2 * j + 1, 2 * j]
+    s11 = C[2 * j + 1, 2 * j + 1] + variance[1]
+    n0, n1 = innovation[j, 0] - shift[j, 0], innovation[j, 1] - shift[j, 1]
+    determinant = s00 * s11 - s10 * s10
+    cross = np.empty((2, 2 * count))
+    for k in range(2):
+        b = 2 * j + k
+        for a in range(2 * count):
+            cross[k, a] = C[max(a, b), min(a, b)]
+    for a in range(2 * count):
+        k0 = (cross[0, a] * s11 - cross[1, a] * s10) / determinant
+        k1 = (cross[1, a] * s00 - cross[0, a] * s10) / determinant
+        moved[a // 2, a % 2] = shift[a // 2, a % 2] + k0 * n0 + k1 * n1
+        row, old = after[a], C[a]
+        for b in range(a + 1):
+            row[b] = old[b] - k0 * cross[0, b] - k1 * cross[1, b]
+
+
+@njit_internal
+def condition_on_all(
+    problem: Problem, marks: IntArray, shifts: Array, joints: Array
+) -> int:
+    """Condition on all pairs of an assignment; return the level of the result, 0 or 1.
+
+    Parameters
+    ----------
+    problem : Problem
+    marks : ndarray, shape (m,)
+        An assignment.
+    shifts, joints : ndarray, shapes (2, J, 2) and (2, 2J, 2J)
+        Overwritten.
+    """
+    here, landmarks = 0, problem.feasible.shape[1]
+    shifts[0] = 0.0
+    joints[0] = problem.joint
+    for i in range(len(marks)):
+        if marks[i] != UNPAIRED:
+            z, q = problem.innovations[i], problem.variances[i]
+            condition(z, q, marks[i], landmarks, shifts, joints, here, 1 - here)
+            here = 1 - here
+    return here
+
+
+@jit
+def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
+    """Find the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
+
+    A scan shows a landmark once: a reading beside one that is taken is of another.
+
+    Parameters
+    ----------
+    problem : Problem
+    marks, distances : ndarray, shape (M, m)
+        Assignments; the distances are infinite before.
+    """
+    innovations, variances = problem.innovations, problem.variances
+    rows, landmarks = problem.feasible.shape
+    shifts = np.empty((2, landmarks, 2))
+    joints = np.empty((2, 2 * landmarks, 2 * landmarks))
+    taken = np.zeros(landmarks, np.bool_)
+    for s in range(len(marks)):
+        here = condition_on_all(problem, marks[s], shifts, joints)
+        taken[:] = False
+        for i in range(rows):
+            if marks[s, i] != UNPAIRED:
+                taken[marks[s, i]] = True
+        for i in range(rows):
+            if marks[s, i] == UNPAIRED:
+                for j in range(landmarks):
+                    if taken[j]:
+                        continue
+                    x, _ = fit(
+                        innovations[i], variances[i], shifts[here], joints[here], j, 1.0
+                    )
+                    distances[s, i] = min(distances[s, i], x)
+
+
+@jit
+def largest_change(problem: Problem, marks: IntArray, fewer: IntArray) -> float:
+    """Bound how much some pairs change any coordinate of the state, in its σ.
+
+    With means μ and deviations σ, after all pairs 1 and without some of them 2, no
+    coordinate has a larger √((μ₂ − μ₁)² + σ₂² − σ₁²) / σ₁.  One pair with innovation ν,
+    given the others, shifts a coordinate of variance P by at most √(P λ νᵀ S⁻¹ ν) and
+    leaves it at least the variance (1 − λ) P::
+
+        λ = largest eigenvalue of S⁻¹ C = 1 − smallest eigenvalue of S⁻¹ Q
+
+    Parameters
+    ----------
+    problem : Problem
+    marks, fewer : ndarray, shape (m,)
+        Two assignments.
+
+    Returns
+    -------
+    float
+        Infinite unless ``fewer`` is ``marks`` without some pairs.
+    """
+    for i in range(len(marks)):
+        if fewer[i] != marks[i] and fewer[i] != UNPAIRED:
+            return np.inf
+    landmarks = problem.feasible.shape[1]
+    shifts = np.empty((2, landmarks, 2))
+    joints = np.empty((2, 2 * landmarks, 2 * landmarks))
+    here = condition_on_all(problem, fewer, shifts, joints)
+    shift, variance = 0.0, 1.0  # in the σ after all pairs
+    for i in range(len(marks)):
+        j = marks[i]
+        if fewer[i] == j:
+            continue
+        z, q, C = problem.innovations[i], problem.variances[i], joints[here]
+        x, determinant = fit(z, q, shifts[here], C, j, 1.0)
+        s00, s11 = C[2 * j, 2 * j] + q[0], C[2 * j + 1, 2 * j + 1] + q[1]
+        half = (s11 * q[0] + s00 * q[1]) / (2 * determinant)
+        root = np.sqrt(max(half * half - q[0] * q[1] / determinant, 0.0))
+        left = half - root  # 1 − λ
+        shift = (shift + np.sqrt(x * (1 - left))) / np.sqrt(left)
+        variance /= left
+        condition(z, q, j, landmarks, shifts, joints, here, 1 - here)
+        here = 1 - here
+    return float(np.sqrt(shift * shift + variance - 1))
+
+
+# --------------------------------------------------------------------------------------
+# Search for the largest clique of pairs of landmarks, compiled.
+#
+# :mod:`slamgym.estimator.association.constellations` has the equations.
+
+
+@jit
+def compare_pairs(
+    pairs: IntArray,
+    local: Array,
+    older: Array,
+    gate: float,
+    largest_turn: float,
+    agree: BoolArray,
+) -> None:
+    """Mark which pairs (i, p), (j, q) of landmarks can both be right.
+
+    ::
+
+        (d_ij − d_pq)² ≤ gate (σ²_ij + σ²_pq),   |α_pq − α_ij| ≤ largest turn
+
+    Parameters
+    ----------
+    pairs : ndarray of int64, shape (N, 2)
+        Landmark i of the local map and p of the older map of each pair.
+    local, older : ndarray, shapes (3, m, m) and (3, n, n)
+        Distance d, its variance σ² and direction α between two landmarks of a map.
+    gate : float
+        Largest squared difference of two distances over its variance.
+    largest_turn : float
+        Largest difference of two directions [rad].
+    agree : ndarray of bool, shape (N, N)
+        The result; a landmark is in one pair only.
+    """
+    for s in range(len(pairs)):
+        i, p = pairs[s, 0], pairs[s, 1]
+        for t in range(s):
+            j, q = pairs[t, 0], pairs[t, 1]
+            is_good = False
+            if i != j and p != q:
+                difference = local[0, i, j] - older[0, p, q]
+                variance = local[1, i, j] + older[1, p, q]
+                if difference * difference <= gate * variance:
+                    turn = wrap_angle_jit(older[2, p, q] - local[2, i, j])
+                    is_good = abs(turn) <= largest_turn
+            agree[s, t] = agree[t, s] = is_good
+
+
+@njit_internal
+def _bounds(
+    pairs: IntArray, open_: IntArray, count: int, bounds: IntArray, seen: IntArray
+) -> None:
+    """Count the landmarks of the local map among the open pairs from each one on."""
+    seen[:] = 0
+    found = 0
+    for k in range(count - 1, -1, -1):
+        i = pairs[open_[k], 0]
+        if seen[i] == 0:
+            seen[i] = 1
+            found += 1
+        bounds[k] = found
+
+
+@jit
+def search_clique(
+    pairs: IntArray, agree: BoolArray, floor: int, nodes: int, clique: IntArray
+) -> tuple[int, int]:
+    """Find the largest set of pairs that all agree with each other.
+
+    Depth-first branch and bound: a set grows by the pairs that agree with all in it.
+    Each landmark of the local map can add one pair at most, which bounds its size.
+
+    Parameters
+    ----------
+    pairs : ndarray of int64, shape (N, 2)
+        Landmarks of each pair, that of the local map first.
+    agree : ndarray of bool, shape (N, N)
+        Which pairs agree.
+    floor : int
+        Only a larger set is of interest.
+    nodes : int
+        Limit of the search.
+    clique : ndarray of int64, shape (m,)
+        The result, where one is found.
+
+    Returns
+    -------
+    size, visited : int
+        Number of pairs found, 0 for none; nodes visited, `nodes` at the limit.
+    """
+    count, depths = len(pairs), len(clique)
+    landmarks = pairs[:, 0].max() + 1 if count else 0
+    open_ = np.zeros((depths + 1, count), np.int64)
+    bounds = np.zeros((depths + 1, count), np.int64)
+    counts = np.zeros(depths + 1, np.int64)
+    at = np.zeros(depths + 1, np.int64)
+    chosen = np.zeros(depths + 1, np.int64)
+    seen = np.zeros(landmarks, np.int64)
+    for k in range(count):
+        open_[0, k] = k
+    counts[0] = count
+    _bounds(pairs, open_[0], count, bounds[0], seen)
+    best, size, visited, depth = floor, 0, 0, 0
+    while depth >= 0:
+        k = at[depth]
+        if k >= counts[depth] or depth + bounds[depth, k] <= best:
+            depth -= 1
+            continue
+        if visited >= nodes:
+            break
+        visited += 1
+        at[depth] += 1
+        pair = open_[depth, k]
+        chosen[depth] = pair
+        if depth + 1 > best:
+            best = size = depth + 1
+            clique[:size] = chosen[:size]
+        if depth + 1 < depths:
+            found = 0
+            for later in range(k + 1, counts[depth]):
+                other = open_[depth, later]
+                if agree[pair, other]:
+                    open_[depth + 1, found] = other
+                    found += 1
+            depth += 1
+            counts[depth], at[depth] = found, 0
+            _bounds(pairs, open_[depth], found, bounds[depth], seen)
+    return size, visited

@@ -6,11 +6,8 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
-from .predict import predict
-from .rules import as_rules
-from .scan_rows import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT
-from .scan_update import DONE, update_belief
-from .screen import usable
+from .kalman_gain import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT, as_rules
+from .scan_update import DONE, predict, update_belief, usable
 
 NEVER = -1
 
@@ -49,7 +46,7 @@ def drive_runs(
     """Take each run through all its steps, in place.
 
     The arguments are plain tuples of the entries of :class:`RunArrays`,
-    :class:`StepData` and :class:`.scan_rows.Workspace`, because numba takes
+    :class:`StepData` and :class:`.kalman_gain.Workspace`, because numba takes
     microseconds to recognise a NamedTuple.
 
     Parameters
@@ -65,7 +62,7 @@ def drive_runs(
     motion_values : ndarray, shape (4,)
         The variances (σx², σy², σα²), and 1 if a robot at rest has motion noise too.
     rule_values
-        As :func:`.rules.as_rules` reads them.
+        As :func:`.kalman_gain.as_rules` reads them.
     """
     runs, data = RunArrays(*run_arrays), StepData(*step_data)
     poses, pose_covariances, nis, degrees_of_freedom = trace

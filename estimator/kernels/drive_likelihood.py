@@ -7,13 +7,10 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
-from .belief_arrays import BeliefArrays
-from .linearise import linearise
-from .predict import predict
-from .rules import FIRST_STD, Rules, as_rules
-from .scan_rows import (
+from .kalman_gain import (
     ADDED,
     FIRST,
+    FIRST_STD,
     GATED,
     INNOVATION,
     LEDGER_HEIGHT,
@@ -22,11 +19,21 @@ from .scan_rows import (
     ROOT,
     SLOT,
     VARIANCE,
+    BeliefArrays,
+    Rules,
     Workspace,
+    as_rules,
     prior_system_jit,
 )
-from .scan_update import DONE, update_belief
-from .screen import bearing_variance, own_covariance, range_variance
+from .scan_update import (
+    DONE,
+    bearing_variance,
+    linearise,
+    own_covariance,
+    predict,
+    range_variance,
+    update_belief,
+)
 
 LOG_TURN = math.log(2 * math.pi)
 
@@ -84,13 +91,13 @@ def follow_drive(
     noise_at_rest : bool
         Whether odometry of exactly (0, 0) has motion noise.
     rule_values
-        As :func:`.rules.as_rules` reads them; those of the sensor's noise are
+        As :func:`.kalman_gain.as_rules` reads them; those of the sensor's noise are
         overwritten.
     start
         Mean (3,) and covariance (3, 3) of the first pose.
     belief_arrays, workspace_arrays
-        Room: the entries of :class:`.belief_arrays.BeliefArrays` and
-        :class:`.scan_rows.Workspace`.
+        Room: the entries of :class:`.kalman_gain.BeliefArrays` and
+        :class:`.kalman_gain.Workspace`.
     slots : ndarray, shape (n,)
         Room for the places of the landmarks in the map.
     record_arrays

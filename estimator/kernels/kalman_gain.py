@@ -1,16 +1,18 @@
 """Kalman gain and covariance update for many readings at once, compiled.
 
 ``system`` holds two rows for each reading, from the row FIRST of the workspace on:
-:mod:`.scan_rows` lists their columns.  The covariance has room for whole vector
-registers (:class:`.belief_arrays.BeliefArrays`), and the rows are up to 4 entries
+:mod:`.kalman_gain` lists their columns.  The covariance has room for whole vector
+registers (:class:`.kalman_gain.BeliefArrays`), and the rows are up to 4 entries
 longer.
 """
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ...jit import fma, njit_internal
-from .scan_rows import CORRECTION, FIRST, INNOVATION, JACOBIAN, ROOT, VARIANCE, WHITE
+from ...jit import fma, njit_inlined, njit_internal
 
 # Share of a variance below which the remainder counts as rounding.
 SINGULAR = 1e-14
@@ -252,3 +254,249 @@ def mirror(covariance: Array, size: int) -> None:
         for a in range(i + 1, i + 4):
             for b in range(i, a):
                 covariance[b, a] = covariance[a, b]
+
+
+# --------------------------------------------------------------------------------------
+# Log determinants of covariances, compiled.
+
+
+@njit_internal
+def half_log_det(P: Array, L: Array) -> float:
+    """Compute ½ log det P by its Cholesky factor; -inf if not positive definite.
+
+    P has an even size, as landmarks have. On return the lower half of ``L``, which has
+    room for it, holds the factor, with reciprocals on the diagonal. The entries are
+    found in blocks of 2 × 2, whose four sums a processor computes at once.
+    """
+    result = 0.0
+    for i in range(0, len(P), 2):
+        for j in range(0, i, 2):
+            _factor_block(P, L, i, j)
+        product = _factor_diagonal_block(P, L, i)
+        if not product > 0.0:
+            return -math.inf
+        result += 0.5 * math.log(product)
+    return result
+
+
+@njit_inlined
+def _factor_block(P: Array, L: Array, i: int, j: int) -> None:
+    """Find rows i, i + 1 and columns j, j + 1 of the factor, left of its diagonal."""
+    a, b, c, d = P[i, j], P[i, j + 1], P[i + 1, j], P[i + 1, j + 1]
+    for k in range(j):
+        upper, lower, left, right = L[i, k], L[i + 1, k], L[j, k], L[j + 1, k]
+        a -= upper * left
+        b -= upper * right
+        c -= lower * left
+        d -= lower * right
+    a, c = a * L[j, j], c * L[j, j]
+    L[i, j], L[i + 1, j] = a, c
+    L[i, j + 1] = (b - a * L[j + 1, j]) * L[j + 1, j + 1]
+    L[i + 1, j + 1] = (d - c * L[j + 1, j]) * L[j + 1, j + 1]
+
+
+@njit_inlined
+def _factor_diagonal_block(P: Array, L: Array, i: int) -> float:
+    """Find the factor of the block at row i; return its determinant, 0 on failure."""
+    a, b, c = P[i, i], P[i + 1, i], P[i + 1, i + 1]
+    for k in range(i):
+        upper, lower = L[i, k], L[i + 1, k]
+        a -= upper * upper
+        b -= lower * upper
+        c -= lower * lower
+    if not a > 0.0:
+        return 0.0
+    L[i, i] = 1.0 / math.sqrt(a)
+    L[i + 1, i] = b * L[i, i]
+    c -= L[i + 1, i] * L[i + 1, i]
+    if not c > 0.0:
+        return 0.0
+    L[i + 1, i + 1] = 1.0 / math.sqrt(c)
+    return float(a * c)
+
+
+@njit_internal
+def largest_variance(covariance: Array, x: int) -> float:
+    """Compute the larger eigenvalue of the block at columns x and x + 1."""
+    xx, yy = covariance[x, x], covariance[x + 1, x + 1]
+    apart, xy = 0.5 * (xx - yy), covariance[x, x + 1]
+    return float(0.5 * (xx + yy) + math.sqrt(apart * apart + xy * xy))
+
+
+# --------------------------------------------------------------------------------------
+# Rules of an update: what distinguishes one filter of the family from another.
+
+# Where Jacobians are taken.
+AT_ESTIMATE = 0
+AT_REFERENCE = 1  # at fixed points kept beside the estimate
+PROJECTED = 2  # at the estimate, then made blind to a rotation of the whole map
+AT_TRUTH = 3  # at the ground truth, for study
+
+# Error frame: how a correction is composed with the state.
+ADDITIVE = 0
+INVARIANT = 1
+
+
+class Rules(NamedTuple):
+    """What distinguishes one filter's update from another's; plain numbers."""
+
+    linearisation: int = AT_ESTIMATE
+    frame: int = ADDITIVE
+    iterations: int = 1
+    sequential: bool = False  # one correction for each reading
+    correlated: bool = True  # a new landmark with the pose it was seen from
+    bearing_std: float = 0.0  # [rad]
+    range_std: float = 0.0  # [m]
+    range_std_per_metre: float = 0.0
+    bearing_std_metres: float = 0.0  # [m]
+    min_range: float = 1e-3  # [m]
+    gate: float = np.inf  # largest NIS of one reading
+    noise_as_read: bool = False  # take noise at the range as read, not as expected
+
+
+FIRST_STD = Rules._fields.index("bearing_std")
+"""Column of the first of the four standard deviations of a reading in the rules."""
+AFTER_STDS = Rules._fields.index("min_range")
+
+
+@njit_inlined
+def as_rules(values: Array) -> Rules:
+    """Read rules from the array ``numpy.array(rules)``.
+
+    Python passes one array faster than a tuple of twelve numbers.
+    """
+    return Rules(
+        int(values[0]),
+        int(values[1]),
+        int(values[2]),
+        values[3] > 0,
+        values[4] > 0,
+        values[5],
+        values[6],
+        values[7],
+        values[8],
+        values[9],
+        values[10],
+        values[11] > 0,
+    )
+
+
+# --------------------------------------------------------------------------------------
+# Room for the intermediate results of one update, and the layout of its rows.
+#
+# ``docs/kernels.md`` has a picture of them.
+
+# The first rows are vectors over the whole state.
+CORRECTION = 0  # δ
+TRANSPORT = 1  # v of the transport T = I + v e_θᵀ
+PRIOR_MEAN = 2  # before this correction
+HEADING = 3  # P[:, θ]
+MEAN_BEFORE = 4  # before the scan
+
+# The stacked system follows: two rows (bearing, range) for each reading in use.  Such a
+# row begins with its row of A and ends with META_WIDTH more columns, which are counted
+# from the end.
+FIRST = 5
+READING = -1  # z
+VARIANCE = -2  # diagonal of Q
+INNOVATION = -3  # ν
+WHITE = -4  # w = L⁻¹ ν
+ROOT = -6  # and the next: row of the diagonal block of L
+JACOBIAN = -11  # and the next four: row of H, by x, y, θ, landmark x, landmark y
+META_WIDTH = 16
+
+# Rows of the ledger of one scan.
+SLOT = 0  # of each reading: place of its landmark in the map, negative for a new one
+OUTCOME = 1  # of each reading: USED, ADDED, GATED or SKIPPED
+NEAR = 2  # of each reading: 1 where the robot is too near its landmark to linearise
+COLUMN = 3  # of each reading in use: its landmark's first column in the state
+LEDGER_HEIGHT = 4
+
+# Outcomes of a reading.
+USED, ADDED, GATED, SKIPPED = 0, 1, 2, 3
+
+
+class Workspace(NamedTuple):
+    """Room for one update; every row begins on a cache line."""
+
+    rows: Array  # (FIRST + 2m + 2, capacity + META_WIDTH), two systems to iterate
+    before: Array  # (capacity, capacity) P to restore after a failure, or empty
+    prior: Array  # (capacity, capacity) P to iterate from, or empty
+
+
+def new_workspace(
+    readings: int, capacity: int, *, iterated: bool, spoilable: bool
+) -> Workspace:
+    """Allocate the workspace of a belief.
+
+    Parameters
+    ----------
+    readings, capacity : int
+        Most readings in one scan, and length of the mean.
+    iterated : bool
+        Whether updates linearise more than once.
+    spoilable : bool
+        Whether an update can fail after it has changed P.
+    """
+    systems = (2 if iterated else 1) * (2 * readings + 2)
+    kept, iterable = capacity * spoilable, capacity * iterated
+    return Workspace(
+        aligned_zeros(FIRST + systems, (capacity + 7) // 8 * 8 + META_WIDTH),
+        aligned_zeros(kept, kept),
+        aligned_zeros(iterable, iterable),
+    )
+
+
+def new_ledger(readings: int) -> IntArray:
+    """Allocate the ledger of a scan of at most so many readings."""
+    return np.zeros((LEDGER_HEIGHT, readings), dtype=np.int64)
+
+
+def prior_system(height: int, iterations: int) -> int:
+    """Return the row at which the system linearised at the prior begins.
+
+    Parameters
+    ----------
+    height : int
+        Number of rows of the workspace.
+    iterations : int
+        With more than one, :func:`.scan_update.save_prior_rows` copies that system to the
+        second half of the rows.
+    """
+    return FIRST if iterations == 1 else FIRST + (height - FIRST) // 2
+
+
+prior_system_jit = njit_internal(prior_system)
+
+
+# --------------------------------------------------------------------------------------
+# The arrays of one belief, as kernels work on them.
+
+CACHE_LINE = 64  # [bytes]
+
+
+class BeliefArrays(NamedTuple):
+    """One run's belief, which kernels change in place.
+
+    The first ``size`` = 3 + 2n entries are in use, in the order (x, y, θ, l1x, l1y, …),
+    and the others are zero.  ``capacity`` is a multiple of 4 above ``size``, so that
+    loops may run over whole vector registers.
+    """
+
+    mean: Array  # (capacity,)
+    covariance: Array  # (capacity, capacity)
+    reference: Array  # (capacity,) fixed points for Jacobians, where the rules use them
+
+
+def aligned_zeros(*shape: int) -> Array:
+    """Return zeros that begin on a cache line, so that no vector spans two lines.
+
+    Examples
+    --------
+    >>> aligned_zeros(3, 5).ctypes.data % CACHE_LINE
+    0
+    """
+    size = int(np.prod(shape))
+    room = np.zeros(size + CACHE_LINE // 8)
+    skipped = -room.ctypes.data % CACHE_LINE // 8
+    return room[skipped : skipped + size].reshape(shape)

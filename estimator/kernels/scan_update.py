@@ -1,22 +1,56 @@
 """Update of one belief by one scan, compiled: screen, correct, map new landmarks."""
 
-from ...arrays import Array, IntArray
-from ...jit import jit
-from .add_landmark import add_landmark
-from .belief_arrays import BeliefArrays
-from .correct import copy_covariance, correct
-from .kalman_gain import block_of
-from .rules import as_rules
-from .scan_rows import (
-    ADDED,
-    MEAN_BEFORE,
-    OUTCOME,
-    SLOT,
-    WHITE,
-    Workspace,
-    prior_system_jit,
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import LARGEST, Array, IntArray
+from ...jit import fma, jit, njit_inlined, njit_internal
+from ..models.bearing_range import (
+    expected_reading_jit,
+    located_jit,
+    reading_slopes_jit,
+    wrap_angle_jit,
 )
-from .screen import bearing_variance, range_variance, screen, usable
+from ..models.rigid_motion import turn_coefficients_jit
+from ..models.unicycle_motion import drive_jit
+from .kalman_gain import (
+    ADDED,
+    AT_ESTIMATE,
+    AT_REFERENCE,
+    AT_TRUTH,
+    COLUMN,
+    CORRECTION,
+    FIRST,
+    GATED,
+    HEADING,
+    INNOVATION,
+    INVARIANT,
+    JACOBIAN,
+    MEAN_BEFORE,
+    META_WIDTH,
+    NEAR,
+    OUTCOME,
+    PRIOR_MEAN,
+    PROJECTED,
+    READING,
+    ROOT,
+    SKIPPED,
+    SLOT,
+    TRANSPORT,
+    USED,
+    VARIANCE,
+    WHITE,
+    BeliefArrays,
+    Rules,
+    Workspace,
+    absorb,
+    as_rules,
+    block_of,
+    mirror,
+    prior_system_jit,
+    times,
+)
 
 # Status of an update, where it is not the reading that failed.
 DONE, NOT_USABLE = -1, -2
@@ -44,20 +78,20 @@ def update_belief(
     Parameters
     ----------
     mean, covariance, reference
-        :class:`.belief_arrays.BeliefArrays`, with room for the landmarks to add.
+        :class:`.kalman_gain.BeliefArrays`, with room for the landmarks to add.
     size : int
         Length of the state.
     readings : ndarray, shape (at least count, 2)
         Rows (β, r) [rad, m].
     ledger
-        A :func:`.scan_rows.new_ledger` whose row SLOT holds the place of each reading's
+        A :func:`.kalman_gain.new_ledger` whose row SLOT holds the place of each reading's
         landmark in the map.  On return its other rows are filled, and SLOT holds the
         places of added landmarks, too.
     rows, before, prior
-        A :class:`.scan_rows.Workspace`.  On return :func:`.scan_record.record` reads
+        A :class:`.kalman_gain.Workspace`.  On return :func:`.scan_update.record` reads
         the rows.
     rule_values
-        The filter's rules, as :func:`.rules.as_rules` reads them.
+        The filter's rules, as :func:`.kalman_gain.as_rules` reads them.
 
     Returns
     -------
@@ -110,3 +144,501 @@ def update_belief(
             ledger[SLOT, k] = (size - 3) // 2
             size += 2
     return DONE, used, nis
+
+
+# --------------------------------------------------------------------------------------
+# Screening of one scan, compiled: minimum range, chi-square gate, nearness.
+
+
+@njit_internal
+def usable(value: float) -> bool:
+    """Whether a number is finite, and its square too, with room to spare."""
+    return abs(value) <= LARGEST
+
+
+@njit_internal
+def screen(
+    belief: BeliefArrays,
+    readings: Array,
+    count: int,
+    rules: Rules,
+    rows: Array,
+    ledger: IntArray,
+) -> int:
+    """Decide the outcome of every reading and collect those to use.
+
+    The belief stays as it is.  Returns how many readings are in use.
+    """
+    mean, system, used = belief.mean, rows[FIRST:], 0
+    for k in range(count):
+        bearing, distance = readings[k, 0], readings[k, 1]
+        column = 3 + 2 * ledger[SLOT, k]
+        ledger[OUTCOME, k] = ADDED if ledger[SLOT, k] < 0 else USED
+        ledger[NEAR, k] = 0
+        if distance < rules.min_range:
+            ledger[OUTCOME, k] = SKIPPED
+        if ledger[OUTCOME, k] != USED:
+            continue
+        dx, dy = mean[column] - mean[0], mean[column + 1] - mean[1]
+        expected = np.sqrt(dx * dx + dy * dy)
+        if expected < rules.min_range:
+            ledger[OUTCOME, k] = SKIPPED
+            continue
+        row = 2 * used
+        ledger[COLUMN, used] = column
+        system[row, READING], system[row + 1, READING] = bearing, distance
+        # The range as read makes σr small just where its error is negative.
+        at = distance if rules.noise_as_read else expected
+        system[row, VARIANCE] = bearing_variance(rules, at)
+        system[row + 1, VARIANCE] = range_variance(rules, at)
+        ledger[NEAR, k] = is_too_near(mean, belief.covariance, column)
+        if rules.gate < np.inf:
+            linearise(mean, belief.reference, rules.linearisation, system, row, column)
+            if not squared_innovation(belief.covariance, system, row, column) <= (
+                rules.gate
+            ):
+                ledger[OUTCOME, k] = GATED
+                continue
+        used += 1
+    return used
+
+
+@njit_internal
+def bearing_variance(rules: Rules, distance: float) -> float:
+    """Return σβ² of a reading at that range [m], which is at least the minimum."""
+    return (rules.bearing_std + rules.bearing_std_metres / distance) ** 2
+
+
+@njit_internal
+def range_variance(rules: Rules, distance: float) -> float:
+    """Return σr² of a reading at that range [m]."""
+    return (rules.range_std + rules.range_std_per_metre * distance) ** 2
+
+
+@njit_internal
+def own_covariance(
+    P: Array, system: Array, row: int, c: int
+) -> tuple[float, float, float]:
+    """Return S of the reading in two rows: S_ββ, S_βr, S_rr."""
+    h, h_below = system[row, JACOBIAN:], system[row + 1, JACOBIAN:]
+    s00, s10, s11 = system[row, VARIANCE], 0.0, system[row + 1, VARIANCE]
+    for i in range(5):
+        at_i = i if i < 3 else c + i - 3
+        for j in range(5):
+            entry = P[at_i, j if j < 3 else c + j - 3]
+            s00 += h[i] * entry * h[j]
+            s10 += h_below[i] * entry * h[j]
+            s11 += h_below[i] * entry * h_below[j]
+    return s00, s10, s11
+
+
+@njit_internal
+def squared_innovation(covariance: Array, system: Array, row: int, c: int) -> float:
+    """Return the NIS of one reading by itself, νᵀ S⁻¹ ν, for the gate."""
+    s00, s10, s11 = own_covariance(covariance, system, row, c)
+    n0, n1 = system[row, INNOVATION], system[row + 1, INNOVATION]
+    weighted = n0 * n0 * s11 - 2 * n0 * n1 * s10 + n1 * n1 * s00
+    nis: float = weighted / (s00 * s11 - s10 * s10)
+    return nis
+
+
+@njit_internal
+def is_too_near(mean: Array, covariance: Array, column: int) -> bool:
+    """Whether the robot is within 10 σ of a landmark, where linearisation fails.
+
+    σ is the largest standard deviation of the landmark's place in the robot's frame,
+    whose error is e_l − e_p − J δ e_θ: a common rotation of robot and map cancels.
+    """
+    P, c = covariance, column
+    dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+    x_turn, y_turn = P[c, 2] - P[0, 2], P[c + 1, 2] - P[1, 2]
+    xx = P[c, c] - 2 * P[c, 0] + P[0, 0] + 2 * dy * x_turn + dy * dy * P[2, 2]
+    yy = P[c + 1, c + 1] - 2 * P[c + 1, 1] + P[1, 1]
+    yy += dx * dx * P[2, 2] - 2 * dx * y_turn
+    xy = P[c, c + 1] - P[c, 1] - P[c + 1, 0] + P[0, 1]
+    xy += dy * y_turn - dx * x_turn - dx * dy * P[2, 2]
+    # the larger eigenvalue of [xx xy; xy yy]
+    spread = (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    return bool(dx * dx + dy * dy < 100 * spread)
+
+
+# --------------------------------------------------------------------------------------
+# One correction of a belief, compiled: linearise, condition, compose; iterated.
+
+
+@njit_inlined
+def correct(
+    belief: BeliefArrays,
+    size: int,
+    ledger: IntArray,
+    rules: Rules,
+    workspace: Workspace,
+    top: int,
+    bottom: int,
+) -> int:
+    """Condition the belief on the readings of some rows, at one linearisation.
+
+    With more iterations the readings are linearised again at each iterate, always
+    against the same prior (Bell and Cathey, 1993).  In the invariant frame the heading
+    column of H keeps the prior's geometry: with the exact Gauss-Newton column the
+    filter would believe that it observes its heading.
+
+    Parameters
+    ----------
+    top, bottom
+        Rows of the system, counted from FIRST.
+
+    Returns
+    -------
+    int
+        -1, or the row at which the innovation covariance is not positive definite; the
+        covariance may then be spoilt.
+    """
+    mean, covariance = belief.mean, belief.covariance
+    rows, columns = workspace.rows, ledger[COLUMN]
+    system, prior_mean = rows[FIRST:], rows[PRIOR_MEAN]
+    for j in range(size):
+        prior_mean[j] = mean[j]
+    if rules.iterations > 1:
+        copy_covariance(covariance, workspace.prior, size)
+    for iteration in range(rules.iterations):
+        if iteration > 0:
+            copy_covariance(workspace.prior, covariance, size)
+        for row in range(top, bottom, 2):
+            c = columns[row // 2]
+            linearise(mean, belief.reference, rules.linearisation, system, row, c)
+            if iteration > 0:
+                relate_to_prior(rows, row, c, rules.frame)
+        for j in range(size):
+            mean[j] = prior_mean[j]
+        block = block_of(size, (bottom - top) // 2)
+        failed = absorb(covariance, size, rows, columns, top, bottom, block)
+        if failed >= 0:
+            return failed
+        if iteration == 0 and rules.iterations > 1:
+            save_prior_rows(rows, top, bottom)
+        compose(mean, rows, size, rules.frame)
+    if rules.frame == INVARIANT:
+        transport(covariance, rows, size)
+    mirror(covariance, size)
+    return -1
+
+
+@njit_internal
+def compose(mean: Array, rows: Array, size: int, frame: int) -> None:
+    """Compose the correction δ with the mean, by the error frame."""
+    if frame == INVARIANT:
+        retract(mean, rows, size)
+        return
+    for j in range(size):
+        mean[j] += rows[CORRECTION, j]
+
+
+@njit_internal
+def relate_to_prior(rows: Array, row: int, c: int, frame: int) -> None:
+    """Turn ν at an iterate into z − h + H δ, the innovation seen from the prior."""
+    system, prior = rows[FIRST:], rows[PRIOR_MEAN]
+    dx, dy = prior[c] - prior[0], prior[c + 1] - prior[1]
+    for i in range(row, row + 2):
+        h = system[i, JACOBIAN : JACOBIAN + 5]
+        if frame == INVARIANT:
+            h[2] = h[3] * dy - h[4] * dx
+        system[i, INNOVATION] += times(system, i, c, rows[CORRECTION])
+
+
+@njit_internal
+def save_prior_rows(rows: Array, top: int, bottom: int) -> None:
+    """Copy rows of the system linearised at the prior to where the report reads them.
+
+    The next iterate overwrites the system itself.
+    """
+    system, saved = rows[FIRST:], rows[prior_system_jit(len(rows), 2) :]
+    for row in range(top, bottom):
+        for j in range(rows.shape[1]):
+            saved[row, j] = system[row, j]
+
+
+@njit_internal
+def copy_covariance(source: Array, target: Array, size: int) -> None:
+    """Copy a covariance."""
+    for i in range(size):
+        for j in range(size):
+            target[i, j] = source[i, j]
+
+
+# --------------------------------------------------------------------------------------
+# Linearisation of one reading, compiled: its rows of H and its innovation.
+#
+# For a reading of the landmark in columns c, c+1 of the state only five columns of H
+# differ from zero: (x, y, θ, c, c+1).  A row of H is stored as these five entries.
+
+
+@njit_internal
+def linearise(
+    mean: Array,
+    reference: Array,
+    linearisation: int,
+    system: Array,
+    row: int,
+    column: int,
+) -> None:
+    """Fill H and ν of the reading in ``row`` and the next, eqs. 1.4 to 1.6."""
+    H = system[row : row + 2, JACOBIAN : JACOBIAN + 5]
+    z, nu = system[row : row + 2, READING], system[row : row + 2, INNOVATION]
+    dx, dy = mean[column] - mean[0], mean[column + 1] - mean[1]
+    bearing, distance = expected_reading_jit(dx, dy, mean[2])
+    nu[0], nu[1] = wrap_angle_jit(z[0] - bearing), z[1] - distance
+    if linearisation in (AT_REFERENCE, AT_TRUTH):
+        dx = reference[column] - reference[0]
+        dy = reference[column + 1] - reference[1]
+    bearing_x, bearing_y, range_x, range_y = reading_slopes_jit(dx, dy)
+    H[0, 0], H[0, 1], H[0, 2] = -bearing_x, -bearing_y, -1.0
+    H[1, 0], H[1, 1], H[1, 2] = -range_x, -range_y, 0.0
+    H[0, 3], H[0, 4] = bearing_x, bearing_y
+    H[1, 3], H[1, 4] = range_x, range_y
+    if linearisation == PROJECTED:
+        _project(reference, column, H)
+
+
+@njit_internal
+def _project(reference: Array, column: int, H: Array) -> None:
+    """H ← H − (H w) wᵀ / wᵀw: blind to the rotation w of robot and landmark together.
+
+    w is J δ of the reference points, spread about their midpoint: the part of a
+    rotation about the origin that is orthogonal to both translations, to which H is
+    blind anyway.
+    """
+    half_x = (reference[column] - reference[0]) / 2
+    half_y = (reference[column + 1] - reference[1]) / 2
+    squared = 1 + 2 * (half_x * half_x + half_y * half_y)
+    for i in range(2):
+        along_x, along_y = H[i, 0] - H[i, 3], H[i, 1] - H[i, 4]
+        turned = along_x * half_y - along_y * half_x + H[i, 2]
+        seen = turned / squared
+        H[i, 0] -= seen * half_y
+        H[i, 1] += seen * half_x
+        H[i, 2] -= seen
+        H[i, 3] += seen * half_y
+        H[i, 4] -= seen * half_x
+
+
+# --------------------------------------------------------------------------------------
+# Corrections in the invariant error frame, compiled: of the mean and of P.
+
+
+@njit_internal
+def retract(mean: Array, rows: Array, size: int) -> None:
+    """Compose an invariant correction δ with the state, in place of adding it.
+
+    With t = δθ and every point q, the robot's position and each landmark::
+
+        q⁺ = R(t) q + V(t) (δq − t J q),    θ⁺ = θ + t
+
+    with R, V and J of :mod:`..models.rigid_motion`.  The row TRANSPORT becomes
+    v = J (q⁺ − q), 0 at θ, for :func:`transport`.
+    """
+    delta, v = rows[CORRECTION], rows[TRANSPORT]
+    t = delta[2]
+    cos, sin, even, odd = turn_coefficients_jit(t)
+    for i in range(-1, size // 2 - 1):
+        c = 3 + 2 * i if i >= 0 else 0  # the pose first, then the landmarks
+        x, y = mean[c], mean[c + 1]
+        ux, uy = delta[c] + t * y, delta[c + 1] - t * x
+        mean[c] = cos * x - sin * y + even * ux - odd * uy
+        mean[c + 1] = sin * x + cos * y + odd * ux + even * uy
+        v[c], v[c + 1] = y - mean[c + 1], mean[c] - x
+    mean[2] += t
+    v[2] = 0.0
+
+
+@njit_internal
+def transport(covariance: Array, rows: Array, size: int) -> None:
+    """P ← T P Tᵀ with T = I + v e_θᵀ and v in the row TRANSPORT; lower half only.
+
+    P is constant in invariant coordinates; T reads it at the corrected estimate.  The
+    row HEADING is overwritten with c = P[:, θ].
+    """
+    v, c = rows[TRANSPORT], rows[HEADING]
+    for j in range(size):
+        c[j] = covariance[2, j] if j < 2 else covariance[j, 2]
+    variance = c[2]
+    for i in range(size):
+        v_i = v[i]
+        rest = c[i] + variance * v_i
+        for j in range(i + 1):
+            moved = fma(v_i, c[j], covariance[i, j])
+            covariance[i, j] = fma(rest, v[j], moved)
+
+
+# --------------------------------------------------------------------------------------
+# Landmark initialisation from one reading, compiled.
+
+
+@njit_internal
+def add_landmark(
+    belief: BeliefArrays,
+    size: int,
+    bearing: float,
+    distance: float,
+    bearing_variance: float,
+    range_variance: float,
+    linearisation: int,
+    correlated: bool,
+) -> None:
+    """Append the landmark of one reading, eq. 1.3, with its correlation to all else.
+
+    ::
+
+        P_l* = F_p P_p*,    P_ll = F_p P_pp F_pᵀ + F_z Q F_zᵀ
+
+    Not ``correlated``: P_l* = 0, the initialisation that makes a filter overconfident.
+    """
+    mean, P, reference = belief
+    r, c = distance, size
+    lx, ly, cos, sin = located_jit(mean[0], mean[1], mean[2], bearing, r)
+    mean[c], mean[c + 1] = lx, ly
+    turned_x, turned_y = -r * sin, r * cos
+    if linearisation in (AT_REFERENCE, PROJECTED):
+        reference[c], reference[c + 1] = lx, ly
+    if linearisation != AT_ESTIMATE:
+        turned_x = reference[1] - reference[c + 1]
+        turned_y = reference[c] - reference[0]
+    x, y = P[c], P[c + 1]
+    for j in range(size):
+        x[j] = P[0, j] + turned_x * P[2, j]
+        y[j] = P[1, j] + turned_y * P[2, j]
+    across, along = bearing_variance * r * r, range_variance
+    x[c] = x[0] + turned_x * x[2] + cos * cos * along + sin * sin * across
+    y[c] = y[0] + turned_x * y[2] + cos * sin * (along - across)
+    y[c + 1] = y[1] + turned_y * y[2] + sin * sin * along + cos * cos * across
+    x[c + 1] = y[c]
+    for j in range(size):
+        if not correlated:
+            x[j] = y[j] = 0.0
+        P[j, c], P[j, c + 1] = x[j], y[j]
+
+
+# --------------------------------------------------------------------------------------
+# Prediction by one odometry reading, compiled; symbols as in the motion model.
+
+
+@jit
+def predict(
+    mean: Array,
+    covariance: Array,
+    reference: Array,
+    size: int,
+    distance: float,
+    turn: float,
+    motion_variance: Array,
+    linearisation: int,
+) -> None:
+    """Move a belief by one odometry reading (d, α), in place; eqs. 1.1 and 1.2.
+
+    Linearised elsewhere than at the estimate, G is taken over the displacement between
+    the predicted positions, which the reference keeps.
+    """
+    x, y, heading, cos, sin = drive_jit(mean[0], mean[1], mean[2], distance, turn)
+    mean[0], mean[1], mean[2] = x, y, heading
+    turned_x, turned_y = -distance * sin, distance * cos
+    if linearisation != AT_ESTIMATE:
+        turned_x, turned_y = -(y - reference[1]), x - reference[0]
+        reference[0], reference[1], reference[2] = x, y, heading
+    propagate(covariance, size, turned_x, turned_y, cos, sin, motion_variance)
+
+
+@njit_internal
+def propagate(
+    covariance: Array,
+    size: int,
+    turned_x: float,
+    turned_y: float,
+    cos: float,
+    sin: float,
+    motion_variance: Array,
+) -> None:
+    """P ← G P Gᵀ + F R Fᵀ with G = I + (turned_x, turned_y, 0, …) e_θᵀ, in O(size).
+
+    F rotates the noise, whose covariance R is diagonal, by the heading (cos, sin).
+    """
+    P = covariance
+    for j in range(size):
+        P[0, j] += turned_x * P[2, j]
+        P[1, j] += turned_y * P[2, j]
+    for j in range(3, size):
+        P[j, 0] = P[0, j]
+        P[j, 1] = P[1, j]
+    for i in range(3):
+        P[i, 0] += turned_x * P[i, 2]
+        P[i, 1] += turned_y * P[i, 2]
+    along, across = motion_variance[0], motion_variance[1]
+    P[0, 0] += cos * cos * along + sin * sin * across
+    P[1, 1] += sin * sin * along + cos * cos * across
+    P[1, 0] += cos * sin * (along - across)
+    P[0, 1] = P[1, 0]
+    P[2, 2] += motion_variance[2]
+
+
+# --------------------------------------------------------------------------------------
+# What a report keeps of a scan: copies of the rows and the ledger of its update.
+
+
+class ScanRecord(NamedTuple):
+    """The stacked system of one scan, copied out of the workspace."""
+
+    rows: Array  # (2m, at least 3 + 2m + META_WIDTH)
+    ledger: IntArray  # (LEDGER_HEIGHT, readings), its columns counted in these rows
+
+    @property
+    def innovation(self) -> Array:
+        """Innovations ν, shape (m, 2)."""
+        return self.rows[:, INNOVATION].reshape(-1, 2)
+
+    def joint_factor(self, *, sequential: bool) -> Array:
+        """Return L of S = L Lᵀ, shape (2m, 2m), lower triangular.
+
+        Off its diagonal blocks L = H Aᵀ, since Q is diagonal; or 0 where readings were
+        linearised one after the other.
+        """
+        rows, count = self.rows, len(self.rows)
+        H = rows[:, JACOBIAN : JACOBIAN + 5]
+        factor = np.zeros((count, count))
+        if not sequential:
+            columns = np.repeat(self.ledger[COLUMN, : count // 2], 2)
+            every = np.arange(count)
+            pose = H[:, :3] @ rows[:, :3].T
+            x = H[every, 3, None] * rows[:, columns].T
+            y = H[every, 4, None] * rows[:, columns + 1].T
+            factor = np.tril(pose + x + y)
+        for k in range(0, count, 2):
+            factor[k : k + 2, k : k + 2] = rows[k : k + 2, ROOT : ROOT + 2]
+        return factor
+
+
+def copy_scan(
+    rows: Array, ledger: IntArray, used: int, first: int
+) -> tuple[Array, IntArray]:
+    """Copy the parts of a :class:`ScanRecord` out of the workspace.
+
+    Where the map is much larger than the scan, the copy has only the columns of the
+    pose and of the landmarks read.
+
+    Parameters
+    ----------
+    rows : ndarray
+        Of the workspace.
+    ledger : ndarray of int64
+        One column for each reading of the scan.
+    used : int
+        Number of readings in use.
+    first : int
+        Row at which the system linearised at the prior begins.
+    """
+    found, kept = rows[first : first + 2 * used], ledger.copy()
+    if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
+        return found.copy(), kept
+    columns = ledger[COLUMN, :used]
+    landmarks = np.stack([columns, columns + 1], axis=1).ravel()
+    chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-META_WIDTH, 0)])
+    kept[COLUMN, :used] = 3 + 2 * np.arange(used)
+    return found[:, chosen], kept

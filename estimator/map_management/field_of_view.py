@@ -7,7 +7,7 @@ from math import inf, pi
 import numpy as np
 
 from ...arrays import Array, BoolArray
-from ..models.angles import wrap_angle
+from ..models.bearing_range import wrap_angle
 from ..support import argument_checks
 
 Visibility = Callable[[Array, Array], BoolArray]

@@ -16,7 +16,7 @@ from ..association.scan_association import ScanAssociation
 from ..interface import Belief, MapView, ScanDecisions, SlamEstimator, UpdateReport
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
-from ..support.nested_state import with_prefix, without_prefix
+from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, undo_all, undone_on_error
 from .filter_pool import FilterPool
 from .managed_slam import ManagedSlam

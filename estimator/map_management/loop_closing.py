@@ -23,7 +23,7 @@ import numpy as np
 from ...arrays import Array, BoolArray, IntArray
 from ..association.constellations import Constellations, match_constellations
 from ..association.same_place import TwoPlaces
-from ..belief import MapView
+from ..interface import MapView
 from ..support import saved_states
 
 Pairs = list[tuple[int, int]]

@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike
 from ...arrays import Array
 from ..association.association_memory import Candidates, Sensor
 from ..association.scan_association import Option, ScanAssociation, associate
-from ..filters.motion_noise import MotionNoise
+from ..filters.ekf import MotionNoise
 from ..interface import (
     Belief,
     MapView,
+    ScanDecisions,
     SlamEstimator,
     UpdateReport,
     checkpoint,
@@ -23,11 +24,11 @@ from ..interface import (
     restore,
 )
 from ..models.rigid_motion import rotation
-from ..support import argument_checks, pair_checks, saved_states
+from ..support import argument_checks, saved_states
+from ..support import argument_checks as pair_checks
 from ..support.argument_checks import LandmarkIds
-from ..support.nested_state import with_prefix, without_prefix
+from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, undo_all, undone_on_error
-from ..update_report import ScanDecisions
 from .map_editor import CachedEditor, edit_map
 from .map_view import is_near, mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy

@@ -22,8 +22,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..filters.gaussian_map import without_landmarks
-from ..filters.landmark_merging import coincide
+from ..filters.gaussian_map import coincide, without_landmarks
 from ..interface import (
     MapView,
     SlamEstimator,

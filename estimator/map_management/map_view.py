@@ -8,7 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..error_frames import ErrorFrame
 from ..filters.ekf import EkfSlam
 from ..interface import (
     Belief,
@@ -18,7 +17,8 @@ from ..interface import (
     SupportsLandmarkIds,
     SupportsMapView,
 )
-from ..models.angles import wrap_angle
+from ..models.bearing_range import wrap_angle
+from ..models.rigid_motion import ErrorFrame
 
 
 def view_map(slam: SlamEstimator) -> MapView:

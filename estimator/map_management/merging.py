@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ..filters.landmark_merging import separation
+from ..filters.gaussian_map import separation
 from ..interface import MapView
 from ..support import saved_states
 from .landmark_records import LandmarkRecords

@@ -12,7 +12,7 @@ from ...arrays import Array
 from ..association.scan_association import LABEL_BITS, NO_LABEL
 from ..interface import SlamEstimator, UpdateReport
 from ..support import saved_states
-from ..support.nested_state import with_prefix, without_prefix
+from ..support.saved_states import with_prefix, without_prefix
 from .map_editor import CachedEditor
 
 ENTRIES = ["number", "motions", "readings", "row_ids", "labels", "removed", "merged"]

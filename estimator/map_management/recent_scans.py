@@ -26,7 +26,7 @@ from ..interface import (
     restore,
 )
 from ..support import saved_states
-from ..support.nested_state import with_prefix, without_prefix
+from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo
 from .map_editor import CachedEditor
 from .recent_scan import Motion, RecentScan, motion_array, motions_of

@@ -11,13 +11,41 @@ l = (lx, ly)   landmark position in the world frame [m, m]
 z = (β, r)     bearing from the robot's heading, and range [rad, m]
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from ...arrays import Array
 from ...jit import njit_inlined, njit_internal
-from .angles import wrap_angle
+
+# --------------------------------------------------------------------------------------
+# Arithmetic on angles in radians.
+
+Angle = TypeVar("Angle", float, Array)
+
+
+def wrap_angle(angle: Angle) -> Angle:
+    """Bring angles into the half-open interval [-π, π).
+
+    Parameters
+    ----------
+    angle : float or ndarray, any shape
+        Angles [rad].
+
+    Returns
+    -------
+    float or ndarray, same shape
+        The same directions, each in [-π, π) [rad].
+
+    Examples
+    --------
+    >>> wrap_angle(np.array([0.0, 2 * np.pi, np.pi]))
+    array([ 0.        ,  0.        , -3.14159265])
+    """
+    wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
+    # The remainder of a tiny negative number rounds up to 2π itself.
+    return wrapped - 2 * np.pi * (wrapped >= np.pi)
+
 
 wrap_angle_jit = njit_internal(wrap_angle)
 

@@ -10,7 +10,7 @@ from filterpy.kalman import (
 )
 
 from ...arrays import Array
-from ..models.angles import wrap_angle
+from ..models.bearing_range import wrap_angle
 from .kalman_slam import (
     SIGMA_ALPHA,
     SIGMA_BETA,

@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..association.nearest_neighbour import Noise
-from ..belief import Belief
-from ..filters.motion_noise import MotionNoise
+from ..filters.ekf import MotionNoise
+from ..interface import Belief, UpdateReport
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
-from ..update_report import UpdateReport
 
 START_FLOOR = 1e-6
 """Least deviation of the first pose [m, rad]: the libraries take no certain one."""

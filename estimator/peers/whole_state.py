@@ -3,8 +3,7 @@
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ..models.angles import wrap_angle
-from ..models.bearing_range import predict_measurement
+from ..models.bearing_range import predict_measurement, wrap_angle
 from ..models.unicycle_motion import predict_pose
 
 

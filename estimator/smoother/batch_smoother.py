@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ..belief import Belief
+from ..interface import Belief
 from ..models.bearing_range import locate_landmark
 from ..support import argument_checks
 from .drive import Drive

@@ -18,8 +18,8 @@ import numpy as np
 
 from ...arrays import Array
 from ...jit import jit, njit_internal
-from ..kernels.rules import as_rules
-from ..kernels.screen import bearing_variance, range_variance
+from ..kernels.kalman_gain import as_rules
+from ..kernels.scan_update import bearing_variance, range_variance
 from ..models.bearing_range import expected_reading_jit, wrap_angle_jit
 from ..models.rigid_motion import composed_jit
 from .drive_arrays import DriveArrays

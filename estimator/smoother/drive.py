@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ..filters.filter_settings import checked_rules
-from ..filters.motion_noise import MotionNoise
-from ..kernels.predict import predict
-from ..kernels.rules import ADDITIVE, AT_ESTIMATE, Rules
+from ..filters.ekf import MotionNoise, checked_rules
+from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE, Rules
+from ..kernels.scan_update import predict
 from ..support import argument_checks
 from .drive_arrays import DriveArrays, landmark_order, noise_factors
 

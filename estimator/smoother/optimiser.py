@@ -8,8 +8,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from ...arrays import Array
-from ..kernels.rules import Rules
-from ..models.angles import wrap_angle
+from ..kernels.kalman_gain import Rules
+from ..models.bearing_range import wrap_angle
 from ..support.memory_limit import refuse_beyond_memory
 from .cost import CAUCHY, HUBER, SQUARED, reading_stds, total_cost
 from .drive_arrays import DriveArrays

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...arrays import Array
-from ..filters.motion_noise import MotionNoise
-from ..kernels.predict import predict
-from ..kernels.rules import AT_ESTIMATE
-from ..models.angles import wrap_angle
+from ..filters.ekf import MotionNoise
+from ..kernels.kalman_gain import AT_ESTIMATE
+from ..kernels.scan_update import predict
+from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import pose_rotation
 from .drive import Motion
 

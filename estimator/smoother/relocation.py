@@ -11,8 +11,8 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
-from ..kernels.rules import Rules, as_rules
-from ..kernels.screen import bearing_variance, range_variance
+from ..kernels.kalman_gain import Rules, as_rules
+from ..kernels.scan_update import bearing_variance, range_variance
 from ..models.bearing_range import expected_reading_jit, located_jit, wrap_angle_jit
 from .cost import robust_loss
 from .drive_arrays import DriveArrays

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
 from ...arrays import Array, IntArray
-from ..belief import Belief
-from ..models.angles import wrap_angle
+from ..interface import Belief
+from ..models.bearing_range import wrap_angle
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .drive import Drive

@@ -6,8 +6,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from ..registry import accepted_options, find_estimator, make_estimator
-from ..support.filter_labels import read_label
+from ..registry import accepted_options, find_estimator, make_estimator, read_label
 from .batch_smoother import robust_kernel, smooth
 from .recorded_slam import RecordedSlam
 from .smoothed_drive import SmoothedDrive

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...arrays import Array
-from ..belief import Belief
-from ..filters.invariant import InvariantEkfSlam
+from ..filters.ekf import InvariantEkfSlam
+from ..interface import Belief
 from .drive import Drive
 
 

@@ -6,8 +6,7 @@ from functools import partial
 from typing import Any
 
 from ...estimator.check_estimator import find_breaches, listed
-from ...estimator.registry import find_estimator
-from ...estimator.support.filter_labels import read_label
+from ...estimator.registry import find_estimator, read_label
 from ..monte_carlo.measure.estimator_choices import estimator_choices
 from ..runs.filter_settings import FilterSettings
 from .errors import BrokenFilterError

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from ...estimator.support.filter_labels import split_labels
+from ...estimator.registry import split_labels
 from ...sim_configs.atomic_file import naming_file
 from . import options
 from .errors import BadInputError, way_to_set

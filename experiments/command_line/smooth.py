@@ -46,7 +46,7 @@ def smooth(
     slamgym smooth sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
     slamgym smooth log.csv -e 'invariant[gate_probability=0.999]' --robust huber
     """
-    from ...estimator.support.filter_labels import read_label
+    from ...estimator.registry import read_label
     from ..figures import save_figure, smoothed_figure
     from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
     from ..runs.log_smoothing import smooth_log, summarise_smoothing

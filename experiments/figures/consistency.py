@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from ...arrays import Array
-from ...estimator.error_frames import additive_error
+from ...estimator.models.rigid_motion import additive_error
 from ..runs.trace import RunTrace
 from .style import ALARM, BLUE, GREY, INK, TEAL, dress, new_figure, write_title
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ...estimator.models.angles import wrap_angle
+from ...estimator.models.bearing_range import wrap_angle
 from .lines import LogLine
 
 NO_LANDMARK = -1

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array
-from ...estimator.error_frames import ErrorFrame
+from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.chi_square import chi_square_quantile
 from ...evaluation.nees import pose_nees
 from ..logs.ground_truth import true_poses_of

@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 
 from ...arrays import Array, IntArray
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
-from ...estimator.kernels.scan_rows import USED
+from ...estimator.kernels.kalman_gain import USED
 from ...evaluation.whiteness import autocorrelation, ljung_box
 
 LAGS = 10  # of the test

@@ -12,7 +12,7 @@ from ...arrays import Array, BoolArray
 from ...estimator.filters.drive_likelihood import GATE, drive_likelihood
 from ...estimator.filters.ekf import EkfSlam
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
-from ...estimator.kernels.scan_rows import GATED
+from ...estimator.kernels.kalman_gain import GATED
 from .log_events import (
     Stretch,
     parts_of,

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ...estimator import registry
 from ...estimator.interface import SlamEstimator
-from ...estimator.support.filter_labels import read_label
+from ...estimator.registry import read_label
 from ...sim_configs import Scenario
 from ...suggestions import closest
 from ..logs.events import Scan

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ...estimator.models.angles import wrap_angle
+from ...estimator.models.bearing_range import wrap_angle
 from ..logs.anonymous import hides_identities
 from ..logs.events import Scan
 from .log_replay import Replay

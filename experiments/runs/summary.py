@@ -8,7 +8,7 @@ import numpy as np
 
 from ... import __version__
 from ...arrays import Array
-from ...estimator.error_frames import ErrorFrame
+from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation import nees
 from ...evaluation.chi_square import chi_square_quantile
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy

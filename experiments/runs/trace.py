@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
-from ...estimator.error_frames import ErrorFrame
+from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.trajectory_error import landmark_covariances
 
 Integers = NDArray[np.integer]

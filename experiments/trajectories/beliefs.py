@@ -13,8 +13,7 @@ from ...arrays import AnyArray
 from ...envs.spaces import count_rows
 from ...estimator.interface import SlamEstimator, UpdateReport
 from ...estimator.map_management.policy import LandmarkPolicy
-from ...estimator.registry import find_estimator
-from ...estimator.support.filter_labels import read_label
+from ...estimator.registry import find_estimator, read_label
 from ...sim_configs import Scenario
 from ..logs.events import NO_LANDMARK
 from ..runs.filter_settings import FilterSettings, settings_for_scenario

@@ -9,7 +9,7 @@ from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
 from slamgym.agents.active_slam_baselines import make_baseline
 from slamgym.agents.active_slam_scores import VALIDATION
 from slamgym.agents.map_truth import matched_rmse
-from slamgym.estimator.filters.batch_results import BatchStorage
+from slamgym.estimator.filters.batch import BatchStorage
 
 SCORES = [
     f"association_{name}" for name in ("precision", "recall", "duplicate", "ghost")

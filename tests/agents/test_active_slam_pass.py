@@ -6,7 +6,7 @@ from numpy_active_slam import SlowTask
 
 from slamgym.agents import ActiveSlamVectorEnv
 from slamgym.agents.active_slam_task import ActiveSlamTask, RewardWeights
-from slamgym.estimator.filters.batch_results import BatchStorage
+from slamgym.estimator.filters.batch import BatchStorage
 from slamgym.sim_configs import load_scenario
 
 FLOOR = [[-8, -8, 8, -8], [8, -8, 8, 8], [8, 8, -8, 8], [-8, 8, -8, -8]]

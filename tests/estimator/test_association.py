@@ -15,10 +15,8 @@ from slamgym.estimator.association.nearest_neighbour import (
     nearest_neighbours,
 )
 from slamgym.estimator.association.tentative_landmarks import TentativeLandmarks
-from slamgym.estimator.kernels import screen as screening
-from slamgym.estimator.kernels.belief_arrays import BeliefArrays
-from slamgym.estimator.kernels.rules import Rules
-from slamgym.estimator.kernels.scan_rows import (
+from slamgym.estimator.kernels import scan_update as screening
+from slamgym.estimator.kernels.kalman_gain import (
     ADDED,
     FIRST,
     JACOBIAN,
@@ -29,9 +27,10 @@ from slamgym.estimator.kernels.scan_rows import (
     SLOT,
     USED,
     VARIANCE,
+    BeliefArrays,
+    Rules,
 )
-from slamgym.estimator.models.angles import wrap_angle
-from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.models.unicycle_motion import predict_pose
 from slamgym.sim_configs import action_sequence, load_scenario
 

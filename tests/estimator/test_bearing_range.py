@@ -5,13 +5,13 @@ from hypothesis import strategies as st
 from numba import njit
 from numeric_jacobian import numeric_jacobian
 
-from slamgym.estimator.models.angles import wrap_angle
 from slamgym.estimator.models.bearing_range import (
     expected_reading_jit,
     locate_landmark,
     located_jit,
     predict_measurement,
     reading_slopes_jit,
+    wrap_angle,
     wrap_angle_jit,
 )
 

@@ -12,8 +12,8 @@ from slamgym.estimator.association.constellations import (
     match_constellations,
 )
 from slamgym.estimator.association.same_place import Match, TwoPlaces
-from slamgym.estimator.error_frames import invariant_error
-from slamgym.estimator.kernels.clique_search import compare_pairs, search_clique
+from slamgym.estimator.kernels.assignment_search import compare_pairs, search_clique
+from slamgym.estimator.models.rigid_motion import invariant_error
 
 STD = 0.05
 GROUP = np.array([(0, 0), (4, 1), (1, 5), (6, 6), (9, 2), (3, 9), (8, 9)], dtype=float)

@@ -9,8 +9,7 @@ from numeric_jacobian import numeric_jacobian
 from scipy.stats import chi2
 
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
-from slamgym.estimator.models.angles import wrap_angle
-from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 
 IDS = list(range(6))
 

@@ -4,12 +4,13 @@ from numeric_jacobian import numeric_jacobian
 from scipy.linalg import logm
 
 from slamgym.estimator import Belief
-from slamgym.estimator.error_frames import (
+from slamgym.estimator.models.rigid_motion import (
     additive_error,
+    compose,
+    composed,
     invariant_covariance,
     invariant_error,
 )
-from slamgym.estimator.models.rigid_motion import compose, composed
 from slamgym.evaluation.chi_square import average_band
 from slamgym.evaluation.nees import heading_nees, normalised_squared_error, pose_nees
 

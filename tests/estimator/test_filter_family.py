@@ -16,7 +16,7 @@ from dense_family import (
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
-from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import wrap_angle
 
 IDS = list(range(6))
 TRUE_MAP = dict(enumerate(SIX))

@@ -14,7 +14,7 @@ from slamgym.estimator import (
     make_batch,
     make_estimator,
 )
-from slamgym.estimator.kernels.in_view import is_hidden
+from slamgym.estimator.kernels.imagine import is_hidden
 from slamgym.estimator.models.bearing_range import predict_measurement
 
 FAMILY = ("ekf", "invariant", "first_estimates", "observability_constrained")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slamgym.estimator import make_estimator
-from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import wrap_angle
 
 
 def drive_around(seed):

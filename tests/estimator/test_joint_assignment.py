@@ -11,7 +11,11 @@ from slamgym.estimator.association.joint_assignment import (
     innovations_of,
     predicted_readings,
 )
-from slamgym.estimator.kernels.joint_readings import UNPAIRED, Problem, largest_change
+from slamgym.estimator.kernels.assignment_search import (
+    UNPAIRED,
+    Problem,
+    largest_change,
+)
 from slamgym.estimator.models.bearing_range import predict_measurement
 
 MISSING = 2.0

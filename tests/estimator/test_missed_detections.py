@@ -13,7 +13,7 @@ from slamgym.estimator.association.missed_detections import (
     Detections,
 )
 from slamgym.estimator.association.scan_assignments import missing_costs
-from slamgym.estimator.belief import MapView
+from slamgym.estimator.interface import MapView
 
 LONGEST = 6.0
 

@@ -7,7 +7,7 @@ from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 
 from slamgym.estimator import make_estimator
 from slamgym.estimator.map_management import ManagedSlam
-from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.smoother import Drive, SmoothingSlam, smooth
 from slamgym.estimator.smoother.start import start_of
 

@@ -15,12 +15,10 @@ from test_submaps import (
     run,
 )
 
-from slamgym.estimator.filters.gaussian_map import without_landmarks
-from slamgym.estimator.filters.landmark_merging import coincide
+from slamgym.estimator.filters.gaussian_map import coincide, without_landmarks
 from slamgym.estimator.large_maps.submaps import gauss_newton, neighbourhood
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
-from slamgym.estimator.models.angles import wrap_angle
-from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.models.unicycle_motion import predict_pose
 
 # By the names that it has in some steps: landmark 4 is also 104, and so on.

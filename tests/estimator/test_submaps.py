@@ -23,8 +23,7 @@ from slamgym.estimator.large_maps.submaps.fusion import fuse
 from slamgym.estimator.large_maps.submaps.gaussian import Gaussian
 from slamgym.estimator.large_maps.submaps.store import CACHE_SIZE, MARKER
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
-from slamgym.estimator.models.angles import wrap_angle
-from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.models.unicycle_motion import predict_pose
 from slamgym.evaluation.nees import pose_nees
 from slamgym.experiments.runs.simulated_runs import simulate_runs

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numeric_jacobian import numeric_jacobian
 
-from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.models.unicycle_motion import drive_jit, predict_pose
 
 

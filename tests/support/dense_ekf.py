@@ -6,8 +6,11 @@ from the equations alone, sharing no code with the kernels.
 
 import numpy as np
 
-from slamgym.estimator.models.angles import wrap_angle
-from slamgym.estimator.models.bearing_range import locate_landmark, predict_measurement
+from slamgym.estimator.models.bearing_range import (
+    locate_landmark,
+    predict_measurement,
+    wrap_angle,
+)
 from slamgym.estimator.models.unicycle_motion import predict_pose
 
 

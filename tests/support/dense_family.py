@@ -8,8 +8,11 @@ import numpy as np
 from dense_ekf import DenseEkf
 from scipy.linalg import expm, sqrtm
 
-from slamgym.estimator.models.angles import wrap_angle
-from slamgym.estimator.models.bearing_range import locate_landmark, predict_measurement
+from slamgym.estimator.models.bearing_range import (
+    locate_landmark,
+    predict_measurement,
+    wrap_angle,
+)
 from slamgym.estimator.models.unicycle_motion import predict_pose
 
 J = np.array([[0.0, -1.0], [1.0, 0.0]])

@@ -3,8 +3,7 @@
 import numpy as np
 from numeric_jacobian import numeric_jacobian
 
-from slamgym.estimator.models.angles import wrap_angle
-from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.models.unicycle_motion import predict_pose
 
 

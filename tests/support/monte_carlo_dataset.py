@@ -14,8 +14,8 @@ import xarray as xr
 
 from slamgym import __version__
 from slamgym.estimator import make_batch
-from slamgym.estimator.error_frames import invariant_error
-from slamgym.estimator.models.angles import wrap_angle
+from slamgym.estimator.models.bearing_range import wrap_angle
+from slamgym.estimator.models.rigid_motion import invariant_error
 from slamgym.evaluation import nees as c
 from slamgym.evaluation.error_bound import posterior_bound
 from slamgym.evaluation.noise_sums import noise_sums

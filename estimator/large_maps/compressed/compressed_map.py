@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
-from ...filters.ekf import EkfSlam
-from ...filters.invariant import InvariantEkfSlam
+from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...interface import Belief
 from ...support.argument_checks import LOWEST_ID
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory

@@ -10,14 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import LARGEST
-from ...belief import describe_filter
-from ...filters.ekf import EkfSlam
-from ...filters.first_estimates import FirstEstimatesEkfSlam
-from ...filters.invariant import InvariantEkfSlam
-from ...filters.iterated import IteratedEkfSlam
-from ...filters.observability_constrained import ObservabilityConstrainedEkfSlam
-from ...interface import Belief, MapView, UpdateReport
-from ...support import argument_checks, pair_checks, saved_states
+from ...filters.ekf import (
+    EkfSlam,
+    FirstEstimatesEkfSlam,
+    InvariantEkfSlam,
+    IteratedEkfSlam,
+    ObservabilityConstrainedEkfSlam,
+)
+from ...interface import Belief, MapView, UpdateReport, describe_filter
+from ...support import argument_checks, saved_states
+from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
 from ...support.undo import Undo, attributes, undo_all, undone_on_error

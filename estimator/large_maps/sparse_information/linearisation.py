@@ -14,8 +14,7 @@ a landmark use the same l̄, the information of the whole map does not observe i
 import numpy as np
 
 from ....arrays import Array, IntArray
-from ...models.angles import wrap_angle
-from ...models.bearing_range import predict_measurement
+from ...models.bearing_range import predict_measurement, wrap_angle
 from .conditional_pose import ConditionalPose, LinearScan
 from .local_information import LocalInformation
 

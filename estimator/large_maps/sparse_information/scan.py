@@ -9,10 +9,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
-from ...filters.ekf import EkfSlam
-from ...filters.filter_settings import reading_variances
-from ...filters.motion_noise import MotionNoise
-from ...filters.scan_workspace import not_positive_definite
+from ...filters.ekf import EkfSlam, MotionNoise, reading_variances
+from ...filters.gaussian_map import not_positive_definite
 from ...support import argument_checks
 from .conditional_pose import ConditionalPose, LinearScan, marginalise_pose
 from .linearisation import BASES, linearise_scan

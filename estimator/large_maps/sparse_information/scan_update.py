@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ....arrays import Array, IntArray
-from ...filters.filter_settings import reading_variances
+from ...filters.ekf import reading_variances
 from ...interface import UpdateReport
 from .conditional_pose import ConditionalPose
 from .local_information import LocalInformation

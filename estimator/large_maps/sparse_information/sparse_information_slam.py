@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array
-from ...belief import Belief, MapView, describe_filter
-from ...interface import UpdateReport
-from ...models.angles import wrap_angle
-from ...support import argument_checks, pair_checks
+from ...interface import Belief, MapView, UpdateReport, describe_filter
+from ...models.bearing_range import wrap_angle
+from ...support import argument_checks
+from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from .conditional_pose import move

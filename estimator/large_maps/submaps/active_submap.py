@@ -3,8 +3,7 @@
 from collections.abc import Collection, Sequence
 
 from ....arrays import Array
-from ...filters.ekf import EkfSlam
-from ...filters.map_filter import FRAMES
+from ...filters.ekf import FRAMES, EkfSlam
 from .gaussian import Gaussian
 from .landmark_index import LandmarkIndex, link_name
 

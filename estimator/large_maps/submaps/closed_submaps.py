@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from ....arrays import Array, IntArray
-from ...error_frames import ErrorFrame
+from ...models.rigid_motion import ErrorFrame
 from ...support.undo import Undo
 from .frame_initialisation import (
     FrameInitialisation,

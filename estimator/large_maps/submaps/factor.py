@@ -4,7 +4,7 @@ Symbols
 -------
 F_k = (p_k, θ_k)  frame of submap k in the world [m, m, rad]
 m̂, P              its mean, (last pose, landmarks) in F_k, and the covariance of its
-                  error, additive or invariant (:mod:`.error_frames`)
+                  error, additive or invariant (:mod:`.rigid_motion`)
 Y                 the same quantities in the world: F_{k+1} and landmarks l relative
                   to F_k,  Y_q = R(θ_k)ᵀ (q − p_k),  Y_θ = θ_{k+1} − θ_k
 
@@ -18,8 +18,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ....arrays import Array
-from ...error_frames import ErrorFrame
-from ...models.angles import wrap_angle
+from ...models.bearing_range import wrap_angle
+from ...models.rigid_motion import ErrorFrame
 from .gaussian import Complex, points_of, state_of
 
 SMALLEST_RATIO = 1e-5

@@ -6,7 +6,7 @@ same landmark in the submap::
 
     0 = R(θ)ᵀ (l − p) − c
 
-In the coordinates ξ of :mod:`.error_frames` its derivative is R(θ)ᵀ (ξ_l − ξ_p) − δc.
+In the coordinates ξ of :mod:`.rigid_motion` its derivative is R(θ)ᵀ (ξ_l − ξ_p) − δc.
 It does not depend on the heading, so the measurement gains no information about the
 orientation of the whole map.
 """
@@ -15,10 +15,13 @@ import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
 from ....arrays import Array, IntArray
-from ...error_frames import ErrorFrame, invariant_covariance
 from ...interface import Belief
-from ...models.rigid_motion import compose
-from ...support.symmetric import as_covariance
+from ...models.rigid_motion import (
+    ErrorFrame,
+    as_covariance,
+    compose,
+    invariant_covariance,
+)
 from ..sparse_cholesky.coordinates import pairs
 from .factor import retract
 from .gaussian import Gaussian, points_of, state_of, times

@@ -6,7 +6,7 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ...interface import Belief
-from ...models.angles import wrap_angle
+from ...models.bearing_range import wrap_angle
 from ...models.rigid_motion import compose
 from ...support.undo import Undo, attributes, undo_all
 from .active_submap import ActiveSubmap

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 
 from ....arrays import Array, IntArray
-from ...error_frames import ErrorFrame
+from ...models.rigid_motion import ErrorFrame
 from ..sparse_cholesky.coordinates import pairs
 from ..sparse_cholesky.submap_dissection import dissect
 from ..sparse_cholesky.submap_elimination import Quadratic, SubmapElimination

@@ -9,9 +9,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from ....arrays import Array
-from ...error_frames import ErrorFrame
-from ...filters.gaussian_map import without_landmarks
-from ...filters.landmark_merging import coincide
+from ...filters.gaussian_map import coincide, without_landmarks
+from ...models.rigid_motion import ErrorFrame
 from .factor import retract
 from .store import Submap
 

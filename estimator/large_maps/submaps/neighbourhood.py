@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
-from ...filters.invariant import InvariantEkfSlam
+from ...filters.ekf import InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds

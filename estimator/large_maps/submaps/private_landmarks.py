@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import cho_solve
 
 from ....arrays import Array, IntArray
-from ...error_frames import ErrorFrame
+from ...models.rigid_motion import ErrorFrame
 from ..sparse_cholesky.coordinates import pairs
 from .factor import FactorError, inverse_spread, regularised
 from .gaussian import times

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from ....arrays import Array
-from ...belief import describe_map
-from ...interface import Belief
+from ...interface import Belief, describe_map
 from ...support import argument_checks
 from ...support.argument_checks import LandmarkIds
 from .graph import SubmapGraph

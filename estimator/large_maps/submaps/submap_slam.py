@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array
-from ...filters.ekf import EkfSlam
-from ...filters.invariant import InvariantEkfSlam
+from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport
-from ...support import argument_checks, pair_checks
+from ...support import argument_checks
+from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from .active_submap import ORIGIN, ActiveSubmap

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....arrays import Array
-from ....estimator.error_frames import ERROR_FRAMES, ErrorFrame
 from ....estimator.interface import Belief
+from ....estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame
 from ....evaluation.association_scores import AssociationScores
 from ....evaluation.gospa import Gospa
 from ....evaluation.nees import pose_nees

@@ -12,9 +12,10 @@ from ....estimator.registry import (
     EstimatorFactory,
     find_estimator,
     list_estimators,
+    read_label,
     register_estimator,
+    split_labels,
 )
-from ....estimator.support.filter_labels import read_label, split_labels
 from ....sim_configs import Scenario
 from ...runs.filter_settings import OFFLINE, FilterSettings, settings_for_scenario
 

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from ....arrays import BoolArray
-from ....estimator.filters.batch import BatchSlam, can_batch
-from ....estimator.filters.batch_results import BatchTrace
+from ....estimator.filters.batch import BatchSlam, BatchTrace, can_batch
 from ....estimator.filters.ekf import EkfSlam
 from ....estimator.interface import (
     Belief,

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....arrays import Array
-from ....estimator.error_frames import ERROR_FRAMES, invariant_error
 from ....estimator.interface import Belief
-from ....estimator.models.angles import wrap_angle
+from ....estimator.models.bearing_range import wrap_angle
+from ....estimator.models.rigid_motion import ERROR_FRAMES, invariant_error
 from ....evaluation import nees
 from ....evaluation.error_bound import PosteriorBound, invariant_squares
 from ....evaluation.noise_sums import CHANNELS, MOMENTS

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ....arrays import Array
-from ....estimator.error_frames import ErrorFrame
+from ....estimator.models.rigid_motion import ErrorFrame
 from ....evaluation.diagnosis import CANNOT_TELL, HONEST, Diagnosis, diagnose
 from ...runs.nan_statistics import finite
 from ..measure.association_measures import (

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ....arrays import Array
-from ....estimator.error_frames import ErrorFrame
+from ....estimator.models.rigid_motion import ErrorFrame
 from ....evaluation.chi_square import average_band, family_band
 from ...figures.style import GREY, INK, dress, new_figure
 from .estimator_lines import (

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from ....arrays import Array, BoolArray, IntArray
-from ....estimator.error_frames import ErrorFrame
+from ....estimator.models.rigid_motion import ErrorFrame
 from ...runs.nan_statistics import quotient
 
 POSE_FREEDOM, POINT_FREEDOM = 3, 2

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ....estimator.error_frames import ErrorFrame
+from ....estimator.models.rigid_motion import ErrorFrame
 from ....evaluation.chi_square import average_band
 from ....evaluation.consistency_report import ConsistencyReport, evaluate_consistency
 from ...runs.nan_statistics import finite, mean, quotient, root_mean_square

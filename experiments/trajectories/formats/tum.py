@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ....arrays import Array
-from ....estimator.models.angles import wrap_angle
+from ....estimator.models.bearing_range import wrap_angle
 from ..trajectory import Trajectory
 from .dead_reckoning import dead_reckoning
 from .episode_files import numbers, read_metadata, write_lines, write_metadata
