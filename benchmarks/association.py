@@ -25,8 +25,7 @@ from slamgym.estimator import (
     SlamEstimator,
     make_estimator,
 )
-from slamgym.estimator.association.nearest_neighbour import Noise
-from slamgym.estimator.association.scan_assignments import assign_scan
+from slamgym.estimator.association.scan_assignments import Noise, assign_scan
 from slamgym.estimator.interface import MapView
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.evaluation import AssociationScores, score_association

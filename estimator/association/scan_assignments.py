@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from math import exp
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
 from ...arrays import Array, IntArray
+from ...jit import jit
 from ..interface import MapView
-from ..kernels.assignment_search import UNPAIRED, Problem, largest_change
-from .association_policy import AssociationPolicy
-from .joint_assignment import best_assignments, innovations_of, predicted_readings
-from .nearest_neighbour import (
-    AMBIGUOUS,
-    NEW,
-    Distances,
-    Noise,
-    innovation_distances,
-    nearest_neighbours,
+from ..kernels.assignment_search import (
+    UNPAIRED,
+    Problem,
+    fill_distances,
+    fill_expected,
+    largest_change,
+    search_assignments,
 )
+from ..models.bearing_range import wrap_angle, wrap_angle_jit
+from ..support import argument_checks
 
 BRANCH_SPREAD = 16.0
 """Assignments of a scan e^8 times less likely than the best one are not considered."""
@@ -161,3 +163,411 @@ def _slots(
     paired = marks != UNPAIRED
     slots[paired] = explained[marks[paired]]
     return np.asarray(slots, dtype=np.int64)
+
+
+# --------------------------------------------------------------------------------------
+# The policy by which readings are associated and new landmarks confirmed.
+
+ASSOCIATIONS = ("auto", "nearest", "joint", "compatibility", "hypotheses")
+
+MOST_SCANS = 63  # that fit one mask of a tentative landmark
+
+
+@dataclass(frozen=True)
+class AssociationPolicy:
+    """How readings are associated, and when a new landmark is confirmed.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
+    """
+
+    association: str = "auto"
+    """How readings without identity are assigned to landmarks: "nearest", each reading
+    to its most likely landmark; "joint", the most likely assignment of the whole scan;
+    "compatibility", the most pairs that are jointly compatible (JCBB); "hypotheses",
+    several joint assignments, followed until the readings decide between them; "auto",
+    hypotheses, but joint in filters for large maps and those that observe the truth."""
+    density: float | None = None
+    """Readings per scan from no landmark of the map, clutter and new landmarks
+    [1 / (rad m)]; None: estimate it from the scans so far."""
+    hypotheses: int = 10
+    """Most hypotheses at a time."""
+    branches: int = 4
+    """Most assignments of one scan that a hypothesis splits into."""
+    search_nodes: int = 2000
+    """Limit of the search for joint assignments; beyond it the best found so far is
+    taken."""
+    pair_gate: float = 15.0
+    """A joint assignment pairs a reading and a landmark up to this νᵀ S⁻¹ ν, given the
+    other pairs."""
+    backdate: bool = True
+    """Whether the sightings before the confirming one count: the filter then repeats
+    the scans since the first sighting, with the new landmark in them."""
+    match_gate: float = 9.21
+    """A reading is of a landmark only up to this νᵀ S⁻¹ ν; χ² of 2 dof, here 99 %."""
+    new_gate: float = 25.0
+    """A reading is of a new landmark only beyond this from all that are known."""
+    ambiguity: float = 1.0
+    """Left out where two landmarks differ by less than this in −2 ln likelihood."""
+    confirm: tuple[int, int] = (3, 8)
+    """(k, n): seen in k of n successive scans, a landmark enters the map."""
+    trust_ids: bool = True
+    """Whether landmarks that come with an identity enter at first sight."""
+
+    def __post_init__(self) -> None:
+        argument_checks.one_of("association", self.association, ASSOCIATIONS)
+        if self.density is not None:
+            argument_checks.above("density", self.density, 0.0)
+        for name in ("hypotheses", "branches", "search_nodes"):
+            argument_checks.whole(name, getattr(self, name), 1)
+        argument_checks.above("pair_gate", self.pair_gate, 0.0)
+        argument_checks.flag("backdate", self.backdate)
+        argument_checks.above("match_gate", self.match_gate, 0.0)
+        argument_checks.at_least("new_gate", self.new_gate, self.match_gate)
+        argument_checks.at_least("ambiguity", self.ambiguity, 0.0)
+        argument_checks.flag("trust_ids", self.trust_ids)
+        object.__setattr__(self, "confirm", _k_of_n(self.confirm))
+
+    @property
+    def pair_tail(self) -> float:
+        """P(χ²₂ > pair_gate): the level of joint tests of several pairs."""
+        return exp(-self.pair_gate / 2)
+
+
+def _k_of_n(value: Any) -> tuple[int, int]:
+    try:
+        k, n = value
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"confirm must be two whole numbers (k, n), got {value!r}"
+        ) from None
+    k, n = (
+        argument_checks.whole("confirm[0]", k, 1),
+        argument_checks.whole("confirm[1]", n, 1),
+    )
+    if not k <= n <= MOST_SCANS:
+        raise ValueError(
+            f"confirm must be (k, n) with k <= n <= {MOST_SCANS}, got ({k}, {n})"
+        )
+    return k, n
+
+
+# --------------------------------------------------------------------------------------
+# Association of readings without identity: gated nearest neighbours.
+
+
+class Noise(NamedTuple):
+    """Noise of a sensor: a reading of range r has σβ + b / r and σr + k r.
+
+    Examples
+    --------
+    >>> Noise(0.1, 0.5, bearing_std_metres=0.4).variances(np.array([4.0])).round(2)
+    array([[0.04, 0.25]])
+    """
+
+    bearing_std: float
+    """σβ [rad]."""
+    range_std: float
+    """σr [m]."""
+    range_std_per_metre: float = 0.0
+    """k."""
+    bearing_std_metres: float = 0.0
+    """b [m]."""
+
+    def variances(self, ranges: Array) -> Array:
+        """Return the variances of bearing and range at ranges (m,) > 0, (m, 2)."""
+        std = np.empty((len(ranges), 2))
+        std[:, 0] = self.bearing_std
+        if self.bearing_std_metres:
+            std[:, 0] += self.bearing_std_metres / ranges
+        std[:, 1] = self.range_std + self.range_std_per_metre * ranges
+        return np.asarray(std**2)
+
+
+# What a reading is of, where it is not a slot of the map.
+NEW, AMBIGUOUS = -1, -2
+
+
+class Distances(NamedTuple):
+    """How well each of m readings fits each of n landmarks."""
+
+    squared: Array
+    """νᵀ S⁻¹ ν, shape (m, n); infinite where beyond what was asked for."""
+    unlikelihood: Array
+    """νᵀ S⁻¹ ν + ln det S, shape (m, n): −2 ln of the likelihood, but for a constant.
+
+    Of two landmarks at the same distance in σ, the more certain one is more likely.
+    """
+
+
+def innovation_distances(
+    mean: Array,
+    covariance: Array,
+    landmarks: int,
+    readings: Array,
+    noise: Noise,
+    largest: float,
+) -> Distances:
+    """Compare every reading with every landmark of a belief.
+
+    ::
+
+        ν = z − h(x),    S = H P Hᵀ + Q
+
+    at the estimate.  The range alone excludes most pairs without their H: where
+    ν_r² > largest (tr C + σr²) with C the covariance of l − p, νᵀ S⁻¹ ν is too large,
+    whatever the bearing.
+
+    Parameters
+    ----------
+    mean, covariance : ndarray
+        (x, y, θ, l1x, …) and P; there may be more behind the landmarks.
+    landmarks : int
+        How many landmarks these hold, n.
+    readings : ndarray, shape (m, 2)
+        Rows (β, r) [rad, m].
+    noise : Noise
+        Of the sensor.
+    largest : float
+        Pairs with a νᵀ S⁻¹ ν above this may be left infinite.
+
+    Examples
+    --------
+    >>> mean = np.array([0, 0, 0, 5.0, 0, 0, 5.0])
+    >>> readings = np.array([(0.0, 5.2), (1.57, 4.9)])
+    >>> P = 0.01 * np.eye(7)
+    >>> fit = innovation_distances(mean, P, 2, readings, Noise(0.1, 0.1), largest=25)
+    >>> (fit.squared < 9.21).tolist()
+    [[True, False], [False, True]]
+    """
+    shape = (len(readings), landmarks)
+    fit = Distances(np.full(shape, np.inf), np.full(shape, np.inf))
+    if fit.squared.size:
+        variances = noise.variances(readings[:, 1])
+        _compare(mean, covariance, readings, variances, largest, fit)
+    return fit
+
+
+@jit
+def _compare(
+    mean: Array,
+    covariance: Array,
+    readings: Array,
+    variances: Array,
+    largest: float,
+    fit: Distances,
+) -> None:
+    squared, unlikelihood = fit
+    P, x, y, heading = covariance, mean[0], mean[1], mean[2]
+    for j in range(squared.shape[1]):
+        c = 3 + 2 * j
+        dx, dy = mean[c] - x, mean[c + 1] - y
+        distance = np.sqrt(dx * dx + dy * dy)
+        if not distance > 0:
+            continue
+        xx = P[0, 0] + P[c, c] - 2 * P[0, c]
+        yy = P[1, 1] + P[c + 1, c + 1] - 2 * P[1, c + 1]
+        is_complete = False
+        for k in range(len(readings)):
+            nu_r = readings[k, 1] - distance
+            if nu_r * nu_r > largest * (xx + yy + variances[k, 1]):
+                continue
+            if not is_complete:  # what the readings share, for few landmarks only
+                is_complete = True
+                xy = P[0, 1] + P[c, c + 1] - P[0, c + 1] - P[1, c]
+                gx, gy = P[2, c] - P[2, 0], P[2, c + 1] - P[2, 1]
+                ex, ey = dx / distance, dy / distance
+                ax, ay = -ey / distance, ex / distance
+                s_rr = ex * ex * xx + 2 * ex * ey * xy + ey * ey * yy
+                s_br = ax * ex * xx + (ax * ey + ay * ex) * xy + ay * ey * yy
+                s_br -= ex * gx + ey * gy
+                s_bb = ax * ax * xx + 2 * ax * ay * xy + ay * ay * yy
+                s_bb += P[2, 2] - 2 * (ax * gx + ay * gy)
+                bearing = np.arctan2(dy, dx) - heading
+            nu_b = wrap_angle_jit(readings[k, 0] - bearing)
+            rr = s_rr + variances[k, 1]
+            bb = s_bb + variances[k, 0]
+            determinant = rr * bb - s_br * s_br
+            if not determinant > 0:
+                continue
+            d = nu_b * nu_b * rr - 2 * nu_b * nu_r * s_br + nu_r * nu_r * bb
+            d /= determinant
+            if d <= largest:
+                squared[k, j] = d
+                unlikelihood[k, j] = d + np.log(determinant)
+
+
+def nearest_neighbours(
+    fit: Distances, *, match: float, new: float, ambiguity: float = 0.0
+) -> IntArray:
+    """Give each reading at most one landmark, and each landmark at most one reading.
+
+    A reading belongs to the landmark under which it is most likely, among those whose
+    νᵀ S⁻¹ ν is within the gate, if it is also that landmark's most likely reading.
+
+    Parameters
+    ----------
+    fit : Distances
+        Of m readings and n landmarks.
+    match : float
+        The gate: largest νᵀ S⁻¹ ν of a pair, χ² of 2 degrees of freedom.
+    new : float
+        A reading farther than this from every landmark is of none of them.
+    ambiguity : float
+        Where the runner-up within the gate is less likely by no more than this in
+        −2 ln of the likelihood, the reading is left out.
+
+    Returns
+    -------
+    ndarray of int64, shape (m,)
+        A slot of the map, `NEW`, or `AMBIGUOUS`: not to be used.
+
+    Examples
+    --------
+    >>> d = np.array([[1.0, np.inf], [4.0, np.inf], [np.inf, 12.0], [np.inf, np.inf]])
+    >>> nearest_neighbours(Distances(d, d), match=9.21, new=25.0).tolist()
+    [0, -2, -2, -1]
+    """
+    rows, landmarks = fit.squared.shape
+    chosen = np.full(rows, NEW, dtype=np.int64)
+    if not fit.squared.size:
+        return chosen
+    scores = np.where(fit.squared <= match, fit.unlikelihood, np.inf)
+    chosen[fit.squared.min(axis=1) <= new] = AMBIGUOUS
+    best = scores.argmin(axis=1)
+    every = np.arange(rows)
+    score = scores[every, best]
+    is_clear = np.isfinite(score) & (scores.argmin(axis=0)[best] == every)
+    if landmarks > 1 and ambiguity > 0:
+        others = scores.copy()
+        others[every, best] = np.inf
+        is_clear &= others.min(axis=1) - np.where(is_clear, score, 0.0) > ambiguity
+    chosen[is_clear] = best[is_clear]
+    return chosen
+
+
+# --------------------------------------------------------------------------------------
+# The most likely joint assignments of a scan's readings to landmarks.
+#
+# An assignment gives each reading one landmark or none, and each landmark at most one
+# reading.  Its cost is −2 ln of its likelihood, up to a constant of the scan::
+#
+#     cost = νᵀ S⁻¹ ν + ln det S + Σ λᵢ,    λᵢ = −2 ln ρᵢ − 2 ln 2π
+#
+# ν and S = H P Hᵀ + Q belong to the paired readings together, the sum is over the
+# readings left out, and ρᵢ is the density, at the reading, of those that come from no
+# landmark of the map: clutter and landmarks that are not mapped yet [1 / (rad m)].
+#
+# A depth-first branch and bound decides one reading after the other.  A pair conditions
+# the expected readings of all landmarks.  By the chain rule of the Gaussian, the cost of
+# an assignment is the sum of the costs of its pairs, each given the pairs before it::
+#
+#     h ← h + K (z − h),  C ← C − K C,    K = C Hⱼᵀ (Cⱼⱼ + Q)⁻¹,    C = H P Hᵀ
+#
+# The k readings still open add at least the following, since C ⪯ k blockdiag(Cⱼⱼ)::
+#
+#     Σᵢ min(λᵢ, minⱼ νᵀ (k Cⱼⱼ + Q)⁻¹ ν + ln det Q)
+
+
+class Solutions(NamedTuple):
+    """The best assignments, the cheapest first."""
+
+    costs: Array
+    """Shape (M,)."""
+    marks: IntArray
+    """Landmark 0 … J − 1 of each reading or `UNPAIRED`, shape (M, m)."""
+    distances: Array
+    """Least νᵀ S⁻¹ ν of each unpaired reading to a landmark without a reading, given
+    the pairs, shape (M, m)."""
+    is_complete: bool
+    """False where the search stopped at its limit of nodes."""
+
+
+def predicted_readings(
+    mean: Array, covariance: Array, slots: IntArray
+) -> tuple[Array, Array]:
+    """Return h(x), shape (J, 2), and H P Hᵀ, shape (2J, 2J), of some landmarks.
+
+    Parameters
+    ----------
+    mean, covariance : ndarray
+        (x, y, θ, l1x, …) and P; there may be more behind the landmarks.
+    slots : ndarray of int64, shape (J,)
+        Places of the landmarks in the map.
+    """
+    count = len(slots)
+    expected, joint = np.empty((count, 2)), np.empty((2 * count, 2 * count))
+    fill_expected(mean, covariance, slots, expected, joint)
+    return expected, joint
+
+
+def innovations_of(readings: Array, expected: Array) -> Array:
+    """Return z − h(x) of all pairs, shape (m, J, 2), bearings in [-π, π)."""
+    innovations = readings[:, None] - expected[None]
+    innovations[..., 0] = wrap_angle(innovations[..., 0])
+    return innovations
+
+
+def best_assignments(
+    problem: Problem,
+    *,
+    most: int = 1,
+    spread: float = np.inf,
+    ceiling: float = np.inf,
+    nodes: int = 2000,
+) -> Solutions:
+    """Return the cheapest assignments of a scan.
+
+    Parameters
+    ----------
+    problem : Problem
+    most : int
+        M, how many at most.
+    spread : float
+        Largest difference of their costs to the least.
+    ceiling : float
+        Cost beyond which only the first one found is of interest.
+    nodes : int
+        Limit of the search.  At the limit, the best assignments found so far are
+        returned.  The first of them always gives each reading in turn the pair that is
+        most likely given the pairs before it.
+
+    Notes
+    -----
+    With ``pairs_first`` and χ² limits this is the joint compatibility test of [1]_.
+
+    References
+    ----------
+    .. [1] J. Neira, J. Tardós, Data association in stochastic mapping using the joint
+       compatibility test, IEEE Transactions on Robotics and Automation 17, 2001.
+
+    Examples
+    --------
+    >>> expected, variances = np.array([(0.0, 5.0), (0.3, 5.0)]), np.full((2, 2), 0.01)
+    >>> problem = Problem(
+    ...     innovations=innovations_of(expected + 0.2, expected),
+    ...     joint=np.tile(0.04 * np.eye(2), (2, 2)),
+    ...     variances=variances,
+    ...     feasible=np.ones((2, 2), dtype=bool),
+    ...     missing=np.full(2, 9.0),
+    ...     gate=25.0,
+    ...     limits=np.full(3, np.inf),
+    ...     pairs_first=False,
+    ... )
+    >>> best_assignments(problem).marks.tolist()
+    [[0, 1]]
+    """
+    rows, visited = len(problem.innovations), 0
+    costs = np.full(most, np.inf)
+    marks = np.full((most, rows), UNPAIRED)
+    distances = np.full((most, rows), np.inf)
+    if problem.feasible.size:
+        visited = search_assignments(problem, costs, marks, spread, ceiling, nodes)
+    else:
+        costs[0] = problem.missing.sum()
+    count = int((np.isfinite(costs) & (costs <= costs[0] + spread)).sum())
+    if problem.feasible.size:
+        fill_distances(problem, marks[:count], distances[:count])
+    return Solutions(costs[:count], marks[:count], distances[:count], visited < nodes)

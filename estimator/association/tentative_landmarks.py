@@ -22,7 +22,7 @@ from ...arrays import Array, BoolArray, IntArray
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import rotation
 from ..support import saved_states
-from .nearest_neighbour import Distances, Noise, innovation_distances
+from .scan_assignments import Distances, Noise, innovation_distances
 
 Masks = NDArray[np.uint64]
 

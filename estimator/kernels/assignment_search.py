@@ -1,6 +1,6 @@
 """Search for the cheapest joint assignments of a scan, compiled.
 
-:mod:`slamgym.estimator.association.joint_assignment` has the equations.  Depth d of the
+:mod:`slamgym.estimator.association.scan_assignments` has the equations.  Depth d of the
 search tree decides the reading ``order[d]``.  The expected readings given the pairs so
 far stand at ``level[d]`` of ``shifts`` and ``joints``.
 """
@@ -250,7 +250,7 @@ def search_assignments(
 # Expected readings of several landmarks, conditioned on pairs of a scan, compiled.
 #
 # ``shifts[d]`` is h minus h(x) and ``joints[d]`` is C after some pairs, its lower half
-# only; :mod:`slamgym.estimator.association.joint_assignment` has the equations.
+# only; :mod:`slamgym.estimator.association.scan_assignments` has the equations.
 
 UNPAIRED = -1
 

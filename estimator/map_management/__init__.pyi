@@ -1,5 +1,5 @@
-from .field_of_view import FieldOfView as FieldOfView
 from .hypotheses import HypothesisSlam as HypothesisSlam
 from .hypotheses import manage as manage
 from .managed_slam import ManagedSlam as ManagedSlam
+from .policy import FieldOfView as FieldOfView
 from .policy import LandmarkPolicy as LandmarkPolicy

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -17,8 +17,7 @@ from ..interface import Belief, MapView, ScanDecisions, SlamEstimator, UpdateRep
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
-from ..support.undo import Undo, undo_all, undone_on_error
-from .filter_pool import FilterPool
+from ..support.undo import Undo, contents, undo_all, undone_on_error
 from .managed_slam import ManagedSlam
 from .policy import LandmarkPolicy, as_policy
 
@@ -299,3 +298,45 @@ class HypothesisSlam:
     def __repr__(self) -> str:
         count = len(self.hypotheses)
         return repr(self.best) + (f", best of {count} hypotheses" if count > 1 else "")
+
+
+# --------------------------------------------------------------------------------------
+# Filters that can be copied often and cheaply.
+
+
+class FilterPool:
+    """Copies managed filters, and reuses those that are no longer needed.
+
+    Parameters
+    ----------
+    make : callable
+        Makes a filter.
+    """
+
+    def __init__(self, make: Callable[[], ManagedSlam]) -> None:
+        self._make = make
+        self._spare: list[ManagedSlam] = []
+
+    def __len__(self) -> int:
+        """Return how many filters nobody uses."""
+        return len(self._spare)
+
+    def fresh(self) -> ManagedSlam:
+        """Return a filter that nobody uses, in any state."""
+        return self._spare.pop() if self._spare else self._make()
+
+    def copy(self, slam: ManagedSlam) -> ManagedSlam:
+        """Return another filter that continues from the same state."""
+        copied = self.fresh()
+        copied.copy_from(slam)
+        return copied
+
+    def checkpoint(self) -> Undo:
+        """Return what takes back which filters nobody uses."""
+        return contents(self)
+
+    def free(self, slams: Iterable[ManagedSlam]) -> None:
+        """Take filters back."""
+        for slam in slams:
+            slam.reset(np.zeros(3), np.zeros(3))  # frees its scans
+            self._spare.append(slam)

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ..association.constellations import Constellations, match_constellations
-from ..association.same_place import TwoPlaces
+from ..association.constellations import Constellations, TwoPlaces, match_constellations
 from ..interface import MapView
 from ..support import saved_states
 

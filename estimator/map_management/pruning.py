@@ -1,19 +1,21 @@
 """Prune a filter's map after each scan: remove landmarks, merge duplicates."""
 
-from collections.abc import Collection, Mapping, Sequence
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ...arrays import Array
-from ..association.nearest_neighbour import Noise
+from ...arrays import Array, IntArray
+from ..association.scan_assignments import Noise
 from ..association.scan_association import ScanAssociation
+from ..filters.gaussian_map import separation
 from ..interface import MapView
+from ..support import saved_states
 from ..support.undo import Undo, contents
-from .landmark_records import LandmarkRecords
 from .loop_closing import LoopCloser, Pairs
 from .map_editor import MapEditor
-from .merging import LandmarkMerger
 from .policy import LandmarkPolicy
 
 
@@ -164,3 +166,253 @@ class MapPruner:
         """Restore what :meth:`state_dict` returned; refuse what does not fit."""
         for part in (self._records, self.merger, self._closer):
             part.load_state_dict(state)
+
+
+# --------------------------------------------------------------------------------------
+# Decide which mapped landmarks are one, and merge them.
+
+
+class LandmarkMerger:
+    """Merges the landmarks of one filter that a policy considers to be the same.
+
+    Two landmarks are merged if their estimates are close, the offset is accurate enough
+    to tell two landmarks apart, it passes the gate, and no scan has shown both.
+
+    Parameters
+    ----------
+    policy : LandmarkPolicy
+    editor : MapEditor
+        Edits the filter's map.
+    records : LandmarkRecords
+        Records of the mapped landmarks, which are joined with the landmarks.
+    """
+
+    def __init__(
+        self, policy: LandmarkPolicy, editor: MapEditor, records: LandmarkRecords
+    ) -> None:
+        self._policy, self._editor, self._records = policy, editor, records
+        self._apart: set[tuple[int, int]] = set()
+        self.aliases: dict[int, int] = {}
+        """Landmarks merged into others: gone to kept."""
+
+    def note_scan(self, view: MapView, ids: Sequence[int]) -> None:
+        """Record that landmarks seen in one scan are different ones."""
+        if self._policy.merge_within is None:
+            return
+        places = view.landmarks[self._places(view, ids)]
+        close = _distances(places, places) < 2 * self._policy.merge_within
+        for i, j in np.argwhere(np.triu(close, 1)).tolist():
+            self._apart.add(_ordered(ids[i], ids[j]))
+
+    def merge(self, seen: set[int]) -> list[tuple[int, int]]:
+        """Merge landmarks just seen with their duplicates; return (kept, gone)."""
+        merged: list[tuple[int, int]] = []
+        while (pair := self._duplicate(seen)) is not None:
+            kept, gone = pair
+            try:
+                self.join([pair])
+            except np.linalg.LinAlgError:  # nothing was merged; later scans try again
+                break
+            seen = (seen - {gone}) | {kept}
+            merged.append(pair)
+        return merged
+
+    def join(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Merge pairs of landmarks; both identities then name the first."""
+        self._records.follow(self._editor.map_view().mapped)
+        self._editor.merge_pairs(pairs)
+        for kept, gone in pairs:
+            self._records.join(kept, gone)
+            earlier = {i: kept for i, j in self.aliases.items() if j == gone}
+            self.aliases |= {gone: kept, **earlier}
+            self._apart = {_renamed(pair, gone, kept) for pair in self._apart}
+        self._records.follow(self._editor.map_view().mapped)
+
+    def forget(self, ids: Iterable[int]) -> None:
+        """Drop what is known about landmarks that have been removed."""
+        gone = set(ids)
+        self._apart = {pair for pair in self._apart if gone.isdisjoint(pair)}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the landmarks known to differ and the aliases, as arrays."""
+        return {
+            "apart": _pairs(sorted(self._apart)),
+            "aliases": _pairs(list(self.aliases.items())),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        apart, aliases = (
+            saved_states.whole_numbers(f"landmarks.{key}", state[key], (-1, 2)).tolist()
+            for key in ("apart", "aliases")
+        )
+        self._apart, self.aliases = {(i, j) for i, j in apart}, dict(aliases)
+
+    def _duplicate(self, seen: set[int]) -> tuple[int, int] | None:
+        """Find two landmarks that are one; keep the first of them in the map."""
+        view, within = self._editor.map_view(), self._policy.merge_within
+        if within is None:
+            return None
+        slots = self._places(view, [i for i in view.ids if i in seen])
+        near = _distances(view.landmarks[slots], view.landmarks) < within
+        for row, other in np.argwhere(near).tolist():
+            kept, gone = sorted((int(slots[row]), other))
+            if kept != gone and self._is_one(view, kept, gone):
+                return view.ids[kept], view.ids[gone]
+        return None
+
+    def _places(self, view: MapView, ids: Sequence[int]) -> IntArray:
+        """Return the places of landmarks in the order of a view."""
+        if view.whole is None:
+            return self._records.slots(ids)
+        places = {i: place for place, i in enumerate(view.ids)}
+        return np.array([places[i] for i in ids], dtype=np.int64)
+
+    def _is_one(self, view: MapView, kept: int, gone: int) -> bool:
+        if _ordered(view.ids[kept], view.ids[gone]) in self._apart:
+            return False
+        between = separation(view.mean, view.covariance, kept, gone)
+        return (
+            between.largest_std <= self._policy.worst_separation_std
+            and between.squared <= self._policy.merge_gate
+        )
+
+
+def _distances(some: Array, others: Array) -> Array:
+    """Distances (k, n) between points (k, 2) and (n, 2)."""
+    dx, dy = (some[:, None] - others).transpose(2, 0, 1)
+    return np.asarray(np.hypot(dx, dy))
+
+
+def _ordered(i: int, j: int) -> tuple[int, int]:
+    return (i, j) if i < j else (j, i)
+
+
+def _renamed(pair: tuple[int, int], old: int, new: int) -> tuple[int, int]:
+    i, j = (new if landmark_id == old else landmark_id for landmark_id in pair)
+    return _ordered(i, j)
+
+
+def _pairs(pairs: Sequence[tuple[int, int]]) -> IntArray:
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+# --------------------------------------------------------------------------------------
+# Records that landmark management keeps of each mapped landmark.
+
+
+class LandmarkRecords:
+    """Sightings, misses and information of the landmarks, in the order of the map.
+
+    The information of a landmark is its block of the information matrix, summed over
+    all its readings with the pose of the robot taken as known::
+
+        Λ = Σ H_lᵀ Q⁻¹ H_l,   H_l = [a / r; e]
+        content = ½ ln det Λ
+
+    with the unit vectors e towards the landmark and a across.  This information is lost
+    when the landmark is marginalised and never seen again.
+
+    Examples
+    --------
+    >>> records = LandmarkRecords()
+    >>> records.follow([7, 9])
+    >>> ahead, across = np.zeros(2), np.ones(2)
+    >>> records.note_sightings([7, 9], ahead, np.array([4.0, 9.0]), across)
+    >>> records.by_information([9, 7])
+    [7, 9]
+    """
+
+    def __init__(self) -> None:
+        self.ids: tuple[int, ...] = ()
+        self.sightings: IntArray = np.zeros(0, dtype=np.int64)
+        self.misses: IntArray = np.zeros(0, dtype=np.int64)
+        self.information: Array = np.zeros((0, 3))
+        self._slots: dict[int, int] = {}
+
+    def follow(self, ids: Sequence[int]) -> None:
+        """Adopt the order of the map: keep records of its landmarks, start new ones."""
+        if self.ids == tuple(ids):
+            return
+        old = {i: k for k, i in enumerate(self.ids)}
+        rows = np.array([old.get(i, -1) for i in ids], dtype=np.int64)
+        fresh = rows < 0
+        for name in ("sightings", "misses", "information"):
+            before = getattr(self, name)
+            after = np.zeros((len(rows), *before.shape[1:]), dtype=before.dtype)
+            after[~fresh] = before[rows[~fresh]]
+            setattr(self, name, after)
+        self.ids = tuple(ids)
+        self._slots = {i: k for k, i in enumerate(self.ids)}
+
+    def note_sightings(
+        self, ids: Sequence[int], bearings: Array, along: Array, across: Array
+    ) -> None:
+        """Count one sighting of each landmark; all arrays have shape (m,).
+
+        Parameters
+        ----------
+        ids : sequence of int
+            The landmarks, without repetition.
+        bearings : ndarray
+            Directions in the world frame in which they were seen [rad].
+        along, across : ndarray
+            Information of each reading along the line of sight and across it [1/m²].
+        """
+        slots = self.slots(ids)
+        cos, sin = np.cos(bearings), np.sin(bearings)
+        self.sightings[slots] += 1
+        self.misses[slots] = 0
+        self.information[slots, 0] += along * cos * cos + across * sin * sin
+        self.information[slots, 1] += (along - across) * cos * sin
+        self.information[slots, 2] += along * sin * sin + across * cos * cos
+
+    def slots(self, ids: Iterable[int]) -> IntArray:
+        """Return the places of landmarks in the order of the map."""
+        return np.array([self._slots[i] for i in ids], dtype=np.int64)
+
+    def note_misses(self, slots: IntArray) -> None:
+        """Count one miss of each landmark: a scan should have shown it and did not."""
+        self.misses[slots] += 1
+
+    def overdue(self, misses: int) -> list[int]:
+        """Return the landmarks missed at least ``misses`` times since last seen."""
+        return [self.ids[k] for k in np.flatnonzero(self.misses >= misses)]
+
+    def join(self, kept: int, gone: int) -> None:
+        """Add the records of one landmark to those of another."""
+        i, j = self._slots[kept], self._slots[gone]
+        self.sightings[i] += self.sightings[j]
+        self.information[i] += self.information[j]
+        self.misses[i] = min(self.misses[i], self.misses[j])
+
+    def by_information(self, ids: Sequence[int]) -> list[int]:
+        """Sort landmarks by information, the least first, of equals the newest."""
+        xx, xy, yy = self.information[self.slots(ids)[::-1]].T
+        order = np.argsort(xx * yy - xy * xy, kind="stable")
+        return [ids[len(ids) - 1 - k] for k in order.tolist()]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of all records, as arrays."""
+        return {
+            "ids": np.array(self.ids, dtype=np.int64),
+            "sightings": self.sightings.copy(),
+            "misses": self.misses.copy(),
+            "information": self.information.copy(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned; refuse what does not fit."""
+        ids = saved_states.landmark_ids("landmarks.ids", state["ids"])
+        count = len(ids)
+        sightings, misses = (
+            saved_states.whole_numbers(f"landmarks.{key}", state[key], (count,), 0)
+            for key in ("sightings", "misses")
+        )
+        information = saved_states.array(
+            "landmarks.information", state["information"], (count, 3)
+        )
+        self.ids = tuple(ids)
+        self._slots = {i: k for k, i in enumerate(ids)}
+        self.sightings, self.misses = sightings, misses
+        self.information = information

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ..association.nearest_neighbour import Noise
+from ..association.scan_assignments import Noise
 from ..filters.ekf import MotionNoise
 from ..interface import Belief, UpdateReport
 from ..support import argument_checks

@@ -16,8 +16,7 @@ from ..interface import (
     checkpoint,
     optional_members,
 )
-from ..map_management.map_editor import edit_map
-from ..map_management.map_view import mapped_ids, marginal, view_map
+from ..map_management.map_editor import edit_map, mapped_ids, marginal, view_map
 from ..support import argument_checks, saved_states
 from ..support.undo import Undo, contents, undo_all, undone_on_error
 from .drive import Drive

@@ -17,7 +17,7 @@ from ...estimator.interface import (
 )
 from ...estimator.map_management.hypotheses import HypothesisSlam
 from ...estimator.map_management.managed_slam import ManagedSlam
-from ...estimator.map_management.map_view import marginal_without_joining
+from ...estimator.map_management.map_editor import marginal_without_joining
 from ..logs.anonymous import hides_identities, true_ids_of
 from ..logs.events import Scan
 from ..logs.ground_truth import true_poses_of

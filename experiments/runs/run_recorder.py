@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...estimator.interface import Belief, SlamEstimator, SupportsJoin, UpdateReport
-from ...estimator.map_management.map_view import (
+from ...estimator.map_management.map_editor import (
     mapped_ids,
     marginal_without_joining,
     view_map,

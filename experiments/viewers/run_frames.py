@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Array, IntArray
 from ...estimator.interface import MapView, SlamEstimator, SupportsJoin, UpdateReport
-from ...estimator.map_management.map_view import view_map
+from ...estimator.map_management.map_editor import view_map
 from ..logs.events import Scan
 from ..logs.slamlog import SlamLog
 from ..logs.steps import steps_of

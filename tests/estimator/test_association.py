@@ -6,7 +6,7 @@ from numeric_jacobian import numeric_jacobian
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import make_estimator
-from slamgym.estimator.association.nearest_neighbour import (
+from slamgym.estimator.association.scan_assignments import (
     AMBIGUOUS,
     NEW,
     Distances,

@@ -6,12 +6,14 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from slamgym.estimator.association import constellations, same_place
+from slamgym.estimator.association import constellations
+from slamgym.estimator.association import constellations as same_place
 from slamgym.estimator.association.constellations import (
     Constellations,
+    Match,
+    TwoPlaces,
     match_constellations,
 )
-from slamgym.estimator.association.same_place import Match, TwoPlaces
 from slamgym.estimator.kernels.assignment_search import compare_pairs, search_clique
 from slamgym.estimator.models.rigid_motion import invariant_error
 

@@ -7,10 +7,9 @@ from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.association import scan_assignments
 from slamgym.estimator.interface import MapView
-from slamgym.estimator.map_management.filter_pool import FilterPool
-from slamgym.estimator.map_management.hypotheses import HypothesisSlam
+from slamgym.estimator.map_management.hypotheses import FilterPool, HypothesisSlam
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
-from slamgym.estimator.map_management.map_view import is_near
+from slamgym.estimator.map_management.map_editor import is_near
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.evaluation import score_association
 from slamgym.sim_configs import action_sequence, load_scenario

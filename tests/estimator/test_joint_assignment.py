@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from slamgym.estimator.association.joint_assignment import (
+from slamgym.estimator.association.scan_assignments import (
     best_assignments,
     innovations_of,
     predicted_readings,

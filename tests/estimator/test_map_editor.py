@@ -12,8 +12,7 @@ from slamgym.estimator.filters.gaussian_map import (
     separation,
     without_landmarks,
 )
-from slamgym.estimator.map_management.map_editor import edit_map
-from slamgym.estimator.map_management.map_view import marginal
+from slamgym.estimator.map_management.map_editor import edit_map, marginal
 from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
 
 MANAGEABLE = list_estimators()

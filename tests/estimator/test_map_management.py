@@ -12,9 +12,12 @@ from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import check_estimator, list_estimators, make_estimator
 from slamgym.estimator.filters.gaussian_map import separation
-from slamgym.estimator.map_management.field_of_view import FieldOfView
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
-from slamgym.estimator.map_management.policy import LandmarkPolicy, as_policy
+from slamgym.estimator.map_management.policy import (
+    FieldOfView,
+    LandmarkPolicy,
+    as_policy,
+)
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments.logs.ground_truth import true_landmarks_of
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog

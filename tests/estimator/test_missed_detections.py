@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 
 from slamgym.estimator import make_estimator
-from slamgym.estimator.association.joint_assignment import predicted_readings
-from slamgym.estimator.association.missed_detections import (
+from slamgym.estimator.association.scan_assignments import (
+    missing_costs,
+    predicted_readings,
+)
+from slamgym.estimator.association.scan_association import (
     RINGS,
     SECTORS,
     SUREST,
     WIDEST,
     Detections,
 )
-from slamgym.estimator.association.scan_assignments import missing_costs
 from slamgym.estimator.interface import MapView
 
 LONGEST = 6.0

@@ -9,7 +9,7 @@ import pytest
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator import list_estimators, make_estimator
-from slamgym.estimator.map_management.field_of_view import FieldOfView
+from slamgym.estimator.map_management.policy import FieldOfView
 from slamgym.estimator.smoother.smoothing_slam import SmoothingSlam
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
