@@ -23,7 +23,7 @@ from slamgym.estimator import make_batch
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.unicycle_motion import predict_pose
 from slamgym.estimator.smoother import Drive, smooth
-from slamgym.estimator.smoother.start import start_of
+from slamgym.estimator.smoother.optimiser import start_of
 
 Array = NDArray[np.float64]
 STEPS, LANDMARKS = 1000, 20

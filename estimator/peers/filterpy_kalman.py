@@ -11,14 +11,18 @@ from filterpy.kalman import (
 
 from ...arrays import Array
 from ..models.bearing_range import wrap_angle
-from .kalman_slam import (
+from .peer_slam import (
     SIGMA_ALPHA,
     SIGMA_BETA,
+    Innovation,
     KalmanPeer,
     Moments,
+    Readings,
+    expected_readings,
+    motion_covariance,
+    moved_state,
+    wrapped,
 )
-from .peer_slam import Innovation, Readings
-from .whole_state import expected_readings, motion_covariance, moved_state, wrapped
 
 
 class FilterpyEkfSlam(KalmanPeer):

@@ -13,7 +13,9 @@ from ...arrays import Array, IntArray
 from ..association.scan_assignments import Noise
 from ..filters.ekf import MotionNoise
 from ..interface import Belief, UpdateReport
-from ..support import argument_checks
+from ..models.bearing_range import locate_landmark, predict_measurement, wrap_angle
+from ..models.unicycle_motion import predict_pose
+from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 
 START_FLOOR = 1e-6
@@ -178,3 +180,136 @@ def _report(innovation: Innovation | None) -> UpdateReport:
         innovation=innovation.values,
         factor=factor,
     )
+
+
+# --------------------------------------------------------------------------------------
+# Kalman filters of other libraries: one Gaussian over the pose and a growing map.
+#
+# The libraries predict and correct; none of them maps, so landmarks enter as in ``ekf``::
+#
+#     l = f(x, z),    P_l* = F_p P_p*,    P_ll = F_p P_pp F_pᵀ + F_z Q F_zᵀ
+
+SIGMA_ALPHA, SIGMA_BETA = 0.5, 2.0
+"""Spread of the points of both unscented filters, with κ = 3 − n: the defaults of Stone
+Soup."""
+
+
+class Moments(NamedTuple):
+    """A Gaussian over pose and map."""
+
+    mean: Array
+    """Shape (3 + 2n,)."""
+    covariance: Array
+    """Shape (3 + 2n, 3 + 2n)."""
+
+
+class KalmanPeer(PeerSlam):
+    """A Kalman filter of another library, its map grown by this adapter."""
+
+    def _start(self, pose: Array, std: Array) -> None:
+        self._state = Moments(pose, np.diag(std**2))
+
+    def _move(self, odometry: Array, variance: Array) -> None:
+        self._state = self._predicted(self._state, odometry, variance)
+
+    def _take_in(self, known: Readings, new: Readings) -> Innovation | None:
+        state, innovation = self._state, None
+        if len(known.slots):
+            state, innovation = self._corrected(state, known)
+        if len(new.slots):
+            state = _with_landmarks(state, new)
+        self._state = state
+        return innovation
+
+    @abstractmethod
+    def _predicted(self, state: Moments, odometry: Array, variance: Array) -> Moments:
+        """Return the state moved by (d, α) with noise of these variances (3,)."""
+
+    @abstractmethod
+    def _corrected(
+        self, state: Moments, readings: Readings
+    ) -> tuple[Moments, Innovation]:
+        """Return the state after readings of mapped landmarks, and what was new."""
+
+    def _mean(self) -> Array:
+        return self._state.mean
+
+    def _moments(self) -> tuple[Array, Array]:
+        return self._state
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return mean, covariance and the landmarks, as copies."""
+        return {
+            "estimator": type(self).__name__,
+            "mean": self._state.mean.copy(),
+            "covariance": self._state.covariance.copy(),
+            "landmark_ids": np.array(self.landmark_ids, dtype=np.int64),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state, bit for bit."""
+        entries = ("mean", "covariance", "landmark_ids")
+        saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
+        ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
+        size = 3 + 2 * len(ids)
+        self._state = Moments(
+            saved_states.array("mean", state["mean"], (size,)),
+            saved_states.array("covariance", state["covariance"], (size, size)),
+        )
+        self._slots = {i: slot for slot, i in enumerate(ids)}
+
+
+def _with_landmarks(state: Moments, new: Readings) -> Moments:
+    """Return the state with landmarks behind it, each correlated with the pose."""
+    mean, P = state
+    found = locate_landmark(mean[:3], new.measurements)
+    n, m = len(mean), len(new.slots)
+    of_pose = found.jacobian_pose.reshape(2 * m, 3)
+    grown = np.empty((n + 2 * m, n + 2 * m))
+    grown[:n, :n] = P
+    grown[n:, :n] = of_pose @ P[:3]
+    grown[:n, n:] = grown[n:, :n].T
+    grown[n:, n:] = of_pose @ P[:3, :3] @ of_pose.T
+    for k, of_reading in enumerate(found.jacobian_measurement):
+        rows = slice(n + 2 * k, n + 2 * k + 2)
+        grown[rows, rows] += (of_reading * new.variances[k]) @ of_reading.T
+    return Moments(np.concatenate([mean, found.position.ravel()]), grown)
+
+
+# --------------------------------------------------------------------------------------
+# The motion and the measurement model over pose and map as one vector.
+
+
+def moved_state(mean: Array, odometry: Array) -> tuple[Array, Array]:
+    """Return g(x, u) of the whole state (n,), and G (n, n)."""
+    pose, of_pose, _ = predict_pose(mean[:3], odometry)
+    G = np.eye(len(mean))
+    G[:3, :3] = of_pose
+    return np.concatenate([pose, mean[3:]]), G
+
+
+def motion_covariance(mean: Array, variance: Array) -> Array:
+    """Return F R Fᵀ over the whole state, (n, n), for variances (3,) of the noise."""
+    F = predict_pose(mean[:3], np.zeros(2)).jacobian_noise
+    Q = np.zeros((len(mean), len(mean)))
+    Q[:3, :3] = (F * variance) @ F.T
+    return Q
+
+
+def wrapped(difference: Array) -> Array:
+    """Return a difference of readings β1, r1, β2, …, its bearings in [-π, π)."""
+    result = np.array(difference, dtype=np.float64)
+    result[0::2] = wrap_angle(result[0::2])
+    return result
+
+
+def expected_readings(mean: Array, slots: IntArray) -> tuple[Array, Array]:
+    """Return the readings h (m, 2) expected at a mean (n,), and H (2m, n)."""
+    landmarks = mean[3:].reshape(-1, 2)[slots]
+    expected, of_pose, of_landmark = predict_measurement(mean[:3], landmarks)
+    H = np.zeros((len(slots), 2, len(mean)))
+    H[:, :, :3] = of_pose
+    for axis in (0, 1):
+        columns = 3 + 2 * slots + axis
+        H[np.arange(len(slots)), :, columns] = of_landmark[:, :, axis]
+    return expected, H.reshape(2 * len(slots), -1)

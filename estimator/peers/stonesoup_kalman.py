@@ -24,9 +24,17 @@ from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, UnscentedKalmanUpdater
 
 from ...arrays import Array, IntArray
-from .kalman_slam import SIGMA_ALPHA, SIGMA_BETA, KalmanPeer, Moments
-from .peer_slam import Innovation, Readings
-from .whole_state import expected_readings, motion_covariance, moved_state
+from .peer_slam import (
+    SIGMA_ALPHA,
+    SIGMA_BETA,
+    Innovation,
+    KalmanPeer,
+    Moments,
+    Readings,
+    expected_readings,
+    motion_covariance,
+    moved_state,
+)
 
 
 class _Motion(GaussianTransitionModel):  # type: ignore[misc]

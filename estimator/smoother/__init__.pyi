@@ -1,5 +1,5 @@
+from .batch_smoother import SmoothedDrive as SmoothedDrive
 from .batch_smoother import smooth as smooth
 from .drive import Drive as Drive
 from .recorded_slam import RecordedSlam as RecordedSlam
-from .smoothed_drive import SmoothedDrive as SmoothedDrive
-from .smoothing_slam import SmoothingSlam as SmoothingSlam
+from .recorded_slam import SmoothingSlam as SmoothingSlam

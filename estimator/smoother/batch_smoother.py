@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import cho_solve, solve_triangular
 
 from ...arrays import Array, IntArray
-from ..interface import Belief
-from ..models.bearing_range import locate_landmark
+from ..interface import Belief, SlamEstimator, SupportsSmoothing
+from ..map_management.hypotheses import HypothesisSlam
+from ..models.bearing_range import locate_landmark, wrap_angle
 from ..support import argument_checks
-from .drive import Drive
-from .optimiser import KINDS, Estimate, Noise, Optimiser, Solution
-from .smoothed_drive import SmoothedDrive
-from .start import start_of
+from ..support.argument_checks import LandmarkIds
+from .drive import Drive, path_between
+from .elimination import conditionals
+from .optimiser import KINDS, Estimate, Noise, Optimiser, Solution, factorised, start_of
 
 ITERATIONS = 5  # of an update of the filter that gives the second start
 SCALES = {"huber": 1.345, "cauchy": 2.3849}  # 95 % efficient without outliers
@@ -171,3 +175,226 @@ def _landmarks_at(
             for i, place in zip(ids.tolist(), located, strict=True):
                 places.setdefault(i, place)
     return np.concatenate([places[i] for i in order.tolist()])
+
+
+# --------------------------------------------------------------------------------------
+# The result of the smoother: all poses and landmarks, and any covariance.
+
+
+class _Marginals(NamedTuple):
+    """What the covariances are made of."""
+
+    given_map: Array
+    """Π, shape (N, 3, 3)."""
+    transitions: Array
+    """Φ, shape (N, 3, 3)."""
+    sensitivity: Array
+    """Ψ, shape (N, 3, 2n)."""
+    factor: Array
+    """Lower Cholesky factor of S, shape (2n, 2n)."""
+    landmarks: Array
+    """P_l, shape (2n, 2n)."""
+
+
+class SmoothedDrive:
+    """The most likely poses and landmarks of a drive, given all its readings.
+
+    ::
+
+        P_l = S⁻¹,    P_k = Π_k + Ψ_k P_l Ψ_kᵀ,    P_kl = Ψ_k P_l
+        P_jk = Π_j Φ_{j+1}ᵀ … Φ_kᵀ + Ψ_j P_l Ψ_kᵀ    for j < k
+
+    with the Schur complement S of the landmarks and Π, Φ, Ψ of
+    `substitution.conditionals`.
+
+    Parameters
+    ----------
+    optimiser : Optimiser
+        That found the solution; it linearises it when a covariance is asked for.
+    solution : Solution
+        The minimum of the cost.
+    order : sequence of int
+        The landmarks in the order of the elimination.
+    drive : Drive
+        What was smoothed.
+    """
+
+    def __init__(
+        self,
+        optimiser: Optimiser,
+        solution: Solution,
+        order: Sequence[int],
+        drive: Drive,
+    ) -> None:
+        estimate = solution.estimate
+        self.cost = solution.cost
+        """Half the sum of the squared, normalised residuals; of a robust kernel, ρ."""
+        self.first_cost = solution.first_cost
+        """The cost at the start."""
+        self.iterations = solution.iterations
+        """Steps of Levenberg-Marquardt."""
+        self.landmark_ids = drive.landmark_ids
+        """In the order of their first reading."""
+        self.poses = estimate.poses.copy()
+        """(x, y, θ), shape (N, 3) [m, m, rad], heading in [-π, π)."""
+        self.poses[:, 2] = wrap_angle(self.poses[:, 2])
+        self._motions, self._noise = tuple(drive.motions), drive.motion_noise
+        self.readings = drive.readings
+        """Number of readings of landmarks."""
+        self._slots = {i: slot for slot, i in enumerate(order)}
+        self._all = estimate.landmarks
+        self.landmarks = self._all[self._columns(self.landmark_ids)].reshape(-1, 2)
+        """Positions in the order of `landmark_ids`, shape (n, 2) [m]."""
+        self._optimiser, self._solution = optimiser, solution
+        if solution.is_damped:
+            _ = self._marginals  # refuses landmarks that are not determined
+
+    @cached_property
+    def _marginals(self) -> _Marginals:
+        minimum = self._optimiser.linearised(self._solution)
+        poses, elimination = self._solution.estimate.poses, minimum.elimination
+        factor = factorised(minimum.information)
+        return _Marginals(
+            *conditionals(poses, elimination),
+            elimination.rows,
+            factor[0],
+            np.asarray(cho_solve(factor, np.eye(len(self._all)))),
+        )
+
+    @property
+    def readings_until(self) -> IntArray:
+        """How many readings of odometry lead to each pose, shape (N,)."""
+        counts = [len(motion.steps) for motion in self._motions]
+        return np.cumsum(counts, dtype=np.int64)
+
+    @property
+    def cost_per_degree(self) -> float:
+        """Twice the cost by its degrees of freedom, nan if there are none.
+
+        It is about 1 if the noise is as assumed, and the kernel not robust.
+        """
+        freedom = 2 * self.readings - 2 * len(self.landmarks)
+        return 2 * self.cost / freedom if freedom else float("nan")
+
+    @property
+    def path(self) -> Array:
+        """The pose at the start and after each reading of odometry, shape (1 + P, 3).
+
+        See `path.path_between`; where several readings lead to a scan.
+        """
+        return path_between(self.poses, self._motions, self._noise)
+
+    @property
+    def pose_covariances(self) -> Array:
+        """Marginal covariance of each pose, shape (N, 3, 3)."""
+        found = self._marginals
+        rows = found.sensitivity.reshape(-1, len(self._all))
+        root = solve_triangular(found.factor, rows.T, lower=True)
+        root = root.T.reshape(found.sensitivity.shape)
+        return np.asarray(found.given_map + root @ root.transpose(0, 2, 1))
+
+    @property
+    def landmark_covariances(self) -> Array:
+        """Marginal covariance of each landmark, shape (n, 2, 2) [m²]."""
+        columns = self._columns(self.landmark_ids).reshape(-1, 2)
+        blocks = self._marginals.landmarks[columns[:, :, None], columns[:, None, :]]
+        return np.asarray(blocks)
+
+    def covariance(
+        self, poses: Sequence[int], landmark_ids: LandmarkIds | None = None
+    ) -> Array:
+        """Return the joint covariance of some poses and landmarks.
+
+        Parameters
+        ----------
+        poses : sequence of int
+            Which poses; negative ones count from the end.
+        landmark_ids : sequence of int, optional
+            Which landmarks; by default all.
+
+        Returns
+        -------
+        ndarray, shape (3p + 2m, 3p + 2m)
+            Of the additive error, in the order given.
+
+        Raises
+        ------
+        ValueError
+            If a pose does not exist or a landmark has no reading.
+        """
+        chosen = [self._pose(pose) for pose in poses]
+        columns = self._columns(self._known(landmark_ids))
+        to_landmarks = self._marginals.sensitivity[chosen].reshape(-1, len(self._all))
+        spread = to_landmarks @ self._marginals.landmarks
+        count = 3 * len(chosen)
+        joint = np.empty((count + len(columns),) * 2)
+        joint[:count, :count] = spread @ to_landmarks.T + self._given_map(chosen)
+        joint[:count, count:] = spread[:, columns]
+        joint[count:, :count] = joint[:count, count:].T
+        joint[count:, count:] = self._marginals.landmarks[np.ix_(columns, columns)]
+        return (joint + joint.T) / 2
+
+    def belief(self, pose: int = -1, landmark_ids: LandmarkIds | None = None) -> Belief:
+        """Return the belief about one pose and some landmarks, given the whole drive.
+
+        Parameters
+        ----------
+        pose : int
+            Which pose; the last one by default.
+        landmark_ids : sequence of int, optional
+            Which landmarks, in this order; by default all.
+        """
+        ids = self._known(landmark_ids)
+        mean = np.concatenate(
+            [self.poses[self._pose(pose)], self._all[self._columns(ids)]]
+        )
+        return Belief(mean, self.covariance([pose], ids), tuple(ids), "invariant")
+
+    def _given_map(self, poses: Sequence[int]) -> Array:
+        """Return the joint covariance of some poses if the map was known."""
+        blocks = np.empty((len(poses), 3, len(poses), 3))
+        for at, first in enumerate(poses):
+            later = {pose for pose in poses if pose >= first}
+            moved = self._marginals.given_map[first]
+            for k in range(first, max(later) + 1):
+                if k > first:
+                    moved = self._marginals.transitions[k] @ moved
+                for other in [i for i, pose in enumerate(poses) if pose == k]:
+                    blocks[other, :, at] = moved
+                    blocks[at, :, other] = moved.T
+        return blocks.reshape(3 * len(poses), -1)
+
+    def _columns(self, ids: Sequence[int]) -> Array:
+        firsts = np.array([2 * self._slots[i] for i in ids], dtype=np.int64)
+        return np.asarray(np.stack([firsts, firsts + 1], axis=1).ravel())
+
+    def _known(self, landmark_ids: LandmarkIds | None) -> list[int]:
+        if landmark_ids is None:
+            return list(self.landmark_ids)
+        ids = argument_checks.identities(landmark_ids, np.size(landmark_ids))
+        for i in ids:
+            if i not in self._slots:
+                raise ValueError(f"landmark {i} has no reading in the drive")
+        return ids
+
+    def _pose(self, pose: int) -> int:
+        count = len(self.poses)
+        if not -count <= pose < count:
+            raise ValueError(f"poses must be below {count}, got {pose}")
+        return pose % count
+
+    def __repr__(self) -> str:
+        return (
+            f"SmoothedDrive of {len(self.poses)} poses and {len(self.landmarks)} "
+            f"landmarks, cost {self.cost:.6g} after {self.iterations} iterations"
+        )
+
+
+# --------------------------------------------------------------------------------------
+# Find the smoother in an estimator that may be managed.
+
+
+def smoother_in(slam: SlamEstimator) -> SupportsSmoothing | None:
+    """Return the smoother, that of the most probable hypothesis; None without one."""
+    inner = slam.best if isinstance(slam, HypothesisSlam) else slam
+    return inner if isinstance(inner, SupportsSmoothing) else None

@@ -12,8 +12,9 @@ from ...arrays import Array, IntArray
 from ..filters.ekf import MotionNoise, checked_rules
 from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE, Rules
 from ..kernels.scan_update import predict
+from ..models.bearing_range import wrap_angle
+from ..models.rigid_motion import pose_rotation
 from ..support import argument_checks
-from .drive_arrays import DriveArrays, landmark_order, noise_factors
 
 
 class Motion(NamedTuple):
@@ -262,3 +263,166 @@ def _sensor_rules(
             f"({rules.bearing_std:g}, {rules.range_std:g})"
         )
     return rules
+
+
+# --------------------------------------------------------------------------------------
+# The data of a drive as kernels take it, and the order of its landmarks.
+#
+# Symbols
+# -------
+# x_k            pose k = 0 … N − 1, (x, y, θ) in the world frame [m, m, rad]
+# Δ_k            odometry from pose k − 1 to pose k, a pose in the frame of pose k − 1
+# ε_k = N_k w_k  noise of that motion in the frame of pose k − 1, w_k ~ N(0, I)
+# V_k            whitener: V_k N_k = I where N_k has full rank
+
+NEGLIGIBLE = 1e-12
+"""Variance of a direction without noise, relative to that of the noisiest one."""
+
+
+class DriveArrays(NamedTuple):
+    """N poses, M readings of n landmarks; entry 0 of the motions is the prior."""
+
+    start: Array
+    """Prior mean of pose 0, shape (3,)."""
+    increments: Array
+    """Δ_k, shape (N, 3) [m, m, rad]; row 0 is not read."""
+    factors: Array
+    """N_k, shape (N, 3, 3); entry 0 is the deviation of the prior."""
+    whiteners: Array
+    """V_k, shape (N, 3, 3)."""
+    firsts: IntArray
+    """The readings of pose k are rows firsts[k] … firsts[k + 1], shape (N + 1,)."""
+    readings: Array
+    """Rows (β, r), shape (M, 2) [rad, m]."""
+    columns: IntArray
+    """First column of the landmark of each reading, 2 slot, shape (M,)."""
+    widths: IntArray
+    """Columns of the landmarks that pose k or a later one reads, shape (N,)."""
+
+
+def noise_factors(covariances: Array) -> tuple[Array, Array]:
+    """Return N with N Nᵀ = Σ, and V with V Σ Vᵀ = I, of covariances (N, 3, 3).
+
+    A direction without noise, to which the solution adheres, gets the weight of the
+    noisiest one in V: V only measures how far an iterate is from the solution.
+
+    Examples
+    --------
+    >>> factor, whitener = noise_factors(np.diag([4.0, 0.0, 1.0])[None])
+    >>> np.allclose(factor @ factor.transpose(0, 2, 1), np.diag([4.0, 0.0, 1.0]))
+    True
+    >>> np.round(np.sort(abs(whitener[0]).max(axis=1)), 3)
+    array([0.5, 0.5, 1. ])
+    """
+    variances, axes = np.linalg.eigh(covariances)
+    largest = variances[:, -1:]
+    noisy = variances > NEGLIGIBLE * largest
+    std = np.sqrt(np.where(noisy, variances, 0.0))
+    scale = np.sqrt(np.where(largest > 0, largest, 1.0))
+    weights = 1 / np.where(noisy, std, scale)
+    factors, whiteners = axes * std[:, None], weights[:, :, None] * axes.mT
+    # One layout whatever the number of poses: for another, kernels compile anew.
+    return np.ascontiguousarray(factors), np.ascontiguousarray(whiteners)
+
+
+def landmark_order(ids: IntArray, firsts: IntArray) -> tuple[IntArray, IntArray]:
+    """Order landmarks by their last reading, the latest first.
+
+    The elimination goes backwards in time.  In this order the landmarks that it has met
+    are always the first ones of the state.
+
+    Parameters
+    ----------
+    ids : ndarray of int64, shape (M,)
+        Landmark of each reading.
+    firsts : ndarray of int64, shape (N + 1,)
+        As in :class:`DriveArrays`.
+
+    Returns
+    -------
+    order : ndarray, shape (n,)
+        Landmark ids.
+    widths : ndarray, shape (N,)
+        As in :class:`DriveArrays`.
+
+    Examples
+    --------
+    >>> order, widths = landmark_order(np.array([4, 7, 4]), np.array([0, 1, 2, 3]))
+    >>> order.tolist(), widths.tolist()
+    ([4, 7], [4, 4, 2])
+    """
+    found, from_the_end = np.unique(ids[::-1], return_index=True)
+    by_last = np.argsort(from_the_end, kind="stable")
+    last_rows = len(ids) - 1 - from_the_end[by_last]
+    last_poses = np.searchsorted(firsts, last_rows, side="right") - 1
+    poses = np.arange(len(firsts) - 1)
+    met = np.searchsorted(-last_poses, -poses, side="right")
+    return found[by_last], 2 * met
+
+
+# --------------------------------------------------------------------------------------
+# The path of a smoothed drive between its poses: after every reading of odometry.
+
+
+def path_between(poses: Array, motions: Sequence[Motion], noise: MotionNoise) -> Array:
+    """Return the pose after each reading of odometry, given the poses at the scans.
+
+    The readings between two poses lead from the first one to the second except for
+    their noise, which the poses determine in sum.  Each reading gets the part of it
+    that is expected, given the sum s::
+
+        E[s_i | s] = Σ_i Φᵀ Σ⁻¹ s
+
+    with the covariance Σ_i after reading i and its transition Φ to the end.
+
+    Parameters
+    ----------
+    poses : ndarray, shape (N, 3)
+        At the scans [m, m, rad].
+    motions : sequence of Motion
+        Those of the drive, the first one empty.
+    noise : MotionNoise
+        Of the odometry.
+
+    Returns
+    -------
+    ndarray, shape (1 + P, 3)
+        The first pose, and that after each of the P readings; headings in [-π, π).
+
+    Examples
+    --------
+    >>> steps = ((1.0, 0.0, 1.0), (1.0, 0.0, 3.0))
+    >>> spread = np.diag([4.0, 0.0, 0.0])
+    >>> still = Motion((), np.zeros(3), np.zeros((3, 3)))
+    >>> motions = [still, Motion(steps, np.array([2.0, 0, 0]), spread)]
+    >>> noise = MotionNoise.checked((1.0, 0, 0), noise_at_rest=True)
+    >>> path_between(np.array([[0.0, 0, 0], [2.4, 0, 0]]), motions, noise)[:, 0]
+    array([0. , 1.1, 2.4])
+    """
+    path = [poses[:1]]
+    for k in range(1, len(poses)):
+        path.append(_between(poses[k - 1], poses[k], motions[k], noise))
+    found = np.concatenate(path)
+    found[:, 2] = wrap_angle(found[:, 2])
+    return found
+
+
+def _between(first: Array, last: Array, motion: Motion, noise: MotionNoise) -> Array:
+    """Return the poses after the readings of one motion, shape (P, 3)."""
+    if len(motion.steps) == 1:
+        return last[None]
+    turn = pose_rotation(first[2])
+    gap = turn.T @ (last - first) - motion.increment
+    gap[2] = wrap_angle(gap[2])
+    pull = np.linalg.pinv(motion.covariance, hermitian=True) @ gap
+    path = np.empty((len(motion.steps), 3))
+    pose, covariance = np.zeros(3), np.zeros((3, 3))
+    for i, (distance, angle, dt) in enumerate(motion.steps):
+        variance = noise.over(distance, angle, dt)
+        predict(pose, covariance, pose, 3, distance, angle, variance, AT_ESTIMATE)
+        onward = np.eye(3)
+        onward[0, 2] = -(motion.increment[1] - pose[1])
+        onward[1, 2] = motion.increment[0] - pose[0]
+        path[i] = first + turn @ (pose + covariance @ onward.T @ pull)
+    path[-1] = last
+    return path

@@ -14,7 +14,7 @@ q = G δ_{k−1} + s, with noise w ~ N(0, I), is eliminated by minimising over w
 
 and pose k by writing q in terms of pose k − 1.  E is never inverted: directions
 without noise, and a start that is known, are exact.  What remains, C and η, is the
-Schur complement of the landmarks.  :mod:`.substitution` goes back, forwards in time.
+Schur complement of the landmarks.  :mod:`.elimination` goes back, forwards in time.
 This is the backward information filter of a two-pass smoother [1]_ with the landmarks
 as parameters.
 
@@ -26,23 +26,22 @@ References
 
 from __future__ import annotations
 
+from math import log1p, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from ...arrays import Array
 from ...jit import jit, njit_internal
-from ..models.bearing_range import reading_slopes_jit
-from .cost import innovation, motion_residual, robust_weight
-from .drive_arrays import DriveArrays
-from .small_matrices import (
-    complement,
-    inverse_root,
-    left_transposed,
-    multiply,
-    right_transposed,
-    transposed_times,
+from ..kernels.kalman_gain import as_rules
+from ..kernels.scan_update import bearing_variance, range_variance
+from ..models.bearing_range import (
+    expected_reading_jit,
+    reading_slopes_jit,
+    wrap_angle_jit,
 )
+from ..models.rigid_motion import composed_jit
+from .drive import DriveArrays
 
 
 class Elimination(NamedTuple):
@@ -280,3 +279,283 @@ def _change_pose(
         curvature[2, j] += tx * curvature[0, j] + ty * curvature[1, j]
     for i in range(3):
         curvature[i, 2] += tx * curvature[i, 0] + ty * curvature[i, 1]
+
+
+# --------------------------------------------------------------------------------------
+# Go back over the eliminated poses, forwards in time, compiled.
+#
+# With the step δ_l of the landmarks, in the symbols of :mod:`.elimination`::
+#
+#     δ_k = q − U (Uᵀ (Λ q − λ) + W δ_l),    q = G δ_{k−1} + s
+#
+# and the covariance of pose k follows from that of pose k − 1.
+
+
+@jit
+def substitute(
+    poses: Array, drive: DriveArrays, landmark_step: Array, out: Elimination
+) -> Array:
+    """Return the new poses, shape (N, 3), given the step of the landmarks.
+
+    They are driven: q is taken from the new pose k − 1, and the noise found acts in its
+    frame.  A direction without noise therefore has none, whatever the step.
+    """
+    new, q, u = np.empty((len(poses), 3)), np.empty(3), np.empty(3)
+    for k in range(len(poses)):
+        x, y, heading, turn = drive.start[0], drive.start[1], drive.start[2], 0.0
+        if k > 0:
+            before, step = new[k - 1], drive.increments[k]
+            x, y, heading, _, _ = composed_jit(
+                before[0], before[1], before[2], step[0], step[1], step[2]
+            )
+            turn = before[2] - poses[k - 1, 2]
+        q[0], q[1] = x - poses[k, 0], y - poses[k, 1]
+        q[2] = wrap_angle_jit(heading - poses[k, 2])
+        _pull(k, q, landmark_step, out, u)
+        U = out.gains[k]
+        dx = -(U[0, 0] * u[0] + U[0, 1] * u[1] + U[0, 2] * u[2])
+        dy = -(U[1, 0] * u[0] + U[1, 1] * u[1] + U[1, 2] * u[2])
+        new[k, 0], new[k, 1], _, _, _ = composed_jit(x, y, turn, dx, dy, 0.0)
+        new[k, 2] = heading - (U[2, 0] * u[0] + U[2, 1] * u[1] + U[2, 2] * u[2])
+    return new
+
+
+@njit_internal
+def _pull(
+    k: int, q: Array, landmark_step: Array, out: Elimination, pull: Array
+) -> None:
+    """Write Uᵀ (Λ q − λ) + W δ_l."""
+    pull[:] = 0.0
+    for i in range(3):
+        for c in range(len(landmark_step)):
+            pull[i] += out.rows[k, i, c] * landmark_step[c]
+    for a in range(3):
+        force = -out.slopes[k, a]
+        for j in range(3):
+            force += out.curvatures[k, a, j] * q[j]
+        for i in range(3):
+            pull[i] += out.gains[k, a, i] * force
+
+
+@jit
+def conditionals(poses: Array, out: Elimination) -> tuple[Array, Array]:
+    """Return the covariance of each pose given the landmarks, and its transition.
+
+    ::
+
+        x_k = Φ_k x_{k−1} − U_k W_k l + U_k n,    n ~ N(0, I),    Φ_k = T_k G_k
+        Π_k = Φ_k Π_{k−1} Φ_kᵀ + K_k,    Ψ_k = Φ_k Ψ_{k−1} − U_k W_k
+
+    so that the error of pose k is Ψ_k e_l plus independent noise of covariance Π_k.
+    Ψ overwrites the rows W.
+
+    Returns
+    -------
+    covariances : ndarray, shape (N, 3, 3)
+        Π.
+    transitions : ndarray, shape (N, 3, 3)
+        Φ; entry 0 is not used.
+    """
+    count = len(poses)
+    covariances, transitions = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
+    K, moved = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(count):
+        U, phi = out.gains[k], transitions[k]
+        right_transposed(U, U, K)
+        multiply(K, out.curvatures[k], phi)
+        complement(phi)
+        rows = out.rows[k]
+        for c in range(rows.shape[1]):
+            x, y, z = rows[0, c], rows[1, c], rows[2, c]
+            for i in range(3):
+                rows[i, c] = -(U[i, 0] * x + U[i, 1] * y + U[i, 2] * z)
+        if k > 0:
+            tx, ty = poses[k - 1, 1] - poses[k, 1], poses[k, 0] - poses[k - 1, 0]
+            before = out.rows[k - 1]
+            for i in range(3):
+                phi[i, 2] += tx * phi[i, 0] + ty * phi[i, 1]
+                for c in range(rows.shape[1]):
+                    rows[i, c] += (
+                        phi[i, 0] * before[0, c]
+                        + phi[i, 1] * before[1, c]
+                        + phi[i, 2] * before[2, c]
+                    )
+            multiply(phi, covariances[k - 1], moved)
+            right_transposed(moved, phi, covariances[k])
+        for i in range(3):
+            for j in range(3):
+                covariances[k, i, j] += K[i, j]
+    return covariances, transitions
+
+
+# --------------------------------------------------------------------------------------
+# The cost of poses and landmarks, compiled: what the smoother minimises.
+#
+# ::
+#
+#     cost = ½ Σ_k ‖V_k ε_k‖² + Σ_j ρ(e_j),    e_j² = ν_β² / σβ² + ν_r² / σr²
+#     ε_k = R(θ_{k−1})ᵀ (x_k − x_{k−1} ⊕ Δ_k)
+#
+# with the innovation ν = z − h(x, l) of each reading, and ε_0 = x_0 − prior mean.  ρ(e)
+# is e²/2, or a robust kernel of scale c: Huber's, c e − c²/2 beyond c, or Cauchy's,
+# ½ c² log(1 + e²/c²).
+
+SQUARED, HUBER, CAUCHY = 0.0, 1.0, 2.0
+
+
+@njit_internal
+def robust_loss(squared: float, kind: float, scale: float) -> float:
+    """Return ρ(e), given e²."""
+    if kind == HUBER and squared > scale * scale:
+        return scale * (sqrt(squared) - scale / 2)
+    if kind == CAUCHY:
+        return scale * scale / 2 * log1p(squared / (scale * scale))
+    return squared / 2
+
+
+@njit_internal
+def robust_weight(squared: float, kind: float, scale: float) -> float:
+    """Return ρ'(e) / e, the weight of a reading in the normal equations."""
+    if kind == HUBER and squared > scale * scale:
+        return scale / sqrt(squared)
+    if kind == CAUCHY:
+        return 1 / (1 + squared / (scale * scale))
+    return 1.0
+
+
+@jit
+def reading_stds(
+    poses: Array, landmarks: Array, drive: DriveArrays, rule_values: Array
+) -> Array:
+    """Return (σβ, σr) of each reading, (M, 2), at the range that it should have."""
+    rules = as_rules(rule_values)
+    stds = np.empty((len(drive.readings), 2))
+    for k in range(len(poses)):
+        for j in range(drive.firsts[k], drive.firsts[k + 1]):
+            c = drive.columns[j]
+            dx, dy = landmarks[c] - poses[k, 0], landmarks[c + 1] - poses[k, 1]
+            distance = np.sqrt(dx * dx + dy * dy)
+            if rules.noise_as_read:
+                distance = drive.readings[j, 1]
+            distance = max(distance, rules.min_range)
+            stds[j, 0] = np.sqrt(bearing_variance(rules, distance))
+            stds[j, 1] = np.sqrt(range_variance(rules, distance))
+    return stds
+
+
+@njit_internal
+def motion_residual(poses: Array, drive: DriveArrays, k: int) -> tuple[float, ...]:
+    """Return x_k − x_{k−1} ⊕ Δ_k in the world frame, and (cos, sin) of θ_{k−1}.
+
+    For k = 0 the prior mean takes the place of x_{k−1} ⊕ Δ_k.
+    """
+    x, y, heading = drive.start[0], drive.start[1], drive.start[2]
+    cos, sin = 1.0, 0.0
+    if k > 0:
+        x, y, heading, cos, sin = composed_jit(
+            poses[k - 1, 0],
+            poses[k - 1, 1],
+            poses[k - 1, 2],
+            drive.increments[k, 0],
+            drive.increments[k, 1],
+            drive.increments[k, 2],
+        )
+    turn = wrap_angle_jit(poses[k, 2] - heading)
+    return poses[k, 0] - x, poses[k, 1] - y, turn, cos, sin
+
+
+@njit_internal
+def innovation(
+    poses: Array, landmarks: Array, drive: DriveArrays, k: int, j: int
+) -> tuple[float, float]:
+    """Return ν = z − h of reading j, taken at pose k."""
+    c = drive.columns[j]
+    dx, dy = landmarks[c] - poses[k, 0], landmarks[c + 1] - poses[k, 1]
+    bearing, distance = expected_reading_jit(dx, dy, poses[k, 2])
+    z = drive.readings[j]
+    return wrap_angle_jit(z[0] - bearing), z[1] - distance
+
+
+@jit
+def total_cost(
+    poses: Array,
+    landmarks: Array,
+    drive: DriveArrays,
+    stds: Array,
+    kind: float,
+    scale: float,
+) -> float:
+    """Return the cost of poses (N, 3) and landmarks (2n,); stds (M, 2) are (σβ, σr)."""
+    total = 0.0
+    for k in range(len(poses)):
+        dx, dy, turn, cos, sin = motion_residual(poses, drive, k)
+        along, across = cos * dx + sin * dy, cos * dy - sin * dx
+        for i in range(3):
+            v = drive.whiteners[k, i]
+            total += (v[0] * along + v[1] * across + v[2] * turn) ** 2 / 2
+        for j in range(drive.firsts[k], drive.firsts[k + 1]):
+            bearing, distance = innovation(poses, landmarks, drive, k, j)
+            squared = (bearing / stds[j, 0]) ** 2 + (distance / stds[j, 1]) ** 2
+            total += robust_loss(squared, kind, scale)
+    return total
+
+
+# --------------------------------------------------------------------------------------
+# Products and roots of matrices (3, 3), compiled: faster than those of numpy.
+#
+# The arguments are C-contiguous, since a kernel is compiled anew for every other
+# layout.
+
+
+@njit_internal
+def multiply(a: Array, b: Array, out: Array) -> None:
+    """Write the product of two matrices (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@njit_internal
+def left_transposed(a: Array, b: Array, out: Array) -> None:
+    """Write aᵀ b of two matrices (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
+
+
+@njit_internal
+def right_transposed(a: Array, b: Array, out: Array) -> None:
+    """Write a bᵀ of two matrices (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
+
+
+@njit_internal
+def transposed_times(a: Array, b: Array, out: Array) -> None:
+    """Write aᵀ b of a matrix (3, 3) and a vector."""
+    for i in range(3):
+        out[i] = a[0, i] * b[0] + a[1, i] * b[1] + a[2, i] * b[2]
+
+
+@njit_internal
+def complement(a: Array) -> None:
+    """Replace a matrix (3, 3) by I − a."""
+    for i in range(3):
+        for j in range(3):
+            a[i, j] = (1.0 if i == j else 0.0) - a[i, j]
+
+
+@njit_internal
+def inverse_root(M: Array, inverse: Array) -> None:
+    """Write L⁻¹ of M = L Lᵀ, both (3, 3), lower triangular."""
+    l00 = np.sqrt(M[0, 0])
+    l10, l20 = M[1, 0] / l00, M[2, 0] / l00
+    l11 = np.sqrt(M[1, 1] - l10 * l10)
+    l21 = (M[2, 1] - l20 * l10) / l11
+    l22 = np.sqrt(M[2, 2] - l20 * l20 - l21 * l21)
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = 1 / l00, 1 / l11, 1 / l22
+    inverse[1, 0] = -l10 / l00 / l11
+    inverse[2, 1] = -l21 / l11 / l22
+    inverse[2, 0] = -(l20 * inverse[0, 0] + l21 * inverse[1, 0]) / l22
+    inverse[0, 1] = inverse[0, 2] = inverse[1, 2] = 0.0

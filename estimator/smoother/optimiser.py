@@ -7,15 +7,32 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from ...arrays import Array
-from ..kernels.kalman_gain import Rules
-from ..models.bearing_range import wrap_angle
+from ...arrays import Array, IntArray
+from ...jit import jit, njit_internal
+from ..filters.ekf import InvariantEkfSlam
+from ..interface import Belief
+from ..kernels.kalman_gain import Rules, as_rules
+from ..kernels.scan_update import bearing_variance, range_variance
+from ..models.bearing_range import (
+    expected_reading_jit,
+    located_jit,
+    wrap_angle,
+    wrap_angle_jit,
+)
 from ..support.memory_limit import refuse_beyond_memory
-from .cost import CAUCHY, HUBER, SQUARED, reading_stds, total_cost
-from .drive_arrays import DriveArrays
-from .elimination import Elimination, eliminate, new_elimination
-from .relocation import relocate
-from .substitution import substitute
+from .drive import Drive, DriveArrays
+from .elimination import (
+    CAUCHY,
+    HUBER,
+    SQUARED,
+    Elimination,
+    eliminate,
+    new_elimination,
+    reading_stds,
+    robust_loss,
+    substitute,
+    total_cost,
+)
 
 KINDS = {None: SQUARED, "huber": HUBER, "cauchy": CAUCHY}
 SLACK = 1e-12  # of the cost, in rounding
@@ -258,3 +275,195 @@ def factorised(information: Array) -> tuple[Array, bool]:
             "positive definite"
         ) from None
     return factor, lower
+
+
+# --------------------------------------------------------------------------------------
+# Move landmarks out of local minima, compiled.
+#
+# A landmark close to the path may be estimated on the wrong side of it. All bearings
+# then have large errors, but no small step reduces the cost. Single readings place it
+# on the right side.
+
+CANDIDATES = 12  # of a landmark, from readings spread evenly over the drive
+
+GAIN = 4.0  # by which the cost must fall
+
+
+@jit
+def relocate(
+    poses: Array,
+    landmarks: Array,
+    drive: DriveArrays,
+    by_landmark: IntArray,
+    owners: IntArray,
+    rule_values: Array,
+    robust: tuple[float, float],
+) -> int:
+    """Move each landmark to where one of its readings puts it, if that costs far less.
+
+    The poses are fixed, and σβ and σr are those at the range read, so that places
+    compare.
+    Landmarks whose readings cost no more than they should are passed over.
+
+    Parameters
+    ----------
+    by_landmark : ndarray of int64, shape (M,)
+        The readings ordered by their landmark's column.
+    owners : ndarray of int64, shape (M,)
+        Pose of each reading.
+    robust
+        Kind and scale of the robust kernel.
+
+    Returns
+    -------
+    int
+        How many landmarks have moved, in place.
+    """
+    rules, moved, first = as_rules(rule_values), 0, 0
+    place = np.empty(2)
+    while first < len(by_landmark):
+        c = drive.columns[by_landmark[first]]
+        last = first
+        while last < len(by_landmark) and drive.columns[by_landmark[last]] == c:
+            last += 1
+        own = by_landmark[first:last]
+        place[0], place[1] = landmarks[c], landmarks[c + 1]
+        least = _cost_at(place, own, poses, drive, owners, rules, robust) - GAIN
+        bound, first = least, last
+        if least < len(own) + 3 * np.sqrt(len(own)):  # the mean, and 3 σ more
+            continue
+        for i in range(0, len(own), max(len(own) // CANDIDATES, 1)):
+            j = own[i]
+            pose, z = poses[owners[j]], drive.readings[j]
+            place[0], place[1], _, _ = located_jit(
+                pose[0], pose[1], pose[2], z[0], z[1]
+            )
+            cost = _cost_at(place, own, poses, drive, owners, rules, robust)
+            if cost < least:
+                least = cost
+                landmarks[c], landmarks[c + 1] = place[0], place[1]
+        moved += least < bound
+    return moved
+
+
+@njit_internal
+def _cost_at(
+    place: Array,
+    own: IntArray,
+    poses: Array,
+    drive: DriveArrays,
+    owners: IntArray,
+    rules: Rules,
+    robust: tuple[float, float],
+) -> float:
+    """Return what the readings of one landmark cost if it is at a place."""
+    total = 0.0
+    for j in own:
+        pose, z = poses[owners[j]], drive.readings[j]
+        bearing, distance = expected_reading_jit(
+            place[0] - pose[0], place[1] - pose[1], pose[2]
+        )
+        to_bearing = wrap_angle_jit(z[0] - bearing)
+        squared = to_bearing**2 / bearing_variance(rules, z[1])
+        squared += (z[1] - distance) ** 2 / range_variance(rules, z[1])
+        total += robust_loss(squared, robust[0], robust[1])
+    return total
+
+
+# --------------------------------------------------------------------------------------
+# Poses and landmarks to start the smoother from, by an invariant filter.
+
+
+def filter_drive(
+    drive: Drive, known: Belief | None = None, *, iterations: int = 1
+) -> tuple[Array, Belief]:
+    """Follow a drive with an invariant filter.
+
+    Parameters
+    ----------
+    drive : Drive
+        Motions and scans.
+    known : Belief, optional
+        A map that the filter has from the beginning.
+    iterations : int
+        Of each update of the filter.
+
+    Returns
+    -------
+    poses : ndarray, shape (N, 3)
+        After each scan [m, m, rad].
+    belief : Belief
+        At the end.
+    """
+    rules, noise = drive.rules, drive.motion_noise
+    slam = InvariantEkfSlam(
+        np.sqrt(noise.variance),
+        (rules.bearing_std, rules.range_std),
+        initial_pose=drive.initial_pose,
+        initial_pose_std=drive.initial_pose_std,
+        range_std_per_metre=rules.range_std_per_metre,
+        bearing_std_metres=rules.bearing_std_metres,
+        range_noise_at="reading" if rules.noise_as_read else "expected",
+        noise_at_rest=noise.at_rest,
+        min_range=rules.min_range,
+        iterations=iterations,
+    )
+    if known is not None:
+        _take_map(slam, drive, known)
+    poses = np.empty((drive.poses, 3))
+    for k, motion in enumerate(drive.motions):
+        for distance, turn, dt in motion.steps:
+            slam.predict((distance, turn), dt)
+        readings, ids = drive.sightings(k)
+        slam.update(readings, ids)
+        poses[k] = slam.map.mean[:3]
+    return poses, slam.belief()
+
+
+def start_of(
+    drive: Drive, belief: Belief | None = None, *, iterations: int = 1
+) -> tuple[Array, dict[int, Array]]:
+    """Return poses (N, 3) that fit a filter's final map, and that map.
+
+    The poses that a filter estimates during the drive do not fit it: each uses only the
+    readings until then, and they jump when a loop is closed. A second pass, which has
+    the map from the beginning, counts all readings twice, but its poses have no jumps.
+
+    Parameters
+    ----------
+    drive : Drive
+        Motions and scans.
+    belief : Belief, optional
+        Of a filter at the end of the drive; an invariant one where not given.
+    iterations : int
+        Of each update of that.
+    """
+    if belief is None:
+        _, belief = filter_drive(drive, iterations=iterations)
+    poses, again = filter_drive(drive, belief)
+    return poses, dict(zip(again.landmark_ids, again.landmarks, strict=True))
+
+
+def _take_map(slam: InvariantEkfSlam, drive: Drive, known: Belief) -> None:
+    """Give a filter at its start the landmarks of a belief that a drive reads."""
+    read = set(drive.landmark_ids)
+    columns = [
+        3 + 2 * slot + axis
+        for slot, i in enumerate(known.landmark_ids)
+        if i in read
+        for axis in (0, 1)
+    ]
+    mean = np.concatenate([drive.initial_pose, known.mean[columns]])
+    covariance = np.zeros((len(mean), len(mean)))
+    covariance[:3, :3] = np.diag(drive.initial_pose_std**2)
+    covariance[3:, 3:] = known.covariance[np.ix_(columns, columns)]
+    ids = [i for i in known.landmark_ids if i in read]
+    slam.load_state_dict(
+        slam.state_dict()
+        | {
+            "mean": mean,
+            "covariance": covariance,
+            "landmark_ids": np.array(ids, dtype=np.int64),
+            "reference": mean,
+        }
+    )

@@ -19,7 +19,7 @@ from ..logs.lines import LogError
 from ..logs.recording import log_header
 from ..logs.slamlog import SlamLog
 
-SMOOTHER = "slamgym.estimator.smoother.smoothing_slam:SmoothingSlam"
+SMOOTHER = "slamgym.estimator.smoother.recorded_slam:SmoothingSlam"
 """Import path of the smoother; its option ``follow`` names the filter that it follows,
 and whose options it takes too."""
 OFFLINE = {"smoother": SMOOTHER}

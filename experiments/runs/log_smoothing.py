@@ -10,7 +10,7 @@ import numpy as np
 from ... import __version__
 from ...arrays import Array, IntArray
 from ...estimator.smoother import SmoothedDrive
-from ...estimator.smoother.within import smoother_in
+from ...estimator.smoother.batch_smoother import smoother_in
 from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
 from ..logs.slamlog import SlamLog

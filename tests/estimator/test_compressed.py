@@ -15,7 +15,7 @@ from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
 from slamgym.estimator.interface import Belief
-from slamgym.estimator.large_maps.compressed import active_set
+from slamgym.estimator.large_maps.compressed import compressed_map as active_set
 from slamgym.estimator.large_maps.compressed.compressed_slam import (
     BASES,
     CompressedEkfSlam,
@@ -24,7 +24,7 @@ from slamgym.estimator.large_maps.compressed.deferred_covariance import (
     BLOCK,
     DeferredCovariance,
 )
-from slamgym.estimator.large_maps.compressed.handover import Handover
+from slamgym.estimator.large_maps.compressed.phase_update import Handover
 from slamgym.estimator.map_management.map_editor import edit_map
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))

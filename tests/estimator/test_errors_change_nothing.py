@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from slamgym.estimator import list_estimators, make_estimator
-from slamgym.estimator.large_maps.submaps import gauss_newton
+from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.unicycle_motion import predict_pose
-from slamgym.estimator.smoother.smoothing_slam import SmoothingSlam
+from slamgym.estimator.smoother.recorded_slam import SmoothingSlam
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
 READINGS = np.array([[0.1, 4.0], [-0.7, 3.0], [1.4, 5.0], [-2.0, 2.0]])

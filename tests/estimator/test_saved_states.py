@@ -10,7 +10,7 @@ from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator import list_estimators, make_estimator
 from slamgym.estimator.map_management.policy import FieldOfView
-from slamgym.estimator.smoother.smoothing_slam import SmoothingSlam
+from slamgym.estimator.smoother.recorded_slam import SmoothingSlam
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
 READINGS = np.array([[0.1, 4.0], [-0.7, 3.0], [1.4, 5.0], [-2.0, 2.0]])

@@ -9,7 +9,7 @@ from slamgym.estimator import make_estimator
 from slamgym.estimator.map_management import ManagedSlam
 from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.smoother import Drive, SmoothingSlam, smooth
-from slamgym.estimator.smoother.start import start_of
+from slamgym.estimator.smoother.optimiser import start_of
 
 START_STD = (0.1, 0.2, 0.05)
 RANGE = 7.0  # of the sensor [m]

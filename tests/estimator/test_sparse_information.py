@@ -15,25 +15,21 @@ from slamgym.estimator import (
     ObservabilityConstrainedEkfSlam,
     check_estimator,
 )
-from slamgym.estimator.large_maps.sparse_cholesky import landmark_dissection
-from slamgym.estimator.large_maps.sparse_cholesky.coordinates import pairs
-from slamgym.estimator.large_maps.sparse_cholesky.extend_add import add_update
-from slamgym.estimator.large_maps.sparse_cholesky.information_matrix import (
+from slamgym.estimator.large_maps import elimination as landmark_dissection
+from slamgym.estimator.large_maps.elimination import RestFactor
+from slamgym.estimator.large_maps.multifrontal import (
     InformationMatrix,
-)
-from slamgym.estimator.large_maps.sparse_cholesky.landmark_elimination import (
-    RestFactor,
-)
-from slamgym.estimator.large_maps.sparse_cholesky.schur_complement import solver
-from slamgym.estimator.large_maps.sparse_information.conditional_pose import (
-    ConditionalPose,
-    LinearScan,
-    cut_links,
-    relocate,
+    add_update,
+    pairs,
+    solver,
 )
 from slamgym.estimator.large_maps.sparse_information.local_information import (
+    ConditionalPose,
+    LinearScan,
     SparseMap,
     begin_local_map,
+    cut_links,
+    relocate,
     write_back,
 )
 from slamgym.estimator.large_maps.sparse_information.sparse_information_slam import (

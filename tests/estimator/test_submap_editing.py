@@ -16,7 +16,8 @@ from test_submaps import (
 )
 
 from slamgym.estimator.filters.gaussian_map import coincide, without_landmarks
-from slamgym.estimator.large_maps.submaps import gauss_newton, neighbourhood
+from slamgym.estimator.large_maps.submaps import closed_submaps as neighbourhood
+from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.models.unicycle_motion import predict_pose

@@ -9,18 +9,15 @@ from scipy.optimize import least_squares
 from scipy.sparse import csc_array
 
 from slamgym.estimator import EkfSlam, check_estimator
-from slamgym.estimator.large_maps.sparse_cholesky.submap_dissection import dissect
-from slamgym.estimator.large_maps.sparse_cholesky.submap_elimination import (
-    SubmapElimination,
-)
-from slamgym.estimator.large_maps.submaps import gauss_newton
+from slamgym.estimator.large_maps.elimination import SubmapElimination, dissect
+from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.factor import (
+    Gaussian,
     factor_error,
     inverse_spread,
     retract,
 )
-from slamgym.estimator.large_maps.submaps.fusion import fuse
-from slamgym.estimator.large_maps.submaps.gaussian import Gaussian
+from slamgym.estimator.large_maps.submaps.graph import fuse
 from slamgym.estimator.large_maps.submaps.store import CACHE_SIZE, MARKER
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle

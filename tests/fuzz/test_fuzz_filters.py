@@ -10,8 +10,11 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 from interrupts import is_interrupted, lines_of
 
 from slamgym.estimator import list_estimators, make_estimator
-from slamgym.estimator.smoother.recorded_slam import HISTORY, RecordedSlam
-from slamgym.estimator.smoother.smoothing_slam import SmoothingSlam
+from slamgym.estimator.smoother.recorded_slam import (
+    HISTORY,
+    RecordedSlam,
+    SmoothingSlam,
+)
 
 NOISES = [
     {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)},

@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
+from ...filters.gaussian_map import checked_map
 from ...interface import Belief
+from ...support import saved_states
 from ...support.argument_checks import LOWEST_ID
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
-from ..sparse_cholesky.coordinates import pairs
-from .active_set import choose_local, largest_whole_map
-from .deferred_covariance import BLOCK, DeferredCovariance
-from .downdate import subtract, symmetric
-from .handover import Handover, begin_handover, blocks_in_a_step, exchanged_rows
+from ..multifrontal import pairs
+from .deferred_covariance import BLOCK, DeferredCovariance, subtract, symmetric
 from .phase_update import (
+    Handover,
     Phase,
+    begin_handover,
     begin_phase,
+    blocks_in_a_step,
     combine,
     end_phase,
+    exchanged_rows,
     roots,
     virtual_landmarks,
 )
-from .saved_state import SavedState
 
 
 class CompressedMap:
@@ -293,3 +295,188 @@ class CompressedMap:
     def _columns(self, ids: Sequence[int]) -> IntArray:
         """Return the columns of landmarks in the map's arrays."""
         return pairs([self.slots[i] for i in ids])
+
+
+# --------------------------------------------------------------------------------------
+# Choice of the local landmarks of a compressed filter, and of their number.
+
+LARGEST_WHOLE_MAP = 350
+"""Up to this many landmarks, the local map is the whole map.
+
+The end of a phase has a cost of its own.  In smaller maps it exceeds two full updates.
+"""
+LARGEST_WHOLE_INVARIANT = 400
+"""The same in the invariant frame, where phases end at twice the cost."""
+SMALLEST_LOCAL_MAP = 30
+"""Smallest number of landmarks at which a local map may be too large."""
+SHORT_PHASE = 4
+"""Steps after which a phase has paid for its end."""
+LARGEST_RATIO, LANDMARKS_PER_RATIO = 2.5, 400
+"""Limit of the extra landmarks, as a multiple of the landmarks of a scan.
+
+The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
+costs a² n.
+"""
+
+
+def largest_whole_map(*, invariant: bool) -> int:
+    """Return the number of landmarks up to which the local map is the whole map."""
+    return LARGEST_WHOLE_INVARIANT if invariant else LARGEST_WHOLE_MAP
+
+
+def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
+    """Return the number of landmarks of the next local map beyond those of a scan.
+
+    Parameters
+    ----------
+    before : int
+        The last such number.
+    read : int
+        Mapped landmarks in the scan.
+    mapped : int
+        Landmarks in the map.
+    lasted : int
+        Steps of the phase that ends.
+
+    Examples
+    --------
+    >>> [extra_landmarks(9, 10, mapped, lasted=20) for mapped in (300, 1000, 5000)]
+    [7, 25, 25]
+    >>> extra_landmarks(9, 10, 1000, lasted=1)  # scans far apart from each other
+    4
+    """
+    if lasted < SHORT_PHASE:
+        return before // 2
+    ratio = min(LARGEST_RATIO, mapped / LANDMARKS_PER_RATIO)
+    return min(2 * before + 8, int(max(read, 4) * ratio))
+
+
+def choose_local(
+    centre: Array,
+    required: Sequence[int],
+    slots: Mapping[int, int],
+    points: Array,
+    size: int,
+) -> dict[int, None]:
+    """Return the required landmarks, and the nearest to a point up to ``size`` in all.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (2,)
+    required : sequence of int
+    slots : mapping
+        Row in ``points`` by landmark.
+    points : ndarray, shape (n, 2)
+        Positions of the landmarks [m].
+    size : int
+    """
+    chosen = dict.fromkeys(required)
+    if len(chosen) >= size:
+        return chosen
+    ids = list(slots)
+    distances = ((points[list(slots.values())] - centre) ** 2).sum(axis=1)
+    count = min(size + len(required), len(ids))
+    nearest = np.argpartition(distances, count - 1)[:count]
+    for k in nearest[np.argsort(distances[nearest], kind="stable")].tolist():
+        if len(chosen) >= size:
+            break
+        chosen[ids[k]] = None
+    return chosen
+
+
+# --------------------------------------------------------------------------------------
+# Check the saved state of a compressed filter before anything changes.
+
+_LOCAL = ("mean", "covariance", "reference", "landmark_ids")
+_OWN = ("landmark_ids", "slots", "points", "references", "strip", "origin", "numbers")
+
+
+COUNTERS = 4
+"""Numbers before the free slots: virtual landmarks, extra ones, age, rest."""
+
+
+class SavedState(NamedTuple):
+    """The attributes of a compressed filter, read from a saved state."""
+
+    local: dict[str, Any]
+    far: DeferredCovariance
+    slots: dict[int, int]
+    near: dict[int, None]
+    arrays: tuple[Array, Array, Array, Array]  # points, references, strip, origin
+    numbers: list[int]
+
+
+def checked_state(
+    state: Mapping[str, Any], name: str, base: str, invariant: bool
+) -> SavedState:
+    """Read what ``CompressedEkfSlam.state_dict`` returned; refuse what does not fit."""
+    far = DeferredCovariance()
+    entries = [*_OWN, *(f"local_{k}" for k in _LOCAL)]
+    entries += [f"far_{k}" for k in far.state_dict()]
+    saved_states.refuse_other_state(state, entries, estimator=name, base=base)
+    far.load_state_dict({k: state[f"far_{k}"] for k in far.state_dict()})
+    ids, local_ids = (
+        saved_states.landmark_ids(key, state[key])
+        for key in ("landmark_ids", "local_landmark_ids")
+    )
+    slots, numbers = (
+        saved_states.whole_numbers(key, state[key], (-1,), 0).tolist()
+        for key in ("slots", "numbers")
+    )
+    _check_slots(slots, numbers, len(ids), len(local_ids))
+    saved = SavedState(
+        checked_map({k: state[f"local_{k}"] for k in _LOCAL}, semidefinite=False),
+        far,
+        dict(zip(ids, slots, strict=True)),
+        dict.fromkeys(local_ids[numbers[0] :]),
+        (
+            _vector(state, "points", far.width),
+            _vector(state, "references", far.width),
+            saved_states.array("strip", state["strip"], (-1, far.width)),
+            _vector(state, "origin", 2),
+        ),
+        numbers,
+    )
+    _check_fit(saved, invariant)
+    return saved
+
+
+def _check_slots(
+    slots: list[int], numbers: list[int], landmarks: int, local: int
+) -> None:
+    """Refuse places of landmarks that do not fit their number."""
+    if landmarks != len(slots):
+        raise ValueError(
+            f"state['slots'] must have one entry for each of {landmarks} landmarks, "
+            f"got {len(slots)}"
+        )
+    if len(numbers) < COUNTERS or numbers[0] > local:
+        raise ValueError(
+            f"state['numbers'] must be at least {COUNTERS}, the first of them at most "
+            f"{local}, got {numbers}"
+        )
+    free = numbers[COUNTERS:]
+    if sorted(slots + free) != list(range(len(slots + free))):
+        raise ValueError(
+            "state['slots'] and the free ones in state['numbers'] must be 0, 1, … "
+            f"without repetition, got {slots} and {free}"
+        )
+
+
+def _vector(state: Mapping[str, Any], key: str, size: int) -> Array:
+    return saved_states.array(key, state[key], (size,))
+
+
+def _check_fit(saved: SavedState, invariant: bool) -> None:
+    strip, virtual, width = saved.arrays[2], saved.numbers[0], saved.far.width
+    rows = virtual_landmarks(len(strip), invariant)
+    if virtual and rows != virtual:
+        raise ValueError(
+            f"state['strip'] must fit {virtual} virtual landmarks and {width} columns, "
+            f"got shape {strip.shape}"
+        )
+    own = np.r_[0:3, 3 + 2 * virtual : len(saved.local["mean"])]
+    covariance = saved.local["covariance"][np.ix_(own, own)]
+    saved_states.refuse_indefinite("state['local_covariance']", covariance)
+    if not set(saved.near) <= set(saved.slots):
+        raise ValueError("state['local_landmark_ids'] must be among landmark_ids")

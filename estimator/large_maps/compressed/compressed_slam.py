@@ -23,11 +23,9 @@ from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
-from . import active_set
-from .active_set import extra_landmarks
-from .compressed_map import CompressedMap
+from . import compressed_map as active_set
+from .compressed_map import CompressedMap, checked_state, extra_landmarks
 from .deferred_covariance import stored_bytes
-from .saved_state import checked_state
 
 BASES: dict[str, type[EkfSlam]] = {
     "ekf": EkfSlam,

@@ -1,16 +1,15 @@
 """Covariance between the landmarks of a large map, with deferred downdates."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ....arrays import Array, IntArray
+from ....jit import jit
 from ...support import saved_states
 from ...support.memory_limit import refuse_beyond_memory
 from ...support.undo import Undo, contents
-from .downdate import Downdate, rows_of, saved_downdates, symmetric
-from .row_exchange import read_columns, read_marginal, write_columns
 
 # Rows of one block: 64 landmarks.
 BLOCK = 128
@@ -284,3 +283,157 @@ def _bounds(columns: IntArray, blocks: range) -> list[int]:
     starts = BLOCK * np.arange(blocks.start, blocks.stop + 1)
     bounds: list[int] = columns.searchsorted(starts).tolist()
     return bounds
+
+
+# --------------------------------------------------------------------------------------
+# A change of a covariance that is applied later, and its saved form.
+
+_CHUNK = 128  # rows that are changed at a time
+
+
+class Downdate(NamedTuple):
+    """A change not yet applied to the stored covariance: P ← P − W diag(s) Wᵀ."""
+
+    root: Array  # W, shape (width, rank)
+    signs: Array  # s, shape (rank,), each 1 or -1
+
+
+def saved_downdates(state: Mapping[str, Any], width: int) -> list[Downdate]:
+    """Return the pending downdates of a state, or refuse them."""
+    signs = saved_states.array("far_pending_signs", state["pending_signs"], (-1,))
+    root = saved_states.array(
+        "far_pending_root", state["pending_root"], (width, len(signs))
+    )
+    shapes = saved_states.whole_numbers(
+        "far_pending_shapes", state["pending_shapes"], (-1, 2), 0
+    )
+    if shapes[:, 1].sum() != len(signs) or (shapes[:, 0] > width).any():
+        raise ValueError(
+            f"state['far_pending_shapes'] must add up to a rank of {len(signs)} in "
+            f"{width} rows, got {shapes.tolist()}"
+        )
+    if not np.isin(signs, (-1, 1)).all():
+        raise ValueError("state['far_pending_signs'] must be 1 or -1")
+    ends = np.cumsum(shapes[:, 1]).tolist()
+    return [
+        Downdate(root[:rows, end - rank : end].copy(), signs[end - rank : end].copy())
+        for (rows, rank), end in zip(shapes.tolist(), ends, strict=True)
+    ]
+
+
+def rows_of(root: Array, columns: IntArray) -> Array:
+    """Return rows of W; columns newer than W have zeros."""
+    if len(root) > columns.max(initial=0):
+        chosen: Array = root[columns]
+        return chosen
+    rows = np.zeros((len(columns), root.shape[1]))
+    inside = columns < len(root)
+    rows[inside] = root[columns[inside]]
+    return rows
+
+
+def subtract(covariance: Array, root: Array, signs: Array) -> None:
+    """P ← P − W diag(s) Wᵀ in place, a few rows at a time, without a second matrix."""
+    for first in range(0, len(covariance), _CHUNK):
+        own = slice(first, first + _CHUNK)
+        covariance[own] -= (root[own] * signs) @ root.T
+
+
+def symmetric(covariance: Array) -> Array:
+    """Copy the lower half into the upper one, in place."""
+    n = len(covariance)
+    for first in range(0, n, _CHUNK):
+        last = min(first + _CHUNK, n)
+        own = covariance[first:last, first:last]
+        own[:] = np.tril(own) + np.tril(own, -1).T
+        covariance[first:last, last:] = covariance[last:, first:last].T
+    return covariance
+
+
+# --------------------------------------------------------------------------------------
+# Copy rows and columns between the arrays of a map and a local map, compiled.
+
+
+@jit
+def read_columns(block: Array, first: int, columns: IntArray, rows: Array) -> None:
+    """Copy some columns of a block into rows (c, width), from column ``first`` on.
+
+    The copy runs row by row, because neighbours share a cache line.
+    """
+    for i in range(len(block)):
+        for j in range(len(columns)):
+            rows[j, first + i] = block[i, columns[j]]
+
+
+@jit
+def read_marginal(
+    block: Array, first: int, columns: IntArray, covariance: Array
+) -> None:
+    """Copy what a block holds of the covariance (c, c) of some columns, lower half."""
+    last = first + len(block)
+    for i in range(len(columns)):
+        row = columns[i]
+        if first <= row < last:
+            for j in range(len(columns)):
+                column = columns[j]
+                if column <= row:
+                    value = block[row - first, column]
+                    covariance[i, j] = covariance[j, i] = value
+
+
+@jit
+def write_columns(
+    block: Array,
+    first: int,
+    own: IntArray,
+    columns: IntArray,
+    rows: Array,
+    places: IntArray,
+) -> None:
+    """Copy the rows at ``places``, from column ``first`` on, into some columns.
+
+    Only the rows ``own`` of the block change.
+    """
+    for i in own:
+        for j in range(len(columns)):
+            block[i, columns[j]] = rows[places[j], first + i]
+
+
+@jit
+def fill_extended(
+    covariance: Array, before: int, pose: Array, rows: Array, virtual: int, step: int
+) -> None:
+    """Put a local map and the extension of a phase into the covariance of a filter.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (capacity, capacity)
+        Overwritten; its first ``before`` rows and columns were in use.
+    pose : ndarray, shape (3, 3)
+        Covariance of the pose.
+    rows : ndarray, shape (a, a - 3)
+        Covariance of pose and local landmarks with the local landmarks.  Of the last
+        a - 3 rows, only the lower half is used.
+    virtual, step : int
+        Number of columns of the extension; every ``step``-th belongs to a coordinate.
+    """
+    size = max(before, len(rows) + virtual)
+    covariance[:size, :size] = 0.0
+    for i in range(len(rows)):
+        for j in range(i + 1):
+            value = pose[i, j] if i < 3 else rows[j, i - 3]
+            if j >= 3:
+                value = rows[i, j - 3]
+            k, m = i + virtual * (i >= 3), j + virtual * (j >= 3)
+            covariance[k, m] = covariance[m, k] = value
+        if virtual:
+            k, m = i + virtual * (i >= 3), 3 + step * i
+            covariance[k, m] = covariance[m, k] = 1.0
+
+
+@jit
+def unpivot(factor: Array, places: IntArray, rows: Array) -> None:
+    """Copy the first rows of a triangular factor, its columns to their places."""
+    for i in range(len(rows)):
+        for j in range(i, len(places)):
+            rows[i, places[j]] = factor[i, j]

@@ -1,24 +1,32 @@
 """The closed submaps of a run, joined when a belief asks for them."""
 
-from collections.abc import Mapping, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
+from ...filters.ekf import InvariantEkfSlam
+from ...filters.gaussian_map import coincide, without_landmarks
+from ...interface import Belief, MapView, UpdateReport
 from ...models.rigid_motion import ErrorFrame
-from ...support.undo import Undo
-from .frame_initialisation import (
+from ...support import argument_checks, saved_states
+from ...support.argument_checks import LandmarkIds
+from ...support.undo import Undo, contents, undo_all
+from .factor import Gaussian, retract
+from .joining import (
     FrameInitialisation,
+    JoinedMap,
     SubmapSummary,
     points_seen,
     summarise,
 )
-from .gaussian import Gaussian
-from .joining import JoinedMap
-from .merging import merged
-from .neighbourhood import Region
-from .store import Submap, SubmapStore
+from .store import LostSubmapError, Submap, SubmapStore
 
 ROUGHLY_CONVERGED = 0.1
 """Decrement at which to stop while computing initial frames."""
@@ -172,3 +180,316 @@ class ClosedSubmaps:
             frames,
             ROUGHLY_CONVERGED,
         ).frames
+
+
+# --------------------------------------------------------------------------------------
+# Pose and near landmarks of the joined map, followed by an ordinary filter.
+#
+# Data association and merging need the covariance of the pose and the landmarks around
+# it in every step, and joining the submaps in every step would be too slow.  The part
+# of the joined map around the robot is therefore copied into an invariant filter, which
+# then processes each step too.  The copy is replaced whenever a submap is closed.
+
+LARGEST_COUNT = 1000
+"""Largest number of landmarks of closed submaps in a neighbourhood."""
+MARGIN = 2.0
+"""Ratio of the copied to the required distance, so that a copy lasts for a while."""
+RECENT_SCANS = 10
+"""Number of scans whose ranges determine the required distance of the next copy."""
+
+
+class Region(NamedTuple):
+    """The disc that a neighbourhood covers."""
+
+    centre: Array
+    """Position of the robot when the copy was made, shape (2,) [m]."""
+    reach: float
+    """Required distance from the robot [m]."""
+    slack: float
+    """Uncertainty of the distances [m]."""
+    is_all: bool = False
+    """Whether the copy holds all landmarks."""
+    farthest: float = np.inf
+    """Distance of the last landmark, if their number was limited [m]."""
+
+    @property
+    def radius(self) -> float:
+        """Radius of the disc [m]."""
+        wanted = np.inf if self.is_all else MARGIN * (self.reach + self.slack)
+        return min(wanted, self.farthest)
+
+    def covers(self, position: Array, within: float) -> bool:
+        """Return whether the disc holds all within a distance of a position (2,)."""
+        away = float(np.hypot(*(position - self.centre)))
+        return away + within + self.slack <= self.radius
+
+    def chosen(self, points: Array) -> tuple[IntArray, Region]:
+        """Return which landmarks (n, 2) lie in the disc, and the disc.
+
+        If there are too many, the nearest and a smaller disc.
+        """
+        distance = np.hypot(*(points - self.centre).T)
+        inside = np.flatnonzero(distance <= self.radius)
+        if len(inside) <= LARGEST_COUNT:
+            return inside, self
+        nearest = inside[np.argsort(distance[inside], kind="stable")[:LARGEST_COUNT]]
+        farthest = float(distance[nearest[-1]])
+        return np.sort(nearest), self._replace(farthest=farthest)
+
+
+JoinedRegion = Callable[[float], tuple[Belief, Region]]
+
+
+class _Copy(NamedTuple):
+    """A part of the joined map, and the filter that follows the robot in it."""
+
+    slam: InvariantEkfSlam
+    region: Region
+
+
+class Neighbourhood:
+    """A part of the joined map; empty until :meth:`view` is called.
+
+    Parameters
+    ----------
+    make : callable
+        Returns a filter without a gate.
+    joined_region : callable
+        Returns the joined belief around the robot within at least a distance [m].
+    saved : tuple, optional
+        Copy and distances to continue from.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], InvariantEkfSlam],
+        joined_region: JoinedRegion,
+        saved: tuple[_Copy, list[float]] | None = None,
+    ) -> None:
+        self._make, self._joined_region = make, joined_region
+        self._copy: _Copy | None = None
+        self.forget()
+        if saved is not None:
+            self._copy, self._reaches = saved
+
+    def forget(self) -> None:
+        """Discard the copy, for a new run."""
+        self._copy = None
+        # Largest distance asked for or measured with each recent scan; the last entry
+        # is for the time since the last scan [m].
+        self._reaches = RECENT_SCANS * [0.0]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the covariance [bytes]."""
+        return 0 if self._copy is None else self._copy.slam.map.covariance.nbytes
+
+    def view(self, within: float) -> MapView:
+        """Return pose and near landmarks, without copying arrays.
+
+        Parameters
+        ----------
+        within : float
+            Distance from the robot that the view covers at least [m].
+        """
+        copy = self._copy
+        if copy is None or not copy.region.covers(copy.slam.map.mean[:2], within):
+            copy = self._renewed(max(within, *self._reaches))
+        self._reaches[-1] = max(within, self._reaches[-1])
+        return copy.slam.map_view()
+
+    def checkpoint(self, *, motion: bool = False) -> Undo:
+        """Return what takes back later calls; ``motion``: only those of predict."""
+        if self._copy is None:
+            return contents(self)
+        return undo_all(self._copy.slam.checkpoint(motion=motion), contents(self))
+
+    def renew(self) -> None:
+        """Replace the copy, if there is one and the submaps can be joined."""
+        if self._copy is not None:
+            with suppress(np.linalg.LinAlgError, LostSubmapError):
+                self._renewed(max(self._reaches))
+
+    def predict(self, odometry: ArrayLike, dt: float) -> None:
+        """Move the robot."""
+        if self._copy is not None:
+            self._copy.slam.predict(odometry, dt)
+
+    def update(
+        self, measurements: ArrayLike, ids: LandmarkIds | None, report: UpdateReport
+    ) -> None:
+        """Process the measurements that the active submap has used.
+
+        Parameters
+        ----------
+        measurements, ids
+            The scan.
+        report : UpdateReport
+            Of the submap's filter, with ``added_ids`` new to the whole map.
+        """
+        if self._copy is None or ids is None:
+            return
+        refused = {*report.rejected_ids, *report.skipped_ids}
+        used = {
+            row: i
+            for row, i in enumerate(np.asarray(ids).ravel().tolist())
+            if i not in refused
+        }
+        if used:
+            readings = np.asarray(measurements)[list(used)]
+            self._correct(self._copy, readings, list(used.values()), report.added_ids)
+
+    def _correct(
+        self, before: _Copy, readings: Array, ids: list[int], new: Sequence[int]
+    ) -> None:
+        """Correct the copy; replace it if it lacks a landmark or the update fails."""
+        farthest = max(float(readings[:, 1].max()), self._reaches[-1])
+        self._reaches = [*self._reaches[1:-1], farthest, 0.0]
+        if not before.slam.map.slots.keys() | set(new) >= set(ids):
+            self.renew()
+        if self._copy is before:  # a new copy contains the scan already
+            try:
+                before.slam.update(readings, ids)
+            except np.linalg.LinAlgError:
+                self.renew()
+
+    def remove(self, ids: Sequence[int]) -> None:
+        """Marginalise landmarks, as far as the copy holds them."""
+        if self._copy is None:
+            return
+        slam = self._copy.slam
+        if held := [i for i in ids if i in slam.map.slots]:
+            slam.remove(held)
+
+    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Condition on pairs of landmarks being one, after the submaps have been.
+
+        Several pairs close a loop: the copy is replaced, since joining the submaps is
+        more accurate than a linear step.
+        """
+        if self._copy is None:
+            return
+        slam, ids = self._copy.slam, {i for pair in pairs for i in pair}
+        held = ids.intersection(slam.map.slots)
+        if len(held) == 2 == len(ids):
+            with suppress(np.linalg.LinAlgError):
+                slam.merge_pairs(pairs)
+        elif held:
+            self.renew()
+        self.remove([gone for _, gone in pairs])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of the whole state as arrays; empty without a copy."""
+        if self._copy is None:
+            return {}
+        slam, region = self._copy
+        limits = [*region.centre, region.reach, region.slack, region.is_all]
+        numbers = np.array([*limits, region.farthest, *self._reaches])
+        return slam.state_dict() | {"extent": numbers}
+
+    def restored(self, state: Mapping[str, Any]) -> Neighbourhood:
+        """Return a neighbourhood that continues from a saved state."""
+        if not state:
+            return Neighbourhood(self._make, self._joined_region)
+        saved_states.refuse_other_state(state, ["extent"])
+        numbers = argument_checks.as_floats("state['extent']", state["extent"])
+        if numbers.shape != (6 + RECENT_SCANS,) or not _is_extent(numbers):
+            raise ValueError(
+                f"state['extent'] must be a finite position and {4 + RECENT_SCANS} "
+                f"numbers >= 0, the third of them 0 or 1, got {numbers}"
+            )
+        x, y, reach, slack, is_all, farthest, *reaches = numbers.tolist()
+        region = Region(np.array([x, y]), reach, slack, bool(is_all), farthest)
+        slam = self._make()
+        slam.load_state_dict({k: v for k, v in state.items() if k != "extent"})
+        saved = _Copy(slam, region), reaches
+        return Neighbourhood(self._make, self._joined_region, saved)
+
+    def _renewed(self, reach: float) -> _Copy:
+        """Replace the copy by one that covers at least a distance [m]."""
+        belief, region = self._joined_region(reach)
+        slam, P = self._make(), belief.covariance
+        state = {
+            "estimator": np.array(type(slam).__name__),
+            "mean": belief.mean,
+            "covariance": (P + P.T) / 2,
+            "reference": belief.mean,
+            "landmark_ids": np.array(belief.landmark_ids, dtype=np.int64),
+        }
+        slam.restore(state)
+        self._copy = _Copy(slam, region)
+        return self._copy
+
+
+def _is_extent(numbers: Array) -> bool:
+    """Return whether numbers may be a region and the distances after it."""
+    return bool(
+        np.isfinite(numbers[:2]).all()
+        and (numbers[2:] >= 0).all()
+        and numbers[4] in (0, 1)
+    )
+
+
+# --------------------------------------------------------------------------------------
+# Merging of landmarks within a submap: a measurement of zero distance.
+#
+# A closed submap is never rewritten.  Landmarks are merged whenever the submap is read,
+# so that the result depends only on the submap and on the list of merged landmarks.
+
+
+def merged(submap: Submap, renamed: Mapping[int, int], frame: ErrorFrame) -> Submap:
+    """Return a submap with merged landmarks in one slot.
+
+    If the submap holds both landmarks, it is conditioned on l_i = l_j.  This is linear
+    in the coordinates of its error, with H = [… I … −I …] in either frame::
+
+        0 = l_i − l_j = R(t) (l̂_i − l̂_j) + V(t) (ξ_i − ξ_j)
+
+    where t is the error of the heading, about which the measurement has no information.
+
+    Parameters
+    ----------
+    submap : Submap
+        As stored.
+    renamed : mapping
+        Slots of merged landmarks, and the slots that replace them.
+    frame : {"additive", "invariant"}
+        Coordinates of the submap's error.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the covariance of the distance of two landmarks is singular.
+
+    Examples
+    --------
+    >>> P = np.diag([1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+    >>> twice = Submap(np.array([3, 8]), np.array([0, 0, 0, 4.0, 0, 6.0, 0]), P)
+    >>> once = merged(twice, {8: 3}, "additive")
+    >>> once.slots, once.mean[3:], once.covariance.diagonal()[3:]
+    (array([3]), array([5., 0.]), array([0.5, 0.5]))
+    """
+    before = submap.slots.tolist()
+    slots = [renamed.get(slot, slot) for slot in before]
+    if slots == before:
+        return submap
+    mean, covariance = submap.mean, submap.covariance
+    first: dict[int, int] = {}
+    gone: list[int] = []
+    for place, slot in enumerate(slots):
+        kept = first.setdefault(slot, place)
+        if kept != place:
+            mean, covariance = _coincided(mean, covariance, kept, place, frame)
+            gone.append(place)
+    return Submap(
+        np.array(list(first), dtype=np.int64),
+        without_landmarks(mean, gone),
+        without_landmarks(covariance, gone),
+    )
+
+
+def _coincided(
+    mean: Array, covariance: Array, kept: int, gone: int, frame: ErrorFrame
+) -> tuple[Array, Array]:
+    corrected = coincide(mean, covariance, kept, gone)
+    return retract(mean, corrected.mean - mean, frame), corrected.covariance

@@ -8,19 +8,20 @@ m̂, P              its mean, (last pose, landmarks) in F_k, and the covariance 
 Y                 the same quantities in the world: F_{k+1} and landmarks l relative
                   to F_k,  Y_q = R(θ_k)ᵀ (q − p_k),  Y_θ = θ_{k+1} − θ_k
 
-Points are complex numbers here (:mod:`.gaussian`).  The error e of m̂ against Y is
+Points are complex numbers here (:mod:`.factor`).  The error e of m̂ against Y is
 Gaussian, N(0, P).
 """
+
+from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from ....arrays import Array
+from ....arrays import Array, ComplexArray
 from ...models.bearing_range import wrap_angle
 from ...models.rigid_motion import ErrorFrame
-from .gaussian import Complex, points_of, state_of
 
 SMALLEST_RATIO = 1e-5
 """Lower bound of a standard deviation, relative to the largest of the submap."""
@@ -130,3 +131,59 @@ def whitened(covariance: Array, columns: Array) -> Array:
     """Return L⁻¹ times columns, where L Lᵀ is the covariance."""
     lower = np.linalg.cholesky(regularised(covariance))
     return np.asarray(solve_triangular(lower, columns, lower=True, check_finite=False))
+
+
+# --------------------------------------------------------------------------------------
+# Gaussians of a pose and landmarks, with points as complex numbers.
+#
+# With a point (x, y) as x + iy, the rotation R(θ) is e^{iθ} and J = [0 −1; 1 0] is i.
+
+Complex = ComplexArray
+
+
+class Gaussian(NamedTuple):
+    """Mean of a pose and n landmarks, and the covariance of its additive error."""
+
+    mean: Array
+    """(x, y, θ, l1x, l1y, …), shape (3 + 2n,)."""
+    covariance: Array
+    """Shape (3 + 2n, 3 + 2n)."""
+
+
+def points_of(state: Array) -> Complex:
+    """Return the positions of the pose and the landmarks, shape (1 + n,)."""
+    return np.concatenate([state[:1], state[3::2]]) + 1j * np.concatenate(
+        [state[1:2], state[4::2]]
+    )
+
+
+def state_of(points: Complex, heading: float) -> Array:
+    """Return (x, y, θ, l1x, l1y, …), shape (3 + 2n,)."""
+    flat = np.ascontiguousarray(points).view(np.float64)
+    return np.concatenate([flat[:2], [heading], flat[2:]])
+
+
+def times(factor: complex, rows: Array) -> Array:
+    """Multiply pairs of rows, as real and imaginary parts, by a complex number."""
+    product = factor * (rows[0::2] + 1j * rows[1::2])
+    out = np.empty_like(rows)
+    out[0::2], out[1::2] = product.real, product.imag
+    return out
+
+
+def with_uncertain_start(map_: Gaussian, start: Array, covariance: Array) -> Gaussian:
+    """Add the uncertainty of the start pose to a map that is given relative to it.
+
+    Parameters
+    ----------
+    map_ : Gaussian
+        Conditioned on a run that begins at ``start``.
+    start, covariance : ndarray, shapes (3,) and (3, 3)
+        Pose at the beginning of the run.
+    """
+    lever = 1j * (points_of(map_.mean) - complex(*start[:2]))
+    G = np.zeros((len(map_.mean), 3))
+    rows = np.r_[0, 3 : len(G) : 2]
+    G[rows, 0] = G[rows + 1, 1] = G[2, 2] = 1.0
+    G[rows, 2], G[rows + 1, 2] = lever.real, lever.imag
+    return Gaussian(map_.mean, map_.covariance + G @ covariance @ G.T)

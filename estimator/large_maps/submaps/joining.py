@@ -8,22 +8,28 @@ the solution, so that the map gains no information about its own position and
 orientation.  Frame 0 is the start of the run, and fixed.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import cho_solve
 from scipy.sparse import coo_array
 
 from ....arrays import Array, IntArray
-from ...models.rigid_motion import ErrorFrame
-from ..sparse_cholesky.coordinates import pairs
-from ..sparse_cholesky.submap_dissection import dissect
-from ..sparse_cholesky.submap_elimination import Quadratic, SubmapElimination
-from . import gauss_newton
-from .factor import FactorError, factor_error, whitened
-from .frame_initialisation import SubmapSummary, points_seen
-from .gauss_newton import Iterate, minimise
-from .gaussian import Gaussian
-from .private_landmarks import PrivateLandmarks, private_landmarks
+from ...models.rigid_motion import ErrorFrame, compose
+from ..elimination import Quadratic, SubmapElimination, dissect
+from ..multifrontal import pairs
+from .factor import (
+    FactorError,
+    Gaussian,
+    factor_error,
+    inverse_spread,
+    regularised,
+    times,
+    whitened,
+)
 from .store import Submap
 
 CONVERGED = 1e-9
@@ -82,7 +88,7 @@ class JoinedMap:
         if not minimise(self._linearise, values, converged):
             raise np.linalg.LinAlgError(
                 f"the joined map did not converge in "
-                f"{gauss_newton.ITERATIONS} iterations: the submaps contradict each "
+                f"{ITERATIONS} iterations: the submaps contradict each "
                 "other, as after a wrong landmark_id, or drifted too far"
             )
 
@@ -173,3 +179,369 @@ class JoinedMap:
         error = self._error(index, submap.mean[rows])
         start = self.frames[index]
         return private_landmarks(submap, rows, wanted, start, error, self._error_frame)
+
+
+# --------------------------------------------------------------------------------------
+# Initial values of the frames of submaps, by divide and conquer.
+#
+# Gauss-Newton needs initial values near the right minimum, and composing the frames one
+# by one drifts too far from it.  Blocks of submaps are therefore joined first, then
+# blocks of blocks, each in its own frame.  A block is then aligned as a rigid body with
+# the landmarks that it shares with the blocks before it.  Block boundaries follow the
+# binary digits of the number of submaps, so that most blocks can be reused when the map
+# grows by one submap.
+
+Refine = Callable[[int, int, Array], Array]
+
+LARGEST_COMPOSED = 4
+"""Up to this many submaps, composing their frames is accurate enough."""
+
+
+class SubmapSummary(NamedTuple):
+    """The part of a closed submap that stays in memory."""
+
+    slots: IntArray
+    """Its landmarks, shape (n,)."""
+    mean: Array
+    """As in the submap, shape (3 + 2n,)."""
+    pose_covariance: Array
+    """Covariance of its last pose, shape (3, 3)."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays [bytes]."""
+        return sum(part.nbytes for part in self)
+
+
+def summarise(submap: Submap) -> SubmapSummary:
+    """Return the part of a submap that stays in memory."""
+    return SubmapSummary(submap.slots, submap.mean, submap.covariance[:3, :3].copy())
+
+
+class FrameInitialisation:
+    """Initial frames, with a cache of joined blocks.
+
+    The result depends only on the arguments, not on the cache.
+    """
+
+    def __init__(self) -> None:
+        self._blocks: dict[tuple[int, int], Array] = {}
+
+    def copy(self) -> "FrameInitialisation":
+        """Return one with the same cache, for more submaps."""
+        copied = FrameInitialisation()
+        copied._blocks = dict(self._blocks)
+        return copied
+
+    def frames(
+        self, summaries: Sequence[SubmapSummary], known: Array, refine: Refine
+    ) -> Array:
+        """Return initial values of all frames in the world, shape (K + 1, 3).
+
+        Parameters
+        ----------
+        summaries : sequence of SubmapSummary
+            The K closed submaps.
+        known : ndarray, shape (J + 1, 3)
+            Frames of an earlier join; at least the start.
+        refine : callable
+            Returns improved frames a to b, given (a, b, frames).
+        """
+        first = len(known) - 1
+        frames, size = known, 1
+        while 2 * size <= len(summaries) - first:
+            size *= 2
+        begin = first
+        while begin < len(summaries):
+            while begin + size > len(summaries):
+                size //= 2
+            block = self._block(summaries, begin, begin + size, refine)
+            frames = _merged(summaries, begin - len(frames) + 1, frames, block)
+            begin += size
+        return frames
+
+    def _block(
+        self, summaries: Sequence[SubmapSummary], a: int, b: int, refine: Refine
+    ) -> Array:
+        """Return the frames a to b relative to frame a."""
+        if (a, b) not in self._blocks:
+            if b - a <= LARGEST_COMPOSED:
+                frames = [np.zeros(3)]
+                for summary in summaries[a:b]:
+                    frames.append(compose(frames[-1], summary.mean[:3])[0])
+                rough = np.array(frames)
+            else:
+                middle = (a + b) // 2
+                left = self._block(summaries, a, middle, refine)
+                right = self._block(summaries, middle, b, refine)
+                rough = _merged(summaries, a, left, right)
+                del self._blocks[a, middle], self._blocks[middle, b]
+            self._blocks[a, b] = refine(a, b, rough)
+        return self._blocks[a, b]
+
+
+def points_seen(summaries: Sequence[SubmapSummary], frames: Array, count: int) -> Array:
+    """Return the landmarks at the positions of the first submap that holds each.
+
+    Parameters
+    ----------
+    summaries : sequence of SubmapSummary
+    frames : ndarray, shape (K, 3) or more
+        Of these submaps.
+    count : int
+        Number of slots.
+
+    Returns
+    -------
+    ndarray, shape (count, 2)
+        NaN for landmarks that no submap holds [m].
+    """
+    points = np.full((count, 2), np.nan)
+    for summary, frame in zip(reversed(summaries), frames[len(summaries) - 1 :: -1]):  # noqa: B905
+        mean = summary.mean
+        seen = complex(*frame[:2]) + np.exp(1j * frame[2]) * (
+            mean[3::2] + 1j * mean[4::2]
+        )
+        points[summary.slots] = seen.view(np.float64).reshape(-1, 2)
+    return points
+
+
+def _merged(
+    summaries: Sequence[SubmapSummary], first: int, left: Array, right: Array
+) -> Array:
+    """Align the right frames with the left ones, which begin at submap ``first``."""
+    middle = first + len(left) - 1
+    start = left[-1]
+    if middle > first:
+        before = summaries[first:middle]
+        after = summaries[middle : middle + len(right) - 1]
+        count = 1 + max(int(o.slots.max(initial=0)) for o in [*before, *after])
+        goal = points_seen(before, left, count)
+        seen = points_seen(after, right, count)
+        common = np.flatnonzero(~np.isnan(goal[:, 0] + seen[:, 0]))
+        start = align(start, before[-1].pose_covariance, seen[common], goal[common])
+    moved = np.array([compose(start, frame)[0] for frame in right])
+    return np.concatenate([left[:-1], moved])
+
+
+def align(start: Array, covariance: Array, seen: Array, landmarks: Array) -> Array:
+    """Align a frame with landmarks by least squares.
+
+    Each landmark has the same weight as the expected position of the frame.
+
+    Parameters
+    ----------
+    start, covariance : ndarray, shapes (3,) and (3, 3)
+        Expected frame.
+    seen : ndarray, shape (n, 2)
+        Landmarks in the frame [m].
+    landmarks : ndarray, shape (n, 2)
+        The same landmarks in the world [m].
+
+    Returns
+    -------
+    ndarray, shape (3,)
+
+    Examples
+    --------
+    >>> seen = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 1.0]])
+    >>> align(np.zeros(3), np.diag([1.0, 1.0, 1e-9]), seen, seen + [0.0, 1.0]).round(2)
+    array([0.  , 0.75, 0.  ])
+    """
+    prior = np.linalg.inv(regularised(covariance))
+    weight = 2 / max(covariance[0, 0] + covariance[1, 1], 1e-18)
+    q, goal = seen[:, 0] + 1j * seen[:, 1], landmarks[:, 0] + 1j * landmarks[:, 1]
+    pose = start.copy()
+    for _ in range(5):
+        turned = np.exp(1j * pose[2]) * q
+        error = goal - complex(*pose[:2]) - turned
+        rows = np.zeros((2 * len(q), 3))
+        rows[0::2, 0] = rows[1::2, 1] = 1.0
+        rows[:, 2] = (1j * turned).view(np.float64)
+        H = prior + weight * rows.T @ rows
+        right = prior @ (start - pose) + weight * rows.T @ error.view(np.float64)
+        pose = pose + np.linalg.solve(H, right)
+    return pose
+
+
+# --------------------------------------------------------------------------------------
+# Landmarks that a single submap holds, as functions of the unknowns of the join.
+
+
+class PrivateLandmarks(NamedTuple):
+    """n landmarks of a single submap, in the world."""
+
+    points: Array
+    """Shape (2n,) [m]."""
+    jacobian: Array
+    """By the unknowns of the submap, shape (2n, u)."""
+    covariance: Array
+    """Conditional covariance given these unknowns, shape (2n, 2n)."""
+
+
+def private_landmarks(
+    submap: Submap,
+    shared: IntArray,
+    wanted: IntArray,
+    start: Array,
+    factor: FactorError,
+    frame: ErrorFrame,
+) -> PrivateLandmarks:
+    """Transform landmarks that only one submap holds into the world.
+
+    Given the error e_b of the shared part, their error is e_p = G e_b + w, with noise
+    w::
+
+        G = P_pb P_bb⁻¹,    cov w = P_pp − G P_bp
+        Y_p = V(t) (G e_b + w) + R(t) m̂_p,     l = p_k + R(θ_k) Y_p
+
+    Parameters
+    ----------
+    submap : Submap
+    shared : ndarray
+        Rows of the pose and the shared landmarks in the submap's state.
+    wanted : ndarray, shape (n,)
+        Slots of the landmarks.
+    start : ndarray, shape (3,)
+        Frame of the submap in the world.
+    factor : FactorError
+        e_b, and its derivative by the unknowns of the submap.  The derivative by
+        ``start`` comes first; it is left out if the frame is fixed.
+    frame : {"additive", "invariant"}
+        Coordinates of the error.
+    """
+    error, jacobian = factor
+    by_slot = {slot: place for place, slot in enumerate(submap.slots.tolist())}
+    rows = 3 + pairs([by_slot[slot] for slot in wanted.tolist()])
+    P = submap.covariance
+    P_bp = P[shared[:, None], rows]
+    lower = np.linalg.cholesky(regularised(P[shared[:, None], shared]))
+    G = cho_solve((lower, True), P_bp, check_finite=False).T
+    points = submap.mean[rows[::2]] + 1j * submap.mean[rows[1::2]]
+    moved = (G @ error).view(np.complex128)
+    by_unknowns = G @ jacobian
+    scale = 1.0 + 0.0j
+    if frame == "additive":
+        seen = points + moved
+    else:
+        turn = float(error[2])
+        scale, slope = inverse_spread(turn)
+        turned = np.exp(1j * turn) * points
+        seen = turned + moved / scale
+        by_turn = slope * (seen - turned) - 1j * scale * turned
+        by_unknowns -= np.outer(by_turn.view(np.float64), jacobian[2])
+    out = np.exp(1j * start[2])
+    by_unknowns = times(out / scale, by_unknowns)
+    if by_unknowns.shape[1] > len(error):  # the start is an unknown, too
+        by_unknowns[0::2, 0] += 1.0
+        by_unknowns[1::2, 1] += 1.0
+        by_unknowns[:, 2] += (1j * out * seen).view(np.float64)
+    noise = P[rows[:, None], rows] - G @ P_bp
+    noise = times(out / scale, times(out / scale, noise).T)
+    world = complex(*start[:2]) + out * seen
+    return PrivateLandmarks(world.view(np.float64), by_unknowns, (noise + noise.T) / 2)
+
+
+# --------------------------------------------------------------------------------------
+# Gauss-Newton iteration with step halving and Anderson acceleration.
+
+ITERATIONS, HALVINGS, MEMORY = 200, 8, 5
+PATIENCE = 30
+"""Iterations after which an extrapolated step only has to lower the cost.
+
+Where large errors remain at the solution, as after improbable readings, plain steps
+approach it slowly, and their decrement rises and falls on the way.
+"""
+
+
+class Iterate(NamedTuple):
+    """One iterate of Gauss-Newton."""
+
+    values: Array
+    """All unknowns, shape (N,)."""
+    cost: float
+    """Sum of the squared errors, in standard deviations."""
+    decrement: float
+    """Decrease of the cost by a full step in a linear problem."""
+    step: Array
+
+    @property
+    def largest_cost(self) -> float:
+        """Largest cost that the next iterate may have, allowing for rounding."""
+        return self.cost * (1 + 1e-9) + 1e-9
+
+
+def minimise(
+    evaluate: Callable[[Array], Iterate], values: Array, converged: float
+) -> bool:
+    """Iterate until the decrement is small; return whether that succeeded.
+
+    Parameters
+    ----------
+    evaluate : callable
+        Linearises the problem at given values.  Its last call is at the result.
+    values : ndarray, shape (N,)
+        Where to begin.
+    converged : float
+        The decrement at which to stop.
+    """
+    now = evaluate(values)
+    past: list[Iterate] = []
+    for iteration in range(ITERATIONS):
+        if now.decrement <= converged:
+            return True
+        past = [*past[-MEMORY:], now] if now.decrement < 1 else []
+        largest = np.inf if iteration >= PATIENCE else now.decrement
+        trial = _accelerated(evaluate, past, largest)
+        now = _descend(evaluate, now) if trial is None else trial
+    return False
+
+
+def _accelerated(
+    evaluate: Callable[[Array], Iterate], past: list[Iterate], largest: float
+) -> Iterate | None:
+    """Step from the last iterates; None where that lowers too little."""
+    if len(past) < 2:
+        return None
+    now = past[-1]
+    trial = evaluate(now.values + accelerated(past))
+    is_better = trial.cost <= now.largest_cost and trial.decrement < largest
+    return trial if is_better else None
+
+
+def _descend(evaluate: Callable[[Array], Iterate], now: Iterate) -> Iterate:
+    """Take the largest of the halved steps that does not increase the cost."""
+    for halving in range(HALVINGS):
+        trial = evaluate(now.values + now.step / 2**halving)
+        if trial.cost <= now.largest_cost:
+            break
+    return trial
+
+
+def accelerated(past: Sequence[Iterate]) -> Array:
+    """Return a step extrapolated from the last iterates (Anderson acceleration [1]_).
+
+    Parameters
+    ----------
+    past : sequence of Iterate
+        The last iterates, two or more.
+
+    References
+    ----------
+    .. [1] D. G. Anderson, Iterative procedures for nonlinear integral equations,
+       Journal of the ACM 12(4), 1965.
+
+    Examples
+    --------
+    Each step of this iteration is half the previous one; the limit is 8:
+
+    >>> values = [0.0, 4.0]
+    >>> past = [Iterate(np.array([v]), 0, 0, np.array([(8 - v) / 2])) for v in values]
+    >>> (values[-1] + accelerated(past)).round(12)
+    array([8.])
+    """
+    moves = np.diff([iterate.values for iterate in past], axis=0)
+    changes = np.diff([iterate.step for iterate in past], axis=0)
+    step = past[-1].step
+    weights = np.linalg.lstsq(changes.T, step)[0]
+    return np.asarray(step - weights @ (moves + changes))

@@ -15,7 +15,7 @@ from ....estimator.interface import (
     SmoothedPath,
     SupportsTruth,
 )
-from ....estimator.smoother.within import smoother_in
+from ....estimator.smoother.batch_smoother import smoother_in
 from ...runs.association import DecisionRecorder, RunDecisions
 from ...runs.filter_settings import FilterSettings
 from ...runs.memory_check import refuse_large_maps

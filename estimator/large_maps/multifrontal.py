@@ -1,0 +1,549 @@
+"""Sparse Cholesky factorisation by small dense fronts (multifrontal method).
+
+A sparse symmetric positive definite H is factorised node by node, children first
+[1]_.  A node eliminates its unknowns p from the front, the dense sum of its own
+entries of H and of its children's updates; r are the other unknowns of the front::
+
+    front = [H_pp H_pr; · H_rr],   L Lᵀ = H_pp,   X = L⁻¹ H_pr,   update = H_rr − Xᵀ X
+
+The update is the Schur complement of H_pp, and is added to the parent's front.
+
+References
+----------
+.. [1] I. Duff, J. Reid, The multifrontal solution of indefinite sparse symmetric
+   linear equations, ACM TOMS 9(3), 1983.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, lapack
+from scipy.sparse import bsr_array, csc_array
+from scipy.sparse.linalg import splu
+
+from ...arrays import Array, BoolArray, IntArray
+from ...jit import jit
+from ..support import saved_states
+
+
+class Node(NamedTuple):
+    """One eliminated front."""
+
+    own: IntArray
+    """p, the unknowns that the node eliminates."""
+    rest: IntArray
+    """r, the unknowns that the front links with them."""
+    lower: Array
+    """L, shape (p, p)."""
+    response: Array
+    """X, shape (p, r)."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays [bytes]."""
+        return sum(array.nbytes for array in self)
+
+
+def eliminate(front: Array, own: IntArray, rest: IntArray) -> tuple[Node, Array]:
+    """Eliminate the first unknowns of a front.
+
+    Parameters
+    ----------
+    front : ndarray, shape (p + r, p + r + k)
+        Rows and columns of the unknowns ``own``, then ``rest``; then k right sides.
+
+    Returns
+    -------
+    node : Node
+    solved : ndarray, shape (p, r + k)
+        X, then L⁻¹ b_p of the right sides b; by columns in memory.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If H_pp is not positive definite.
+    """
+    p, r = len(own), len(rest)
+    lower = _cholesky(front[:p, :p])
+    solved = _solve(lower, front[:p, p:])
+    response = np.ascontiguousarray(solved[:, :r])
+    return Node(own, rest, lower, response), solved
+
+
+def eliminate_in_place(
+    top: Array, remainder: Array, own: IntArray, rest: IntArray
+) -> Node:
+    """Eliminate the first unknowns of a front, which becomes the update.
+
+    This takes half the work of :func:`eliminate` followed by the product Xᵀ X.
+
+    Parameters
+    ----------
+    top : ndarray, shape (p, p + r)
+        Upper triangle of [H_pp H_pr].
+    remainder : ndarray, shape (r, r)
+        Upper triangle of H_rr; then that of the update.
+    own, rest : ndarray
+        The unknowns of a :class:`Node`.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If H_pp is not positive definite.
+    """
+    from scipy.linalg.blas import dsyrk, dtrsm  # noqa: PLC0415 (slow to import)
+
+    p = len(own)
+    lower = _cholesky(top[:, :p].T)
+    response = top[:, p:].copy()
+    if response.size:
+        # The transposes are contiguous in Fortran order: nothing is copied.
+        dtrsm(1.0, lower.T, response.T, side=1, overwrite_b=1)
+        dsyrk(-1.0, response.T, 1.0, remainder.T, lower=1, overwrite_c=1)
+    return Node(own, rest, lower, response)
+
+
+def _cholesky(matrix: Array) -> Array:
+    """Factorise the lower triangle of a matrix."""
+    try:
+        return np.linalg.cholesky(matrix).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError as error:
+        raise np.linalg.LinAlgError(
+            "the information matrix is not positive definite"
+        ) from error
+
+
+def substitute_forward(nodes: Sequence[Node], values: Array) -> None:
+    """Replace b by y, with L y = b, in place.
+
+    Unknowns that no node eliminates receive b_r − H_rp H_pp⁻¹ b_p.
+
+    Parameters
+    ----------
+    nodes : sequence of Node
+        Children first.
+    values : ndarray, shape (N,) or (N, k)
+    """
+    for node in nodes:
+        right = values[node.own]
+        if not right.any():
+            continue
+        solved = _solve(node.lower, right)
+        values[node.own] = solved
+        values[node.rest] -= node.response.T @ solved
+
+
+def substitute_back(nodes: Sequence[Node], values: Array) -> None:
+    """Replace y by x, with Lᵀ x = y, in place; unknowns of no node are given."""
+    for node in reversed(nodes):
+        right = values[node.own] - node.response @ values[node.rest]
+        values[node.own] = _solve(node.lower, right, transposed=True)
+
+
+def marginal_covariance(
+    nodes: Sequence[Node], rows: csc_array
+) -> tuple[Array, dict[int, Array]]:
+    """Return A H⁻¹ Aᵀ = Yᵀ Y, with L Y = Aᵀ, for a sparse A.
+
+    The function visits only nodes that A touches and their ancestors.  It keeps a row
+    of Y from the first node that changes it until its own node is done.
+
+    Parameters
+    ----------
+    nodes : sequence of Node
+        Children first.
+    rows : csc_array, shape (v, N)
+        A.
+
+    Returns
+    -------
+    covariance : ndarray, shape (v, v)
+    remainder : dict of int to ndarray, shape (v,)
+        Rows of −H_rp H_pp⁻¹ Aᵀ, by unknowns r that no node eliminates.  Rows that are
+        not listed are zero.
+    """
+    size = rows.shape[0]
+    starts = rows.indptr.tolist()
+    changed = np.diff(rows.indptr) > 0
+    live: dict[int, Array] = {}
+    total = np.zeros((size, size))
+    for node in nodes:
+        if not changed[node.own].any():
+            continue
+        own = node.own.tolist()
+        right = np.zeros((len(own), size))
+        for place, unknown in enumerate(own):
+            here = slice(starts[unknown], starts[unknown + 1])
+            right[place, rows.indices[here]] = rows.data[here]
+            if unknown in live:
+                right[place] += live.pop(unknown)
+        used = np.flatnonzero(right.any(axis=0))
+        Y = _solve(node.lower, right[:, used])
+        total[used[:, None], used] += Y.T @ Y
+        changed[node.rest] = True
+        for unknown, change in zip(
+            node.rest.tolist(), node.response.T @ Y, strict=True
+        ):
+            if unknown not in live:
+                live[unknown] = np.zeros(size)
+            live[unknown][used] -= change
+    return total, live
+
+
+def _solve(lower: Array, right: Array, *, transposed: bool = False) -> Array:
+    """Return L⁻¹ b, or L⁻ᵀ b."""
+    if not right.size:
+        return right.copy()
+    # solve_triangular calls the same routine, at several times the cost of a small L.
+    solved, _ = lapack.dtrtrs(lower.T, right, lower=0, trans=not transposed)
+    return np.asarray(solved)
+
+
+# --------------------------------------------------------------------------------------
+# Elimination of the landmarks around a local map from a sparse information matrix.
+
+Solver = Callable[[Array], Array]
+
+LARGEST_DENSE = 150
+"""Up to this many landmarks, a dense Cholesky factor is faster than a sparse one."""
+
+
+class Factor(Protocol):
+    """Factor of Λ_HH, which is made when it is first used."""
+
+    def solve(self, right: Array) -> Array:
+        """Return Λ_HH⁻¹ b."""
+        ...
+
+    def respond(self, shift: Array) -> Array:
+        """Return T δ_B."""
+        ...
+
+    def release(self) -> None:
+        """Free the memory of the factor; the next use makes it again."""
+
+
+class SchurComplement(NamedTuple):
+    """Effect of eliminated landmarks H on a local map L.
+
+    ::
+
+        Λ_LL δ_L + Λ_LH δ_H = b_L,   Λ_HL δ_L + Λ_HH δ_H = 0
+        ⟹ (Λ_LL − C) δ_L = b_L,   δ_H = −T δ_B,   T = Λ_HH⁻¹ Λ_HB,   C = Λ_BH T
+
+    where B ⊂ L are the local landmarks linked with H.
+    """
+
+    slots: IntArray
+    """H."""
+    border: IntArray
+    """Columns of B in L, shape (c,)."""
+    response: Array
+    """T, shape (2h, c); not computed, (0, c), if H is the whole rest of the map."""
+    complement: Array
+    """C, shape (c, c), symmetric."""
+    factor: Factor
+
+
+class SubsetFactor:
+    """Factor of the rows and columns of some landmarks."""
+
+    def __init__(
+        self,
+        matrix: InformationMatrix,
+        slots: IntArray,
+        response: Array,
+        solve: Solver | None = None,
+    ) -> None:
+        self._matrix, self._slots = matrix, slots
+        self._response, self._solve = response, solve
+
+    def solve(self, right: Array) -> Array:
+        """Return Λ_HH⁻¹ b."""
+        if self._solve is None:
+            self._solve = solver(self._matrix, self._slots)
+        return self._solve(right)
+
+    def respond(self, shift: Array) -> Array:
+        """Return T δ_B."""
+        return np.asarray(self._response @ shift)
+
+    def release(self) -> None:
+        """Free the memory of the factor."""
+        self._solve = None
+
+
+def eliminate_subset(
+    matrix: InformationMatrix, local: IntArray, subset: IntArray
+) -> SchurComplement:
+    """Eliminate some landmarks around a local map.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If their information is not positive definite.
+    """
+    link = matrix.submatrix(subset, local).tocsc()
+    border = np.flatnonzero(np.diff(link.indptr))
+    right = link[:, border].toarray()
+    solve = solver(matrix, subset)
+    # One memory layout: BLAS must return the same bits after a state is reloaded.
+    response = np.ascontiguousarray(solve(right) if len(border) else right)
+    complement = right.T @ response
+    return SchurComplement(
+        subset,
+        border,
+        response,
+        (complement + complement.T) / 2,
+        SubsetFactor(matrix, subset, response, solve),
+    )
+
+
+def solver(matrix: InformationMatrix, slots: IntArray) -> Solver:
+    """Factorise the rows and columns of some landmarks."""
+    if not len(slots):
+        return np.copy
+    if len(slots) <= LARGEST_DENSE:
+        factor = cho_factor(matrix.dense(slots), lower=True, check_finite=False)
+        return lambda right: np.asarray(cho_solve(factor, right, check_finite=False))
+    return _sparse_solver(matrix.submatrix(slots, slots).tocsc())
+
+
+def _sparse_solver(information: csc_array) -> Solver:
+    """Factorise a sparse symmetric positive definite matrix."""
+    try:
+        factor = splu(
+            information,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+    except RuntimeError as error:
+        raise np.linalg.LinAlgError(
+            f"the information matrix is not positive definite: {error}"
+        ) from error
+    return lambda right: np.asarray(factor.solve(np.ascontiguousarray(right)))
+
+
+# --------------------------------------------------------------------------------------
+# The sum of a front and the updates of its children, compiled.
+
+
+@jit
+def add_update(top: Array, rest: Array, at: IntArray, update: Array) -> None:
+    """Add a child's update (r, r) to the rows and columns ``at`` (r,) of a front.
+
+    The front is ``top`` (p, n), its first rows, above ``rest`` (n - p, n - p), the
+    other rows without their first columns.  Only upper triangles are read and written.
+    """
+    p = len(top)
+    for i in range(len(at)):
+        for j in range(i, len(at)):
+            row, column = at[i], at[j]
+            if row > column:
+                row, column = column, row
+            if row < p:
+                top[row, column] += update[i, j]
+            else:
+                rest[row - p, column - p] += update[i, j]
+
+
+# --------------------------------------------------------------------------------------
+# A large sparse information matrix over landmarks, stored row by row.
+
+_ARRAY_OBJECTS = 220
+"""Memory of two empty array objects [bytes]."""
+
+
+class InformationMatrix:
+    """Symmetric sparse matrix of 2 × 2 blocks, one row of blocks for each landmark.
+
+    Row i holds the slots of the landmarks linked with landmark i, including i itself,
+    and the corresponding blocks.  Rows are replaced one by one, so that the cost of
+    changing a few landmarks does not depend on the size of the map.
+    """
+
+    def __init__(self) -> None:
+        self._links: list[IntArray] = []
+        self._blocks: list[Array] = []
+        self._place = np.zeros(0, dtype=np.int64)  # scratch, see _found
+
+    def __len__(self) -> int:
+        return len(self._links)
+
+    def checkpoint(self) -> Callable[[], None]:
+        """Return what takes back later changes; rows are replaced, never changed."""
+        links, blocks = list(self._links), list(self._blocks)
+
+        def undo() -> None:
+            self._links, self._blocks = list(links), list(blocks)
+
+        return undo
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of links and blocks [bytes]."""
+        return sum(
+            links.nbytes + blocks.nbytes + _ARRAY_OBJECTS
+            for links, blocks in zip(self._links, self._blocks, strict=True)
+        )
+
+    @property
+    def block_count(self) -> int:
+        """Number of nonzero 2 × 2 blocks."""
+        return sum(map(len, self._links))
+
+    def grow(self, count: int) -> None:
+        """Append empty rows until the matrix has ``count`` rows."""
+        for _ in range(count - len(self)):
+            self._links.append(np.empty(0, dtype=np.int64))
+            self._blocks.append(np.empty((0, 2, 2)))
+        if len(self._place) < count:
+            self._place = np.zeros(2 * count, dtype=np.int64)
+
+    def dense(self, slots: IntArray) -> Array:
+        """Return the rows and columns of a few landmarks, shape (2k, 2k)."""
+        return np.asarray(self.submatrix(slots, slots).toarray())
+
+    def diagonal(self, slots: IntArray) -> Array:
+        """Return the diagonal blocks of landmarks, shape (k, 2, 2)."""
+        counts, links, blocks = self.rows(slots)
+        return np.asarray(blocks[links == np.repeat(slots, counts)])
+
+    def submatrix(self, rows: IntArray, columns: IntArray) -> bsr_array:
+        """Return the blocks of some rows and columns, shape (2r, 2c), sparse."""
+        shape = (2 * len(rows), 2 * len(columns))
+        if not (len(rows) and len(columns)):
+            return bsr_array(shape)
+        counts, links, blocks = self.rows(rows)
+        place, wanted = self._found(columns, links)
+        owner = np.repeat(np.arange(len(rows)), counts)[wanted]
+        starts = np.searchsorted(owner, np.arange(len(rows) + 1))
+        return bsr_array((blocks[wanted], place[wanted], starts), shape=shape)
+
+    def replace(self, slots: IntArray, dense: Array) -> None:
+        """Replace the rows and columns of a few landmarks, omitting zero blocks."""
+        k = len(slots)
+        blocks = dense.reshape(k, 2, k, 2).transpose(0, 2, 1, 3)
+        linked = np.asarray(blocks.any(axis=(2, 3)))
+        for i, slot in enumerate(slots.tolist()):
+            links = self._links[slot]
+            kept = ~self._found(slots, links)[1]
+            new = linked[i]
+            self._links[slot] = np.concatenate([links[kept], slots[new]])
+            self._blocks[slot] = np.concatenate(
+                [self._blocks[slot][kept], blocks[i, new]]
+            )
+
+    def nearest_by_links(self, slots: IntArray, count: int) -> IntArray:
+        """Return up to ``count`` other landmarks, fewest links away first."""
+        found: list[IntArray] = []
+        missing, front = count, slots
+        is_found = np.zeros(len(self), dtype=bool)
+        is_found[slots] = True
+        while missing > 0 and len(front):
+            front = np.unique(self.rows(front)[1])
+            front = front[~is_found[front]][:missing]
+            is_found[front] = True
+            found.append(front)
+            missing -= len(front)
+        return np.concatenate([*found, np.empty(0, dtype=np.int64)])
+
+    def _found(self, slots: IntArray, links: IntArray) -> tuple[IntArray, BoolArray]:
+        """Return the places of links among slots, and which of them are among these.
+
+        The scratch array needs no clearing: a place that an earlier call has left
+        there does not lead to the link.
+        """
+        self._place[slots] = np.arange(len(slots))
+        place = self._place[links]
+        return place, slots.take(place, mode="clip") == links
+
+    def links(self, slot: int) -> IntArray:
+        """Return the landmarks linked with a landmark, including itself."""
+        return self._links[slot]
+
+    def is_filled(self, slots: IntArray) -> BoolArray:
+        """Return which landmarks have a nonempty row, shape (k,)."""
+        return np.array([len(self._links[i]) > 0 for i in slots.tolist()], dtype=bool)
+
+    def neighbours(self, slots: IntArray) -> IntArray:
+        """Return all landmarks linked with the given ones, without these."""
+        if not len(slots):
+            return slots
+        return np.setdiff1d(self.rows(slots)[1], slots)
+
+    def rows(self, slots: IntArray) -> tuple[IntArray, IntArray, Array]:
+        """Return row lengths, links and blocks of landmarks, row after row."""
+        rows: Sequence[int] = slots.tolist()
+        if not rows:
+            nothing = np.empty(0, dtype=np.int64)
+            return nothing, nothing, np.empty((0, 2, 2))
+        links = [self._links[i] for i in rows]
+        counts = np.array([len(each) for each in links], dtype=np.int64)
+        blocks = np.concatenate([self._blocks[i] for i in rows])
+        return counts, np.concatenate(links), blocks
+
+    def state_dict(self) -> dict[str, Array | IntArray]:
+        """Return copies of all rows, one after another."""
+        counts, links, blocks = self.rows(np.arange(len(self)))
+        return {"counts": counts, "links": links, "blocks": blocks}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Replace all rows by those of a :meth:`state_dict`.
+
+        Raises
+        ------
+        ValueError
+            If the arrays do not fit together; the matrix is then unchanged.
+        """
+        counts, links = (
+            saved_states.whole_numbers(f"matrix_{key}", state[key], (-1,), 0)
+            for key in ("counts", "links")
+        )
+        blocks = saved_states.array("matrix_blocks", state["blocks"], (-1, 2, 2))
+        _check_rows(counts, links, blocks)
+        ends = np.cumsum(counts)[:-1]
+        self._links = [part.copy() for part in np.split(links, ends)][: len(counts)]
+        self._blocks = [part.copy() for part in np.split(blocks, ends)][: len(counts)]
+        self._place = np.zeros(2 * len(counts), dtype=np.int64)
+
+
+def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:
+    if counts.sum() != len(links) or blocks.shape != (len(links), 2, 2):
+        raise ValueError(
+            f"state['matrix_links'] and state['matrix_blocks'] must have "
+            f"{counts.sum()} rows, got {len(links)} and {blocks.shape}"
+        )
+    if len(links) and not 0 <= links.min() <= links.max() < len(counts):
+        raise ValueError(
+            f"state['matrix_links'] must lie in [0, {len(counts)}), got "
+            f"{links.min()} to {links.max()}"
+        )
+    rows = np.repeat(np.arange(len(counts)), counts)
+    order, mirrored = np.lexsort((links, rows)), np.lexsort((rows, links))
+    same = np.array_equal(rows[order], links[mirrored]) and np.array_equal(
+        links[order], rows[mirrored]
+    )
+    if not same or not np.allclose(
+        blocks[order], blocks[mirrored].transpose(0, 2, 1), rtol=1e-9, atol=0
+    ):
+        raise ValueError("state['matrix_blocks'] must be a symmetric matrix")
+
+
+# --------------------------------------------------------------------------------------
+# Where the coordinates of landmarks stand in a map's arrays.
+
+
+def pairs(places: Sequence[int] | IntArray) -> IntArray:
+    """Return the two columns of each landmark, in turn: 2 p, 2 p + 1.
+
+    Examples
+    --------
+    >>> pairs([0, 3])
+    array([0, 1, 6, 7])
+    """
+    return (2 * np.asarray(places, dtype=np.int64)[:, None] + (0, 1)).ravel()
