@@ -22,7 +22,7 @@ import xarray as xr
 from rich.console import Console
 from rich.table import Table
 
-from slamgym.evaluation.chi_square import average_band
+from slamgym.evaluation.hypothesis_tests import average_band
 from slamgym.experiments.monte_carlo import monte_carlo
 
 SCENARIOS = (

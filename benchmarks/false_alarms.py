@@ -12,16 +12,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from slamgym.evaluation.chi_square import average_band
 from slamgym.evaluation.hypothesis_tests import (
+    average_band,
+    bootstrap_test,
     family_test,
     final_step_test,
     nis_test,
-    whiteness_test,
-)
-from slamgym.evaluation.time_average_tests import (
-    bootstrap_test,
     time_average_test,
+    whiteness_test,
 )
 
 Array = NDArray[np.float64]

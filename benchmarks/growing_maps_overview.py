@@ -24,7 +24,7 @@ from slamgym.estimator import (
     SparseInformationSlam,
     SubmapSlam,
 )
-from slamgym.evaluation.chi_square import average_band
+from slamgym.evaluation.hypothesis_tests import average_band
 from slamgym.evaluation.nees import pose_nees
 from slamgym.experiments.figures.style import (
     GREY,

@@ -16,22 +16,20 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.rigid_motion import ErrorFrame
 from ..estimator.support import argument_checks
-from .chi_square import Band
 from .hypothesis_tests import (
+    EQUIVALENCE_MARGIN,
+    Band,
+    EquivalenceTest,
     FamilyTest,
     HypothesisTest,
+    bootstrap_test,
+    equivalence_test,
     family_test,
     final_step_test,
     nis_test,
     runs_to_detect,
-    whiteness_test,
-)
-from .time_average_tests import (
-    EQUIVALENCE_MARGIN,
-    EquivalenceTest,
-    bootstrap_test,
-    equivalence_test,
     time_average_test,
+    whiteness_test,
 )
 
 FEW_RUNS = 20

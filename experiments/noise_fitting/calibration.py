@@ -9,7 +9,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...estimator.models.rigid_motion import ErrorFrame
-from ...evaluation.chi_square import chi_square_quantile
+from ...evaluation.hypothesis_tests import chi_square_quantile
 from ...evaluation.nees import pose_nees
 from ..logs.ground_truth import true_poses_of
 from ..logs.slamlog import SlamLog

@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 from ...arrays import Array, IntArray
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
 from ...estimator.kernels.kalman_gain import USED
-from ...evaluation.whiteness import autocorrelation, ljung_box
+from ...evaluation.hypothesis_tests import autocorrelation, ljung_box
 
 LAGS = 10  # of the test
 LONGEST = 50  # lag at which a sum of correlations ends at the latest

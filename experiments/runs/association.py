@@ -17,13 +17,15 @@ from ...estimator.interface import (
 )
 from ...estimator.map_management.policy import policy_of
 from ...evaluation.association_scores import (
+    CUTOFF,
     AssociationScores,
+    Gospa,
+    gospa,
     known_places,
     landmark_identities,
     places_of,
     score_association,
 )
-from ...evaluation.gospa import CUTOFF, Gospa, gospa
 from ...evaluation.trajectory_error import Alignment, align_positions
 from .nan_statistics import finite
 

@@ -10,7 +10,7 @@ from ... import __version__
 from ...arrays import Array
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation import nees
-from ...evaluation.chi_square import chi_square_quantile
+from ...evaluation.hypothesis_tests import chi_square_quantile
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
 from ..logs.anonymous import hides_identities
 from ..logs.ground_truth import path_accuracy

@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ...arrays import Array, IntArray
-from ...evaluation.chi_square import chi_square_limits
+from ...evaluation.hypothesis_tests import chi_square_limits
 from ...sim_configs.atomic_file import replace_when_written
 from ..figures.consistency import nis_band
 from ..figures.web_style import page_template

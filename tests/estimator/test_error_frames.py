@@ -11,7 +11,7 @@ from slamgym.estimator.models.rigid_motion import (
     invariant_covariance,
     invariant_error,
 )
-from slamgym.evaluation.chi_square import average_band
+from slamgym.evaluation.hypothesis_tests import average_band
 from slamgym.evaluation.nees import heading_nees, normalised_squared_error, pose_nees
 
 MEAN = np.array([1.0, -2.0, 0.7, 3.0, 4.0, -5.0, 2.0])

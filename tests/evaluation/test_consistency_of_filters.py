@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slamgym.estimator import make_batch
-from slamgym.evaluation.chi_square import average_band
+from slamgym.evaluation.hypothesis_tests import average_band
 from slamgym.evaluation.nees import pose_nees
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario

@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 from scipy.stats import kurtosistest
 
-from slamgym.evaluation import CAUSES, diagnose, noise_sums
-from slamgym.evaluation.error_findings import errors_of
-from slamgym.evaluation.noise_findings import _kurtosis_score, noise_findings
-from slamgym.evaluation.noise_sums import CHANNELS, MOMENTS
-from slamgym.evaluation.time_average_tests import time_average_test
+from slamgym.evaluation import CAUSES, diagnose
+from slamgym.evaluation import noise_findings as noise_sums
+from slamgym.evaluation.diagnosis import errors_of
+from slamgym.evaluation.hypothesis_tests import time_average_test
+from slamgym.evaluation.noise_findings import (
+    CHANNELS,
+    MOMENTS,
+    _kurtosis_score,
+    noise_findings,
+)
 
 RUNS, STEPS = 60, 40
 MOTION_STD, SENSOR_STD = (0.2, 0.1, 0.05), (0.02, 0.1)

@@ -6,24 +6,21 @@ from linear_filter import kalman_scores
 from scipy.stats import chi2, norm, skew
 from scipy.stats import t as student
 
-from slamgym.evaluation.chi_square import (
-    average_band,
-    chi_square_quantile,
-    family_band,
-)
 from slamgym.evaluation.hypothesis_tests import (
+    average_band,
+    bootstrap_test,
+    chi_square_quantile,
+    equivalence_test,
+    family_band,
     family_test,
     final_step_test,
+    ljung_box,
     nis_test,
+    normal_scores,
     runs_to_detect,
+    time_average_test,
     whiteness_test,
 )
-from slamgym.evaluation.time_average_tests import (
-    bootstrap_test,
-    equivalence_test,
-    time_average_test,
-)
-from slamgym.evaluation.whiteness import ljung_box, normal_scores
 
 REPETITIONS, RUNS, STEPS, DOF = 2000, 50, 60, 3
 GRID = np.arange(STEPS // 10, STEPS + 1, STEPS // 10) - 1

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from slamgym.evaluation.hypothesis_tests import autocorrelation
 from slamgym.evaluation.nees import (
     landmark_nees,
     normalised_squared_error,
@@ -11,7 +12,6 @@ from slamgym.evaluation.nees import (
     relative_map_nees,
     state_nees,
 )
-from slamgym.evaluation.whiteness import autocorrelation
 
 RUNS = 20_000
 MEAN = np.array([3.0, -2.0, 0.7, 5.0, 1.0, -4.0, 6.0])

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from slamgym.evaluation.noise_findings import HEAVY_TAILS, noise_findings
-from slamgym.evaluation.noise_sums import CHANNELS, noise_sums
+from slamgym.evaluation.noise_findings import (
+    CHANNELS,
+    HEAVY_TAILS,
+    noise_findings,
+    noise_sums,
+)
 
 RUNS = 3
 

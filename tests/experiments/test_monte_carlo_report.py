@@ -12,9 +12,8 @@ from monte_carlo_dataset import FILTERS, typical, with_failures
 from rich.console import Console
 from scipy.stats import chi2
 
-from slamgym.evaluation.chi_square import family_band
 from slamgym.evaluation.consistency_report import evaluate_consistency
-from slamgym.evaluation.time_average_tests import equivalence_test
+from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES
 from slamgym.experiments.monte_carlo.report.estimator_lines import look_of, thinned

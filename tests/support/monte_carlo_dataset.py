@@ -18,7 +18,7 @@ from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.models.rigid_motion import invariant_error
 from slamgym.evaluation import nees as c
 from slamgym.evaluation.error_bound import posterior_bound
-from slamgym.evaluation.noise_sums import noise_sums
+from slamgym.evaluation.noise_findings import noise_sums
 from slamgym.evaluation.trajectory_error import position_accuracy
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario

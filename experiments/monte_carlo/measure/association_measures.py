@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from ....arrays import Array
 from ....estimator.interface import Belief
 from ....estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame
-from ....evaluation.association_scores import AssociationScores
-from ....evaluation.gospa import Gospa
+from ....evaluation.association_scores import AssociationScores, Gospa
 from ....evaluation.nees import pose_nees
 from ...runs.association import RunAssociation, TrueLandmarks, compare_association
 from ...runs.filter_settings import FilterSettings

@@ -5,7 +5,7 @@ import numpy as np
 from ....arrays import Array, BoolArray
 from ....envs.robot import wall_distances
 from ....evaluation.error_bound import PosteriorBound, posterior_bound
-from ....evaluation.noise_sums import noise_sums
+from ....evaluation.noise_findings import noise_sums
 from ....sim_configs import Scenario
 from ...runs.simulated_runs import SimulatedRuns
 

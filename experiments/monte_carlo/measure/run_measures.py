@@ -15,7 +15,7 @@ from ....estimator.models.bearing_range import wrap_angle
 from ....estimator.models.rigid_motion import ERROR_FRAMES, invariant_error
 from ....evaluation import nees
 from ....evaluation.error_bound import PosteriorBound, invariant_squares
-from ....evaluation.noise_sums import CHANNELS, MOMENTS
+from ....evaluation.noise_findings import CHANNELS, MOMENTS
 from ....evaluation.trajectory_error import ellipse_areas, position_accuracy
 from ....sim_configs import Scenario
 from ...runs.simulated_runs import SimulatedRuns
@@ -121,7 +121,7 @@ def measure_runs(
     bound : PosteriorBound
         Of the errors of any filter in these runs.
     noise : ndarray, shape (B, 5, 7)
-        Sums of the noise, see :func:`~slamgym.evaluation.noise_sums`.
+        Sums of the noise, see :func:`~slamgym.evaluation.noise_findings`.
     resolution : float
         True landmarks nearer to each other count as one place [m], where identities are
         hidden.

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ....arrays import Array
-from ....evaluation.gospa import CUTOFF, Gospa
+from ....evaluation.association_scores import CUTOFF, Gospa
 from ...runs.nan_statistics import finite, mean
 from ..measure.association_measures import (
     COUNTS,

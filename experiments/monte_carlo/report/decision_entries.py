@@ -4,8 +4,7 @@ import math
 from typing import Any
 
 from ....evaluation.consistency_report import ConsistencyReport
-from ....evaluation.hypothesis_tests import HypothesisTest
-from ....evaluation.time_average_tests import EQUIVALENCE_MARGIN
+from ....evaluation.hypothesis_tests import EQUIVALENCE_MARGIN, HypothesisTest
 from ...runs.nan_statistics import finite
 
 

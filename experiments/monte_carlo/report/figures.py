@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from ....arrays import Array
 from ....estimator.models.rigid_motion import ErrorFrame
-from ....evaluation.chi_square import average_band, family_band
+from ....evaluation.hypothesis_tests import average_band, family_band
 from ...figures.style import GREY, INK, dress, new_figure
 from .estimator_lines import (
     EstimatorLook,

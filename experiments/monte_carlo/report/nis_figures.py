@@ -6,8 +6,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ....arrays import Array
-from ....evaluation.chi_square import chi_square_quantile
-from ....evaluation.whiteness import autocorrelation, normal_scores
+from ....evaluation.hypothesis_tests import (
+    autocorrelation,
+    chi_square_quantile,
+    normal_scores,
+)
 from ...figures.style import GREY, dress, new_figure
 from .estimator_lines import EstimatorLook, legend_above, plain
 from .scores import EstimatorScores

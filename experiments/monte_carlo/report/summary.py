@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 
 from ....estimator.models.rigid_motion import ErrorFrame
-from ....evaluation.chi_square import average_band
 from ....evaluation.consistency_report import ConsistencyReport, evaluate_consistency
+from ....evaluation.hypothesis_tests import average_band
 from ...runs.nan_statistics import finite, mean, quotient, root_mean_square
 from ..measure.association_measures import KNOWN_IDS_ATE
 from .association import association_summary

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ....evaluation.consistency_report import FEW_AVERAGES, ConsistencyReport
-from ....evaluation.time_average_tests import EQUIVALENCE_MARGIN
+from ....evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
 
 CONSISTENT = "consistent"
 NEARLY = "nearly consistent"

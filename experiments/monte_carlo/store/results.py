@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .... import __version__
-from ....evaluation.noise_sums import CHANNELS, MOMENTS
+from ....evaluation.noise_findings import CHANNELS, MOMENTS
 from ...runs.own_files import replace_own
 from ..measure.run_measures import NOISE_SIZES, VARIABLES, Block, Variable
 from .job_folder import RESULTS
