@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
 
-from ..arrays import BoolArray
+from ..arrays import AnyArray, Array, BoolArray, ComplexArray, IntArray
 from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
-from ..estimator.filters.batch import BatchStorage, can_batch
+from ..envs.vector import LandmarkWorldVectorEnv
+from ..estimator.filters.batch import BatchBeliefs, BatchStorage, can_batch
 from ..estimator.filters.ekf import EkfSlam
+from ..jit import jit
 from ..sim_configs import Scenario
-from .active_slam_task import ActiveSlamTask, split_settings
-from .agent_knowledge import AgentKnowledge
-from .association_record import AssociationRecord
-from .belief_arrays import belief_storage, live_storage
+from .active_slam_task import ActiveSlamTask, AssociationRecord, split_settings
+from .belief_features import belief_storage, live_storage
+from .belief_observation import SeparateFilters, choose_filters, update_filters
 from .estimator_choice import EstimatorChoice, checked_belief, choose_estimator
-from .map_truth import map_rmse, matched_rmse
+from .wall_routes import AgentKnowledge
 
 Observation = dict[str, Any]
 
@@ -248,3 +253,204 @@ class ActiveSlamEnv(LandmarkWorldEnv):
             scores = self._record.scores([self._estimator], ended)
             counts |= {key: float(score[0]) for key, score in scores.items()}
         return {key: row[0] for key, row in rows.items()}, {**info, **counts}
+
+
+# --------------------------------------------------------------------------------------
+# Active SLAM in many worlds, simulated together and with batched filters.
+
+Observations = dict[str, AnyArray]
+
+
+class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
+    """Many worlds of `ActiveSlamEnv`, whose docstring describes the task.
+
+    World i after ``reset(seed=s)`` equals a single one after ``reset(seed=s + i)``.
+
+    Parameters
+    ----------
+    num_envs : int
+        B, the number of worlds.
+    scenario, estimator_options, **settings
+        As in `ActiveSlamEnv`.
+    estimator : str, default "invariant"
+        The registered name of a filter that runs in batches. Where the scenario hides
+        identities, one that landmark management takes; filters run one by one then.
+    max_episode_steps : int, optional
+        Truncates episodes earlier than the scenario's own number of steps.
+    autoreset_mode : AutoresetMode or str, default "NextStep"
+        Any of Gymnasium's three. "Disabled" needs ``options={"reset_mask": …}``.
+    render_mode : {"human", "rgb_array"}, optional
+        As in `LandmarkWorldVectorEnv`; the frames also show the beliefs.
+
+    Examples
+    --------
+    >>> envs = ActiveSlamVectorEnv(num_envs=3, scenario="active_easy")
+    >>> observations, infos = envs.reset(seed=0)
+    >>> observations["walls"].shape
+    (3, 8)
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: Scenario | Mapping[str, object] | str | Path = "active_medium",
+        *,
+        estimator: str = "invariant",
+        estimator_options: Mapping[str, Any] | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **settings: Any,
+    ) -> None:
+        weights, form, changes = split_settings(settings)
+        super().__init__(
+            num_envs,
+            scenario,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+            render_mode=render_mode,
+            **changes,
+        )
+        self.task = ActiveSlamTask(self.scenario, weights, num_envs, form)
+        self.single_observation_space = self.task.observation_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        count = self.scenario.landmarks.count
+        self._filters = choose_filters(
+            estimator, self.scenario, num_envs, count, estimator_options
+        )
+        by_id = self.scenario.sensor.identities
+        self._all = np.ones(num_envs, dtype=np.bool_)
+        self._record = None if by_id else AssociationRecord(num_envs)
+
+    def beliefs(self) -> BatchBeliefs:
+        """Return the present beliefs of all filters."""
+        if not self.task.begun:
+            raise ResetNeeded("call reset first: there are no episodes yet")
+        return self._filters.beliefs()
+
+    def _reward(self, actions: ArrayLike, moving: BoolArray) -> tuple[Array, BoolArray]:
+        if np.count_nonzero(moving) < self.num_envs:
+            self._begin_filters(~moving)
+        self._filter(self._all, moving)
+        outcome = self.task.proceed(
+            self._filters.storage(), moving, actions, self._worlds.collisions
+        )
+        return outcome.rewards, outcome.terminated
+
+    def _begin(self, worlds: BoolArray, seeds: Sequence[int | None] = ()) -> None:
+        """Start episodes in some worlds, each with its first scan."""
+        super()._begin(worlds, seeds)
+        self._begin_filters(worlds)
+        self._filter(worlds, ~worlds)
+        self.task.begin(self._filters.storage(), worlds)
+
+    def _begin_filters(self, worlds: BoolArray) -> None:
+        if self._record is not None:
+            self._record.begin(worlds)
+        estimates = self._worlds.start_estimates
+        self._filters.reset(estimates, self.scenario.start.std, runs=worlds)
+
+    def _filter(self, worlds: BoolArray, moved: BoolArray) -> None:
+        observations = super()._observations()
+        if self._record is not None:
+            true_ids: Any = self._worlds.landmark_ids
+            self._record.add(worlds, true_ids, observations["mask"])
+        update_filters(self._filters, observations, worlds, moved=moved)
+        if self.render_mode is not None:
+            self.show_beliefs(list(map(self._filters.belief, range(self.num_envs))))
+
+    def _observations(self) -> Observations:
+        observations = self.task.observations()
+        if self.autoreset_mode != AutoresetMode.DISABLED:
+            return observations
+        # a partial reset repeats them: the caller must not write into the originals
+        return {key: rows.copy() for key, rows in observations.items()}
+
+    def _infos(self) -> dict[str, Any]:
+        beliefs, success = self._filters.storage(), self.task.outcome.success.copy()
+        error = map_rmse if self._record is None else matched_rmse
+        rmse = error(beliefs, self._worlds.complex_landmarks)
+        infos = {
+            **super()._infos(),
+            "mapped": self.task.mapped,
+            "known": self.task.known,
+            "success": success,
+            "true_rmse": rmse,
+            "honest_success": success & (rmse <= self.task.weights.accuracy),
+        }
+        if self._record is not None and isinstance(self._filters, SeparateFilters):
+            infos |= self._record.scores(self._filters.filters, self._ended)
+        return infos
+
+
+# --------------------------------------------------------------------------------------
+# How far maps are from the truth: for `info`, never for an observation or a reward.
+
+
+def map_rmse(beliefs: BatchStorage, landmarks: ComplexArray) -> Array:
+    """Compute the root mean square error of maps, (B,) [m]; 0 of an empty one.
+
+    The error of a landmark is its distance from the truth in the world's frame, with
+    no alignment: an error of the first heading counts.
+
+    Parameters
+    ----------
+    beliefs : BatchStorage
+        Of B worlds.
+    landmarks : complex ndarray, shape (B, N)
+        True positions x + iy [m]; row i is landmark i.
+
+    Examples
+    --------
+    >>> beliefs = BatchStorage(
+    ...     np.array([[0.0, 0.0, 0.0, 3.0, 4.0, 0.0, 0.0]]),
+    ...     np.zeros((1, 7, 7)),
+    ...     np.array([[-1, 0]]),
+    ... )
+    >>> map_rmse(beliefs, np.array([[9.0 + 9.0j, 3.0 + 3.5j]]))
+    array([0.5])
+    """
+    errors = np.empty(len(landmarks))
+    _write_rmse(beliefs.means, beliefs.slots, landmarks, errors)
+    return errors
+
+
+def matched_rmse(beliefs: BatchStorage, landmarks: ComplexArray) -> Array:
+    """Compute the same of maps that assign their own identities, (B,) [m].
+
+    Landmarks of map and truth are matched one to one, so that the sum of the squared
+    distances is smallest. A duplicate is therefore compared with another landmark.
+
+    Examples
+    --------
+    >>> beliefs = BatchStorage(
+    ...     np.array([[0.0, 0.0, 0.0, 3.0, 4.0, 3.0, 4.1]]),
+    ...     np.zeros((1, 7, 7)),
+    ...     np.array([[0, 1]]),
+    ... )
+    >>> matched_rmse(beliefs, np.array([[3.0 + 4.0j, 3.0 + 0.1j]])).round(3)
+    array([2.759])
+    """
+    errors = np.zeros(len(landmarks))
+    for b, slots in enumerate(beliefs.slots):
+        places = beliefs.means[b, 3 : 3 + 2 * np.count_nonzero(slots >= 0)]
+        if len(places):
+            mapped = places[::2] + 1j * places[1::2]
+            squares = np.abs(mapped[:, None] - landmarks[b]) ** 2
+            errors[b] = math.sqrt(squares[linear_sum_assignment(squares)].mean())
+    return errors
+
+
+@jit
+def _write_rmse(
+    means: Array, slots: IntArray, landmarks: ComplexArray, errors: Array
+) -> None:
+    for b in range(len(means)):
+        squares, mapped = 0.0, 0
+        for i in range(slots.shape[1]):
+            if slots[b, i] >= 0:
+                x = 3 + 2 * slots[b, i]
+                dx = means[b, x] - landmarks[b, i].real
+                dy = means[b, x + 1] - landmarks[b, i].imag
+                squares, mapped = squares + dx * dx + dy * dy, mapped + 1
+        errors[b] = math.sqrt(squares / mapped) if mapped else 0.0

@@ -25,11 +25,9 @@ from ..envs.controllers import Waypoints
 from ..envs.robot import wrap_angle
 from ..sim_configs import Robot, Scenario
 from ..sim_configs.field_types import unknown_choice
-from .agent_knowledge import AgentKnowledge
 from .belief_features import largest_variances, world_bounds
 from .belief_space_planner import GREEDY, MPC, BeliefSpacePlanner
-from .coverage_grid import CoverageGrid
-from .wall_routes import CLEARANCE, as_points
+from .wall_routes import CLEARANCE, AgentKnowledge, CoverageGrid, as_points
 
 BASELINES = ("random", "coverage", "frontier", "revisit", "greedy", "mpc")
 """The names that :func:`make_baseline` accepts."""

@@ -1,24 +1,36 @@
 """An estimator in the loop: its belief becomes part of the observation."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 
-from ..arrays import AnyArray
+from ..arrays import AnyArray, Array, BoolArray
 from ..envs import LandmarkWorldEnv
-from ..estimator.filters.batch import BatchBeliefs, BatchStorage
+from ..envs.vector.landmark_world_vector import final_infos
+from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage
 from ..estimator.support import argument_checks
 from ..sim_configs import Scenario
-from .belief_arrays import belief_storage
-from .belief_features import belief_features, belief_space, world_bounds
+from .belief_features import (
+    belief_features,
+    belief_space,
+    belief_storage,
+    update_batch,
+    world_bounds,
+)
 from .estimator_choice import (
     BeliefOfMap,
     EstimatorChoice,
     checked_belief,
+    choose_batch,
     choose_estimator,
 )
 
@@ -180,3 +192,294 @@ def with_features(observation: Observation, features: Mapping[str, Any]) -> Obse
     """Add features to an observation, with the keys in alphabetical order."""
     both = {**observation, **features}
     return {key: both[key] for key in sorted(both)}
+
+
+# --------------------------------------------------------------------------------------
+# Filters in the loop of many worlds: beliefs become part of the observations.
+
+Observations = dict[str, AnyArray]
+Infos = dict[str, Any]
+
+
+class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
+    """Runs one filter per world on the observations, and adds the beliefs.
+
+    Row i of every array equals that of `BeliefObservation` in world i, to the bit. The
+    wrapper supports every autoreset mode; ``infos["final_obs"]`` has the last beliefs.
+
+    Parameters
+    ----------
+    env : VectorEnv
+        A `LandmarkWorldVectorEnv`, as ``gymnasium.make_vec`` makes it.
+    estimator : str, default "invariant"
+        The registered name of a filter that runs in batches. Where the world hides
+        identities, one that landmark management takes; filters run one by one then.
+    estimator_options : mapping, optional
+        Further options of the filter.
+    max_landmarks : int, optional
+        N, the number of landmark rows. The default is that of the world.
+
+    Raises
+    ------
+    ValueError
+        If the filter cannot run in batches, or if the worlds have more landmarks than
+        there are rows.
+
+    Examples
+    --------
+    >>> import gymnasium, slamgym
+    >>> worlds = gymnasium.make_vec("slamgym/LandmarkWorld-v0", 3, scenario="loop")
+    >>> worlds = BeliefObservationVector(worlds, estimator="ekf")
+    >>> observations, infos = worlds.reset(seed=0)
+    >>> observations["belief_landmarks"].shape
+    (3, 20, 2)
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Observations, AnyArray, AnyArray],
+        estimator: str = "invariant",
+        *,
+        estimator_options: Mapping[str, Any] | None = None,
+        max_landmarks: int | None = None,
+    ) -> None:
+        super().__init__(env)
+        self.scenario = scenario_of(env)
+        if not hasattr(type(env.unwrapped), "start_estimates"):
+            raise ValueError(
+                "env must be a LandmarkWorldVectorEnv, which has start_estimates, "
+                f"got {type(env.unwrapped).__name__}"
+            )
+        rows = count_landmark_rows(self.scenario, max_landmarks)
+        is_hidden = not self.scenario.sensor.identities
+        self._missing_rows = 0 if is_hidden else rows - self.scenario.landmarks.count
+        self._bounds = world_bounds(self.scenario)
+        self._filters = choose_filters(
+            estimator, self.scenario, self.num_envs, rows, estimator_options
+        )
+        self._mode = env.metadata["autoreset_mode"]
+        single = with_belief(env.single_observation_space, rows)
+        self.single_observation_space = single
+        self.observation_space = batch_space(single, self.num_envs)
+        self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        self._all = np.ones(self.num_envs, dtype=np.bool_)
+        self._begun = False
+
+    @property
+    def beliefs(self) -> BatchBeliefs:
+        """The present beliefs of the filters."""
+        if not self._begun:
+            raise ResetNeeded("call reset first: there are no beliefs")
+        return self._filters.beliefs()
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, Infos]:
+        """Start episodes in the worlds, with a new map in each filter."""
+        mask = (options or {}).get("reset_mask")
+        worlds = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask.copy()
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._begin(observations, worlds)
+        self._begun = True
+        self._ended = self._ended & ~worlds
+        return self._with_beliefs(observations), infos
+
+    def step(
+        self, actions: AnyArray
+    ) -> tuple[Observations, AnyArray, AnyArray, AnyArray, Infos]:
+        """Step the worlds, then predict and update."""
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        ended = terminated | truncated
+        if self._mode == AutoresetMode.SAME_STEP:
+            self._finish(observations, ended, infos)
+        else:
+            begun = self._ended & (self._mode == AutoresetMode.NEXT_STEP)
+            if np.count_nonzero(begun):
+                self._restart(begun)
+            self._update(observations, self._all, moved=~begun)
+            self._ended = ended
+        return self._with_beliefs(observations), rewards, terminated, truncated, infos
+
+    def _finish(
+        self, observations: Observations, ended: BoolArray, infos: Infos
+    ) -> None:
+        """Update with the last scan of ended episodes, then with the first new one."""
+        last = {key: rows.copy() for key, rows in observations.items()}
+        for world in np.flatnonzero(ended).tolist():
+            for key, rows in last.items():
+                rows[world] = infos["final_obs"][world][key]
+        self._update(last, self._all, moved=self._all)
+        if not ended.any():
+            return
+        shown = self._with_beliefs(last)
+        infos["final_obs"] = final_infos(shown, {}, ended)["final_obs"]
+        self._begin(observations, ended)
+
+    def _begin(self, observations: Observations, worlds: BoolArray) -> None:
+        self._restart(worlds)
+        self._update(observations, worlds, moved=~worlds)
+
+    def _restart(self, worlds: BoolArray) -> None:
+        worlds_of: Any = self.env.unwrapped
+        estimates = worlds_of.start_estimates
+        self._filters.reset(estimates, self.scenario.start.std, runs=worlds)
+
+    def _update(
+        self, observations: Observations, worlds: BoolArray, *, moved: BoolArray
+    ) -> None:
+        if self._missing_rows:
+            longer = {
+                key: _padded(observations[key], self._missing_rows)
+                for key in ("landmarks", "mask")
+            }
+            observations = {**observations, **longer}
+        update_filters(self._filters, observations, worlds, moved=moved)
+
+    def _with_beliefs(self, observations: Observations) -> Observations:
+        features = belief_features(self._filters.storage(), self._bounds)
+        return with_features(observations, features)
+
+
+def _padded(rows: AnyArray, more: int) -> AnyArray:
+    """Append empty rows to the second axis."""
+    padding = [(0, 0), (0, more), *((0, 0) for _ in rows.shape[2:])]
+    return np.pad(rows, padding)
+
+
+# --------------------------------------------------------------------------------------
+# One filter per world: in a batch, or side by side where worlds hide identities.
+
+
+class SeparateFilters:
+    """Filters side by side, for vector worlds that hide identities.
+
+    Batches do not associate; these filters are managed and do.
+
+    Parameters
+    ----------
+    estimator : str
+        Registered name or "module:Class".
+    scenario : Scenario
+        Source of the noise settings.
+    runs : int
+        B, the number of worlds.
+    rows : int
+        N, the most landmarks in a map.
+    options : mapping, optional
+        Further options of the filters.
+
+    Raises
+    ------
+    ValueError
+        If the name is unknown, or an option does not fit.
+    """
+
+    def __init__(
+        self,
+        estimator: str,
+        scenario: Scenario,
+        runs: int,
+        rows: int,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        if not isinstance(estimator, str):
+            raise ValueError(
+                "estimator must be a registered name for vector environments, "
+                f"got {estimator!r}"
+            )
+        self.filters = [
+            choose_estimator(estimator, scenario, options, rows=rows)
+            for _ in range(runs)
+        ]
+        """Filter i is that of world i."""
+        self._steps = np.zeros(runs, dtype=np.int64)
+        capacity = 3 + 2 * rows
+        self._means = np.zeros((runs, capacity))
+        self._covariances = np.zeros((runs, capacity, capacity))
+        self._slots = np.full((runs, rows), -1, dtype=np.int64)
+
+    def reset(self, poses: Array, pose_std: Any, *, runs: BoolArray) -> None:
+        """Start new runs in some worlds, at poses (B, 3) with deviations (3,)."""
+        for run in np.flatnonzero(runs).tolist():
+            self.filters[run].reset(poses[run], pose_std)
+            self._steps[run] = 0
+
+    def update(
+        self,
+        observations: Mapping[str, AnyArray],
+        worlds: BoolArray,
+        *,
+        moved: BoolArray,
+    ) -> None:
+        """Update the filters of some worlds with an observation, batched along B.
+
+        Parameters
+        ----------
+        observations : mapping
+            Batched observations of a landmark world.
+        worlds : bool ndarray, shape (B,)
+            Worlds whose filters are updated.
+        moved : bool ndarray, shape (B,)
+            Which of them have moved; the others take the scan from their start.
+        """
+        for run in np.flatnonzero(worlds).tolist():
+            slam = self.filters[run]
+            if moved[run]:
+                slam.predict(observations["odometry"][run])
+                self._steps[run] += 1
+            seen = np.flatnonzero(observations["mask"][run])
+            slam.update(observations["landmarks"][run][seen], None)
+            belief = checked_belief(slam, int(self._steps[run]))
+            stored = belief_storage(belief, self._slots.shape[1], by_id=False)
+            self._means[run] = stored.means[0]
+            self._covariances[run] = stored.covariances[0]
+            self._slots[run] = stored.slots[0]
+
+    def storage(self) -> BatchStorage:
+        """Return the arrays of the beliefs; they change with the next update."""
+        return BatchStorage.of(self._means, self._covariances, self._slots)
+
+    def belief(self, run: int) -> BeliefOfMap:
+        """Return the belief of one world."""
+        return checked_belief(self.filters[run], int(self._steps[run]))
+
+    def beliefs(self) -> BatchBeliefs:
+        """Return the beliefs of all worlds side by side, as a snapshot."""
+        return self.storage().beliefs()
+
+
+Filters = BatchSlam | SeparateFilters
+
+
+def choose_filters(
+    estimator: str,
+    scenario: Scenario,
+    runs: int,
+    rows: int,
+    options: Mapping[str, Any] | None = None,
+) -> Filters:
+    """Make a batch of filters; where the scenario hides identities, separate ones.
+
+    Raises
+    ------
+    ValueError
+        If the name is unknown, an option does not fit, or the filter cannot run in
+        batches and must.
+    """
+    choose = choose_batch if scenario.sensor.identities else SeparateFilters
+    filters: Filters = choose(estimator, scenario, runs, rows, options)
+    return filters
+
+
+def update_filters(
+    filters: Filters,
+    observations: Mapping[str, AnyArray],
+    worlds: BoolArray,
+    *,
+    moved: BoolArray,
+) -> None:
+    """Update the filters of some worlds; see `SeparateFilters.update`."""
+    if isinstance(filters, SeparateFilters):
+        filters.update(observations, worlds, moved=moved)
+    else:
+        update_batch(filters, observations, worlds, moved=moved)

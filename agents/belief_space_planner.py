@@ -30,9 +30,8 @@ from ..arrays import Array, BoolArray, IndexArray
 from ..envs.robot import wrap_angle
 from ..estimator.filters.imagine import imagine
 from ..estimator.kernels.imagine import Imagined
-from .agent_knowledge import AgentKnowledge
 from .belief_features import largest_variances
-from .wall_routes import as_points
+from .wall_routes import AgentKnowledge, as_points
 
 _CLEARANCE = 0.5  # of arcs, distance kept from walls beyond the robot's radius [m]
 _ALIGNED = 0.5  # heading error below which a robot drives while it turns [rad]

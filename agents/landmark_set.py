@@ -23,7 +23,7 @@ from ..estimator.filters.batch import BatchStorage
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..jit import jit, njit_internal
 from ..sim_configs.field_types import unknown_choice
-from .belief_kernels import (
+from .belief_features import (
     correlation_jit,
     on_log_scale_jit,
     relative_spread,

@@ -12,14 +12,18 @@ e               end of a wall [m]
 
 import math
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import shortest_path
 
 from ..arrays import Array, BoolArray, ComplexArray
 from ..envs.robot import wall_distances
+from ..estimator.kernels.imagine import as_view
 from ..sim_configs import Scenario
-from .belief_features import world_bounds
+from .active_slam_kernels import SECTORS, cells_in_view
+from .belief_features import Bounds, world_bounds
+from .estimator_choice import BeliefOfMap, FollowingEstimator
 
 CLEARANCE = 1.0  # of goals on a floor without inner walls [m]
 _GAP = 0.5  # kept between the robot and walls on a route [m]
@@ -223,3 +227,149 @@ def wall_clearance(
 ) -> Array:
     """Return the distances of points (…) from the nearest wall of (W,) [m]."""
     return np.asarray(wall_distances(points, starts, ends - starts).min(axis=-1))
+
+
+# --------------------------------------------------------------------------------------
+# The floor of a bounded world: its cells and walls, and what the sensor sees of it.
+#
+# An agent knows the walls but not the landmarks. Poses are estimates.
+
+__all__ = ["SECTORS", "CoverageGrid"]
+
+_CELLS_PER_SIDE = 24  # at most
+_SMALLEST_CELL = 0.75  # [m]
+
+
+class CoverageGrid:
+    """Cells and walls of a scenario's world.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With walls around the floor.
+
+    Attributes
+    ----------
+    bounds : (xmin, ymin, xmax, ymax)
+        Rectangle around the walls [m].
+    cells : complex ndarray, shape (C,)
+        Centres of the cells, row by row from the lower left [m].
+    cell_size : float
+        Approximate side of a cell [m].
+
+    Raises
+    ------
+    ValueError
+        If the scenario has no walls.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> grid = CoverageGrid(load_scenario("corridor"))
+    >>> grid.cells[0].round(2), len(grid.cells)
+    (np.complex128(-0.82-0.82j), 361)
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        if not scenario.walls:
+            raise ValueError(
+                "scenario must have walls around its floor, got none in "
+                f"'{scenario.name}'"
+            )
+        self.bounds: Bounds = world_bounds(scenario)
+        left, bottom, right, top = self.bounds
+        width, height = right - left, top - bottom
+        self.cell_size = max(_SMALLEST_CELL, max(width, height) / _CELLS_PER_SIDE)
+        columns, rows = round(width / self.cell_size), round(height / self.cell_size)
+        x = left + (np.arange(columns) + 0.5) * width / columns
+        y = bottom + (np.arange(rows) + 0.5) * height / rows
+        self.cells: ComplexArray = (x[None, :] + 1j * y[:, None]).ravel()
+        self.diagonal = math.hypot(width, height)
+        walls = np.array(scenario.walls)
+        self._ends: ComplexArray = walls.view(np.complex128)
+        sensor = scenario.sensor
+        hiding = walls if sensor.occlusion else walls[:0]
+        view = as_view(sensor.max_range, sensor.field_of_view, hiding)
+        places = np.stack([self.cells.real, self.cells.imag])
+        self.plan = places, walls, self.bounds, self.diagonal, tuple(view)
+        """A `Floor`, as kernels take it."""
+        self._scenario = scenario
+
+    @cached_property
+    def routes(self) -> WallRoutes:
+        """Routes on the floor, around inner walls."""
+        return WallRoutes(self._scenario, self.cells)
+
+    def visible_from(self, poses: Array, chosen: BoolArray | None = None) -> BoolArray:
+        """Return which cells are in view from poses, (B, 3) to (B, C).
+
+        Cells nearer than the sensor's smallest range count as seen. With paths
+        (B, T, 3), a cell counts that is in view from any of their poses; with a choice
+        (C,) of cells, only those are returned, in their order.
+        """
+        cells, _, _, _, view = self.plan
+        if chosen is not None:
+            cells = np.ascontiguousarray(cells[:, chosen])
+        paths = np.ascontiguousarray(poses).reshape(len(poses), -1, 3)
+        seen = np.zeros((len(poses), cells.shape[1]), dtype=np.bool_)
+        cells_in_view(paths, cells, view, seen)
+        return seen
+
+    def clearance(self, points: Array) -> Array:
+        """Return the distance of points (…, 2) from the nearest wall, to (…) [m]."""
+        places = points[..., 0] + 1j * points[..., 1]
+        return wall_clearance(places, *self._ends.T)
+
+
+# --------------------------------------------------------------------------------------
+# The knowledge of an agent in active SLAM: belief, floor and progress, no truth.
+
+
+class AgentKnowledge(NamedTuple):
+    """What an agent may know at one step, for policies that plan."""
+
+    scenario: Scenario
+    grid: CoverageGrid
+    estimator: FollowingEstimator
+    """For predictions. A policy that changes its state must restore it."""
+    belief: BeliefOfMap
+    explored: BoolArray
+    """Cells of the grid seen so far, as believed, shape (C,)."""
+    known: BoolArray
+    """Landmarks known to the required accuracy, shape (N,); with hidden identities in
+    the order of the map."""
+    accuracy: float
+    """Required standard deviation of a landmark [m]."""
+    prior_std: tuple[float, float]
+    """Standard deviations of the coordinates of an unmapped landmark [m]."""
+    step: int
+    """Steps so far."""
+
+    @property
+    def known_in_map(self) -> BoolArray:
+        """Which landmarks of the belief are known, in its order, shape (n,)."""
+        ids = list(self.belief.landmark_ids)
+        rows = ids if self.scenario.sensor.identities else list(range(len(ids)))
+        return self.known[rows]
+
+    @property
+    def missing(self) -> int:
+        """How many landmarks are not yet mapped."""
+        return len(self.known) - len(self.belief.landmark_ids)
+
+    @property
+    def to_explore(self) -> BoolArray:
+        """Which cells are unseen and within the robot's reach, shape (C,)."""
+        return ~self.explored & self.grid.routes.reachable
+
+    def goals(self) -> Array:
+        """Return the positions worth a visit, shape (K, 2) [m].
+
+        These are the mapped landmarks that are not yet known and, while a landmark is
+        not yet mapped, the unexplored cells that the robot can get to.
+        """
+        landmarks: Array = self.belief.landmarks[~self.known_in_map]
+        if not self.missing:
+            return landmarks
+        cells = self.grid.cells[self.to_explore]
+        return np.concatenate([landmarks, as_points(cells)])

@@ -21,5 +21,5 @@ gymnasium.register(
 gymnasium.register(
     id="slamgym/ActiveSlam-v0",
     entry_point="slamgym.agents.active_slam:ActiveSlamEnv",
-    vector_entry_point="slamgym.agents.active_slam_vector:ActiveSlamVectorEnv",
+    vector_entry_point="slamgym.agents.active_slam:ActiveSlamVectorEnv",
 )

@@ -34,9 +34,9 @@ from slamgym.agents.active_slam_scores import (
     run_episodes,
     score_table,
 )
-from slamgym.agents.belief_arrays import belief_storage
-from slamgym.agents.coverage_grid import SECTORS, CoverageGrid
+from slamgym.agents.belief_features import belief_storage
 from slamgym.agents.information_reward import effort, map_covariances
+from slamgym.agents.wall_routes import SECTORS, CoverageGrid
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import Belief, EkfSlam, list_estimators
 from slamgym.sim_configs import drawn_scenario, load_scenario

@@ -6,9 +6,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
+from slamgym.agents.active_slam import matched_rmse
 from slamgym.agents.active_slam_baselines import make_baseline
 from slamgym.agents.active_slam_scores import VALIDATION
-from slamgym.agents.map_truth import matched_rmse
 from slamgym.estimator.filters.batch import BatchStorage
 
 SCORES = [

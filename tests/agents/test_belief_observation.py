@@ -18,10 +18,13 @@ from numpy_belief_features import (
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.agents import BeliefObservation, BeliefObservationVector
-from slamgym.agents.belief_arrays import belief_storage
-from slamgym.agents.belief_features import belief_features, world_bounds
-from slamgym.agents.belief_kernels import on_log_scale as log_scale_of_one
-from slamgym.agents.belief_kernels import write_features
+from slamgym.agents.belief_features import (
+    belief_features,
+    belief_storage,
+    world_bounds,
+    write_features,
+)
+from slamgym.agents.belief_features import on_log_scale as log_scale_of_one
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, make_batch
 from slamgym.sim_configs import load_scenario
 

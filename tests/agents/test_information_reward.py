@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.agents import BeliefObservation, BeliefObservationVector, InformationReward
-from slamgym.agents.belief_arrays import belief_storage
+from slamgym.agents.belief_features import belief_storage
 from slamgym.agents.information_reward import (
     CRITERIA,
     a_optimality,

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 from slamgym.agents import ActiveSlamEnv
 from slamgym.agents.active_slam_baselines import make_baseline
 from slamgym.agents.active_slam_scores import VALIDATION, baseline_policy, run_episode
-from slamgym.agents.coverage_grid import CoverageGrid
+from slamgym.agents.wall_routes import CoverageGrid
 from slamgym.sim_configs import load_scenario
 
 ROOMS = load_scenario("active_rooms")

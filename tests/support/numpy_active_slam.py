@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy_belief_features import belief_features, marginals_of
 
-from slamgym.agents.coverage_grid import SECTORS, CoverageGrid
 from slamgym.agents.information_reward import effort, landmark_prior_std, uncertainty
+from slamgym.agents.wall_routes import SECTORS, CoverageGrid
 from slamgym.envs.bearing_range import BearingRangeSensor
 
 DIRECTIONS = np.exp(2j * np.pi * np.arange(SECTORS) / SECTORS)
