@@ -22,8 +22,7 @@ import xarray as xr
 from slamgym.estimator import Belief, InvariantEkfSlam
 from slamgym.estimator.support.argument_checks import LandmarkIds
 from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.report.diagnosis import diagnosis_summary
-from slamgym.experiments.monte_carlo.report.scores import scores_of
+from slamgym.experiments.monte_carlo.verdict import diagnosis_summary, scores_of
 from slamgym.sim_configs import Scenario, load_scenario
 
 HONEST, CANNOT_TELL = "honest", "cannot tell"

@@ -18,8 +18,7 @@ import time
 from collections.abc import Callable
 
 from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
-from slamgym.experiments.monte_carlo.measure.bounds import bound_runs
-from slamgym.experiments.monte_carlo.measure.filtered_runs import filter_runs
+from slamgym.experiments.monte_carlo.filtered_runs import bound_runs, filter_runs
 from slamgym.experiments.runs.filter_settings import settings_for_scenario
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario

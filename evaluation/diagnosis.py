@@ -12,7 +12,7 @@ The tests answer two questions in this order.
    innovations are wrong too, or the errors are as wrong in the first steps as later,
    it is not the cause, and the answer is "cannot tell".
 
-The tests of the second question are those of :mod:`.diagnosis`.
+The tests of the second question are those of :mod:`.verdict`.
 """
 
 from __future__ import annotations

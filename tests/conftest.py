@@ -147,7 +147,7 @@ def sb3():
     return library
 
 
-REPORT = "slamgym.experiments.monte_carlo.report.html_report"
+REPORT = "slamgym.experiments.monte_carlo.report"
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from . import options
-from .option_values import assignments, given_options, standard_deviations
+from .options import assignments, given_options, standard_deviations
 from .program import command
 
 if TYPE_CHECKING:
@@ -53,9 +53,9 @@ def fit_noise(
     slamgym fit-noise log.csv --write
     slamgym fit-noise MRCLAM_Dataset6 --robot 3 --estimator ekf
     """
-    from ..noise_fitting.header import refuse_other_formats, write_noise
+    from ..noise_fitting.fit import refuse_other_formats, write_noise
     from ..runs.filter_settings import noise_or_assumed, settings_for
-    from .log_files import note_choices, read_any_log
+    from .options import note_choices, read_any_log
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
 
@@ -114,9 +114,8 @@ def _fit_and_write(
 
 
 def _show(summary: dict[str, Any], place: Path, reporter: "Reporter") -> None:
-    from .noise_fit_tables import advice, noise_table
-    from .noise_fit_tables import noise_comparison_table as comparison_table
-    from .tables import heading, written
+    from .tables import advice, heading, noise_table, written
+    from .tables import noise_comparison_table as comparison_table
 
     title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])
     reporter.show(title, noise_table(summary), "", comparison_table(summary), "")

@@ -4,8 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from . import options
-from .errors import interruptible
-from .program import command
+from .program import command, interruptible
 
 if TYPE_CHECKING:
     from ..trajectories.manifest import Manifest
@@ -87,11 +86,10 @@ def generate(
     slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]
     """
     from ..trajectories import generate_trajectories
-    from .chosen_filters import refuse_broken
-    from .cluster import connected
+    from .monte_carlo import connected
+    from .options import chosen_scenario, refuse_broken
     from .output_folder import default_folder
     from .reporter import Reporter
-    from .scenario_options import chosen_scenario
 
     world = chosen_scenario(scenario, steps, set_)
     if estimator is not None:

@@ -3,13 +3,14 @@
 import contextlib
 import shlex
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from . import options
-from .errors import FAILURE, interruptible
-from .option_values import changes
-from .program import command
+from .options import changes
+from .program import FAILURE, BadInputError, command, interruptible
 
 if TYPE_CHECKING:
     from .reporter import Reporter
@@ -94,14 +95,14 @@ def monte_carlo(
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
     from .. import monte_carlo
-    from ..monte_carlo.report.html_report import write_html_report
-    from ..monte_carlo.store.job_folder import REPORT, RESULTS, SUMMARY
+    from ..monte_carlo.report import write_html_report
+    from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
     from ..runs.own_files import replace_own
-    from .chosen_filters import refuse_broken
-    from .cluster import connected
+    from .options import chosen_scenario, refuse_broken
+
+    # MERGED-EMPTY
     from .output_folder import as_json_text, default_folder
     from .reporter import Reporter
-    from .scenario_options import chosen_scenario
 
     world = chosen_scenario(scenario, steps, set_)
     assumed = changes("--assume", assume)
@@ -153,8 +154,8 @@ def _show(summary: dict[str, Any], place: Path, reporter: "Reporter") -> None:
     """Print the table, a sentence for each estimator, the notes, and the files."""
     from rich.text import Text
 
-    from ..monte_carlo.report.diagnosis import diagnosis_lines
-    from ..monte_carlo.report.table import monte_carlo_table
+    from ..monte_carlo.report import monte_carlo_table
+    from ..monte_carlo.verdict import diagnosis_lines
     from .tables import written
 
     sentences = [
@@ -180,3 +181,93 @@ def _compile(estimators: str, *, identities: bool) -> None:
     )
     with contextlib.suppress(Exception):  # the job itself fails too, and reports it
         monte_carlo(small, estimators, 1)
+
+
+# --------------------------------------------------------------------------------------
+# The clusters that may do the work of a command: Dask and Ray.
+
+_HERE = "127.0.0.1"  # what starts here listens to this machine only
+_INTERVAL = 1.0  # between looks at the workers of a local cluster [s]
+
+
+@contextlib.contextmanager
+def connected(
+    backend: str | None, scheduler: str | None, jobs: int | None
+) -> Iterator[None]:
+    """Connect to a cluster, or start one on this machine, for the block.
+
+    Parameters
+    ----------
+    backend : str or None
+        "dask" or "ray"; no other needs a cluster.
+    scheduler : str or None
+        Address of the cluster; None starts one for Dask, while Ray does so by itself.
+    jobs : int or None
+        Workers of a cluster that is started.
+
+    Raises
+    ------
+    BadInputError
+        If the backend is not installed, or none that has a scheduler.
+    """
+    if backend == "dask":
+        with _dask_client(scheduler, jobs):
+            yield
+        return
+    if scheduler is not None:
+        _join_ray(backend, scheduler)
+    yield
+
+
+def _dask_client(scheduler: str | None, jobs: int | None) -> Any:
+    try:
+        import distributed
+    except ImportError:
+        raise BadInputError(
+            "--backend dask needs dask.distributed: pip install 'slamgym[dask]'"
+        ) from None
+    client: Any = distributed.Client
+    if scheduler is not None:
+        return client(scheduler)
+    return _with_new_workers(
+        client(
+            n_workers=jobs,
+            threads_per_worker=1,
+            host=_HERE,
+            dashboard_address=f"{_HERE}:0",
+        )
+    )
+
+
+@contextlib.contextmanager
+def _with_new_workers(client: Any) -> Iterator[None]:
+    """Replace workers of a local cluster that are gone.
+
+    Dask restarts a worker that was killed, but not one that was killed as it started.
+    """
+    over, cluster = threading.Event(), client.cluster
+    wanted = len(cluster.worker_spec)
+
+    def replace() -> None:
+        while not over.wait(_INTERVAL):
+            if len(cluster.workers) < wanted:
+                cluster.scale(wanted)
+
+    with client:
+        watch = threading.Thread(target=replace, daemon=True)
+        watch.start()
+        try:
+            yield
+        finally:
+            over.set()
+            watch.join()
+
+
+def _join_ray(backend: str | None, scheduler: str) -> None:
+    if backend != "ray":
+        raise BadInputError("--scheduler is for --backend dask or ray")
+    try:
+        import ray  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise BadInputError("--backend ray needs ray: pip install ray") from None
+    ray.init(address=scheduler)

@@ -12,16 +12,14 @@ import typer
 from ...estimator.registry import split_labels
 from ...sim_configs.atomic_file import naming_file
 from . import options
-from .errors import BadInputError, way_to_set
-from .option_values import assignments, given_options, standard_deviations
-from .program import command
+from .options import assignments, given_options, standard_deviations
+from .program import BadInputError, command, way_to_set
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ...sim_configs import Scenario
-    from ..noise_study.many_runs import NoiseEffect
-    from ..noise_study.one_run import NoiseRow, NoiseRun
+    from ..noise_study import NoiseEffect, NoiseRow, NoiseRun
     from ..runs.filter_settings import FilterSettings
     from .reporter import Reporter
 
@@ -108,12 +106,19 @@ def noise_study(
     slamgym noise-study loop -e 'invariant[iterations=3]'
     slamgym noise-study six_landmarks --runs 100 -e ekf,invariant
     """
-    from ..noise_study.one_run import study_log, study_scenario
+    from ..noise_study import study_log, study_scenario
     from ..runs.filter_settings import settings_for, settings_for_scenario
-    from .chosen_filters import refuse_broken, with_options
-    from .log_files import note_choices, note_noise, read_any_log
+    from .options import (
+        chosen_controller,
+        chosen_scenario,
+        note_choices,
+        note_noise,
+        read_any_log,
+        recorded,
+        refuse_broken,
+        with_options,
+    )
     from .reporter import Reporter
-    from .scenario_options import chosen_controller, chosen_scenario, recorded
 
     is_scenario = _is_scenario(source)
     kinds = (_SCENARIO, _ONE_RUN if runs == 1 else _MANY_RUNS)
@@ -196,9 +201,8 @@ def one_run_study(
     from ... import __version__
     from ..figures import noise_study_figure
     from ..runs.summary import settings_table
-    from .noise_tables import runs_table
-    from .tables import heading
-    from .warm_up import warm_up
+    from .run_files import warm_up
+    from .tables import heading, runs_table
 
     def run(reporter: "Reporter") -> Results:
         warm_up(settings, reporter)
@@ -229,9 +233,8 @@ def effects_study(
 ) -> Study:
     """Prepare the study of a scenario over many runs."""
     from ... import __version__
-    from ..noise_study.figures import noise_effects_figure
-    from ..noise_study.many_runs import CHANGED, noise_effects
-    from .noise_tables import effects_table
+    from ..noise_study import CHANGED, noise_effects, noise_effects_figure
+    from .tables import effects_table
 
     if change != "all" and change not in CHANGED:
         raise BadInputError(

@@ -11,18 +11,19 @@ from pathlib import Path
 from typing import Any
 
 from ...sim_configs.atomic_file import naming_file, unfinished
-from ..logs.lines import LogError
-from ..runs.folder_lock import locked_folder, naming_folder
+from ..logs.slamlog import LogError
 from ..runs.own_files import (
     MANIFEST,
     OwnFile,
     files_below,
+    locked_folder,
     measured,
+    naming_folder,
     own_entry,
     own_files,
     write_own_files,
 )
-from .errors import BadInputError
+from .program import BadInputError
 
 SUMMARY = "summary.json"
 """Every output folder holds it; its ``files`` lists the files of the command."""

@@ -1,18 +1,251 @@
 """The program ``slamgym``, and the decorator by which a command joins it."""
 
+import contextlib
 import inspect
+import io
+import os
+import shutil
+import signal
+import socket
 import sys
 import textwrap
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar
 
+import numpy as np
 import typer
+from typer.core import TyperGroup
 
 from ... import __version__
-from .errors import OneLineErrors
+from ...sim_configs.atomic_file import unfinished
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+# --------------------------------------------------------------------------------------
+# Errors of the command line: one line on standard error, and an exit code.
+
+FAILURE, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+
+
+class BrokenFilterError(ValueError):
+    """A filter of the user's own cannot run; the message lists why, one a line."""
+
+
+class InterruptedRunError(Exception):
+    """Ctrl-C or SIGTERM, its cause; the message may name the work that remains."""
+
+
+class OneLineErrors(TyperGroup):
+    """A group of commands that reports an error in one line, or in a list.
+
+    Bad input ends with exit code 2, a failure with 1, Ctrl-C with 130, SIGTERM with
+    143. The traceback is shown when the environment variable ``SLAMGYM_TRACEBACK`` is
+    set.
+    """
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Run a command, and exit the program unless in another one."""
+        stands_alone = kwargs.pop("standalone_mode", True)
+        kwargs["standalone_mode"] = False
+        line = threading.Lock()
+        if not stands_alone:
+            return super().main(*args, **kwargs)
+        _replace_unknown_characters()
+        try:
+            with ending_in_time(line), terminable():
+                result = super().main(*args, **kwargs)
+        except Exception as error:
+            if "SLAMGYM_TRACEBACK" in os.environ:
+                raise
+            line.acquire()  # waits for the end where another thread has taken it
+            sys.stderr.write(f"slamgym: {message_of(error)}\n")
+            sys.exit(exit_code_of(error))
+        sys.exit(result if isinstance(result, int) else 0)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the chosen command."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise InterruptedRunError from error
+
+
+class TerminationError(KeyboardInterrupt):
+    """A scheduler or ``kill`` sent SIGTERM; it is handled like Ctrl-C."""
+
+
+_CODES = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED}
+_NOTHING_WRITTEN = "interrupted; nothing was written"
+
+_OF_SCENARIOS = {
+    "--motion-std": "motion.std=[0.1,0.1,0.05]",
+    "--measurement-std": "sensor.std=[0.02,0.1]",
+    "--initial-pose-std": "start.std=[0.1,0.1,0.05]",
+    "--range-std-per-metre": "sensor.range_std_per_metre=0.05",
+    "--noise-at-rest": "motion.noise_at_rest=true",
+}
+
+_PATIENCE = 1.0
+"""How long a command may clean up after a signal before it is ended [s]."""
+_SHOW_CURSOR = b"\r\x1b[K\x1b[?25h"  # and clear the line of the progress bar
+
+
+def _end_after_a_signal(reader: socket.socket, line: threading.Lock) -> None:
+    """Wait for a signal, give the main thread some time, and end the process."""
+    with reader:
+        while received := reader.recv(1):
+            if received[0] in _CODES:
+                break
+        else:
+            return
+    deadline = time.monotonic() + _PATIENCE
+    import psutil
+
+    time.sleep(max(deadline - time.monotonic(), 0))
+    message = _remaining[-1] if _remaining else _NOTHING_WRITTEN
+    if line.acquire(blocking=False):
+        shown = _SHOW_CURSOR if os.isatty(2) else b""
+        os.write(2, shown + f"slamgym: {message}\n".encode())
+    with contextlib.suppress(psutil.Error):
+        for process in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                # That of joblib cleans up, and then ends by itself.
+                if "resource_tracker" not in " ".join(process.cmdline()):
+                    process.kill()
+    for path in tuple(unfinished):
+        with contextlib.suppress(OSError):
+            path.unlink() if path.is_file() else shutil.rmtree(path)
+    os._exit(_CODES[signal.Signals(received[0])])
+
+
+def _one_line(text: str) -> str:
+    return "; ".join(line.strip() for line in text.splitlines() if line.strip())
+
+
+_remaining: list[str] = []
+"""Messages of the blocks that can be interrupted, the innermost last."""
+
+
+def _replace_unknown_characters() -> None:
+    """Print a question mark for each character that a terminal's encoding lacks."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def _terminate(_number: int, _frame: object) -> NoReturn:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one spoils no clean-up
+    raise TerminationError
+
+
+def _way_to_set(error: Any) -> str:
+    """Return the way to set what a command for scenarios has no option for."""
+    taken = getattr(getattr(error, "ctx", None), "command", None)
+    options = [name for option in getattr(taken, "params", ()) for name in option.opts]
+    option = getattr(error, "option_name", None) or ""
+    return way_to_set(option) if "--set" in options else ""
+
+
+@contextlib.contextmanager
+def ending_in_time(line: threading.Lock) -> Iterator[None]:
+    """End this process soon after a SIGINT or SIGTERM in the block, whatever it does.
+
+    Python runs signal handlers in its main thread, and only between two steps of Python
+    code: a kernel, or a decomposition of a large matrix, may delay them for minutes.
+    The system's own handler also writes to a socket, where a thread waits. If the
+    process still exists `_PATIENCE` later, the thread ends it, also outside the block.
+
+    Parameters
+    ----------
+    line : threading.Lock
+        Taken for good by the thread that writes the line about the end.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _remaining.clear()
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    former = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    threading.Thread(
+        target=_end_after_a_signal, args=(reader, line), daemon=True
+    ).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(former)
+        writer.close()
+
+
+def exit_code_of(error: Exception) -> int:
+    """Return the exit code of an error: bad input, failure or interruption.
+
+    Examples
+    --------
+    >>> exit_code_of(ValueError("steps must be >= 2, got 1")), exit_code_of(OSError())
+    (2, 1)
+    """
+    if isinstance(error, InterruptedRunError):
+        terminated = isinstance(error.__cause__, TerminationError)
+        return TERMINATED if terminated else INTERRUPTED
+    if isinstance(error, np.linalg.LinAlgError):
+        return FAILURE
+    is_asked_wrongly = hasattr(error, "format_message")
+    return BAD_INPUT if is_asked_wrongly or isinstance(error, ValueError) else FAILURE
+
+
+def message_of(error: Exception) -> str:
+    r"""Return the message of an error as one line, or the list of a broken filter.
+
+    Examples
+    --------
+    >>> message_of(ValueError("dt must be > 0, got 0\n steps must be >= 2, got 1"))
+    'dt must be > 0, got 0; steps must be >= 2, got 1'
+    """
+    if isinstance(error, BrokenFilterError | InterruptedRunError):
+        return str(error) or _NOTHING_WRITTEN
+    if hasattr(error, "format_message"):  # of the command line itself
+        return _one_line(error.format_message()) + _way_to_set(error)
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, MemoryError):
+        return _one_line(str(error)) or "there is not enough memory"
+    if isinstance(error, ValueError | OSError | ImportError):
+        return _one_line(str(error))
+    what = f"{type(error).__name__}: {_one_line(str(error))}"
+    return f"internal error, {what} (SLAMGYM_TRACEBACK=1 shows where)"
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Raise `TerminationError` in the block at the first SIGTERM, unless ignored."""
+    usual = signal.getsignal(signal.SIGTERM)
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if usual is not signal.SIG_DFL or not in_main_thread:
+        yield
+        return
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, usual)
+
+
+def way_to_set(option: str) -> str:
+    """Return how to set a noise of a world that has an option for logs, else nothing.
+
+    Examples
+    --------
+    >>> way_to_set("--noise-at-rest"), way_to_set("--robot")
+    ('; for the world: --set motion.noise_at_rest=true', '')
+    """
+    change = _OF_SCENARIOS.get(option)
+    return f"; for the world: --set {change}" if change else ""
+
 
 main = typer.Typer(
     name="slamgym",
@@ -73,3 +306,18 @@ def _slamgym(
 
 
 main.callback(invoke_without_command=True, help=_help_of(_slamgym)[1])(_slamgym)
+
+
+class BadInputError(ValueError):
+    """The user's input cannot be used; the message gives the reason in one line."""
+
+
+@contextlib.contextmanager
+def interruptible(message: str) -> Iterator[None]:
+    """Report Ctrl-C and SIGTERM in the block with a message about what remains."""
+    _remaining.append(message)
+    try:
+        yield
+    except KeyboardInterrupt as error:  # the message stays, for `ending_in_time`
+        raise InterruptedRunError(message) from error
+    _remaining.remove(message)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from . import options
-from .option_values import assignments
+from .options import assignments
 from .program import command
 
 if TYPE_CHECKING:
@@ -56,10 +56,9 @@ def render(
     """
     from ...envs.rendering import check_video, write_video
     from ..runs.filter_settings import settings_for_scenario
-    from .chosen_filters import refuse_broken
+    from .options import chosen_controller, chosen_scenario, refuse_broken
     from .reporter import Reporter
-    from .scenario_options import chosen_controller, chosen_scenario
-    from .warm_up import warm_up
+    from .run_files import warm_up
 
     world = chosen_scenario(scenario, steps, set_)
     shown = estimator or "invariant"

@@ -4,7 +4,7 @@ import shlex
 from functools import partial
 
 from . import options
-from .option_values import assignments
+from .options import assignments
 from .program import command
 
 
@@ -42,11 +42,16 @@ def run(
     """
     from ...sim_configs import save_scenario
     from ..runs.filter_settings import settings_for_scenario
-    from .chosen_filters import chosen_filters, tested_filters, with_options
+    from .options import (
+        chosen_filters,
+        chosen_scenario,
+        recorded,
+        tested_filters,
+        with_options,
+    )
     from .output_folder import default_folder, output_folder
     from .reporter import Reporter
     from .run_files import check_rerun, filter_and_write, show_run
-    from .scenario_options import chosen_scenario, recorded
 
     world = chosen_scenario(scenario, steps, set_)
     filters = chosen_filters(

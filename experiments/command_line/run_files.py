@@ -1,6 +1,7 @@
 """Filter a log: the files of the run, and its printed results."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,23 +10,29 @@ from rich.table import Table
 from rich.text import Text
 
 from .. import figures
+from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
-from ..logs.steps import steps_of
 from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import Replay, replay
 from ..runs.summary import summarise
 from ..runs.trace import RunTrace
 from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
 from ..viewers.rerun_recording import import_rerun
-from .association_table import association_table
-from .errors import BadInputError
 from .output_folder import write_summary
+from .program import BadInputError
 from .reporter import Reporter
-from .tables import comparison_table, heading, key_figures, landmark_table, written
-from .warm_up import warm_up
+from .tables import (
+    association_table,
+    comparison_table,
+    heading,
+    key_figures,
+    landmark_table,
+    written,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
 
 _FEW_STEPS = 60  # of a run whose every step is drawn by default
 
@@ -219,3 +226,30 @@ def _association(summary: dict[str, Any]) -> tuple[Table | str, ...]:
 def _warnings(summary: dict[str, Any]) -> tuple[Text | str, ...]:
     lines = [Text(f"Warning: {text}", "yellow") for text in summary["warnings"]]
     return (*lines, "") if lines else ()
+
+
+# --------------------------------------------------------------------------------------
+# Compile a filter by its first steps.
+
+
+def warm_up(settings: FilterSettings, reporter: Reporter) -> None:
+    """Take a filter's first steps, and print a note if it compiles.
+
+    Raises
+    ------
+    ValueError
+        If the estimator refuses its settings.
+    """
+    origin = (0.0, 0.0, 0.0)
+    settings.make(origin)
+    usual = replace(settings, motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2)
+    with reporter.note_if_compiling("the filter"):
+        estimator = usual.make(origin)
+        try:
+            for _ in range(2):
+                estimator.predict((0.1, 0.0))
+                estimator.update([(0.0, 5.0)], [0])
+            if settings.options.get("management"):
+                estimator.update([(0.0, 5.0)])
+        finally:
+            estimator.reset(origin, (0.0, 0.0, 0.0))  # deletes the files it wrote

@@ -3,12 +3,17 @@
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 from rich.text import Text
 
-from ..monte_carlo.report.headings import headings_and_key
+from ..monte_carlo.report import headings_and_key
+from ..noise_study import Variation
+
+if TYPE_CHECKING:
+    from ..noise_study import NoiseEffect, NoiseRun
+
 
 _FATES = (
     ("rejected", "rejected by the gate"),
@@ -229,3 +234,234 @@ def smoothing_figures(summary: dict[str, Any]) -> Table:
             ("misfit", f"{ratio} per degree of freedom; 1 is expected"),
         ]
     )
+
+
+# --------------------------------------------------------------------------------------
+# The scores of a run's association as a table for the terminal.
+
+
+def association_table(scores: dict[str, Any]) -> Table:
+    """Lay out the ``association`` of a summary.
+
+    Parameters
+    ----------
+    scores : dict
+        As in :func:`slamgym.experiments.runs.summary.association_summary`.
+    """
+    title = "Association"
+    if scores["resolution"]:
+        title += f", landmarks nearer than {scores['resolution']:g} m counted as one"
+    return named_rows(_rows(scores), title)
+
+
+def _rows(scores: dict[str, Any]) -> list[tuple[str, str]]:
+    found = scores["gospa"]
+    rows = [("GOSPA of the map", _gospa(found, "aligned") + " once best fitted")]
+    rows.append(("… raw", f"{_gospa(found, 'raw')}; cut-off {found['cutoff']:g} m"))
+    if scores["correct"] is None:
+        return rows
+    readings = (
+        f"{scores['correct']} correct, {scores['wrong']} wrong, {scores['missed']} "
+        f"not used, {scores['clutter_used']} of clutter used"
+    )
+    new = (
+        f"{scores['new_correct']} correct, {scores['duplicate']} duplicates, "
+        f"{scores['ghost']} of clutter"
+    )
+    size = f"{scores['map_size']}; {scores['true_map_size']} were seen often enough"
+    shares = f"{_share(scores['precision'])}, recall {_share(scores['recall'])}"
+    return [
+        ("readings", readings),
+        ("new landmarks", new),
+        ("map size", size),
+        ("precision", shares),
+        *rows,
+    ]
+
+
+def _gospa(found: dict[str, Any], which: str) -> str:
+    parts = found[which]
+    return (
+        f"{significant(parts['distance'])} m: {parts['missed_count']} missed, "
+        f"{parts['false_count']} false, localisation "
+        f"{significant(parts['localisation'] ** 0.5)} m"
+    )
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+# --------------------------------------------------------------------------------------
+# The results of noise studies as tables for the terminal.
+
+_COLUMNS = {
+    "pose_area": "pose\narea\n[m²]",
+    "landmark_area": "landmark\narea\n[m²]",
+    "landmark_rmse": "map\nerror\n[m]",
+    "landmark_rmse_aligned": "map,\naligned\n[m]",
+    "ate": "path\nerror\n[m]",
+    "nees_per_degree": "NEES\n/ degree",
+    "nis_per_degree": "NIS\n/ degree",
+}
+
+
+def runs_table(runs: "Sequence[NoiseRun]") -> Table:
+    """Lay out the study of one run, a row for each variation."""
+    title = "Final 3σ areas and RMS errors; for NEES and NIS, 1 is expected"
+    rows: list[dict[str, Any]] = [run.row._asdict() for run in runs]
+    shown = [key for key in _COLUMNS if any(row[key] is not None for row in rows)]
+    table = _table("noise", "value", title=title)
+    for key in shown:
+        table.add_column(Text(_COLUMNS[key]), justify="right", no_wrap=True)
+    for run, row in zip(runs, rows, strict=True):
+        change, _, value = run.title.partition(" = ")
+        table.add_row(change, value, *(significant(row[key]) for key in shown))
+    return table
+
+
+def effects_table(name: str, runs: int, effects: "Sequence[NoiseEffect]") -> Table:
+    """Lay out the study over many runs, a column for each estimator."""
+    labels = list(dict.fromkeys(effect.estimator for effect in effects))
+    headings, key = headings_and_key(labels)
+    note = "± is the standard error. noise_study.csv holds further figures."
+    table = _table(
+        "changed",
+        "noise",
+        title=f"{name}, {runs} runs each: NEES / 3 of the pose; 1 is expected",
+        caption=f"{key}\n{note}".strip(),
+    )
+    for heading in headings:
+        table.add_column(Text(heading), justify="right", overflow="fold")
+    rows: dict[tuple[str, Variation], list[str]] = {}
+    for effect in effects:
+        variation = Variation(effect.sigma, effect.factor)
+        rows.setdefault((effect.changed, variation), []).append(_cell(effect))
+    for (changed, variation), cells in rows.items():
+        table.add_row(changed, "" if changed == "nothing" else str(variation), *cells)
+    return table
+
+
+def _table(*names: str, title: str, caption: str | None = None) -> Table:
+    table = Table(
+        title=title,
+        caption=None if caption is None else Text(caption),
+        title_justify="left",
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
+    )
+    for name in names:
+        table.add_column(name, no_wrap=True)
+    return table
+
+
+def _cell(effect: "NoiseEffect") -> str:
+    """Write the NEES, its standard error where known, and the failed runs."""
+    nees, error = effect.nees_per_degree, effect.nees_per_degree_error
+    text = "–" if math.isnan(nees) else f"{nees:.3g}"
+    if not math.isnan(error):
+        text += f" ± {error:.3g}"
+    return f"{text} ({effect.failed} failed)" if effect.failed else text
+
+
+# --------------------------------------------------------------------------------------
+# The result of a noise fit as tables for the terminal.
+
+_VERDICTS = {
+    "fitted": "",
+    "zero": "may be zero",
+    "unknown": "no reading depends on it: not fitted",
+}
+
+
+def noise_table(summary: dict[str, Any]) -> Table:
+    """Lay out the standard deviations with their intervals."""
+    table = Table(box=None, pad_edge=False)
+    for heading in ("noise", "before", "most likely", "95 % interval", "suggested", ""):
+        is_text = heading in ("noise", "")
+        table.add_column(Text(heading), justify="left" if is_text else "right")
+    suggested = _noise_by_name(summary["runs"]["suggested"]["settings"])
+    for row in summary["noise"]:
+        table.add_row(
+            f"{row['name']} [{row['unit']}]".replace("[", "\\["),
+            significant(row["before"]),
+            "-" if row["verdict"] == "unknown" else significant(row["value"]),
+            _interval(row),
+            significant(suggested[row["name"]]),
+            _VERDICTS[row["verdict"]],
+        )
+    return table
+
+
+def noise_comparison_table(summary: dict[str, Any]) -> Table:
+    """Lay out the results of filters under each noise."""
+    table, runs = Table(box=None, pad_edge=False), summary["runs"]
+    for heading in ("", *runs):
+        table.add_column(Text(heading), justify="right" if heading else "left")
+    for name, path in (
+        ("log likelihood", ("log_likelihood",)),
+        ("readings rejected", ("readings", "rejected")),
+        ("NIS per degree, 1 expected", ("nis", "per_degree")),
+        ("pose NEES per degree, 1 expected", ("nees", "per_degree")),
+        ("path error, raw [m RMS]", ("ate", "raw")),
+        ("path error, aligned [m RMS]", ("ate", "aligned")),
+        ("map error, aligned [m RMS]", ("landmark_rmse", "aligned")),
+        ("bearing innovations white, p", ("whiteness", "bearing", "p")),
+        ("range innovations white, p", ("whiteness", "range", "p")),
+    ):
+        values = [_at(run, path) for run in runs.values()]
+        if any(value is not None for value in values):
+            table.add_row(name, *map(_figure, values))
+    return table
+
+
+def advice(summary: dict[str, Any]) -> Table:
+    """Describe the suggested inflation of the sensor noise, and its reason."""
+    factors = summary["inflation"]
+    inflated = [
+        f"{sigma} × {factors[name]:.3g}"
+        for sigma, name in (("σβ", "bearing"), ("σr", "range"))
+        if factors[name] > 1
+    ]
+    text = "none needed"
+    if inflated:
+        text = f"{', '.join(inflated)}: the errors of readings are correlated in time"
+    rows = [("inflation", text)]
+    if summary["calibration"] is not None:
+        factor, low, high = (
+            f"{summary['calibration'][key]:.3g}" for key in ("factor", "low", "high")
+        )
+        text = f"× {factor} ({low} … {high}) of the most likely σβ and σr"
+        rows.append(("by the truth", f"{text} would make the pose NEES 1 per degree"))
+    return named_rows(rows)
+
+
+def _interval(row: dict[str, Any]) -> str:
+    if row["verdict"] == "unknown" or row["high"] is None:
+        return "-"
+    return f"{significant(row['low'])} … {significant(row['high'])}"
+
+
+def _noise_by_name(settings: dict[str, Any]) -> dict[str, float]:
+    sigmas = ("σx", "σy", "σα", "σβ", "σr")
+    noise = dict(
+        zip(sigmas, settings["motion_std"] + settings["measurement_std"], strict=True)
+    )
+    options = settings["options"]
+    noise["σr per metre"] = options.get("range_std_per_metre", 0.0)
+    noise["σβ in metres"] = options.get("bearing_std_metres", 0.0)
+    return noise
+
+
+def _at(run: dict[str, Any], path: tuple[str, ...]) -> Any:
+    value: Any = run
+    for key in path:
+        value = None if value is None else value[key]
+    return value
+
+
+def _figure(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return str(value) if isinstance(value, int) else f"{value:.4g}"

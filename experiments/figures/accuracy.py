@@ -1,22 +1,35 @@
 """Figure of the distances of a run's path and map from ground truth."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from ...arrays import Array, BoolArray
+from ...estimator.models.rigid_motion import additive_error
 from ...evaluation.trajectory_error import LandmarkDistances, landmark_distances
 from ..runs.trace import RunTrace
 from . import style
-from .map_picture import box_around
-from .style import ALARM, GREY, INK, TEAL, EllipseKind, dress, write_title
-from .walls import Walls, draw_walls, wall_ends
+from .maps import Walls, box_around, draw_walls, wall_ends
+from .style import (
+    ALARM,
+    BLUE,
+    GREY,
+    INK,
+    TEAL,
+    EllipseKind,
+    dress,
+    new_figure,
+    write_title,
+)
 
 _LANDMARK = EllipseKind("estimated landmark, 3σ", TEAL, fill=0.15)
 _MOST_ERRORS = 80  # error lines along the path
@@ -184,3 +197,338 @@ def _summary(
         rms = np.sqrt(np.mean(distances.euclidean**2))
         parts.append(f"landmark error {rms:.2g} m RMS")
     return "  ·  ".join(parts)
+
+
+# --------------------------------------------------------------------------------------
+# Figure of the final maps of several filters side by side.
+
+_COLUMNS = 2
+_LONGEST = 52  # characters of a title
+
+
+def comparison_figure(traces: Sequence[RunTrace], walls: Walls = ()) -> Figure:
+    """Draw the final map and path of each filter over ground truth, side by side.
+
+    All panels show the same area: that of the first filter, widened for the others to
+    at most twice its size.
+
+    Parameters
+    ----------
+    traces : sequence of RunTrace
+        Runs of the filters over one drive, at least two.
+    walls : sequence of (x0, y0, x1, y1)
+        Walls to draw [m].
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two.
+    """
+    if len(traces) < 2:
+        raise ValueError(f"traces must be of two filters or more, got {len(traces)}")
+    limits = _common_limits(traces, walls)
+    width, height = limits[1] - limits[0]
+    rows = -(-len(traces) // _COLUMNS)
+    figure = style.new_figure(11.0, (4.9 * height / width + 0.8) * rows + 0.7)
+    panels = figure.subplots(rows, _COLUMNS, squeeze=False)
+    for k, axes in enumerate(panels.flat):
+        if k >= len(traces):
+            axes.set_axis_off()
+            continue
+        style.dress(axes)
+        axes.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
+        axes.set(xlabel="x [m]", ylabel="y [m]" if k % _COLUMNS == 0 else "")
+        keys = draw_against_truth(axes, traces[k]) + draw_walls(axes, walls)
+        name = traces[k].estimator
+        title = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
+        style.write_title(axes, title, honesty(traces[k]))
+    style.legend_below(figure, keys, columns=len(keys))
+    return figure
+
+
+def honesty(trace: RunTrace) -> str:
+    """Write how many true landmarks lie inside their 3σ ellipses, and the error."""
+    distances = distances_from_truth(trace)
+    if distances is None:
+        return f"{len(trace.landmarks)} landmarks"
+    count = len(distances.euclidean)
+    inside = int((distances.mahalanobis <= 3).sum())
+    rms = np.sqrt(np.mean(distances.euclidean**2))
+    return f"{inside} of {count} landmarks inside 3σ  ·  map error {rms:.2g} m RMS"
+
+
+def _common_limits(traces: Sequence[RunTrace], walls: Walls) -> Array:
+    boxes = np.array([truth_limits(trace, walls) for trace in traces])
+    low, high = boxes[0]
+    room = 0.5 * float((high - low).max())
+    return np.stack(
+        [
+            np.maximum(boxes[:, 0].min(axis=0), low - room),
+            np.minimum(boxes[:, 1].max(axis=0), high + room),
+        ]
+    )
+
+
+# --------------------------------------------------------------------------------------
+# Figure of a run's errors and innovations against its covariances.
+
+_ROWS = (("x error [m]", "x"), ("y error [m]", "y"), ("θ error [rad]", "θ"))
+_LOG_FROM = 8.0  # times the band's upper bound: larger NIS needs a logarithmic axis
+
+
+def errors_figure(trace: RunTrace) -> Figure:
+    """Draw pose errors with their ±3σ bands, and the NIS with its 95% band, over time.
+
+    Without true poses, the figure shows the NIS alone, which needs no truth.
+
+    Parameters
+    ----------
+    trace : RunTrace
+        The run.
+    """
+    truth = trace.true_poses
+    known = truth is not None and bool(np.isfinite(truth).any())
+    rows = len(_ROWS) + 1 if known else 1
+    figure = new_figure(8.4, 1.0 + 1.9 * rows)
+    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    if truth is not None and known:
+        errors = -additive_error(truth, trace.poses)
+        std = np.sqrt(
+            np.maximum(np.diagonal(trace.pose_covariances, axis1=1, axis2=2), 0)
+        )
+        for k, (label, name) in enumerate(_ROWS):
+            _draw_error(axes[k], trace.t, errors[:, k], std[:, k])
+            axes[k].set_ylabel(label)
+            inside = np.abs(errors[:, k]) <= 3 * std[:, k]
+            share = np.mean(inside[np.isfinite(errors[:, k])])
+            title = f"{name}: {share:.0%} of the errors within ±3σ"
+            write_title(axes[k], title, size=10)
+        _legend_above(axes[0], columns=2)
+    _draw_nis(axes[-1], trace)
+    axes[-1].set_xlabel(f"time [{trace.time_unit}]")
+    figure.align_ylabels(axes)
+    return figure
+
+
+def nis_band(
+    dof: NDArray[np.integer], probability: float = 0.95
+) -> tuple[Array, Array]:
+    """Return the bounds of a consistent filter's NIS for a probability.
+
+    Parameters
+    ----------
+    dof : ndarray of int, shape (k,)
+        Degrees of freedom.
+    probability : float, default 0.95
+        Probability between the bounds; half of the rest lies below, half above.
+
+    Returns
+    -------
+    lower, upper : ndarray, shape (k,)
+        Quantiles of χ²(dof), nan where dof is 0.
+    """
+    known = np.where(dof > 0, dof, np.nan)
+    tail = (1 - probability) / 2
+    return np.asarray(chdtri(known, 1 - tail)), np.asarray(chdtri(known, tail))
+
+
+def _draw_error(axes: Axes, t: Array, error: Array, std: Array) -> None:
+    dress(axes)
+    axes.fill_between(t, -3 * std, 3 * std, color=BLUE, alpha=0.15, lw=0, label="±3σ")
+    for sign in (-1, 1):
+        axes.plot(t, sign * 3 * std, color=BLUE, lw=0.8, alpha=0.6)
+    axes.axhline(0, color=GREY, lw=0.6)
+    axes.plot(t, error, color=INK, lw=1.2, label="error")
+    axes.margins(x=0.01)
+
+
+def _draw_nis(axes: Axes, trace: RunTrace) -> None:
+    """Draw the NIS of the steps with a correction; outliers have another marker."""
+    dress(axes)
+    lower, upper = nis_band(trace.nis_dof)
+    used = trace.nis_dof > 0
+    axes.fill_between(
+        trace.t,
+        lower,
+        upper,
+        step="mid",
+        color=TEAL,
+        alpha=0.18,
+        lw=0,
+        label="95% band",
+    )
+    inside = used & (trace.nis >= lower) & (trace.nis <= upper)
+    size = 4.0 if len(trace.t) <= 300 else 2.0
+    for which, marker, colour, label in (
+        (inside, "o", INK, "inside"),
+        (used & ~inside, "D", ALARM, "outside"),
+    ):
+        axes.plot(
+            trace.t[which], trace.nis[which], marker, color=colour, ms=size, label=label
+        )
+    axes.set_ylabel("NIS")
+    axes.margins(x=0.01)
+    if not used.any():
+        write_title(axes, "NIS: no step corrected anything", size=10)
+        return
+    share = np.mean(inside[used])
+    write_title(axes, f"NIS: {share:.0%} of the steps in the 95% band", size=10)
+    if trace.nis[used].max() > _LOG_FROM * np.nanmax(upper):
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=max(0.3 * float(np.nanmin(lower)), 1e-3))
+    else:
+        axes.set_ylim(bottom=0)
+    _legend_above(axes, columns=3)
+
+
+def _legend_above(axes: Axes, columns: int) -> None:
+    axes.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.01, 0.98),
+        ncols=columns,
+        frameon=False,
+        fontsize=9,
+        borderaxespad=0.2,
+    )
+
+
+# --------------------------------------------------------------------------------------
+# Figure of the covariance of the whole state at the begin and end of a run.
+
+_MOST_LABELS = 30  # rows; larger maps name only some of their landmarks
+_UNDEFINED = "#c9ced4"
+
+
+def covariance_figure(trace: RunTrace) -> Figure:
+    """Show the first and the final covariance as heat maps of correlations.
+
+    Each row is labelled with its standard deviation, so that the figure shows the whole
+    covariance. Rows without uncertainty have no correlations and are grey.
+
+    Parameters
+    ----------
+    trace : RunTrace
+        The run.
+    """
+    sizes = [len(ids) for ids, *_ in trace.landmark_history]
+    first_step = next((step for step, size in enumerate(sizes) if size), 0)
+    figure = new_figure(12.4, 5.6)
+    before, after = figure.subplots(1, 2)
+    _draw_correlations(before, trace.first_covariance, trace.map_at(first_step).ids)
+    image = _draw_correlations(after, trace.final_covariance, trace.landmark_ids)
+    write_title(
+        before,
+        "Before: the first map",
+        _covariance_summary(trace.first_covariance, first_step),
+    )
+    write_title(
+        after,
+        "After: the final map",
+        _covariance_summary(trace.final_covariance, trace.last_step),
+    )
+    bar = figure.colorbar(image, ax=[before, after], shrink=0.85, aspect=28, pad=0.015)
+    bar.set_label("correlation", fontsize=10, color=INK)
+    bar.ax.tick_params(labelsize=9, color=GREY)
+    bar.outline.set_visible(False)
+    figure.draw_without_rendering()  # the layout needs a second pass
+    return figure
+
+
+def correlations(covariance: Array) -> Array:
+    """Divide a covariance by the standard deviations of its rows and columns.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, n)
+        Any covariance.
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+        In [-1, 1]; nan in rows and columns without variance.
+
+    Examples
+    --------
+    >>> correlations(np.array([[4.0, 1.0], [1.0, 1.0]]))
+    array([[1. , 0.5],
+           [0.5, 1. ]])
+    """
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    std = np.where(std > 0, std, np.nan)
+    return np.asarray(np.clip(covariance / std[:, None] / std, -1.0, 1.0))
+
+
+def _draw_correlations(
+    axes: Axes, covariance: Array, ids: NDArray[np.integer]
+) -> AxesImage:
+    image = axes.imshow(
+        np.ma.masked_invalid(correlations(covariance)),
+        cmap="RdBu_r",  # blue to red through white: safe for colour-blind eyes
+        vmin=-1,
+        vmax=1,
+        interpolation="nearest",
+    )
+    axes.set_facecolor(_UNDEFINED)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0, labelsize=9, labelcolor=INK, pad=3)
+    rows, labels = row_labels(ids)
+    axes.set_yticks(rows, labels)
+    axes.set_xticks(rows, labels, rotation=90)
+    few = len(covariance) <= _MOST_LABELS
+    for line in (axes.axhline, axes.axvline):  # between pose and landmarks
+        line(2.5, color="white", lw=1.5 if few else 0.6)
+    if few:
+        _write_deviations(axes, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    return image
+
+
+def row_labels(ids: NDArray[np.integer]) -> tuple[list[float], list[str]]:
+    """Label the rows x, y, θ, l0x, l0y, …; for large maps only some landmarks.
+
+    Returns
+    -------
+    positions, labels : list of float, list of str
+        Positions in rows, and texts.
+    """
+    rows, labels = [0.0, 1.0, 2.0], ["x", "y", "θ"]
+    if 3 + 2 * len(ids) <= _MOST_LABELS:
+        for k, landmark in enumerate(ids):
+            rows += [3.0 + 2 * k, 4.0 + 2 * k]
+            labels += [f"l{landmark}x", f"l{landmark}y"]
+        return rows, labels
+    stride = -(-len(ids) // (_MOST_LABELS // 2 - 3))
+    chosen = range(stride // 2, len(ids), stride)
+    return (
+        [1.0, *(3.5 + 2 * k for k in chosen)],  # the pose is too thin for three
+        ["pose", *(f"l{ids[k]}" for k in chosen)],
+    )
+
+
+def _write_deviations(axes: Axes, std: Array) -> None:
+    for row, value in enumerate(std):
+        unit = "rad" if row == 2 else "m"
+        axes.annotate(
+            f"σ = {value:.2g} {unit}",
+            (1, row),
+            (5, 0),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+            color=GREY,
+        )
+
+
+def _covariance_summary(covariance: Array, step: int) -> str:
+    """Write the step, the number of landmarks, and their mean correlation."""
+    every = correlations(covariance)
+    landmarks = every[3:, 3:]
+    n = len(landmarks) // 2
+    between = ~np.kron(np.eye(n, dtype=bool), np.ones((2, 2), dtype=bool))
+    values = np.abs(landmarks[between])
+    text = f"after step {step}: {n} landmarks"
+    if np.isnan(every).any():
+        text = f"grey: known exactly; {text}"
+    if not np.isfinite(values).any():
+        return text
+    return f"{text}, mean |correlation| between them {np.nanmean(values):.2f}"

@@ -1,24 +1,44 @@
 """Figures of maps: after one step, after every step, and for different noise."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
 from matplotlib.text import Text
 from numpy.typing import NDArray
 from PIL import Image
 
 from ...arrays import Array
 from ...envs.rendering import BlittedFigure
-from ...envs.rendering.scene import ELLIPSE_HANDLER
+from ...envs.rendering.scene import ELLIPSE_HANDLER, WALL
+from ...estimator.models.rigid_motion import rotation
+from ...evaluation.trajectory_error import PositionAccuracy, poses_at
 from ...sim_configs.atomic_file import replace_when_written
+from ..logs.ground_truth import path_accuracy
+from ..runs.log_smoothing import SmoothedLog
 from ..runs.trace import RunTrace
-from .map_picture import MapPicture, map_limits, pose_stride
-from .style import dress, legend_below, new_figure, write_title
-from .walls import Walls, draw_walls
+from . import style
+from .style import (
+    GREY,
+    INK,
+    ORANGE,
+    TEAL,
+    EllipseKind,
+    dress,
+    legend_below,
+    new_figure,
+    set_ellipses,
+    write_title,
+)
 
 
 def map_figure(trace: RunTrace, step: int | None = None, walls: Walls = ()) -> Figure:
@@ -234,3 +254,319 @@ def _label_outer_axes(grid: NDArray[np.object_], panels: int) -> None:
             axes.tick_params(labelbottom=last, labelleft=j == 0)
             axes.set_xlabel("x [m]" if last else "")
             axes.set_ylabel("y [m]" if j == 0 else "")
+
+
+# --------------------------------------------------------------------------------------
+# The map picture of the EKF-SLAM homework: poses and landmarks with their ellipses.
+#
+# Predicted poses are magenta and updated ones blue, first landmarks red and later ones
+# green, each with its 3σ ellipse. The kinds also differ by line style, for colour-blind
+# readers.
+
+PREDICTED = EllipseKind("predicted pose, 3σ", "#d216c6", (0, (4, 3)), width=1.2)
+UPDATED = EllipseKind("updated pose, 3σ", "#1d4ed8", fill=0.12, width=1.3)
+FIRST = EllipseKind("landmark at first, 3σ", "#dc1f26", (0, (5, 1.5, 1, 1.5)))
+LATER = EllipseKind("landmark later, 3σ", "#128a3a", fill=0.16, width=1.5)
+_FORMER = EllipseKind("landmark in between", LATER.colour, width=0.6, alpha=0.35)
+
+_MOST_POSES = 60  # ellipses along the path; longer runs show every second, third, …
+_MOST_FORMER = 300  # green ellipses of earlier steps
+_SHORTEST_SIDE = 0.55  # of a map, as a share of its longest
+_ARROW = np.array([[1.0, 0.0], [-0.75, 0.7], [-0.35, 0.0], [-0.75, -0.7]])
+
+
+class _Artists(NamedTuple):
+    """The artists that change with the step, from back to front."""
+
+    former: EllipseCollection
+    later: EllipseCollection
+    first: EllipseCollection
+    estimates: Line2D
+    path: Line2D
+    updated: EllipseCollection
+    predicted: EllipseCollection
+    robot: Polygon
+
+
+class MapPicture:
+    """The artists of the map picture of one run on given axes.
+
+    Parameters
+    ----------
+    axes : Axes
+        The axes.
+    trace : RunTrace
+        The run.
+    scale : float, default 1
+        Scale of lines and markers, smaller for small panels.
+    """
+
+    def __init__(self, axes: Axes, trace: RunTrace, *, scale: float = 1.0) -> None:
+        self._trace = trace
+        self._axes = axes
+        self._first_steps = trace.first_steps()
+        self._truth = self._add_truth(scale)
+        self._artists = self._add_artists(scale)
+
+    @property
+    def moving(self) -> tuple[Artist, ...]:
+        """The artists that `show` changes, from back to front."""
+        return tuple(self._artists)
+
+    def show(self, step: int) -> None:
+        """Draw the run up to and including a step."""
+        artists, trace = self._artists, self._trace
+        steps = np.append(np.arange(0, step, pose_stride(trace)), step)
+        artists.path.set_data(*trace.poses[: step + 1, :2].T)
+        set_ellipses(
+            artists.predicted,
+            trace.predicted_poses[steps, :2],
+            trace.predicted_pose_covariances[steps, :2, :2],
+        )
+        set_ellipses(
+            artists.updated,
+            trace.poses[steps, :2],
+            trace.pose_covariances[steps, :2, :2],
+        )
+        artists.robot.set_xy(self._arrow_at(trace.poses[step]))
+        self._show_landmarks(step)
+
+    def legend_keys(self) -> list[Artist]:
+        """Return the keys of a legend, to be drawn with `ELLIPSE_HANDLER`."""
+        kinds = [PREDICTED, UPDATED, FIRST, LATER]
+        keys: list[Artist] = [kind.legend_key() for kind in kinds]
+        truth = [] if self._trace.true_landmarks is None else [self._truth]
+        return [*keys, self._artists.path, *truth]
+
+    def _show_landmarks(self, step: int) -> None:
+        artists, trace = self._artists, self._trace
+        seen = self._first_steps <= step
+        set_ellipses(
+            artists.first,
+            trace.first_landmarks[seen],
+            trace.first_landmark_covariances[seen],
+        )
+        now = trace.map_at(step)
+        set_ellipses(artists.later, now.means, now.covariances)
+        artists.estimates.set_data(*now.means.T)
+        former = [trace.map_at(k) for k in self._former_steps(step)]
+        set_ellipses(
+            artists.former,
+            np.concatenate([np.empty((0, 2)), *(m.means for m in former)]),
+            np.concatenate([np.empty((0, 2, 2)), *(m.covariances for m in former)]),
+        )
+
+    def _former_steps(self, step: int) -> range:
+        """Return the earlier steps whose landmarks are shown too: few in large maps."""
+        stride = -(-self._trace.last_step * len(self._first_steps) // _MOST_FORMER)
+        return range(0, step, max(1, stride))
+
+    def _arrow_at(self, pose: Array) -> Array:
+        (left, right), (low, high) = self._axes.get_xlim(), self._axes.get_ylim()
+        cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        size = 0.018 * max(right - left, high - low)
+        return np.asarray(
+            pose[:2] + size * _ARROW @ np.array([[cos, sin], [-sin, cos]])
+        )
+
+    def _add_truth(self, scale: float) -> Line2D:
+        truth = self._trace.true_landmarks
+        points = np.empty((0, 2)) if truth is None else truth
+        few = len(points) <= 60
+        (crosses,) = self._axes.plot(
+            *points.T,
+            "+",
+            color=INK,
+            ms=(9 if few else 5) * scale,
+            mew=(1.3 if few else 0.9) * scale,
+            zorder=5,
+            label="true landmark",
+        )
+        return crosses
+
+    def _add_artists(self, scale: float) -> _Artists:
+        axes = self._axes
+        artists = _Artists(
+            former=_FORMER.add_to(axes, scale),
+            later=LATER.add_to(axes, scale),
+            first=FIRST.add_to(axes, scale),
+            estimates=Line2D([], [], ls="", marker=".", ms=3 * scale, c=LATER.colour),
+            path=Line2D([], [], color=GREY, lw=1.1 * scale, label="estimated path"),
+            updated=UPDATED.add_to(axes, scale),
+            predicted=PREDICTED.add_to(axes, scale),
+            robot=Polygon(
+                np.full((1, 2), np.nan), fc=UPDATED.colour, ec="white", lw=0.6
+            ),
+        )
+        for depth, artist in enumerate(artists):
+            artist.set_zorder(2 + 0.1 * depth)
+            if artist.axes is None:
+                axes.add_artist(artist)
+        return artists
+
+
+def pose_stride(trace: RunTrace) -> int:
+    """Return the number of steps between two drawn ellipses of the pose."""
+    return -(-len(trace.t) // _MOST_POSES)
+
+
+def map_limits(trace: RunTrace, walls: Walls = ()) -> Array:
+    """Return a box around a run's poses, landmarks, 3σ ellipses and walls.
+
+    See `box_around`.
+
+    Returns
+    -------
+    ndarray, shape (2, 2)
+        Lower left and upper right corner [m].
+    """
+    truth = trace.true_landmarks
+    points = [trace.poses[:, :2], trace.landmarks, wall_ends(walls)]
+    return box_around(
+        np.concatenate(points if truth is None else [*points, truth]),
+        np.concatenate(
+            [trace.poses[:, :2], trace.predicted_poses[:, :2], trace.first_landmarks]
+        ),
+        np.concatenate(
+            [
+                trace.pose_covariances[:, :2, :2],
+                trace.predicted_pose_covariances[:, :2, :2],
+                trace.first_landmark_covariances,
+            ]
+        ),
+    )
+
+
+def box_around(points: Array, means: Array, covariances: Array) -> Array:
+    """Return a box around points and 3σ ellipses, unless these are much larger.
+
+    Ellipses widen the box of the points by at most a third of its span, so that one
+    uncertain landmark does not make all others tiny.
+
+    Parameters
+    ----------
+    points : ndarray, shape (m, 2)
+        Positions [m]; rows of nan are ignored.
+    means, covariances : ndarray, shapes (k, 2) and (k, 2, 2)
+        Means and covariances of the ellipses [m, m²].
+
+    Returns
+    -------
+    ndarray, shape (2, 2)
+        Lower left and upper right corner [m]; neither side much shorter than the other.
+    """
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    span = max(float((high - low).max()), 1e-3)
+    reach = 3 * np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
+    lowest = (means - reach).min(axis=0, initial=np.inf)
+    highest = (means + reach).max(axis=0, initial=-np.inf)
+    low = np.maximum(np.minimum(low, lowest), low - span / 3)
+    high = np.minimum(np.maximum(high, highest), high + span / 3)
+    size = np.maximum(high - low, (high - low).max() * _SHORTEST_SIDE) + 0.06 * span
+    centre = (low + high) / 2
+    return np.stack([centre - size / 2, centre + size / 2])
+
+
+# --------------------------------------------------------------------------------------
+# The walls of a world in figures.
+
+Walls = Sequence[Sequence[float]]
+"""Rows (x0, y0, x1, y1) [m]."""
+
+
+def wall_ends(walls: Walls) -> Array:
+    """Return the end points of walls, shape (2n, 2) [m]."""
+    return np.reshape(np.asarray(walls, dtype=float), (-1, 2))
+
+
+def draw_walls(axes: Axes, walls: Walls) -> list[Artist]:
+    """Draw walls, and return the keys of a legend: none without walls."""
+    if not len(walls):
+        return []
+    lines = LineCollection(
+        list(wall_ends(walls).reshape(-1, 2, 2)),
+        colors=WALL,
+        linewidths=2.2,
+        capstyle="round",
+        zorder=1.5,
+        label="wall",
+    )
+    axes.add_collection(lines, autolim=False)
+    return [lines]
+
+
+# --------------------------------------------------------------------------------------
+# Figure of a smoothed log: truth, filter and smoother in one map.
+
+_LANDMARK = EllipseKind("smoothed landmark, 3σ", TEAL, fill=0.15)
+_POSE = EllipseKind("smoothed pose, 3σ", style.BLUE, fill=0.12, width=0.9)
+
+
+def smoothed_figure(smoothed: SmoothedLog) -> Figure:
+    """Draw the paths of filter and smoother, the truth, and the smoothed map.
+
+    The truth is moved by the rotation and translation that bring it closest to the
+    smoothed path: many logs have it in a frame of its own.
+
+    Parameters
+    ----------
+    smoothed : SmoothedLog
+        The smoothed log.
+    """
+    drive, trace = smoothed.drive, smoothed.filtered.trace
+    paths = np.concatenate([smoothed.poses[:, :2], trace.poses[:, :2], drive.landmarks])
+    limits = box_around(paths, drive.landmarks, drive.landmark_covariances)
+    width, height = limits[1] - limits[0]
+    figure = style.new_figure(7.2, 6.2 * height / width + 1.6)
+    axes = figure.add_subplot()
+    dress(axes)
+    axes.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    (filtered,) = axes.plot(
+        *trace.poses[:, :2].T, color=ORANGE, lw=1.0, label=f"filter: {trace.estimator}"
+    )
+    (path,) = axes.plot(
+        *smoothed.poses[:, :2].T, color=style.BLUE, lw=1.4, label="smoother"
+    )
+    chosen = np.arange(0, len(drive.poses), -(-len(drive.poses) // _MOST_POSES))
+    covariances = drive.pose_covariances[chosen, :2, :2]
+    style.set_ellipses(_POSE.add_to(axes), drive.poses[chosen, :2], covariances)
+    style.set_ellipses(
+        _LANDMARK.add_to(axes), drive.landmarks, drive.landmark_covariances
+    )
+    axes.plot(*drive.landmarks.T, ".", color=TEAL, ms=3)
+    keys: list[Artist] = [path, filtered, _POSE.legend_key(), _LANDMARK.legend_key()]
+    accuracy = path_accuracy(smoothed.log, trace.t, smoothed.poses)
+    truth = _truth_beside(smoothed, accuracy)
+    if truth is not None:
+        (line,) = axes.plot(*truth.T, "--", color=INK, lw=0.9, label="ground truth")
+        keys.insert(0, line)
+    write_title(axes, f"{smoothed.log.name}, smoothed", _subtitle(smoothed, accuracy))
+    style.legend_below(figure, keys, columns=3)
+    return figure
+
+
+def _truth_beside(
+    smoothed: SmoothedLog, accuracy: PositionAccuracy | None
+) -> Array | None:
+    """Return the true path moved onto the smoothed one, (m, 2), or None."""
+    if accuracy is None:
+        return None
+    truth, times = smoothed.log.ground_truth, smoothed.filtered.trace.t
+    inside = np.isfinite(
+        poses_at(truth[:, 0], np.column_stack([times, smoothed.poses]))
+    ).all(axis=1)
+    angle, shift = accuracy.alignment
+    return np.asarray((truth[inside, 1:3] - shift) @ rotation(angle))
+
+
+def _subtitle(smoothed: SmoothedLog, accuracy: PositionAccuracy | None) -> str:
+    drive, trace = smoothed.drive, smoothed.filtered.trace
+    parts = [f"{len(drive.poses)} poses, {len(drive.landmarks)} landmarks"]
+    filtered = path_accuracy(smoothed.log, trace.t, trace.poses)
+    if accuracy is not None and filtered is not None:
+        parts.append(
+            f"path error, aligned: {accuracy.aligned_rmse:.3g} m, "
+            f"filter {filtered.aligned_rmse:.3g} m"
+        )
+    return "  ·  ".join(parts)

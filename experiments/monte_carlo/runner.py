@@ -5,35 +5,54 @@ nothing else, such as the number of runs, estimators or workers. Runs are simula
 filtered and measured in blocks; a worker computes one block at a time.
 """
 
-from collections.abc import Callable, Generator, Iterable, Mapping
-from contextlib import closing
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from joblib import delayed
+import psutil
+from joblib import Parallel, delayed, effective_n_jobs, parallel_config
+from joblib.parallel import BACKENDS as KNOWN_BACKENDS
+from joblib.parallel import get_active_backend
 
 from ...arrays import Array
 from ...estimator import registry
 from ...estimator.interface import SupportsTruth
 from ...evaluation.error_bound import PosteriorBound
 from ...sim_configs import Scenario, load_scenario
-from ..runs.blas_threads import one_blas_thread
-from ..runs.filter_settings import FilterSettings
-from ..runs.integers import integer
+from ...sim_configs.field_types import unknown_choice
+from ..runs.filter_settings import (
+    EstimatorChoice,
+    FilterSettings,
+    estimator_choices,
+    integer,
+    one_blas_thread,
+)
 from ..runs.simulated_runs import SimulatedRuns, simulate_runs
-from .measure.association_measures import with_known_ids
-from .measure.bounds import bound_runs, noise_of_runs
-from .measure.estimator_choices import EstimatorChoice, estimator_choices
-from .measure.filtered_runs import filter_runs
-from .measure.run_measures import Block, measure_runs
-from .store.job_folder import RESULTS
-from .store.result_blocks import BlockFolder, Job, Span
-from .store.results import dataset_of, load_results, write_results
-from .workers import Workers, engage_workers, saying_what_is_kept
+from .filtered_runs import bound_runs, filter_runs, noise_of_runs
+from .results import (
+    RESULTS,
+    BlockFolder,
+    Job,
+    Span,
+    dataset_of,
+    load_results,
+    write_results,
+)
+from .run_measures import Block, measure_runs, with_known_ids
 
 if TYPE_CHECKING:
     import xarray as xr
+
 
 Progress = Callable[[int, int], object]
 
@@ -262,3 +281,173 @@ def _span(first_run: int, runs: int, block_size: int) -> Span:
             f"{runs}, got {first_run}"
         )
     return Span(first_run, runs)
+
+
+# --------------------------------------------------------------------------------------
+# Engage the workers of a long job: processes, threads, or a cluster.
+
+Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed
+Workers = Callable[[Iterable[Call]], Iterable[Any]]
+
+BACKENDS = ("loky", "threading", "dask", "ray")
+_PATIENCE = 0.5
+"""How long a worker lives on without the process that engaged it [s]."""
+
+
+def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
+    """Return workers that compute calls in any order; None if this process does it all.
+
+    Parameters
+    ----------
+    jobs : int or None
+        Number of workers; -1 for one on each core.
+    backend : str or None
+        One of `BACKENDS`; None for what joblib is configured to use.
+
+    Raises
+    ------
+    ValueError
+        If an argument does not fit, or Ray is not installed.
+    """
+    if backend not in (None, *BACKENDS):
+        raise ValueError(unknown_choice("backend", backend, BACKENDS))
+    if jobs not in (None, -1):
+        integer("jobs", jobs or 0, 1)
+    if backend == "ray":
+        return _ray_workers(None if jobs == -1 else jobs)
+    if backend is None and effective_n_jobs(jobs) == 1:
+        return None
+    return _joblib_workers(jobs, backend)
+
+
+@contextmanager
+def saying_what_is_kept(kept: str) -> Iterator[None]:
+    """Report the loss of a worker process, and which results are kept."""
+    try:
+        yield
+    except BrokenProcessPool as error:
+        raise OSError(
+            f"a worker process was killed, perhaps for lack of memory; {kept}"
+        ) from error
+
+
+def _joblib_workers(jobs: int | None, backend: str | None) -> Workers:
+    chosen: dict[str, Any] = {} if backend is None else {"backend": backend}
+    if jobs is not None or backend is not None:
+        chosen["n_jobs"] = jobs or -1
+    with parallel_config(**chosen):
+        begin: dict[str, Any] = {}
+        if isinstance(get_active_backend()[0], KNOWN_BACKENDS["loky"]):
+            begin = {"initializer": _end_with, "initargs": (os.getpid(),)}
+        workers: Workers = Parallel(
+            return_as="generator_unordered", pre_dispatch="2*n_jobs", **begin
+        )
+        return workers
+
+
+def _end_with(engaging: int) -> None:
+    """Let this worker end when the process that engaged it is gone, and not before.
+
+    A scheduler may send SIGTERM to all processes of a job.  The one that engaged the
+    workers then ends them.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    threading.Thread(target=_watch, args=(engaging,), daemon=True).start()
+
+
+def _watch(engaging: int) -> None:
+    while os.getppid() == engaging and psutil.pid_exists(engaging):
+        time.sleep(_PATIENCE)
+    os._exit(1)
+
+
+def _ray_workers(jobs: int | None) -> Workers:
+    """Engage a cluster's workers by Ray's own pool.
+
+    Ray's backend for joblib returns results only when the last one is complete, so that
+    no block could be written before.
+    """
+    try:
+        from ray.util.multiprocessing import Pool  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise ValueError("backend 'ray' needs ray: pip install ray") from None
+
+    def compute(calls: Iterable[Call]) -> Iterator[Any]:
+        handler = signal.getsignal(signal.SIGTERM)
+        with Pool(jobs) as pool:
+            _handle_sigterm(handler)  # Ray replaces it by one that aborts
+            yield from pool.imap_unordered(_call, calls)
+
+    return compute
+
+
+def _handle_sigterm(handler: Any) -> None:
+    if callable(handler) and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+
+
+def _call(call: Call) -> Any:
+    function, arguments, options = call
+    return function(*arguments, **options)
+
+
+# --------------------------------------------------------------------------------------
+# Write the Python call that reproduces the results of a Monte Carlo.
+
+ASSUMED_FILE = "assumed.toml"
+
+
+def python_call(summary: dict[str, Any]) -> str:
+    """Write the call of ``monte_carlo`` that made a summary.
+
+    The call reads a scenario that is no preset, or a changed one, from a file, and a
+    comment asks to save it first; likewise the scenario whose noise was assumed.
+
+    Parameters
+    ----------
+    summary : dict
+        Result of ``summarise_monte_carlo``.
+    """
+    preset = _is_preset(summary)
+    name = summary["scenario"]
+    world = name if preset else f"{name}.toml"
+    files = [] if preset else [world]
+    arguments = [repr(world), _estimators(summary["estimators"])]
+    first = summary["first_run"]
+    arguments += [f"runs={first + summary['runs']}", f"seed={summary['seed']}"]
+    if summary["assumed_toml"]:
+        files.append(ASSUMED_FILE)
+        arguments.append(f"assumed={ASSUMED_FILE!r}")
+    arguments += [
+        f"{option}={summary[option]}"
+        for option in ("block_size", "resolution", "first_run")
+        if summary[option]
+    ]
+    note = (
+        f"# first save {' and '.join(map(repr, files))}, see below\n" if files else ""
+    )
+    listed = "".join(f"    {argument},\n" for argument in arguments)
+    return (
+        "from slamgym.experiments.monte_carlo import monte_carlo\n\n"
+        f"{note}monte_carlo(\n{listed})"
+    )
+
+
+def _is_preset(summary: dict[str, Any]) -> bool:
+    """Whether the scenario equals the preset of its name."""
+    try:
+        world = load_scenario(tomllib.loads(summary["scenario_toml"]))
+        return bool(world == load_scenario(summary["scenario"]))
+    except ValueError:
+        return False
+
+
+def _estimators(entries: dict[str, Any]) -> str:
+    """Write names alone where they suffice, else labels with (name, options)."""
+    named = {
+        label: (entry.get("name", label), entry.get("options") or {})
+        for label, entry in entries.items()
+    }
+    if all(label == name and not options for label, (name, options) in named.items()):
+        return repr(list(named))
+    return repr(named)

@@ -10,12 +10,24 @@ I      Σ g_s g_sᵀ, the outer product of scores, which estimates the informati
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, IntArray
+from ...arrays import Array, BoolArray, IntArray
+from ...estimator.interface import SlamEstimator
+from ...estimator.kernels.drive_likelihood import DriveEvents
+from ...estimator.map_management.hypotheses import HypothesisSlam
+from ...estimator.map_management.managed_slam import ManagedSlam
+from ...estimator.smoother import Drive, RecordedSlam
+from ...estimator.smoother.drive import Sightings
+from ..logs.recording import predictions, steps_of
+from ..logs.slamlog import OdometryRow, Scan, SlamLog
+from ..runs.filter_settings import SMOOTHER, FilterSettings
+from ..runs.log_replay import Progress, replay
 
 Likelihoods = Callable[[Array], Array]
 """Of parameters (B, p), the log likelihoods (B, S) of the steps."""
@@ -205,3 +217,250 @@ def _step(here: Scores, damping: float) -> Array:
     weights = damping * np.diag(here.information) + FAINT
     step = np.linalg.solve(here.information + np.diag(weights), here.gradient)
     return np.asarray(step, dtype=np.float64)
+
+
+# --------------------------------------------------------------------------------------
+# Associate the readings of a log without identities, and write them into the log.
+
+
+def associated_log(
+    log: SlamLog, settings: FilterSettings, progress: Progress | None = None
+) -> SlamLog:
+    """Return a log with the identities on which a filter decides.
+
+    The landmarks are those of the filter's final map, as for the smoother; readings of
+    others are left out. The odometry between two scans gets the time of the second one.
+    True positions of landmarks are left out, because their ids would be others.
+
+    Parameters
+    ----------
+    log : SlamLog
+        Without identities.
+    settings : FilterSettings
+        Of the filter, with its landmark management.
+    progress : callable, optional
+        Called with (steps done, steps).
+    """
+    options = {**settings.options, "follow": settings.estimator}
+    slam = replace(settings, estimator=SMOOTHER, options=options).make(log.start)
+    replay(log, slam, progress=progress)
+    header = {k: v for k, v in log.header.items() if k != "identities"}
+    return replace(
+        log,
+        header=header,
+        motion="turn-last",
+        events=tuple(_events(log, _recorded(slam))),
+        landmark_ids=np.empty(0, dtype=np.int64),
+        landmarks=np.empty((0, 2)),
+    )
+
+
+def _recorded(slam: SlamEstimator) -> Drive:
+    """Return the drive that a managed smoother has recorded."""
+    inner = slam.best if isinstance(slam, HypothesisSlam) else slam
+    inner = inner.filter if isinstance(inner, ManagedSlam) else inner
+    if not isinstance(inner, RecordedSlam):
+        raise ValueError(f"{type(inner).__name__} records no associations")
+    return inner.recorded()
+
+
+def _events(log: SlamLog, drive: Drive) -> Iterator[OdometryRow | Scan]:
+    """Yield the events of a drive, pose by pose."""
+    motions = [motion.steps for motion in drive.motions]
+    times = _times_after(log, np.cumsum([len(steps) for steps in motions]))
+    for pose, (steps, t) in enumerate(zip(motions, times.tolist(), strict=True)):
+        for distance, turn, dt in steps:
+            yield OdometryRow(t, distance, turn, dt)
+        for readings, ids in _distinct(drive.sightings(pose)):
+            yield Scan(t, readings, ids)
+
+
+def _distinct(sightings: Sightings) -> Iterable[Sightings]:
+    """Split the readings of one pose so that no landmark repeats."""
+    _, which = np.unique(sightings.ids, return_inverse=True)
+    turn = np.array([(which[:k] == j).sum() for k, j in enumerate(which)], dtype=int)
+    for part in range(turn.max(initial=-1) + 1):
+        chosen = turn == part
+        yield Sightings(sightings.measurements[chosen], sightings.ids[chosen])
+
+
+def _times_after(log: SlamLog, counts: IntArray) -> Array:
+    """Return the times after these numbers of predictions."""
+    times, until, done = [], [], 0
+    for step in steps_of(log):
+        done += sum(len(predictions(row, log.motion)) for row in step.motions)
+        times.append(step.t)
+        until.append(done)
+    reached = np.searchsorted(until, counts)
+    return np.array(times)[np.minimum(reached, len(times) - 1)]
+
+
+# --------------------------------------------------------------------------------------
+# The events of a log as arrays for the kernels: motions, readings, landmarks.
+
+Motion = tuple[float, float, float]
+Stretch = tuple[int, int]
+"""Steps of a drive, from the first to before the second."""
+
+
+class TimedEvents(NamedTuple):
+    """The events of a log, and the time of each step."""
+
+    events: DriveEvents
+    times: Array
+    """Shape (S,)."""
+
+
+def events_of(log: SlamLog) -> TimedEvents:
+    """Return the events of a log that identifies its readings, one step of each replay.
+
+    Raises
+    ------
+    ValueError
+        If the log has no scan, no motion, or no landmark that is read twice.
+    """
+    collected, times = _EventList(), []
+    for step in steps_of(log):
+        motions = _motions_of(log, step.motions)
+        scan, sightings = step.scan, None
+        if scan is not None and scan.landmark_ids is not None:
+            sightings = Sightings(scan.measurements, scan.landmark_ids)
+        collected.add(motions, sightings)
+        times.append(step.t)
+    timed = TimedEvents(collected.events(), np.array(times))
+    _refuse_empty(log, timed.events)
+    return timed
+
+
+def without_readings(events: DriveEvents, dropped: BoolArray) -> DriveEvents:
+    """Return the events without some readings, where ``dropped`` (M,) is True."""
+    kept = ~dropped
+    counts = np.concatenate([[0], np.cumsum(kept)])
+    return events._replace(
+        readings=events.readings[kept],
+        landmarks=events.landmarks[kept],
+        first_readings=counts[events.first_readings],
+    )
+
+
+def stretches_of(events: DriveEvents, most: int) -> list[Stretch]:
+    """Cut a drive into consecutive stretches with at most so many landmarks each.
+
+    A step with more landmarks is a stretch of its own.
+    """
+    begins, seen = [0], set[int]()
+    for s in range(len(events.first_readings) - 1):
+        first, end = events.first_readings[s : s + 2]
+        read = set(events.landmarks[first:end].tolist())
+        if seen and len(seen | read) > most:
+            begins.append(s)
+            seen = set()
+        seen |= read
+    return list(pairwise([*begins, len(events.first_readings) - 1]))
+
+
+def parts_of(
+    events: DriveEvents, stretches: Sequence[Stretch]
+) -> tuple[DriveEvents, ...]:
+    """Return stretches of a drive, the landmarks of each numbered from 0."""
+    if len(stretches) == 1:
+        return (events,)
+    return tuple(_part(events, *stretch) for stretch in stretches)
+
+
+def sample_of(
+    events: DriveEvents, stretches: Sequence[Stretch], most_readings: int
+) -> tuple[DriveEvents, list[Stretch]]:
+    """Return evenly spread stretches of a drive as one drive, and where they are there.
+
+    About as many readings as asked remain.
+    """
+    every = int(np.ceil(len(events.readings) / most_readings))
+    chosen = stretches[every // 2 :: every] if every > 1 else stretches
+    ends = np.cumsum([0, *(end - begin for begin, end in chosen)]).tolist()
+    return _joined(events, chosen), list(pairwise(ends))
+
+
+def _joined(events: DriveEvents, stretches: Sequence[Stretch]) -> DriveEvents:
+    def rows(first: IntArray) -> tuple[IntArray, IntArray]:
+        """Return which rows are in the stretches, and where those of a step begin."""
+        spans = [np.arange(first[begin], first[end]) for begin, end in stretches]
+        counts = [np.diff(first[begin : end + 1]) for begin, end in stretches]
+        until = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+        return np.concatenate(spans), until
+
+    motions, first_motions = rows(events.first_motions)
+    readings, first_readings = rows(events.first_readings)
+    return DriveEvents(
+        events.motions[motions],
+        first_motions,
+        events.readings[readings],
+        events.landmarks[readings],
+        first_readings,
+    )
+
+
+def _part(events: DriveEvents, begin: int, end: int) -> DriveEvents:
+    motions = events.first_motions[begin : end + 1]
+    readings = events.first_readings[begin : end + 1]
+    within = slice(readings[0], readings[-1])
+    _, landmarks = np.unique(events.landmarks[within], return_inverse=True)
+    return DriveEvents(
+        events.motions[motions[0] : motions[-1]],
+        motions - motions[0],
+        events.readings[within],
+        landmarks.astype(np.int64),
+        readings - readings[0],
+    )
+
+
+class _EventList:
+    """Collects steps one after the other."""
+
+    def __init__(self) -> None:
+        self.motions: list[Motion] = []
+        self.sightings = [Sightings(np.empty((0, 2)), np.empty(0, dtype=np.int64))]
+        self.until_motions, self.until_readings = [0], [0]
+
+    def add(self, motions: Iterable[Motion], sightings: Sightings | None) -> None:
+        """Append a step."""
+        self.motions += motions
+        count = 0
+        if sightings is not None:
+            self.sightings.append(sightings)
+            count = len(sightings.ids)
+        self.until_motions.append(len(self.motions))
+        self.until_readings.append(self.until_readings[-1] + count)
+
+    def events(self) -> DriveEvents:
+        """Return all steps as arrays, the landmarks numbered by their ids."""
+        readings, ids = zip(*self.sightings, strict=True)
+        _, landmarks = np.unique(np.concatenate(ids), return_inverse=True)
+        return DriveEvents(
+            np.array(self.motions, dtype=np.float64).reshape(-1, 3),
+            np.array(self.until_motions, dtype=np.int64),
+            np.concatenate(readings),
+            landmarks.astype(np.int64),
+            np.array(self.until_readings, dtype=np.int64),
+        )
+
+
+def _motions_of(log: SlamLog, rows: Iterable[OdometryRow]) -> list[Motion]:
+    return [(*u, dt) for row in rows for u, dt in predictions(row, log.motion)]
+
+
+def _refuse_empty(log: SlamLog, events: DriveEvents) -> None:
+    if not len(events.readings):
+        raise ValueError(
+            f"{log.name} holds no scan: without readings of landmarks there are no "
+            "innovations to fit a noise to"
+        )
+    if not events.motions[:, :2].any():
+        raise ValueError(
+            f"{log.name} holds no motion: the noise of a robot at rest cannot be fitted"
+        )
+    if len(np.unique(events.landmarks)) == len(events.landmarks):
+        raise ValueError(
+            f"{log.name} reads no landmark twice: there are no innovations to fit a "
+            "noise to"
+        )

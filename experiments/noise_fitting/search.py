@@ -2,36 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from ...arrays import Array, BoolArray
+from ...estimator.filters.drive_likelihood import GATE, drive_likelihood
+from ...estimator.filters.ekf import EkfSlam
+from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
+from ...estimator.kernels.kalman_gain import GATED
+from ..runs.filter_settings import FilterSettings
 from .intervals import NOT_ZERO, Interval, Verdict, intervals
-from .likelihood import LogLikelihood
-from .noise_vector import (
-    BEARING,
-    ENTRIES,
-    IN_METRES,
-    PER_METRE,
-    RANGE,
-    fitted_entries,
-    positive_start,
-    replaceable_by_zero,
-)
 from .scoring import (
     BETTER,
     FAINT,
     GREATEST,
+    Stretch,
     maximise,
+    parts_of,
     restricted,
+    sample_of,
     scores,
+    stretches_of,
     totals,
+    without_readings,
 )
 
 ROUNDS = 12  # of rejecting readings and fitting the others
 COARSE = 6  # iterations of a round after which readings are rejected anew
 FACTORS = 4.0 ** np.arange(-3, 3)  # of motion and of sensor noise, tried at the start
+
+
+# --------------------------------------------------------------------------------------
+# The noise that a filter assumes, as a vector of seven standard deviations.
+
+BEARING, RANGE, PER_METRE, IN_METRES = 3, 4, 5, 6  # columns of the sensor's noise
+
+
 NEEDLESS = (PER_METRE, IN_METRES)
 EXACT = 1e-6  # [rad, m] below which readings have no noise
 PLAIN = 0.15  # standard deviation of log σ below which it is certainly not zero
@@ -255,3 +265,179 @@ def _table(
         )
         for i, interval in judged.items()
     )
+
+
+class NoiseEntry(NamedTuple):
+    """One standard deviation."""
+
+    name: str
+    unit: str
+    """Of a motion: per unit of the log's time."""
+
+
+ENTRIES = (
+    NoiseEntry("σx", "m"),
+    NoiseEntry("σy", "m"),
+    NoiseEntry("σα", "rad"),
+    NoiseEntry("σβ", "rad"),
+    NoiseEntry("σr", "m"),
+    NoiseEntry("σr per metre", "m/m"),
+    NoiseEntry("σβ in metres", "m"),
+)
+
+SMALL = 0.1  # share of its neighbours at which the search for a zero begins
+
+
+def noise_of(settings: FilterSettings) -> Array:
+    """Return the noise of settings, shape (7,)."""
+    options = settings.options
+    return np.array(
+        [
+            *settings.motion_std,
+            *settings.measurement_std,
+            options.get("range_std_per_metre", 0.0),
+            options.get("bearing_std_metres", 0.0),
+        ]
+    )
+
+
+def with_noise(settings: FilterSettings, noise: Array) -> FilterSettings:
+    """Return settings with another noise (7,), rounded to 4 significant digits."""
+    values = [float(f"{value:.4g}") for value in noise]
+    more = {"range_std_per_metre": values[PER_METRE]}
+    if "bearing_std_metres" in settings.options or values[IN_METRES]:
+        more["bearing_std_metres"] = values[IN_METRES]
+    return replace(
+        settings,
+        motion_std=tuple(values[:3]),
+        measurement_std=tuple(values[BEARING:PER_METRE]),
+        options={**settings.options, **more},
+    )
+
+
+def fitted_entries(noise: Array) -> BoolArray:
+    """Return which entries are fitted, (7,): all, but σβ in metres only if used."""
+    fitted = np.ones(len(ENTRIES), dtype=np.bool_)
+    fitted[IN_METRES] = noise[IN_METRES] > 0
+    return fitted
+
+
+def positive_start(noise: Array, typical_range: float) -> Array:
+    """Replace zeros of a noise (7,) by small numbers, with which a search can begin.
+
+    Examples
+    --------
+    >>> positive_start(np.array([0.1, 0, 0.05, 0.02, 0.1, 0, 0]), 5.0)
+    array([0.1  , 0.01 , 0.05 , 0.02 , 0.1  , 0.002, 0.   ])
+    """
+    start, metres = noise.copy(), max(typical_range, 1e-3)
+    along, turning = noise[:2].max(), noise[2]
+    range_std = max(noise[RANGE], noise[PER_METRE] * metres, 1e-3)
+    bearing_std = max(noise[BEARING], noise[IN_METRES] / metres, 1e-3)
+    instead = (
+        *((SMALL * along or 0.01),) * 2,
+        SMALL * (turning or along or 0.01),
+        SMALL * bearing_std,
+        SMALL * range_std,
+        SMALL * range_std / metres,
+        0.0,
+    )
+    return np.where(start > 0, start, instead)
+
+
+def replaceable_by_zero(noise: Array) -> BoolArray:
+    """Return which entries of a sensor's noise another entry can replace, (7,)."""
+    can = np.zeros(len(ENTRIES), dtype=np.bool_)
+    can[[RANGE, PER_METRE]] = noise[RANGE] > 0 and noise[PER_METRE] > 0
+    can[[BEARING, IN_METRES]] = noise[BEARING] > 0 and noise[IN_METRES] > 0
+    return can
+
+
+# --------------------------------------------------------------------------------------
+# The likelihood of a log's readings as a function of its noise.
+
+MOST_LANDMARKS = 100  # of one map
+MOST_READINGS = 12_000  # of a sample
+SAMPLED_LANDMARKS = 40  # of one map of a sample
+
+
+@dataclass(frozen=True, eq=False)
+class LogLikelihood:
+    """The log likelihood of a drive's readings under a noise, from the innovations.
+
+    A pass of a filter takes a time that grows with the square of its map.  A drive past
+    many landmarks is therefore cut into parts, and each begins with an empty map.
+    """
+
+    filter: EkfSlam
+    """At its start."""
+    events: DriveEvents
+    gate: float = GATE
+    threads: int | None = None
+    most_landmarks: int = MOST_LANDMARKS
+    """Of one part."""
+    stretches: Sequence[Stretch] = ()
+    """The parts, if they are given."""
+
+    @cached_property
+    def parts(self) -> tuple[DriveEvents, ...]:
+        """The parts of the drive."""
+        stretches = self.stretches or stretches_of(self.events, self.most_landmarks)
+        return parts_of(self.events, stretches)
+
+    def sample(self, most_readings: int = MOST_READINGS) -> LogLikelihood:
+        """Return the likelihood of evenly spread parts of a drive with many readings.
+
+        A drive with fewer readings is returned whole.
+        """
+        if len(self.events.readings) <= most_readings:
+            return self
+        stretches = stretches_of(self.events, SAMPLED_LANDMARKS)
+        if len(stretches) == 1:
+            return self
+        events, chosen = sample_of(self.events, stretches, most_readings)
+        return replace(self, events=events, stretches=chosen)
+
+    def of(self, noises: Array) -> Array:
+        """Return the log likelihoods of the steps (B, S) under noises (B, 7)."""
+        return self._passes(noises, keep_beliefs=False).log_likelihoods
+
+    def record(self, noises: Array) -> DriveRecord:
+        """Return the full records of the passes under noises (B, 7).
+
+        The poses of each part begin where the filter does.
+        """
+        return self._passes(noises, keep_beliefs=True)
+
+    def _passes(self, noises: Array, *, keep_beliefs: bool) -> DriveRecord:
+        records = [
+            drive_likelihood(
+                self.filter,
+                part,
+                noises,
+                gate=self.gate,
+                keep_beliefs=keep_beliefs,
+                threads=self.threads,
+            )
+            for part in self.parts
+        ]
+        if len(records) == 1:
+            return records[0]
+        rejected = np.sum([record.rejected for record in records], axis=0)
+        joined = (
+            entries[0] if entries[0].ndim == 1 else np.concatenate(entries, axis=1)
+            for entries in zip(*records, strict=True)
+        )
+        return DriveRecord(*joined)._replace(rejected=rejected)
+
+    def rejected(self, noise: Array) -> BoolArray:
+        """Return which readings the gate rejects under a noise (7,), shape (M,)."""
+        return np.asarray(self.record(noise[None]).outcomes[0] == GATED)
+
+    def without(self, dropped: BoolArray) -> LogLikelihood:
+        """Return the likelihood of all but some readings, without a gate.
+
+        It is smooth: no reading is rejected here and accepted there.
+        """
+        kept = without_readings(self.events, dropped)
+        return replace(self, events=kept, gate=np.inf)

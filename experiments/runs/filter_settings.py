@@ -2,22 +2,44 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
+import marshal
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
 from ...estimator import registry
-from ...estimator.interface import SlamEstimator
-from ...estimator.registry import read_label
+from ...estimator.interface import (
+    SlamEstimator,
+    SupportsBeliefLimit,
+    SupportsMemoryEstimate,
+)
+from ...estimator.registry import (
+    EstimatorFactory,
+    find_estimator,
+    list_estimators,
+    read_label,
+    register_estimator,
+    split_labels,
+)
+from ...estimator.support.argument_checks import refuse_large_belief
+from ...estimator.support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ...sim_configs import Scenario
 from ...suggestions import closest
-from ..logs.events import Scan
-from ..logs.lines import LogError
 from ..logs.recording import log_header
-from ..logs.slamlog import SlamLog
+from ..logs.slamlog import LogError, Scan, SlamLog
+
+if TYPE_CHECKING:
+    from .simulated_runs import SimulatedRuns
+
 
 SMOOTHER = "slamgym.estimator.smoother.recorded_slam:SmoothingSlam"
 """Import path of the smoother; its option ``follow`` names the filter that it follows,
@@ -291,3 +313,266 @@ def _flag(name: str, key: str, text: str) -> bool:
     if text not in ("true", "false"):
         raise LogError(f"{name}: {key} must be true or false, got {text!r}")
     return text == "true"
+
+
+# --------------------------------------------------------------------------------------
+# Parse which estimators a Monte Carlo compares.
+
+_PACKAGE = Path(registry.__file__).resolve().parents[1]
+OWN_NAMES = frozenset(list_estimators())
+"""Names that stay those of slamgym's own estimators."""
+
+
+class EstimatorChoice(NamedTuple):
+    """An estimator and its label in the results."""
+
+    label: str
+    name: str
+    """Registered name or "module:Class"."""
+    options: Mapping[str, Any] = {}
+    """Arguments of its constructor other than the noise."""
+
+    def code(self) -> str:
+        """Return a digest of the user's own source; empty for slamgym's estimators."""
+        estimator = find_estimator(self.name)
+        try:
+            source = inspect.getsourcefile(estimator)
+        except TypeError:
+            return ""
+        except OSError:  # written in a notebook or an interpreter: no file
+            return _digest(_code_of_methods(estimator))
+        if source is None or Path(source).resolve().is_relative_to(_PACKAGE):
+            return ""
+        return _digest(Path(source).read_bytes())
+
+    def settings(self, scenario: Scenario) -> FilterSettings:
+        """Return its settings for the noise of a world."""
+        return settings_for_scenario(
+            scenario, estimator=self.name, options=self.options
+        )
+
+
+def _digest(code: bytes) -> str:
+    return hashlib.sha256(code).hexdigest()[:12]
+
+
+def _code_of_methods(estimator: object) -> bytes:
+    """Return the compiled code of a class's own methods."""
+    members = sorted(vars(estimator).items())
+    return b"".join(
+        marshal.dumps(member.__code__)
+        for _, member in members
+        if inspect.isfunction(member)
+    )
+
+
+def estimator_choices(
+    estimators: str | Iterable[str | EstimatorFactory] | Mapping[str, Any],
+) -> tuple[EstimatorChoice, ...]:
+    """Parse estimators from names, classes or labels.
+
+    Parameters
+    ----------
+    estimators : str, iterable of str, or mapping
+        Names separated by commas, with optional options in brackets; or several such
+        texts or classes; or a mapping from labels to a name, a class, or a pair (name,
+        options).
+
+    Raises
+    ------
+    ValueError
+        If there is none, one is unknown or malformed, or a label occurs twice.
+
+    Examples
+    --------
+    >>> for choice in estimator_choices("ekf,invariant[iterations=3]"):
+    ...     print(choice)
+    EstimatorChoice(label='ekf', name='ekf', options={})
+    EstimatorChoice(label='invariant[iterations=3]', name='invariant', \
+options={'iterations': 3})
+    """
+    if not isinstance(estimators, Iterable):
+        raise ValueError(
+            "estimators must be names, labels, or labels mapped to classes, "
+            f"got {estimators!r}"
+        )
+    choices = _choices(estimators)
+    if not choices:
+        raise ValueError("estimators must name at least one, got none")
+    labels = [choice.label for choice in choices]
+    for choice in choices:
+        if labels.count(choice.label) > 1:
+            raise ValueError(f"estimators must differ, got '{choice.label}' twice")
+    for choice in choices:
+        find_estimator(choice.name)
+    return tuple(choices)
+
+
+def _choices(
+    estimators: str | Iterable[str | EstimatorFactory] | Mapping[str, Any],
+) -> list[EstimatorChoice]:
+    if isinstance(estimators, Mapping):
+        return [_labelled(label, what) for label, what in estimators.items()]
+    several = [estimators] if isinstance(estimators, str) else estimators
+    return [choice for one in several for choice in _unlabelled(one)]
+
+
+def _unlabelled(what: Any) -> list[EstimatorChoice]:
+    """Read names separated by commas, or a class, whose name is then its label."""
+    if isinstance(what, str):
+        return [_read(label) for label in split_labels(what)]
+    label = getattr(what, "__name__", None)
+    if not (callable(what) and label):
+        raise ValueError(f"estimators must be names or classes, got {what!r}")
+    return [_labelled(label, what)]
+
+
+def _read(label: str) -> EstimatorChoice:
+    name, options = read_label(label)
+    return EstimatorChoice(label, OFFLINE.get(name, name), options)
+
+
+def _labelled(label: str, what: Any) -> EstimatorChoice:
+    if isinstance(what, str):
+        return _read(what)._replace(label=label)
+    if isinstance(what, tuple) and len(what) == 2:
+        name, options = what
+        return EstimatorChoice(label, _name_of(label, name), options)
+    return EstimatorChoice(label, _name_of(label, what))
+
+
+def _name_of(label: str, what: str | Callable[..., Any]) -> str:
+    """Return the import path of a class, or register what cannot be imported."""
+    if isinstance(what, str):
+        return OFFLINE.get(what, what)
+    module, name = getattr(what, "__module__", ""), getattr(what, "__qualname__", "")
+    path = f"{module}:{name}"
+    if module != "__main__" and name.isidentifier():
+        return path
+    name = label if label not in OWN_NAMES else f"{label} of yours"
+    register_estimator(name, what)
+    return name
+
+
+# --------------------------------------------------------------------------------------
+# Check whether the maps of a job fit into memory, before the filters run.
+
+
+def refuse_large_map(log: SlamLog, estimator: SlamEstimator) -> None:
+    """Refuse a log with more landmarks than memory holds for this filter.
+
+    The check counts the least memory of a run: the filter's map and the final belief of
+    the landmarks that the log names. It accepts a log without names, and a filter that
+    does not estimate its memory (``memory_for``).
+
+    Raises
+    ------
+    ValueError
+        If they exceed the filter's ``belief_limit``.
+    MemoryError
+        With the required and the available memory.
+    """
+    scans = [event.landmark_ids for event in log.events if isinstance(event, Scan)]
+    named = [ids for ids in scans if ids is not None]
+    if not named:
+        return
+    landmarks = len(np.unique(np.concatenate(named)))
+    _refuse_beyond_limit(landmarks, estimator)
+    if not isinstance(estimator, SupportsMemoryEstimate):
+        return
+    refuse_beyond_memory(
+        f"a map of the {landmarks} landmarks that {log.name} reads",
+        estimator.memory_for(landmarks) + covariance_bytes(landmarks),
+        "take fewer steps, or landmarks",
+    )
+
+
+def refuse_large_maps(
+    runs: "SimulatedRuns", estimator: SlamEstimator, *, at_once: bool
+) -> None:
+    """Refuse runs with more landmarks than memory holds for this filter.
+
+    Parameters
+    ----------
+    runs : SimulatedRuns
+        Input of the filters.
+    estimator : SlamEstimator
+        One of them.
+    at_once : bool
+        Whether all filters are in memory together; the final beliefs always are.
+
+    Raises
+    ------
+    ValueError
+        If they exceed the filter's ``belief_limit``.
+    MemoryError
+        With the required and the available memory.
+    """
+    read = runs.identified().visible.any(axis=1).sum(axis=1).tolist()  # by each run
+    _refuse_beyond_limit(max(read), estimator)
+    if not isinstance(estimator, SupportsMemoryEstimate):
+        return
+    maps = [estimator.memory_for(landmarks) for landmarks in read]
+    beliefs = sum(covariance_bytes(landmarks) for landmarks in read)
+    refuse_beyond_memory(
+        f"a block of {len(read)} runs that read up to {max(read)} landmarks each",
+        beliefs + (sum(maps) if at_once else max(maps)),
+        "take a smaller block_size, or fewer steps",
+    )
+
+
+def _refuse_beyond_limit(landmarks: int, estimator: SlamEstimator) -> None:
+    """Refuse a run with more landmarks than the filter's belief may hold."""
+    if isinstance(estimator, SupportsBeliefLimit):
+        refuse_large_belief(landmarks, estimator.belief_limit, "take fewer steps")
+
+
+# --------------------------------------------------------------------------------------
+# Check integers that files store.
+
+_LARGEST = 2**63 - 1  # of int64
+
+
+def integer(name: str, value: object, least: int) -> int:
+    """Check an integer that fits int64, and return it as int.
+
+    Raises
+    ------
+    ValueError
+        If it is none, or is too small or too large.
+
+    Examples
+    --------
+    >>> integer("seed", np.int64(3), 0)
+    3
+    """
+    whole = int(value) if isinstance(value, int | np.integer) else None
+    if whole is None or isinstance(value, bool) or whole < least:
+        raise ValueError(f"{name} must be an integer >= {least}, got {value!r}")
+    if whole > _LARGEST:
+        raise ValueError(f"{name} must be at most {_LARGEST}, got {whole}")
+    return whole
+
+
+# --------------------------------------------------------------------------------------
+# Limit BLAS to one thread, which is fastest for the small products of filters.
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """Run linear algebra on one thread within the context.
+
+    Several threads are many times slower on shared cores, and the last bits of a
+    product depend on their number.
+
+    Examples
+    --------
+    >>> from threadpoolctl import threadpool_info
+    >>> with one_blas_thread():
+    ...     pools = [pool for pool in threadpool_info() if pool["user_api"] == "blas"]
+    >>> {pool["num_threads"] for pool in pools}
+    {1}
+    """
+    import scipy.linalg  # noqa: F401, PLC0415 (loads the BLAS to be limited)
+
+    limits: AbstractContextManager[Any] = threadpool_limits(1, user_api="blas")
+    return limits

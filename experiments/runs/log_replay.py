@@ -1,15 +1,21 @@
 """Feed a log to an estimator, and keep what it believes at every step."""
 
+from __future__ import annotations
+
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
+from typing import NamedTuple, overload
 
 import numpy as np
 
 from ...arrays import Array
 from ...estimator.interface import (
     Belief,
+    MapView,
     SlamEstimator,
     SupportsJoin,
     SupportsTruth,
@@ -17,24 +23,44 @@ from ...estimator.interface import (
 )
 from ...estimator.map_management.hypotheses import HypothesisSlam
 from ...estimator.map_management.managed_slam import ManagedSlam
-from ...estimator.map_management.map_editor import marginal_without_joining
-from ..logs.anonymous import hides_identities, true_ids_of
-from ..logs.events import Scan
-from ..logs.ground_truth import true_poses_of
-from ..logs.slamlog import SlamLog
-from ..logs.steps import Step, predictions, steps_of
-from .association import DecisionRecorder, RunDecisions
-from .blas_threads import one_blas_thread
-from .map_history import MapHistory
-from .memory_check import refuse_large_map
-from .run_recorder import MapChanges, ReadingCounts, RunRecorder
-from .trace import RunTrace
+from ...estimator.map_management.map_editor import (
+    mapped_ids,
+    marginal_without_joining,
+    view_map,
+)
+from ..logs.ground_truth import (
+    hides_identities,
+    true_ids_of,
+    true_landmarks_of,
+    true_poses_of,
+)
+from ..logs.recording import Step, predictions, steps_of
+from ..logs.slamlog import Scan, SlamLog
+from .filter_settings import one_blas_thread, refuse_large_map
+from .trace import DecisionRecorder, MapEstimate, RunDecisions, RunTrace
 
 Progress = Callable[[int, int], object]
 Watcher = Callable[[int, SlamEstimator, UpdateReport | None], object]
 
 _MOST_MAPS = 500  # kept of a run by default
 _MOST_JOINED = 50  # the same where each must be joined from submaps
+
+
+# --------------------------------------------------------------------------------------
+# Record what an estimator believes during a run, step by step, as a trace.
+
+
+class MapChanges(NamedTuple):
+    """Changes of the map of a run other than added landmarks."""
+
+    confirmed: int = 0
+    """Tentative landmarks that were confirmed."""
+    removed: int = 0
+    """Landmarks marginalised."""
+    merged: int = 0
+    """Landmarks merged into another one."""
+    most: int = 0
+    """Largest size of the map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,3 +248,236 @@ def _naming_time(log: SlamLog, step: Step) -> Iterator[None]:
 
 def _ids(scan: Scan) -> list[int] | None:
     return None if scan.landmark_ids is None else scan.landmark_ids.tolist()
+
+
+class ReadingCounts(NamedTuple):
+    """The readings of a log, counted by what became of them."""
+
+    associated: int = 0
+    """Corrected the belief."""
+    added: int = 0
+    """Added a landmark to the map."""
+    rejected: int = 0
+    """Rejected by the chi-square gate."""
+    skipped: int = 0
+    """Too close to use."""
+    near: int = 0
+    """Associated ones within 10 σ of the robot, where linearisation is poor."""
+    tentative: int = 0
+    """Supported landmarks that are not yet confirmed."""
+    ambiguous: int = 0
+    """Fitted more than one landmark."""
+
+
+class RunRecorder:
+    """Collect beliefs and reports, step by step, into the arrays of a trace."""
+
+    def __init__(self, slam: SlamEstimator, steps: int, history: MapHistory) -> None:
+        self._slam, self._steps = slam, steps
+        self._predicted = _PoseTrack(steps)
+        self._updated = _PoseTrack(steps)
+        self._nis = np.zeros(steps)
+        self._dof = np.zeros(steps, dtype=np.int64)
+        self._history = history
+        self._first: dict[int, tuple[Array, Array]] = {}
+        self._first_covariance: Array | None = None
+        self._readings: Counter[str] = Counter()
+        self._changes: Counter[str] = Counter()
+        self._ids: tuple[int, ...] = ()
+        self.last_seen: dict[int, int] = {}
+        """The step of the last reading of each landmark."""
+
+    def add(self, predicted: Belief, report: UpdateReport | None) -> None:
+        """Record one step, after the scan at its end."""
+        step = len(self._history)
+        self._predicted.put(step, predicted)
+        updated = predicted
+        if report is not None:
+            updated = marginal_without_joining(self._slam, ())
+            self._nis[step] = report.nis
+            self._dof[step] = report.degrees_of_freedom
+            self._count(report)
+            seen = (*report.associated_ids, *report.added_ids)
+            self.last_seen |= dict.fromkeys(seen, step)
+            self._keep_new(mapped_ids(self._slam))
+        self._updated.put(step, updated)
+        if step == self._steps - 1:
+            self.belief = self._slam.belief()
+            if isinstance(
+                self._slam, SupportsJoin
+            ):  # the joined map corrects the pose too
+                self._updated.put(step, self.belief)
+        if step == self._steps - 1 or self._history.is_due(step, self._ids):
+            self._history.append(view_map(self._slam))
+        else:
+            self._history.leave_out()
+
+    def counts(self) -> ReadingCounts:
+        """Count the readings."""
+        return ReadingCounts(**self._readings)
+
+    def changes(self) -> MapChanges:
+        """Count the changes of the map."""
+        return MapChanges(**self._changes)
+
+    def _count(self, report: UpdateReport) -> None:
+        for outcome in ("associated", "added", "rejected", "skipped", "near"):
+            self._readings[outcome] += len(getattr(report, f"{outcome}_ids"))
+        self._readings["tentative"] += len(report.tentative_rows)
+        self._readings["ambiguous"] += len(report.ambiguous_rows)
+        for change in ("confirmed", "removed", "merged"):
+            self._changes[change] += len(getattr(report, f"{change}_ids"))
+
+    def trace(
+        self,
+        name: str,
+        times: Array,
+        log: SlamLog,
+        identities: Mapping[int, int] | None = None,
+    ) -> RunTrace:
+        """Return the trace of the run; identities are those of its own landmarks."""
+        belief = self.belief
+        first = [self._first[i] for i in belief.landmark_ids]
+        first_covariance = self._first_covariance
+        if first_covariance is None:
+            first_covariance = self._updated.covariances[0]
+        return RunTrace(
+            estimator=name,
+            t=times,
+            time_unit="steps" if _counts_steps(times) else "s",
+            frame=belief.frame,
+            predicted_poses=self._predicted.poses,
+            predicted_pose_covariances=self._predicted.covariances,
+            poses=self._updated.poses,
+            pose_covariances=self._updated.covariances,
+            true_poses=true_poses_of(log, times),
+            nis=self._nis,
+            nis_dof=self._dof,
+            landmark_ids=np.array(belief.landmark_ids, dtype=np.int64),
+            landmarks=belief.landmarks,
+            first_landmarks=np.array([mean for mean, _ in first]).reshape(-1, 2),
+            first_landmark_covariances=np.array([P for _, P in first]).reshape(
+                -1, 2, 2
+            ),
+            landmark_history=self._history,
+            true_landmarks=true_landmarks_of(
+                log, belief.landmark_ids, belief.landmarks, identities
+            ),
+            first_covariance=first_covariance,
+            final_covariance=belief.covariance,
+        )
+
+    def _keep_new(self, ids: tuple[int, ...]) -> None:
+        """Keep landmarks as they are when they enter the map."""
+        if ids == self._ids:
+            return
+        new = [i for i in ids if i not in self._first]
+        belief = marginal_without_joining(self._slam, new)
+        if self._first_covariance is None:
+            self._first_covariance = belief.covariance
+        pairs = zip(belief.landmarks, belief.landmark_covariances, strict=True)
+        self._first |= dict(zip(new, pairs, strict=True))
+        self._ids = ids
+        self._changes["most"] = max(self._changes["most"], len(ids))
+
+
+class _PoseTrack:
+    """Poses (steps, 3) and their covariances (steps, 3, 3)."""
+
+    def __init__(self, steps: int) -> None:
+        self.poses = np.empty((steps, 3))
+        self.covariances = np.empty((steps, 3, 3))
+
+    def put(self, step: int, belief: Belief) -> None:
+        self.poses[step] = belief.pose
+        self.covariances[step] = belief.pose_covariance
+
+
+def _counts_steps(times: Array) -> bool:
+    return bool((times == np.arange(len(times))).all())
+
+
+# --------------------------------------------------------------------------------------
+# The maps of a run after every step, or after a limited number of steps.
+
+
+class MapHistory(Sequence[MapEstimate]):
+    """The maps of a run, one per step; a step without one has the map before it.
+
+    Parameters
+    ----------
+    most : int, optional
+        Number of maps to keep, evenly spaced over the run; all by default. The first
+        map with a landmark and the latest one are kept in addition.
+
+    Examples
+    --------
+    >>> history = MapHistory(most=2)
+    >>> for x in range(5):
+    ...     history.append(Belief(np.array([0, 0, 0, x, 0.0]), np.eye(5), (7,)))
+    >>> [float(landmarks.means[0, 0]) for landmarks in history]
+    [0.0, 0.0, 2.0, 2.0, 4.0]
+    """
+
+    def __init__(self, most: int | None = None) -> None:
+        self._most = most
+        self._stride = 1
+        self._kept: dict[int, MapEstimate] = {}
+        self._first_map: int | None = None
+        self._length = 0
+
+    def append(self, belief: Belief | MapView) -> None:
+        """Append the belief after the next step."""
+        step = self._length
+        ids = belief.ids if isinstance(belief, MapView) else belief.landmark_ids
+        self._latest = MapEstimate(
+            np.array(ids, dtype=np.int64),
+            belief.landmarks.copy(),
+            belief.landmark_covariances,
+        )
+        is_due = self.is_due(step, ids)
+        if ids and self._first_map is None:
+            self._first_map = step
+        if is_due:
+            self._kept[step] = self._latest
+            self._thin()
+        self._length += 1
+
+    def leave_out(self) -> None:
+        """Skip the next step, which must be neither due nor the last."""
+        self._length += 1
+
+    def is_due(self, step: int, ids: Sequence[int]) -> bool:
+        """Whether the map of a step will be kept; ``ids`` are the landmarks in it."""
+        is_first_map = self._first_map is None and len(ids) > 0
+        return is_first_map or self._is_due(step)
+
+    @overload
+    def __getitem__(self, index: int) -> MapEstimate: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[MapEstimate]: ...
+    def __getitem__(self, index: int | slice) -> MapEstimate | Sequence[MapEstimate]:
+        """Return the map after a step, or the latest kept one before it."""
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(self._length))]
+        step = range(self._length)[index]
+        if step == self._length - 1:
+            return self._latest
+        kept = list(self._kept)
+        return self._kept[kept[bisect_right(kept, step) - 1]]
+
+    def __len__(self) -> int:
+        """Return the number of steps, kept or not."""
+        return self._length
+
+    def _is_due(self, step: int) -> bool:
+        return step % self._stride == 0 or step == self._first_map
+
+    def _thin(self) -> None:
+        """Drop every second map if there are too many."""
+        if self._most is None or len(self._kept) <= self._most + 1:
+            return
+        self._stride *= 2
+        self._kept = {
+            step: kept for step, kept in self._kept.items() if self._is_due(step)
+        }

@@ -13,12 +13,10 @@ from ...estimator.smoother import SmoothedDrive
 from ...estimator.smoother.batch_smoother import smoother_in
 from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
+from ..logs.recording import predictions, steps_of
 from ..logs.slamlog import SlamLog
-from ..logs.steps import predictions, steps_of
-from .blas_threads import one_blas_thread
-from .filter_settings import FilterSettings
+from .filter_settings import FilterSettings, one_blas_thread
 from .log_replay import Progress, Replay, replay
-from .nan_statistics import finite
 from .summary import (
     accuracy_of,
     map_accuracy,
@@ -27,6 +25,7 @@ from .summary import (
     rmse_table,
     settings_table,
 )
+from .trace import finite
 
 
 @dataclass(frozen=True, eq=False)

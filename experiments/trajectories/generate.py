@@ -1,37 +1,41 @@
 """Generate trajectories shard by shard, and continue after an interruption."""
 
+from __future__ import annotations
+
+import tempfile
 from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short_repr
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from ...envs.controllers import CONTROLLERS
+from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.field_types import unknown_choice
-from ..runs.integers import integer
-from .dataset import is_whole
-from .formats import trajectory_format
-from .job_options import (
-    check_estimator,
-    checked_smallest_std,
-    default_episodes_per_shard,
-)
+from ..runs.filter_settings import integer, one_blas_thread
+from .formats import TrajectoryFormat, trajectory_format
 from .manifest import (
     MANIFEST,
     Job,
     Manifest,
     ShardEntry,
+    checksum,
+    claimed,
+    is_whole,
+    naming,
+    put_in_place,
     read_manifest,
+    staging_folder,
+    versions_now,
     write_manifest,
 )
-from .shard_folder import claimed, naming, put_in_place, staging_folder
-from .shard_work import MadeShard, ShardWork, make_shard, versions_of
 
 if TYPE_CHECKING:
-    from ..monte_carlo.workers import Workers
+    from ..monte_carlo.runner import Workers
+
 
 Progress = Callable[[int, int], object]
 
@@ -139,7 +143,7 @@ def generate_trajectories(
 def _engaged(jobs: int | None, backend: str | None) -> "Workers | None":
     if jobs is None and backend is None:
         return None
-    from ..monte_carlo.workers import engage_workers  # noqa: PLC0415 (loads joblib)
+    from ..monte_carlo.runner import engage_workers  # noqa: PLC0415 (loads joblib)
 
     return engage_workers(jobs, backend)
 
@@ -181,7 +185,7 @@ def _made(
     if workers is None:
         yield from (work.make(number, bar.advance) for number in numbers)
         return
-    from ..monte_carlo.workers import saying_what_is_kept  # noqa: PLC0415
+    from ..monte_carlo.runner import saying_what_is_kept  # noqa: PLC0415
 
     kept = f"whole shards stay in {work.staging.parent}, the same command continues"
     with saying_what_is_kept(kept):
@@ -244,3 +248,182 @@ class _Bar:
     def skip(self, episodes: int) -> None:
         """Count episodes of earlier calls."""
         self._done += episodes * self._steps
+
+
+# --------------------------------------------------------------------------------------
+# Drive and write single shards, in this process or in a worker.
+
+
+class MadeShard(NamedTuple):
+    """A shard in a staging folder, or its content."""
+
+    number: int
+    """Its place in the data set, from 0."""
+    entry: ShardEntry
+    files: dict[str, bytes] | None
+    """Content of its files by their relative paths ("." for a shard that is one file);
+    None if the shard stands in the staging folder."""
+
+
+@dataclass(frozen=True)
+class ShardWork:
+    """All that a worker needs to make any shard of a data set.
+
+    Attributes
+    ----------
+    job : Job
+        The data set.
+    versions : dict of str to str
+        Versions in its manifest; a worker with other ones refuses to work.
+    staging : Path
+        Absolute folder for shards that are not in place yet. A worker on a machine
+        without it sends the files instead.
+    """
+
+    job: Job
+    versions: dict[str, str]
+    staging: Path
+
+    def make(
+        self, number: int, progress: Callable[[int], object] | None = None
+    ) -> MadeShard:
+        """Drive and write the episodes of a shard.
+
+        Parameters
+        ----------
+        number : int
+            Which shard, from 0.
+        progress : callable, optional
+            Called with the number of steps just done, in all episodes together.
+
+        Raises
+        ------
+        ValueError
+            If this machine has other versions than the manifest.
+        """
+        here = versions_of(self.job)
+        if here != self.versions:
+            raise ValueError(
+                f"a worker has the versions {here}, the data set {self.versions}: both "
+                "must be equal, for equal bytes"
+            )
+        if self.staging.is_dir():
+            return MadeShard(number, self._write(number, self.staging, progress), None)
+        with tempfile.TemporaryDirectory() as folder:
+            entry = self._write(number, Path(folder), progress)
+            return MadeShard(number, entry, _content(_place(Path(folder), entry)))
+
+    def fetch(self, made: MadeShard) -> Path:
+        """Return the path of a made shard in the staging folder."""
+        path = _place(self.staging, made.entry)
+        if made.files is not None:
+            for name, content in made.files.items():
+                file = path / name
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_bytes(content)
+        return path
+
+    def _write(
+        self, number: int, staging: Path, progress: Callable[[int], object] | None
+    ) -> ShardEntry:
+        # The process that engages workers never loads the simulator.
+        from .driven_episodes import drive_episodes  # noqa: PLC0415
+
+        job, layout = self.job, trajectory_format(self.job.format)
+        episodes = job.episodes_of(number)
+        name = f"shard_{number:05d}{layout.ENDING}"
+        seeds = [job.seed + episode for episode in episodes]
+        trajectories = drive_episodes(
+            job.scenario, job.controller, seeds, progress=progress
+        )
+        if job.estimator is not None:
+            from .driven_episodes import with_beliefs  # noqa: PLC0415
+
+            name_of = job.estimator
+            trajectories = [with_beliefs(each, name_of) for each in trajectories]
+        partial = staging / str(episodes.start) / name
+        partial.parent.mkdir()
+        options = {name: getattr(job, name) for name in layout.OPTIONS}
+        layout.write(trajectories, partial, **options)
+        return ShardEntry(name, episodes.start, len(episodes), checksum(partial))
+
+
+def versions_of(job: Job) -> dict[str, str]:
+    """Return the versions that determine the bits of a job on this machine."""
+    kernels = () if job.estimator is None else ("numba",)
+    return versions_now((*trajectory_format(job.format).LIBRARIES, *kernels))
+
+
+def make_shard(work: ShardWork, number: int) -> MadeShard:
+    """Make a shard in a worker, on one thread."""
+    with one_blas_thread():
+        return work.make(number)
+
+
+def _place(staging: Path, entry: ShardEntry) -> Path:
+    return staging / str(entry.first_episode) / entry.name
+
+
+def _content(shard: Path) -> dict[str, bytes]:
+    files = [shard] if shard.is_file() else shard.rglob("*")
+    return {
+        file.relative_to(shard).as_posix(): file.read_bytes()
+        for file in files
+        if file.is_file()
+    }
+
+
+# --------------------------------------------------------------------------------------
+# Options of a data set that depend on its format or its scenario.
+
+_MOST_EPISODES = 100
+_MOST_MEMORY = 256e6  # [bytes] of a shard
+
+
+def checked_smallest_std(
+    format: str, layout: TrajectoryFormat, given: float | None
+) -> float | None:
+    """Return the smallest standard deviation that a format writes, if it has one."""
+    usual = layout.OPTIONS.get("smallest_std")
+    if given is None:
+        return usual
+    if usual is None:
+        raise ValueError(
+            f"smallest_std is of the format 'g2o': format '{format}' writes no noise"
+        )
+    if not 0 < given < float("inf"):
+        raise ValueError(f"smallest_std must be a finite number > 0, got {given!r}")
+    return float(given)
+
+
+def check_estimator(
+    world: Scenario, format: str, layout: TrajectoryFormat, estimator: str | None
+) -> None:
+    """Refuse a filter that cannot be, and a format that does not hold beliefs."""
+    if estimator is None:
+        return
+    if not isinstance(estimator, str):
+        raise TypeError(f"estimator must be the name of a filter, got {estimator!r}")
+    if not layout.HOLDS_BELIEFS:
+        raise ValueError(
+            f"estimator must be None for format '{format}', which holds no beliefs "
+            f"(npz, parquet and minari do), got {estimator!r}"
+        )
+    from .driven_episodes import belief_settings  # noqa: PLC0415 (loads the filters)
+
+    belief_settings(world, estimator).make((0.0, 0.0, 0.0))
+
+
+def default_episodes_per_shard(scenario: Scenario, *, beliefs: bool = False) -> int:
+    """Return how many episodes of a scenario a shard holds by default.
+
+    Examples
+    --------
+    >>> from slamgym.sim_configs import load_scenario
+    >>> default_episodes_per_shard(load_scenario("loop"))
+    100
+    """
+    row = 25 * count_rows(scenario) + 57  # bytes of one moment
+    if beliefs:
+        row += 56 * count_rows(scenario) + 96
+    return int(max(1, min(_MOST_EPISODES, _MOST_MEMORY // (row * scenario.steps))))

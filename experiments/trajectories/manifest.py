@@ -6,21 +6,32 @@ every shard with its SHA-256. It holds no date and no path: the same job gives t
 bytes.
 """
 
+import contextlib
 import hashlib
 import json
+import os
 import platform
-from collections.abc import Iterable
+import re
+import secrets
+import shutil
+import time
+import warnings
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ... import __version__
 from ...sim_configs import Scenario
 from ...sim_configs.atomic_file import replace_when_written
 from ...sim_configs.scenario_files import scenario_text
-from ..runs.integers import integer
-from .trajectory import scenario_from_text
+from ...suggestions import closest
+from ..runs.filter_settings import integer
+from ..runs.own_files import files_below, locked_folder, set_aside
+from .formats import trajectory_format
+from .trajectory import Trajectory, scenario_from_text
 
 MANIFEST = "manifest.json"
 _KIND = "slamgym trajectories 1"
@@ -242,3 +253,243 @@ def checksum(path: Path) -> str:
 def _file_checksum(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+# --------------------------------------------------------------------------------------
+# The folder of a data set while it is written: one writer, only complete shards.
+
+_WRITING = ".writing-"
+_ATTEMPTS, _BETWEEN = 20, 0.1  # [s]
+_LEFTOVERS = re.compile(r"\.writing-[0-9a-f]{8}|\.manifest\.[0-9a-f]{8}\.json")
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Make a folder if it does not exist, and lock it during the block.
+
+    Files that a killed writer left half written are removed.
+
+    Raises
+    ------
+    ValueError
+        If the folder is a file, or holds something other than a data set, or another
+        process writes to it.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"out must be a folder, got the file {folder}")
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked_folder(folder):
+        leftovers = [e for e in folder.iterdir() if _LEFTOVERS.fullmatch(e.name)]
+        names = (Path(name).parts[0] for name in files_below(folder))
+        foreign = next((name for name in names if not _LEFTOVERS.fullmatch(name)), None)
+        if foreign and not (folder / MANIFEST).exists():
+            raise ValueError(
+                f"out must be a new or empty folder, or hold a {MANIFEST}: "
+                f"{folder} holds {foreign}"
+            )
+        for leftover in leftovers:
+            _remove(leftover)
+        yield
+
+
+@contextlib.contextmanager
+def staging_folder(folder: Path) -> Iterator[Path]:
+    """Provide an absolute folder inside `folder`, and remove it after the block.
+
+    Shards are written there, and `put_in_place` moves them.
+    """
+    staging = folder.resolve() / f"{_WRITING}{secrets.token_hex(4)}"
+    staging.mkdir()
+    try:
+        yield staging
+    finally:
+        _remove(staging)
+
+
+@contextlib.contextmanager
+def naming(folder: Path) -> Iterator[None]:
+    """Name the folder in errors of the system, such as a full disk.
+
+    Raises
+    ------
+    OSError
+        In place of an error of the system.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.strerror is None:
+            raise
+        raise OSError(
+            f"{folder} cannot be written: {error.strerror}; whole shards stay there, "
+            "and the same command continues"
+        ) from error
+
+
+def put_in_place(staged: Path, folder: Path, own: set[ShardEntry | None]) -> None:
+    """Move a complete shard, a file or a folder, and replace the shard that is there.
+
+    What is there is set aside with a warning, if it is none of our own shards.
+    """
+    path = folder / staged.name
+    if os.path.lexists(path):
+        if path.is_symlink() or not any(is_whole(folder, each) for each in own if each):
+            set_aside(path, f"does not match its checksum in {MANIFEST}")
+        else:
+            _remove(path)
+    staged.replace(path)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or a folder, to which a worker that is ending may still write."""
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)
+        return
+    for _ in range(_ATTEMPTS):
+        shutil.rmtree(path, ignore_errors=True)
+        if not path.exists():
+            return
+        time.sleep(_BETWEEN)
+    shutil.rmtree(path)
+
+
+# --------------------------------------------------------------------------------------
+# Read generated trajectories one after the other.
+
+_DAMAGED = ("raise", "skip")
+
+
+class DamagedShardError(ValueError):
+    """A shard is missing, or its bytes differ from the manifest."""
+
+
+class TrajectoryDataset:
+    """The trajectories in a folder; iteration reads shard after shard.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder with a manifest.
+    damaged : {"raise", "skip"}
+        Treatment of damaged shards, see `load_trajectories`.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the shards.
+    manifest : Manifest
+        Their description; ``manifest.is_complete`` reports whether all are written.
+    """
+
+    def __init__(self, folder: Path, damaged: Literal["raise", "skip"]) -> None:
+        self.folder = folder
+        self.manifest: Manifest = read_manifest(folder)
+        self._skips = damaged == "skip"
+        self._format = trajectory_format(self.manifest.job.format)
+
+    def __len__(self) -> int:
+        return sum(shard.episodes for shard in self.manifest.shards)
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        for shard in self.manifest.shards:
+            try:
+                self._check(shard)
+            except DamagedShardError as error:
+                if not self._skips:
+                    raise
+                warnings.warn(f"{error}: left out", stacklevel=2)
+                continue
+            yield from self._format.read(self.folder / shard.name)
+
+    def shard(self, number: int) -> Iterator[Trajectory]:
+        """Yield the trajectories of one shard.
+
+        Parameters
+        ----------
+        number : int
+            Index in ``manifest.shards``.
+
+        Raises
+        ------
+        DamagedShardError
+            If the shard is damaged, even where iteration skips such shards.
+        """
+        shard = self.manifest.shards[number]
+        self._check(shard)
+        yield from self._format.read(self.folder / shard.name)
+
+    def damaged_shards(self) -> list[str]:
+        """Return the names of the shards that are missing or damaged."""
+        return [
+            shard.name
+            for shard in self.manifest.shards
+            if not is_whole(self.folder, shard)
+        ]
+
+    def _check(self, shard: ShardEntry) -> None:
+        if not is_whole(self.folder, shard):
+            last = shard.first_episode + shard.episodes - 1
+            raise DamagedShardError(
+                f"{self.folder / shard.name} does not match its checksum (episodes "
+                f"{shard.first_episode} to {last})"
+            )
+
+
+def load_trajectories(
+    path: str | PathLike[str], *, damaged: Literal["raise", "skip"] = "raise"
+) -> TrajectoryDataset:
+    """Open a folder of generated trajectories in any format.
+
+    Parameters
+    ----------
+    path : path
+        The folder; an unfinished one gives its written shards, and warns.
+    damaged : {"raise", "skip"}, optional
+        Treatment of a shard that does not match its checksum: iteration raises a
+        `DamagedShardError`, or warns and continues with the next one.
+
+    Returns
+    -------
+    TrajectoryDataset
+        Iterable over `Trajectory` in the order of episodes, any number of times; one
+        shard at a time is in memory.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds no manifest, or `damaged` is neither.
+    ImportError
+        If the package of its format is not installed.
+
+    Warns
+    -----
+    UserWarning
+        If episodes are missing, with their number and the way to generate them.
+    """
+    if damaged not in _DAMAGED:
+        hint = closest(str(damaged), _DAMAGED)
+        raise ValueError(f"damaged must be 'raise' or 'skip', got {damaged!r}{hint}")
+    dataset = TrajectoryDataset(Path(path), damaged)
+    if not dataset.manifest.is_complete:
+        warnings.warn(_unfinished(dataset), stacklevel=2)
+    return dataset
+
+
+def _unfinished(dataset: TrajectoryDataset) -> str:
+    """Write how many episodes are there, and the job that generates the rest."""
+    job = dataset.manifest.job
+    return (
+        f"{dataset.folder} is not finished: {len(dataset)} of {job.episodes} episodes "
+        "are there. Where no process writes them now, the same slamgym generate or "
+        f"generate_trajectories makes the others: scenario '{job.scenario.name}', "
+        f"episodes={job.episodes}, controller={job.controller!r}, seed={job.seed}, "
+        f"format={job.format!r}, episodes_per_shard={job.episodes_per_shard}"
+    )
+
+
+def is_whole(folder: Path, shard: ShardEntry) -> bool:
+    """Whether a shard has the checksum in the manifest."""
+    try:
+        return checksum(folder / shard.name) == shard.sha256
+    except OSError:
+        return False

@@ -10,12 +10,11 @@ import numpy as np
 
 from ...arrays import Array
 from ...sim_configs.atomic_file import replace_when_written
-from ..logs.events import Scan
-from ..logs.slamlog import SlamLog
-from ..logs.steps import steps_of
+from ..logs.recording import steps_of
+from ..logs.slamlog import Scan, SlamLog
 from ..runs.summary import pose_nees
-from . import run_frames
-from .viewed_run import ViewedRun, map_at, shown_steps
+from . import run_page as run_frames
+from .run_page import ViewedRun, map_at, shown_steps
 
 SIGMAS = 3
 _COLOURS = ([0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167])  # Okabe, Ito

@@ -1,30 +1,31 @@
 """Write a run of one or more filters as one web page to play, without network."""
 
+from __future__ import annotations
+
 import base64
 import hashlib
 import json
+import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
-from ...arrays import Array, IntArray
+from ...arrays import AnyArray, Array, IntArray
+from ...estimator.interface import MapView, SlamEstimator, SupportsJoin, UpdateReport
+from ...estimator.map_management.map_editor import view_map
 from ...evaluation.hypothesis_tests import chi_square_limits
 from ...sim_configs.atomic_file import replace_when_written
-from ..figures.consistency import nis_band
-from ..figures.web_style import page_template
-from ..logs.anonymous import true_ids_of
-from ..logs.events import Scan
-from ..logs.slamlog import SlamLog
-from ..logs.steps import steps_of
+from ..figures.accuracy import nis_band
+from ..figures.style import page_template
+from ..logs.ground_truth import true_ids_of
+from ..logs.recording import steps_of
+from ..logs.slamlog import Scan, SlamLog
 from ..runs.summary import pose_nees
 from ..runs.trace import RunTrace
-from . import run_frames
-from .packed_arrays import PackedArrays, deviation_codes, position_codes
-from .run_frames import OUTCOMES, MapFrame, RunFrames
-from .viewed_run import ViewedRun, map_at, shown_steps
 
 _PARTS = Path(__file__).parent / "run_page_parts"
 _SCRIPTS = ("data.js", "map.js", "chart.js", "player.js")
@@ -224,7 +225,7 @@ def _notes(steps: Sequence[int], runs: Sequence[ViewedRun]) -> list[str]:
         elif not kept:
             notes.append(
                 f"Correlations are omitted: {trace.estimator} has more than "
-                f"{run_frames.MOST_CORRELATED} landmarks."
+                f"{MOST_CORRELATED} landmarks."
             )
         elif len(kept) < len(steps):
             notes.append(
@@ -248,3 +249,361 @@ def _inline_json(value: Any) -> Markup:
     """Write JSON that cannot end the script element around it."""
     text = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c"))
+
+
+# --------------------------------------------------------------------------------------
+# Keep the map, its correlations and the outcomes of the readings, step by step.
+
+OUTCOMES = (
+    "not used",
+    "used",
+    "new",
+    "rejected",
+    "too close",
+    "tentative",
+    "ambiguous",
+)
+"""What became of a reading; its code is the place in this list."""
+NO_ID = -1
+"""In place of the landmark of a reading that was given to none."""
+MOST_CORRELATED = 300
+"""Landmarks of the largest map whose correlations are kept."""
+
+_UNUSED, _USED, _NEW, _REJECTED, _SKIPPED, _TENTATIVE, _AMBIGUOUS = range(7)
+_MOST_FRAMES = 2000
+_MOST_LANDMARKS = 400_000  # summed over the frames
+_MOST_PAIRS = 2_000_000  # summed over the frames with correlations
+
+
+class MapFrame(NamedTuple):
+    """The map after one step, and what became of the scan's readings."""
+
+    ids: IntArray
+    """Landmarks, shape (n,)."""
+    means: Array
+    """Shape (n, 2) [m]."""
+    covariances: Array
+    """Shape (n, 2, 2) [m²]."""
+    outcomes: NDArray[np.uint8]
+    """Of each reading, its place in `OUTCOMES`, shape (m,)."""
+    row_ids: IntArray
+    """The mapped landmark of each reading, or `NO_ID`, shape (m,)."""
+
+
+class CorrelationFrame(NamedTuple):
+    """The correlations after one step: of the robot's position and n landmarks."""
+
+    ids: IntArray
+    """Landmarks, shape (n,)."""
+    values: Array
+    """In [0, 1]: of row 1 with column 0, 2 with 0, 2 with 1, …, shape (n (n + 1) / 2,).
+    The robot is row 0."""
+
+
+class RunFrames:
+    """Watch a replay, and keep what a viewer shows of it, within bounded memory.
+
+    A long run, or one with a large map, keeps evenly spaced steps, and fewer of them
+    with correlations. Maps above `MOST_CORRELATED` landmarks keep no correlations.
+
+    Parameters
+    ----------
+    log : SlamLog
+        The log that is replayed.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import make_estimator
+    >>> from slamgym.experiments.runs import replay
+    >>> log = SlamLog("one scan", events=(Scan(0, [(0.0, 5.0), (1.0, 4.0)], [4, 9]),))
+    >>> frames = RunFrames(log)
+    >>> slam = make_estimator("ekf", motion_std=(0.1,) * 3, measurement_std=(0.1, 0.1))
+    >>> trace = replay(log, slam, watch=frames.watch).trace
+    >>> frames.maps[0].ids, frames.correlations[0].values
+    (array([4, 9]), array([0., 0., 0.]))
+    """
+
+    def __init__(self, log: SlamLog) -> None:
+        self._scans = [step.scan for step in steps_of(log)]
+        last = len(self._scans) - 1
+        self._maps = ThinnedSteps[MapFrame](_MOST_FRAMES, _MOST_LANDMARKS, last)
+        self._pairs = ThinnedSteps[CorrelationFrame](_MOST_FRAMES, _MOST_PAIRS, last)
+        self.largest = 0
+        """Landmarks of the largest map."""
+        self.joins = False
+        """Whether the filter joins its map on demand; then the frames hold no map."""
+
+    @property
+    def maps(self) -> dict[int, MapFrame]:
+        """The kept maps by their steps, the first and the last one among them."""
+        return self._maps.items
+
+    @property
+    def correlations(self) -> dict[int, CorrelationFrame]:
+        """The kept correlations by their steps; empty where a map is too large."""
+        return {} if self.largest > MOST_CORRELATED else self._pairs.items
+
+    def watch(
+        self, step: int, slam: SlamEstimator, report: UpdateReport | None
+    ) -> None:
+        """Keep a step, if it is due; pass this as ``watch`` of ``replay``."""
+        if not self._maps.is_due(step):
+            return
+        self.joins = isinstance(slam, SupportsJoin)
+        outcomes = row_outcomes(self._scans[step], report)
+        if self.joins:
+            empty = np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2))
+            self._maps.put(step, MapFrame(*empty, *outcomes), 1)
+            return
+        view = view_map(slam)
+        ids = np.array(view.ids, dtype=np.int64)
+        maps = ids, view.landmarks.copy(), view.landmark_covariances
+        self._maps.put(step, MapFrame(*maps, *outcomes), len(ids) + 1)
+        self.largest = max(self.largest, len(ids))
+        if self.largest <= MOST_CORRELATED and self._pairs.is_due(step):
+            values = correlations_of(view)
+            self._pairs.put(step, CorrelationFrame(ids, values), len(values) + 1)
+
+
+def row_outcomes(
+    scan: Scan | None, report: UpdateReport | None
+) -> tuple[NDArray[np.uint8], IntArray]:
+    """Return what became of each reading of a scan, and its landmark in the map.
+
+    Returns
+    -------
+    outcomes : ndarray of uint8, shape (m,)
+        Places in `OUTCOMES`.
+    row_ids : ndarray of int, shape (m,)
+        `NO_ID` where the filter gave a reading to no landmark.
+    """
+    rows = 0 if scan is None else len(scan.measurements)
+    if scan is None or report is None:
+        return np.zeros(rows, np.uint8), np.full(rows, NO_ID)
+    ids = _landmark_of_rows(scan, report)
+    by_id = dict.fromkeys(report.added_ids, _NEW)
+    by_id |= dict.fromkeys(report.rejected_ids, _REJECTED)
+    by_id |= dict.fromkeys(report.skipped_ids, _SKIPPED)
+    known = np.array([NO_ID if i is None else i for i in ids], np.int64)
+    codes = np.array([by_id.get(i, _USED) for i in known.tolist()], np.uint8)
+    codes[known == NO_ID] = _UNUSED
+    codes[list(report.tentative_rows)] = _TENTATIVE
+    codes[list(report.ambiguous_rows)] = _AMBIGUOUS
+    return codes, known
+
+
+def correlations_of(view: MapView) -> Array:
+    """Return how strongly the positions of robot and landmarks are correlated.
+
+    For two positions a and b, ρ is their largest canonical correlation: the largest
+    correlation between a coordinate of a and one of b, over all directions ::
+
+        ρ = σ₁(Lₐ⁻¹ Pₐᵦ Lᵦ⁻ᵀ),    Lₐ Lₐᵀ = Pₐₐ
+
+    Parameters
+    ----------
+    view : MapView
+        The belief over the pose and n landmarks.
+
+    Returns
+    -------
+    ndarray, shape (n (n + 1) / 2,)
+        As in `CorrelationFrame`; 0 where a position is certain.
+    """
+    size = 3 + 2 * len(view.ids)
+    columns = np.r_[0, 1, 3:size]
+    P = np.asarray(view.covariance)[np.ix_(columns, columns)]
+    count = len(columns) // 2
+    one, other = np.tril_indices(count, -1)
+    blocks = P.reshape(count, 2, count, 2)
+    own = np.arange(count)
+    whiten = _inverse_factors(blocks[own, :, own, :])
+    white = whiten[one] @ blocks[one, :, other, :] @ whiten[other].transpose(0, 2, 1)
+    return np.minimum(_largest_singular_values(white), 1.0)
+
+
+def _landmark_of_rows(scan: Scan, report: UpdateReport) -> Sequence[int | None]:
+    rows = len(scan.measurements)
+    if len(report.row_ids) == rows:
+        return report.row_ids
+    if scan.landmark_ids is None:
+        return (NO_ID,) * rows
+    return tuple(scan.landmark_ids.tolist())
+
+
+def _inverse_factors(P: Array) -> Array:
+    """Return L⁻¹ of L Lᵀ = P, shape (n, 2, 2); zeros where P is singular."""
+    inverse = np.zeros_like(P)
+    a, b = P[:, 0, 0], P[:, 1, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = 1 / np.sqrt(a)
+        second = 1 / np.sqrt(P[:, 1, 1] - b * b / a)
+        inverse[:, 0, 0], inverse[:, 1, 1] = first, second
+        inverse[:, 1, 0] = -b / a * second
+    inverse[~np.isfinite(inverse).all(axis=(1, 2))] = 0.0
+    return inverse
+
+
+def _largest_singular_values(A: Array) -> Array:
+    """Return σ₁ of 2 × 2 matrices, shape (n,), in closed form."""
+    (a, b), (c, d) = A[:, 0].T, A[:, 1].T
+    return np.asarray((np.hypot(a + d, c - b) + np.hypot(a - d, c + b)) / 2)
+
+
+# --------------------------------------------------------------------------------------
+# Pack many arrays into one short text inside a web page.
+#
+# The arrays become integers or single-precision numbers. Arrays of successive frames
+# hold differences to the frame before, which deflate shrinks; ``data.js`` unpacks them.
+
+TENTHS = 1e4
+"""Positions are integers of a tenth of a millimetre."""
+LOG_STEPS = 2000.0
+"""Standard deviations σ are integers of 2000 ln σ, a resolution of 0.05 %."""
+
+_ALIGNMENT = 4  # [bytes] of the page's typed arrays
+_TYPES = ("float32", "int32", "int16", "uint8")
+
+
+class PackedArrays:
+    """Arrays by name, collected for one page.
+
+    Examples
+    --------
+    >>> packed = PackedArrays()
+    >>> packed.put("t", np.array([0.0, 0.5]), "float32")
+    >>> packed.put_frames("ids", [np.array([4]), np.array([4, 9])], "int32")
+    >>> packed.table["ids"]
+    {'type': 'int32', 'length': 3, 'counts': 'ids.counts'}
+    """
+
+    def __init__(self) -> None:
+        self.table: dict[str, dict[str, Any]] = {}
+        """Type, length and, of frames, the name of their numbers of entries."""
+        self._parts: list[bytes] = []
+
+    def put(self, name: str, values: AnyArray, kind: str) -> None:
+        """Add a flat array as one of float32, int32, int16, uint8."""
+        if kind not in _TYPES:
+            raise ValueError(f"kind must be one of {', '.join(_TYPES)}, got {kind!r}")
+        flat = np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<"))
+        self.table[name] = {"type": kind, "length": flat.size}
+        content = flat.tobytes()
+        self._parts.append(content + bytes(-len(content) % _ALIGNMENT))
+
+    def put_frames(self, name: str, frames: Sequence[AnyArray], kind: str) -> None:
+        """Add flat arrays of one integer type, one a frame, of any lengths each."""
+        counts = f"{name}.counts"
+        self.put(counts, np.array([len(frame) for frame in frames]), "int32")
+        before = np.empty(0, dtype=kind)
+        changes = [before]
+        for frame in frames:
+            now = np.asarray(frame, dtype=kind)
+            change = now.copy()
+            common = min(len(now), len(before))
+            change[:common] -= before[:common]  # modulo 2ⁿ, as the page adds up
+            changes.append(change)
+            before = now
+        self.put(name, np.concatenate(changes), kind)
+        self.table[name]["counts"] = counts
+
+    def text(self) -> str:
+        """Return all arrays in the order of the table, deflated, in base64."""
+        return base64.b64encode(zlib.compress(b"".join(self._parts))).decode()
+
+
+def position_codes(metres: Array) -> AnyArray:
+    """Return positions as integers, :data:`TENTHS` a metre; nan is the least one."""
+    least, most = np.iinfo(np.int32).min, np.iinfo(np.int32).max
+    codes = np.clip(np.round(metres * TENTHS), least + 1, most)
+    return np.where(np.isnan(codes), least, codes).astype(np.int32)
+
+
+def deviation_codes(std: Array) -> AnyArray:
+    """Return 2000 ln σ as integers; zero and nan are the least one."""
+    least, most = np.iinfo(np.int16).min, np.iinfo(np.int16).max
+    with np.errstate(divide="ignore", invalid="ignore"):
+        codes = np.clip(np.round(LOG_STEPS * np.log(std)), least, most)
+    return np.where(np.isnan(codes), least, codes).astype(np.int16)
+
+
+# --------------------------------------------------------------------------------------
+# A filter's run as the viewers take it, and the steps that they show.
+
+
+class ViewedRun(NamedTuple):
+    """One filter's run over the log of the page."""
+
+    trace: RunTrace
+    """Its beliefs; its name labels the filter."""
+    frames: RunFrames
+    """What it watched of the same replay."""
+
+
+def shown_steps(frames: Sequence[RunFrames]) -> list[int]:
+    """Return the steps that all filters have kept, in ascending order."""
+    return sorted(set.intersection(*(set(kept.maps) for kept in frames)))
+
+
+def map_at(run: ViewedRun, step: int) -> MapFrame:
+    """Return the map of a step; of a filter that joins its map, the last joined one."""
+    frame = run.frames.maps[step]
+    if not run.frames.joins:
+        return frame
+    ids, means, covariances = run.trace.map_at(step)
+    return frame._replace(
+        ids=ids.astype(np.int64), means=means, covariances=covariances
+    )
+
+
+# --------------------------------------------------------------------------------------
+# Items of the steps of a run, all of them or evenly spaced ones.
+
+_Item = TypeVar("_Item")
+
+
+class ThinnedSteps(Generic[_Item]):
+    """Items by step; where they become too many, every second one is dropped.
+
+    Parameters
+    ----------
+    most_steps : int
+        Largest number of items, the last one not counted.
+    most_size : int
+        Largest sum of their sizes; at least two items are kept.
+    last : int
+        The last step, which is always kept.
+
+    Examples
+    --------
+    >>> kept = ThinnedSteps(most_steps=3, most_size=100, last=8)
+    >>> for step in range(9):
+    ...     if kept.is_due(step):
+    ...         kept.put(step, f"map {step}", size=1)
+    >>> list(kept.items), kept.stride
+    ([0, 4, 8], 4)
+    """
+
+    def __init__(self, most_steps: int, most_size: int, last: int) -> None:
+        self._most_steps, self._most_size, self._last = most_steps, most_size, last
+        self._sizes: dict[int, int] = {}
+        self.items: dict[int, _Item] = {}
+        """The kept items, by their steps in ascending order."""
+        self.stride = 1
+        """Steps between two items."""
+
+    def is_due(self, step: int) -> bool:
+        """Whether the item of a step will be kept."""
+        return step % self.stride == 0 or step == self._last
+
+    def put(self, step: int, item: _Item, size: int) -> None:
+        """Keep the item of a step that is due."""
+        self.items[step], self._sizes[step] = item, size
+        while len(self.items) > 2 and self._is_full():
+            self.stride *= 2
+            for old in [k for k in self.items if not self.is_due(k)]:
+                del self.items[old], self._sizes[old]
+
+    def _is_full(self) -> bool:
+        too_many = len(self.items) > self._most_steps + 1
+        return too_many or sum(self._sizes.values()) > self._most_size

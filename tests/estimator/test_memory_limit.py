@@ -14,7 +14,7 @@ from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.support import memory_limit
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
-from slamgym.experiments.runs.memory_check import refuse_large_map, refuse_large_maps
+from slamgym.experiments.runs.filter_settings import refuse_large_map, refuse_large_maps
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 
 NOISE = (TOWN_MOTION_STD, (0.01, 0.05))

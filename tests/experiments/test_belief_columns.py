@@ -9,7 +9,7 @@ from slamgym.experiments.trajectories import (
     generate_trajectories,
     load_trajectories,
 )
-from slamgym.experiments.trajectories.beliefs import with_beliefs
+from slamgym.experiments.trajectories.driven_episodes import with_beliefs
 from slamgym.experiments.trajectories.manifest import read_manifest
 from slamgym.experiments.trajectories.trajectory import ARRAYS, BELIEFS
 from slamgym.sim_configs import load_scenario

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
-from slamgym.experiments.monte_carlo.measure.bounds import noise_of_runs
-from slamgym.experiments.monte_carlo.report.html_report import escaped as escape
-from slamgym.experiments.monte_carlo.report.html_report import html_report
+from slamgym.experiments.monte_carlo.filtered_runs import noise_of_runs
+from slamgym.experiments.monte_carlo.report import escaped as escape
+from slamgym.experiments.monte_carlo.report import html_report
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 

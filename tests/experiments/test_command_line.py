@@ -14,15 +14,11 @@ from typer.testing import CliRunner
 from slamgym import jit as kernel_cache
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments import figures
-from slamgym.experiments.command_line import (
-    errors,
-    reporter,
-    run_files,
-    tables,
-    warm_up,
-)
+from slamgym.experiments.command_line import program as errors
+from slamgym.experiments.command_line import reporter, run_files, tables
+from slamgym.experiments.command_line import run_files as warm_up
 from slamgym.experiments.command_line.app import main
-from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
+from slamgym.experiments.runs.filter_settings import estimator_choices
 from slamgym.experiments.runs.own_files import MANIFEST
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
@@ -948,7 +944,7 @@ def test_a_log_too_large_for_memory_is_named(log, monkeypatch):
     def fail(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr("slamgym.experiments.logs.lines.Path.read_bytes", fail)
+    monkeypatch.setattr("slamgym.experiments.logs.slamlog.Path.read_bytes", fail)
     message = refused("replay", log)
     assert message == f"the log {log} does not fit into memory"
 

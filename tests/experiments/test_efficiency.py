@@ -5,8 +5,7 @@ import pytest
 
 from slamgym.evaluation.error_bound import posterior_bound
 from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
-from slamgym.experiments.monte_carlo.report.html_report import html_report
-from slamgym.experiments.monte_carlo.report.table import measures
+from slamgym.experiments.monte_carlo.report import html_report, measures
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 

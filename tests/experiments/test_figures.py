@@ -20,9 +20,8 @@ from slamgym.experiments.figures import (
     save_figure,
     truth_figure,
 )
-from slamgym.experiments.figures.consistency import nis_band
-from slamgym.experiments.figures.covariance import correlations
-from slamgym.experiments.figures.map_picture import FIRST, LATER, PREDICTED, UPDATED
+from slamgym.experiments.figures.accuracy import correlations, nis_band
+from slamgym.experiments.figures.maps import FIRST, LATER, PREDICTED, UPDATED
 from slamgym.experiments.figures.style import new_figure
 
 

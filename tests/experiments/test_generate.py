@@ -21,27 +21,28 @@ from presets import PRESETS
 
 from slamgym.envs.controllers import CONTROLLERS
 from slamgym.experiments.command_line import reporter
-from slamgym.experiments.command_line.errors import InterruptedRunError
 from slamgym.experiments.command_line.generate import generate as generate_command
-from slamgym.experiments.command_line.scenario_options import recorded
+from slamgym.experiments.command_line.options import recorded
+from slamgym.experiments.command_line.program import InterruptedRunError
 from slamgym.experiments.logs.slamlog import write_slamlog
-from slamgym.experiments.trajectories import (
-    driven_episodes,
-    generate,
-    shard_folder,
-    shard_work,
-)
-from slamgym.experiments.trajectories.dataset import (
-    DamagedShardError,
-    load_trajectories,
-)
+from slamgym.experiments.trajectories import driven_episodes, generate
+from slamgym.experiments.trajectories import formats as npz
+from slamgym.experiments.trajectories import generate as shard_work
+from slamgym.experiments.trajectories import manifest as shard_folder
 from slamgym.experiments.trajectories.driven_episodes import drive_episodes
-from slamgym.experiments.trajectories.formats import FORMATS, npz, trajectory_format
-from slamgym.experiments.trajectories.formats.slamlog_files import to_slamlog
-from slamgym.experiments.trajectories.generate import generate_trajectories
-from slamgym.experiments.trajectories.job_options import default_episodes_per_shard
+from slamgym.experiments.trajectories.formats import (
+    FORMATS,
+    to_slamlog,
+    trajectory_format,
+)
+from slamgym.experiments.trajectories.generate import (
+    default_episodes_per_shard,
+    generate_trajectories,
+)
 from slamgym.experiments.trajectories.manifest import (
+    DamagedShardError,
     checksum,
+    load_trajectories,
     read_manifest,
     versions_now,
 )

@@ -16,8 +16,8 @@ import pytest
 
 from slamgym.envs.rendering.scene import _title
 from slamgym.estimator import make_estimator
-from slamgym.experiments.command_line.errors import BadInputError
 from slamgym.experiments.command_line.output_folder import output_folder, write_summary
+from slamgym.experiments.command_line.program import BadInputError
 from slamgym.experiments.figures.style import new_figure
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.importers.utias import read_utias

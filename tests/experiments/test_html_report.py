@@ -14,14 +14,14 @@ from monte_carlo_dataset import typical, with_failures
 from PIL import Image
 
 from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.report import html_report as module
-from slamgym.experiments.monte_carlo.report.html_report import (
+from slamgym.experiments.monte_carlo import report as module
+from slamgym.experiments.monte_carlo.report import (
     headline,
     html_report,
     write_html_report,
 )
-from slamgym.experiments.monte_carlo.report.summary import summarise_monte_carlo
-from slamgym.experiments.noise_study.variations import scaled_scenario
+from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
+from slamgym.experiments.noise_study import scaled_scenario
 from slamgym.sim_configs import load_scenario
 
 HOSTILE = "</title></pre><script>alert(\"1\")</script> & '$x$' 100 %"

@@ -22,23 +22,27 @@ from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, make_estimator, registry
 from slamgym.evaluation import AssociationScores, Gospa
 from slamgym.evaluation.nees import pose_nees, state_nees
-from slamgym.experiments.command_line.cluster import connected
+from slamgym.experiments.command_line.monte_carlo import connected
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
-from slamgym.experiments.monte_carlo.measure.bounds import bound_runs, noise_of_runs
-from slamgym.experiments.monte_carlo.measure.estimator_choices import estimator_choices
-from slamgym.experiments.monte_carlo.measure.filtered_runs import filter_runs
-from slamgym.experiments.monte_carlo.measure.run_measures import (
+from slamgym.experiments.monte_carlo.filtered_runs import (
+    bound_runs,
+    filter_runs,
+    noise_of_runs,
+)
+from slamgym.experiments.monte_carlo.report import html_report, measures
+from slamgym.experiments.monte_carlo.results import load_results, merge_blocks
+from slamgym.experiments.monte_carlo.run_measures import (
     HIDDEN_VARIABLES,
     VARIABLES,
     measure_runs,
 )
-from slamgym.experiments.monte_carlo.report.html_report import html_report
-from slamgym.experiments.monte_carlo.report.table import measures
-from slamgym.experiments.monte_carlo.reproduction import python_call
-from slamgym.experiments.monte_carlo.store.result_blocks import merge_blocks
-from slamgym.experiments.monte_carlo.store.results import load_results
-from slamgym.experiments.runs.filter_settings import settings_for, settings_for_scenario
+from slamgym.experiments.monte_carlo.runner import python_call
+from slamgym.experiments.runs.filter_settings import (
+    estimator_choices,
+    settings_for,
+    settings_for_scenario,
+)
 from slamgym.experiments.runs.log_replay import replay
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario

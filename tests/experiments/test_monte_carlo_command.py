@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.store.results import load_results
+from slamgym.experiments.monte_carlo.results import load_results
 
 FRAGILE = '''
 from slamgym.estimator import EkfSlam

@@ -15,19 +15,26 @@ from scipy.stats import chi2
 from slamgym.evaluation.consistency_report import evaluate_consistency
 from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
 from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.measure.run_measures import VARIABLES
-from slamgym.experiments.monte_carlo.report.estimator_lines import look_of, thinned
-from slamgym.experiments.monte_carlo.report.figures import report_figures
-from slamgym.experiments.monte_carlo.report.html_report import html_report
-from slamgym.experiments.monte_carlo.report.nis_figures import (
+from slamgym.experiments.monte_carlo.figures import (
+    look_of,
     nis_autocorrelation,
     pooled_nis,
+    report_figures,
+    thinned,
 )
-from slamgym.experiments.monte_carlo.report.scores import scores_of
-from slamgym.experiments.monte_carlo.report.summary import summarise_monte_carlo
-from slamgym.experiments.monte_carlo.report.table import measures, monte_carlo_table
-from slamgym.experiments.monte_carlo.report.verdict import KINDS, judge
-from slamgym.experiments.monte_carlo.report.warnings import run_warnings
+from slamgym.experiments.monte_carlo.report import (
+    html_report,
+    measures,
+    monte_carlo_table,
+)
+from slamgym.experiments.monte_carlo.run_measures import VARIABLES
+from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
+from slamgym.experiments.monte_carlo.verdict import (
+    KINDS,
+    judge,
+    run_warnings,
+    scores_of,
+)
 from slamgym.sim_configs import load_scenario
 
 FAILURES = (

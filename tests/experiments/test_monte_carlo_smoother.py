@@ -5,8 +5,8 @@ import pytest
 
 from slamgym.estimator.smoother import Drive, smooth
 from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.report.html_report import write_html_report
-from slamgym.experiments.monte_carlo.report.summary import (
+from slamgym.experiments.monte_carlo.report import write_html_report
+from slamgym.experiments.monte_carlo.summary import (
     consistency_of,
     summarise_monte_carlo,
 )

@@ -6,14 +6,16 @@ import json
 import numpy as np
 import pytest
 
+from slamgym.experiments import noise_study as many_runs
 from slamgym.experiments.command_line.noise_study import effects_study, write_study
 from slamgym.experiments.command_line.reporter import Reporter
 from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.report.scores import scores_of
-from slamgym.experiments.noise_study import many_runs
-from slamgym.experiments.noise_study.figures import noise_effects_figure
-from slamgym.experiments.noise_study.many_runs import noise_effects
-from slamgym.experiments.noise_study.variations import scaled_scenario
+from slamgym.experiments.monte_carlo.verdict import scores_of
+from slamgym.experiments.noise_study import (
+    noise_effects,
+    noise_effects_figure,
+    scaled_scenario,
+)
 from slamgym.experiments.runs.filter_settings import SIGMAS
 from slamgym.sim_configs import load_scenario
 

@@ -20,26 +20,25 @@ from slamgym.experiments.logs import (
     record_episode,
     write_slamlog,
 )
-from slamgym.experiments.logs.anonymous import without_identities
+from slamgym.experiments.logs.ground_truth import without_identities
 from slamgym.experiments.noise_fitting import (
     fit_noise,
     noise_fit_figure,
     summarise_fit,
     write_noise,
 )
-from slamgym.experiments.noise_fitting.associated_log import associated_log
-from slamgym.experiments.noise_fitting.calibration import nees_bounds
-from slamgym.experiments.noise_fitting.inflation import positive_sum
-from slamgym.experiments.noise_fitting.likelihood import LogLikelihood
-from slamgym.experiments.noise_fitting.log_events import (
+from slamgym.experiments.noise_fitting.fit import nees_bounds, positive_sum
+from slamgym.experiments.noise_fitting.intervals import profile_crossing
+from slamgym.experiments.noise_fitting.scoring import (
+    associated_log,
+    curvature,
     events_of,
+    maximise,
     parts_of,
     sample_of,
     stretches_of,
 )
-from slamgym.experiments.noise_fitting.noise_vector import noise_of
-from slamgym.experiments.noise_fitting.profile import profile_crossing
-from slamgym.experiments.noise_fitting.scoring import curvature, maximise
+from slamgym.experiments.noise_fitting.search import LogLikelihood, noise_of
 from slamgym.experiments.noise_fitting.summary import options_line
 from slamgym.experiments.runs import replay, settings_for, summarise
 from slamgym.sim_configs import action_sequence, load_scenario

@@ -9,8 +9,7 @@ import pytest
 from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import Scan
-from slamgym.experiments.noise_study.one_run import study_log, study_scenario
-from slamgym.experiments.noise_study.variations import scaled_scenario
+from slamgym.experiments.noise_study import scaled_scenario, study_log, study_scenario
 from slamgym.experiments.runs.filter_settings import (
     SIGMAS,
     FilterSettings,

@@ -7,15 +7,16 @@ import pytest
 
 from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, UpdateReport, make_estimator
-from slamgym.experiments.logs.anonymous import without_identities
-from slamgym.experiments.logs.ground_truth import path_accuracy, true_poses_of
+from slamgym.experiments.logs.ground_truth import (
+    path_accuracy,
+    true_poses_of,
+    without_identities,
+)
 from slamgym.experiments.logs.importers import read_log
-from slamgym.experiments.logs.recording import record_episode
+from slamgym.experiments.logs.recording import record_episode, steps_of
 from slamgym.experiments.logs.slamlog import LogError, OdometryRow, Scan, SlamLog
-from slamgym.experiments.logs.steps import steps_of
 from slamgym.experiments.runs.filter_settings import FilterSettings, settings_for
-from slamgym.experiments.runs.log_replay import replay
-from slamgym.experiments.runs.map_history import MapHistory
+from slamgym.experiments.runs.log_replay import MapHistory, replay
 from slamgym.experiments.runs.summary import pose_nees, summarise
 from slamgym.sim_configs import load_scenario
 

@@ -16,14 +16,16 @@ from slamgym.experiments.logs import OdometryRow, Scan, SlamLog
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.runs import replay
 from slamgym.experiments.runs.summary import pose_nees
-from slamgym.experiments.viewers import RunFrames, ViewedRun, run_frames, write_run_page
-from slamgym.experiments.viewers.packed_arrays import (
+from slamgym.experiments.viewers import RunFrames, ViewedRun, write_run_page
+from slamgym.experiments.viewers import run_page as run_frames
+from slamgym.experiments.viewers.run_page import (
     PackedArrays,
+    ThinnedSteps,
+    correlations_of,
     deviation_codes,
     position_codes,
+    row_outcomes,
 )
-from slamgym.experiments.viewers.run_frames import correlations_of, row_outcomes
-from slamgym.experiments.viewers.thinned_steps import ThinnedSteps
 from slamgym.sim_configs import load_scenario
 
 HOSTILE = "</script></title><script>document.title = 'taken'</script> & '\"$x$"

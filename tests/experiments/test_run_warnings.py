@@ -6,7 +6,7 @@ import pytest
 from slamgym.estimator import make_estimator
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
 from slamgym.experiments.runs.log_replay import replay
-from slamgym.experiments.runs.run_warnings import abandoned_landmarks, run_warnings
+from slamgym.experiments.runs.summary import abandoned_landmarks, run_warnings
 
 NOISE = {"motion_std": (0.02, 0.02, 0.01), "measurement_std": (0.02, 0.1)}
 PLACES = np.array([(4.0, 1.0), (5.0, -1.0), (3.0, -2.0)])

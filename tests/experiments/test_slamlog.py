@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slamgym.experiments.logs.anonymous import hides_identities, without_identities
+from slamgym.experiments.logs.ground_truth import hides_identities, without_identities
 from slamgym.experiments.logs.slamlog import (
     LogError,
     OdometryRow,

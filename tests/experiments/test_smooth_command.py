@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 from slamgym.estimator.smoother import Drive, SmoothedDrive, smooth
 from slamgym.experiments.command_line.app import main
-from slamgym.experiments.logs.events import OdometryRow, Scan
-from slamgym.experiments.logs.slamlog import SlamLog, write_slamlog
+from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog, write_slamlog
 from slamgym.experiments.runs.filter_settings import SMOOTHER, settings_for
 from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
 

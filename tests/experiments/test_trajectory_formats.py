@@ -12,16 +12,19 @@ import numpy as np
 import pytest
 from presets import PRESETS
 
-from slamgym.experiments.logs.events import OdometryRow
 from slamgym.experiments.logs.importers import read_log
+from slamgym.experiments.logs.slamlog import OdometryRow
 from slamgym.experiments.trajectories import (
     driven_episodes,
     generate_trajectories,
     load_trajectories,
 )
 from slamgym.experiments.trajectories.driven_episodes import drive_episodes
-from slamgym.experiments.trajectories.formats import FORMATS, trajectory_format
-from slamgym.experiments.trajectories.formats.slamlog_files import to_slamlog
+from slamgym.experiments.trajectories.formats import (
+    FORMATS,
+    to_slamlog,
+    trajectory_format,
+)
 from slamgym.experiments.trajectories.trajectory import ARRAYS
 from slamgym.sim_configs import load_scenario
 
@@ -496,7 +499,7 @@ def test_an_unknown_format_is_answered_with_a_suggestion():
 
 
 def test_a_missing_package_is_named(monkeypatch):
-    module = "slamgym.experiments.trajectories.formats.parquet"
+    module = "slamgym.experiments.trajectories.parquet"
     monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(ImportError, match="'parquet' needs the package pyarrow: pip"):

@@ -9,13 +9,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..events import float_array
-from ..lines import LogLine, ReadFile, read_lines, shown
-from ..slamlog import SlamLog, read_slamlog
-from .course import read_course
-from .freiburg import read_freiburg
-from .graph import GRAPH_TAGS
-from .isam import read_isam
+from ..slamlog import (
+    LogLine,
+    ReadFile,
+    SlamLog,
+    float_array,
+    read_lines,
+    read_slamlog,
+    shown,
+)
+from .course import read_course, read_freiburg
+from .graph import GRAPH_TAGS, read_isam
 from .utias import read_utias
 
 EXPECTED = (

@@ -11,10 +11,18 @@ from typing import cast
 import numpy as np
 
 from ....arrays import Array, IntArray
-from ..events import EventRecorder, OdometryRow, Reading, Scan, wrap_bearing
-from ..lines import LogError, LogLine, read_lines
-from ..slamlog import SlamLog
-from .world_file import read_world, world_beside
+from ..slamlog import (
+    EventRecorder,
+    LogError,
+    LogLine,
+    OdometryRow,
+    Reading,
+    Scan,
+    SlamLog,
+    read_lines,
+    shown,
+    wrap_bearing,
+)
 
 PUBLISHED_LANDMARKS = np.array([[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12.0]])
 """Ground truth that the homework prints for the six landmarks of its log [m]."""
@@ -109,3 +117,104 @@ def _take_scan(recorder: EventRecorder, line: LogLine, step: int, count: int) ->
     for k, (bearing, distance) in enumerate(pairs):
         reading = Reading(float(step), k, wrap_bearing(float(bearing)), float(distance))
         recorder.add_reading(line, reading)
+
+
+# --------------------------------------------------------------------------------------
+# The log of the Freiburg robot mapping course (``sensor.dat`` and ``world.dat``).
+#
+# Lines ``ODOMETRY r1 t r2`` (turn r1, drive t, turn r2) and ``SENSOR id range
+# bearing``.
+
+ROW_FORMS = {"ODOMETRY": "ODOMETRY r1 t r2", "SENSOR": "SENSOR id range bearing"}
+
+
+def read_freiburg(path: str | PathLike[str]) -> SlamLog:
+    """Read a Freiburg log, and its landmarks if ``world.dat`` is in the same folder.
+
+    Each step becomes two turn-last rows, (0, r1) with dt = 0 and (t, r2) with dt = 1,
+    which is the same motion. Bearings are wrapped into [-π, π).
+
+    Parameters
+    ----------
+    path : path
+        The file of ODOMETRY and SENSOR lines.
+
+    Returns
+    -------
+    SlamLog
+        Motion turn-last, one unit of time per step, starting at the origin.
+
+    Raises
+    ------
+    LogError
+        If a line is of another kind.
+    OSError
+        If the file cannot be opened.
+    """
+    recorder, step = EventRecorder(), 0
+    for line in read_lines(path):
+        kind, *fields = line.text.split()
+        if kind not in ROW_FORMS:
+            raise line.error(" or ".join(ROW_FORMS.values()), shown(line.text))
+        line.check_count(fields, (3,), ROW_FORMS[kind])
+        if kind == "ODOMETRY":
+            step += 1
+            before, d, after = map(line.to_real, fields)
+            recorder.add_turn_drive_turn(line, step, before=before, d=d, after=after)
+        else:
+            bearing = wrap_bearing(line.to_real(fields[2]))
+            landmark_id, distance = line.to_id(fields[0]), line.to_real(fields[1])
+            recorder.add_reading(
+                line, Reading(float(step), landmark_id, bearing, distance)
+            )
+    world = world_beside(path)
+    ids, landmarks = read_world(world) if world else (np.arange(0), np.empty((0, 2)))
+    return SlamLog(
+        name=Path(path).stem,
+        header={
+            "source": "Freiburg robot mapping course",
+            "truth": world.name if world else "none",
+        },
+        landmark_ids=ids,
+        landmarks=landmarks,
+        events=recorder.finish(),
+    )
+
+
+# --------------------------------------------------------------------------------------
+# Files ``world.dat``: true landmark positions, lines ``id x y``.
+
+
+def read_world(
+    path: str | PathLike[str],
+) -> tuple[IntArray, Array]:
+    """Read landmark ids (n,) and positions (n, 2) [m].
+
+    Raises
+    ------
+    LogError
+        If a line is not ``id x y``, or an id comes twice.
+    OSError
+        If the file cannot be opened.
+    """
+    positions: dict[int, tuple[float, float]] = {}
+    for line in read_lines(path):
+        fields = line.text.split()
+        line.check_count(fields, (3,), "id x y")
+        landmark_id = line.to_id(fields[0])
+        if landmark_id in positions:
+            raise line.error("each landmark once", f"id {landmark_id} again")
+        positions[landmark_id] = (line.to_real(fields[1]), line.to_real(fields[2]))
+    return np.array(list(positions), dtype=np.int64), np.array(list(positions.values()))
+
+
+def world_beside(path: str | PathLike[str]) -> Path | None:
+    """Return the ``world.dat`` in the folder of a log, if there is one.
+
+    Examples
+    --------
+    >>> world_beside("nowhere/data.txt") is None
+    True
+    """
+    world = Path(path).parent / "world.dat"
+    return world if world.is_file() else None

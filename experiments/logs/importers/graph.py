@@ -2,9 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from os import PathLike
+from pathlib import Path
 
-from ..lines import LogLine, shown
+import numpy as np
+
+from ....arrays import Array
+from ..slamlog import (
+    EventRecorder,
+    LogError,
+    LogLine,
+    OdometryRow,
+    Reading,
+    Scan,
+    SlamLog,
+    numbers,
+    read_lines,
+    shown,
+    wrap_bearing,
+)
 
 EDGE_TAGS = ("EDGE_SE2", "EDGE2")
 ODOMETRY_TAGS = ("ODOMETRY", *EDGE_TAGS)
@@ -122,3 +141,340 @@ def id_at(line: LogLine, place: int) -> int:
 def reals_at(line: LogLine, first: int, end: int | None = None) -> list[float]:
     """Read numbers from some fields of a line, the tag being field 0."""
     return [line.to_real(number) for number in line.text.split()[first:end]]
+
+
+# --------------------------------------------------------------------------------------
+# The noise that the information matrices of a graph specify, as a filter assumes it.
+#
+# An edge with the information Ω claims the standard deviation ``sqrt(uᵀ Ω⁻¹ u)`` along
+# a unit vector u. For odometry u is along and across the drive, and in the turn; for a
+# reading it is along and across the line of sight. Correlations are ignored.
+#
+# Three conventions are in use:
+#
+# * iSAM's ``ODOMETRY``, ``EDGE2`` and ``LANDMARK`` lines hold the upper triangular R of
+#   Ω = Rᵀ R by rows, in the frame of pose i.
+# * g2o's ``EDGE_SE2`` and ``EDGE_SE2_XY`` lines hold the upper triangle of Ω by rows;
+#   that of an ``EDGE_SE2`` is in the frame of pose j.
+# * A file with ``VERTEX2`` lines is TORO's, whose ``EDGE2`` lines hold Ω in the order xx,
+#   xy, yy, θθ, xθ, yθ.
+
+ALIKE = 1e-3
+"""Relative difference of standard deviations up to which they count as equal."""
+
+G2O, ISAM, TORO = "g2o", "iSAM", "TORO"
+_ROWS = {2: (0, 1, 1, 2), 3: (0, 1, 2, 1, 3, 4, 2, 4, 5)}
+_TORO_ROWS = (0, 1, 4, 1, 2, 5, 4, 5, 3)
+
+
+def noise_header(graph: Graph, chain: Sequence[LogLine]) -> dict[str, str]:
+    """Return the noise of a graph as entries of a log's header.
+
+    Each standard deviation is the median over the lines. Readings have the bearing
+    noise σβ or, if this fits better, the noise b across the line of sight of a sensor
+    of positions, so that σβ = b / r.
+
+    Returns
+    -------
+    dict of str to str
+        ``motion_std``, ``measurement_std`` if the graph has readings,
+        ``bearing_std_metres`` for a sensor of positions, and ``noise``, which states
+        whether the matrices differ.
+
+    Raises
+    ------
+    LogError
+        If a line has no information, or a singular or indefinite one.
+    """
+    is_toro = any(line.text.split()[0] == "VERTEX2" for line in graph.vertices)
+    motion = np.array([_motion_std(line, is_toro=is_toro) for line in chain])
+    header = {"motion_std": numbers(*np.median(motion, axis=0))}
+    are_alike = _alike(motion)
+    lines = [line for at_pose in graph.readings.values() for line in at_pose]
+    if lines:
+        sensor, stds = _sensor_noise(lines)
+        header |= sensor
+        are_alike &= _alike(stds)
+    what = "its" if are_alike else "the medians of its differing"
+    return {**header, "noise": f"from the file, by {what} information matrices"}
+
+
+def _sensor_noise(lines: Sequence[LogLine]) -> tuple[dict[str, str], Array]:
+    """Return the entries of the readings, and the deviations that they are from."""
+    bearing, across, along = np.array([_reading_std(line) for line in lines]).T
+    if _spread(across) < _spread(bearing):
+        sensor = {"bearing_std_metres": numbers(np.median(across))}
+        sensor["measurement_std"] = numbers(0.0, np.median(along))
+        return sensor, np.column_stack([across, along])
+    stds = numbers(float(np.median(bearing)), np.median(along))
+    return {"measurement_std": stds}, np.column_stack([bearing, along])
+
+
+def _motion_std(line: LogLine, *, is_toro: bool) -> Array:
+    """Return (σx, σy, σα) along the drive, across, and of the turn."""
+    dx, dy, turn = reals_at(line, 3, 6)
+    angle = math.atan(dy / dx) if dx else math.copysign(math.pi / 2, dy) * (dy != 0)
+    tag = line.text.split()[0]
+    kind = {"EDGE_SE2": G2O, "EDGE2": TORO if is_toro else ISAM}.get(tag, ISAM)
+    if kind == G2O:
+        angle -= turn
+    cos, sin = math.cos(angle), math.sin(angle)
+    return _stds(line, 6, kind, np.array([(cos, sin, 0), (-sin, cos, 0), (0, 0, 1)]))
+
+
+def _reading_std(line: LogLine) -> Array:
+    """Return the standard deviations of the bearing, across, and of the range."""
+    x, y = reals_at(line, 3, 5)
+    distance = math.hypot(x, y)
+    if not distance:
+        raise line.error("a landmark away from its pose", "distance 0")
+    cos, sin = x / distance, y / distance
+    kind = ISAM if line.text.split()[0] == "LANDMARK" else G2O
+    across, along = _stds(line, 5, kind, np.array([(-sin, cos), (cos, sin)]))
+    return np.array([across / distance, across, along])
+
+
+def _stds(line: LogLine, first: int, kind: str, directions: Array) -> Array:
+    """Return the standard deviation along each row of ``directions``."""
+    values = np.array(reals_at(line, first))
+    if not len(values):
+        raise line.error("information at the end of the line", "none")
+    size = directions.shape[1]
+    rows = _TORO_ROWS if kind == TORO and size == 3 else _ROWS[size]
+    matrix = values[list(rows)].reshape(size, size)
+    if kind == ISAM:
+        upper = np.triu(matrix)
+        matrix = upper.T @ upper
+    try:
+        lower = np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        raise line.error("positive definite information", line.text) from None
+    # with Ω = L Lᵀ, uᵀ Ω⁻¹ u = ‖L⁻¹ u‖²
+    return np.asarray(np.linalg.norm(np.linalg.solve(lower, directions.T), axis=0))
+
+
+def _alike(table: Array) -> bool:
+    """Whether the rows of a table are equal but for rounding."""
+    return bool(np.allclose(table, np.median(table, axis=0), rtol=ALIKE, atol=0))
+
+
+def _spread(values: Array) -> float:
+    """Return how much positive numbers differ, relative to their size."""
+    return float(np.std(np.log(values)))
+
+
+# --------------------------------------------------------------------------------------
+# True poses and landmarks for a log, from a graph file that holds them.
+
+Point = tuple[float, ...]
+
+
+def with_truth(
+    log: SlamLog, steps: Mapping[int, int], path: str | PathLike[str]
+) -> SlamLog:
+    """Return the log with the truth of a graph file.
+
+    The file holds a line ``VERTEX2`` or ``VERTEX_SE2`` for every pose, and may hold a
+    ``VERTEX_XY`` for every landmark. Or it has no such line, but exact ``EDGE2`` or
+    ``ODOMETRY`` and ``LANDMARK`` lines: its poses then follow from them, from the
+    origin. Ids are those of the log's file.
+
+    Parameters
+    ----------
+    log : SlamLog
+        A log without truth, in which pose k has t = k.
+    steps : mapping of int to int
+        k of every pose, by its id in the file of the log.
+    path : path
+        The file.
+
+    Returns
+    -------
+    SlamLog
+        The log, which starts at the first true pose.
+
+    Raises
+    ------
+    LogError
+        If the file is no such graph, or its poses are not those of the log.
+    OSError
+        If it cannot be opened.
+    """
+    graph = sort_lines(read_lines(path))
+    poses, places = _values(graph)
+    if not poses:
+        poses = _composed(graph)
+        places = _seen_places(graph, poses)
+    _check_poses(path, poses, steps)
+    table = np.array([(step, *poses[i]) for i, step in steps.items()])
+    return replace(
+        log,
+        header={**log.header, "truth": f"graph {Path(path).name}"},
+        start=table[0, 1:],
+        landmark_ids=np.array(list(places), dtype=np.int64),
+        landmarks=np.array(list(places.values())).reshape(-1, 2),
+        ground_truth=table,
+    )
+
+
+def _values(graph: Graph) -> tuple[dict[int, Point], dict[int, Point]]:
+    """Return the poses and the places of landmarks in the vertices, by id."""
+    poses: dict[int, Point] = {}
+    places: dict[int, Point] = {}
+    for line in graph.vertices:
+        tag, *fields = line.text.split()
+        known, form = (poses, "i x y θ") if tag in POSE_TAGS else (places, "i x y")
+        line.check_count(fields, (len(form.split()),), f"{tag} {form}")
+        if id_at(line, 1) in known:
+            raise line.error("each vertex once", f"{tag} {fields[0]} again")
+        known[id_at(line, 1)] = tuple(reals_at(line, 2))
+    return poses, places
+
+
+def _check_poses(
+    path: str | PathLike[str], poses: Mapping[int, Point], steps: Mapping[int, int]
+) -> None:
+    if len(poses) != len(steps):
+        raise LogError(
+            f"{path}: expected the true poses of the {len(steps)} poses of the log, "
+            f"got {len(poses)}"
+        )
+    missing = steps.keys() - poses.keys()
+    if missing:
+        raise LogError(
+            f"{path}: expected the poses of the log, found no pose {min(missing)}"
+        )
+
+
+def _composed(graph: Graph) -> dict[int, Point]:
+    """Return the poses that exact odometry leads to, by id."""
+    chain, steps, _ = chain_of(graph)
+    poses: list[Point] = [(0.0, 0.0, 0.0)]
+    for line in chain:
+        dx, dy, turn = reals_at(line, 3, 6)
+        poses.append((*_to_world(poses[-1], dx, dy), poses[-1][2] + turn))
+    return {i: poses[step] for i, step in steps.items()}
+
+
+def _seen_places(graph: Graph, poses: Mapping[int, Point]) -> dict[int, Point]:
+    """Return the places where exact readings show the landmarks first, by id."""
+    places: dict[int, Point] = {}
+    for pose, lines in graph.readings.items():
+        for line in lines:
+            if pose not in poses:
+                raise line.error("a pose of the odometry", f"pose {pose}")
+            place = _to_world(poses[pose], *reals_at(line, 3, 5))
+            places.setdefault(id_at(line, 2), place)
+    return places
+
+
+def _to_world(pose: Point, dx: float, dy: float) -> tuple[float, float]:
+    x, y, heading = pose
+    cos, sin = math.cos(heading), math.sin(heading)
+    return x + cos * dx - sin * dy, y + sin * dx + cos * dy
+
+
+# --------------------------------------------------------------------------------------
+# Read pose-landmark graphs as text, in the formats of iSAM, TORO and g2o.
+#
+# Lines ``ODOMETRY i j dx dy dθ …`` or ``EDGE2`` (pose j in the frame of pose i) and
+# ``LANDMARK i j x y …`` (landmark j in the frame of pose i), or ``EDGE_SE2`` and
+# ``EDGE_SE2_XY``. The information matrices at the ends of the lines are ignored unless
+# asked for, and so are the estimates in ``VERTEX`` and ``FIX`` lines.
+
+
+def read_isam(
+    path: str | PathLike[str],
+    *,
+    truth: str | PathLike[str] | None = None,
+    noise_from_file: bool = False,
+) -> SlamLog:
+    """Read a graph whose odometry lines form one chain of poses.
+
+    Poses and landmarks share one sequence of ids in many files: landmarks keep theirs,
+    while poses are renumbered, so that pose k has t = k. An increment (dx, dy, dθ)
+    becomes two turn-last rows, (0, φ) with dt = 0 and (d, dθ - φ) with dt = 1, where
+    d (cos φ, sin φ) = (dx, dy) and φ in [-π/2, π/2]; d < 0 means driving backwards.
+
+    Loop closures, edges between two poses that were both visited before, are left out
+    and counted in the header (``left_out``): a filter has no use for them. Landmarks
+    that have a vertex, but no edge, are named there too.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    truth : path, optional
+        A graph of the true poses, see :func:`.graph.with_truth`.
+    noise_from_file : bool
+        Whether the header gets the noise that the information matrices specify, see
+        :func:`.graph.noise_header`.
+
+    Returns
+    -------
+    SlamLog
+        Motion turn-last, one unit of time per pose. It starts at the first true pose,
+        without a truth at the origin.
+
+    Raises
+    ------
+    LogError
+        If a line is of no known kind, or the odometry is no chain, or a landmark is
+        seen from a pose outside the chain, or a graph with loop closures has no
+        landmarks, or the truth is of other poses, or the noise is asked for and a line
+        does not specify it.
+    OSError
+        If a file cannot be opened.
+    """
+    graph = sort_lines(read_lines(path))
+    chain, steps, closures = chain_of(graph)
+    header = {"source": "iSAM or g2o text", "truth": "none"}
+    if closures and not graph.readings:
+        raise graph.lines[-1].error(
+            "readings of landmarks, as a filter has no use for loop closures "
+            "between poses",
+            "the end of the file",
+        )
+    left_out = [f"{closures} loop closures between poses"] * bool(closures)
+    left_out += [f"landmark {i}, which no edge reads" for i in unread_landmarks(graph)]
+    if left_out:
+        header["left_out"] = "; ".join(left_out)
+    if noise_from_file:
+        header |= noise_header(graph, chain)
+    log = SlamLog(
+        name=Path(path).stem, header=header, events=_events(graph, chain, steps)
+    )
+    return log if truth is None else with_truth(log, steps, truth)
+
+
+def _events(
+    graph: Graph, chain: list[LogLine], steps: dict[int, int]
+) -> tuple[OdometryRow | Scan, ...]:
+    """Follow the chain of poses, and record the readings of each pose."""
+    for pose in graph.readings.keys() - steps.keys():
+        raise graph.readings[pose][0].error("a pose of the odometry", f"pose {pose}")
+    recorder = EventRecorder()
+    for pose, step in steps.items():
+        if step:
+            _take_increment(recorder, chain[step - 1], step)
+        for line in graph.readings.get(pose, []):
+            _take_reading(recorder, line, step)
+    return recorder.finish()
+
+
+def _take_increment(recorder: EventRecorder, line: LogLine, step: int) -> None:
+    dx, dy, turn = reals_at(line, 3, 6)
+    sign = -1.0 if dx < 0 else 1.0
+    direction = math.atan2(sign * dy, abs(dx))
+    distance = sign * math.hypot(dx, dy)
+    recorder.add_turn_drive_turn(
+        line, step, before=direction, d=distance, after=turn - direction
+    )
+
+
+def _take_reading(recorder: EventRecorder, line: LogLine, step: int) -> None:
+    x, y = reals_at(line, 3, 5)
+    bearing = wrap_bearing(math.atan2(y, x))
+    recorder.add_reading(
+        line, Reading(float(step), id_at(line, 2), bearing, math.hypot(x, y))
+    )

@@ -18,9 +18,17 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ....evaluation.trajectory_error import poses_at
-from ..events import EventRecorder, OdometryRow, Reading, Scan, wrap_bearing
-from ..lines import LogError, LogLine, read_lines
-from ..slamlog import SlamLog
+from ..slamlog import (
+    EventRecorder,
+    LogError,
+    LogLine,
+    OdometryRow,
+    Reading,
+    Scan,
+    SlamLog,
+    read_lines,
+    wrap_bearing,
+)
 
 ODOMETRY_STEP = 0.1  # [s]
 LONGEST = 1e6  # [s]: 10 million rows

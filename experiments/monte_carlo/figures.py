@@ -1,0 +1,446 @@
+"""Figures of many runs: NEES, heading, NIS and errors over time, per estimator."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from ...arrays import AnyArray, Array
+from ...estimator.models.rigid_motion import ErrorFrame
+from ...evaluation.hypothesis_tests import (
+    autocorrelation,
+    average_band,
+    chi_square_quantile,
+    family_band,
+    normal_scores,
+)
+from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, TEAL, dress, new_figure
+from .verdict import POSE_FREEDOM, EstimatorScores, labels_of, scores_of
+
+# --------------------------------------------------------------------------------------
+# Colours, dashes and markers of the estimators in a figure, and thinned lines.
+
+
+class EstimatorLook(NamedTuple):
+    """Colour, dashes and marker, distinct even without colour."""
+
+    colour: str
+    dashes: Any
+    marker: str
+
+    def line(self, label: str | None = None) -> dict[str, Any]:
+        """Return the arguments of a matplotlib line."""
+        return {"color": self.colour, "ls": self.dashes, "lw": 1.5, "label": label}
+
+
+Shown = list[tuple[EstimatorScores, EstimatorLook]]
+
+_WIDTH = 4.8
+_LOG_FROM = 4.0
+_BINS = 70
+_FEW_DOTS = 100
+MOST_DOTS = 300
+"""Of one estimator in `runs_figure`, which shows quantiles of more runs."""
+
+
+def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> dict[str, Figure]:
+    """Draw all figures of a report.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Results of ``monte_carlo``.
+    summary : dict
+        Their summary, of ``summarise_monte_carlo``.
+
+    Returns
+    -------
+    dict of str to Figure
+        ``nees``, ``runs``, ``heading``, ``nis`` and ``rmse``, of the estimators with
+        successful runs; empty if there is none. ``nis`` shows those with innovations,
+        which a smoother has not.
+    """
+    frame: ErrorFrame = summary["frame"]
+    each = [scores_of(dataset, label, frame) for label in labels_of(dataset)]
+    shown = [(scores, look_of(i)) for i, scores in enumerate(each) if scores.good.any()]
+    if not shown:
+        return {}
+    figures = {
+        "nees": nees_figure(shown, frame, summary),
+        "runs": runs_figure(shown, frame),
+        "heading": heading_figure(shown, summary["knowable_heading_std"]),
+        "rmse": rmse_figure(shown),
+    }
+    innovative = [pair for pair in shown if pair[0].nis_per_degree is not None]
+    return figures | ({"nis": nis_figure(innovative)} if innovative else {})
+
+
+def nees_figure(shown: Shown, frame: ErrorFrame, summary: dict[str, Any]) -> Figure:
+    """Draw ANEES / 3 over time, with the 95 % bands of one step and of the grid."""
+    figure = new_figure(_WIDTH, 2.9)
+    axes = figure.subplots()
+    runs = max(int(scores.good.sum()) for scores, _ in shown)
+    band = np.array(average_band(runs, POSE_FREEDOM)) / POSE_FREEDOM
+    axes.axhspan(*band, color=GREY, alpha=0.25, lw=0, label="95 % band")
+    if times := grid_steps(summary):
+        wide = np.array(family_band(runs, POSE_FREEDOM, times)) / POSE_FREEDOM
+        label = f"95 % band, {times} step{'s' * (times > 1)}"
+        for end, name in zip(wide, (label, None), strict=True):
+            axes.axhline(end, color=GREY, lw=0.8, label=name)
+    extremes = [band]
+    for scores, look in shown:
+        average = scores.ratios(frame).mean(axis=0)
+        steps = np.arange(scores.first, scores.first + len(average))
+        axes.plot(*thinned(steps, average), **look.line(plain(scores.label)))
+        _mark_grid(axes, summary["estimators"][scores.label]["decisions"], look)
+        extremes.append(average)
+    everything = np.concatenate(extremes)
+    dress(axes)
+    if everything.max() > _LOG_FROM or everything.min() < 1 / _LOG_FROM:
+        log_ticks(axes, "y")
+    axes.margins(x=0.01)
+    axes.set(xlabel="step", ylabel="ANEES / 3")
+    legend_above(figure, axes)
+    return figure
+
+
+def runs_figure(shown: Shown, frame: ErrorFrame) -> Figure:
+    """Draw the time average of each run's NEES / 3, a row of dots per estimator."""
+    figure = new_figure(_WIDTH, 0.8 + 1.0 * len(shown))
+    axes = figure.subplots()
+    size = 3.4 if len(shown[0][0].good) <= _FEW_DOTS else 2.6
+    each = [_dots(scores.ratios(frame).mean(axis=1)) for scores, _ in shown]
+    logs = np.log10(np.concatenate(each))
+    edges = np.linspace(min(logs.min(), -0.5), max(logs.max(), 0.6), _BINS + 1)
+    for row, ((scores, look), dots) in enumerate(zip(shown, each, strict=True)):
+        x, lift = _swarm(np.log10(dots), edges)
+        axes.plot(10**x, row + lift, "o", color=look.colour, ms=size, mew=0, alpha=0.75)
+        median = np.median(scores.ratios(frame).mean(axis=1))
+        axes.plot([median] * 2, [row - 0.34, row + 0.34], color=INK, lw=1.6)
+        axes.annotate(
+            plain(scores.label),
+            (0.01, row - 0.5),
+            xycoords=("axes fraction", "data"),
+            va="center",
+            fontsize=10,
+            color=INK,
+        )
+    dress(axes)
+    axes.set_xlim(10 ** edges[0] / 1.1, 10 ** edges[-1] * 1.1)
+    log_ticks(axes, "x")
+    axes.axvline(1, color=GREY, lw=1.0)
+    axes.axvline(3, color=GREY, lw=1.0, ls=(0, (1.4, 1.6)))
+    axes.set_yticks([])
+    axes.set_ylim(len(shown) - 0.55, -0.7)
+    axes.grid(visible=False, axis="y")
+    axes.set_xlabel("time average of NEES / 3")
+    return figure
+
+
+def heading_figure(shown: Shown, knowable: float) -> Figure:
+    """Draw claimed and true deviation of the heading, a panel per estimator [°]."""
+    figure = new_figure(_WIDTH, 0.75 + 1.3 * len(shown))
+    panels = figure.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)
+    for axes, (scores, look) in zip(panels[:, 0], shown, strict=True):
+        claimed, true = (
+            np.degrees(_root_mean_square(scores.over_time(name)))
+            for name in ("heading_std", "heading_error")
+        )
+        axes.plot(*thinned(scores.steps, true), color=INK, lw=1.0, label="true error")
+        axes.plot(
+            *thinned(scores.steps, claimed),
+            **(look.line("claimed deviation") | {"ls": "-", "lw": 2.0}),
+        )
+        axes.axhline(
+            np.degrees(knowable),
+            color=GREY,
+            lw=1.2,
+            ls=(0, (1.4, 1.6)),
+            label="at the start",
+        )
+        dress(axes)
+        axes.margins(x=0.01)
+        axes.set_ylim(bottom=0)
+        axes.set_title(plain(scores.label), loc="left", fontsize=10, color=INK, pad=3)
+    panels[-1, 0].set_xlabel("step")
+    figure.supylabel("heading, RMS over runs [°]", fontsize=10, color=INK)
+    legend_above(figure, panels[0, 0])
+    return figure
+
+
+def rmse_figure(shown: Shown) -> Figure:
+    """Draw the root mean square of the position's raw error over time."""
+    figure = new_figure(_WIDTH, 2.5)
+    axes = figure.subplots()
+    for scores, look in shown:
+        rms = _root_mean_square(scores.over_time("position_error"))
+        axes.plot(*thinned(scores.steps, rms), **look.line(plain(scores.label)))
+    if "position_bound_raw" in shown[0][0].results:
+        bound = shown[0][0].over_time("position_bound_raw").mean(axis=0)
+        least = thinned(shown[0][0].steps, np.sqrt(bound))
+        axes.plot(*least, color=GREY, ls=":", lw=1.5, label="bound of any filter")
+    dress(axes)
+    axes.margins(x=0.01)
+    axes.set_ylim(bottom=0)
+    axes.set(xlabel="step", ylabel="RMS error, raw [m]")
+    legend_above(figure, axes)
+    return figure
+
+
+def grid_steps(summary: dict[str, Any]) -> int:
+    """Return how many steps are tested together; 0 without tests."""
+    decisions = [entry["decisions"] for entry in summary["estimators"].values()]
+    return max((len(found["grid"]["steps"]) for found in decisions if found), default=0)
+
+
+def _mark_grid(
+    axes: Axes, decisions: dict[str, Any] | None, look: EstimatorLook
+) -> None:
+    """Mark the tested steps, filled where rejected."""
+    if decisions is None:
+        return
+    grid = decisions["grid"]
+    steps, ratios = np.array(grid["steps"]), np.array(grid["statistic"], dtype=float)
+    rejected = np.array(grid["rejected"])
+    for chosen, face in ((rejected, look.colour), (~rejected, "white")):
+        axes.plot(
+            steps[chosen],
+            ratios[chosen],
+            look.marker,
+            ms=4.5,
+            color=look.colour,
+            mfc=face,
+            mew=1.2,
+            zorder=3,
+        )
+
+
+def _root_mean_square(values: Array) -> Array:
+    """Return the RMS over runs; nan, a gap in a line, where it overflows."""
+    with np.errstate(over="ignore"):
+        square = (values**2).mean(axis=0)
+    return np.sqrt(np.where(np.isfinite(square), square, np.nan))
+
+
+def _dots(values: Array) -> Array:
+    """Return the values of few runs, or quantiles of many."""
+    if len(values) <= MOST_DOTS:
+        return values
+    return np.asarray(np.quantile(values, (np.arange(MOST_DOTS) + 0.5) / MOST_DOTS))
+
+
+def _swarm(values: Array, edges: Array) -> tuple[Array, Array]:
+    """Return x and height of dots, stacked per bin around the middle of their row."""
+    bins = np.clip(np.searchsorted(edges, values, "right") - 1, 0, _BINS - 1)
+    order = np.argsort(values, kind="stable")
+    lift = np.zeros(len(values))
+    tallest = max(int(np.bincount(bins).max()), 8)
+    for b in np.unique(bins):
+        rows = order[bins[order] == b]
+        lift[rows] = (np.arange(len(rows)) - (len(rows) - 1) / 2) * 0.6 / tallest
+    return (edges[bins] + edges[bins + 1]) / 2, lift
+
+
+PURPLE, SKY = "#cc79a7", "#56b4e9"  # Okabe, Ito
+_COLOURS = (BLUE, ORANGE, TEAL, PURPLE, SKY, ALARM)
+_DASHES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 1.6)),
+    (0, (7, 1.5, 1.5, 1.5)),
+    (0, (1.4, 1.4)),
+    (0, (10, 2.5)),
+    (0, (4, 1.3, 1.3, 1.3, 1.3, 1.3)),
+)
+_MARKERS = ("o", "s", "^", "D", "v", "P")
+_MOST_POINTS = 400
+_LETTERS = 52  # in a row of a legend
+_KEY = 6  # width of a key in letters
+_ROW = 0.19  # height of a row of a legend [inch]
+
+
+def look_of(place: int) -> EstimatorLook:
+    """Return the look of the estimator with an index in the results, from 0."""
+    dashes = (place + place // len(_COLOURS)) % len(_DASHES)  # shifts per cycle
+    return EstimatorLook(
+        _COLOURS[place % len(_COLOURS)],
+        _DASHES[dashes],
+        _MARKERS[place % len(_MARKERS)],
+    )
+
+
+def thinned(
+    x: AnyArray, y: Array, *, most: int = _MOST_POINTS
+) -> tuple[AnyArray, Array]:
+    """Leave out points of a line that would not be visible, but no peak.
+
+    The line is cut into pieces; each keeps its lowest and its highest point.
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (n,)
+        The line.
+    most : int
+        Approximate number of points that remain.
+
+    Examples
+    --------
+    >>> x, y = thinned(np.arange(1000.0), np.arange(1000.0) == 637, most=20)
+    >>> len(x), int(y.sum())
+    (20, 1)
+    """
+    if len(x) <= most:
+        return x, y
+    pieces = np.array_split(np.arange(len(x)), most // 2)
+    lowest = [piece[y[piece].argmin()] for piece in pieces]
+    highest = [piece[::-1][y[piece][::-1].argmax()] for piece in pieces]
+    rows = np.unique([0, *lowest, *highest, len(x) - 1])
+    return x[rows], y[rows]
+
+
+def plain(label: str) -> str:
+    r"""Protect a label from being parsed as mathematics or hidden by matplotlib.
+
+    Examples
+    --------
+    >>> plain("$a$"), plain("_mine")
+    ('\\$a\\$', ' _mine')
+    """
+    shown = label.replace("$", r"\$")
+    return f" {shown}" if shown.startswith("_") else shown
+
+
+def log_ticks(axes: Axes, which: str) -> None:
+    """Make an axis logarithmic, with ticks such as 0.5, 1, 2, 5, 10."""
+    getattr(axes, f"set_{which}scale")("log")
+    axis = getattr(axes, f"{which}axis")
+    low, high = axis.get_view_interval()
+    wide = high > 100 * low
+    axis.set_major_locator(LogLocator(subs=(1, 3) if wide else (1, 2, 5), numticks=12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def legend_above(figure: Figure, axes: Axes) -> None:
+    """Put the legend above the axes in as many columns as fit; the figure grows."""
+    handles, labels = axes.get_legend_handles_labels()
+    longest = max((len(label) for label in labels), default=0) + _KEY
+    columns = max(1, min(len(labels), _LETTERS // longest))
+    rows = math.ceil(len(labels) / columns)
+    figure.set_figheight(figure.get_figheight() + _ROW * rows)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper left",
+        ncols=columns,
+        frameon=False,
+        fontsize=9.5,
+        labelcolor=INK,
+        borderaxespad=0.1,
+        borderpad=0.0,
+        handlelength=2.4,
+        columnspacing=1.4,
+    )
+
+
+# --------------------------------------------------------------------------------------
+# Figures of innovations over many runs: their size and whiteness.
+
+_MOST_BLOCKS = 60
+_LAGS = 10
+_TAIL = 0.025
+_LEAST = 0.02  # smallest range of correlations on the axis
+
+
+def nis_figure(shown: list[tuple[EstimatorScores, EstimatorLook]]) -> Figure:
+    """Draw NIS by its degrees of freedom over time, and its autocorrelation.
+
+    Innovations are white, so the NIS of neighbouring steps may be pooled: each point
+    covers a block of steps and all runs, with its 95 % band of χ².
+
+    Parameters
+    ----------
+    shown : list of (EstimatorScores, EstimatorLook)
+        Estimators with successful runs.
+    """
+    figure = new_figure(4.8, 4.0)
+    above, below = figure.subplots(2, 1, height_ratios=(3, 2))
+    _draw_band(above, shown[0][0])
+    for scores, look in shown:
+        steps, ratios, _ = pooled_nis(scores)
+        above.plot(steps, ratios, **look.line(plain(scores.label)))
+    above.set(xlabel="step", ylabel="NIS / degrees of freedom")
+    _draw_autocorrelations(below, shown)
+    for axes in (above, below):
+        dress(axes)
+    figure.align_ylabels()
+    legend_above(figure, above)
+    return figure
+
+
+def pooled_nis(scores: EstimatorScores) -> tuple[Array, Array, Array]:
+    """Pool the NIS of all runs in blocks of steps.
+
+    Returns
+    -------
+    steps, ratios, degrees_of_freedom : ndarray, shape (k,)
+        Middle of each block, its NIS by degrees of freedom, and its degrees of freedom;
+        blocks without a correction are left out.
+    """
+    freedom = scores.over_time("nis_dof")
+    nis = np.where(freedom > 0, scores.over_time("nis"), 0.0)
+    blocks = np.array_split(
+        np.arange(len(scores.steps)), min(_MOST_BLOCKS, len(scores.steps))
+    )
+    totals = np.array([nis[:, block].sum() for block in blocks])
+    counts = np.array([freedom[:, block].sum() for block in blocks], dtype=np.float64)
+    middles = np.array([scores.steps[block].mean() for block in blocks])
+    used = counts > 0
+    return middles[used], totals[used] / counts[used], counts[used]
+
+
+def nis_autocorrelation(scores: EstimatorScores) -> tuple[Array, Array]:
+    """Compute the autocorrelation of the NIS.
+
+    Each NIS is first transformed to be nearly normal, as in the test of whiteness.
+
+    Returns
+    -------
+    correlations, pairs : ndarray, shape (lags,)
+        Correlations at lags 1 to 10, and their numbers of pairs.
+    """
+    normal = normal_scores(scores.over_time("nis"), scores.over_time("nis_dof"))
+    return autocorrelation(normal, lags=min(_LAGS, normal.shape[1] - 1))
+
+
+def _draw_band(axes: Axes, scores: EstimatorScores) -> None:
+    steps, _, freedom = pooled_nis(scores)
+    low, high = (
+        chi_square_quantile(tail, freedom) / freedom for tail in (_TAIL, 1 - _TAIL)
+    )
+    axes.fill_between(steps, low, high, color=GREY, alpha=0.25, lw=0, label="95 % band")
+    axes.axhline(1, color=GREY, lw=0.8)
+    axes.margins(x=0.01)
+
+
+def _draw_autocorrelations(
+    axes: Axes, shown: list[tuple[EstimatorScores, EstimatorLook]]
+) -> None:
+    axes.axhline(0, color=GREY, lw=0.8)
+    largest = 0.0
+    offsets = np.linspace(-0.25, 0.25, len(shown)) if len(shown) > 1 else [0.0]
+    for (scores, look), offset in zip(shown, offsets, strict=True):
+        correlations, pairs = nis_autocorrelation(scores)
+        largest = max(largest, float(abs(correlations).max()))
+        lags = np.arange(1, len(correlations) + 1)
+        if scores is shown[0][0]:
+            limit = 1.96 / np.sqrt(np.maximum(pairs, 1))
+            axes.bar(lags, 2 * limit, 0.8, -limit, color=GREY, alpha=0.25, lw=0)
+        axes.vlines(lags + offset, 0, correlations, color=look.colour, lw=1.2)
+        axes.plot(lags + offset, correlations, look.marker, color=look.colour, ms=3.5)
+    axes.set_ylim(*np.array([-1.1, 1.1]) * max(largest, _LEAST))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set(xlabel="lag [scans]", ylabel="autocorrelation")

@@ -1,0 +1,298 @@
+"""Run one filter over many simulated runs: in a batch if possible, else one by one."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from ...arrays import Array, BoolArray
+from ...envs.robot import wall_distances
+from ...estimator.filters.batch import BatchSlam, BatchTrace, can_batch
+from ...estimator.filters.ekf import EkfSlam
+from ...estimator.interface import Belief, SlamEstimator, SmoothedPath, SupportsTruth
+from ...estimator.smoother.batch_smoother import smoother_in
+from ...evaluation.error_bound import PosteriorBound, posterior_bound
+from ...evaluation.noise_findings import noise_sums
+from ...sim_configs import Scenario
+from ..runs.filter_settings import FilterSettings, refuse_large_maps
+from ..runs.simulated_runs import SimulatedRuns
+from ..runs.trace import DecisionRecorder, RunDecisions
+
+_NOT_FINITE = "the pose, its covariance or the NIS is not finite"
+_MAP_NOT_FINITE = "the belief about the map is not finite"
+
+
+class Failure(NamedTuple):
+    """Where and why a run failed."""
+
+    step: int
+    """Step of the run."""
+    message: str
+
+
+class FilteredRuns(NamedTuple):
+    """The beliefs of a filter in B runs."""
+
+    trace: BatchTrace
+    """The belief after every step; nan from the step on at which a run failed."""
+    beliefs: list[Belief | None]
+    """Final beliefs; None for a run that failed."""
+    failures: Mapping[int, Failure]
+    """By the index of the run."""
+    decisions: Mapping[int, RunDecisions] = {}
+    """About readings without identity, by the index of the run."""
+
+
+def filter_runs(
+    settings: FilterSettings, runs: SimulatedRuns, *, threads: int | None = None
+) -> FilteredRuns:
+    """Feed every run to a filter of its own.
+
+    A filter made of the shared kernels runs in a batch, any other one step by step; the
+    results are the same to the last bit. An error in one run ends that run alone.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        Makes the filters.
+    runs : SimulatedRuns
+        Their input.
+    threads : int, optional
+        Threads of a batch; all cores by default.
+    """
+    first = settings.make(runs.initial_poses[0])
+    is_batch = can_batch(first) and runs.true_ids is None
+    refuse_large_maps(runs, first, at_once=is_batch)
+    if is_batch:
+        return _in_a_batch(cast(EkfSlam, first), settings, runs, threads)
+    count, steps, _ = runs.visible.shape
+    trace = _empty_trace(count, steps)
+    beliefs: list[Belief | None] = []
+    failures: dict[int, Failure] = {}
+    decisions: dict[int, RunDecisions] = {}
+    for run in range(count):
+        failure = _one_by_one(settings, runs, run, trace, beliefs, decisions)
+        if failure is not None:
+            _erase(trace, run, failure.step)
+            beliefs.append(None)
+            failures[run] = failure
+    return FilteredRuns(trace, beliefs, failures, decisions)
+
+
+def _in_a_batch(
+    estimator: EkfSlam,
+    settings: FilterSettings,
+    runs: SimulatedRuns,
+    threads: int | None,
+) -> FilteredRuns:
+    count, _, landmarks = runs.visible.shape
+    batch = BatchSlam(
+        estimator,
+        count,
+        landmarks,
+        initial_poses=runs.initial_poses,
+        initial_pose_std=settings.initial_pose_std,
+        threads=threads,
+    )
+    trace = batch.run(runs.odometry, runs.measurements, runs.visible, runs.dt)
+    finite = _finite(trace)
+    beliefs: list[Belief | None] = [
+        _renamed(batch.belief(run), runs) for run in range(count)
+    ]
+    finite[:, -1] &= [belief is None or _is_finite_map(belief) for belief in beliefs]
+    failures = {}
+    for run in np.flatnonzero(~finite.all(axis=1)).tolist():
+        failures[run] = _why(settings, runs, run, int(finite[run].argmin()))
+        _erase(trace, run, failures[run].step)
+        beliefs[run] = None
+    return FilteredRuns(trace, beliefs, failures)
+
+
+def _renamed(belief: Belief, runs: SimulatedRuns) -> Belief:
+    """Return a belief of a batch, which names landmarks by their rows, by their ids."""
+    if runs.ids is None:
+        return belief
+    rows = np.array(belief.landmark_ids, dtype=np.int64)
+    return replace(belief, landmark_ids=tuple(runs.ids_of(rows)))
+
+
+def _why(settings: FilterSettings, runs: SimulatedRuns, run: int, step: int) -> Failure:
+    """Repeat a run that failed in a batch, for the message of the single filter."""
+    trace = _empty_trace(*runs.visible.shape[:2])
+    failure = _one_by_one(settings, runs, run, trace, [], {})
+    return failure or Failure(step, _NOT_FINITE)
+
+
+def _one_by_one(
+    settings: FilterSettings,
+    runs: SimulatedRuns,
+    run: int,
+    trace: BatchTrace,
+    beliefs: list[Belief | None],
+    decisions: dict[int, RunDecisions],
+) -> Failure | None:
+    """Filter one run into its row of the trace; keep final belief and decisions."""
+    step = 0
+    try:
+        slam = settings.make(runs.initial_poses[run])
+        recorder = DecisionRecorder(slam)
+        pass_truth = _truth_source(slam, runs, run)
+        for step in range(runs.visible.shape[1]):
+            pass_truth(step)
+            belief = _step(slam, runs, run, step, trace, recorder)
+            if not _finite(trace, (run, step)):
+                return Failure(step, _NOT_FINITE)
+        if (smoother := smoother_in(slam)) is not None:
+            belief = _take_smoothed(smoother.smoothed(), trace, run)
+    except (Exception, SystemExit) as error:
+        return Failure(step, f"{type(error).__name__}: {error}")
+    if not _is_finite_map(belief):
+        return Failure(step, _MAP_NOT_FINITE)
+    beliefs.append(belief)
+    if runs.true_ids is not None and (made := recorder.result()) is not None:
+        decisions[run] = made
+    return None
+
+
+def _truth_source(
+    slam: SlamEstimator, runs: SimulatedRuns, run: int
+) -> Callable[[int], None]:
+    """Return the function that passes the truth of a step to an observing filter."""
+    if not isinstance(slam, SupportsTruth):
+        return _unobserved
+    landmarks = dict(enumerate(runs.landmarks[run]))
+    return lambda step: slam.observe_truth(runs.true_poses[run, step], landmarks)
+
+
+def _unobserved(_: int) -> None:
+    """Pass nothing."""
+
+
+def _step(
+    slam: SlamEstimator,
+    runs: SimulatedRuns,
+    run: int,
+    step: int,
+    trace: BatchTrace,
+    recorder: DecisionRecorder,
+) -> Belief:
+    if step > 0:  # the first scan is before any motion
+        slam.predict(runs.odometry[run, step], runs.dt[step])
+    seen = np.flatnonzero(runs.visible[run, step])
+    readings = runs.measurements[run, step, seen]
+    if runs.true_ids is None:
+        report = slam.update(readings, runs.ids_of(seen))
+    else:
+        report = slam.update(readings)
+        recorder.add(report, runs.true_ids[run, step, seen])
+    belief = slam.belief()
+    trace.poses[run, step] = belief.pose
+    trace.pose_covariances[run, step] = belief.pose_covariance
+    trace.nis[run, step] = report.nis
+    trace.degrees_of_freedom[run, step] = report.degrees_of_freedom
+    return belief
+
+
+def _take_smoothed(path: SmoothedPath, trace: BatchTrace, run: int) -> Belief:
+    """Put the poses given the whole drive in place of the filter's; return the belief.
+
+    They have no innovations, and so no NIS.
+    """
+    trace.poses[run], trace.pose_covariances[run] = path.poses, path.pose_covariances
+    trace.nis[run], trace.degrees_of_freedom[run] = 0.0, 0
+    return path.belief()
+
+
+def _finite(trace: BatchTrace, where: Any = ...) -> BoolArray:
+    """Report where the trace is finite, shape (B, T), or (T,) or () of a part."""
+    poses, covariances = trace.poses[where], trace.pose_covariances[where]
+    known = np.isfinite(poses).all(axis=-1) & np.isfinite(trace.nis[where])
+    return np.asarray(known & np.isfinite(covariances).all(axis=(-2, -1)))
+
+
+def _is_finite_map(belief: Belief) -> bool:
+    return bool(np.isfinite(belief.mean).all() and np.isfinite(belief.covariance).all())
+
+
+def _empty_trace(runs: int, steps: int) -> BatchTrace:
+    return BatchTrace(
+        np.full((runs, steps, 3), np.nan),
+        np.full((runs, steps, 3, 3), np.nan),
+        np.full((runs, steps), np.nan),
+        np.zeros((runs, steps), dtype=np.int64),
+    )
+
+
+def _erase(trace: BatchTrace, run: int, step: int) -> None:
+    """Set a run to nan from the step on at which it failed."""
+    for array in (trace.poses, trace.pose_covariances, trace.nis):
+        array[run, step:] = np.nan
+    trace.degrees_of_freedom[run, step:] = 0
+
+
+# --------------------------------------------------------------------------------------
+# The bound on the errors of any filter in simulated runs, and their actual noise.
+
+_MANY = 6  # deviations that a displacement hardly exceeds
+
+
+def bound_runs(scenario: Scenario, runs: SimulatedRuns) -> PosteriorBound:
+    """Return the bound along each run's true path, with the noise of the world.
+
+    Where the world hides identities, it is that of a filter which knows them. The
+    covariances are left out: they take as much memory as the filters.
+    """
+    identified = runs.identified()
+    dt = np.tile(runs.dt, (len(runs.odometry), 1))
+    if not scenario.motion.noise_at_rest:
+        dt *= runs.odometry.any(axis=2)
+    bound = posterior_bound(
+        runs.true_poses,
+        identified.landmarks_of_rows,
+        identified.visible,
+        dt,
+        motion_std=scenario.motion.std,
+        measurement_std=scenario.sensor.std,
+        start_std=scenario.start.std,
+        range_std_per_metre=scenario.sensor.range_std_per_metre,
+    )
+    return bound._replace(covariances=())
+
+
+def noise_of_runs(scenario: Scenario, assumed: Scenario, runs: SimulatedRuns) -> Array:
+    """Return sums over the noise of each run, in deviations that `assumed` has.
+
+    Clutter does not count, nor motion at rest where no noise is assumed, nor motion
+    that begins near a wall: walls stop the longest displacements.
+    """
+    identified = runs.identified()
+    noisy = ~_near_walls(scenario, runs.true_poses)
+    if not assumed.motion.noise_at_rest:
+        noisy &= runs.odometry.any(axis=2)
+    return noise_sums(
+        runs.true_poses,
+        identified.landmarks_of_rows,
+        runs.odometry,
+        identified.measurements,
+        identified.visible,
+        motion_std=assumed.motion.std,
+        measurement_std=assumed.sensor.std,
+        range_std_per_metre=assumed.sensor.range_std_per_metre,
+        noise_in=assumed.motion.noise_in,
+        noisy_steps=noisy,
+    )
+
+
+def _near_walls(scenario: Scenario, poses: Array) -> BoolArray:
+    """Return the steps, shape (B, T), that begin where a wall may end them."""
+    near = np.zeros(poses.shape[:2], dtype=np.bool_)
+    if not scenario.walls:
+        return near
+    ends = np.array(scenario.walls)
+    start, end = ends[:, 0] + 1j * ends[:, 1], ends[:, 2] + 1j * ends[:, 3]
+    at = poses[:, :-1, 0] + 1j * poses[:, :-1, 1]
+    robot, std = scenario.robot, max(scenario.motion.std[:2])
+    reach = robot.radius + robot.max_speed * scenario.dt + _MANY * std
+    near[:, 1:] = wall_distances(at, start, end - start).min(axis=-1) < reach
+    return near

@@ -1,1 +1,0 @@
-"""Filter simulated runs, and measure their errors and consistency."""

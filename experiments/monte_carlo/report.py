@@ -1,0 +1,520 @@
+"""Write the report of a Monte Carlo as one web page without other files or network."""
+
+import html
+import io
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from html import escape
+from pathlib import Path
+from string import ascii_uppercase
+from typing import Any, NamedTuple
+
+import xarray as xr
+from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from rich.table import Table
+from rich.text import Text
+
+from ...evaluation.consistency_report import FEW_AVERAGES
+from ...sim_configs.atomic_file import replace_when_written
+from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, PALE, TEAL, page_environment
+from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
+from .runner import ASSUMED_FILE, python_call
+from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT, in_degrees, p_text
+
+_NOTHING = "–"
+_LARGE = 1e5  # written without three decimals
+_FEW = 3  # estimators; a headline counts more of them
+
+
+def write_html_report(
+    dataset: xr.Dataset, summary: dict[str, Any], path: str | Path
+) -> None:
+    """Write the report, which appears complete or not at all.
+
+    The same results give the same bytes.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Results of ``monte_carlo``.
+    summary : dict
+        Their summary, of ``summarise_monte_carlo``.
+    path : str or Path
+        The .html file; its folder must exist.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    """
+    page = html_report(dataset, summary)
+    with replace_when_written(path) as partial:
+        partial.write_text(page, encoding="utf-8")
+
+
+def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
+    """Return the report's HTML; see :func:`write_html_report`."""
+    environment = page_environment(Path(__file__).parent, finalize=escaped)
+    entries = summary["estimators"]
+    page = {
+        "headline": headline(summary),
+        "command": summary["command"] or python_call(summary),
+        "described": "; ".join(_described(*entry) for entry in entries.items()),
+        "files": _files(summary),
+        "measures": measures(summary),
+        "bad_run": _bad_run(summary),
+        "figures": report_figures(dataset, summary),
+        "good_runs": max(entry["good_runs"] for entry in entries.values()),
+        "tested": grid_steps(summary),
+    }
+    environment.globals |= {
+        "most_dots": MOST_DOTS,
+        "few_averages": FEW_AVERAGES,
+        "kinds": KINDS,
+        "signs": {CONSISTENT: "✓", NEARLY: "≈", NOT_CONSISTENT: "✗"},
+        "outcomes": {True: "accepted", False: "rejected", None: _NOTHING},
+        "inside": {CONSISTENT: "yes", NOT_CONSISTENT: "no, outside"},
+        "breakable": _breakable,
+        "extreme": _extreme,
+        "interval": _interval,
+        "number": number,
+        "p_value": _p_value,
+        "percent": percent,
+        "svg": lambda *part: Markup(inline_svg(*part)),
+        "verbatim": lambda text: Markup(html.escape(text)),
+    }
+    return environment.get_template("html_report.html").render(summary | page)
+
+
+def headline(summary: dict[str, Any]) -> str:
+    """Write the verdicts in one line.
+
+    Examples
+    --------
+    >>> entries = {"ekf": {"verdict": "not consistent"}}
+    >>> headline({"scenario": "loop", "estimators": entries})
+    'loop: ekf not consistent'
+    """
+    entries = summary["estimators"]
+    words = [entry["verdict"] for entry in entries.values()]
+    if len(entries) <= _FEW:
+        said = "; ".join(
+            f"{label} {word}" for label, word in zip(entries, words, strict=True)
+        )
+    else:
+        said = f"{words.count(CONSISTENT)} of {len(words)} estimators consistent"
+    return f"{summary['scenario']}: {said}"
+
+
+def _bad_run(summary: dict[str, Any]) -> str:
+    scores = [entry["association"] for entry in summary["estimators"].values()]
+    return "" if None in scores else f" {bad_run_text(scores[0])}"
+
+
+def _files(summary: dict[str, Any]) -> dict[str, str]:
+    """Return the scenario files that the page shows, by their titles."""
+    files = {f"The scenario, {summary['scenario']}.toml": summary["scenario_toml"]}
+    if summary["assumed_toml"]:
+        title = f"The scenario that the estimators assume, {ASSUMED_FILE}"
+        files[title] = summary["assumed_toml"]
+    return files
+
+
+def _described(label: str, entry: dict[str, Any]) -> str:
+    name, options = entry.get("name", label), entry.get("options") or {}
+    listed = ", ".join(f"{key} = {value}" for key, value in options.items())
+    estimator = name if name == label else f"{label}: {name}"
+    return f"{estimator} ({listed})" if listed else estimator
+
+
+def _breakable(label: str) -> Markup:
+    """Allow line breaks in a long name after its punctuation."""
+    return Markup(re.sub(r"([_,:=])|(?=\[)", r"\1<wbr>", str(escaped(label))))
+
+
+def _extreme(found: float | list[float]) -> float:
+    """Return the ratio of the grid that is farthest from 1."""
+    if isinstance(found, list):
+        return max(found, key=lambda ratio: abs(ratio - 1))
+    return found
+
+
+def _p_value(p_value: float | None) -> str:
+    if p_value is None:
+        return _NOTHING
+    return p_text(p_value).removeprefix("p ").removeprefix("= ")
+
+
+def _interval(ends: Iterable[float | None]) -> str:
+    """Write an interval of numbers >= 0; a dash where unknown."""
+    known = [max(end, 0.0) for end in ends if end is not None]
+    if len(known) < 2:
+        return _NOTHING
+    written = [f"{end:.3f}" if end < _LARGE else number(end) for end in known]
+    return f"[{', '.join(written)}]"
+
+
+def escaped(value: object) -> Markup:
+    """Write a value as HTML without line breaks before a % or inside an interval.
+
+    Examples
+    --------
+    >>> print(escape("<b> at 5 %, [1, 2]"))
+    &lt;b&gt; at 5&nbsp;%, [1,&nbsp;2]
+    """
+    if isinstance(value, Markup):
+        return value
+    safe = html.escape(str(value)).replace(" %", "&nbsp;%")
+    return Markup(re.sub(r"(\[[\d.e+-]+,) ([\d.e+-]+\])", r"\1&nbsp;\2", safe))
+
+
+# --------------------------------------------------------------------------------------
+# The table of a Monte Carlo: one row per measure, one column per estimator.
+
+Entry = dict[str, Any]
+_STYLES = {"good": "green", "bad": "red", "open": "yellow"}
+_LEAST_BOUND = math.radians(0.1)  # of a heading that is shown
+
+
+class Measure(NamedTuple):
+    """One row of the table."""
+
+    name: str
+    right: str
+    """Value of a consistent filter, or lower bound; else empty."""
+    of: Callable[[Entry], str]
+    """Writes the cell of one estimator from its entry in the summary."""
+
+
+def measures(summary: dict[str, Any]) -> list[Measure]:
+    """List the rows that follow the verdict.
+
+    Parameters
+    ----------
+    summary : dict
+        Result of ``summarise_monte_carlo``.
+    """
+    frame, runs = summary["frame"], summary["runs"]
+    other = "additive" if frame == "invariant" else "invariant"
+    knowable = summary["knowable_heading_std"]
+    least = f"≥ {in_degrees(knowable)}" if knowable >= _LEAST_BOUND else ""
+
+    def at(
+        *keys: str, write: Callable[[float], str] = number
+    ) -> Callable[[Entry], str]:
+        return lambda entry: _cell(entry, keys, write)
+
+    return [
+        Measure(f"NEES / 3, {frame} frame", "1", at("pose_nees", frame, "mean")),
+        Measure("… at the end", "1", at("pose_nees", frame, "end")),
+        Measure("… of the median run", "≲ 1", at("median_run")),
+        Measure("… runs above 3", "few", at("share_above_3", write=percent)),
+        Measure(
+            "… steps in the 95 % band",
+            "varies",
+            at("pose_nees", frame, "share_inside_band", write=percent),
+        ),
+        Measure(f"NEES / 3, {other} frame", "", at("pose_nees", other, "mean")),
+        Measure("NEES of the heading", "1", at("heading_nees", "mean")),
+        Measure("NIS / degrees of freedom", "1", at("nis")),
+        Measure(
+            "heading at the end, claimed",
+            least,
+            at("heading_std_end", "claimed", write=in_degrees),
+        ),
+        Measure(
+            "… true error",
+            "= claimed",
+            at("heading_std_end", "true", write=in_degrees),
+        ),
+        Measure("… RMSE over all steps", "", at("rmse", "heading", write=in_degrees)),
+        *(
+            Measure(f"efficiency of the {name}", "≤ 1", _efficiency(key))
+            for name, key in (("position", "pose"), ("heading",) * 2, ("map",) * 2)
+        ),
+        Measure("path (ATE), raw [m]", "", at("ate", "raw")),
+        Measure("… aligned [m]", "", at("ate", "aligned")),
+        Measure("landmark RMSE, raw [m]", "", at("landmark_rmse", "raw")),
+        Measure("… aligned [m]", "", at("landmark_rmse", "aligned")),
+        *_association_measures(summary),
+        Measure(
+            f"failed runs of {runs}", "0", lambda entry: str(len(entry["failed_runs"]))
+        ),
+    ]
+
+
+def _efficiency(key: str) -> Callable[[Entry], str]:
+    """Return what writes bound by mean squared error, with its 95 % interval."""
+
+    def write(entry: Entry) -> str:
+        found = (entry.get("efficiency") or {}).get(key)
+        if found is None:
+            return _NOTHING
+        reach = found["interval"][1]
+        spread = "" if reach is None else f" ± {reach - found['value']:.2f}"
+        return f"{found['value']:.2f}{spread}"
+
+    return write
+
+
+def _association_measures(summary: dict[str, Any]) -> list[Measure]:
+    """List the rows of a world that hides identities."""
+    entries = [entry["association"] for entry in summary["estimators"].values()]
+    if None in entries:
+        return []
+
+    def at(
+        *keys: str, write: Callable[[float], str] = number
+    ) -> Callable[[Entry], str]:
+        return lambda entry: _cell(entry["association"], keys, write)
+
+    cutoff, runs = entries[0]["gospa"]["cutoff"], summary["runs"]
+    size = entries[0]["true_map_size"]
+    true_size = "" if size is None else number(size)
+    return [
+        Measure("path (ATE), median run, raw [m]", "", at("median_ate", "hidden")),
+        Measure("… with known identities [m]", "", at("median_ate", "known")),
+        Measure(f"GOSPA of the map, {cutoff:g} m, raw [m]", "", _gospa("raw")),
+        Measure("… aligned [m]", "", _gospa("aligned")),
+        Measure("… landmarks missed, false", "0, 0", _missed_and_false),
+        Measure("landmarks in the map", true_size, at("map_size")),
+        Measure("… new ones correct", true_size, at("new_correct")),
+        Measure("… duplicates", "0", at("duplicate")),
+        Measure("… of clutter", "0", at("ghost")),
+        Measure("readings given right", "", at("correct")),
+        Measure("… wrong", "0", at("wrong")),
+        Measure("… not used", "0", at("missed")),
+        Measure("… clutter used", "0", at("clutter_used")),
+        Measure("precision", "1", at("precision", write=share)),
+        Measure("recall", "1", at("recall", write=share)),
+        Measure(
+            f"bad runs of {runs}",
+            "0",
+            lambda entry: str(entry["association"]["bad_runs"]["count"]),
+        ),
+    ]
+
+
+def _gospa(which: str) -> Callable[[Entry], str]:
+    keys = ("association", "gospa", which, "distance")
+    return lambda entry: _cell(entry, keys, number)
+
+
+def _missed_and_false(entry: Entry) -> str:
+    found = entry["association"]["gospa"]["aligned"]
+    keys = ("missed_count", "false_count")
+    return ", ".join(_cell(found, (key,), number) for key in keys)
+
+
+def share(value: float) -> str:
+    """Write a share that should be 1.
+
+    Examples
+    --------
+    >>> share(0.98765), share(1.0)
+    ('.988', '1.000')
+    """
+    return f"{value:.3f}".removeprefix("0")
+
+
+def monte_carlo_table(summary: dict[str, Any]) -> Table:
+    """Lay out a summary for a terminal of 80 columns or more.
+
+    Parameters
+    ----------
+    summary : dict
+        Result of ``summarise_monte_carlo``.
+    """
+    entries = summary["estimators"]
+    headings, key = headings_and_key(list(entries))
+    table = Table(
+        title=Text(
+            f"{summary['scenario']}: {summary['runs']} runs of {summary['steps']} "
+            f"steps, seed {summary['seed']}"
+        ),
+        caption=Text(f"{key}\n{_caption(entries)}".strip()),
+        caption_justify="left",
+        pad_edge=False,
+        box=None,
+    )
+    table.add_column("")
+    table.add_column("should be", justify="right", style="dim", no_wrap=True)
+    for heading in headings:
+        table.add_column(Text(heading), justify="right", overflow="fold", min_width=7)
+    verdicts = [entry["verdict"] for entry in entries.values()]
+    table.add_row(
+        "verdict", "", *(Text(word, _STYLES[KINDS[word]]) for word in verdicts)
+    )
+    for measure in measures(summary):
+        cells = [Text(measure.of(entry)) for entry in entries.values()]
+        table.add_row(Text(measure.name), Text(measure.right), *cells)
+    return table
+
+
+def _caption(entries: dict[str, Entry]) -> str:
+    text = "Averages over runs and steps; heading and RMSE are root mean squares."
+    scores = next((entry["association"] for entry in entries.values()), None)
+    if scores is None:
+        return text
+    return f"{text} {bad_run_text(scores)}"
+
+
+def bad_run_text(scores: dict[str, Any]) -> str:
+    """Write what a bad run is."""
+    return (
+        "A run is bad if it failed, or if its path error is more than "
+        f"{scores['bad_runs']['margin']:g} m above that of the same filter with known "
+        "identities."
+    )
+
+
+def number(value: float) -> str:
+    """Write a number with three digits.
+
+    Examples
+    --------
+    >>> number(1.0), number(0.01234), number(12345.6), number(1e9)
+    ('1.00', '0.0123', '12346', '1e+09')
+    """
+    if abs(value) >= 1e6:
+        return f"{value:.0e}"
+    size = math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:.{min(max(2 - size, 0), 6)}f}"
+
+
+def percent(share: float) -> str:
+    """Write a share as a percentage.
+
+    Examples
+    --------
+    >>> percent(0.0), percent(0.005), percent(0.7303)
+    ('0 %', '0.5 %', '73 %')
+    """
+    shown = 100 * share
+    return f"{shown:.2g} %" if shown < 99.5 else f"{shown:.0f} %"
+
+
+def _cell(entry: Entry, keys: tuple[str, ...], write: Callable[[float], str]) -> str:
+    value: Any = entry
+    for key in keys:
+        value = value[key]
+    return _NOTHING if value is None else write(value)
+
+
+# --------------------------------------------------------------------------------------
+# Headings of columns that are labels of estimators, however long.
+
+_ROOM = 36  # characters for all columns of a terminal of 80
+_GAP = 2
+
+
+def headings_and_key(labels: Sequence[str]) -> tuple[list[str], str]:
+    r"""Return the headings of columns, and the key that explains short ones.
+
+    Labels that fit beside each other are headings themselves, and the key is empty.
+    Else the headings are letters, and the key has a line for each.
+
+    Examples
+    --------
+    >>> headings_and_key(["ekf", "invariant"])
+    (['ekf', 'invariant'], '')
+    >>> headings, key = headings_and_key(["ekf", "invariant[iterations=3]", "iterated"])
+    >>> print(headings, key, sep="\n")
+    ['A', 'B', 'C']
+    A  ekf
+    B  invariant[iterations=3]
+    C  iterated
+    """
+    fits = sum(len(label) + _GAP for label in labels) <= _ROOM
+    if fits or len(labels) > len(ascii_uppercase):
+        return list(labels), ""
+    letters = ascii_uppercase[: len(labels)]
+    lines = [
+        f"{letter}  {label}" for letter, label in zip(letters, labels, strict=True)
+    ]
+    return list(letters), "\n".join(lines)
+
+
+# --------------------------------------------------------------------------------------
+# Figures as SVG inside a web page, in its fonts and colours.
+
+COLOUR_VARIABLES = {
+    INK: "--ink",
+    "#000000": "--ink",
+    GREY: "--grey",
+    PALE: "--pale",
+    "#ffffff": "--paper",
+    BLUE: "--blue",
+    ORANGE: "--orange",
+    TEAL: "--teal",
+    PURPLE: "--purple",
+    SKY: "--sky",
+    ALARM: "--alarm",
+}
+"""CSS variables that the page must define, by the colours of the figures."""
+
+
+def inline_svg(figure: Figure, name: str, description: str) -> str:
+    """Return a figure as an ``<svg>`` element without size, font or colour of its own.
+
+    It fills the available width and keeps text as text; the same figure gives the same
+    bytes.
+
+    Parameters
+    ----------
+    figure : Figure
+        A figure in the colours of `COLOUR_VARIABLES`.
+    name : str
+        Prefix of all ids, unique on the page.
+    description : str
+        Text for screen readers.
+    """
+    buffer = io.StringIO()
+    figure.draw_without_rendering()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :].strip()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"<style[^>]*>.*?</style>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = _use_page_style(_short_numbers(_own_ids(svg, name)))
+    box = re.search(r'viewBox="[^"]*"', svg)
+    attributes = (
+        f'{box[0] if box else ""} role="img" aria-label="{escape(description)}"'
+    )
+    return re.sub(r"<svg\b[^>]*>", lambda _: f"<svg {attributes}>", svg, count=1)
+
+
+def _own_ids(svg: str, name: str) -> str:
+    """Keep only ids that are referenced, and prefix them with the figure's name."""
+    used = set(re.findall(r'(?:url\(#|href="#)([^)"]+)', svg))
+
+    def renamed(match: re.Match[str]) -> str:
+        return f' id="{name}-{match[1]}"' if match[1] in used else ""
+
+    svg = re.sub(r'\s+id="([^"]*)"', renamed, svg)
+    svg = re.sub(r"url\(#", f"url(#{name}-", svg)
+    return re.sub(r'(?:xlink:)?href="#', f'href="#{name}-', svg)
+
+
+def _short_numbers(svg: str) -> str:
+    """Round coordinates to a hundredth of a point."""
+
+    def shortened(match: re.Match[str]) -> str:
+        return re.sub(r"(\.\d\d)\d+", r"\1", match[0])
+
+    svg = re.sub(r'\b(?:d|x|y|transform)="[^"]*"', shortened, svg)
+    return re.sub(r"\s*\n\s*", "\n", svg)
+
+
+def _use_page_style(svg: str) -> str:
+    """Remove fonts, and take colours from the page's variables."""
+    svg = re.sub(r"\bfont: ([\d.]+px) [^;\"]*", r"font-size: \1", svg)
+    svg = re.sub(r"font-family: [^;\"]*;?", "", svg)
+    for colour, variable in COLOUR_VARIABLES.items():
+        svg = re.sub(rf"\b(fill|stroke): {colour}\b", rf"\1: var({variable})", svg)
+    return svg

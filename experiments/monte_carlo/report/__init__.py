@@ -1,1 +1,0 @@
-"""Report the results: scores, verdicts, tables, figures, and the HTML report."""

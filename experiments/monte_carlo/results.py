@@ -1,0 +1,607 @@
+"""The results of a Monte Carlo as one dataset: estimator × run × step.
+
+xarray and netCDF are loaded where they are used, because workers need neither.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import platform
+import re
+import zipfile
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ... import __version__
+from ...evaluation.noise_findings import CHANNELS, MOMENTS
+from ...sim_configs import Scenario
+from ...sim_configs.atomic_file import replace_when_written
+from ...sim_configs.scenario_files import scenario_text
+from ..runs.filter_settings import EstimatorChoice
+from ..runs.own_files import (
+    files_below,
+    locked_folder,
+    naming_folder,
+    own_entry,
+    own_files,
+    replace_own,
+    set_aside,
+)
+from .run_measures import NOISE_SIZES, VARIABLES, Block, Variable, variables_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+# --------------------------------------------------------------------------------------
+# Keep the results of a Monte Carlo as blocks of runs, in memory or in a folder.
+#
+# A folder holds ``job.json``, the description of the job, and ``blocks/runs-*.npz``.
+# Each block appears complete or not at all, so that a job may be killed at any time and
+# then continues after its last complete block. Blocks of one job from several machines
+# may be put into one folder.
+
+
+class Span(NamedTuple):
+    """Consecutive runs."""
+
+    first: int
+    stop: int
+
+    @property
+    def size(self) -> int:
+        """Number of runs."""
+        return self.stop - self.first
+
+
+Blocks = Iterator[tuple[Span, list[Block]]]
+
+_PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
+_FROM_TRUTH = "for a consistent filter, NEES and NIS are χ² with the stated degrees"
+
+
+def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Dataset:
+    """Combine the blocks of a job into a dataset in memory.
+
+    Parameters
+    ----------
+    job : Job
+        The job.
+    blocks : iterator
+        All its blocks, in order.
+    runs : Span
+        Their runs.
+    command : str
+        Command that reproduces the results.
+    """
+    import xarray as xr  # noqa: PLC0415
+
+    sizes = _sizes(job, runs)
+    arrays: dict[str, Any] = {
+        name: np.empty(
+            [sizes[dim] for dim in _dims(variable)],
+            object if variable.kind == "U" else variable.kind,
+        )
+        for name, variable in job.variables.items()
+    }
+    _fill(arrays, job, blocks, runs)
+    return xr.Dataset(
+        {
+            name: (_dims(variable), arrays[name], {"long_name": variable.meaning})
+            for name, variable in job.variables.items()
+        },
+        {dim: (dim, values) for dim, values in _coordinates(job, runs).items()},
+        attributes(job, runs, command),
+    )
+
+
+def write_results(
+    path: Path, job: Job, blocks: Blocks, runs: Span, command: str = ""
+) -> None:
+    """Write the blocks of a job as one netCDF file, one block in memory at a time.
+
+    Parameters
+    ----------
+    path : Path
+        The file; after an error it stays as it was.
+    job, blocks, runs, command
+        As in :func:`dataset_of`.
+    """
+    try:
+        with replace_own(path) as partial:
+            _write(partial, job, blocks, runs, command)
+    except (OSError, RuntimeError) as error:  # netCDF raises the second on a full disk
+        reason = getattr(error, "strerror", None) or error
+        raise OSError(
+            f"{path} cannot be written: {reason}; its blocks stay, to continue from"
+        ) from error
+
+
+def load_results(path: str | Path) -> xr.Dataset:
+    """Open the results of a Monte Carlo; arrays are read on demand.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ``results.nc``, or the folder that holds it.
+
+    Raises
+    ------
+    ValueError
+        If the file is not one, or not complete.
+    """
+    import xarray as xr  # noqa: PLC0415
+
+    file = Path(path)
+    file = file / RESULTS if file.is_dir() else file
+    if not file.exists():
+        raise ValueError(f"{file} does not exist")
+    try:
+        results = xr.open_dataset(file, engine="netcdf4")
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(
+            f"{file} is truncated, or holds no results: {error}; if there is blocks/ "
+            "beside it, the same command makes the file again from them"
+        ) from error
+    lacking = sorted(set(VARIABLES) - set(results.variables))
+    if lacking:
+        results.close()
+        raise ValueError(f"{file} is no result of a Monte Carlo: no {lacking[0]}")
+    return results
+
+
+def _write(path: Path, job: Job, blocks: Blocks, runs: Span, command: str) -> None:
+    import netCDF4  # noqa: PLC0415
+
+    with netCDF4.Dataset(path, "w") as file:
+        for dim, size in _sizes(job, runs).items():
+            file.createDimension(dim, size)
+        for dim, values in _coordinates(job, runs).items():
+            file.createVariable(dim, _stored(values.dtype.kind), (dim,))[:] = values
+        for name, variable in job.variables.items():
+            made = file.createVariable(name, _stored(variable.kind), _dims(variable))
+            made.long_name = variable.meaning
+            if variable.kind == "?":
+                made.setncattr("dtype", "bool")  # xarray gives it back as such
+        _fill(file.variables, job, blocks, runs)
+        file.setncatts(attributes(job, runs, command))
+
+
+def attributes(job: Job, runs: Span, command: str) -> dict[str, Any]:
+    """Return the origin of results: all that is needed to reproduce them."""
+    identity = job.identity()
+    return {
+        "title": f"Monte Carlo of {job.scenario.name}, {runs.size} runs",
+        "scenario_name": job.scenario.name,
+        "scenario": identity["scenario"],
+        "assumed": identity["assumed"],
+        "estimators": json.dumps(identity["estimators"]),
+        "seed": job.seed,
+        "runs": runs.size,
+        "block_size": job.block_size,
+        "resolution": job.resolution,
+        "versions": json.dumps(_versions()),
+        "command": command,
+        "comment": _FROM_TRUTH,
+    }
+
+
+def _versions() -> dict[str, str]:
+    own = {"slamgym": __version__, "python": platform.python_version()}
+    return own | {package: version(package) for package in _PACKAGES}
+
+
+def _fill(
+    arrays: MutableMapping[str, Any] | Mapping[str, Any],
+    job: Job,
+    blocks: Blocks,
+    runs: Span,
+) -> None:
+    variables = job.variables
+    for span, parts in blocks:
+        rows = slice(span.first - runs.first, span.stop - runs.first)
+        for number, block in enumerate(parts):
+            for name, values in block.items():
+                text = variables[name].kind == "U"
+                part = values.astype(object) if text else values
+                arrays[name][number, rows] = part
+
+
+def _stored(kind: str) -> Any:
+    """Return the type in a netCDF file, which has no booleans."""
+    return {"?": "i1", "i": "i8", "U": str}.get(kind, kind)
+
+
+def _dims(variable: Variable) -> tuple[str, ...]:
+    return ("estimator", *variable.dims)
+
+
+def _sizes(job: Job, runs: Span) -> dict[str, int]:
+    return {
+        "estimator": len(job.estimators),
+        "run": runs.size,
+        "step": job.scenario.steps + 1,
+        "landmark": job.scenario.landmarks.count,
+        **NOISE_SIZES,
+    }
+
+
+def _coordinates(job: Job, runs: Span) -> dict[str, np.ndarray[Any, Any]]:
+    return {dim: np.arange(size) for dim, size in _sizes(job, runs).items()} | {
+        "estimator": np.array([choice.label for choice in job.estimators]),
+        "run": np.arange(runs.first, runs.stop),
+        "noise": np.array(CHANNELS),
+        "moment": np.array(MOMENTS),
+    }
+
+
+# --------------------------------------------------------------------------------------
+# The folder of a Monte Carlo: it belongs to one job (``job.json``) and one writer.
+
+FORMAT = "slamgym monte carlo 3"
+JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
+REPORT, SUMMARY = "report.html", "summary.json"
+_PARTIAL = re.compile(
+    r"\.{1,2}(job|results|report|summary|slamgym_files|runs-\d{7,}-\d{7,})"
+    r"(\.[0-9a-f]{8}){1,2}\.(json|nc|html|npz)"
+)
+
+
+@contextlib.contextmanager
+def claimed(
+    path: Path, identity: dict[str, Any], *, fresh: bool = False
+) -> Iterator[None]:
+    """Make a folder for a job, or check that it is the job's, and lock it.
+
+    Files that a killed writer left half written are removed.
+
+    Parameters
+    ----------
+    path : Path
+        The folder; it is made if it does not exist.
+    identity : dict
+        The job in plain values.
+    fresh : bool
+        Whether to remove the results of an earlier job, this one or another. Files
+        that were changed since are set aside with a warning.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds another job, or what slamgym did not write, or another
+        process writes to it.
+    OSError
+        If it cannot be written.
+    """
+    with naming_folder(path):
+        path.mkdir(parents=True, exist_ok=True)
+    with locked_folder(path):
+        found = None
+        if any(not _is_leftover(Path(name)) for name in files_below(path)):
+            found = identity_in(path)
+            if not fresh:
+                refuse_other(path, found, identity)
+        with naming_folder(path):
+            for file in (*path.iterdir(), *(path / BLOCKS).glob(".*")):
+                if _is_leftover(file):
+                    file.unlink()
+            if fresh and found:
+                _clear(path, found)
+            with replace_when_written(path / JOB) as partial:
+                text = json.dumps(identity, indent=2, ensure_ascii=False)
+                partial.write_text(text + "\n", encoding="utf-8")
+            (path / BLOCKS).mkdir(exist_ok=True)
+        yield
+
+
+def _clear(path: Path, identity: dict[str, Any]) -> None:
+    """Remove the results of a job, and set aside what is not proven to be one."""
+    digest, own = digest_of(identity), own_files(path)
+    for block in blocks_in(path):
+        problem = problem_with(block, digest)
+        if problem:
+            set_aside(block, problem)
+        else:
+            block.unlink()
+    for name in (RESULTS, REPORT, SUMMARY):
+        if not os.path.lexists(path / name):
+            continue
+        if own_entry(path, name, own):
+            (path / name).unlink()
+        else:
+            set_aside(path / name, "is not as slamgym wrote it")
+
+
+def blocks_in(path: Path) -> list[Path]:
+    """List the whole blocks of a folder, in order."""
+    return sorted((path / BLOCKS).glob("runs-*.npz"))
+
+
+def problem_with(block: Path, digest: str) -> str:
+    """Return what is wrong with a block of a job; empty if it is complete.
+
+    Raises
+    ------
+    ValueError
+        If it is of another job.
+    """
+    try:
+        with zipfile.ZipFile(block) as archive:
+            if archive.testzip() is not None:
+                return "is damaged"
+        with np.load(block, allow_pickle=False) as arrays:
+            job = str(arrays["job"])
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        return f"is truncated or damaged ({error})"
+    if job != digest:
+        raise ValueError(f"{block} is of another job than its folder: move it away")
+    return ""
+
+
+def digest_of(identity: dict[str, Any]) -> str:
+    """Return the digest that identifies a job in its blocks."""
+    text = json.dumps(identity, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def identity_in(path: Path) -> dict[str, Any]:
+    """Read the job of a folder.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    file = path / JOB
+    if not file.exists():
+        raise ValueError(f"{path} holds no Monte Carlo of slamgym: there is no {JOB}")
+    try:
+        identity = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        identity = None
+    if not isinstance(identity, dict) or identity.get("format") != FORMAT:
+        raise ValueError(f"{file} is damaged, or not of a Monte Carlo of slamgym")
+    return identity
+
+
+def refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> None:
+    """Refuse a folder of another job.
+
+    Raises
+    ------
+    ValueError
+        With the first difference.
+    """
+    for key, value in asked.items():
+        if found.get(key) != value:
+            raise ValueError(
+                f"{path} holds results of {_described(key, found.get(key))}, "
+                f"not of {_described(key, value)}: "
+                "choose another folder, or ask for fresh results"
+            )
+
+
+def _is_leftover(file: Path) -> bool:
+    """Whether a writer that was killed at once may have left this file."""
+    return _PARTIAL.fullmatch(file.name) is not None
+
+
+def _described(key: str, value: Any) -> str:
+    """Describe a part of a job in a few words."""
+    if key in ("scenario", "assumed"):
+        lines = str(value).splitlines()
+        digest = hashlib.sha256(str(value).encode()).hexdigest()[:8]
+        return f"{key} {lines[0].removeprefix('name = ') if lines else ''} ({digest})"
+    if key == "estimators" and isinstance(value, dict):
+        return f"estimators {', '.join(value)}"
+    if key == "code" and isinstance(value, dict):
+        return f"code {', '.join(f'{k} {v}' for k, v in value.items())}"
+    return f"{key} {value}"
+
+
+class Job(NamedTuple):
+    """What is computed, except for the number of runs."""
+
+    scenario: Scenario
+    assumed: Scenario
+    """The scenario whose noise the estimators assume."""
+    estimators: tuple[EstimatorChoice, ...]
+    seed: int
+    block_size: int
+    resolution: float = 0.0
+    """True landmarks nearer to each other count as one place [m]."""
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """The variables of its results."""
+        return variables_of(self.scenario)
+
+    def identity(self) -> dict[str, Any]:
+        """Describe the job in plain values, equal for equal jobs."""
+        return {
+            "format": FORMAT,
+            "scenario": scenario_text(self.scenario),
+            "assumed": scenario_text(self.assumed),
+            "estimators": {
+                choice.label: {"name": choice.name, "options": dict(choice.options)}
+                for choice in self.estimators
+            },
+            "code": {"slamgym": __version__}
+            | {
+                choice.label: digest
+                for choice in self.estimators
+                if (digest := choice.code())
+            },
+            "seed": self.seed,
+            "block_size": self.block_size,
+            **({"resolution": self.resolution} if self.resolution else {}),
+        }
+
+    def spans(self, runs: Span) -> list[Span]:
+        """Divide runs into blocks; the last one may be shorter."""
+        size = self.block_size
+        starts = range(runs.first, runs.stop, size)
+        return [Span(first, min(first + size, runs.stop)) for first in starts]
+
+
+class BlockFolder:
+    """The blocks of one job; its folder is locked within ``with``.
+
+    Parameters
+    ----------
+    job : Job
+        The job.
+    path : Path, optional
+        The folder; without one, blocks are kept in memory.
+    fresh : bool
+        Whether to remove the results of an earlier job, this one or another.
+
+    Raises
+    ------
+    ValueError
+        If the folder is a file. On entry: if it holds another job, or files that
+        slamgym did not write, or another process writes to it.
+    OSError
+        On entry, if it cannot be written.
+    """
+
+    def __init__(self, job: Job, path: Path | None, *, fresh: bool = False) -> None:
+        if path is not None and path.exists() and not path.is_dir():
+            raise ValueError(f"out must be a folder, got the file {path}")
+        self._job = job
+        self._path = path
+        self._fresh = fresh
+        self._identity = job.identity()  # as the sources of its estimators are now
+        self._digest = digest_of(self._identity)
+        self._kept: dict[int, list[Block]] = {}
+        self._claim = contextlib.ExitStack()
+
+    def __enter__(self) -> "BlockFolder":
+        """Lock the folder."""
+        if self._path is not None:
+            claim = claimed(self._path, self._identity, fresh=self._fresh)
+            self._claim.enter_context(claim)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Unlock the folder."""
+        self._claim.close()
+
+    def missing(self, runs: Span) -> list[Span]:
+        """List the blocks that are still to be computed; warn of a damaged one."""
+        return [span for span in self._job.spans(runs) if not self._has(span)]
+
+    def add(self, span: Span, blocks: list[Block]) -> None:
+        """Keep a block, one part per estimator."""
+        if self._path is None:
+            self._kept[span.first] = blocks
+            return
+        arrays = {
+            f"{number}/{name}": array
+            for number, block in enumerate(blocks)
+            for name, array in block.items()
+        }
+        file = self._file(span)
+        try:
+            with replace_when_written(file) as partial:
+                np.savez(partial, allow_pickle=False, job=self._digest, **arrays)
+        except OSError as error:
+            whole = len(list(file.parent.glob("runs-*.npz")))
+            raise OSError(
+                f"{file} cannot be written: {error.strerror or error}; "
+                f"{whole} complete blocks stay there, to continue from"
+            ) from error
+        for shorter in self._files_from(span.first):
+            if shorter != file:
+                shorter.unlink()
+
+    def blocks(self, runs: Span) -> Iterator[tuple[Span, list[Block]]]:
+        """Yield all blocks in order, one at a time."""
+        for span in self._job.spans(runs):
+            if self._path is None:
+                yield span, self._kept.pop(span.first)
+            else:
+                yield span, self._read(span)
+
+    def _has(self, span: Span) -> bool:
+        if self._path is None:
+            return False
+        for file in self._files_from(span.first):
+            problem = problem_with(file, self._digest)
+            if problem:
+                set_aside(file, f"{problem}, and its runs are repeated")
+            elif _stop_of(file) >= span.stop:
+                return True
+        return False
+
+    def _read(self, span: Span) -> list[Block]:
+        file = self._files_from(span.first)[-1]  # the longest
+        with np.load(file, allow_pickle=False) as arrays:
+            return [
+                {
+                    name: arrays[f"{number}/{name}"][: span.size]
+                    for name in self._job.variables
+                }
+                for number in range(len(self._job.estimators))
+            ]
+
+    def _file(self, span: Span) -> Path:
+        assert self._path is not None
+        name = f"runs-{span.first:07d}-{span.stop:07d}.npz"
+        return self._path / BLOCKS / name
+
+    def _files_from(self, first: int) -> list[Path]:
+        assert self._path is not None
+        return sorted((self._path / BLOCKS).glob(f"runs-{first:07d}-*.npz"))
+
+
+def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
+    """Copy the blocks of one job from several folders into one.
+
+    ``monte_carlo`` with ``out=target`` then computes only the missing blocks.
+
+    Parameters
+    ----------
+    sources : sequence of str or Path
+        Folders written by ``monte_carlo``, at least one.
+    target : str or Path
+        A new folder, or one of the same job.
+
+    Raises
+    ------
+    ValueError
+        If a folder holds a different job from the first, or a damaged block, or another
+        process writes to the target.
+    """
+    folders = [Path(source) for source in sources]
+    if not folders:
+        raise ValueError("sources must be at least one folder, got none")
+    place, identity = Path(target), identity_in(folders[0])
+    for folder in folders:
+        refuse_other(folder, identity_in(folder), identity)
+    with claimed(place, identity):
+        digest = digest_of(identity)
+        for folder in folders:
+            for file in blocks_in(folder):
+                _copy_block(file, place / BLOCKS / file.name, digest)
+
+
+def _copy_block(file: Path, copy: Path, digest: str) -> None:
+    """Copy a block of a job, if the copy does not exist."""
+    problem = problem_with(file, digest)
+    if problem:
+        raise ValueError(f"{file} {problem}")
+    if not copy.exists():
+        with replace_when_written(copy) as partial:
+            partial.write_bytes(file.read_bytes())
+
+
+def _stop_of(file: Path) -> int:
+    return int(file.stem.rpartition("-")[2])

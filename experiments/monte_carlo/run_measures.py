@@ -1,0 +1,404 @@
+"""Measure the errors and the consistency of every run of a Monte Carlo.
+
+Each run is measured by itself, so its figures do not depend on the other runs.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import Array
+from ...estimator.interface import Belief
+from ...estimator.models.bearing_range import wrap_angle
+from ...estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame, invariant_error
+from ...evaluation import nees
+from ...evaluation.association_scores import AssociationScores, Gospa
+from ...evaluation.error_bound import PosteriorBound, invariant_squares
+from ...evaluation.nees import pose_nees
+from ...evaluation.noise_findings import CHANNELS, MOMENTS
+from ...evaluation.trajectory_error import ellipse_areas, position_accuracy
+from ...sim_configs import Scenario
+from ..runs.filter_settings import FilterSettings
+from ..runs.simulated_runs import SimulatedRuns
+from ..runs.trace import RunAssociation, TrueLandmarks, compare_association
+from .filtered_runs import Failure, FilteredRuns, filter_runs
+
+Block = dict[str, NDArray[np.generic]]
+
+Value = NDArray[np.generic] | float
+
+STEP, RUN, LANDMARK = ("run", "step"), ("run",), ("run", "landmark")
+NOISE = "run", "noise", "moment"
+NOISE_SIZES = {"noise": len(CHANNELS), "moment": len(MOMENTS)}
+
+
+class Variable(NamedTuple):
+    """One variable of the results."""
+
+    dims: tuple[str, ...]
+    """Dimensions other than ``estimator``."""
+    kind: str
+    """numpy kind: f8, i8, ?, or U for text."""
+    meaning: str
+
+
+VARIABLES: dict[str, Variable] = {
+    "pose_nees_invariant": Variable(STEP, "f8", "NEES of the pose, 3 degrees"),
+    "pose_nees_additive": Variable(STEP, "f8", "NEES of the pose, 3 degrees"),
+    "position_nees_invariant": Variable(STEP, "f8", "NEES of the position, 2 degrees"),
+    "position_nees_additive": Variable(STEP, "f8", "NEES of the position, 2 degrees"),
+    "heading_nees": Variable(STEP, "f8", "NEES of the heading, 1 degree, any frame"),
+    "nis": Variable(STEP, "f8", "NIS of the scan"),
+    "nis_dof": Variable(STEP, "i8", "its degrees of freedom"),
+    "readings": Variable(RUN, "i8", "number of readings"),
+    "position_error": Variable(STEP, "f8", "distance to the true position [m]"),
+    "heading_error": Variable(STEP, "f8", "true minus estimated heading [rad]"),
+    "heading_std": Variable(STEP, "f8", "claimed deviation of the heading [rad]"),
+    "position_std": Variable(STEP, "f8", "root of the trace of the covariance [m]"),
+    "ate": Variable(RUN, "f8", "RMS distance of the path, not aligned [m]"),
+    "ate_aligned": Variable(RUN, "f8", "the same after the best rigid motion [m]"),
+    "pose_area": Variable(RUN, "f8", "final 3σ ellipse of the position [m²]"),
+    "state_nees_invariant": Variable(RUN, "f8", "final NEES of pose and map"),
+    "state_nees_additive": Variable(RUN, "f8", "final NEES of pose and map"),
+    "state_dof": Variable(RUN, "i8", "its degrees of freedom"),
+    "relative_map_nees": Variable(RUN, "f8", "final NEES of the map from the robot"),
+    "relative_map_dof": Variable(RUN, "i8", "its degrees of freedom"),
+    "landmark_rmse": Variable(RUN, "f8", "final RMS map error, not aligned [m]"),
+    "landmark_rmse_aligned": Variable(RUN, "f8", "the same after the best motion [m]"),
+    "landmark_area": Variable(RUN, "f8", "mean final 3σ ellipse of landmarks [m²]"),
+    "landmark_nees_invariant": Variable(LANDMARK, "f8", "final NEES, 2 degrees"),
+    "landmark_nees_additive": Variable(LANDMARK, "f8", "final NEES, 2 degrees"),
+    "landmark_error": Variable(LANDMARK, "f8", "final distance to the truth [m]"),
+    "landmark_mahalanobis": Variable(LANDMARK, "f8", "the same in deviations"),
+    "position_error_invariant": Variable(STEP, "f8", "the same, invariant frame [m]"),
+    "position_bound": Variable(STEP, "f8", "least mean square of that [m²]"),
+    "position_bound_raw": Variable(STEP, "f8", "that of the raw position [m²]"),
+    "heading_bound": Variable(STEP, "f8", "least mean square of the heading [rad²]"),
+    "map_error_centred": Variable(RUN, "f8", "final RMS about the map's centre [m]"),
+    "map_bound": Variable(RUN, "f8", "least mean square of that [m²]"),
+    "noise_sums": Variable(NOISE, "f8", "sums over the noise in assumed deviations"),
+    "failed": Variable(RUN, "?", "whether the run ended before its time"),
+    "failed_at": Variable(RUN, "i8", "at which step, -1 if it did not"),
+    "message": Variable(RUN, "U", "why"),
+}
+
+
+# --------------------------------------------------------------------------------------
+# Measure how well a run associated readings without identity.
+#
+# A run is bad if it fails, or if its path error is more than `MARGIN` above that of the
+# same filter with known identities on the same readings.
+
+COUNTS = AssociationScores._fields
+
+KNOWN_IDS_ATE = "known_ids_ate"
+
+MAPS = ("raw", "aligned")
+
+PREFIX = "association_"
+
+MEANINGS: dict[str, str] = {
+    **{f"{PREFIX}{name}": f"{name.replace('_', ' ')}, see docs" for name in COUNTS},
+    f"{PREFIX}precision": "share of right ones among readings given to landmarks",
+    f"{PREFIX}recall": "share of right ones among readings of landmarks",
+    **{
+        f"gospa_{which}_{part}": f"GOSPA of the final map, {which}: {part}"
+        for which in MAPS
+        for part in Gospa._fields
+    },
+    KNOWN_IDS_ATE: "path error of the same filter with known identities, raw [m]",
+}
+"""Of the variables that only a world without identities has; nan where unknown."""
+
+
+HIDDEN_VARIABLES: dict[str, Variable] = VARIABLES | {
+    name: Variable(RUN, "f8", meaning) for name, meaning in MEANINGS.items()
+}
+
+
+KNOWN_IDS_NEES = "known_ids_nees"
+"""Followed by the error frame."""
+
+
+HIDDEN_VARIABLES |= {
+    f"{KNOWN_IDS_NEES}_{frame}": Variable(STEP, "f8", "NEES with known identities")
+    for frame in ERROR_FRAMES
+}
+"""Those of a world that hides identities."""
+
+
+def variables_of(scenario: Scenario) -> dict[str, Variable]:
+    """Return the variables of the results in a world."""
+    return VARIABLES if scenario.sensor.identities else HIDDEN_VARIABLES
+
+
+def measure_runs(
+    runs: SimulatedRuns,
+    filtered: FilteredRuns,
+    bound: PosteriorBound,
+    noise: Array,
+    *,
+    resolution: float = 0.0,
+) -> Block:
+    """Measure a filter's runs against the truth.
+
+    Parameters
+    ----------
+    runs : SimulatedRuns
+        B runs of T steps among L landmarks.
+    filtered : FilteredRuns
+        The beliefs of a filter in these runs.
+    bound : PosteriorBound
+        Of the errors of any filter in these runs.
+    noise : ndarray, shape (B, 5, 7)
+        Sums of the noise, see :func:`~slamgym.evaluation.noise_findings`.
+    resolution : float
+        True landmarks nearer to each other count as one place [m], where identities are
+        hidden.
+
+    Returns
+    -------
+    dict
+        The `VARIABLES`, or the `HIDDEN_VARIABLES`, shape (B,), (B, T) or (B, L) each;
+        nan where undefined.
+    """
+    block = _empty_block(runs)
+    failures = dict(filtered.failures)
+    for run in range(len(runs.visible)):
+        with np.errstate(all="ignore"):  # a diverged run may overflow
+            measured = _measure_path(runs.true_poses[run], filtered, run)
+            map_measures = _try_to_measure_map(runs, run, filtered, resolution)
+        if isinstance(map_measures, Failure):
+            failures[run] = map_measures
+        else:
+            measured |= map_measures
+        for name, value in measured.items():
+            block[name][run] = value
+    block["position_bound"], block["heading_bound"] = bound.position, bound.heading
+    block["position_bound_raw"], block["map_bound"] = bound.raw_position, bound.map
+    block["noise_sums"] = noise
+    block["readings"] = runs.visible.sum(axis=(1, 2))
+    _write_failures(block, failures)
+    return block
+
+
+def _try_to_measure_map(
+    runs: SimulatedRuns, run: int, filtered: FilteredRuns, resolution: float
+) -> dict[str, Value] | Failure:
+    """Measure the final map; a malformed belief of a user's estimator is a failure."""
+    belief = filtered.beliefs[run]
+    if belief is None:
+        return {}
+    try:
+        if runs.true_ids is not None:
+            made = filtered.decisions.get(run)
+            belief = identified(belief, {} if made is None else made.identities())
+        return {
+            **_measure_map(runs.true_poses[run, -1], runs.landmarks[run], belief),
+            **measure_association(runs, filtered, run, resolution),
+        }
+    except Exception as error:
+        message = f"the final belief is no map of this world: {error}"
+        return Failure(runs.visible.shape[1] - 1, message)
+
+
+def _write_failures(block: Block, failures: Mapping[int, Failure]) -> None:
+    messages = [""] * len(block["failed"])
+    for run, failure in failures.items():
+        block["failed"][run] = True
+        block["failed_at"][run] = failure.step
+        messages[run] = failure.message
+    block["message"] = np.array(messages)
+
+
+def _empty_block(runs: SimulatedRuns) -> Block:
+    shape = (*runs.visible.shape[:2], runs.landmarks.shape[1])
+    sizes = dict(zip(("run", "step", "landmark"), shape, strict=True)) | NOISE_SIZES
+    variables = VARIABLES if runs.true_ids is None else HIDDEN_VARIABLES
+    blanks = {"f8": np.nan, "i8": 0, "?": False, "U": ""}
+    return {
+        name: np.full([sizes[dim] for dim in dims], blanks[kind], dtype=kind)
+        for name, (dims, kind, _) in variables.items()
+    }
+
+
+def _measure_path(truth: Array, filtered: FilteredRuns, run: int) -> dict[str, Value]:
+    poses = filtered.trace.poses[run]
+    covariances = filtered.trace.pose_covariances[run]
+    posed = truth, poses, covariances
+    errors = truth - poses
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    measured: dict[str, Value] = {
+        "heading_nees": nees.heading_nees(*posed),
+        "nis": filtered.trace.nis[run],
+        "nis_dof": filtered.trace.degrees_of_freedom[run],
+        "position_error": np.hypot(errors[:, 0], errors[:, 1]),
+        "position_error_invariant": np.linalg.norm(
+            invariant_error(truth, poses)[:, :2], axis=1
+        ),
+        "heading_error": wrap_angle(errors[:, 2]),
+        "heading_std": np.sqrt(variances[:, 2]),
+        "position_std": np.sqrt(variances[:, 0] + variances[:, 1]),
+        "failed_at": -1,
+    }
+    for frame in ERROR_FRAMES:
+        measured[f"pose_nees_{frame}"] = nees.pose_nees(*posed, frame=frame)
+        measured[f"position_nees_{frame}"] = nees.position_nees(*posed, frame=frame)
+    if run not in filtered.failures:
+        path = position_accuracy(poses[:, :2], truth[:, :2])
+        measured |= {
+            "ate": path.raw_rmse,
+            "ate_aligned": path.aligned_rmse,
+            "pose_area": float(ellipse_areas(covariances[-1:, :2, :2])[0]),
+        }
+    return measured
+
+
+def _measure_map(
+    true_pose: Array, true_landmarks: Array, belief: Belief
+) -> dict[str, Value]:
+    ids = list(belief.landmark_ids)
+    if len(set(ids)) < len(ids) or not set(ids) <= set(range(len(true_landmarks))):
+        raise ValueError(
+            f"landmark_ids must be different ones of 0 … {len(true_landmarks) - 1}, "
+            f"got {tuple(ids)}"
+        )
+    states = (
+        np.concatenate([true_pose, true_landmarks[ids].ravel()]),
+        belief.mean,
+        belief.covariance,
+    )
+    measured: dict[str, Value] = {
+        "state_dof": 3 + 2 * len(ids),
+        "relative_map_dof": 2 * len(ids),
+    }
+    for frame in ERROR_FRAMES:
+        value = nees.state_nees(*states, frame=frame)
+        measured[f"state_nees_{frame}"] = float(value)
+    if not ids:
+        return measured
+    for frame in ERROR_FRAMES:
+        values = nees.landmark_nees(*states, frame=frame)
+        measured[f"landmark_nees_{frame}"] = _by_id(values, ids, len(true_landmarks))
+    _, centred = invariant_squares(invariant_error(*states[:2]))
+    accuracy = position_accuracy(belief.landmarks, true_landmarks[ids])
+    return measured | {
+        "relative_map_nees": float(nees.relative_map_nees(*states)),
+        "map_error_centred": float(np.sqrt(centred)),
+        "landmark_rmse": accuracy.raw_rmse,
+        "landmark_rmse_aligned": accuracy.aligned_rmse,
+        "landmark_area": float(ellipse_areas(belief.landmark_covariances).mean()),
+        "landmark_error": _by_id(accuracy.raw_errors, ids, len(true_landmarks)),
+        "landmark_mahalanobis": np.sqrt(measured["landmark_nees_additive"]),
+    }
+
+
+def _by_id(values: Array, ids: list[int], count: int) -> Array:
+    """Return values for all landmarks, nan for those that are not in the map."""
+    rows = np.full(count, np.nan)
+    rows[ids] = values
+    return rows
+
+
+MARGIN = 1.0
+"""Path error above that with known identities [m]."""
+
+SHARES = ("precision", "recall")
+
+
+def measure_association(
+    runs: SimulatedRuns, filtered: FilteredRuns, run: int, resolution: float
+) -> Mapping[str, NDArray[np.generic] | float]:
+    """Measure one run; empty if its filter reports no decisions, or failed.
+
+    Parameters
+    ----------
+    runs : SimulatedRuns
+        The runs.
+    filtered : FilteredRuns
+        The beliefs of a filter in them.
+    run : int
+        Index of the run.
+    resolution : float
+        True landmarks nearer to each other count as one place [m].
+    """
+    made, belief = filtered.decisions.get(run), filtered.beliefs[run]
+    if made is None or belief is None:
+        return {}
+    truth = TrueLandmarks(np.arange(runs.landmarks.shape[1]), runs.landmarks[run])
+    found = compare_association(
+        made, truth, belief.landmark_ids, belief.landmarks, resolution=resolution
+    )
+    return _values(found)
+
+
+def _values(found: RunAssociation) -> dict[str, float]:
+    scores = {} if found.scores is None else found.scores.as_dict()
+    parts = {"raw": found.raw, "aligned": found.aligned}
+    return {
+        **{f"{PREFIX}{name}": float(value) for name, value in scores.items()},
+        **{
+            f"gospa_{which}_{part}": float(value)
+            for which, whole in parts.items()
+            for part, value in whole._asdict().items()
+        },
+    }
+
+
+def identified(belief: Belief, identities: Mapping[int, int]) -> Belief:
+    """Return a belief about true landmarks by their identity.
+
+    Of several mapped landmarks that are of one true landmark, the first counts; those
+    of none are left out.
+    """
+    chosen: dict[int, int] = {}
+    for landmark in belief.landmark_ids:
+        chosen.setdefault(identities.get(landmark, -1), landmark)
+    chosen.pop(-1, None)
+    slots = {landmark: slot for slot, landmark in enumerate(belief.landmark_ids)}
+    part = Belief.marginal(
+        belief.mean, belief.covariance, slots, list(chosen.values()), belief.frame
+    )
+    return replace(part, landmark_ids=tuple(chosen))
+
+
+def with_known_ids(
+    settings: FilterSettings, runs: SimulatedRuns, threads: int | None
+) -> dict[str, Array]:
+    """Return the scores of the same filter with known identities.
+
+    It has no landmark management.
+
+    Returns
+    -------
+    dict
+        Path errors (B,) [m], and the NEES of the pose (B, T) in both frames; nan in
+        runs that fail.
+    """
+    options = {k: v for k, v in settings.options.items() if k != "management"}
+    plain = replace(settings, options=options)
+    trace = filter_runs(plain, runs.identified(), threads=threads).trace
+    gaps = trace.poses[:, :, :2] - runs.true_poses[:, :, :2]
+    errors = np.sqrt((gaps**2).sum(axis=2).mean(axis=1))
+    posed = runs.true_poses, trace.poses, trace.pose_covariances
+    with np.errstate(all="ignore"):  # a diverged run may overflow
+        scores = {
+            f"{KNOWN_IDS_NEES}_{frame}": _pose_nees(*posed, frame)
+            for frame in ERROR_FRAMES
+        }
+    return {KNOWN_IDS_ATE: errors, **scores}
+
+
+def _pose_nees(
+    truth: Array, poses: Array, covariances: Array, frame: ErrorFrame
+) -> Array:
+    """Return the NEES of the pose run by run, (B, T)."""
+    return np.array(
+        [
+            pose_nees(*run, frame=frame)
+            for run in zip(truth, poses, covariances, strict=True)
+        ]
+    )

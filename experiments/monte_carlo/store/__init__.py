@@ -1,1 +1,0 @@
-"""The results of a Monte Carlo on disk: job folder, blocks, dataset."""

@@ -1,0 +1,547 @@
+"""Reduce a consistency report to one word and one sentence."""
+
+from __future__ import annotations
+
+import json
+import math
+import textwrap
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from ...arrays import Array, BoolArray, IntArray
+from ...estimator.models.rigid_motion import ErrorFrame
+from ...evaluation.consistency_report import FEW_AVERAGES, FEW_RUNS, ConsistencyReport
+from ...evaluation.diagnosis import CANNOT_TELL, HONEST, Diagnosis, diagnose
+from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
+from ..runs.summary import MOST_REJECTED, NIS_RANGE, nis_suspicion
+from ..runs.trace import finite, quotient
+from .run_measures import KNOWN_IDS_ATE, KNOWN_IDS_NEES, PREFIX
+
+CONSISTENT = "consistent"
+NEARLY = "nearly consistent"
+NOT_CONSISTENT = "not consistent"
+NOT_SHOWN = "not shown"
+KINDS = {CONSISTENT: "good", NEARLY: "good", NOT_CONSISTENT: "bad", NOT_SHOWN: "open"}
+"""Rating of each word, which chooses its colour."""
+
+_ERROR_RATE = 0.05
+_DECIDING = 3  # final step, time averages and grid share the error rate
+_SMALLEST_P = 1e-16
+_MARGIN = f"[{EQUIVALENCE_MARGIN.low:g}, {EQUIVALENCE_MARGIN.high:g}]"
+_INSIDE = f"lies inside {_MARGIN}"
+_TOO_SURE = 0.9
+_NOT_REFUSED = "its errors agree with its covariances (5 %)"
+
+
+class Verdict(NamedTuple):
+    """One word and its reason."""
+
+    word: str
+    """"consistent": no test rejects, and the ratio is shown to be near 1;
+    "nearly consistent": rejected, but shown to be near 1; "not consistent": rejected,
+    which happens to a consistent filter in at most 5 % of cases; "not shown": neither,
+    or some runs failed."""
+    reason: str
+    """Continues after the word, without a full stop."""
+
+
+def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
+    """Reduce a report to a verdict.
+
+    Parameters
+    ----------
+    report : ConsistencyReport or None
+        None if fewer than 2 runs succeeded, or no test could be done.
+    failed, runs : int
+        Numbers of failed runs and of all runs.
+    """
+    if report is None:
+        reason = f"{runs - failed} of {runs} runs succeeded: too few to decide"
+        return Verdict(NOT_SHOWN, reason)
+    verdict = _verdict_on_successes(report)
+    if not failed:
+        return verdict
+    word = verdict.word if verdict.word == NOT_CONSISTENT else NOT_SHOWN
+    others = f"{failed} of {runs} runs failed; of the others, {verdict.reason}"
+    return Verdict(word, others)
+
+
+def verdict_sentence(label: str, verdict: Verdict) -> str:
+    """Write a verdict as a sentence.
+
+    Examples
+    --------
+    >>> verdict_sentence("ekf", Verdict("not shown", "1 run of 1 decides nothing"))
+    'ekf: not shown: 1 run of 1 decides nothing.'
+    """
+    return f"{label}: {verdict.word}: {verdict.reason}."
+
+
+def heading_sentence(claimed: float | None, knowable: float) -> str:
+    """Write whether a filter claims to know its heading better than is possible.
+
+    Parameters
+    ----------
+    claimed : float or None
+        Standard deviation of the final heading according to the filter [rad].
+    knowable : float
+        That of the start, which is the lower bound [rad].
+
+    Returns
+    -------
+    str
+        Empty if it does not.
+
+    Examples
+    --------
+    >>> heading_sentence(0.05, 0.1)
+    'It claims to know its heading to 2.9° at the end, but the start was known to...
+    >>> heading_sentence(0.12, 0.1)
+    ''
+    """
+    if claimed is None or claimed >= _TOO_SURE * knowable:
+        return ""
+    return (
+        f"It claims to know its heading to {in_degrees(claimed)} at the end, but the "
+        f"start was known to {in_degrees(knowable)} only, which no reading can improve."
+    )
+
+
+def in_degrees(angle: float) -> str:
+    """Write the size of an angle [rad] in degrees.
+
+    Examples
+    --------
+    >>> in_degrees(0.1), in_degrees(1e-4), in_degrees(0.035)
+    ('5.7°', '0.0057°', '2.0°')
+    """
+    degrees = abs(math.degrees(angle))
+    size = math.floor(math.log10(degrees)) if degrees else 0
+    return f"{degrees:.{min(max(1 - size, 0), 6)}f}°"
+
+
+def p_text(p_value: float) -> str:
+    """Write a p-value with two digits.
+
+    Examples
+    --------
+    >>> p_text(0.0), p_text(0.0123)
+    ('p < 1e-16', 'p = 0.012')
+    """
+    small = p_value < _SMALLEST_P
+    return f"p < {_SMALLEST_P:g}" if small else f"p = {p_value:.2g}"
+
+
+def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
+    """Return the verdict on the successful runs."""
+    verdict = report.equivalence
+    low, high = max(verdict.interval[0], 0.0), verdict.interval[1]  # of a ratio >= 0
+    interval = f"the 90 % interval of the ratio, [{low:.3f}, {high:.3f}]"
+    refusal = _refusal(report)
+    if refusal and _is_near_everywhere(report):
+        return Verdict(
+            NEARLY, f"{refusal}, which is certain but small: {interval}, {_INSIDE}"
+        )
+    if refusal:
+        return Verdict(NOT_CONSISTENT, refusal + _outliers(report))
+    if verdict.accepted:
+        return Verdict(CONSISTENT, f"{_NOT_REFUSED}, and {interval}, {_INSIDE}")
+    if verdict.verdict == NOT_CONSISTENT:  # rejects in up to 10 %: not enough
+        kept = "no test rejects it (5 %), but"
+        lies = f"{interval}, lies outside {_MARGIN}"
+    else:
+        kept, lies = f"{_NOT_REFUSED}, but", f"{interval}, is not inside {_MARGIN}"
+    needed = _runs_needed(report)
+    many = f", about {needed:,} in total if its ratio is 1" if needed else ""
+    return Verdict(NOT_SHOWN, f"{kept} {lies}: more runs are needed{many}")
+
+
+def _runs_needed(report: ConsistencyReport) -> int:
+    """Return with how many runs a filter of ratio 1 is accepted in 90 % of cases.
+
+    Its 90 % interval must then be about half as wide as the margin.  Its width is in
+    proportion to the ratio, and to one over the square root of the number of runs.  0
+    if there are too few runs now.
+    """
+    ratio, (low, high) = report.equivalence.statistic, report.equivalence.interval
+    runs = report.runs - len(report.failed_runs)
+    if runs < FEW_AVERAGES:
+        return 0
+    least, most = EQUIVALENCE_MARGIN
+    below, above = 1 - low / ratio, high / ratio - 1
+    width = max(below / (1 - least), above / (most - 1))
+    needed = max(runs * (2 * width) ** 2, runs + 1)
+    digit: float = 10.0 ** (math.floor(math.log10(needed)) - 1)
+    return int(math.ceil(needed / digit) * digit)
+
+
+def _refusal(report: ConsistencyReport) -> str:
+    """Write how wrong the filter is, if final step, averages or grid reject it."""
+    final, average, grid = report.final_step, report.time_average, report.family
+    p_value = min(final.p_value, report.average_p_value)
+    ratios = [final.statistic, average.statistic]
+    claims = "what its covariances claim"
+    amounts = "{} times {} at the end, {} times over all steps"
+    if p_value * _DECIDING < _ERROR_RATE:
+        what = amounts.format(_number(ratios[0]), claims, _number(ratios[1]))
+    elif grid.p_value * _DECIDING < _ERROR_RATE:
+        worst = int(abs(np.log(grid.statistic[grid.rejected])).argmax())
+        step = int(report.family_steps[grid.rejected][worst]) + 1  # it knows no step 0
+        ratios, p_value = [float(grid.statistic[grid.rejected][worst])], grid.p_value
+        what = f"{_number(ratios[0])} times {claims} at step {step}"
+    else:
+        return ""
+    cautious = ": it is too cautious" if max(ratios) < 1 else ""
+    return f"its squared errors are {what} ({p_text(p_value)}){cautious}"
+
+
+def _is_near_everywhere(report: ConsistencyReport) -> bool:
+    low, high = EQUIVALENCE_MARGIN
+    ratios = (report.final_step.statistic, *report.family.statistic)
+    return report.equivalence.accepted and all(low <= r <= high for r in ratios)
+
+
+def _outliers(report: ConsistencyReport) -> str:
+    """Point out that a few runs dominate the average."""
+    most = EQUIVALENCE_MARGIN.high
+    if not report.median_ratio <= most < report.mean_ratio:
+        return ""
+    return (
+        f"; few runs make this average: the median is {report.median_ratio:.2f}, "
+        f"{report.share_above_3:.1%} of the runs are above 3"
+    )
+
+
+def _number(ratio: float) -> str:
+    return f"{ratio:.3g}" if ratio < 1e6 else f"{ratio:.0e}"
+
+
+# --------------------------------------------------------------------------------------
+# Warnings about the results of a Monte Carlo: too few runs, and failed runs.
+
+LARGE_MAP = 1.2
+"""Ratio of map sizes above which a map is split."""
+
+_MOST_GROUPS = 3
+_LETTERS = 160  # of a message
+
+
+def failure_groups(failures: Iterable[FailedRun]) -> list[dict[str, Any]]:
+    """Group failures by their message.
+
+    Returns
+    -------
+    list of dict
+        ``{count, message, run, step}``, the most frequent first, with the first run of
+        each message and the step at which it failed, -1 where unknown.
+
+    Examples
+    --------
+    >>> failure_groups([FailedRun(0, 3, "boom"), FailedRun(4, 7, "boom")])
+    [{'count': 2, 'message': 'boom', 'run': 0, 'step': 3}]
+    """
+    groups: dict[str, dict[str, Any]] = {}
+    for run, step, message in failures:
+        new = {"count": 0, "message": message, "run": run, "step": step}
+        groups.setdefault(message, new)["count"] += 1
+    return sorted(groups.values(), key=lambda group: -int(group["count"]))
+
+
+def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[str]:
+    """List why the numbers of a Monte Carlo should be used with caution.
+
+    Parameters
+    ----------
+    entries : mapping
+        By label, each with ``good_runs`` and ``failure_groups``, and perhaps ``nis``,
+        ``unused_readings`` and ``association``.
+    runs : int
+        Number of all runs.
+
+    Returns
+    -------
+    list of str
+        Sentences of one line without markup; they name up to 3 different failures per
+        estimator.
+
+    Examples
+    --------
+    >>> groups = [{"count": 2, "message": "boom", "run": 0, "step": 3}]
+    >>> entry = {"good_runs": 3, "failure_groups": groups}
+    >>> for line in run_warnings({"ekf": entry}, 5):
+    ...     print(line)
+    ekf: 2 of 5 runs failed: 2 × boom (first: run 0, step 3).
+    Only 5 runs: below 20 little can be shown.
+    """
+    failed = {label: _failed(label, entry, runs) for label, entry in entries.items()}
+    found = [sentence for sentence in failed.values() if sentence]
+    for label, entry in entries.items():
+        found += [f"{label}: {text}" for text in _suspicions(entry) if text]
+    if runs < FEW_RUNS:
+        found.append(f"Only {runs} runs: below {FEW_RUNS} little can be shown.")
+        return found
+    for label, entry in entries.items():
+        if entry["good_runs"] < FEW_RUNS:
+            found.append(
+                f"{label}: only {entry['good_runs']} runs did not fail: below "
+                f"{FEW_RUNS} little can be shown."
+            )
+    return found
+
+
+def _suspicions(entry: Mapping[str, Any]) -> Iterator[str]:
+    """Yield suspicions from the numbers of an estimator, empty for none."""
+    unused, nis = entry.get("unused_readings") or 0.0, entry.get("nis")
+    is_managed = "management" in entry.get("options", {})  # it may leave readings out
+    if unused > MOST_REJECTED and not is_managed and nis is None:
+        yield "its reports list no reading that corrected the belief: it has no NIS."
+    elif unused > MOST_REJECTED and not is_managed:
+        yield (
+            f"{unused:.0%} of the readings corrected nothing, rejected by a gate or "
+            "too near: the filter may diverge."
+        )
+    if nis is not None and not NIS_RANGE[0] <= nis <= NIS_RANGE[1]:
+        associates = is_managed or bool(entry.get("association"))
+        yield f"the {nis_suspicion(nis, associates=associates)}"
+    yield from _split_map(entry.get("association") or {})
+
+
+def _split_map(scores: Mapping[str, float | None]) -> Iterator[str]:
+    size, true_size = scores.get("map_size"), scores.get("true_map_size")
+    if size and true_size and size > LARGE_MAP * true_size:
+        yield (
+            f"the map has {size:.1f} landmarks on average, but {true_size:.1f} were "
+            "seen: it is split."
+        )
+
+
+def _failed(label: str, entry: Mapping[str, Any], runs: int) -> str:
+    groups = entry["failure_groups"]
+    if not groups:
+        return ""
+    named = [_group(group) for group in groups[:_MOST_GROUPS]]
+    if len(groups) > _MOST_GROUPS:
+        others = sum(group["count"] for group in groups[_MOST_GROUPS:])
+        named.append(f"{others} × other messages")
+    return f"{label}: {runs - entry['good_runs']} of {runs} runs failed: " + (
+        "; ".join(named) + "."
+    )
+
+
+def _group(group: Mapping[str, Any]) -> str:
+    message = textwrap.shorten(group["message"], _LETTERS, placeholder=" …")
+    at = f", step {group['step']}" if group["step"] >= 0 else ""
+    return f"{group['count']} × {message} (first: run {group['run']}{at})"
+
+
+# --------------------------------------------------------------------------------------
+# The cause of an inconsistency, as an entry of the summary and as a sentence.
+
+_MISTAKES = ("wrong", "duplicate", "ghost", "clutter_used")
+
+
+def diagnosis_summary(
+    scores: EstimatorScores, frame: ErrorFrame
+) -> dict[str, Any] | None:
+    """Name the cause for which an estimator is not consistent.
+
+    Returns
+    -------
+    dict or None
+        ``cause``, one of :data:`slamgym.evaluation.CAUSES`, its ``p``, a ``sentence``,
+        and ``others``, further causes; see :func:`slamgym.evaluation.diagnose`. None
+        for results without noise, which an older version wrote.
+    """
+    if "noise_sums" not in scores.results:
+        return None
+    found = _diagnosed(scores, frame)
+    return {
+        "cause": found.cause,
+        "p": finite(found.p_value),
+        "sentence": found.sentence,
+        "others": list(found.others),
+    }
+
+
+def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
+    """Write the cause in an entry of the summary as a line, if there is one.
+
+    Examples
+    --------
+    >>> found = {"cause": "clutter", "sentence": "clutter: it is used."}
+    >>> diagnosis_lines("ekf", {"diagnosis": found})
+    ('ekf: cause: clutter: it is used.',)
+    """
+    found = entry.get("diagnosis")
+    if found is None or found["cause"] == HONEST:
+        return ()
+    return (f"{label}: cause: {found['sentence']}",)
+
+
+def _diagnosed(scores: EstimatorScores, frame: ErrorFrame) -> Diagnosis:
+    """Diagnose the runs that succeeded; the noise of all runs counts.
+
+    If runs failed and the others are consistent, the answer is "cannot tell".
+    """
+    nees = scores.over_time(f"pose_nees_{frame}")[:, scores.first - 1 :]
+    heading = scores.over_time("heading_nees")[:, scores.first - 1 :]
+    found = diagnose(
+        scores.per_run("noise_sums"),
+        nees,
+        heading,
+        nis_ratio=scores.nis_per_degree,
+        heading_knowledge=_heading_knowledge(scores),
+        mistakes=_mistakes(scores),
+        known_nees=_known_nees(scores, frame),
+    )
+    if found.cause != "honest" or not scores.failures:
+        return found
+    failed, runs = len(scores.failures), len(scores.good)
+    return Diagnosis(
+        CANNOT_TELL,
+        found.p_value,
+        f"cannot tell: {failed} of {runs} runs failed; the others are honest.",
+    )
+
+
+def _heading_knowledge(scores: EstimatorScores) -> Array | None:
+    """Divide the variance of the last heading by the least possible one."""
+    bound = scores.per_run("heading_bound")[:, -1]
+    if scores.nis_per_degree is None or not (bound > 0).all():
+        return None
+    return np.asarray(scores.per_run("heading_std")[:, -1] ** 2 / bound)
+
+
+def _mistakes(scores: EstimatorScores) -> Array | None:
+    if KNOWN_IDS_ATE not in scores.results:
+        return None
+    counts = [scores.per_run(f"{PREFIX}{name}") for name in _MISTAKES]
+    return np.asarray(np.nan_to_num(np.sum(counts, axis=0)))
+
+
+def _known_nees(scores: EstimatorScores, frame: ErrorFrame) -> Array | None:
+    """Return the NEES of the same filter with known identities, if it failed nowhere.
+
+    Results that an older version wrote have none.
+    """
+    name = f"{KNOWN_IDS_NEES}_{frame}"
+    if name not in scores.results:
+        return None
+    known = scores.over_time(name)[:, scores.first - 1 :]
+    return known if np.isfinite(known).all() else None
+
+
+# --------------------------------------------------------------------------------------
+# Select the results of a Monte Carlo that count: successful runs, after the start.
+#
+# The first step is a scan before any motion. If the start is certain, further leading
+# steps have no NEES; they are left out as well.
+
+POSE_FREEDOM, POINT_FREEDOM = 3, 2
+_FIRST = 1
+_LARGEST = 1e100  # squares of larger numbers would overflow
+_NO_MESSAGE = "its NEES or NIS is not finite, or above 1e100"
+
+
+class FailedRun(NamedTuple):
+    """A run that is left out of all figures, and the reason."""
+
+    run: int
+    step: int
+    """-1 where unknown."""
+    message: str
+
+
+class EstimatorScores(NamedTuple):
+    """One estimator's results: M successful runs, K steps after the start."""
+
+    label: str
+    first: int
+    """First step that has a NEES, >= 1."""
+    good: BoolArray
+    """Which of all runs succeeded, shape (runs,)."""
+    failures: tuple[FailedRun, ...]
+    results: xr.Dataset
+    """Of all runs and steps."""
+
+    @property
+    def steps(self) -> IntArray:
+        """Numbers of the steps after the start, shape (K,)."""
+        return np.arange(_FIRST, self.results.sizes["step"])
+
+    def over_time(self, name: str) -> Array:
+        """Return a variable of the runs and steps that count, shape (M, K)."""
+        return np.asarray(self.results[name].values[self.good, _FIRST:])
+
+    def per_run(self, name: str) -> Array:
+        """Return a variable of the runs that count, shape (M, ...)."""
+        return np.asarray(self.results[name].values[self.good])
+
+    def ratios(self, frame: ErrorFrame) -> Array:
+        """Return NEES of the pose divided by 3, shape (M, K + 1 − first)."""
+        nees = self.over_time(f"pose_nees_{frame}")[:, self.first - _FIRST :]
+        return np.asarray(nees / POSE_FREEDOM)
+
+    @property
+    def nis_per_degree(self) -> float | None:
+        """Sum of NIS by the sum of degrees of freedom; None without readings."""
+        freedom = self.over_time("nis_dof")
+        return quotient(np.where(freedom > 0, self.over_time("nis"), 0.0), freedom)
+
+
+def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorScores:
+    """Select one estimator's results, and find its failed runs.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        Results of ``monte_carlo``.
+    label : str
+        Label of the estimator.
+    frame : {"additive", "invariant"}
+        Error coordinates whose NEES must be finite, and below 1e100.
+    """
+    results = dataset.sel(estimator=label)
+    nees = results[f"pose_nees_{frame}"].values
+    nis, freedom = results["nis"].values, results["nis_dof"].values
+    known = nees < _LARGEST
+    first = _FIRST + int(known[:, _FIRST:].any(axis=0).argmax())
+    gaps = ~known
+    gaps[:, :first] = False
+    gaps |= ~(nis < _LARGEST) & (freedom > 0)
+    flagged = results["failed"].values.astype(bool)
+    good = ~(flagged | gaps.any(axis=1))
+    at = np.where(flagged, results["failed_at"].values, gaps.argmax(axis=1))
+    failures = [
+        FailedRun(
+            int(dataset["run"].values[row]),
+            int(at[row]),
+            str(results["message"].values[row]) or _NO_MESSAGE,
+        )
+        for row in np.flatnonzero(~good)
+    ]
+    return EstimatorScores(label, first, good, tuple(failures), results)
+
+
+def labels_of(dataset: xr.Dataset) -> tuple[str, ...]:
+    """Return the labels of the estimators in their order."""
+    return tuple(str(label) for label in dataset["estimator"].values)
+
+
+def estimators_of(dataset: xr.Dataset) -> dict[str, Any]:
+    """Return name and options of each estimator by its label."""
+    return dict(json.loads(dataset.attrs.get("estimators", "{}")))
+
+
+def start_heading_std(dataset: xr.Dataset) -> float:
+    """Return the standard deviation of the heading at the start [rad].
+
+    Readings are relative to the robot and no landmark is known beforehand, so they hold
+    no information about the orientation of the map: no later heading is known better.
+    """
+    table = tomllib.loads(dataset.attrs["scenario"])
+    return float(table.get("start", {}).get("std", (0.0, 0.0, 0.0))[2])

@@ -1,0 +1,444 @@
+"""File formats of trajectories, one module each, loaded on demand.
+
+A shard of some episodes is one file or one folder. Every module has `write` and `read`,
+and those of the other fields of `TrajectoryFormat` that differ from
+their defaults.
+"""
+
+import json
+import math
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from ...arrays import Array
+from ...envs.spaces import count_rows
+from ...estimator.filters.batch import BatchSlam
+from ...estimator.filters.ekf import EkfSlam
+from ...estimator.models.bearing_range import wrap_angle
+from ...estimator.models.unicycle_motion import drive
+from ...sim_configs import Scenario
+from ...sim_configs.field_types import unknown_choice
+from ...sim_configs.scenario_files import scenario_text
+from ..logs.recording import log_header
+from ..logs.slamlog import (
+    NO_LANDMARK,
+    OdometryRow,
+    Scan,
+    SlamLog,
+    read_slamlog,
+    write_slamlog,
+)
+from ..runs.filter_settings import settings_for_scenario
+from .trajectory import (
+    ARRAYS,
+    BELIEFS,
+    Trajectory,
+    array_of,
+    arrays_to_write,
+    scenario_from_text,
+)
+
+FORMATS = {
+    "slamlog": "slamlog_files",
+    "npz": "npz",
+    "parquet": "parquet",
+    "minari": "minari_dataset",
+    "tum": "tum",
+    "g2o": "g2o",
+}
+"""Names of the formats and of their modules."""
+
+
+class TrajectoryFormat(NamedTuple):
+    """What a module of this package defines."""
+
+    write: Callable[..., None]
+    """Writes a shard: (trajectories, path), and its options by name. The same
+    trajectories give the same bytes."""
+    read: Callable[[Path], Iterator[Trajectory]]
+    """Yields the trajectories of a shard, one after the other."""
+    check: Callable[[Scenario], None] = lambda scenario: None
+    """Raises a ValueError for a scenario that the format cannot hold."""
+    ENDING: str = ""
+    """The ending of the names of its shards."""
+    LIBRARIES: tuple[str, ...] = ()
+    """The packages besides numpy that write it; their versions determine the bytes."""
+    OPTIONS: Mapping[str, float] = {}
+    """Names and defaults of the numbers > 0 that its `write` also takes."""
+    HOLDS_BELIEFS: bool = False
+    """Whether it writes and reads the beliefs of a filter too."""
+
+
+def trajectory_format(name: str) -> TrajectoryFormat:
+    """Load a format by its name.
+
+    Raises
+    ------
+    ValueError
+        If there is no such format.
+    ImportError
+        If its package is not installed; the message shows how to install it.
+
+    Examples
+    --------
+    >>> trajectory_format("npz").ENDING
+    '.npz'
+    >>> trajectory_format("npy")
+    Traceback (most recent call last):
+    ValueError: format must be one of slamlog, npz, parquet, minari, tum, g2o, got \
+'npy'; did you mean 'npz'?
+    """
+    if name not in FORMATS:
+        raise ValueError(unknown_choice("format", name, FORMATS))
+    try:
+        module = import_module(f".{FORMATS[name]}", __name__)
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"the format '{name}' needs the package {error.name}: "
+            "pip install 'slamgym[trajectories]'"
+        ) from None
+    defined = {
+        n: vars(module)[n] for n in TrajectoryFormat._fields if n in vars(module)
+    }
+    return TrajectoryFormat(**defined)
+
+
+# --------------------------------------------------------------------------------------
+# Shards as folders of text files, with metadata that the text formats lack.
+#
+# In addition to the files of its episodes, a shard has ``episodes.jsonl`` with one line
+# per episode: its name, seed, controller, and scenario as TOML.
+
+METADATA = "episodes.jsonl"
+
+
+def write_metadata(
+    trajectories: Sequence[Trajectory], folder: Path
+) -> list[tuple[str, Trajectory]]:
+    """Make the folder of a shard with its metadata, and name the episodes.
+
+    Returns
+    -------
+    list of (str, Trajectory)
+        Names such as ``"seed_00000007"``, prefixes of the names of the episode's files,
+        and the trajectories.
+    """
+    folder.mkdir()
+    named = [(f"seed_{each.seed:08d}", each) for each in trajectories]
+    tables = [
+        {
+            "name": name,
+            "seed": each.seed,
+            "controller": each.controller,
+            "scenario": scenario_text(each.scenario),
+        }
+        for name, each in named
+    ]
+    write_lines(folder / METADATA, [json.dumps(table) for table in tables])
+    return named
+
+
+def read_metadata(folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield for each episode its name, and its scenario, controller and seed."""
+    for line in (folder / METADATA).read_text(encoding="utf-8").splitlines():
+        table = json.loads(line)
+        table["scenario"] = scenario_from_text(table["scenario"])
+        yield table.pop("name"), table
+
+
+def write_lines(path: Path, lines: Sequence[str]) -> None:
+    """Write lines as a UTF-8 text file, the same on every system."""
+    path.write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Write numbers separated by blanks, so that reading gives the same bits.
+
+    Examples
+    --------
+    >>> numbers([0.1, 2])
+    '0.1 2.0'
+    """
+    return " ".join(repr(float(value)) for value in values)
+
+
+# --------------------------------------------------------------------------------------
+# Shards as npz files of numpy: every array of E episodes stacked, exact.
+#
+# The arrays are those of `Trajectory` with an additional first axis E:
+# ``start_estimate`` has the shape (E, 3). ``seed``, ``controller`` and ``scenario`` (as
+# TOML) are (E,).
+
+ENDING = ".npz"
+HOLDS_BELIEFS = True
+
+_NO_DATE = (1980, 1, 1, 0, 0, 0)  # a constant: equal arrays give equal bytes
+
+
+def _write_npz(trajectories: Sequence[Trajectory], path: Path) -> None:
+    """Write a shard, uncompressed; see `TrajectoryFormat`."""
+    columns = {
+        "scenario": np.array([scenario_text(each.scenario) for each in trajectories]),
+        "controller": np.array([each.controller for each in trajectories]),
+        "seed": np.array([each.seed for each in trajectories]),
+    }
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, column in columns.items():
+            _add(archive, name, column)
+        for name in arrays_to_write(trajectories):
+            stacked = np.stack([array_of(each, name) for each in trajectories])
+            _add(archive, name, stacked)
+
+
+def _read_npz(path: Path) -> Iterator[Trajectory]:
+    """Yield the trajectories of a shard; see `TrajectoryFormat`."""
+    with np.load(path, allow_pickle=False) as archive:
+        columns = {name: archive[name] for name in archive.files}
+    arrays = [name for name in (*ARRAYS, *BELIEFS) if name in columns]
+    for k in range(len(columns["seed"])):
+        yield Trajectory(
+            scenario=scenario_from_text(str(columns["scenario"][k])),
+            controller=str(columns["controller"][k]),
+            seed=int(columns["seed"][k]),
+            **{name: columns[name][k] for name in arrays},
+        )
+
+
+def _add(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
+    member = zipfile.ZipInfo(f"{name}.npy", date_time=_NO_DATE)
+    with archive.open(member, "w", force_zip64=True) as stream:
+        np.lib.format.write_array(stream, array, allow_pickle=False)
+
+
+# --------------------------------------------------------------------------------------
+# Shards as folders of TUM files: the true path and the path by odometry alone.
+#
+# The lines are ``t x y z qx qy qz qw`` with t in seconds and z = 0, as evo reads them.
+# There are two files per episode, ``NAME_truth.tum`` and ``NAME_odometry.tum``; the
+# latter integrates odometry from the initial pose of filters.
+#
+# The files hold the paths alone: no readings, landmarks, actions or collisions.
+# Positions are exact; headings read back in [-π, π] within 1e-15, and odometry within
+# 1e-15 times the size of the coordinates.
+
+
+def _write_tum(trajectories: Sequence[Trajectory], path: Path) -> None:
+    """Write a shard; see `TrajectoryFormat`."""
+    for name, each in write_metadata(trajectories, path):
+        dt = each.scenario.dt
+        write_lines(path / f"{name}_truth.tum", _lines(each.poses, dt))
+        path_by_odometry = dead_reckoning(each.start_estimate, each.odometry)
+        write_lines(path / f"{name}_odometry.tum", _lines(path_by_odometry, dt))
+
+
+def _read_tum(path: Path) -> Iterator[Trajectory]:
+    """Yield the trajectories of a shard; see `TrajectoryFormat`."""
+    for name, about in read_metadata(path):
+        reckoned = _poses(path / f"{name}_odometry.tum")
+        yield Trajectory(
+            **about,
+            start_estimate=reckoned[0],
+            odometry=_increments(reckoned),
+            poses=_poses(path / f"{name}_truth.tum"),
+        )
+
+
+def _lines(poses: Array, dt: float) -> list[str]:
+    return [
+        numbers((step * dt, x, y, 0, 0, 0, math.sin(half), math.cos(half)))
+        for step, (x, y, half) in enumerate((poses * (1.0, 1.0, 0.5)).tolist())
+    ]
+
+
+def _poses(path: Path) -> Array:
+    table: Array = np.loadtxt(path, ndmin=2)
+    half = np.arctan2(table[:, 6], table[:, 7])
+    heading = [wrap_angle(2.0 * angle) for angle in half.tolist()]
+    return np.column_stack([table[:, 1:3], heading])
+
+
+def _increments(poses: Array) -> Array:
+    """Return the odometry of a dead-reckoned path: distances and turns."""
+    dx, dy = np.diff(poses[:, :2], axis=0).T
+    heading = poses[:-1, 2]
+    turns = [wrap_angle(turn) for turn in np.diff(poses[:, 2]).tolist()]
+    return np.column_stack([dx * np.cos(heading) + dy * np.sin(heading), turns])
+
+
+# --------------------------------------------------------------------------------------
+# Compute the path from odometry alone.
+
+
+def dead_reckoning(start: Array, odometry: Array) -> Array:
+    """Integrate odometry.
+
+    ::
+
+        x' = x + d cos θ,    y' = y + d sin θ,    θ' = θ + α
+
+    Parameters
+    ----------
+    start : ndarray, shape (3,)
+        First pose [m, m, rad].
+    odometry : ndarray, shape (T, 2)
+        Rows (d, α) [m, rad].
+
+    Returns
+    -------
+    ndarray, shape (T + 1, 3)
+        Poses (x, y, θ) [m, m, rad], the start first, θ not wrapped.
+
+    Examples
+    --------
+    >>> turns = np.array([[1.0, np.pi / 2], [2.0, 0.0]])
+    >>> dead_reckoning(np.zeros(3), turns).round(2).tolist()
+    [[0.0, 0.0, 0.0], [1.0, 0.0, 1.57], [1.0, 2.0, 1.57]]
+    """
+    x, y, heading = start.tolist()
+    distances, turns = odometry.T
+    headings = np.cumsum([heading, *turns])
+    along_x, along_y, *_ = drive(0.0, 0.0, headings[:-1], distances, turns)
+    return np.column_stack(
+        [np.cumsum([x, *along_x]), np.cumsum([y, *along_y]), headings]
+    )
+
+
+# --------------------------------------------------------------------------------------
+# Estimate path and landmarks of a drive by a filter, to start an optimiser there.
+
+_ESTIMATOR = "invariant"
+
+
+def filtered_path(trajectory: Trajectory) -> tuple[Array, dict[int, Array]]:
+    """Return the online poses and the final landmarks of an invariant EKF.
+
+    The errors of odometry alone grow without bounds, and an optimiser that starts there
+    often ends in another minimum. Every loop that the filter closes bounds them.
+
+    Returns
+    -------
+    poses : ndarray, shape (T + 1, 3)
+        Poses (x, y, θ), given the readings up to each of them [m, m, rad]; odometry
+        alone if the filter fails. The first is the start estimate.
+    landmarks : dict of int to ndarray, shape (2,)
+        Positions of the mapped landmarks [m].
+    """
+    mask = array_of(trajectory, "mask")
+    start = trajectory.start_estimate
+    settings = settings_for_scenario(trajectory.scenario, estimator=_ESTIMATOR)
+    batch = BatchSlam(
+        cast(EkfSlam, settings.make(start)),
+        1,
+        mask.shape[1],
+        initial_poses=start[None],
+        initial_pose_std=settings.initial_pose_std,
+        threads=1,
+    )
+    odometry = np.vstack([np.zeros(2), trajectory.odometry])[None]
+    durations = np.append(0.0, np.ones(trajectory.steps))
+    measurements = array_of(trajectory, "measurements")[None]
+    poses = batch.run(odometry, measurements, mask[None], durations).poses[0]
+    belief = batch.belief(0)
+    if not (np.isfinite(poses).all() and np.isfinite(belief.mean).all()):
+        return dead_reckoning(start, trajectory.odometry), {}
+    poses[0] = start
+    pairs = zip(belief.landmark_ids, belief.landmarks, strict=True)
+    return poses, dict(pairs)
+
+
+# --------------------------------------------------------------------------------------
+# Shards as folders of slamlog CSVs, one per episode: the input of a filter, exact.
+#
+# A log holds the start, odometry, measurements, true poses and landmarks, and the true
+# ids of hidden identities; reading gives the same bits. It does not hold the actions
+# and the collisions.
+
+
+def _write_slamlog(trajectories: Sequence[Trajectory], path: Path) -> None:
+    """Write a shard; see `TrajectoryFormat`."""
+    for name, trajectory in write_metadata(trajectories, path):
+        write_slamlog(to_slamlog(trajectory), path / f"{name}.csv")
+
+
+def _read_slamlog(path: Path) -> Iterator[Trajectory]:
+    """Yield the trajectories of a shard; see `TrajectoryFormat`."""
+    for name, about in read_metadata(path):
+        yield _trajectory(read_slamlog(path / f"{name}.csv"), about)
+
+
+def to_slamlog(trajectory: Trajectory) -> SlamLog:
+    """Return the log of a trajectory, for replay.
+
+    Time counts steps, as in `record_episode`,
+    whose log of the same seed is equal.
+
+    Raises
+    ------
+    ValueError
+        If the trajectory lacks measurements or landmarks.
+    """
+    landmarks = array_of(trajectory, "landmarks")
+    measurements = array_of(trajectory, "measurements")
+    mask = array_of(trajectory, "mask")
+    true_ids = trajectory.landmark_ids
+    events: list[OdometryRow | Scan] = []
+    for step, seen in enumerate(mask):
+        if step > 0:
+            distance, turn = trajectory.odometry[step - 1].tolist()
+            events.append(OdometryRow(float(step), distance, turn, dt=1.0))
+        if seen.any():
+            readings = measurements[step][seen]
+            if trajectory.scenario.sensor.identities:
+                scan = Scan(float(step), readings, np.flatnonzero(seen))
+            else:
+                of = None if true_ids is None else true_ids[step][seen]
+                scan = Scan(float(step), readings, true_ids=of)
+            events.append(scan)
+    times = np.arange(len(trajectory.poses), dtype=np.float64)
+    return SlamLog(
+        name=trajectory.scenario.name,
+        header=log_header(trajectory.scenario, trajectory.seed),
+        start=trajectory.start_estimate,
+        landmark_ids=np.arange(len(landmarks)),
+        landmarks=landmarks,
+        events=tuple(events),
+        ground_truth=np.column_stack([times, trajectory.poses]),
+    )
+
+
+def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
+    moves = [event for event in log.events if isinstance(event, OdometryRow)]
+    rows = count_rows(about["scenario"])
+    measurements = np.zeros((len(moves) + 1, rows, 2))
+    mask = np.zeros((len(moves) + 1, rows), dtype=np.bool_)
+    true_ids = np.full(mask.shape, NO_LANDMARK, dtype=np.int64)
+    for scan in _scans(log):
+        ids = scan.landmark_ids
+        places = int(scan.t), np.arange(len(scan.measurements)) if ids is None else ids
+        measurements[places], mask[places] = scan.measurements, True
+        if scan.true_ids is not None:
+            true_ids[places] = scan.true_ids
+    hides = not about["scenario"].sensor.identities
+    return Trajectory(
+        **about,
+        start_estimate=log.start,
+        odometry=np.array([(move.d, move.alpha) for move in moves]),
+        poses=log.ground_truth[:, 1:],
+        landmarks=log.landmarks,
+        measurements=measurements,
+        mask=mask,
+        landmark_ids=true_ids if hides and _tells_true_ids(log) else None,
+    )
+
+
+def _tells_true_ids(log: SlamLog) -> bool:
+    return all(scan.true_ids is not None for scan in _scans(log))
+
+
+def _scans(log: SlamLog) -> Iterator[Scan]:
+    return (event for event in log.events if isinstance(event, Scan))
