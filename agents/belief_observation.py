@@ -346,10 +346,6 @@ def _padded(rows: AnyArray, more: int) -> AnyArray:
     return np.pad(rows, padding)
 
 
-# --------------------------------------------------------------------------------------
-# One filter per world: in a batch, or side by side where worlds hide identities.
-
-
 class SeparateFilters:
     """Filters side by side, for vector worlds that hide identities.
 

@@ -321,10 +321,6 @@ class CoverageGrid:
         return wall_clearance(places, *self._ends.T)
 
 
-# --------------------------------------------------------------------------------------
-# The knowledge of an agent in active SLAM: belief, floor and progress, no truth.
-
-
 class AgentKnowledge(NamedTuple):
     """What an agent may know at one step, for policies that plan."""
 

@@ -26,13 +26,9 @@ from second_core import two_processes
 
 from slamgym.estimator import EkfSlam, make_batch, make_estimator
 from slamgym.estimator.filters.gaussian_map import GaussianMap, workspace_for
-from slamgym.estimator.kernels.kalman_gain import (
-    SLOT,
-    BeliefArrays,
-    aligned_zeros,
-    new_ledger,
-)
+from slamgym.estimator.kernels.kalman_gain import SLOT, BeliefArrays, new_ledger
 from slamgym.estimator.kernels.scan_update import predict, update_belief
+from slamgym.estimator.support.memory_limit import aligned_zeros
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.05, 0.02, 0.02]), np.array([0.02, 0.08])
 NOISE: dict[str, Any] = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}

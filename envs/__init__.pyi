@@ -1,7 +1,5 @@
 from . import controllers as controllers
 from . import rendering as rendering
-from . import robot as robot
-from . import sensors as sensors
 from . import vector as vector
 from .landmark_world import LandmarkWorldEnv as LandmarkWorldEnv
 from .vector import LandmarkWorldVectorEnv as LandmarkWorldVectorEnv

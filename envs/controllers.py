@@ -121,10 +121,6 @@ def make_vector_controller(
     return VectorRandomWalk(singles, generators)
 
 
-# --------------------------------------------------------------------------------------
-# The interface of controllers, for one robot and for many, and its argument checks.
-
-
 class Controller(Protocol):
     """Chooses the actions of one robot."""
 
@@ -210,10 +206,6 @@ def positive(value: float, name: str) -> float:
     if not 0 < value < math.inf:
         raise ValueError(f"{name} must be finite and > 0, got {value}")
     return value
-
-
-# --------------------------------------------------------------------------------------
-# Open-loop control: a sequence of actions, whatever the pose.
 
 
 class OpenLoop:

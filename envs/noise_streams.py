@@ -302,10 +302,6 @@ def _poisson_cdf(mean: float, largest: int) -> Array:
     return np.cumsum(np.exp(logs))
 
 
-# --------------------------------------------------------------------------------------
-# Noise of many worlds, each with the numbers of a single world with its key.
-
-
 class VectorNoise:
     """Draws the noise of B worlds, step by step.
 

@@ -215,10 +215,6 @@ class SupportsBeliefLimit(Protocol):
     """Largest number of landmarks of a dense belief."""
 
 
-# --------------------------------------------------------------------------------------
-# Beliefs over robot pose and map: a snapshot to keep, and a view to look at.
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Belief:
     """A Gaussian belief over robot pose and map: a snapshot, safe to keep.
@@ -440,10 +436,6 @@ def describe_filter(slam: _HasMarginals) -> str:
     pose = slam.belief([])
     found = describe_map(len(slam.landmark_ids), pose.pose, pose.pose_covariance)
     return f"{type(slam).__name__} of {found}"
-
-
-# --------------------------------------------------------------------------------------
-# The report of one update: innovations, NIS, and the outcome of each reading.
 
 
 class ScanDecisions(NamedTuple):

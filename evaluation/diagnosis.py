@@ -3,8 +3,8 @@
 The tests answer two questions in this order.
 
 1. Do odometry and readings have the noise that the filter assumes?  With the truth,
-   all noise values are known (:mod:`.noise_findings`).  A wrong standard deviation, a bias
-   and heavy tails are tested separately (:mod:`.noise_findings`): a bias changes the
+   all noise values are known (:mod:`.noise_findings`).  A wrong standard deviation, a
+   bias and heavy tails are tested separately: a bias changes the
    mean, a wrong deviation the variance, and heavy tails the kurtosis.
 2. If so, do the covariances agree with the errors?  If not, the cause is in the filter:
    its association if identities are hidden, otherwise its linearisation.  Linearisation

@@ -221,10 +221,6 @@ def _chi_square_test(total: float, freedom: int, error_rate: float) -> Hypothesi
     return HypothesisTest(total / freedom, interval, p_value, error_rate)
 
 
-# --------------------------------------------------------------------------------------
-# Chi-square bands: where averages of NEES and NIS lie if a filter is consistent.
-
-
 class Band(NamedTuple):
     """Interval that holds a statistic with a stated probability."""
 
@@ -383,10 +379,6 @@ def _skew(scores: Array, skewness: float, runs: int) -> Array:
     if abs(c) < 1e-9:
         return scores
     return np.asarray(3 / c * (np.cbrt(1 + c * (scores - c / 6)) - 1))
-
-
-# --------------------------------------------------------------------------------------
-# Whiteness of innovations: autocorrelations and the Ljung-Box test.
 
 
 class LjungBox(NamedTuple):

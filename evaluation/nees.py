@@ -3,8 +3,9 @@
 NEES = eᵀ P⁻¹ e of an error e with claimed covariance P.  If P is correct, NEES is
 chi-square with as many degrees of freedom as e has entries.  Averages over runs (ANEES)
 are not divided by the dimension unless the name says so.  Every function names the
-frame of its error, additive or invariant (:mod:`slamgym.estimator.models.rigid_motion`),
-because the additive NEES rejects even a consistent filter if the heading is uncertain.
+frame of its error, additive or invariant
+(:mod:`slamgym.estimator.models.rigid_motion`), because the additive NEES
+rejects even a consistent filter if the heading is uncertain.
 """
 
 from __future__ import annotations

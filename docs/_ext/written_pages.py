@@ -47,7 +47,6 @@ PACKAGES: tuple[ModuleType, ...] = (
     estimator.models,
     estimator.smoother,
     envs.robot,
-    envs.sensors,
     envs.rendering,
     envs.vector,
 )

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import pyplot
 from matplotlib.artist import Artist
 from matplotlib.backend_bases import Event
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -30,7 +29,7 @@ class _Drawing(NamedTuple):
 
     scene: Scene
     blitted: BlittedFigure
-    window: "Window | None"
+    window: Window | None
 
 
 class WorldRenderer:
@@ -120,8 +119,6 @@ class WorldRenderer:
         figure: Figure = PlainTextFigure()
         window = None
         if self._mode == "human":
-            # MERGED-EMPTY  # noqa: PLC0415 (pyplot, for windows only)
-
             window = Window(self._fps)
             figure = window.figure
         else:
@@ -130,10 +127,6 @@ class WorldRenderer:
         figure.set_size_inches(_INCHES, _INCHES)
         scene = Scene(figure, self._scenario, self._landmarks)
         return _Drawing(scene, BlittedFigure(figure, scene.moving), window)
-
-
-# --------------------------------------------------------------------------------------
-# Fast frames of a figure in which only some artists move.
 
 
 class BlittedFigure:
@@ -191,10 +184,6 @@ class BlittedFigure:
             self._figure.draw_artist(artist)
 
 
-# --------------------------------------------------------------------------------------
-# A window of matplotlib that shows an episode.
-
-
 class Window:
     """A figure on the screen with a limited number of frames per second.
 
@@ -203,6 +192,9 @@ class Window:
     """
 
     def __init__(self, fps: float) -> None:
+        from matplotlib import pyplot  # noqa: PLC0415 (slow; for windows only)
+
+        self._pyplot = pyplot
         self.figure: Figure = pyplot.figure(FigureClass=PlainTextFigure)
         self._seconds_per_frame = 1 / fps
         self._due = time.monotonic()
@@ -217,7 +209,7 @@ class Window:
 
     def refresh(self, blitted: BlittedFigure) -> None:
         """Show the present frame, then run the event loop until the next one is due."""
-        if not pyplot.fignum_exists(self.figure.number):
+        if not self._pyplot.fignum_exists(self.figure.number):
             return
         blitted.draw()
         if not self._has_screen:
@@ -230,4 +222,4 @@ class Window:
 
     def close(self) -> None:
         """Close the window and free the figure in pyplot."""
-        pyplot.close(self.figure)
+        self._pyplot.close(self.figure)

@@ -400,10 +400,6 @@ def episode_steps(scenario: Scenario, most: int | None) -> int:
     return min(most, scenario.steps)
 
 
-# --------------------------------------------------------------------------------------
-# Rendering of worlds that are simulated together: one renderer per world.
-
-
 class VectorRenderer:
     """One `EpisodeRenderer` per world.
 

@@ -390,10 +390,6 @@ def _starts(
     return np.array(landmarks), np.array(poses), np.array(estimates)
 
 
-# --------------------------------------------------------------------------------------
-# Worlds of different scenarios with the interface of `WorldBatch`.
-
-
 class MixedWorlds:
     """B single worlds of different scenarios, stepped one after the other.
 

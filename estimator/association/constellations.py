@@ -10,8 +10,8 @@ Pairs (i, p) and (j, q) of a local and an older landmark agree if ::
 
 and if the turn between both directions is plausible.  The largest set of pairs that all
 agree, a maximum clique, is the candidate for a match [1]_.  Landmarks between those of
-the clique are added, and the match is tested (:mod:`.constellations`).  It is refused where
-a second place fits nearly as well.
+the clique are added, and the match is tested.  It is refused where a second place fits
+nearly as well.
 
 References
 ----------
@@ -187,9 +187,9 @@ def _blocks(covariance: Array) -> Array:
 #
 #     r_i = M(φ) (â_i − b̂_p) = ξ_p − ξ_i,    M(φ) = V(−φ)⁻¹
 #
-# however large φ is; V is the left Jacobian of SE(2).  A translation u and a further turn
-# t of the local map change r by G (u, t) with G = [1, J (b̂ − mean b̂)].  With S = cov(r)
-# and ‖r‖² = rᵀ S⁻¹ r::
+# however large φ is; V is the left Jacobian of SE(2).  A translation u and a
+# further turn t of the local map change r by G (u, t), where G is [1, J (b̂ − mean b̂)].
+# With S = cov(r) and ‖r‖² = rᵀ S⁻¹ r::
 #
 #     shape          min over (u, t) of ‖r − G (u, t)‖²              χ² of 2k − 3 dof
 #     displacement   min over t of ‖r − J (b̂ − mean b̂) t‖² − shape   χ² of 2 dof

@@ -254,10 +254,6 @@ def _k_of_n(value: Any) -> tuple[int, int]:
     return k, n
 
 
-# --------------------------------------------------------------------------------------
-# Association of readings without identity: gated nearest neighbours.
-
-
 class Noise(NamedTuple):
     """Noise of a sensor: a reading of range r has σβ + b / r and σr + k r.
 
@@ -461,7 +457,8 @@ def nearest_neighbours(
 # landmark of the map: clutter and landmarks that are not mapped yet [1 / (rad m)].
 #
 # A depth-first branch and bound decides one reading after the other.  A pair conditions
-# the expected readings of all landmarks.  By the chain rule of the Gaussian, the cost of
+# the expected readings of all landmarks.  By the chain rule of the Gaussian, the cost
+# of
 # an assignment is the sum of the costs of its pairs, each given the pairs before it::
 #
 #     h ← h + K (z − h),  C ← C − K C,    K = C Hⱼᵀ (Cⱼⱼ + Q)⁻¹,    C = H P Hᵀ

@@ -172,7 +172,8 @@ class ScanAssociation:
 # --------------------------------------------------------------------------------------
 # The cost of landmarks that a scan should have shown and did not.
 #
-# An assignment that leaves a landmark without a reading, although the sensor sees it with
+# An assignment that leaves a landmark without a reading, although the sensor sees it
+# with
 # probability P_D, is less likely by the factor 1 − P_D::
 #
 #     cost = −2 Σ ln(1 − P_D(β, r))
@@ -244,10 +245,6 @@ class Detections(NamedTuple):
         return cls(seen, expected)
 
 
-# --------------------------------------------------------------------------------------
-# How many readings come from no landmark of the map, by the scans so far.
-
-
 class UnexplainedDensity(NamedTuple):
     """A running average of the readings that belong to no landmark of the map.
 
@@ -287,10 +284,6 @@ class UnexplainedDensity(NamedTuple):
             max(self.longest, longest),
             MEMORY * self.landmarks + landmarks,
         )
-
-
-# --------------------------------------------------------------------------------------
-# The memory of association between scans, and its model of the sensor.
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,13 @@ from ..kernels.batch import (
     drive_runs,
     step_runs,
 )
-from ..kernels.kalman_gain import Workspace, aligned_zeros
+from ..kernels.kalman_gain import Workspace
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame
 from ..support import argument_checks, saved_states
-from ..support.memory_limit import share_out, usable_cores
+from ..support.memory_limit import aligned_zeros, share_out, usable_cores
 from .ekf import FRAMES, EkfSlam
 from .gaussian_map import GaussianMap, workspace_for
-
-# --------------------------------------------------------------------------------------
-# The beliefs of many runs, side by side.
 
 
 class BatchOfBeliefs:
@@ -516,10 +513,6 @@ def first_poses(name: str, poses: ArrayLike, count: int) -> Array:
         )
     argument_checks.refuse_beyond(name, first, poses)
     return np.broadcast_to(first, (count, 3))
-
-
-# --------------------------------------------------------------------------------------
-# What a batch of runs returns: traces, beliefs and views of its arrays.
 
 
 class BatchTrace(NamedTuple):

@@ -14,10 +14,10 @@ from ..kernels.drive_likelihood import (
     DriveRecord,
     follow_drive,
 )
-from ..kernels.kalman_gain import SKIPPED, aligned_zeros
+from ..kernels.kalman_gain import SKIPPED
 from ..models.bearing_range import wrap_angle
 from ..support import argument_checks
-from ..support.memory_limit import share_out, usable_cores
+from ..support.memory_limit import aligned_zeros, share_out, usable_cores
 from .batch import can_batch
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap, workspace_for

@@ -44,10 +44,6 @@ from .gaussian_map import (
 UpdateKernel = Callable[..., tuple[int, int, float]]
 
 
-# --------------------------------------------------------------------------------------
-# A filter that keeps its belief in a Gaussian map: belief, saved state, editing.
-
-
 class MapFilter:
     """A filter without its steps: reset, belief, saved state, map editing."""
 
@@ -373,10 +369,6 @@ class EkfSlam(MapFilter):
         raise not_positive_definite(ids[failed])
 
 
-# --------------------------------------------------------------------------------------
-# The right-invariant EKF-SLAM, which stays consistent if the heading is uncertain.
-
-
 class InvariantEkfSlam(EkfSlam):
     """Right-invariant EKF, the recommended filter.
 
@@ -442,10 +434,6 @@ class InvariantEkfSlam(EkfSlam):
         self._adopt(rules)
 
 
-# --------------------------------------------------------------------------------------
-# The first-estimates EKF-SLAM: Jacobians at fixed linearisation points.
-
-
 class FirstEstimatesEkfSlam(EkfSlam):
     """First-estimates-Jacobian EKF: the standard filter, linearised at fixed points.
 
@@ -470,10 +458,6 @@ class FirstEstimatesEkfSlam(EkfSlam):
     _linearisation: ClassVar[int] = AT_REFERENCE
 
 
-# --------------------------------------------------------------------------------------
-# The observability-constrained EKF-SLAM: projected Jacobians.
-
-
 class ObservabilityConstrainedEkfSlam(EkfSlam):
     """Observability-constrained EKF: Jacobians at the latest estimate, projected.
 
@@ -495,10 +479,6 @@ class ObservabilityConstrainedEkfSlam(EkfSlam):
     """
 
     _linearisation: ClassVar[int] = PROJECTED
-
-
-# --------------------------------------------------------------------------------------
-# The iterated EKF-SLAM: Gauss-Newton inside the update.
 
 
 class IteratedEkfSlam(EkfSlam):
@@ -599,10 +579,6 @@ def _gate(probability: float | None) -> float:
     return -2 * log1p(-probability)  # P(χ²₂ > g) = e^{−g/2}
 
 
-# --------------------------------------------------------------------------------------
-# The motion noise of a filter, which may depend on whether the robot moves.
-
-
 class MotionNoise(NamedTuple):
     """Variances of the motion noise, and whether it acts on a robot at rest."""
 
@@ -632,10 +608,6 @@ class MotionNoise(NamedTuple):
         if not (self.at_rest or distance or turn):
             return self.variance * 0.0
         return self.variance * dt
-
-
-# --------------------------------------------------------------------------------------
-# The report of an update on the shared kernels; its parts are computed on request.
 
 
 class ScanReport(UpdateReport):

@@ -19,7 +19,6 @@ from ..kernels.kalman_gain import (
     BeliefArrays,
     Rules,
     Workspace,
-    aligned_zeros,
     new_ledger,
     new_workspace,
     prior_system,
@@ -27,7 +26,7 @@ from ..kernels.kalman_gain import (
 from ..kernels.scan_update import copy_scan
 from ..models.rigid_motion import ErrorFrame, left_jacobian
 from ..support import saved_states
-from ..support.memory_limit import landmarks_that_fit
+from ..support.memory_limit import aligned_zeros, landmarks_that_fit
 from ..support.undo import Undo
 
 FIRST_ALLOCATION = 8  # landmarks
@@ -325,10 +324,6 @@ def _filled(arrays: BeliefArrays, contents: Sequence[Array]) -> BeliefArrays:
     for array, content in zip(arrays, contents, strict=True):
         array[tuple(slice(size) for size in content.shape)] = content
     return arrays
-
-
-# --------------------------------------------------------------------------------------
-# The arrays in which a filter processes a scan; they grow with scan and map.
 
 
 class ScanWorkspace:

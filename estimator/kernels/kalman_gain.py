@@ -13,6 +13,7 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import fma, njit_inlined, njit_internal
+from ..support.memory_limit import aligned_zeros
 
 # Share of a variance below which the remainder counts as rounding.
 SINGULAR = 1e-14
@@ -460,19 +461,13 @@ def prior_system(height: int, iterations: int) -> int:
     height : int
         Number of rows of the workspace.
     iterations : int
-        With more than one, :func:`.scan_update.save_prior_rows` copies that system to the
-        second half of the rows.
+        With more than one, :func:`.scan_update.save_prior_rows` copies that system
+        to the second half of the rows.
     """
     return FIRST if iterations == 1 else FIRST + (height - FIRST) // 2
 
 
 prior_system_jit = njit_internal(prior_system)
-
-
-# --------------------------------------------------------------------------------------
-# The arrays of one belief, as kernels work on them.
-
-CACHE_LINE = 64  # [bytes]
 
 
 class BeliefArrays(NamedTuple):
@@ -486,17 +481,3 @@ class BeliefArrays(NamedTuple):
     mean: Array  # (capacity,)
     covariance: Array  # (capacity, capacity)
     reference: Array  # (capacity,) fixed points for Jacobians, where the rules use them
-
-
-def aligned_zeros(*shape: int) -> Array:
-    """Return zeros that begin on a cache line, so that no vector spans two lines.
-
-    Examples
-    --------
-    >>> aligned_zeros(3, 5).ctypes.data % CACHE_LINE
-    0
-    """
-    size = int(np.prod(shape))
-    room = np.zeros(size + CACHE_LINE // 8)
-    skipped = -room.ctypes.data % CACHE_LINE // 8
-    return room[skipped : skipped + size].reshape(shape)

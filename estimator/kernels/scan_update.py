@@ -84,9 +84,9 @@ def update_belief(
     readings : ndarray, shape (at least count, 2)
         Rows (β, r) [rad, m].
     ledger
-        A :func:`.kalman_gain.new_ledger` whose row SLOT holds the place of each reading's
-        landmark in the map.  On return its other rows are filled, and SLOT holds the
-        places of added landmarks, too.
+        A :func:`.kalman_gain.new_ledger` whose row SLOT holds the place of each
+        reading's landmark in the map.  On return its other rows are filled, and SLOT
+        holds the places of added landmarks, too.
     rows, before, prior
         A :class:`.kalman_gain.Workspace`.  On return :func:`.scan_update.record` reads
         the rows.
@@ -577,10 +577,6 @@ def propagate(
     P[1, 0] += cos * sin * (along - across)
     P[0, 1] = P[1, 0]
     P[2, 2] += motion_variance[2]
-
-
-# --------------------------------------------------------------------------------------
-# What a report keeps of a scan: copies of the rows and the ledger of its update.
 
 
 class ScanRecord(NamedTuple):

@@ -548,7 +548,7 @@ class SubmapElimination:
 # References
 # ----------
 # .. [1] L. Paz, J. Tardós, J. Neira, Divide and conquer: EKF SLAM in O(n), IEEE T-RO
-#    24(5), 2008.
+#    volume 24, number 5, 2008.
 # .. [2] A. George, Nested dissection of a regular finite element mesh, SIAM Journal on
 #    Numerical Analysis 10(2), 1973.
 

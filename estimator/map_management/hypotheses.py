@@ -300,10 +300,6 @@ class HypothesisSlam:
         return repr(self.best) + (f", best of {count} hypotheses" if count > 1 else "")
 
 
-# --------------------------------------------------------------------------------------
-# Filters that can be copied often and cheaply.
-
-
 class FilterPool:
     """Copies managed filters, and reuses those that are no longer needed.
 

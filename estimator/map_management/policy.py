@@ -97,7 +97,7 @@ class LandmarkPolicy(AssociationPolicy):
         return (self.merge_within or 0.0) / (sqrt(self.merge_gate) + 3.0)
 
 
-def as_policy(value: "LandmarkPolicy | Mapping[str, Any] | bool") -> LandmarkPolicy:
+def as_policy(value: LandmarkPolicy | Mapping[str, Any] | bool) -> LandmarkPolicy:
     """Return a policy, given as such, by its fields, or as True for the default.
 
     Raises
@@ -134,10 +134,6 @@ def policy_of(slam: object) -> LandmarkPolicy:
     """Return the policy of an estimator; the default where it has none."""
     policy = getattr(slam, "policy", None)
     return policy if isinstance(policy, LandmarkPolicy) else LandmarkPolicy()
-
-
-# --------------------------------------------------------------------------------------
-# Landmarks that a scan should show: those in the field of view of the sensor.
 
 
 @dataclass(frozen=True)

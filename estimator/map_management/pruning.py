@@ -168,10 +168,6 @@ class MapPruner:
             part.load_state_dict(state)
 
 
-# --------------------------------------------------------------------------------------
-# Decide which mapped landmarks are one, and merge them.
-
-
 class LandmarkMerger:
     """Merges the landmarks of one filter that a policy considers to be the same.
 
@@ -295,10 +291,6 @@ def _renamed(pair: tuple[int, int], old: int, new: int) -> tuple[int, int]:
 
 def _pairs(pairs: Sequence[tuple[int, int]]) -> IntArray:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
-
-
-# --------------------------------------------------------------------------------------
-# Records that landmark management keeps of each mapped landmark.
 
 
 class LandmarkRecords:

@@ -97,7 +97,8 @@ turn_coefficients_jit = njit_inlined(turn_coefficients)
 # The error of a belief, in the coordinates in which a filter's covariance lives.
 #
 # Additive: e = x − x̂, the heading wrapped.  Invariant: the coordinates of SE_{1+n}(2),
-# in which a turn of the whole map is a straight line.  With t = θ − θ̂ and every point q,
+# in which a turn of the whole map is a straight line.  With t = θ − θ̂ and every point
+# q,
 # the robot's position and each landmark::
 #
 #     ξ_θ = t,    ξ_q = V(t)⁻¹ (q − R(t) q̂),    to first order  ξ = D e

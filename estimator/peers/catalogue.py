@@ -31,7 +31,7 @@ class Peer(NamedTuple):
             )
 
 
-_GTSAM = f"{__package__}.gtsam_smoothers"
+_GTSAM = f"{__package__}.gtsam_graph"
 _FILTERPY = f"{__package__}.filterpy_kalman"
 _STONESOUP = f"{__package__}.stonesoup_kalman"
 

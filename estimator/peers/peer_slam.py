@@ -185,7 +185,8 @@ def _report(innovation: Innovation | None) -> UpdateReport:
 # --------------------------------------------------------------------------------------
 # Kalman filters of other libraries: one Gaussian over the pose and a growing map.
 #
-# The libraries predict and correct; none of them maps, so landmarks enter as in ``ekf``::
+# The libraries predict and correct; none of them maps, so landmarks enter as in
+# ``ekf``::
 #
 #     l = f(x, z),    P_l* = F_p P_p*,    P_ll = F_p P_pp F_pᵀ + F_z Q F_zᵀ
 

@@ -177,10 +177,6 @@ def _landmarks_at(
     return np.concatenate([places[i] for i in order.tolist()])
 
 
-# --------------------------------------------------------------------------------------
-# The result of the smoother: all poses and landmarks, and any covariance.
-
-
 class _Marginals(NamedTuple):
     """What the covariances are made of."""
 

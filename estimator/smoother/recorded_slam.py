@@ -202,10 +202,6 @@ def _is_history(saved: Any) -> bool:
     return is_one and isinstance(saved.item(), Event | None)
 
 
-# --------------------------------------------------------------------------------------
-# The smoother with the interface of a filter: it records a drive, then smooths it.
-
-
 class SmoothingSlam(RecordedSlam):
     """A filter that records its drive, and smooths it at the end.
 

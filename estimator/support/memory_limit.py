@@ -8,7 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 from math import inf, sqrt
 from pathlib import Path
 
+import numpy as np
 import psutil
+
+from ...arrays import Array
 
 # Less than this is not checked [bytes].
 SMALL = 2**24
@@ -141,3 +144,20 @@ def share_out(work: Callable[[slice], object], count: int, threads: int) -> None
     shares = [slice(start, start + share) for start in range(0, count, share)]
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, shares))
+
+
+CACHE_LINE = 64  # [bytes]
+
+
+def aligned_zeros(*shape: int) -> Array:
+    """Return zeros that begin on a cache line, so that no vector spans two lines.
+
+    Examples
+    --------
+    >>> aligned_zeros(3, 5).ctypes.data % CACHE_LINE
+    0
+    """
+    size = int(np.prod(shape))
+    room = np.zeros(size + CACHE_LINE // 8)
+    skipped = -room.ctypes.data % CACHE_LINE // 8
+    return room[skipped : skipped + size].reshape(shape)

@@ -22,14 +22,12 @@ from .program import command, main
 __all__ = [
     "fit_noise",
     "generate",
-    "listings",
     "main",
     "monte_carlo",
     "noise_study",
     "render_video",
     "replay",
     "run",
-    "smooth",
 ]
 
 

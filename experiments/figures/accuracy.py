@@ -419,12 +419,12 @@ def covariance_figure(trace: RunTrace) -> Figure:
     write_title(
         before,
         "Before: the first map",
-        _covariance_summary(trace.first_covariance, first_step),
+        _size_of_correlations(trace.first_covariance, first_step),
     )
     write_title(
         after,
         "After: the final map",
-        _covariance_summary(trace.final_covariance, trace.last_step),
+        _size_of_correlations(trace.final_covariance, trace.last_step),
     )
     bar = figure.colorbar(image, ax=[before, after], shrink=0.85, aspect=28, pad=0.015)
     bar.set_label("correlation", fontsize=10, color=INK)
@@ -519,7 +519,7 @@ def _write_deviations(axes: Axes, std: Array) -> None:
         )
 
 
-def _covariance_summary(covariance: Array, step: int) -> str:
+def _size_of_correlations(covariance: Array, step: int) -> str:
     """Write the step, the number of landmarks, and their mean correlation."""
     every = correlations(covariance)
     landmarks = every[3:, 3:]

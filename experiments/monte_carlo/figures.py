@@ -21,9 +21,6 @@ from ...evaluation.hypothesis_tests import (
 from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, TEAL, dress, new_figure
 from .verdict import POSE_FREEDOM, EstimatorScores, labels_of, scores_of
 
-# --------------------------------------------------------------------------------------
-# Colours, dashes and markers of the estimators in a figure, and thinned lines.
-
 
 class EstimatorLook(NamedTuple):
     """Colour, dashes and marker, distinct even without colour."""

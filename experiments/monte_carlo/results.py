@@ -483,7 +483,7 @@ class BlockFolder:
         self._kept: dict[int, list[Block]] = {}
         self._claim = contextlib.ExitStack()
 
-    def __enter__(self) -> "BlockFolder":
+    def __enter__(self) -> BlockFolder:
         """Lock the folder."""
         if self._path is not None:
             claim = claimed(self._path, self._identity, fresh=self._fresh)

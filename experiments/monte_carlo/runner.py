@@ -114,7 +114,7 @@ def monte_carlo(
     resolution: float = 0.0,
     command: str = "",
     progress: Progress | None = None,
-) -> "xr.Dataset":
+) -> xr.Dataset:
     """Run estimators many times over a scenario, and measure every run.
 
     Parameters

@@ -488,7 +488,7 @@ def refuse_large_map(log: SlamLog, estimator: SlamEstimator) -> None:
 
 
 def refuse_large_maps(
-    runs: "SimulatedRuns", estimator: SlamEstimator, *, at_once: bool
+    runs: SimulatedRuns, estimator: SlamEstimator, *, at_once: bool
 ) -> None:
     """Refuse runs with more landmarks than memory holds for this filter.
 

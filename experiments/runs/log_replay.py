@@ -46,10 +46,6 @@ _MOST_MAPS = 500  # kept of a run by default
 _MOST_JOINED = 50  # the same where each must be joined from submaps
 
 
-# --------------------------------------------------------------------------------------
-# Record what an estimator believes during a run, step by step, as a trace.
-
-
 class MapChanges(NamedTuple):
     """Changes of the map of a run other than added landmarks."""
 
@@ -395,10 +391,6 @@ class _PoseTrack:
 
 def _counts_steps(times: Array) -> bool:
     return bool((times == np.arange(len(times))).all())
-
-
-# --------------------------------------------------------------------------------------
-# The maps of a run after every step, or after a limited number of steps.
 
 
 class MapHistory(Sequence[MapEstimate]):

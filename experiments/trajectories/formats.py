@@ -43,16 +43,6 @@ from .trajectory import (
     scenario_from_text,
 )
 
-FORMATS = {
-    "slamlog": "slamlog_files",
-    "npz": "npz",
-    "parquet": "parquet",
-    "minari": "minari_dataset",
-    "tum": "tum",
-    "g2o": "g2o",
-}
-"""Names of the formats and of their modules."""
-
 
 class TrajectoryFormat(NamedTuple):
     """What a module of this package defines."""
@@ -95,8 +85,11 @@ def trajectory_format(name: str) -> TrajectoryFormat:
     """
     if name not in FORMATS:
         raise ValueError(unknown_choice("format", name, FORMATS))
+    found = FORMATS[name]
+    if isinstance(found, TrajectoryFormat):
+        return found
     try:
-        module = import_module(f".{FORMATS[name]}", __name__)
+        module = import_module(f".{found}", __package__)
     except ModuleNotFoundError as error:
         raise ImportError(
             f"the format '{name}' needs the package {error.name}: "
@@ -174,8 +167,6 @@ def numbers(values: Iterable[float]) -> str:
 # ``start_estimate`` has the shape (E, 3). ``seed``, ``controller`` and ``scenario`` (as
 # TOML) are (E,).
 
-ENDING = ".npz"
-HOLDS_BELIEFS = True
 
 _NO_DATE = (1980, 1, 1, 0, 0, 0)  # a constant: equal arrays give equal bytes
 
@@ -442,3 +433,14 @@ def _tells_true_ids(log: SlamLog) -> bool:
 
 def _scans(log: SlamLog) -> Iterator[Scan]:
     return (event for event in log.events if isinstance(event, Scan))
+
+
+FORMATS = {
+    "slamlog": TrajectoryFormat(_write_slamlog, _read_slamlog),
+    "npz": TrajectoryFormat(_write_npz, _read_npz, ENDING=".npz", HOLDS_BELIEFS=True),
+    "parquet": "parquet",
+    "minari": "minari_dataset",
+    "tum": TrajectoryFormat(_write_tum, _read_tum),
+    "g2o": "g2o",
+}
+"""The formats, or the modules that define them and load a library."""

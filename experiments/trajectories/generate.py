@@ -140,7 +140,7 @@ def generate_trajectories(
         return _continue(job, Path(out), versions, workers, progress)
 
 
-def _engaged(jobs: int | None, backend: str | None) -> "Workers | None":
+def _engaged(jobs: int | None, backend: str | None) -> Workers | None:
     if jobs is None and backend is None:
         return None
     from ..monte_carlo.runner import engage_workers  # noqa: PLC0415 (loads joblib)
@@ -152,7 +152,7 @@ def _continue(
     job: Job,
     out: Path,
     versions: dict[str, str],
-    workers: "Workers | None",
+    workers: Workers | None,
     progress: Progress | None,
 ) -> Manifest:
     manifest = _begun(job, out, versions)
@@ -179,7 +179,7 @@ def _continue(
 
 
 def _made(
-    work: ShardWork, numbers: list[int], workers: "Workers | None", bar: "_Bar"
+    work: ShardWork, numbers: list[int], workers: Workers | None, bar: _Bar
 ) -> Generator[MadeShard, None, None]:
     """Yield shards as they come, in any order where workers make them."""
     if workers is None:
@@ -248,10 +248,6 @@ class _Bar:
     def skip(self, episodes: int) -> None:
         """Count episodes of earlier calls."""
         self._done += episodes * self._steps
-
-
-# --------------------------------------------------------------------------------------
-# Drive and write single shards, in this process or in a worker.
 
 
 class MadeShard(NamedTuple):

@@ -527,10 +527,6 @@ def deviation_codes(std: Array) -> AnyArray:
     return np.where(np.isnan(codes), least, codes).astype(np.int16)
 
 
-# --------------------------------------------------------------------------------------
-# A filter's run as the viewers take it, and the steps that they show.
-
-
 class ViewedRun(NamedTuple):
     """One filter's run over the log of the page."""
 

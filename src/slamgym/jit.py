@@ -81,11 +81,6 @@ def _compile(
     return cast("Kernel", kernel)
 
 
-def _multiply_add(a: float, b: float, c: float) -> float:
-    """Return a b + c in plain Python, rounded twice."""
-    return a * b + c
-
-
 def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:
     def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.fma(*arguments)
@@ -97,9 +92,9 @@ def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:
 # where.  One kernel would then give different bits alone and inside another kernel.
 fma = cast(
     "Callable[[float, float, float], float]",
-    _multiply_add if _PLAIN else intrinsic(_emitted_fma),
+    (lambda a, b, c: a * b + c) if _PLAIN else intrinsic(_emitted_fma),
 )
-"""a b + c, rounded once."""
+"""a b + c, rounded once; twice in plain Python."""
 
 
 def _multiply_words(a: np.uint64, b: np.uint64) -> tuple[np.uint64, np.uint64]:

@@ -14,9 +14,9 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         experiments
     """,
     "envs": """
-        angles actions
         robot streams
-        sensors controllers
+        noise_streams controllers
+        bearing_range
         spaces rendering
         landmark_world
         vector
@@ -24,8 +24,6 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
     "estimator": """
         support
         models
-        error_frames
-        belief update_report
         interface
         kernels
         association
@@ -37,15 +35,13 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         check_estimator
     """,
     "estimator.large_maps": """
-        sparse_cholesky
+        multifrontal
+        elimination
         compressed sparse_information submaps
     """,
     "evaluation": """
-        chi_square nees trajectory_error error_bound association_scores gospa
-        whiteness noise_sums
-        hypothesis_tests noise_findings
-        time_average_tests
-        error_findings
+        hypothesis_tests trajectory_error error_bound association_scores
+        nees noise_findings
         diagnosis
         consistency_report
     """,
@@ -60,9 +56,14 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         command_line
     """,
     "experiments.monte_carlo": """
-        reproduction measure workers
-        store report
+        filtered_runs
+        run_measures
+        results
         runner
+        verdict
+        summary
+        figures
+        report
     """,
 }
 STRANGERS = {
@@ -70,7 +71,7 @@ STRANGERS = {
     ("envs", "evaluation"),
     ("estimator", "sim_configs"),
 }
-EVALUATION_KNOWS = {"models", "support", "error_frames", "interface", "belief"}
+EVALUATION_KNOWS = {"models", "support", "interface"}
 MAY_IMPORT = {  # besides the standard library and lazy_loader
     "sim_configs": {"numpy", "pydantic", "pydantic_core"},
     "envs": {"numpy", "scipy", "gymnasium", "pymunk"},
@@ -78,7 +79,7 @@ MAY_IMPORT = {  # besides the standard library and lazy_loader
     "evaluation": {"numpy", "scipy"},
     "agents": {"numpy", "scipy", "gymnasium"},
 }
-DRAWING = {"artists", "clock", "scene", "blitting", "renderer", "video", "window"}
+DRAWING = {"scene", "renderer", "video"}
 DRAWING_LIBRARIES = {"matplotlib", "PIL", "imageio_ffmpeg"}
 PEERS = {"gtsam", "filterpy", "stonesoup"}
 

@@ -118,7 +118,7 @@ class LocalInformation:
 
     def absorb(
         self, pose: ConditionalPose, measurement: MapMeasurement
-    ) -> tuple["LocalInformation", ConditionalPose]:
+    ) -> tuple[LocalInformation, ConditionalPose]:
         """Add information, Λ ← Λ + Yᵀ Y, and move map and pose to the new mean."""
         Y = measurement.rows
         added = replace(self, information=self.information + Y.T @ Y)
@@ -126,7 +126,7 @@ class LocalInformation:
 
     def settle(
         self, pose: ConditionalPose, residual: Array
-    ) -> tuple["LocalInformation", ConditionalPose]:
+    ) -> tuple[LocalInformation, ConditionalPose]:
         """Move the map by δ = (Λ_LL − C)⁻¹ b, and the pose by K δ."""
         if not residual.any():
             return self, pose
@@ -134,7 +134,7 @@ class LocalInformation:
         moved = pose._replace(mean=pose.mean + pose.gain @ delta)
         return replace(self, points=self.points + delta), moved
 
-    def extended(self, slots: IntArray, points: Array) -> "LocalInformation":
+    def extended(self, slots: IntArray, points: Array) -> LocalInformation:
         """Append landmarks without information, at these points."""
         return replace(
             self,
@@ -144,7 +144,7 @@ class LocalInformation:
             information=np.pad(self.information, (0, 2 * len(slots))),
         )
 
-    def without(self, gone: BoolArray, information: Array) -> "LocalInformation":
+    def without(self, gone: BoolArray, information: Array) -> LocalInformation:
         """Drop landmarks, shape (k,); ``information`` is that of the others."""
         rest = ~np.repeat(gone, 2)
         place = np.cumsum(rest) - 1
@@ -289,7 +289,7 @@ class LinearScan(NamedTuple):
     landmarks: IntArray
     """Positions of the landmarks in the local map, shape (n,)."""
 
-    def subset(self, chosen: BoolArray) -> "LinearScan":
+    def subset(self, chosen: BoolArray) -> LinearScan:
         """Return some of the measurements."""
         return LinearScan(
             self.innovation[chosen],

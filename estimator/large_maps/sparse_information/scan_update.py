@@ -144,10 +144,6 @@ def _exceeds_bound(
     return bool(count > sparsity.bound and len(seen) >= enough)
 
 
-# --------------------------------------------------------------------------------------
-# Selection of the measurements of one scan, with their NIS.
-
-
 class Screened(NamedTuple):
     """n measurements of mapped landmarks; m are used."""
 

@@ -51,7 +51,7 @@ class SparseBelief:
     """Factor of all landmarks except the local ones, if known."""
 
     @classmethod
-    def empty(cls, pose: Array, std: Array) -> "SparseBelief":
+    def empty(cls, pose: Array, std: Array) -> SparseBelief:
         """Return the belief of a robot at this pose, shape (3,), without a map."""
         start = ConditionalPose(
             pose.copy(), np.zeros((3, 0)), np.diag(std**2), pose[:2].copy()
@@ -205,10 +205,6 @@ class SparseBelief:
         self.count = count
         factor = self.local.eliminated.factor
         self.rest = factor if isinstance(factor, RestFactor) else None
-
-
-# --------------------------------------------------------------------------------------
-# Marginals of the pose and some landmarks of a sparse information map.
 
 
 class Marginal(NamedTuple):

@@ -78,7 +78,7 @@ class ClosedSubmaps:
         submap = self.store.load(index)
         return merged(submap, self.renamed, self._frame) if self.renamed else submap
 
-    def with_appended(self, submap: Submap) -> "ClosedSubmaps":
+    def with_appended(self, submap: Submap) -> ClosedSubmaps:
         """Return the same submaps with one more, which is stored."""
         self.store.append(submap)
         summaries = [*self.summaries, summarise(submap)]
@@ -90,7 +90,7 @@ class ClosedSubmaps:
         """Return what takes back which submaps are stored."""
         return partial(self.store.truncate, len(self))
 
-    def with_merged(self, kept: int, gone: int) -> "ClosedSubmaps":
+    def with_merged(self, kept: int, gone: int) -> ClosedSubmaps:
         """Return the same submaps with one slot replaced by another.
 
         Raises

@@ -178,7 +178,8 @@ class SubmapGraph:
 # Fusion of the active submap with the joined map of the closed ones.
 #
 # A landmark in both has one position, which is an exact measurement of zero difference.
-# With the frame F = (p, θ) of the active submap and a landmark l in the world, and c the
+# With the frame F = (p, θ) of the active submap and a landmark l in the world, and c
+# the
 # same landmark in the submap::
 #
 #     0 = R(θ)ᵀ (l − p) − c
@@ -397,10 +398,6 @@ class ActiveSubmap:
         self.filter.map.rename({gone: kept for kept, gone in here if gone in self})
 
 
-# --------------------------------------------------------------------------------------
-# The limits at which a submap is closed.
-
-
 class ClosingRule(NamedTuple):
     """Limits of a submap; infinite ones have no effect."""
 
@@ -414,7 +411,7 @@ class ClosingRule(NamedTuple):
     @classmethod
     def checked(
         cls, size: int, heading: float | None, extent: float | None
-    ) -> "ClosingRule":
+    ) -> ClosingRule:
         """Return the rule of the options of :class:`SubmapSlam`, which it checks."""
         least = argument_checks.whole("submap_size", size, 1)
         limits = (("heading_limit", heading), ("extent_limit", extent))
@@ -432,10 +429,6 @@ class ClosingRule(NamedTuple):
             or active.heading_variance > self.heading**2
             or hypot(x, y) > self.extent
         )
-
-
-# --------------------------------------------------------------------------------------
-# Frame of the active submap, by composition of the submaps before it.
 
 
 class Chain:
@@ -477,7 +470,7 @@ class Chain:
         }
 
     @classmethod
-    def restored(cls, state: dict[str, Array]) -> "Chain":
+    def restored(cls, state: dict[str, Array]) -> Chain:
         """Return the chain that :meth:`state_dict` saved."""
         chain = cls(state["start"][0], state["start"][1:])
         chain.rebase(state["joined"], state["present"][0], state["present"][1:])

@@ -227,7 +227,7 @@ class FrameInitialisation:
     def __init__(self) -> None:
         self._blocks: dict[tuple[int, int], Array] = {}
 
-    def copy(self) -> "FrameInitialisation":
+    def copy(self) -> FrameInitialisation:
         """Return one with the same cache, for more submaps."""
         copied = FrameInitialisation()
         copied._blocks = dict(self._blocks)
@@ -362,10 +362,6 @@ def align(start: Array, covariance: Array, seen: Array, landmarks: Array) -> Arr
         right = prior @ (start - pose) + weight * rows.T @ error.view(np.float64)
         pose = pose + np.linalg.solve(H, right)
     return pose
-
-
-# --------------------------------------------------------------------------------------
-# Landmarks that a single submap holds, as functions of the unknowns of the join.
 
 
 class PrivateLandmarks(NamedTuple):

@@ -34,10 +34,6 @@ from .store import (
 BASES: dict[str, type[EkfSlam]] = {"ekf": EkfSlam, "invariant": InvariantEkfSlam}
 
 
-# --------------------------------------------------------------------------------------
-# Questions about the belief of a run in submaps.
-
-
 class SubmapQueries:
     """Base class of :class:`SubmapSlam`: the part that does not change the belief."""
 

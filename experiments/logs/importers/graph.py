@@ -156,7 +156,8 @@ def reals_at(line: LogLine, first: int, end: int | None = None) -> list[float]:
 #   Ω = Rᵀ R by rows, in the frame of pose i.
 # * g2o's ``EDGE_SE2`` and ``EDGE_SE2_XY`` lines hold the upper triangle of Ω by rows;
 #   that of an ``EDGE_SE2`` is in the frame of pose j.
-# * A file with ``VERTEX2`` lines is TORO's, whose ``EDGE2`` lines hold Ω in the order xx,
+# * A file with ``VERTEX2`` lines is TORO's, whose ``EDGE2`` lines hold Ω in the order
+# xx,
 #   xy, yy, θθ, xθ, yθ.
 
 ALIKE = 1e-3
