@@ -216,7 +216,7 @@ def _of_one_run(
     )
     at = 3 + 2 * np.argsort(rows)
     columns = np.concatenate([np.arange(3), np.stack([at, at + 1], axis=1).ravel()])
-    return P[np.ix_(columns, columns)]
+    return np.asarray(P[np.ix_(columns, columns)])
 
 
 def _about_centre(covariance: Array) -> float:

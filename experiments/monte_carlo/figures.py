@@ -242,7 +242,8 @@ def _swarm(values: Array, edges: Array) -> tuple[Array, Array]:
     return (edges[bins] + edges[bins + 1]) / 2, lift
 
 
-PURPLE, SKY = "#cc79a7", "#56b4e9"  # Okabe, Ito
+PURPLE: str = "#cc79a7"  # Okabe, Ito
+SKY: str = "#56b4e9"
 _COLOURS = (BLUE, ORANGE, TEAL, PURPLE, SKY, ALARM)
 _DASHES: tuple[Any, ...] = (
     "-",
