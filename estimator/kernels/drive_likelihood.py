@@ -22,11 +22,11 @@ from .kalman_gain import (
     BeliefArrays,
     Rules,
     Workspace,
-    as_rules,
     prior_system_jit,
 )
 from .scan_update import (
     DONE,
+    as_rules,
     bearing_variance,
     linearise,
     own_covariance,
