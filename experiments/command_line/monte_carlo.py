@@ -95,9 +95,9 @@ def monte_carlo(
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
     from .. import monte_carlo
+    from ..jobs import replace_own
     from ..monte_carlo.report import write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
-    from ..runs.own_files import replace_own
     from .options import chosen_scenario, refuse_broken
 
     # MERGED-EMPTY
