@@ -99,8 +99,6 @@ def monte_carlo(
     from ..monte_carlo.report import write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
     from .options import chosen_scenario, refuse_broken
-
-    # MERGED-EMPTY
     from .output_folder import as_json_text, default_folder
     from .reporter import Reporter
 

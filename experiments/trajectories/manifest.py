@@ -242,15 +242,13 @@ class TrajectoryDataset:
         return sum(shard.episodes for shard in self.manifest.shards)
 
     def __iter__(self) -> Iterator[Trajectory]:
-        for shard in self.manifest.shards:
+        for number in range(len(self.manifest.shards)):
             try:
-                self._check(shard)
+                yield from self.shard(number)
             except DamagedShardError as error:
                 if not self._skips:
                     raise
                 warnings.warn(f"{error}: left out", stacklevel=2)
-                continue
-            yield from self._format.read(self.folder / shard.name)
 
     def shard(self, number: int) -> Iterator[Trajectory]:
         """Yield the trajectories of one shard.
@@ -266,7 +264,12 @@ class TrajectoryDataset:
             If the shard is damaged, even where iteration skips such shards.
         """
         shard = self.manifest.shards[number]
-        self._check(shard)
+        if not is_whole(self.folder, shard):
+            last = shard.first_episode + shard.episodes - 1
+            raise DamagedShardError(
+                f"{self.folder / shard.name} does not match its checksum (episodes "
+                f"{shard.first_episode} to {last})"
+            )
         yield from self._format.read(self.folder / shard.name)
 
     def damaged_shards(self) -> list[str]:
@@ -276,14 +279,6 @@ class TrajectoryDataset:
             for shard in self.manifest.shards
             if not is_whole(self.folder, shard)
         ]
-
-    def _check(self, shard: ShardEntry) -> None:
-        if not is_whole(self.folder, shard):
-            last = shard.first_episode + shard.episodes - 1
-            raise DamagedShardError(
-                f"{self.folder / shard.name} does not match its checksum (episodes "
-                f"{shard.first_episode} to {last})"
-            )
 
 
 def load_trajectories(

@@ -16,7 +16,11 @@ import pytest
 
 from slamgym.envs.rendering.scene import _title
 from slamgym.estimator import make_estimator
-from slamgym.experiments.command_line.output_folder import output_folder, write_summary
+from slamgym.experiments.command_line.output_folder import (
+    STAGING,
+    output_folder,
+    write_summary,
+)
 from slamgym.experiments.command_line.program import BadInputError
 from slamgym.experiments.figures.style import new_figure
 from slamgym.experiments.jobs import MANIFEST as OWN_FILES
@@ -204,7 +208,7 @@ def test_a_folder_that_cannot_be_replaced_is_put_back(error, tmp_path, monkeypat
             write_summary(folder, {})
 
     def refuse(source, target):
-        if source.suffix == ".partial":
+        if source.parent.name == STAGING and target.parent == out:
             raise error
         return replace(source, target)
 
