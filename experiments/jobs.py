@@ -301,7 +301,9 @@ def difference(found: Mapping[str, Any], asked: Mapping[str, Any]) -> str | None
 
 
 @contextlib.contextmanager
-def naming(place: str | Path, kept: str = "", *also: type[Exception]) -> Iterator[None]:
+def naming(
+    place: str | Path, kept: str = "", also: type[Exception] = OSError
+) -> Iterator[None]:
     """Name what cannot be written in errors of the file system, and what is kept.
 
     Parameters
@@ -310,12 +312,12 @@ def naming(place: str | Path, kept: str = "", *also: type[Exception]) -> Iterato
         A file, or a folder.
     kept : str, optional
         The rest of the message.
-    *also : type
-        Other errors of a writer that mean the same.
+    also : type, optional
+        Another error that means the same.
     """
     try:
         yield
-    except (OSError, *also) as error:
+    except (OSError, also) as error:
         reason = getattr(error, "strerror", None)
         if type(error) is OSError and reason is None:
             raise  # it is a message of slamgym

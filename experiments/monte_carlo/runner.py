@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from ...estimator import registry
 from ...estimator.interface import SupportsTruth
@@ -162,7 +163,8 @@ def monte_carlo(
             return load_results(results)
 
 
-class _Work(NamedTuple):
+@dataclass(frozen=True)
+class _Work:
     """All that a worker needs to compute a block."""
 
     job: Job

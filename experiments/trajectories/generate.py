@@ -139,7 +139,8 @@ def generate_trajectories(
         estimator,
     )
     versions = versions_of(job)
-    workers = None if jobs is backend is None else engage_workers(jobs, backend)
+    serial = jobs is None and backend is None
+    workers = None if serial else engage_workers(jobs, backend)
     folder = Path(out)
     kept = "; whole shards stay there, and the same command continues"
     with claimed(folder) as anything, naming(folder, kept):
