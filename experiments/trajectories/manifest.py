@@ -9,7 +9,7 @@ bytes.
 import hashlib
 import json
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
@@ -151,37 +151,31 @@ def _manifest(table: dict[str, Any]) -> Manifest:
     for name in (shard["name"] for shard in table["shards"]):
         if name in ("", "..") or Path(name).name != name:
             raise ValueError(f"a shard must be named without a folder, got {name!r}")
+    job, shards = table["job"], table["shards"]
+    texts = ["scenario", "controller", "format"]
+    if job.get("estimator") is not None:
+        texts.append("estimator")
+    job = _checked(job, texts, seed=0, episodes=1, episodes_per_shard=1)
+    shards = [
+        _checked(each, ["sha256"], first_episode=0, episodes=0) for each in shards
+    ]
     return Manifest(
-        job=_job(table["job"]),
+        job=Job(**{**job, "scenario": scenario_from_text(job["scenario"])}),
         versions=dict(table["versions"]),
-        shards=tuple(_shard(shard) for shard in table["shards"]),
+        shards=tuple(ShardEntry(**each) for each in shards),
     )
 
 
-def _job(table: dict[str, Any]) -> Job:
-    scenario = scenario_from_text(_text(table, "scenario"))
-    job = Job(**{**table, "scenario": scenario})
-    for name, least in {"seed": 0, "episodes": 1, "episodes_per_shard": 1}.items():
-        integer(name, getattr(job, name), least)
-    _text(table, "controller")
-    _text(table, "format")
-    if job.estimator is not None:
-        _text(table, "estimator")
-    return job
-
-
-def _shard(table: dict[str, Any]) -> ShardEntry:
-    _text(table, "sha256")
-    entry = ShardEntry(**table)
-    integer("first_episode", entry.first_episode, 0)
-    integer("episodes", entry.episodes, 0)
-    return entry
-
-
-def _text(table: dict[str, Any], name: str) -> str:
-    if not isinstance(table[name], str):
-        raise ValueError(f"{name} must be text, got {table[name]!r}")
-    return str(table[name])
+def _checked(
+    table: dict[str, Any], texts: Iterable[str], **least: int
+) -> dict[str, Any]:
+    """Return a table with some texts, and with some integers of a least value."""
+    for name in texts:
+        if not isinstance(table[name], str):
+            raise ValueError(f"{name} must be text, got {table[name]!r}")
+    for name, lowest in least.items():
+        integer(name, table[name], lowest)
+    return table
 
 
 def checksum(path: Path) -> str:
