@@ -241,7 +241,8 @@ def claimed(folder: Path) -> Iterator[str | None]:
     Yields
     ------
     str or None
-        The name of a file or folder in it, without `leftovers`; None if there is none.
+        The name of a file or folder in it that `remove_leftovers` keeps; None if there
+        is none.
 
     Raises
     ------

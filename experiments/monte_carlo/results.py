@@ -234,7 +234,7 @@ REPORT, SUMMARY = "report.html", "summary.json"
 
 
 class BlockFolder(NamedTuple):
-    """The blocks of a job in its folder, which `opened` locks."""
+    """The blocks of a job in its folder, which `opened` makes, checks and locks."""
 
     path: Path
     digest: str
@@ -274,16 +274,14 @@ class BlockFolder(NamedTuple):
         for runs in blocks:
             file = self._files_from(runs.start)[-1]  # the longest
             with np.load(file, allow_pickle=False) as arrays:
-                yield (
-                    runs,
-                    [
-                        {
-                            name: arrays[f"{number}/{name}"][: len(runs)]
-                            for name in job.variables
-                        }
-                        for number in range(len(job.estimators))
-                    ],
-                )
+                parts = [
+                    {
+                        name: arrays[f"{number}/{name}"][: len(runs)]
+                        for name in job.variables
+                    }
+                    for number in range(len(job.estimators))
+                ]
+            yield runs, parts
 
     def copy(self, file: Path) -> None:
         """Add a block of another folder, if it is not there."""
@@ -503,6 +501,6 @@ def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
     place, identity = Path(target), identity_in(folders[0])
     for folder in folders:
         refuse_other(folder, identity_in(folder), identity)
-    with opened(place, identity) as target_folder:
+    with opened(place, identity) as merged:
         for file in (file for folder in folders for file in blocks_in(folder)):
-            target_folder.copy(file)
+            merged.copy(file)
