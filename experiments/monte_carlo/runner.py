@@ -10,6 +10,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,20 +146,21 @@ def monte_carlo(
         threads=None if workers is None else 1,
     )
     blocks = blocks_of(asked, size)
-    report: dict[str, Any] = {"runs": len(asked), "progress": progress}
+    compute = partial(
+        complete, work, workers=workers, runs=len(asked), progress=progress
+    )
     with one_blas_thread():
         if out is None:
             found: dict[range, list[Block]] = {}
             kept = "nothing is kept without a folder for the results"
-            complete(work, blocks, found.__setitem__, workers, kept=kept, **report)
+            compute(blocks, found.__setitem__, kept=kept)
             parts = ((block, found.pop(block)) for block in blocks)
             return dataset_of(job, parts, asked, command)
-        with opened(Path(out), job.identity(), fresh=fresh) as folder:
-            missing = folder.missing(blocks)
-            kept = f"the finished runs are in {folder.path}, and the same command "
-            kept += "continues"
-            complete(work, missing, folder.add, workers, kept=kept, **report)
-            results = folder.path / RESULTS
+        out = Path(out)
+        with opened(out, job.identity(), fresh=fresh) as folder:
+            kept = f"the finished runs are in {out}, and the same command continues"
+            compute(folder.missing(blocks), folder.add, kept=kept)
+            results = out / RESULTS
             write_results(results, job, folder.read(blocks, job), asked, command)
             return load_results(results)
 
