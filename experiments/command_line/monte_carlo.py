@@ -95,12 +95,10 @@ def monte_carlo(
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
     from .. import monte_carlo
+    from ..jobs import replace_own
     from ..monte_carlo.report import write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
-    from ..runs.own_files import replace_own
     from .options import chosen_scenario, refuse_broken
-
-    # MERGED-EMPTY
     from .output_folder import as_json_text, default_folder
     from .reporter import Reporter
 

@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from ...sim_configs.atomic_file import naming_file, unfinished
-from ..logs.slamlog import LogError
-from ..runs.own_files import (
+from ..jobs import (
     MANIFEST,
     OwnFile,
     files_below,
     locked_folder,
     measured,
-    naming_folder,
+    naming,
     own_entry,
     own_files,
     write_own_files,
 )
+from ..logs.slamlog import LogError
 from .program import BadInputError
 
 SUMMARY = "summary.json"
@@ -65,7 +65,7 @@ def output_folder(path: Path) -> Iterator[Path]:
     staging = folder / STAGING
     with _made(folder), locked_folder(folder), _naming_in_place(staging, folder):
         _publish(folder)  # what a killed command left
-        with naming_folder(folder):
+        with naming(f"the folder {folder}"):
             staging.mkdir()
         unfinished.add(staging)
         try:
@@ -85,7 +85,7 @@ def _made(folder: Path) -> Iterator[None]:
     """Make a folder and those above it; after an error, remove those that are empty."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        with naming_folder(folder):
+        with naming(f"the folder {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:

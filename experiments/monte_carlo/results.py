@@ -10,9 +10,8 @@ import hashlib
 import json
 import os
 import platform
-import re
 import zipfile
-from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,16 +23,17 @@ from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...sim_configs import Scenario
 from ...sim_configs.atomic_file import replace_when_written
 from ...sim_configs.scenario_files import scenario_text
-from ..runs.filter_settings import EstimatorChoice
-from ..runs.own_files import (
-    files_below,
-    locked_folder,
-    naming_folder,
+from ..jobs import (
+    claimed,
+    difference,
+    naming,
     own_entry,
     own_files,
+    remove_leftovers,
     replace_own,
     set_aside,
 )
+from ..runs.filter_settings import EstimatorChoice
 from .run_measures import NOISE_SIZES, VARIABLES, Block, Variable, variables_of
 
 if TYPE_CHECKING:
@@ -49,34 +49,22 @@ if TYPE_CHECKING:
 # may be put into one folder.
 
 
-class Span(NamedTuple):
-    """Consecutive runs."""
-
-    first: int
-    stop: int
-
-    @property
-    def size(self) -> int:
-        """Number of runs."""
-        return self.stop - self.first
-
-
-Blocks = Iterator[tuple[Span, list[Block]]]
+Blocks = Iterable[tuple[range, list[Block]]]
 
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
 _FROM_TRUTH = "for a consistent filter, NEES and NIS are χ² with the stated degrees"
 
 
-def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Dataset:
+def dataset_of(job: Job, blocks: Blocks, runs: range, command: str = "") -> xr.Dataset:
     """Combine the blocks of a job into a dataset in memory.
 
     Parameters
     ----------
     job : Job
         The job.
-    blocks : iterator
-        All its blocks, in order.
-    runs : Span
+    blocks : iterable
+        All its blocks, in any order.
+    runs : range
         Their runs.
     command : str
         Command that reproduces the results.
@@ -103,7 +91,7 @@ def dataset_of(job: Job, blocks: Blocks, runs: Span, command: str = "") -> xr.Da
 
 
 def write_results(
-    path: Path, job: Job, blocks: Blocks, runs: Span, command: str = ""
+    path: Path, job: Job, blocks: Blocks, runs: range, command: str = ""
 ) -> None:
     """Write the blocks of a job as one netCDF file, one block in memory at a time.
 
@@ -114,14 +102,9 @@ def write_results(
     job, blocks, runs, command
         As in :func:`dataset_of`.
     """
-    try:
-        with replace_own(path) as partial:
-            _write(partial, job, blocks, runs, command)
-    except (OSError, RuntimeError) as error:  # netCDF raises the second on a full disk
-        reason = getattr(error, "strerror", None) or error
-        raise OSError(
-            f"{path} cannot be written: {reason}; its blocks stay, to continue from"
-        ) from error
+    kept, full = "; its blocks stay, to continue from", RuntimeError  # of netCDF
+    with naming(path, kept, full), replace_own(path) as partial:
+        _write(partial, job, blocks, runs, command)
 
 
 def load_results(path: str | Path) -> xr.Dataset:
@@ -157,7 +140,7 @@ def load_results(path: str | Path) -> xr.Dataset:
     return results
 
 
-def _write(path: Path, job: Job, blocks: Blocks, runs: Span, command: str) -> None:
+def _write(path: Path, job: Job, blocks: Blocks, runs: range, command: str) -> None:
     import netCDF4  # noqa: PLC0415
 
     with netCDF4.Dataset(path, "w") as file:
@@ -174,17 +157,17 @@ def _write(path: Path, job: Job, blocks: Blocks, runs: Span, command: str) -> No
         file.setncatts(attributes(job, runs, command))
 
 
-def attributes(job: Job, runs: Span, command: str) -> dict[str, Any]:
+def attributes(job: Job, runs: range, command: str) -> dict[str, Any]:
     """Return the origin of results: all that is needed to reproduce them."""
     identity = job.identity()
     return {
-        "title": f"Monte Carlo of {job.scenario.name}, {runs.size} runs",
+        "title": f"Monte Carlo of {job.scenario.name}, {len(runs)} runs",
         "scenario_name": job.scenario.name,
         "scenario": identity["scenario"],
         "assumed": identity["assumed"],
         "estimators": json.dumps(identity["estimators"]),
         "seed": job.seed,
-        "runs": runs.size,
+        "runs": len(runs),
         "block_size": job.block_size,
         "resolution": job.resolution,
         "versions": json.dumps(_versions()),
@@ -202,11 +185,11 @@ def _fill(
     arrays: MutableMapping[str, Any] | Mapping[str, Any],
     job: Job,
     blocks: Blocks,
-    runs: Span,
+    runs: range,
 ) -> None:
     variables = job.variables
     for span, parts in blocks:
-        rows = slice(span.first - runs.first, span.stop - runs.first)
+        rows = slice(span.start - runs.start, span.stop - runs.start)
         for number, block in enumerate(parts):
             for name, values in block.items():
                 text = variables[name].kind == "U"
@@ -223,20 +206,20 @@ def _dims(variable: Variable) -> tuple[str, ...]:
     return ("estimator", *variable.dims)
 
 
-def _sizes(job: Job, runs: Span) -> dict[str, int]:
+def _sizes(job: Job, runs: range) -> dict[str, int]:
     return {
         "estimator": len(job.estimators),
-        "run": runs.size,
+        "run": len(runs),
         "step": job.scenario.steps + 1,
         "landmark": job.scenario.landmarks.count,
         **NOISE_SIZES,
     }
 
 
-def _coordinates(job: Job, runs: Span) -> dict[str, np.ndarray[Any, Any]]:
+def _coordinates(job: Job, runs: range) -> dict[str, np.ndarray[Any, Any]]:
     return {dim: np.arange(size) for dim, size in _sizes(job, runs).items()} | {
         "estimator": np.array([choice.label for choice in job.estimators]),
-        "run": np.arange(runs.first, runs.stop),
+        "run": np.arange(runs.start, runs.stop),
         "noise": np.array(CHANNELS),
         "moment": np.array(MOMENTS),
     }
@@ -248,16 +231,76 @@ def _coordinates(job: Job, runs: Span) -> dict[str, np.ndarray[Any, Any]]:
 FORMAT = "slamgym monte carlo 3"
 JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
 REPORT, SUMMARY = "report.html", "summary.json"
-_PARTIAL = re.compile(
-    r"\.{1,2}(job|results|report|summary|slamgym_files|runs-\d{7,}-\d{7,})"
-    r"(\.[0-9a-f]{8}){1,2}\.(json|nc|html|npz)"
-)
+
+
+class BlockFolder(NamedTuple):
+    """The blocks of a job in its folder, which `opened` makes, checks and locks."""
+
+    path: Path
+    digest: str
+    """Of the job."""
+
+    def missing(self, blocks: Iterable[range]) -> list[range]:
+        """Return the blocks that are still to be computed; warn of a damaged one."""
+        return [runs for runs in blocks if not self._has(runs)]
+
+    def _has(self, runs: range) -> bool:
+        for file in self._files_from(runs.start):
+            problem = problem_with(file, self.digest)
+            if problem:
+                set_aside(file, f"{problem}, and its runs are repeated")
+            elif int(file.stem.rpartition("-")[2]) >= runs.stop:
+                return True
+        return False
+
+    def add(self, runs: range, parts: list[Block]) -> None:
+        """Keep a block, one part per estimator."""
+        arrays = {
+            f"{number}/{name}": array
+            for number, part in enumerate(parts)
+            for name, array in part.items()
+        }
+        file = self.path / BLOCKS / f"runs-{runs.start:07d}-{runs.stop:07d}.npz"
+        whole = len(blocks_in(self.path))
+        kept = f"; {whole} complete blocks stay there, to continue from"
+        with naming(file, kept), replace_when_written(file) as partial:
+            np.savez(partial, allow_pickle=False, job=self.digest, **arrays)
+        for shorter in self._files_from(runs.start):
+            if shorter != file:
+                shorter.unlink()
+
+    def read(self, blocks: Iterable[range], job: Job) -> Blocks:
+        """Yield blocks with their runs, one at a time."""
+        for runs in blocks:
+            file = self._files_from(runs.start)[-1]  # the longest
+            with np.load(file, allow_pickle=False) as arrays:
+                parts = [
+                    {
+                        name: arrays[f"{number}/{name}"][: len(runs)]
+                        for name in job.variables
+                    }
+                    for number in range(len(job.estimators))
+                ]
+            yield runs, parts
+
+    def copy(self, file: Path) -> None:
+        """Add a block of another folder, if it is not there."""
+        problem = problem_with(file, self.digest)
+        if problem:
+            raise ValueError(f"{file} {problem}")
+        copy = self.path / BLOCKS / file.name
+        if not copy.exists():
+            with replace_when_written(copy) as partial:
+                partial.write_bytes(file.read_bytes())
+
+    def _files_from(self, first: int) -> list[Path]:
+        return sorted((self.path / BLOCKS).glob(f"runs-{first:07d}-*.npz"))
 
 
 @contextlib.contextmanager
-def claimed(
+def opened(
     path: Path, identity: dict[str, Any], *, fresh: bool = False
-) -> Iterator[None]:
+) -> Iterator[BlockFolder]:
     """Make a folder for a job, or check that it is the job's, and lock it.
 
     Files that a killed writer left half written are removed.
@@ -275,30 +318,24 @@ def claimed(
     Raises
     ------
     ValueError
-        If the folder holds another job, or what slamgym did not write, or another
-        process writes to it.
+        If the folder is a file, holds another job or what slamgym did not write, or
+        another process writes to it.
     OSError
         If it cannot be written.
     """
-    with naming_folder(path):
-        path.mkdir(parents=True, exist_ok=True)
-    with locked_folder(path):
-        found = None
-        if any(not _is_leftover(Path(name)) for name in files_below(path)):
-            found = identity_in(path)
-            if not fresh:
-                refuse_other(path, found, identity)
-        with naming_folder(path):
-            for file in (*path.iterdir(), *(path / BLOCKS).glob(".*")):
-                if _is_leftover(file):
-                    file.unlink()
-            if fresh and found:
+    with claimed(path) as anything:
+        found = identity_in(path) if anything else None
+        if found and not fresh:
+            refuse_other(path, found, identity)
+        with naming(f"the folder {path}"):
+            remove_leftovers(path, path / BLOCKS)
+            if found and fresh:
                 _clear(path, found)
             with replace_when_written(path / JOB) as partial:
                 text = json.dumps(identity, indent=2, ensure_ascii=False)
                 partial.write_text(text + "\n", encoding="utf-8")
             (path / BLOCKS).mkdir(exist_ok=True)
-        yield
+        yield BlockFolder(path, digest_of(identity))
 
 
 def _clear(path: Path, identity: dict[str, Any]) -> None:
@@ -379,18 +416,13 @@ def refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> No
     ValueError
         With the first difference.
     """
-    for key, value in asked.items():
-        if found.get(key) != value:
-            raise ValueError(
-                f"{path} holds results of {_described(key, found.get(key))}, "
-                f"not of {_described(key, value)}: "
-                "choose another folder, or ask for fresh results"
-            )
-
-
-def _is_leftover(file: Path) -> bool:
-    """Whether a writer that was killed at once may have left this file."""
-    return _PARTIAL.fullmatch(file.name) is not None
+    key = difference(found, asked)
+    if key is not None:
+        raise ValueError(
+            f"{path} holds results of {_described(key, found.get(key))}, "
+            f"not of {_described(key, asked.get(key))}: "
+            "choose another folder, or ask for fresh results"
+        )
 
 
 def _described(key: str, value: Any) -> str:
@@ -403,7 +435,7 @@ def _described(key: str, value: Any) -> str:
         return f"estimators {', '.join(value)}"
     if key == "code" and isinstance(value, dict):
         return f"code {', '.join(f'{k} {v}' for k, v in value.items())}"
-    return f"{key} {value}"
+    return f"{key} {0.0 if value is None else value}"
 
 
 class Job(NamedTuple):
@@ -444,123 +476,6 @@ class Job(NamedTuple):
             **({"resolution": self.resolution} if self.resolution else {}),
         }
 
-    def spans(self, runs: Span) -> list[Span]:
-        """Divide runs into blocks; the last one may be shorter."""
-        size = self.block_size
-        starts = range(runs.first, runs.stop, size)
-        return [Span(first, min(first + size, runs.stop)) for first in starts]
-
-
-class BlockFolder:
-    """The blocks of one job; its folder is locked within ``with``.
-
-    Parameters
-    ----------
-    job : Job
-        The job.
-    path : Path, optional
-        The folder; without one, blocks are kept in memory.
-    fresh : bool
-        Whether to remove the results of an earlier job, this one or another.
-
-    Raises
-    ------
-    ValueError
-        If the folder is a file. On entry: if it holds another job, or files that
-        slamgym did not write, or another process writes to it.
-    OSError
-        On entry, if it cannot be written.
-    """
-
-    def __init__(self, job: Job, path: Path | None, *, fresh: bool = False) -> None:
-        if path is not None and path.exists() and not path.is_dir():
-            raise ValueError(f"out must be a folder, got the file {path}")
-        self._job = job
-        self._path = path
-        self._fresh = fresh
-        self._identity = job.identity()  # as the sources of its estimators are now
-        self._digest = digest_of(self._identity)
-        self._kept: dict[int, list[Block]] = {}
-        self._claim = contextlib.ExitStack()
-
-    def __enter__(self) -> BlockFolder:
-        """Lock the folder."""
-        if self._path is not None:
-            claim = claimed(self._path, self._identity, fresh=self._fresh)
-            self._claim.enter_context(claim)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Unlock the folder."""
-        self._claim.close()
-
-    def missing(self, runs: Span) -> list[Span]:
-        """List the blocks that are still to be computed; warn of a damaged one."""
-        return [span for span in self._job.spans(runs) if not self._has(span)]
-
-    def add(self, span: Span, blocks: list[Block]) -> None:
-        """Keep a block, one part per estimator."""
-        if self._path is None:
-            self._kept[span.first] = blocks
-            return
-        arrays = {
-            f"{number}/{name}": array
-            for number, block in enumerate(blocks)
-            for name, array in block.items()
-        }
-        file = self._file(span)
-        try:
-            with replace_when_written(file) as partial:
-                np.savez(partial, allow_pickle=False, job=self._digest, **arrays)
-        except OSError as error:
-            whole = len(list(file.parent.glob("runs-*.npz")))
-            raise OSError(
-                f"{file} cannot be written: {error.strerror or error}; "
-                f"{whole} complete blocks stay there, to continue from"
-            ) from error
-        for shorter in self._files_from(span.first):
-            if shorter != file:
-                shorter.unlink()
-
-    def blocks(self, runs: Span) -> Iterator[tuple[Span, list[Block]]]:
-        """Yield all blocks in order, one at a time."""
-        for span in self._job.spans(runs):
-            if self._path is None:
-                yield span, self._kept.pop(span.first)
-            else:
-                yield span, self._read(span)
-
-    def _has(self, span: Span) -> bool:
-        if self._path is None:
-            return False
-        for file in self._files_from(span.first):
-            problem = problem_with(file, self._digest)
-            if problem:
-                set_aside(file, f"{problem}, and its runs are repeated")
-            elif _stop_of(file) >= span.stop:
-                return True
-        return False
-
-    def _read(self, span: Span) -> list[Block]:
-        file = self._files_from(span.first)[-1]  # the longest
-        with np.load(file, allow_pickle=False) as arrays:
-            return [
-                {
-                    name: arrays[f"{number}/{name}"][: span.size]
-                    for name in self._job.variables
-                }
-                for number in range(len(self._job.estimators))
-            ]
-
-    def _file(self, span: Span) -> Path:
-        assert self._path is not None
-        name = f"runs-{span.first:07d}-{span.stop:07d}.npz"
-        return self._path / BLOCKS / name
-
-    def _files_from(self, first: int) -> list[Path]:
-        assert self._path is not None
-        return sorted((self._path / BLOCKS).glob(f"runs-{first:07d}-*.npz"))
-
 
 def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
     """Copy the blocks of one job from several folders into one.
@@ -586,22 +501,6 @@ def merge_blocks(sources: Sequence[str | Path], target: str | Path) -> None:
     place, identity = Path(target), identity_in(folders[0])
     for folder in folders:
         refuse_other(folder, identity_in(folder), identity)
-    with claimed(place, identity):
-        digest = digest_of(identity)
-        for folder in folders:
-            for file in blocks_in(folder):
-                _copy_block(file, place / BLOCKS / file.name, digest)
-
-
-def _copy_block(file: Path, copy: Path, digest: str) -> None:
-    """Copy a block of a job, if the copy does not exist."""
-    problem = problem_with(file, digest)
-    if problem:
-        raise ValueError(f"{file} {problem}")
-    if not copy.exists():
-        with replace_when_written(copy) as partial:
-            partial.write_bytes(file.read_bytes())
-
-
-def _stop_of(file: Path) -> int:
-    return int(file.stem.rpartition("-")[2])
+    with opened(place, identity) as merged:
+        for file in (file for folder in folders for file in blocks_in(folder)):
+            merged.copy(file)

@@ -7,29 +7,17 @@ filtered and measured in blocks; a worker computes one block at a time.
 
 from __future__ import annotations
 
-import os
-import signal
-import threading
-import time
 import tomllib
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import psutil
-from joblib import Parallel, delayed, effective_n_jobs, parallel_config
-from joblib.parallel import BACKENDS as KNOWN_BACKENDS
-from joblib.parallel import get_active_backend
-
-from ...arrays import Array
 from ...estimator import registry
 from ...estimator.interface import SupportsTruth
-from ...evaluation.error_bound import PosteriorBound
 from ...sim_configs import Scenario, load_scenario
-from ...sim_configs.field_types import unknown_choice
+from ..jobs import Progress, blocks_of, complete, engage_workers
 from ..runs.filter_settings import (
     EstimatorChoice,
     FilterSettings,
@@ -37,15 +25,14 @@ from ..runs.filter_settings import (
     integer,
     one_blas_thread,
 )
-from ..runs.simulated_runs import SimulatedRuns, simulate_runs
+from ..runs.simulated_runs import simulate_runs
 from .filtered_runs import bound_runs, filter_runs, noise_of_runs
 from .results import (
     RESULTS,
-    BlockFolder,
     Job,
-    Span,
     dataset_of,
     load_results,
+    opened,
     write_results,
 )
 from .run_measures import Block, measure_runs, with_known_ids
@@ -54,48 +41,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-Progress = Callable[[int, int], object]
-
 BLOCK_SIZE = 64
-
-
-@dataclass(frozen=True)
-class _Work:
-    """All that a worker needs to compute a block."""
-
-    scenario: Scenario
-    assumed: Scenario
-    settings: tuple[FilterSettings, ...]
-    factories: Mapping[str, registry.EstimatorFactory]
-    seed: int
-    threads: int | None
-    resolution: float
-
-    def do(self, span: Span) -> list[Block]:
-        """Simulate, filter and measure runs; return one block per estimator."""
-        for name, factory in self.factories.items():
-            if ":" not in name and not registry.is_registered(name):
-                registry.register_estimator(name, factory)
-        first = self.seed + span.first
-        runs = simulate_runs(self.scenario, span.size, first, only_read=True)
-        bound = bound_runs(self.scenario, runs)
-        noise = noise_of_runs(self.scenario, self.assumed, runs)
-        return [
-            self._measure(settings, runs, bound, noise) for settings in self.settings
-        ]
-
-    def _measure(
-        self,
-        settings: FilterSettings,
-        runs: SimulatedRuns,
-        bound: PosteriorBound,
-        noise: Array,
-    ) -> Block:
-        filtered = filter_runs(settings, runs, threads=self.threads)
-        block = measure_runs(runs, filtered, bound, noise, resolution=self.resolution)
-        if runs.true_ids is not None:
-            block |= with_known_ids(settings, runs, self.threads)
-        return block
 
 
 def monte_carlo(
@@ -176,88 +122,77 @@ def monte_carlo(
     """
     world, choices = load_scenario(scenario), estimator_choices(estimators)
     assumed_world = world if assumed is None else load_scenario(assumed)
-    _refuse_other_kind(assumed_world, world)
-    size = integer("block_size", block_size, 1)
-    asked = _span(integer("first_run", first_run, 0), integer("runs", runs, 1), size)
-    whole_seed, apart = integer("seed", seed, 0), _resolution(resolution)
-    job = Job(world, assumed_world, choices, whole_seed, size, apart)
-    workers = engage_workers(jobs, backend)
-    work = _Work(
-        world,
-        assumed_world,
-        tuple(_checked(choice, assumed_world) for choice in choices),
-        {choice.name: registry.find_estimator(choice.name) for choice in choices},
-        job.seed,
-        threads=None if workers is None else 1,
-        resolution=job.resolution,
-    )
-    path = None if out is None else Path(out)
-    with one_blas_thread(), BlockFolder(job, path, fresh=fresh) as folder:
-        with saying_what_is_kept(_kept_in(path)):
-            _complete(folder, asked, work, workers, progress or _no_progress)
-        blocks = folder.blocks(asked)
-        if path is None:
-            return dataset_of(job, blocks, asked, command)
-        write_results(path / RESULTS, job, blocks, asked, command)
-        return load_results(path / RESULTS)
-
-
-def _refuse_other_kind(assumed: Scenario, world: Scenario) -> None:
-    """Refuse an assumed world with other identities than the true one."""
-    if assumed.sensor.identities != world.sensor.identities:
+    if assumed_world.sensor.identities != world.sensor.identities:
         raise ValueError(
             "assumed must agree with scenario in sensor.identities: only its noise "
             "may differ"
         )
+    size = integer("block_size", block_size, 1)
+    asked = range(integer("first_run", first_run, 0), integer("runs", runs, 1))
+    if first_run % size or first_run >= runs:
+        raise ValueError(
+            f"first_run must be a multiple of block_size = {size} below runs = {runs}, "
+            f"got {first_run}"
+        )
+    seed = integer("seed", seed, 0)
+    if not 0 <= resolution < float("inf"):
+        raise ValueError(f"resolution must be a number >= 0, got {resolution!r}")
+    job = Job(world, assumed_world, choices, seed, size, float(resolution))
+    workers = engage_workers(jobs, backend)
+    work = _Work(
+        job,
+        tuple(_checked(choice, assumed_world) for choice in choices),
+        {choice.name: registry.find_estimator(choice.name) for choice in choices},
+        threads=None if workers is None else 1,
+    )
+    blocks = blocks_of(asked, size)
+    compute = partial(
+        complete, work, workers=workers, runs=len(asked), progress=progress
+    )
+    with one_blas_thread():
+        if out is None:
+            found: dict[range, list[Block]] = {}
+            kept = "nothing is kept without a folder for the results"
+            compute(blocks, found.__setitem__, kept=kept)
+            parts = ((block, found.pop(block)) for block in blocks)
+            return dataset_of(job, parts, asked, command)
+        out = Path(out)
+        with opened(out, job.identity(), fresh=fresh) as folder:
+            kept = f"the finished runs are in {out}, and the same command continues"
+            compute(folder.missing(blocks), folder.add, kept=kept)
+            results = out / RESULTS
+            write_results(results, job, folder.read(blocks, job), asked, command)
+            return load_results(results)
 
 
-def _resolution(value: float) -> float:
-    if not 0 <= value < float("inf"):
-        raise ValueError(f"resolution must be a number >= 0, got {value!r}")
-    return float(value)
+@dataclass(frozen=True)
+class _Work:
+    """All that a worker needs to compute a block."""
 
+    job: Job
+    settings: tuple[FilterSettings, ...]
+    factories: Mapping[str, registry.EstimatorFactory]
+    threads: int | None
 
-def _no_progress(done: int, runs: int) -> None:
-    """Report nothing."""
-
-
-def _complete(
-    folder: BlockFolder,
-    asked: Span,
-    work: _Work,
-    workers: Workers | None,
-    progress: Progress,
-) -> None:
-    """Compute the blocks that a folder lacks."""
-    missing = folder.missing(asked)
-    done = asked.size - sum(span.size for span in missing)
-    progress(done, asked.size)
-    with closing(_computed(work, missing, workers)) as computed:  # ends the workers
-        for span, blocks in computed:
-            folder.add(span, blocks)
-            done += span.size
-            progress(done, asked.size)
-
-
-def _kept_in(path: Path | None) -> str:
-    if path is None:
-        return "nothing is kept without a folder for the results"
-    return f"the finished runs are in {path}, and the same command continues"
-
-
-def _computed(
-    work: _Work, spans: list[Span], workers: Workers | None
-) -> Generator[tuple[Span, list[Block]], None, None]:
-    """Yield the blocks as they come, in any order."""
-    if workers is None:
-        yield from ((span, work.do(span)) for span in spans)
-        return
-    yield from workers(delayed(_do)(work, span) for span in spans)
-
-
-def _do(work: _Work, span: Span) -> tuple[Span, list[Block]]:
-    with one_blas_thread():  # in a process of its own
-        return span, work.do(span)
+    def __call__(self, block: range, _: object) -> list[Block]:
+        """Simulate, filter and measure runs; return one block per estimator."""
+        for name, factory in self.factories.items():
+            if ":" not in name and not registry.is_registered(name):
+                registry.register_estimator(name, factory)
+        world, first = self.job.scenario, self.job.seed + block.start
+        runs = simulate_runs(world, len(block), first, only_read=True)
+        bound = bound_runs(world, runs)
+        noise = noise_of_runs(world, self.job.assumed, runs)
+        parts = []
+        for settings in self.settings:
+            filtered = filter_runs(settings, runs, threads=self.threads)
+            part = measure_runs(
+                runs, filtered, bound, noise, resolution=self.job.resolution
+            )
+            if runs.true_ids is not None:
+                part |= with_known_ids(settings, runs, self.threads)
+            parts.append(part)
+        return parts
 
 
 def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:
@@ -272,123 +207,6 @@ def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:
             "sensor.identities = true"
         )
     return settings
-
-
-def _span(first_run: int, runs: int, block_size: int) -> Span:
-    if first_run % block_size or first_run >= runs:
-        raise ValueError(
-            f"first_run must be a multiple of block_size = {block_size} below runs = "
-            f"{runs}, got {first_run}"
-        )
-    return Span(first_run, runs)
-
-
-# --------------------------------------------------------------------------------------
-# Engage the workers of a long job: processes, threads, or a cluster.
-
-Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed
-Workers = Callable[[Iterable[Call]], Iterable[Any]]
-
-BACKENDS = ("loky", "threading", "dask", "ray")
-_PATIENCE = 0.5
-"""How long a worker lives on without the process that engaged it [s]."""
-
-
-def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
-    """Return workers that compute calls in any order; None if this process does it all.
-
-    Parameters
-    ----------
-    jobs : int or None
-        Number of workers; -1 for one on each core.
-    backend : str or None
-        One of `BACKENDS`; None for what joblib is configured to use.
-
-    Raises
-    ------
-    ValueError
-        If an argument does not fit, or Ray is not installed.
-    """
-    if backend not in (None, *BACKENDS):
-        raise ValueError(unknown_choice("backend", backend, BACKENDS))
-    if jobs not in (None, -1):
-        integer("jobs", jobs or 0, 1)
-    if backend == "ray":
-        return _ray_workers(None if jobs == -1 else jobs)
-    if backend is None and effective_n_jobs(jobs) == 1:
-        return None
-    return _joblib_workers(jobs, backend)
-
-
-@contextmanager
-def saying_what_is_kept(kept: str) -> Iterator[None]:
-    """Report the loss of a worker process, and which results are kept."""
-    try:
-        yield
-    except BrokenProcessPool as error:
-        raise OSError(
-            f"a worker process was killed, perhaps for lack of memory; {kept}"
-        ) from error
-
-
-def _joblib_workers(jobs: int | None, backend: str | None) -> Workers:
-    chosen: dict[str, Any] = {} if backend is None else {"backend": backend}
-    if jobs is not None or backend is not None:
-        chosen["n_jobs"] = jobs or -1
-    with parallel_config(**chosen):
-        begin: dict[str, Any] = {}
-        if isinstance(get_active_backend()[0], KNOWN_BACKENDS["loky"]):
-            begin = {"initializer": _end_with, "initargs": (os.getpid(),)}
-        workers: Workers = Parallel(
-            return_as="generator_unordered", pre_dispatch="2*n_jobs", **begin
-        )
-        return workers
-
-
-def _end_with(engaging: int) -> None:
-    """Let this worker end when the process that engaged it is gone, and not before.
-
-    A scheduler may send SIGTERM to all processes of a job.  The one that engaged the
-    workers then ends them.
-    """
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    threading.Thread(target=_watch, args=(engaging,), daemon=True).start()
-
-
-def _watch(engaging: int) -> None:
-    while os.getppid() == engaging and psutil.pid_exists(engaging):
-        time.sleep(_PATIENCE)
-    os._exit(1)
-
-
-def _ray_workers(jobs: int | None) -> Workers:
-    """Engage a cluster's workers by Ray's own pool.
-
-    Ray's backend for joblib returns results only when the last one is complete, so that
-    no block could be written before.
-    """
-    try:
-        from ray.util.multiprocessing import Pool  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise ValueError("backend 'ray' needs ray: pip install ray") from None
-
-    def compute(calls: Iterable[Call]) -> Iterator[Any]:
-        handler = signal.getsignal(signal.SIGTERM)
-        with Pool(jobs) as pool:
-            _handle_sigterm(handler)  # Ray replaces it by one that aborts
-            yield from pool.imap_unordered(_call, calls)
-
-    return compute
-
-
-def _handle_sigterm(handler: Any) -> None:
-    if callable(handler) and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, handler)
-
-
-def _call(call: Call) -> Any:
-    function, arguments, options = call
-    return function(*arguments, **options)
 
 
 # --------------------------------------------------------------------------------------

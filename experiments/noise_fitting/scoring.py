@@ -319,17 +319,29 @@ def events_of(log: SlamLog) -> TimedEvents:
     ValueError
         If the log has no scan, no motion, or no landmark that is read twice.
     """
-    collected, times = _EventList(), []
+    motions: list[Motion] = []
+    sightings = [Sightings(np.empty((0, 2)), np.empty(0, dtype=np.int64))]
+    until_motions, until_readings, times = [0], [0], []
     for step in steps_of(log):
-        motions = _motions_of(log, step.motions)
-        scan, sightings = step.scan, None
+        for row in step.motions:
+            motions += [(*u, dt) for u, dt in predictions(row, log.motion)]
+        count, scan = 0, step.scan
         if scan is not None and scan.landmark_ids is not None:
-            sightings = Sightings(scan.measurements, scan.landmark_ids)
-        collected.add(motions, sightings)
+            sightings.append(Sightings(scan.measurements, scan.landmark_ids))
+            count = len(scan.landmark_ids)
+        until_motions.append(len(motions))
+        until_readings.append(until_readings[-1] + count)
         times.append(step.t)
-    timed = TimedEvents(collected.events(), np.array(times))
-    _refuse_empty(log, timed.events)
-    return timed
+    readings, ids = zip(*sightings, strict=True)
+    events = DriveEvents(
+        np.array(motions, dtype=np.float64).reshape(-1, 3),
+        np.array(until_motions, dtype=np.int64),
+        np.concatenate(readings),
+        _numbered(np.concatenate(ids)),
+        np.array(until_readings, dtype=np.int64),
+    )
+    _refuse_empty(log, events)
+    return TimedEvents(events, np.array(times))
 
 
 def without_readings(events: DriveEvents, dropped: BoolArray) -> DriveEvents:
@@ -365,7 +377,13 @@ def parts_of(
     """Return stretches of a drive, the landmarks of each numbered from 0."""
     if len(stretches) == 1:
         return (events,)
-    return tuple(_part(events, *stretch) for stretch in stretches)
+    parts = (_joined(events, [stretch]) for stretch in stretches)
+    return tuple(part._replace(landmarks=_numbered(part.landmarks)) for part in parts)
+
+
+def _numbered(ids: IntArray) -> IntArray:
+    """Return the numbers of landmarks from 0, in the order of their ids."""
+    return np.unique(ids, return_inverse=True)[1].astype(np.int64)
 
 
 def sample_of(
@@ -398,55 +416,6 @@ def _joined(events: DriveEvents, stretches: Sequence[Stretch]) -> DriveEvents:
         events.landmarks[readings],
         first_readings,
     )
-
-
-def _part(events: DriveEvents, begin: int, end: int) -> DriveEvents:
-    motions = events.first_motions[begin : end + 1]
-    readings = events.first_readings[begin : end + 1]
-    within = slice(readings[0], readings[-1])
-    _, landmarks = np.unique(events.landmarks[within], return_inverse=True)
-    return DriveEvents(
-        events.motions[motions[0] : motions[-1]],
-        motions - motions[0],
-        events.readings[within],
-        landmarks.astype(np.int64),
-        readings - readings[0],
-    )
-
-
-class _EventList:
-    """Collects steps one after the other."""
-
-    def __init__(self) -> None:
-        self.motions: list[Motion] = []
-        self.sightings = [Sightings(np.empty((0, 2)), np.empty(0, dtype=np.int64))]
-        self.until_motions, self.until_readings = [0], [0]
-
-    def add(self, motions: Iterable[Motion], sightings: Sightings | None) -> None:
-        """Append a step."""
-        self.motions += motions
-        count = 0
-        if sightings is not None:
-            self.sightings.append(sightings)
-            count = len(sightings.ids)
-        self.until_motions.append(len(self.motions))
-        self.until_readings.append(self.until_readings[-1] + count)
-
-    def events(self) -> DriveEvents:
-        """Return all steps as arrays, the landmarks numbered by their ids."""
-        readings, ids = zip(*self.sightings, strict=True)
-        _, landmarks = np.unique(np.concatenate(ids), return_inverse=True)
-        return DriveEvents(
-            np.array(self.motions, dtype=np.float64).reshape(-1, 3),
-            np.array(self.until_motions, dtype=np.int64),
-            np.concatenate(readings),
-            landmarks.astype(np.int64),
-            np.array(self.until_readings, dtype=np.int64),
-        )
-
-
-def _motions_of(log: SlamLog, rows: Iterable[OdometryRow]) -> list[Motion]:
-    return [(*u, dt) for row in rows for u, dt in predictions(row, log.motion)]
 
 
 def _refuse_empty(log: SlamLog, events: DriveEvents) -> None:

@@ -15,7 +15,7 @@ from ...estimator.filters.ekf import EkfSlam
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
 from ...estimator.kernels.kalman_gain import GATED
 from ..runs.filter_settings import FilterSettings
-from .intervals import NOT_ZERO, Interval, Verdict, intervals
+from .intervals import NOT_ZERO, Verdict, intervals
 from .scoring import (
     BETTER,
     FAINT,
@@ -42,7 +42,8 @@ FACTORS = 4.0 ** np.arange(-3, 3)  # of motion and of sensor noise, tried at the
 BEARING, RANGE, PER_METRE, IN_METRES = 3, 4, 5, 6  # columns of the sensor's noise
 
 
-NEEDLESS = (PER_METRE, IN_METRES)
+NEEDLESS = ((PER_METRE, RANGE), (IN_METRES, BEARING))
+"""Entries of the sensor's noise, and those that can replace them."""
 EXACT = 1e-6  # [rad, m] below which readings have no noise
 PLAIN = 0.15  # standard deviation of log σ below which it is certainly not zero
 
@@ -104,7 +105,8 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
         If the fit diverges.
     """
     start = positive_start(before, _typical_range(likelihood))
-    chosen = fitted_entries(start)
+    chosen = np.ones(len(ENTRIES), dtype=np.bool_)
+    chosen[IN_METRES] = start[IN_METRES] > 0  # fitted only if it is used
     smooth, found = _in_turns(likelihood, start, chosen)
     found = _without_zeros(smooth, _without_needless(smooth, found))
     _refuse_diverged(found)
@@ -117,7 +119,11 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
     for i, interval in judged.items():
         if interval.verdict == "unknown":
             noise[i] = before[i]
-    return Found(noise, _table(before, noise, judged), found.passes)
+    table = tuple(
+        FittedNoise(*ENTRIES[i], float(before[i]), float(noise[i]), low, high, verdict)
+        for i, (verdict, low, high) in judged.items()
+    )
+    return Found(noise, table, found.passes)
 
 
 def _in_turns(
@@ -177,17 +183,17 @@ def _fixed_at_zero(found: _Fit, entry: int) -> _Fit:
 
 def _without_needless(smooth: LogLikelihood, found: _Fit) -> _Fit:
     """Fit again without the part of σr per metre, or of σβ in metres, if possible."""
-    for entry in NEEDLESS:
-        if not (found.free[entry] and replaceable_by_zero(found.noise)[entry]):
+    for entry, instead in NEEDLESS:
+        if not (found.free[entry] and (found.noise[[entry, instead]] > 0).all()):
             continue
         if _is_plain(smooth, found, entry):
             continue
         fewer = _fixed_at_zero(found, entry)
         away = _typical_range(smooth)
         if entry == PER_METRE:
-            fewer.noise[RANGE] += found.noise[entry] * away
+            fewer.noise[instead] += found.noise[entry] * away
         else:
-            fewer.noise[BEARING] += found.noise[entry] / away
+            fewer.noise[instead] += found.noise[entry] / away
         simpler = _fit(smooth, fewer)
         if simpler.likelihood > found.likelihood - NOT_ZERO:
             found = simpler
@@ -229,8 +235,8 @@ def _refuse_most(rejected: BoolArray) -> None:
 def _refuse_diverged(found: _Fit) -> None:
     if not found.converged or found.noise.max() > 0.5 * GREATEST:
         values = ", ".join(
-            f"{entry.name} {value:.3g}"
-            for entry, value in zip(ENTRIES, found.noise, strict=True)
+            f"{name} {value:.3g}"
+            for (name, _), value in zip(ENTRIES, found.noise, strict=True)
         )
         raise np.linalg.LinAlgError(
             f"the fit diverges, after {found.passes} passes it is at {values}"
@@ -249,41 +255,16 @@ def _refuse_exact(noise: Array, typical_range: float) -> None:
             )
 
 
-def _table(
-    before: Array, noise: Array, judged: dict[int, Interval]
-) -> tuple[FittedNoise, ...]:
-    """Return a row of each fitted entry."""
-    return tuple(
-        FittedNoise(
-            ENTRIES[i].name,
-            ENTRIES[i].unit,
-            float(before[i]),
-            float(noise[i]),
-            interval.low,
-            interval.high,
-            interval.verdict,
-        )
-        for i, interval in judged.items()
-    )
-
-
-class NoiseEntry(NamedTuple):
-    """One standard deviation."""
-
-    name: str
-    unit: str
-    """Of a motion: per unit of the log's time."""
-
-
 ENTRIES = (
-    NoiseEntry("σx", "m"),
-    NoiseEntry("σy", "m"),
-    NoiseEntry("σα", "rad"),
-    NoiseEntry("σβ", "rad"),
-    NoiseEntry("σr", "m"),
-    NoiseEntry("σr per metre", "m/m"),
-    NoiseEntry("σβ in metres", "m"),
+    ("σx", "m"),
+    ("σy", "m"),
+    ("σα", "rad"),
+    ("σβ", "rad"),
+    ("σr", "m"),
+    ("σr per metre", "m/m"),
+    ("σβ in metres", "m"),
 )
+"""Name and unit of each standard deviation; of a motion, per unit of the log's time."""
 
 SMALL = 0.1  # share of its neighbours at which the search for a zero begins
 
@@ -315,13 +296,6 @@ def with_noise(settings: FilterSettings, noise: Array) -> FilterSettings:
     )
 
 
-def fitted_entries(noise: Array) -> BoolArray:
-    """Return which entries are fitted, (7,): all, but σβ in metres only if used."""
-    fitted = np.ones(len(ENTRIES), dtype=np.bool_)
-    fitted[IN_METRES] = noise[IN_METRES] > 0
-    return fitted
-
-
 def positive_start(noise: Array, typical_range: float) -> Array:
     """Replace zeros of a noise (7,) by small numbers, with which a search can begin.
 
@@ -343,14 +317,6 @@ def positive_start(noise: Array, typical_range: float) -> Array:
         0.0,
     )
     return np.where(start > 0, start, instead)
-
-
-def replaceable_by_zero(noise: Array) -> BoolArray:
-    """Return which entries of a sensor's noise another entry can replace, (7,)."""
-    can = np.zeros(len(ENTRIES), dtype=np.bool_)
-    can[[RANGE, PER_METRE]] = noise[RANGE] > 0 and noise[PER_METRE] > 0
-    can[[BEARING, IN_METRES]] = noise[BEARING] > 0 and noise[IN_METRES] > 0
-    return can
 
 
 # --------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +17,6 @@ from ..runs.log_replay import Progress, replay
 from ..runs.summary import settings_table, summarise
 from ..runs.trace import finite
 from .fit import GATE_PROBABILITY, Fitted, NoiseFit, Whiteness
-from .search import FittedNoise
 
 STAGES = ("before", "fitted", "suggested")
 COMPARED = ("nis", "nees", "ate", "landmark_rmse", "readings")
@@ -54,10 +52,15 @@ def summarise_fit(fit: NoiseFit, *, progress: Progress | None = None) -> dict[st
         "estimator": fit.before.settings.estimator,
         "readings": fit.readings,
         "passes": fit.passes,
-        "noise": [_row(noise) for noise in fit.noise],
+        "noise": [
+            row._asdict() | {"low": finite(row.low), "high": finite(row.high)}
+            for row in fit.noise
+        ],
         "runs": runs,
         "inflation": {"bearing": bearing.inflation, "range": distance.inflation},
-        "calibration": _calibration(fit),
+        "calibration": None
+        if fit.calibration is None
+        else {key: finite(value) for key, value in fit.calibration._asdict().items()},
         "options": options_line(fit.suggested),
     }
 
@@ -103,19 +106,6 @@ def _of_the_readings(fit: NoiseFit, settings: FilterSettings) -> FilterSettings:
     options = {k: v for k, v in settings.options.items() if k != "management"}
     gate = {"gate_probability": GATE_PROBABILITY}
     return replace(settings, options=gate | options)
-
-
-def _calibration(fit: NoiseFit) -> dict[str, float | None] | None:
-    if fit.calibration is None:
-        return None
-    return {key: finite(value) for key, value in fit.calibration._asdict().items()}
-
-
-def _row(noise: FittedNoise) -> dict[str, Any]:
-    row = noise._asdict()
-    return row | {
-        key: row[key] if math.isfinite(row[key]) else None for key in ("low", "high")
-    }
 
 
 # --------------------------------------------------------------------------------------

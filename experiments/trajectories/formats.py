@@ -415,6 +415,7 @@ def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
         if scan.true_ids is not None:
             true_ids[places] = scan.true_ids
     hides = not about["scenario"].sensor.identities
+    known = all(scan.true_ids is not None for scan in _scans(log))
     return Trajectory(
         **about,
         start_estimate=log.start,
@@ -423,12 +424,8 @@ def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
         landmarks=log.landmarks,
         measurements=measurements,
         mask=mask,
-        landmark_ids=true_ids if hides and _tells_true_ids(log) else None,
+        landmark_ids=true_ids if hides and known else None,
     )
-
-
-def _tells_true_ids(log: SlamLog) -> bool:
-    return all(scan.true_ids is not None for scan in _scans(log))
 
 
 def _scans(log: SlamLog) -> Iterator[Scan]:

@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import tempfile
-from collections.abc import Callable, Generator, Mapping
-from contextlib import closing
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from importlib import metadata
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as short_repr
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+from ... import __version__
 from ...envs.controllers import CONTROLLERS
 from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.field_types import unknown_choice
-from ..runs.filter_settings import integer, one_blas_thread
+from ..jobs import (
+    Progress,
+    claimed,
+    complete,
+    difference,
+    engage_workers,
+    naming,
+    remove,
+    remove_leftovers,
+    set_aside,
+    staging_folder,
+)
+from ..runs.filter_settings import integer
 from .formats import TrajectoryFormat, trajectory_format
 from .manifest import (
     MANIFEST,
@@ -23,21 +38,10 @@ from .manifest import (
     Manifest,
     ShardEntry,
     checksum,
-    claimed,
     is_whole,
-    naming,
-    put_in_place,
     read_manifest,
-    staging_folder,
-    versions_now,
     write_manifest,
 )
-
-if TYPE_CHECKING:
-    from ..monte_carlo.runner import Workers
-
-
-Progress = Callable[[int, int], object]
 
 
 def generate_trajectories(
@@ -135,130 +139,114 @@ def generate_trajectories(
         estimator,
     )
     versions = versions_of(job)
-    workers = _engaged(jobs, backend)
-    with claimed(Path(out)), naming(Path(out)):
-        return _continue(job, Path(out), versions, workers, progress)
+    serial = jobs is None and backend is None
+    workers = None if serial else engage_workers(jobs, backend)
+    folder = Path(out)
+    kept = "; whole shards stay there, and the same command continues"
+    with claimed(folder) as anything, naming(folder, kept):
+        manifest = _begun(job, folder, versions, anything)
+        with staging_folder(folder) as staging:
+            shards = _Shards(folder, staging, manifest)
+            complete(
+                ShardWork(job, versions, staging),
+                shards.missing(),
+                shards.keep,
+                workers,
+                runs=job.episodes,
+                steps=world.steps,
+                progress=progress,
+                kept=f"whole shards stay in {staging.parent}, the same command "
+                "continues",
+            )
+    return shards.manifest
 
 
-def _engaged(jobs: int | None, backend: str | None) -> Workers | None:
-    if jobs is None and backend is None:
-        return None
-    from ..monte_carlo.runner import engage_workers  # noqa: PLC0415 (loads joblib)
-
-    return engage_workers(jobs, backend)
-
-
-def _continue(
-    job: Job,
-    out: Path,
-    versions: dict[str, str],
-    workers: Workers | None,
-    progress: Progress | None,
+def _begun(
+    job: Job, folder: Path, versions: dict[str, str], anything: str | None
 ) -> Manifest:
-    manifest = _begun(job, out, versions)
-    bar = _Bar(job, progress)
-    entries = {job.shard_of(entry.first_episode): entry for entry in manifest.shards}
-    missing = []
-    for number in range(job.shards):
-        entry, episodes = entries.get(number), len(job.episodes_of(number))
-        if entry and entry.episodes == episodes and is_whole(out, entry):
-            bar.skip(episodes)
-        else:
-            missing.append(number)
-    with staging_folder(out) as staging:
-        work = ShardWork(job, manifest.versions, staging)
-        with closing(_made(work, missing, workers, bar)) as made:  # ends the workers
-            for shard in made:
-                promised = entries.get(shard.number)
-                _check_promise(out, promised, shard.entry)
-                put_in_place(work.fetch(shard), out, {promised, shard.entry})
-                entries[shard.number] = shard.entry
-                manifest = manifest.with_shards(entries[k] for k in sorted(entries))
-                write_manifest(manifest, out)
-    return manifest
-
-
-def _made(
-    work: ShardWork, numbers: list[int], workers: Workers | None, bar: _Bar
-) -> Generator[MadeShard, None, None]:
-    """Yield shards as they come, in any order where workers make them."""
-    if workers is None:
-        yield from (work.make(number, bar.advance) for number in numbers)
-        return
-    from ..monte_carlo.runner import saying_what_is_kept  # noqa: PLC0415
-
-    kept = f"whole shards stay in {work.staging.parent}, the same command continues"
-    with saying_what_is_kept(kept):
-        for made in workers((make_shard, (work, number), {}) for number in numbers):
-            yield made
-            bar.advance(made.entry.episodes * work.job.scenario.steps)
-
-
-def _check_promise(out: Path, promised: ShardEntry | None, made: ShardEntry) -> None:
-    if promised and promised.episodes == made.episodes and promised != made:
-        raise OSError(
-            f"{out / made.name} was damaged, and generated again it differs from "
-            f"{MANIFEST}: this machine does not make the same bits"
-        )
-
-
-def _begun(job: Job, out: Path, versions: dict[str, str]) -> Manifest:
     """Return the manifest of a job that was begun, or begin it."""
-    manifest = read_manifest(out) if (out / MANIFEST).exists() else None
+    there = (folder / MANIFEST).exists()
+    if anything and not there:
+        raise ValueError(
+            f"out must be a new or empty folder, or hold a {MANIFEST}: "
+            f"{folder} holds {anything}"
+        )
+    remove_leftovers(folder)
+    manifest = read_manifest(folder) if there else None
     if manifest is None or not manifest.shards:  # begun without a shard
         manifest = Manifest(job, versions)
-        write_manifest(manifest, out)
+        write_manifest(manifest, folder)
         return manifest
-    there = manifest.job
-    _refuse_other(out, "scenario.", vars(there.scenario), vars(job.scenario))
-    _refuse_other(out, "the version of ", manifest.versions, versions)
-    if there.episodes < job.episodes:  # a last shard that is not full is made again
-        manifest = replace(manifest, job=replace(there, episodes=job.episodes))
-    _refuse_other(out, "", vars(manifest.job), vars(job))
-    return manifest
-
-
-def _refuse_other(
-    out: Path, what: str, there: Mapping[str, object], wanted: Mapping[str, object]
-) -> None:
-    for name in {**there, **wanted}:
-        if there.get(name) != wanted.get(name):
+    begun = vars(manifest.job)
+    if manifest.job.episodes < job.episodes:
+        begun = begun | {"episodes": job.episodes}
+    for what, found, asked in (
+        ("scenario.", vars(manifest.job.scenario), vars(job.scenario)),
+        ("the version of ", manifest.versions, versions),
+        ("", begun, vars(job)),
+    ):
+        name = difference(found, asked)
+        if name is not None:
             raise ValueError(
-                f"{out} holds another job, with {what}{name} = "
-                f"{short_repr(there.get(name))}, not {short_repr(wanted.get(name))}: "
+                f"{folder} holds another job, with {what}{name} = "
+                f"{short_repr(found.get(name))}, not {short_repr(asked.get(name))}: "
                 "choose another out"
             )
+    return replace(manifest, job=job)
 
 
-class _Bar:
-    """Count the steps that are done, and report them."""
+@dataclass
+class _Shards:
+    """The shards of a data set in its folder, which is claimed."""
 
-    def __init__(self, job: Job, progress: Progress | None) -> None:
-        self._steps = job.scenario.steps
-        self._total = job.episodes * self._steps
-        self._progress = progress
-        self._done = 0
+    folder: Path
+    staging: Path
+    manifest: Manifest
 
-    def advance(self, steps: int) -> None:
-        """Count steps that were driven."""
-        self._done += steps
-        if self._progress is not None:
-            self._progress(self._done, self._total)
+    def missing(self) -> list[range]:
+        """Return the episodes of each shard that is missing, damaged or not full."""
+        whole = {
+            range(shard.first_episode, shard.first_episode + shard.episodes)
+            for shard in self.manifest.shards
+            if is_whole(self.folder, shard)
+        }
+        return [block for block in self.manifest.job.shards if block not in whole]
 
-    def skip(self, episodes: int) -> None:
-        """Count episodes of earlier calls."""
-        self._done += episodes * self._steps
+    def keep(self, block: range, made: MadeShard) -> None:
+        """Move a shard to its place, and list it in the manifest.
+
+        What is there is set aside with a warning, if it is none of our own shards.
+        """
+        listed = {shard.first_episode: shard for shard in self.manifest.shards}
+        promised, entry = listed.get(block.start), made.entry
+        path = self.folder / entry.name
+        if promised and promised.episodes == entry.episodes and promised != entry:
+            raise OSError(
+                f"{path} was damaged, and generated again it differs from {MANIFEST}: "
+                "this machine does not make the same bits"
+            )
+        staged = fetched(made, self.staging)
+        if os.path.lexists(path):
+            own = [shard for shard in (promised, entry) if shard]
+            if path.is_symlink() or not any(is_whole(self.folder, s) for s in own):
+                set_aside(path, f"does not match its checksum in {MANIFEST}")
+            else:
+                remove(path)
+        staged.replace(path)
+        listed[block.start] = entry
+        in_order = tuple(listed[first] for first in sorted(listed))
+        self.manifest = replace(self.manifest, shards=in_order)
+        write_manifest(self.manifest, self.folder)
 
 
 class MadeShard(NamedTuple):
     """A shard in a staging folder, or its content."""
 
-    number: int
-    """Its place in the data set, from 0."""
     entry: ShardEntry
-    files: dict[str, bytes] | None
+    path: Path
+    files: dict[str, bytes] | None = None
     """Content of its files by their relative paths ("." for a shard that is one file);
-    None if the shard stands in the staging folder."""
+    None if the shard stands in the staging folder of the job."""
 
 
 @dataclass(frozen=True)
@@ -280,15 +268,15 @@ class ShardWork:
     versions: dict[str, str]
     staging: Path
 
-    def make(
-        self, number: int, progress: Callable[[int], object] | None = None
+    def __call__(
+        self, episodes: range, progress: Callable[[int], object] | None
     ) -> MadeShard:
         """Drive and write the episodes of a shard.
 
         Parameters
         ----------
-        number : int
-            Which shard, from 0.
+        episodes : range
+            The shard's.
         progress : callable, optional
             Called with the number of steps just done, in all episodes together.
 
@@ -303,69 +291,66 @@ class ShardWork:
                 f"a worker has the versions {here}, the data set {self.versions}: both "
                 "must be equal, for equal bytes"
             )
-        if self.staging.is_dir():
-            return MadeShard(number, self._write(number, self.staging, progress), None)
+        if self.staging.is_dir():  # another worker may have begun this shard
+            place = Path(tempfile.mkdtemp(dir=self.staging))
+            return self._write(episodes, place, progress)
         with tempfile.TemporaryDirectory() as folder:
-            entry = self._write(number, Path(folder), progress)
-            return MadeShard(number, entry, _content(_place(Path(folder), entry)))
-
-    def fetch(self, made: MadeShard) -> Path:
-        """Return the path of a made shard in the staging folder."""
-        path = _place(self.staging, made.entry)
-        if made.files is not None:
-            for name, content in made.files.items():
-                file = path / name
-                file.parent.mkdir(parents=True, exist_ok=True)
-                file.write_bytes(content)
-        return path
+            made = self._write(episodes, Path(folder), progress)
+            files = [made.path] if made.path.is_file() else made.path.rglob("*")
+            content = {
+                file.relative_to(made.path).as_posix(): file.read_bytes()
+                for file in files
+                if file.is_file()
+            }
+            return made._replace(files=content)
 
     def _write(
-        self, number: int, staging: Path, progress: Callable[[int], object] | None
-    ) -> ShardEntry:
+        self,
+        episodes: range,
+        folder: Path,
+        progress: Callable[[int], object] | None,
+    ) -> MadeShard:
         # The process that engages workers never loads the simulator.
-        from .driven_episodes import drive_episodes  # noqa: PLC0415
+        from .driven_episodes import drive_episodes, with_beliefs  # noqa: PLC0415
 
         job, layout = self.job, trajectory_format(self.job.format)
-        episodes = job.episodes_of(number)
-        name = f"shard_{number:05d}{layout.ENDING}"
         seeds = [job.seed + episode for episode in episodes]
         trajectories = drive_episodes(
             job.scenario, job.controller, seeds, progress=progress
         )
         if job.estimator is not None:
-            from .driven_episodes import with_beliefs  # noqa: PLC0415
-
             name_of = job.estimator
             trajectories = [with_beliefs(each, name_of) for each in trajectories]
-        partial = staging / str(episodes.start) / name
-        partial.parent.mkdir()
+        number = episodes.start // job.episodes_per_shard
+        path = folder / f"shard_{number:05d}{layout.ENDING}"
         options = {name: getattr(job, name) for name in layout.OPTIONS}
-        layout.write(trajectories, partial, **options)
-        return ShardEntry(name, episodes.start, len(episodes), checksum(partial))
+        layout.write(trajectories, path, **options)
+        count = len(episodes)
+        entry = ShardEntry(path.name, episodes.start, count, checksum(path))
+        return MadeShard(entry, path)
+
+
+def fetched(made: MadeShard, staging: Path) -> Path:
+    """Return the path of a shard in the staging folder, where its files are put."""
+    if made.files is None:
+        return made.path
+    path = staging / made.entry.name
+    for name, content in made.files.items():
+        file = path / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(content)
+    return path
 
 
 def versions_of(job: Job) -> dict[str, str]:
     """Return the versions that determine the bits of a job on this machine."""
     kernels = () if job.estimator is None else ("numba",)
-    return versions_now((*trajectory_format(job.format).LIBRARIES, *kernels))
-
-
-def make_shard(work: ShardWork, number: int) -> MadeShard:
-    """Make a shard in a worker, on one thread."""
-    with one_blas_thread():
-        return work.make(number)
-
-
-def _place(staging: Path, entry: ShardEntry) -> Path:
-    return staging / str(entry.first_episode) / entry.name
-
-
-def _content(shard: Path) -> dict[str, bytes]:
-    files = [shard] if shard.is_file() else shard.rglob("*")
+    packages = ("numpy", *trajectory_format(job.format).LIBRARIES, *kernels)
     return {
-        file.relative_to(shard).as_posix(): file.read_bytes()
-        for file in files
-        if file.is_file()
+        "slamgym": __version__,
+        "python": ".".join(platform.python_version_tuple()[:2]),
+        "machine": platform.machine(),
+        **{name: metadata.version(name) for name in packages},
     }
 
 

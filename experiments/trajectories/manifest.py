@@ -6,30 +6,21 @@ every shard with its SHA-256. It holds no date and no path: the same job gives t
 bytes.
 """
 
-import contextlib
 import hashlib
 import json
-import os
-import platform
-import re
-import secrets
-import shutil
-import time
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
-from importlib import metadata
+from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
 
-from ... import __version__
 from ...sim_configs import Scenario
 from ...sim_configs.atomic_file import replace_when_written
 from ...sim_configs.scenario_files import scenario_text
 from ...suggestions import closest
+from ..jobs import blocks_of, sha256_of
 from ..runs.filter_settings import integer
-from ..runs.own_files import files_below, locked_folder, set_aside
 from .formats import trajectory_format
 from .trajectory import Trajectory, scenario_from_text
 
@@ -71,26 +62,9 @@ class Job:
     estimator: str | None = None
 
     @property
-    def shards(self) -> int:
-        """Number of shards."""
-        return -(-self.episodes // self.episodes_per_shard)
-
-    def shard_of(self, episode: int) -> int:
-        """Return the number of the shard of an episode."""
-        return episode // self.episodes_per_shard
-
-    def episodes_of(self, shard: int) -> range:
-        """Return the numbers of the episodes of a shard.
-
-        Examples
-        --------
-        >>> from slamgym.sim_configs import load_scenario
-        >>> scenario = load_scenario("loop")
-        >>> Job(scenario, "random", 0, 120, 50, "npz").episodes_of(2)
-        range(100, 120)
-        """
-        first = shard * self.episodes_per_shard
-        return range(first, min(first + self.episodes_per_shard, self.episodes))
+    def shards(self) -> list[range]:
+        """The episodes of every shard."""
+        return blocks_of(range(self.episodes), self.episodes_per_shard)
 
 
 @dataclass(frozen=True)
@@ -136,26 +110,6 @@ class Manifest:
         """Whether all episodes are written."""
         return sum(shard.episodes for shard in self.shards) == self.job.episodes
 
-    def with_shards(self, shards: Iterable[ShardEntry]) -> "Manifest":
-        """Return the manifest with other shards."""
-        return replace(self, shards=tuple(shards))
-
-
-def versions_now(libraries: Iterable[str] = ()) -> dict[str, str]:
-    """Return the versions that determine the bits on this machine.
-
-    Parameters
-    ----------
-    libraries : iterable of str
-        Packages besides numpy.
-    """
-    return {
-        "slamgym": __version__,
-        "python": ".".join(platform.python_version_tuple()[:2]),
-        "machine": platform.machine(),
-        **{name: metadata.version(name) for name in ("numpy", *libraries)},
-    }
-
 
 def write_manifest(manifest: Manifest, folder: Path) -> None:
     """Write a manifest, which appears complete or not at all."""
@@ -197,37 +151,31 @@ def _manifest(table: dict[str, Any]) -> Manifest:
     for name in (shard["name"] for shard in table["shards"]):
         if name in ("", "..") or Path(name).name != name:
             raise ValueError(f"a shard must be named without a folder, got {name!r}")
+    job, shards = table["job"], table["shards"]
+    texts = ["scenario", "controller", "format"]
+    if job.get("estimator") is not None:
+        texts.append("estimator")
+    job = _checked(job, texts, seed=0, episodes=1, episodes_per_shard=1)
+    shards = [
+        _checked(each, ["sha256"], first_episode=0, episodes=0) for each in shards
+    ]
     return Manifest(
-        job=_job(table["job"]),
+        job=Job(**{**job, "scenario": scenario_from_text(job["scenario"])}),
         versions=dict(table["versions"]),
-        shards=tuple(_shard(shard) for shard in table["shards"]),
+        shards=tuple(ShardEntry(**each) for each in shards),
     )
 
 
-def _job(table: dict[str, Any]) -> Job:
-    scenario = scenario_from_text(_text(table, "scenario"))
-    job = Job(**{**table, "scenario": scenario})
-    for name, least in {"seed": 0, "episodes": 1, "episodes_per_shard": 1}.items():
-        integer(name, getattr(job, name), least)
-    _text(table, "controller")
-    _text(table, "format")
-    if job.estimator is not None:
-        _text(table, "estimator")
-    return job
-
-
-def _shard(table: dict[str, Any]) -> ShardEntry:
-    _text(table, "sha256")
-    entry = ShardEntry(**table)
-    integer("first_episode", entry.first_episode, 0)
-    integer("episodes", entry.episodes, 0)
-    return entry
-
-
-def _text(table: dict[str, Any], name: str) -> str:
-    if not isinstance(table[name], str):
-        raise ValueError(f"{name} must be text, got {table[name]!r}")
-    return str(table[name])
+def _checked(
+    table: dict[str, Any], texts: Iterable[str], **least: int
+) -> dict[str, Any]:
+    """Return a table with some texts, and with some integers of a least value."""
+    for name in texts:
+        if not isinstance(table[name], str):
+            raise ValueError(f"{name} must be text, got {table[name]!r}")
+    for name, lowest in least.items():
+        integer(name, table[name], lowest)
+    return table
 
 
 def checksum(path: Path) -> str:
@@ -242,115 +190,12 @@ def checksum(path: Path) -> str:
         If there is no such shard.
     """
     if not path.is_dir():
-        return _file_checksum(path)
+        return sha256_of(path)
     names = (
         file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file()
     )
-    lines = [f"{_file_checksum(path / name)}  {name}\n" for name in sorted(names)]
+    lines = [f"{sha256_of(path / name)}  {name}\n" for name in sorted(names)]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
-
-
-def _file_checksum(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-# --------------------------------------------------------------------------------------
-# The folder of a data set while it is written: one writer, only complete shards.
-
-_WRITING = ".writing-"
-_ATTEMPTS, _BETWEEN = 20, 0.1  # [s]
-_LEFTOVERS = re.compile(r"\.writing-[0-9a-f]{8}|\.manifest\.[0-9a-f]{8}\.json")
-
-
-@contextlib.contextmanager
-def claimed(folder: Path) -> Iterator[None]:
-    """Make a folder if it does not exist, and lock it during the block.
-
-    Files that a killed writer left half written are removed.
-
-    Raises
-    ------
-    ValueError
-        If the folder is a file, or holds something other than a data set, or another
-        process writes to it.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"out must be a folder, got the file {folder}")
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked_folder(folder):
-        leftovers = [e for e in folder.iterdir() if _LEFTOVERS.fullmatch(e.name)]
-        names = (Path(name).parts[0] for name in files_below(folder))
-        foreign = next((name for name in names if not _LEFTOVERS.fullmatch(name)), None)
-        if foreign and not (folder / MANIFEST).exists():
-            raise ValueError(
-                f"out must be a new or empty folder, or hold a {MANIFEST}: "
-                f"{folder} holds {foreign}"
-            )
-        for leftover in leftovers:
-            _remove(leftover)
-        yield
-
-
-@contextlib.contextmanager
-def staging_folder(folder: Path) -> Iterator[Path]:
-    """Provide an absolute folder inside `folder`, and remove it after the block.
-
-    Shards are written there, and `put_in_place` moves them.
-    """
-    staging = folder.resolve() / f"{_WRITING}{secrets.token_hex(4)}"
-    staging.mkdir()
-    try:
-        yield staging
-    finally:
-        _remove(staging)
-
-
-@contextlib.contextmanager
-def naming(folder: Path) -> Iterator[None]:
-    """Name the folder in errors of the system, such as a full disk.
-
-    Raises
-    ------
-    OSError
-        In place of an error of the system.
-    """
-    try:
-        yield
-    except OSError as error:
-        if error.strerror is None:
-            raise
-        raise OSError(
-            f"{folder} cannot be written: {error.strerror}; whole shards stay there, "
-            "and the same command continues"
-        ) from error
-
-
-def put_in_place(staged: Path, folder: Path, own: set[ShardEntry | None]) -> None:
-    """Move a complete shard, a file or a folder, and replace the shard that is there.
-
-    What is there is set aside with a warning, if it is none of our own shards.
-    """
-    path = folder / staged.name
-    if os.path.lexists(path):
-        if path.is_symlink() or not any(is_whole(folder, each) for each in own if each):
-            set_aside(path, f"does not match its checksum in {MANIFEST}")
-        else:
-            _remove(path)
-    staged.replace(path)
-
-
-def _remove(path: Path) -> None:
-    """Remove a file or a folder, to which a worker that is ending may still write."""
-    if path.is_symlink() or not path.is_dir():
-        path.unlink(missing_ok=True)
-        return
-    for _ in range(_ATTEMPTS):
-        shutil.rmtree(path, ignore_errors=True)
-        if not path.exists():
-            return
-        time.sleep(_BETWEEN)
-    shutil.rmtree(path)
 
 
 # --------------------------------------------------------------------------------------
@@ -391,15 +236,13 @@ class TrajectoryDataset:
         return sum(shard.episodes for shard in self.manifest.shards)
 
     def __iter__(self) -> Iterator[Trajectory]:
-        for shard in self.manifest.shards:
+        for number in range(len(self.manifest.shards)):
             try:
-                self._check(shard)
+                yield from self.shard(number)
             except DamagedShardError as error:
                 if not self._skips:
                     raise
                 warnings.warn(f"{error}: left out", stacklevel=2)
-                continue
-            yield from self._format.read(self.folder / shard.name)
 
     def shard(self, number: int) -> Iterator[Trajectory]:
         """Yield the trajectories of one shard.
@@ -415,7 +258,12 @@ class TrajectoryDataset:
             If the shard is damaged, even where iteration skips such shards.
         """
         shard = self.manifest.shards[number]
-        self._check(shard)
+        if not is_whole(self.folder, shard):
+            last = shard.first_episode + shard.episodes - 1
+            raise DamagedShardError(
+                f"{self.folder / shard.name} does not match its checksum (episodes "
+                f"{shard.first_episode} to {last})"
+            )
         yield from self._format.read(self.folder / shard.name)
 
     def damaged_shards(self) -> list[str]:
@@ -425,14 +273,6 @@ class TrajectoryDataset:
             for shard in self.manifest.shards
             if not is_whole(self.folder, shard)
         ]
-
-    def _check(self, shard: ShardEntry) -> None:
-        if not is_whole(self.folder, shard):
-            last = shard.first_episode + shard.episodes - 1
-            raise DamagedShardError(
-                f"{self.folder / shard.name} does not match its checksum (episodes "
-                f"{shard.first_episode} to {last})"
-            )
 
 
 def load_trajectories(

@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -81,26 +81,10 @@ class Trajectory:
         return len(self.odometry)
 
 
-ARRAYS = (
-    "start_estimate",
-    "odometry",
-    "poses",
-    "landmarks",
-    "actions",
-    "measurements",
-    "mask",
-    "collisions",
-    "landmark_ids",
-)
+_NAMES = tuple(field.name for field in fields(Trajectory))
+ARRAYS = _NAMES[_NAMES.index("start_estimate") : _NAMES.index("belief_poses")]
 """The names of the arrays of a drive."""
-
-BELIEFS = (
-    "belief_poses",
-    "belief_pose_covariances",
-    "belief_landmarks",
-    "belief_landmark_covariances",
-    "belief_landmark_ids",
-)
+BELIEFS = _NAMES[_NAMES.index("belief_poses") :]
 """The names of the arrays of what a filter believes during it."""
 
 

@@ -48,7 +48,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
     "experiments": """
         logs
         runs
-        figures
+        figures jobs
         viewers
         monte_carlo
         noise_study noise_fitting

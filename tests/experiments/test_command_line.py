@@ -18,8 +18,8 @@ from slamgym.experiments.command_line import program as errors
 from slamgym.experiments.command_line import reporter, run_files, tables
 from slamgym.experiments.command_line import run_files as warm_up
 from slamgym.experiments.command_line.app import main
+from slamgym.experiments.jobs import MANIFEST
 from slamgym.experiments.runs.filter_settings import estimator_choices
-from slamgym.experiments.runs.own_files import MANIFEST
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
 

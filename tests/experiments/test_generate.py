@@ -24,11 +24,10 @@ from slamgym.experiments.command_line import reporter
 from slamgym.experiments.command_line.generate import generate as generate_command
 from slamgym.experiments.command_line.options import recorded
 from slamgym.experiments.command_line.program import InterruptedRunError
+from slamgym.experiments.jobs import claimed
 from slamgym.experiments.logs.slamlog import write_slamlog
 from slamgym.experiments.trajectories import driven_episodes, generate
-from slamgym.experiments.trajectories import formats as npz
 from slamgym.experiments.trajectories import generate as shard_work
-from slamgym.experiments.trajectories import manifest as shard_folder
 from slamgym.experiments.trajectories.driven_episodes import drive_episodes
 from slamgym.experiments.trajectories.formats import (
     FORMATS,
@@ -37,14 +36,15 @@ from slamgym.experiments.trajectories.formats import (
 )
 from slamgym.experiments.trajectories.generate import (
     default_episodes_per_shard,
+    fetched,
     generate_trajectories,
+    versions_of,
 )
 from slamgym.experiments.trajectories.manifest import (
     DamagedShardError,
     checksum,
     load_trajectories,
     read_manifest,
-    versions_now,
 )
 from slamgym.sim_configs import load_scenario
 
@@ -199,11 +199,12 @@ def test_workers_make_the_bytes_of_one_process_in_every_format(tmp_path):
 def test_a_worker_that_does_not_see_the_folder_sends_its_files(tmp_path):
     for name in ("npz", "slamlog"):
         job = small(tmp_path / name, format=name).job
-        work = shard_work.ShardWork(job, versions_now(), tmp_path / f"{name} staging")
-        made = work.make(1)
+        staging = tmp_path / f"{name} staging"
+        work = shard_work.ShardWork(job, versions_of(job), staging)
+        made = work(range(3, 6), None)
         assert made.files
-        work.staging.mkdir()
-        staged = work.fetch(pickle.loads(pickle.dumps(made)))
+        staging.mkdir()
+        staged = fetched(pickle.loads(pickle.dumps(made)), staging)
         assert checksum(staged) == made.entry.sha256
         assert made.entry == read_manifest(tmp_path / name).shards[1]
 
@@ -212,7 +213,18 @@ def test_a_worker_with_other_versions_refuses_to_work(tmp_path):
     job = small(tmp_path / "out").job
     work = shard_work.ShardWork(job, {"numpy": "1.0.0"}, tmp_path)
     with pytest.raises(ValueError, match=r"both must be equal, for equal bytes"):
-        work.make(0)
+        work(range(3), None)
+
+
+def test_a_shard_that_a_lost_worker_began_is_made_by_another(tmp_path):
+    for name in ("npz", "slamlog"):
+        manifest = small(tmp_path / name, format=name)
+        job, staging = manifest.job, tmp_path / f"{name} staging"
+        staging.mkdir()
+        work = shard_work.ShardWork(job, versions_of(job), staging)
+        lost, made = work(range(3, 6), None), work(range(3, 6), None)
+        assert lost.path != made.path
+        assert made.entry == manifest.shards[1]
 
 
 @pytest.mark.parametrize("workers", [{"jobs": 0}, {"backend": "dusk"}, {"jobs": -2}])
@@ -326,6 +338,8 @@ def test_whole_shards_are_not_driven_again(tmp_path, monkeypatch):
 def test_an_error_while_writing_leaves_whole_shards_and_no_rests(tmp_path, monkeypatch):
     written = []
 
+    npz = FORMATS["npz"]
+
     def write_two(trajectories, path, write=npz.write):
         path.write_text("half")
         if len(written) == 2:
@@ -334,7 +348,7 @@ def test_an_error_while_writing_leaves_whole_shards_and_no_rests(tmp_path, monke
         write(trajectories, path)
 
     with monkeypatch.context() as patch:
-        patch.setattr(npz, "write", write_two)
+        patch.setitem(FORMATS, "npz", npz._replace(write=write_two))
         with pytest.raises(OSError, match="disk full"):
             small(tmp_path / "out")
     names = sorted(entry.name for entry in (tmp_path / "out").iterdir())
@@ -513,7 +527,7 @@ def test_a_job_that_failed_before_its_first_shard_does_not_stand_in_the_way(tmp_
 @pytest.mark.skipif(os.name == "nt", reason="folders are not locked on Windows")
 def test_a_second_writer_is_refused(tmp_path):
     with (
-        shard_folder.claimed(tmp_path / "out"),
+        claimed(tmp_path / "out"),
         pytest.raises(ValueError, match="another process is writing to"),
     ):
         small(tmp_path / "out")

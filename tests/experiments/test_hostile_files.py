@@ -16,14 +16,18 @@ import pytest
 
 from slamgym.envs.rendering.scene import _title
 from slamgym.estimator import make_estimator
-from slamgym.experiments.command_line.output_folder import output_folder, write_summary
+from slamgym.experiments.command_line.output_folder import (
+    STAGING,
+    output_folder,
+    write_summary,
+)
 from slamgym.experiments.command_line.program import BadInputError
 from slamgym.experiments.figures.style import new_figure
+from slamgym.experiments.jobs import MANIFEST as OWN_FILES
+from slamgym.experiments.jobs import files_below
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.importers.utias import read_utias
 from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.runs.own_files import MANIFEST as OWN_FILES
-from slamgym.experiments.runs.own_files import files_below
 from slamgym.experiments.trajectories import generate_trajectories
 from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
 from slamgym.sim_configs import load_scenario
@@ -204,7 +208,7 @@ def test_a_folder_that_cannot_be_replaced_is_put_back(error, tmp_path, monkeypat
             write_summary(folder, {})
 
     def refuse(source, target):
-        if source.suffix == ".partial":
+        if source.parent.name == STAGING and target.parent == out:
             raise error
         return replace(source, target)
 

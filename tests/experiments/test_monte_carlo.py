@@ -655,6 +655,17 @@ def test_a_folder_of_another_job_is_refused_untouched(tmp_path):
         monte_carlo("six_landmarks", "ekf", 2, out=tmp_path / "mine")
 
 
+def test_a_folder_of_another_resolution_is_refused_untouched(tmp_path):
+    job = {"estimators": "ekf", "runs": 2, "out": tmp_path}
+    monte_carlo("six_landmarks", **job, resolution=0.5).close()
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    with pytest.raises(
+        ValueError, match=r"resolution 0\.5, not of resolution 0\.0: ch"
+    ):
+        monte_carlo("six_landmarks", **job)
+    assert before == {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
+
+
 def test_options_may_be_words():
     (choice,) = estimator_choices("ekf[landmark_init=independent,noise_at_rest=false]")
     assert choice.options == {"landmark_init": "independent", "noise_at_rest": False}
