@@ -1,6 +1,6 @@
 """The program ``slamgym`` with all its commands.
 
-Each command is a function in a module of its own. Its parameters are its options, and
+Each command is a function in a module of its own, which takes options by name, and
 it imports what is heavy when it runs, so that help answers at once.
 """
 
@@ -12,12 +12,13 @@ from . import (
     generate,
     monte_carlo,
     noise_study,
-    options,
     render_video,
     replay,
     run,
 )
+from .options import Options, takes
 from .program import command, main
+from .reporter import Reporter
 
 __all__ = [
     "fit_noise",
@@ -36,7 +37,8 @@ __all__ = [
 
 
 @command
-def scenarios(as_json: options.AsJson = False) -> None:
+@takes("as_json")
+def scenarios(*, given: Options) -> None:
     """List the scenarios.
 
     List the scenarios that come with slamgym. Use their names in other commands.
@@ -58,11 +60,12 @@ def scenarios(as_json: options.AsJson = False) -> None:
         }
         for name, scenario in each
     ]
-    _show("scenarios", rows, as_json=as_json)
+    _show("scenarios", rows, given.reporter())
 
 
 @command
-def estimators(as_json: options.AsJson = False) -> None:
+@takes("as_json")
+def estimators(*, given: Options) -> None:
     """List the filters.
 
     List the filters of slamgym, and those of other libraries, which you install with
@@ -84,7 +87,7 @@ def estimators(as_json: options.AsJson = False) -> None:
         _entry(peer.name, peer.library, peer.description, installed=peer.installed)
         for peer in list_peers()
     ]
-    _show("estimators", rows, as_json=as_json)
+    _show("estimators", rows, given.reporter())
 
 
 def _entry(
@@ -98,12 +101,9 @@ def _entry(
     }
 
 
-def _show(what: str, rows: list[dict[str, Any]], *, as_json: bool) -> None:
+def _show(what: str, rows: list[dict[str, Any]], reporter: Reporter) -> None:
     from rich.table import Table
 
-    from .reporter import Reporter
-
-    reporter = Reporter(as_json=as_json)
     table = Table(box=None, pad_edge=False)
     for key in rows[0]:
         numeric = type(rows[0][key]) is int

@@ -18,6 +18,7 @@ from ..runs.summary import summarise
 from ..runs.trace import RunTrace
 from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
 from ..viewers.rerun_recording import import_rerun
+from .options import Options
 from .output_folder import write_summary
 from .program import BadInputError
 from .reporter import Reporter
@@ -60,12 +61,9 @@ def filter_and_write(
     log: SlamLog,
     filters: Mapping[str, FilterSettings],
     folder: Path,
-    every_step: bool | None,
+    given: Options,
     reporter: Reporter,
-    *,
-    resolution: float = 0.0,
     walls: Sequence[Sequence[float]] = (),
-    rerun: Path | None = None,
 ) -> dict[str, Any]:
     """Filter a log, and write figures, run.html, log.csv and summary.json.
 
@@ -80,22 +78,19 @@ def filter_and_write(
         The filters, at least one.
     folder : Path
         The folder to write to.
-    every_step : bool or None
-        Whether to draw the map after every step; None: if there are few steps.
+    given : Options
+        ``every_step``, ``resolution`` and ``rerun``.
     reporter : Reporter
         Shows the progress.
-    resolution : float
-        True landmarks nearer to each other count as one in scores of association [m].
     walls : sequence of (x0, y0, x1, y1)
         Walls to draw on the page [m].
-    rerun : Path, optional
-        Where to write a recording for rerun.
 
     Returns
     -------
     dict
         The summary that was written; ``others`` holds those of the further filters.
     """
+    every_step = given.every_step
     if every_step is None:
         every_step = sum(1 for _ in steps_of(log)) <= _FEW_STEPS + 1
     runs, frames = [], []
@@ -108,11 +103,11 @@ def filter_and_write(
         ViewedRun(run.trace, kept) for run, kept in zip(runs, frames, strict=True)
     ]
     write_run_page(folder / "run.html", log, viewed, walls=walls)
-    if rerun is not None:
-        write_rerun(rerun, log, viewed, walls=walls)
+    if given.rerun is not None:
+        write_rerun(given.rerun, log, viewed, walls=walls)
     write_slamlog(runs[0].log, folder / "log.csv")
     summaries = [
-        summarise(run, settings, resolution=resolution)
+        summarise(run, settings, resolution=given.resolution)
         for run, settings in zip(runs, filters.values(), strict=True)
     ]
     return write_summary(folder, {**summaries[0], "others": summaries[1:]})
