@@ -3,19 +3,12 @@
 Each command is a function in a module of its own, which takes options by name, and
 it imports what is heavy when it runs, so that help answers at once.
 """
+# ruff: noqa: I001 (the order of the imports is the order of the commands in the help)
 
 import inspect
 from typing import Any
 
-from . import (
-    fit_noise,
-    generate,
-    monte_carlo,
-    noise_study,
-    render_video,
-    replay,
-    run,
-)
+from . import run, replay, fit_noise, monte_carlo, generate, noise_study, render_video
 from .options import Options, takes
 from .program import command, main
 from .reporter import Reporter

@@ -113,7 +113,7 @@ def noise_study(
     if not is_scenario:
         log = given.read(Path(source))
         note_choices(log, reporter)
-        stds: dict[str, Any] = given.stds()
+        stds = given.stds()
         settings = settings_for(log, estimator=estimator, options=chosen, **stds)
         study = one_run_study(
             log.name, estimator, settings, partial(study_log, log, settings)

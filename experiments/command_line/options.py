@@ -290,7 +290,7 @@ class Options:
             raise BadInputError(f"the log {path} does not fit into memory") from error
         return without_identities(log) if self.hide_identities else log
 
-    def stds(self) -> dict[str, tuple[float, ...]]:
+    def stds(self) -> dict[str, Any]:
         """Parse the standard deviations that the user gave.
 
         Examples

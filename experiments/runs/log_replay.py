@@ -150,7 +150,14 @@ def replay(
         for number, step in enumerate(steps):
             with _naming_time(log, step):
                 show_truth(number)
-                report = _take(step, log, estimator, recorder, decisions)
+                for row in step.motions:
+                    for odometry, dt in predictions(row, log.motion):
+                        estimator.predict(odometry, dt)
+                predicted, report = marginal_without_joining(estimator, ()), None
+                if step.scan is not None:
+                    report = estimator.update(step.scan.measurements, _ids(step.scan))
+                    decisions.add(report, true_ids_of(step.scan))
+                recorder.add(predicted, report)
             watch(number, estimator, report)
             progress(number + 1, len(steps))
     made = decisions.result() if hides_identities(log) else None
@@ -201,34 +208,9 @@ def _truth_source(
     landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
     if poses is None or not np.isfinite(poses).all():
         return _unwatched
-    if not _seen(log) <= landmarks.keys():
+    if not landmarks.keys() >= set(chain(*(_ids(scan) or () for scan in log.scans))):
         return _unwatched
     return lambda step: estimator.observe_truth(poses[step], landmarks)
-
-
-def _seen(log: SlamLog) -> set[int]:
-    """Return the ids of the landmarks that the log has readings of."""
-    scans = (event for event in log.events if isinstance(event, Scan))
-    return set(chain.from_iterable(_ids(scan) or () for scan in scans))
-
-
-def _take(
-    step: Step,
-    log: SlamLog,
-    estimator: SlamEstimator,
-    recorder: RunRecorder,
-    decisions: DecisionRecorder,
-) -> UpdateReport | None:
-    for row in step.motions:
-        for odometry, dt in predictions(row, log.motion):
-            estimator.predict(odometry, dt)
-    predicted = marginal_without_joining(estimator, ())
-    report = None
-    if step.scan is not None:
-        report = estimator.update(step.scan.measurements, _ids(step.scan))
-        decisions.add(report, true_ids_of(step.scan))
-    recorder.add(predicted, report)
-    return report
 
 
 @contextlib.contextmanager
