@@ -92,11 +92,7 @@ def study_log(
     list of NoiseRun
         The reference, then two runs for each of `SIGMAS`.
     """
-
-    def varied(variation: Variation) -> tuple[SlamLog, FilterSettings]:
-        return log, settings.scaled(*variation)
-
-    return _study(varied, progress)
+    return _study(lambda variation: (log, settings.scaled(*variation)), progress)
 
 
 def study_scenario(

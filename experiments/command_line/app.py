@@ -73,7 +73,7 @@ def estimators(*, given: Options) -> None:
     from ...estimator.registry import find_estimator, list_estimators
 
     rows = [
-        _entry(name, "slamgym", _first_line(find_estimator(name)), installed=True)
+        _entry(name, "slamgym", inspect.getdoc(find_estimator(name)), installed=True)
         for name in list_estimators()
     ]
     rows += [
@@ -84,13 +84,13 @@ def estimators(*, given: Options) -> None:
 
 
 def _entry(
-    name: str, library: str, description: str, *, installed: bool
+    name: str, library: str, description: str | None, *, installed: bool
 ) -> dict[str, Any]:
     return {
         "name": name,
         "library": library,
         "installed": installed,
-        "description": description,
+        "description": (description or "").partition("\n")[0],
     }
 
 
@@ -111,7 +111,3 @@ def _show(what: str, rows: list[dict[str, Any]], reporter: Reporter) -> None:
 
 def _cell(value: object) -> str:
     return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
-
-
-def _first_line(factory: object) -> str:
-    return (inspect.getdoc(factory) or "").partition("\n")[0]

@@ -1,18 +1,12 @@
 """``slamgym fit-noise``: the noise of a log, by maximum likelihood."""
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 from .. import figures, noise_fitting
-from ..logs.slamlog import SlamLog
-from ..runs.filter_settings import FilterSettings, noise_or_assumed, settings_for
+from ..runs.filter_settings import noise_or_assumed, settings_for
 from .options import LogFile, Options, note_choices, option, takes
 from .output_folder import default_folder, output_folder, write_summary
 from .program import command
-from .reporter import Reporter
-
-if TYPE_CHECKING:
-    from ..noise_fitting import NoiseFit
 
 
 @command
@@ -48,6 +42,7 @@ def fit_noise(
     slamgym fit-noise MRCLAM_Dataset6 --robot 3 --estimator ekf
     """
     from ..noise_fitting.fit import refuse_other_formats, write_noise
+    from .tables import advice, heading, noise_comparison_table, noise_table, written
 
     reporter = given.reporter()
     drive = given.read(log)
@@ -62,37 +57,23 @@ def fit_noise(
     )
     place = given.out or default_folder(drive.name, "noise")
     with output_folder(place) as folder:
-        result, summary = _fit_and_write(drive, settings, folder, reporter)
+        with (
+            reporter.progress("fitting") as tick,
+            reporter.note_if_compiling("the likelihood"),
+        ):
+            fit = noise_fitting.fit_noise(drive, settings, progress=tick)
+        with reporter.progress("replaying") as tick:
+            summary = noise_fitting.summarise_fit(fit, progress=tick)
+        innovations = noise_fitting.noise_fit_figure(fit)
+        figures.save_figure(innovations, folder / "innovations.png")
+        summary = write_summary(folder, summary)
     if write:
-        write_noise(log, result.suggested.settings)
-    _show(summary, place, reporter)
+        write_noise(log, fit.suggested.settings)
+    title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])
+    compared = noise_comparison_table(summary)
+    reporter.show(title, noise_table(summary), "", compared, "", advice(summary), "")
+    reporter.show_verbatim(summary["options"])
+    reporter.show("", written(str(place), summary["files"]))
     if write:
         reporter.show(f"Wrote the suggested noise into the header of {log}")
     reporter.finish({**summary, "out": str(place), "written": write})
-
-
-def _fit_and_write(
-    drive: SlamLog, settings: FilterSettings, folder: Path, reporter: Reporter
-) -> tuple["NoiseFit", dict[str, Any]]:
-    """Fit the noise, replay, and write innovations.png and summary.json."""
-    with (
-        reporter.progress("fitting") as tick,
-        reporter.note_if_compiling("the likelihood"),
-    ):
-        result = noise_fitting.fit_noise(drive, settings, progress=tick)
-    with reporter.progress("replaying") as tick:
-        summary = noise_fitting.summarise_fit(result, progress=tick)
-    innovations = noise_fitting.noise_fit_figure(result)
-    figures.save_figure(innovations, folder / "innovations.png")
-    return result, write_summary(folder, summary)
-
-
-def _show(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
-    from .tables import advice, heading, noise_table, written
-    from .tables import noise_comparison_table as comparison_table
-
-    title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])
-    reporter.show(title, noise_table(summary), "", comparison_table(summary), "")
-    reporter.show(advice(summary), "")
-    reporter.show_verbatim(summary["options"])
-    reporter.show("", written(str(place), summary["files"]))

@@ -22,7 +22,6 @@ from .options import (
 )
 from .output_folder import as_json_text, default_folder
 from .program import FAILURE, BadInputError, command, interruptible
-from .reporter import Reporter
 
 
 @command
@@ -101,9 +100,11 @@ def monte_carlo(
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
     from .. import monte_carlo
-    from ..monte_carlo.report import write_html_report
+    from ..monte_carlo.report import monte_carlo_table, write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
+    from ..monte_carlo.verdict import diagnosis_lines
     from ..runs.own_files import replace_own
+    from .tables import written
 
     world = given.scenario(scenario)
     assumed = changes("--assume", assume)
@@ -146,28 +147,18 @@ def monte_carlo(
             write_html_report(results, summary, partial)
         with replace_own(place / SUMMARY) as partial:
             partial.write_text(as_json_text(summary), encoding="utf-8")
-    _show(summary, place, reporter)
-    went_well = any(entry["good_runs"] for entry in summary["estimators"].values())
-    return 0 if went_well else FAILURE
-
-
-def _show(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
-    """Print the table, a sentence for each estimator, the notes, and the files."""
-    from ..monte_carlo.report import monte_carlo_table
-    from ..monte_carlo.verdict import diagnosis_lines
-    from .tables import written
-
     sentences = [
-        sentence
+        Text(sentence)
         for label, entry in summary["estimators"].items()
         for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
     ]
-    reporter.show(monte_carlo_table(summary), "")
-    for lines in (sentences, summary["notes"]):
-        if lines:
-            reporter.show(*map(Text, lines), "")
+    reporter.show(monte_carlo_table(summary), "", *sentences, "")
+    if summary["notes"]:
+        reporter.show(*map(Text, summary["notes"]), "")
     reporter.show(written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
+    went_well = any(entry["good_runs"] for entry in summary["estimators"].values())
+    return 0 if went_well else FAILURE
 
 
 def _compile(estimators: str, *, identities: bool) -> None:

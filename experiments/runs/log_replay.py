@@ -322,7 +322,7 @@ class RunRecorder:
         return RunTrace(
             estimator=name,
             t=times,
-            time_unit="steps" if _counts_steps(times) else "s",
+            time_unit="steps" if (times == np.arange(len(times))).all() else "s",
             frame=belief.frame,
             predicted_poses=self._predicted.poses,
             predicted_pose_covariances=self._predicted.covariances,
@@ -369,10 +369,6 @@ class _PoseTrack:
     def put(self, step: int, belief: Belief) -> None:
         self.poses[step] = belief.pose
         self.covariances[step] = belief.pose_covariance
-
-
-def _counts_steps(times: Array) -> bool:
-    return bool((times == np.arange(len(times))).all())
 
 
 class MapHistory(Sequence[MapEstimate]):
