@@ -94,8 +94,8 @@ def filter_and_write(
         every_step = sum(1 for _ in steps_of(log)) <= _FEW_STEPS + 1
     runs, viewed = [], []
     for label, settings in filters.items():
-        warm_up(settings, reporter)
         frames = RunFrames(log)
+        warm_up(settings, reporter)
         with reporter.progress("filtering") as tick:
             run = replay(
                 log,
@@ -171,13 +171,13 @@ def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
     title = heading("", summary["log"], " filtered by ", summary["estimator"])
     reporter.show(title, landmark_table(summary), "", key_figures(summary), "")
     if summary["others"]:
-        runs = {run["estimator"]: run for run in (summary, *summary["others"])}
-        reporter.show(comparison_table(runs), "")
+        runs = (summary, *summary["others"])
+        reporter.show(comparison_table({run["estimator"]: run for run in runs}), "")
     if summary["association"] is not None:
         reporter.show(association_table(summary["association"]), "")
     if summary["warnings"]:
-        lines = [Text(f"Warning: {text}", "yellow") for text in summary["warnings"]]
-        reporter.show(*lines, "")
+        warnings = (Text(f"Warning: {text}", "yellow") for text in summary["warnings"])
+        reporter.show(*warnings, "")
     reporter.show(written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
 

@@ -111,23 +111,7 @@ class RunTrace:
                 f"landmark_history must have {steps} entries, "
                 f"got {len(self.landmark_history)}"
             )
-        size = 3 + 2 * n
-        shapes = {
-            "t": (steps,),
-            "predicted_poses": (steps, 3),
-            "predicted_pose_covariances": (steps, 3, 3),
-            "poses": (steps, 3),
-            "pose_covariances": (steps, 3, 3),
-            "true_poses": (steps, 3),
-            "nis": (steps,),
-            "nis_dof": (steps,),
-            "landmarks": (n, 2),
-            "first_landmarks": (n, 2),
-            "first_landmark_covariances": (n, 2, 2),
-            "true_landmarks": (n, 2),
-            "final_covariance": (size, size),
-        }
-        for name, shape in shapes.items():
+        for name, shape in _shapes(steps, n).items():
             value = getattr(self, name)
             if value is not None and np.shape(value) != shape:
                 raise ValueError(
@@ -155,6 +139,25 @@ class RunTrace:
             ids = self.map_at(step).ids.tolist()
             first.update({i: step for i in ids if i in first})
         return np.array(list(first.values()), dtype=np.int64)
+
+
+def _shapes(steps: int, n: int) -> dict[str, tuple[int, ...]]:
+    size = 3 + 2 * n
+    return {
+        "t": (steps,),
+        "predicted_poses": (steps, 3),
+        "predicted_pose_covariances": (steps, 3, 3),
+        "poses": (steps, 3),
+        "pose_covariances": (steps, 3, 3),
+        "true_poses": (steps, 3),
+        "nis": (steps,),
+        "nis_dof": (steps,),
+        "landmarks": (n, 2),
+        "first_landmarks": (n, 2),
+        "first_landmark_covariances": (n, 2, 2),
+        "true_landmarks": (n, 2),
+        "final_covariance": (size, size),
+    }
 
 
 # --------------------------------------------------------------------------------------
