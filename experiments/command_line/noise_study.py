@@ -178,10 +178,11 @@ def one_run_study(
     """Prepare the study of a log or of one run of a scenario."""
     from ... import __version__
     from ..runs.summary import settings_table
-    from .run_files import warm_up
-    from .tables import heading, runs_table
 
     def run(reporter: Reporter) -> Results:
+        from .run_files import warm_up
+        from .tables import heading, runs_table
+
         warm_up(settings, reporter)
         with reporter.progress("filtering") as tick:
             runs = study(progress=tick)
