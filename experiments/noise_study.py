@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,13 +26,14 @@ from ..suggestions import closest
 from .figures.style import GREY, INK, dress, new_figure, write_title
 from .logs.ground_truth import path_accuracy
 from .logs.slamlog import SlamLog
-from .monte_carlo import monte_carlo
-from .monte_carlo.figures import log_ticks, look_of, plain
-from .monte_carlo.verdict import EstimatorScores, labels_of, scores_of
 from .runs.filter_settings import SIGMAS, FilterSettings, settings_for
 from .runs.log_replay import Replay, replay
 from .runs.summary import map_accuracy, nees_summary, nis_summary
 from .runs.trace import RunTrace, finite, mean, root_mean_square, standard_error
+
+if TYPE_CHECKING:
+    from .monte_carlo.figures import EstimatorLook
+    from .monte_carlo.verdict import EstimatorScores
 
 Progress = Callable[[int, int], object]
 
@@ -92,11 +93,7 @@ def study_log(
     list of NoiseRun
         The reference, then two runs for each of `SIGMAS`.
     """
-
-    def varied(variation: Variation) -> tuple[SlamLog, FilterSettings]:
-        return log, settings.scaled(*variation)
-
-    return _study(varied, progress)
+    return _study(lambda variation: (log, settings.scaled(*variation)), progress)
 
 
 def study_scenario(
@@ -264,6 +261,9 @@ def noise_effects(
     >>> len(effects), effects[1].sigma, effects[1].factor
     (11, 'σx', 10.0)
     """
+    from .monte_carlo import monte_carlo
+    from .monte_carlo.verdict import labels_of, scores_of
+
     world = load_scenario(scenario)
     jobs_to_do = [("nothing", REFERENCE, world, world), *_changes(world, changed)]
     effects: list[NoiseEffect] = []
@@ -392,12 +392,15 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
     effects : sequence of NoiseEffect
         Of `noise_effects`.
     """
+    from .monte_carlo.figures import log_ticks, look_of, plain
+
     places = list(dict.fromkeys(e.changed for e in effects if e.changed in _TITLES))
-    labels = list(dict.fromkeys(effect.estimator for effect in effects))
+    labels = dict.fromkeys(effect.estimator for effect in effects)
+    looks = {label: look_of(k) for k, label in enumerate(labels)}
     figure = new_figure(1.2 + 3.4 * len(places), 4.6)
     all_axes = figure.subplots(1, len(places), sharey=True, sharex=True, squeeze=False)
     for axes, place in zip(all_axes[0], places, strict=True):
-        _draw(axes, [e for e in effects if e.changed in (place, "nothing")], labels)
+        _draw(axes, [e for e in effects if e.changed in (place, "nothing")], looks)
         write_title(axes, *_TITLES[place])
         log_ticks(axes, "x")
     names = (str(REFERENCE), *SIGMAS)
@@ -407,8 +410,14 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
         "mean pose NEES / 3 ± standard error; 1 is expected",
         fontsize=10,
     )
+    keys = [
+        Line2D([], [], ls="", marker=look.marker, color=look.colour, label=plain(label))
+        for label, look in looks.items()
+    ]
+    for text, fill in (("σ × 10", INK), ("σ ÷ 10", "white")):
+        keys.append(Line2D([], [], ls="", marker="o", color=INK, mfc=fill, label=text))
     figure.legend(
-        handles=_keys(labels),
+        handles=keys,
         loc="outside upper left",
         ncols=len(labels) + 2,
         frameon=False,
@@ -417,12 +426,14 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
     return figure
 
 
-def _draw(axes: Axes, effects: Sequence[NoiseEffect], labels: list[str]) -> None:
+def _draw(
+    axes: Axes, effects: Sequence[NoiseEffect], looks: Mapping[str, EstimatorLook]
+) -> None:
     dress(axes)
     axes.axvline(1.0, color=GREY, lw=1.0, ls=(0, (4, 3)))
     rows = {sigma: row for row, sigma in enumerate((REFERENCE.sigma, *SIGMAS))}
     for effect in effects:
-        look = look_of(labels.index(effect.estimator))
+        look = looks[effect.estimator]
         shift = 0.0 if effect.factor == 1 else -_SHIFT if effect.factor > 1 else _SHIFT
         row, error = rows[effect.sigma] + shift, effect.nees_per_degree_error
         if math.isfinite(error):
@@ -437,14 +448,3 @@ def _draw(axes: Axes, effects: Sequence[NoiseEffect], labels: list[str]) -> None
             mfc=look.colour if effect.factor >= 1 else "white",
             mew=1.4,
         )
-
-
-def _keys(labels: list[str]) -> list[Line2D]:
-    """Return the keys of the legend."""
-    keys = [
-        Line2D([], [], ls="", marker=look.marker, color=look.colour, label=plain(label))
-        for label, look in ((label, look_of(k)) for k, label in enumerate(labels))
-    ]
-    for text, fill in (("σ × 10", INK), ("σ ÷ 10", "white")):
-        keys.append(Line2D([], [], ls="", marker="o", color=INK, mfc=fill, label=text))
-    return keys

@@ -1,23 +1,17 @@
 """The program ``slamgym`` with all its commands.
 
-Each command is a function in a module of its own. Its parameters are its options, and
+Each command is a function in a module of its own, which takes options by name, and
 it imports what is heavy when it runs, so that help answers at once.
 """
+# ruff: noqa: I001 (the order of the imports is the order of the commands in the help)
 
 import inspect
 from typing import Any
 
-from . import (
-    fit_noise,
-    generate,
-    monte_carlo,
-    noise_study,
-    options,
-    render_video,
-    replay,
-    run,
-)
+from . import run, replay, fit_noise, monte_carlo, generate, noise_study, render_video
+from .options import Options, takes
 from .program import command, main
+from .reporter import Reporter
 
 __all__ = [
     "fit_noise",
@@ -36,7 +30,8 @@ __all__ = [
 
 
 @command
-def scenarios(as_json: options.AsJson = False) -> None:
+@takes("as_json")
+def scenarios(*, given: Options) -> None:
     """List the scenarios.
 
     List the scenarios that come with slamgym. Use their names in other commands.
@@ -58,11 +53,12 @@ def scenarios(as_json: options.AsJson = False) -> None:
         }
         for name, scenario in each
     ]
-    _show("scenarios", rows, as_json=as_json)
+    _show("scenarios", rows, given.reporter())
 
 
 @command
-def estimators(as_json: options.AsJson = False) -> None:
+@takes("as_json")
+def estimators(*, given: Options) -> None:
     """List the filters.
 
     List the filters of slamgym, and those of other libraries, which you install with
@@ -77,33 +73,30 @@ def estimators(as_json: options.AsJson = False) -> None:
     from ...estimator.registry import find_estimator, list_estimators
 
     rows = [
-        _entry(name, "slamgym", _first_line(find_estimator(name)), installed=True)
+        _entry(name, "slamgym", inspect.getdoc(find_estimator(name)), installed=True)
         for name in list_estimators()
     ]
     rows += [
         _entry(peer.name, peer.library, peer.description, installed=peer.installed)
         for peer in list_peers()
     ]
-    _show("estimators", rows, as_json=as_json)
+    _show("estimators", rows, given.reporter())
 
 
 def _entry(
-    name: str, library: str, description: str, *, installed: bool
+    name: str, library: str, description: str | None, *, installed: bool
 ) -> dict[str, Any]:
     return {
         "name": name,
         "library": library,
         "installed": installed,
-        "description": description,
+        "description": (description or "").partition("\n")[0],
     }
 
 
-def _show(what: str, rows: list[dict[str, Any]], *, as_json: bool) -> None:
+def _show(what: str, rows: list[dict[str, Any]], reporter: Reporter) -> None:
     from rich.table import Table
 
-    from .reporter import Reporter
-
-    reporter = Reporter(as_json=as_json)
     table = Table(box=None, pad_edge=False)
     for key in rows[0]:
         numeric = type(rows[0][key]) is int
@@ -118,7 +111,3 @@ def _show(what: str, rows: list[dict[str, Any]], *, as_json: bool) -> None:
 
 def _cell(value: object) -> str:
     return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
-
-
-def _first_line(factory: object) -> str:
-    return (inspect.getdoc(factory) or "").partition("\n")[0]

@@ -3,7 +3,10 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from . import options
+from .. import trajectories
+from .monte_carlo import connected
+from .options import Options, ScenarioName, option, refuse_broken, takes
+from .output_folder import default_folder
 from .program import command, interruptible
 
 if TYPE_CHECKING:
@@ -11,18 +14,22 @@ if TYPE_CHECKING:
 
 
 @command
+@takes(
+    "episodes controller seed format_ shard smallest_std estimator jobs backend "
+    "scheduler steps set_ out as_json",
+    controller="waypoints",
+)
 def generate(
-    scenario: options.ScenarioName,
+    scenario: ScenarioName,
     *,
+    given: Options,
     episodes: Annotated[
         int,
-        options.option("N", "Number of episodes; episode i has seed SEED + i.", min=1),
+        option("N", "Number of episodes; episode i has seed SEED + i.", min=1),
     ],
-    controller: options.ControllerName = "waypoints",
-    seed: options.Seed = 0,
     format_: Annotated[
         str,
-        options.option(
+        option(
             "--format NAME",
             "npz, parquet and minari hold everything; slamlog, g2o and tum hold what "
             "their formats express.",
@@ -30,7 +37,7 @@ def generate(
     ] = "npz",
     shard: Annotated[
         int | None,
-        options.option(
+        option(
             "N",
             "Episodes in each file or folder of the data set.",
             "100, fewer if they are large",
@@ -39,7 +46,7 @@ def generate(
     ] = None,
     smallest_std: Annotated[
         float | None,
-        options.option(
+        option(
             "--smallest-std S",
             "Smallest standard deviation in files of g2o [m, rad].",
             "0.001",
@@ -47,28 +54,22 @@ def generate(
     ] = None,
     estimator: Annotated[
         str | None,
-        options.option(
+        option(
             "--estimator -e NAME",
             "A filter whose beliefs after every scan are written beside the truth "
             "(npz, parquet and minari).",
             "none",
         ),
     ] = None,
-    jobs: options.Jobs = None,
-    backend: options.Backend = None,
-    scheduler: options.Scheduler = None,
-    steps: options.Steps = None,
-    set_: options.ScenarioChanges = None,
     out: Annotated[
         Path | None,
-        options.option(
+        option(
             "DIR",
             "The folder to write: new, empty, or begun by the same command, which then "
             "continues, perhaps with more episodes.",
             "results/<name>-<controller>-<format>",
         ),
     ] = None,
-    as_json: options.AsJson = False,
 ) -> None:
     """Write a data set of trajectories.
 
@@ -85,36 +86,30 @@ def generate(
     slamgym generate hidden_identities --episodes 100 --estimator invariant
     slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]
     """
-    from ..trajectories import generate_trajectories
-    from .monte_carlo import connected
-    from .options import chosen_scenario, refuse_broken
-    from .output_folder import default_folder
-    from .reporter import Reporter
-
-    world = chosen_scenario(scenario, steps, set_)
+    world = given.scenario(scenario)
     if estimator is not None:
         refuse_broken(estimator)
-    place = out or default_folder(world.name, controller, format_)
-    reporter = Reporter(as_json=as_json)
+    place = out or default_folder(world.name, given.controller, format_)
+    reporter = given.reporter()
     stopped = f"interrupted; whole shards stay in {place}, the same command continues"
     with (
-        connected(backend, scheduler, jobs),
+        connected(given.backend, given.scheduler, given.jobs),
         reporter.warnings(),
         reporter.progress("driving", unit="steps") as tick,
         interruptible(stopped),
     ):
-        manifest = generate_trajectories(
+        manifest = trajectories.generate_trajectories(
             world,
             place,
             episodes=episodes,
-            controller=controller,
-            seed=seed,
+            controller=given.controller,
+            seed=given.seed,
             format=format_,
             episodes_per_shard=shard,
             smallest_std=smallest_std,
             estimator=estimator,
-            jobs=jobs,
-            backend=backend,
+            jobs=given.jobs,
+            backend=given.backend,
             progress=tick,
         )
     size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())

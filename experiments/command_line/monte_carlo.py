@@ -6,23 +6,36 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
-from . import options
-from .options import changes
+from rich.text import Text
+
+from ...sim_configs import load_scenario
+from .options import (
+    REPEATED,
+    Options,
+    ScenarioName,
+    changes,
+    option,
+    refuse_broken,
+    takes,
+)
+from .output_folder import as_json_text, default_folder
 from .program import FAILURE, BadInputError, command, interruptible
-
-if TYPE_CHECKING:
-    from .reporter import Reporter
 
 
 @command
+@takes(
+    "estimators runs seed steps set_ assume resolution jobs backend scheduler "
+    "block_size first_run merge fresh out as_json"
+)
 def monte_carlo(
-    scenario: options.ScenarioName,
+    scenario: ScenarioName,
     *,
+    given: Options,
     estimators: Annotated[
         str,
-        options.option(
+        option(
             "--estimators -e NAMES",
             'Filters separated by commas, such as "ekf,invariant[iterations=3]", or '
             'your own "module:Class"; options in brackets.',
@@ -30,54 +43,46 @@ def monte_carlo(
     ] = "ekf,invariant",
     runs: Annotated[
         int,
-        options.option(
+        option(
             "",
             "Number of runs. Run i is the world of seed SEED + i; jobs whose seeds are "
             "closer than this share worlds.",
         ),
     ] = 200,
-    seed: options.Seed = 0,
-    steps: options.Steps = None,
-    set_: options.ScenarioChanges = None,
     assume: Annotated[
         list[str] | None,
-        options.option(
+        option(
             "KEY=VALUE",
             "A change of the scenario that only the filters assume, such as "
-            f"motion.std=[0.1,0.1,0.1]. {options.REPEATED}",
+            f"motion.std=[0.1,0.1,0.1]. {REPEATED}",
         ),
     ] = None,
-    resolution: options.Resolution = 0.0,
-    jobs: options.Jobs = None,
-    backend: options.Backend = None,
-    scheduler: options.Scheduler = None,
     block_size: Annotated[
-        int, options.option("N", "Number of runs computed and written together.")
+        int, option("N", "Number of runs computed and written together.")
     ] = 64,
     first_run: Annotated[
         int,
-        options.option("N", "Omit the runs below N, a multiple of the block size."),
+        option("N", "Omit the runs below N, a multiple of the block size."),
     ] = 0,
     merge: Annotated[
         list[Path] | None,
-        options.option(
+        option(
             "DIR",
-            "Add the results of another machine for this job. " + options.REPEATED,
+            "Add the results of another machine for this job. " + REPEATED,
         ),
     ] = None,
     fresh: Annotated[
-        bool, options.option("--fresh", "Remove earlier results in the folder first.")
+        bool, option("--fresh", "Remove earlier results in the folder first.")
     ] = False,
     out: Annotated[
         Path | None,
-        options.option(
+        option(
             "DIR",
             "The folder to write. An interrupted job there continues, and more runs "
             "are added to existing ones.",
             "results/monte-carlo-<scenario>",
         ),
     ] = None,
-    as_json: options.AsJson = False,
 ) -> int:
     """Many runs: are the filters consistent?
 
@@ -96,15 +101,14 @@ def monte_carlo(
     """  # noqa: D400 (the list of commands shows the question)
     from .. import monte_carlo
     from ..jobs import replace_own
-    from ..monte_carlo.report import write_html_report
+    from ..monte_carlo.report import monte_carlo_table, write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
-    from .options import chosen_scenario, refuse_broken
-    from .output_folder import as_json_text, default_folder
-    from .reporter import Reporter
+    from ..monte_carlo.verdict import diagnosis_lines
+    from .tables import written
 
-    world = chosen_scenario(scenario, steps, set_)
+    world = given.scenario(scenario)
     assumed = changes("--assume", assume)
-    reporter = Reporter(as_json=as_json)
+    reporter = given.reporter()
     refuse_broken(estimators)
     place = out or default_folder("monte-carlo", world.name)
     told = world.with_changes(**assumed) if assumed else world
@@ -113,7 +117,7 @@ def monte_carlo(
     if merge:
         monte_carlo.merge_blocks(merge, place)
     with (
-        connected(backend, scheduler, jobs),
+        connected(given.backend, given.scheduler, given.jobs),
         reporter.warnings(),
         reporter.progress("running", unit="runs") as tick,
         interruptible(
@@ -124,15 +128,15 @@ def monte_carlo(
             world,
             estimators,
             runs,
-            seed,
+            given.seed,
             assumed=told,
             out=place,
-            jobs=jobs,
-            backend=backend,
+            jobs=given.jobs,
+            backend=given.backend,
             block_size=block_size,
             first_run=first_run,
             fresh=fresh,
-            resolution=resolution,
+            resolution=given.resolution,
             command=shlex.join(["slamgym", *sys.argv[1:]]),
             progress=tick,
         ) as results,
@@ -143,35 +147,22 @@ def monte_carlo(
             write_html_report(results, summary, partial)
         with replace_own(place / SUMMARY) as partial:
             partial.write_text(as_json_text(summary), encoding="utf-8")
-    _show(summary, place, reporter)
+    sentences = [
+        Text(sentence)
+        for label, entry in summary["estimators"].items()
+        for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
+    ]
+    reporter.show(monte_carlo_table(summary), "", *sentences, "")
+    if summary["notes"]:
+        reporter.show(*map(Text, summary["notes"]), "")
+    reporter.show(written(str(place), summary["files"]))
+    reporter.finish({**summary, "out": str(place)})
     went_well = any(entry["good_runs"] for entry in summary["estimators"].values())
     return 0 if went_well else FAILURE
 
 
-def _show(summary: dict[str, Any], place: Path, reporter: "Reporter") -> None:
-    """Print the table, a sentence for each estimator, the notes, and the files."""
-    from rich.text import Text
-
-    from ..monte_carlo.report import monte_carlo_table
-    from ..monte_carlo.verdict import diagnosis_lines
-    from .tables import written
-
-    sentences = [
-        sentence
-        for label, entry in summary["estimators"].items()
-        for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
-    ]
-    reporter.show(monte_carlo_table(summary), "")
-    for lines in (sentences, summary["notes"]):
-        if lines:
-            reporter.show(*map(Text, lines), "")
-    reporter.show(written(str(place), summary["files"]))
-    reporter.finish({**summary, "out": str(place)})
-
-
 def _compile(estimators: str, *, identities: bool) -> None:
     """Run all estimators for some steps, which compiles their kernels."""
-    from ...sim_configs import load_scenario
     from ..monte_carlo import monte_carlo
 
     small = load_scenario("six_landmarks").with_changes(

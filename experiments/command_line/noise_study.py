@@ -10,18 +10,28 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from ...estimator.registry import split_labels
+from ...sim_configs import Scenario, list_presets
 from ...sim_configs.atomic_file import naming_file
-from . import options
-from .options import assignments, given_options, standard_deviations
+from ...suggestions import closest
+from .. import figures
+from ..runs.filter_settings import FilterSettings, settings_for, settings_for_scenario
+from .options import (
+    Options,
+    note_choices,
+    note_noise,
+    option,
+    refuse_broken,
+    takes,
+    with_options,
+)
+from .output_folder import default_folder, output_folder, write_summary
 from .program import BadInputError, command, way_to_set
+from .reporter import Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ...sim_configs import Scenario
     from ..noise_study import NoiseEffect, NoiseRow, NoiseRun
-    from ..runs.filter_settings import FilterSettings
-    from .reporter import Reporter
 
 _LOG, _SCENARIO = "a log", "a scenario"
 _ONE_RUN, _MANY_RUNS = "one run of a scenario", "a scenario with --runs above 1"
@@ -39,6 +49,12 @@ _ONLY_FOR = {
 
 
 @command
+@takes(
+    "estimator motion_std measurement_std initial_pose_std landmark_init "
+    "gate_probability range_std_per_metre noise_at_rest option_texts hide_identities "
+    "robot truth noise_from_file seed steps controller set_ runs change jobs out "
+    "as_json"
+)
 def noise_study(
     source: Annotated[
         str,
@@ -48,46 +64,26 @@ def noise_study(
     ],
     *,
     context: typer.Context,
+    given: Options,
     estimator: Annotated[
         str,
-        options.option(
+        option(
             "--estimator -e NAME",
             "A filter, as for replay; with --runs, several with commas between.",
         ),
     ] = "invariant",
-    motion_std: options.MotionStd = None,
-    measurement_std: options.MeasurementStd = None,
-    initial_pose_std: options.InitialPoseStd = None,
-    landmark_init: options.LandmarkInit = None,
-    gate_probability: options.GateProbability = None,
-    range_std_per_metre: options.RangeStdPerMetre = None,
-    noise_at_rest: options.NoiseAtRest = None,
-    option: options.EstimatorOptions = None,
-    hide_identities: options.HideIdentities = False,
-    robot: options.RobotNumber = None,
-    truth: options.TruthFile = None,
-    noise_from_file: options.NoiseFromFile = False,
-    seed: options.Seed = 0,
-    steps: options.Steps = None,
-    controller: options.ControllerName = "open_loop",
-    set_: options.ScenarioChanges = None,
     runs: Annotated[
         int,
-        options.option(
-            "", "For a scenario: with more than one, each change is a Monte Carlo."
-        ),
+        option("", "For a scenario: with more than one, each change is a Monte Carlo."),
     ] = 1,
     change: Annotated[
         str,
-        options.option(
+        option(
             "both|world|filter|all",
             "With --runs: whether noises change in world and filter, in the world "
             "alone, or in what the filter assumes.",
         ),
     ] = "all",
-    jobs: options.Jobs = None,
-    out: options.OutFolder = None,
-    as_json: options.AsJson = False,
 ) -> None:
     """Every noise times 10 and divided by 10.
 
@@ -107,66 +103,48 @@ def noise_study(
     slamgym noise-study six_landmarks --runs 100 -e ekf,invariant
     """
     from ..noise_study import study_log, study_scenario
-    from ..runs.filter_settings import settings_for, settings_for_scenario
-    from .options import (
-        chosen_controller,
-        chosen_scenario,
-        note_choices,
-        note_noise,
-        read_any_log,
-        recorded,
-        refuse_broken,
-        with_options,
-    )
-    from .reporter import Reporter
 
     is_scenario = _is_scenario(source)
     kinds = (_SCENARIO, _ONE_RUN if runs == 1 else _MANY_RUNS)
     _refuse_without_effect(context, *(kinds if is_scenario else (_LOG,)))
-    given = given_options(
-        landmark_init=landmark_init,
-        gate_probability=gate_probability,
-        range_std_per_metre=range_std_per_metre,
-        noise_at_rest=noise_at_rest,
-    )
-    chosen = given | assignments("--option", option)
+    named, chosen = given.named_options(), given.filter_options()
     refuse_broken(estimator, chosen)
-    reporter = Reporter(as_json=as_json)
+    reporter = given.reporter()
     if not is_scenario:
-        log = read_any_log(
-            Path(source),
-            robot,
-            truth=truth,
-            noise_from_file=noise_from_file,
-            hide_identities=hide_identities,
-        )
+        log = given.read(Path(source))
         note_choices(log, reporter)
-        stds: dict[str, Any] = standard_deviations(
-            motion_std, measurement_std, initial_pose_std
-        )
+        stds = given.stds()
         settings = settings_for(log, estimator=estimator, options=chosen, **stds)
         study = one_run_study(
             log.name, estimator, settings, partial(study_log, log, settings)
         )
-        write_study(study, out, reporter)
-        note_noise(log, settings, {*stds, *given}, reporter)
+        write_study(study, given.out, reporter)
+        note_noise(log, settings, {*stds, *named}, reporter)
         return
-    world = chosen_scenario(source, steps, set_)
+    world = given.scenario(source)
     if runs == 1:
         settings = settings_for_scenario(world, estimator=estimator, options=chosen)
-        chosen_controller(controller, world, seed)  # refuses a wrong name
-        record = partial(recorded, controller=controller, seed=seed)
+        given.driver(world)  # refuses a wrong name
         study = one_run_study(
             world.name,
             estimator,
             settings,
-            partial(study_scenario, world, record, estimator=estimator, options=chosen),
+            partial(
+                study_scenario,
+                world,
+                given.record,
+                estimator=estimator,
+                options=chosen,
+            ),
         )
     else:
-        texts = [f"{key}={value}" for key, value in given.items()] + (option or [])
+        texts = [f"{key}={value}" for key, value in named.items()]
+        texts += given.option_texts or []
         labels = [with_options(label, texts) for label in split_labels(estimator)]
-        study = effects_study(world, ",".join(labels), runs, seed, change, jobs)
-    write_study(study, out, reporter)
+        study = effects_study(
+            world, ",".join(labels), runs, given.seed, change, given.jobs
+        )
+    write_study(study, given.out, reporter)
 
 
 class Results(NamedTuple):
@@ -188,28 +166,30 @@ class Study(NamedTuple):
     """Of its folder, by default."""
     about: dict[str, Any]
     """The head of its summary."""
-    run: "Callable[[Reporter], Results]"
+    run: Callable[[Reporter], Results]
 
 
 def one_run_study(
     name: str,
     estimator: str,
-    settings: "FilterSettings",
+    settings: FilterSettings,
     study: "Callable[..., list[NoiseRun]]",
 ) -> Study:
     """Prepare the study of a log or of one run of a scenario."""
     from ... import __version__
-    from ..figures import noise_study_figure
     from ..runs.summary import settings_table
-    from .run_files import warm_up
-    from .tables import heading, runs_table
 
-    def run(reporter: "Reporter") -> Results:
+    def run(reporter: Reporter) -> Results:
+        from .run_files import warm_up
+        from .tables import heading, runs_table
+
         warm_up(settings, reporter)
         with reporter.progress("filtering") as tick:
             runs = study(progress=tick)
         with reporter.progress("drawing"):
-            figure = noise_study_figure([(run.title, run.trace) for run in runs])
+            figure = figures.noise_study_figure(
+                [(run.title, run.trace) for run in runs]
+            )
         title = heading("", name, ", noise study of ", estimator)
         rows, titles = [run.row for run in runs], [run.title for run in runs]
         return Results(rows, titles, figure, 130, (title, runs_table(runs)))
@@ -224,7 +204,7 @@ def one_run_study(
 
 
 def effects_study(
-    world: "Scenario",
+    world: Scenario,
     estimators: str,
     runs: int,
     seed: int,
@@ -242,7 +222,7 @@ def effects_study(
         )
     places = [place for place in CHANGED if change in ("all", place)]
 
-    def run(reporter: "Reporter") -> Results:
+    def run(reporter: Reporter) -> Results:
         with reporter.progress("running", unit="runs") as tick:
             effects = noise_effects(
                 world, estimators, runs, seed, changed=places, jobs=jobs, progress=tick
@@ -254,16 +234,14 @@ def effects_study(
     return Study((world.name, f"{runs}-runs"), about, run)
 
 
-def write_study(study: Study, out: Path | None, reporter: "Reporter") -> None:
+def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
     """Run a study, write its figure, table and summary, and print its results."""
-    from ..figures import save_figure
-    from .output_folder import default_folder, output_folder, write_summary
     from .tables import written
 
     place = out or default_folder("noise-study", *study.names)
     with output_folder(place) as folder:
         found = study.run(reporter)
-        save_figure(found.figure, folder / "noise_study.png", dpi=found.dpi)
+        figures.save_figure(found.figure, folder / "noise_study.png", dpi=found.dpi)
         _write_table(folder / "noise_study.csv", found.rows)
         rows = [_plain(row) for row in found.rows]
         if found.titles:
@@ -294,9 +272,6 @@ def _plain(row: "NoiseRow | NoiseEffect") -> dict[str, Any]:
 
 def _is_scenario(source: str) -> bool:
     """Whether a source is a scenario; refuse what is neither scenario nor log."""
-    from ...sim_configs import list_presets
-    from ...suggestions import closest
-
     if source in list_presets() or source.endswith(".toml"):
         return True
     if Path(source).exists():

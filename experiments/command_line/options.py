@@ -1,12 +1,16 @@
 """The arguments and options that several commands share, each with its help."""
 
+# ruff: noqa: RUF009 (what `_shared` returns is a field)
+
+import inspect
 import json
 import math
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass, field, fields
+from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import typer
@@ -22,6 +26,8 @@ from ..logs.slamlog import SlamLog
 from ..runs.filter_settings import FilterSettings, estimator_choices
 from .program import BadInputError, BrokenFilterError
 from .reporter import Reporter
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 REPEATED = "May be repeated."
 
@@ -52,6 +58,11 @@ def option(
     )
 
 
+def _shared(default: object, *described: Any, **limits: Any) -> Any:
+    """Declare an option of several commands by its default and as in `option`."""
+    return field(default=default, metadata={"option": option(*described, **limits)})
+
+
 ScenarioName = Annotated[
     str,
     typer.Argument(
@@ -61,222 +72,344 @@ ScenarioName = Annotated[
 LogFile = Annotated[
     Path, typer.Argument(metavar="LOG", help="A log of any format that replay reads.")
 ]
-EstimatorName = Annotated[
-    str,
-    option(
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """The options that commands share, as the user gave them; the others' defaults.
+
+    A command takes some of them, see :func:`takes`.
+    """
+
+    estimator: str = _shared(
+        "invariant",
         "--estimator -e NAME",
         'A filter (see: slamgym estimators), or your own "module:Class", with or '
         'without options, as in "invariant[iterations=3]".',
-    ),
-]
-EstimatorNames = Annotated[
-    str,
-    option(
+    )
+    labels: str = _shared(
+        "invariant",
         "--estimator -e NAMES",
         'Filters separated by commas, such as "ekf,invariant[iterations=3]", or your '
         'own "module:Class". run.html and comparison.png show all of them; the other '
         "files and numbers are those of the first.",
-    ),
-]
-EstimatorOptions = Annotated[
-    list[str] | None,
-    option(
+    )
+    option_texts: list[str] | None = _shared(
+        None,
         "--option KEY=VALUE",
         "An option of all filters, such as gate_probability=0.999; options in brackets "
         f"take precedence. {REPEATED}",
-    ),
-]
-ScenarioChanges = Annotated[
-    list[str] | None,
-    option(
-        "--set KEY=VALUE",
-        f"A change of the scenario, such as sensor.max_range=4. {REPEATED}",
-    ),
-]
-Seed = Annotated[int, option("", "Seed of all random numbers.", min=0)]
-Steps = Annotated[int | None, option("", "Steps to drive.", "those of the scenario")]
-ControllerName = Annotated[
-    str,
-    option(
-        "NAME",
-        "open_loop applies the scenario's controls, waypoints steers along their "
-        "nominal path, random drives at random.",
-    ),
-]
-TruthFile = Annotated[
-    Path | None,
-    option(
-        "FILE",
-        "A graph file with the true poses of an iSAM or g2o text, by their ids.",
-        "none",
-    ),
-]
-NoiseFromFile = Annotated[
-    bool,
-    option(
-        "--noise-from-file",
-        "Take the noise from the information matrices of an iSAM or g2o text.",
-    ),
-]
-OutFolder = Annotated[
-    Path | None,
-    option(
-        "DIR",
-        "The folder to write: new, empty, or with earlier output of slamgym, which is "
-        "replaced unless you changed it.",
-        "results/<name>-<estimator>",
-    ),
-]
-RerunFile = Annotated[
-    Path | None,
-    option(
-        "FILE",
-        "Also write the content of run.html as a recording for the viewer rerun (.rrd; "
-        "needs slamgym[viewer]).",
-        "none",
-    ),
-]
-EveryStep = Annotated[
-    bool | None,
-    option(
-        "--every-step/--no-every-step",
-        "Draw the map after every step, into map_steps/.",
-        "if there are 60 steps or fewer",
-    ),
-]
-AsJson = Annotated[bool, option("--json", "Print one JSON object and nothing else.")]
-MotionStd = Annotated[
-    str | None,
-    option(
+    )
+    motion_std: str | None = _shared(
+        None,
         "A,B,C",
         "σx,σy,σα of the motion noise in the robot's frame [m, m, rad], per unit of "
         "the log's time: a step or a second.",
         "from the log",
-    ),
-]
-MeasurementStd = Annotated[
-    str | None,
-    option("A,B", "σβ,σr of bearing and range [rad, m].", "from the log"),
-]
-InitialPoseStd = Annotated[
-    str | None,
-    option(
-        "A,B,C", "σx,σy,σθ of the first pose [m, m, rad].", "from the log, else 0,0,0"
-    ),
-]
-LandmarkInit = Annotated[
-    str | None,
-    option(
+    )
+    measurement_std: str | None = _shared(
+        None, "A,B", "σβ,σr of bearing and range [rad, m].", "from the log"
+    )
+    initial_pose_std: str | None = _shared(
+        None,
+        "A,B,C",
+        "σx,σy,σθ of the first pose [m, m, rad].",
+        "from the log, else 0,0,0",
+    )
+    landmark_init: str | None = _shared(
+        None,
         "full|independent",
         "How a landmark enters the map: full correlates it with the pose; "
         "independent, as in the homework, does not.",
         "full",
-    ),
-]
-GateProbability = Annotated[
-    float | None,
-    option(
+    )
+    gate_probability: float | None = _shared(
+        None,
         "P",
         "Reject readings outside this probability region of their innovation.",
         "none rejected",
-    ),
-]
-RangeStdPerMetre = Annotated[
-    float | None,
-    option(
+    )
+    range_std_per_metre: float | None = _shared(
+        None,
         "K",
         "Part of σr that grows with the range: σr + K r.",
         "from the log, else 0",
-    ),
-]
-NoiseAtRest = Annotated[
-    bool | None,
-    option(
+    )
+    noise_at_rest: bool | None = _shared(
+        None,
         "--noise-at-rest/--no-noise-at-rest",
         "Whether there is motion noise while the odometry reports no motion.",
         "from the log, else not",
-    ),
-]
-HideIdentities = Annotated[
-    bool,
-    option(
+    )
+    hide_identities: bool = _shared(
+        False,
         "--hide-identities",
         "Let the filter associate the readings of a log that identifies them.",
-    ),
-]
-Resolution = Annotated[
-    float,
-    option(
+    )
+    robot: int | None = _shared(
+        None, "K", "Which robot of a UTIAS folder.", "the lowest number"
+    )
+    truth: Path | None = _shared(
+        None,
+        "FILE",
+        "A graph file with the true poses of an iSAM or g2o text, by their ids.",
+        "none",
+    )
+    noise_from_file: bool = _shared(
+        False,
+        "--noise-from-file",
+        "Take the noise from the information matrices of an iSAM or g2o text.",
+    )
+    seed: int = _shared(0, "", "Seed of all random numbers.", min=0)
+    steps: int | None = _shared(None, "", "Steps to drive.", "those of the scenario")
+    controller: str = _shared(
+        "open_loop",
+        "NAME",
+        "open_loop applies the scenario's controls, waypoints steers along their "
+        "nominal path, random drives at random.",
+    )
+    set_: list[str] | None = _shared(
+        None,
+        "--set KEY=VALUE",
+        f"A change of the scenario, such as sensor.max_range=4. {REPEATED}",
+    )
+    resolution: float = _shared(
+        0.0,
         "R",
         "In scores of association, true landmarks nearer to each other than R count as "
         "one [m].",
         "each counts",
-    ),
-]
-Jobs = Annotated[
-    int | None,
-    option(
+    )
+    jobs: int | None = _shared(
+        None,
         "--jobs -j N",
         "Worker processes, -1 for one on each core.",
         "this process alone",
-    ),
-]
-Backend = Annotated[
-    str | None,
-    option(
+    )
+    backend: str | None = _shared(
+        None,
         "loky|dask|ray",
         "Where the workers run: loky, on this machine; dask or ray, on a cluster.",
-    ),
-]
-Scheduler = Annotated[
-    str | None,
-    option("ADDRESS", "The Dask or Ray cluster.", "a cluster of this machine"),
-]
-RobotNumber = Annotated[
-    int | None,
-    option("K", "Which robot of a UTIAS folder.", "the lowest number"),
-]
+    )
+    scheduler: str | None = _shared(
+        None, "ADDRESS", "The Dask or Ray cluster.", "a cluster of this machine"
+    )
+    out: Path | None = _shared(
+        None,
+        "DIR",
+        "The folder to write: new, empty, or with earlier output of slamgym, which is "
+        "replaced unless you changed it.",
+        "results/<name>-<estimator>",
+    )
+    every_step: bool | None = _shared(
+        None,
+        "--every-step/--no-every-step",
+        "Draw the map after every step, into map_steps/.",
+        "if there are 60 steps or fewer",
+    )
+    rerun: Path | None = _shared(
+        None,
+        "FILE",
+        "Also write the content of run.html as a recording for the viewer rerun (.rrd; "
+        "needs slamgym[viewer]).",
+        "none",
+    )
+    as_json: bool = _shared(False, "--json", "Print one JSON object and nothing else.")
+
+    def reporter(self) -> Reporter:
+        """Return what prints the progress and the results."""
+        return Reporter(as_json=self.as_json)
+
+    def scenario(self, name: str) -> Scenario:
+        """Load a preset or a .toml file, with the changes of ``--steps`` and ``--set``.
+
+        Raises
+        ------
+        ValueError
+            If there is no such scenario, it is a log, or a change does not fit.
+        """
+        changed = changes("--set", self.set_)
+        if self.steps is not None:
+            changed["steps"] = self.steps
+        _refuse_log(name)
+        return load_scenario(name).with_changes(**changed)
+
+    def driver(self, scenario: Scenario) -> Controller:
+        """Make the controller; a random one drives the same path for the same seed.
+
+        Raises
+        ------
+        BadInputError
+            If there is no such controller.
+        """
+        if self.controller not in CONTROLLERS:
+            hint, known = closest(self.controller, CONTROLLERS), ", ".join(CONTROLLERS)
+            raise BadInputError(
+                f"unknown controller '{self.controller}'{hint} (there are {known})"
+            )
+        random = np.random.default_rng([self.seed, 1])
+        return make_controller(self.controller, scenario, random)
+
+    def record(
+        self,
+        scenario: Scenario,
+        progress: Callable[[int, int], object] | None = None,
+    ) -> SlamLog:
+        """Record one episode with the controller; see `record_episode`."""
+        from ..logs.recording import record_episode
+
+        driver = self.driver(scenario)
+        return record_episode(scenario, driver, self.seed, progress=progress)
+
+    def read(self, path: Path) -> SlamLog:
+        """Read a log of any known format, with its truth if that is in another file.
+
+        Raises
+        ------
+        BadInputError
+            If a file cannot be opened, or does not fit into memory.
+        LogError
+            If one is malformed.
+        """
+        try:
+            log = read_log(
+                path,
+                robot=self.robot,
+                truth=self.truth,
+                noise_from_file=self.noise_from_file,
+            )
+        except OSError as error:
+            reason, file = error.strerror or error, error.filename or path
+            hint = ""
+            if str(path) in list_presets():
+                hint = f"; {path} is a scenario: slamgym run {path}"
+            raise BadInputError(
+                f"cannot read the log {file}: {reason}{hint}"
+            ) from error
+        except MemoryError as error:
+            raise BadInputError(f"the log {path} does not fit into memory") from error
+        return without_identities(log) if self.hide_identities else log
+
+    def stds(self) -> dict[str, Any]:
+        """Parse the standard deviations that the user gave.
+
+        Examples
+        --------
+        >>> Options(motion_std="0.2,.1,1e-2").stds()
+        {'motion_std': (0.2, 0.1, 0.01)}
+        >>> Options(measurement_std="0.2,-1").stds()
+        Traceback (most recent call last):
+        slamgym.experiments.command_line.program.BadInputError: --measurement-std must \
+be 2 numbers >= 0 with commas between, got '0.2,-1'
+        """
+        counts = {"motion_std": 3, "measurement_std": 2, "initial_pose_std": 3}
+        return {
+            name: _numbers(f"--{name.replace('_', '-')}", getattr(self, name), count)
+            for name, count in counts.items()
+            if getattr(self, name) is not None
+        }
+
+    def named_options(self) -> dict[str, Any]:
+        """Return the options of filters that the user gave by their own names.
+
+        Examples
+        --------
+        >>> Options(gate_probability=0.99).named_options()
+        {'gate_probability': 0.99}
+        """
+        names = (
+            *("landmark_init", "gate_probability"),
+            *("range_std_per_metre", "noise_at_rest"),
+        )
+        values = {name: getattr(self, name) for name in names}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def filter_options(self) -> dict[str, Any]:
+        """Return all options of filters that the user gave."""
+        return self.named_options() | assignments("--option", self.option_texts)
+
+    def filters(
+        self, settings: Callable[..., FilterSettings]
+    ) -> dict[str, FilterSettings]:
+        """Set up the filters by their labels; options in brackets take precedence.
+
+        Parameters
+        ----------
+        settings : callable
+            Called with ``estimator`` and ``options``.
+
+        Raises
+        ------
+        ValueError
+            If there is none, or one is unknown, malformed, named twice, or cannot run.
+
+        Examples
+        --------
+        >>> from functools import partial
+        >>> from slamgym.experiments.runs import settings_for_scenario
+        >>> set_up = partial(settings_for_scenario, load_scenario("loop"))
+        >>> list(Options(labels="ekf,invariant[iterations=3]").filters(set_up))
+        ['ekf', 'invariant[iterations=3]']
+        """
+        options = self.filter_options()
+        refuse_broken(self.labels, options)
+        return {
+            choice.label: settings(
+                estimator=choice.name, options={**options, **choice.options}
+            )
+            for choice in estimator_choices(self.labels)
+        }
+
+
+_SHARED = {
+    each.name: inspect.Parameter(
+        each.name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=each.default,
+        annotation=Annotated[each.type, each.metadata["option"]],
+    )
+    for each in fields(Options)
+}
+
+
+def takes(names: str, **defaults: Any) -> Callable[[_Function], Callable[..., Any]]:
+    """Give a command some of :class:`Options`, as its argument ``given``.
+
+    Parameters
+    ----------
+    names : str
+        The options in the order of the help, with white space between; those that the
+        command declares itself stand among them.
+    defaults
+        Where they differ from those of :class:`Options`.
+    """
+    order = names.split()
+
+    def expand(function: _Function) -> Callable[..., Any]:
+        own = dict(inspect.signature(function).parameters)
+        del own["given"]
+        taken = [name for name in order if name not in own]
+
+        @wraps(function)
+        def run(*arguments: Any, **values: Any) -> Any:
+            shared = {name: values.pop(name) for name in taken if name in values}
+            return function(*arguments, given=Options(**defaults | shared), **values)
+
+        first = [own[name] for name in own if name not in order]
+        every = _SHARED | own
+        parameters = first + [
+            every[name].replace(default=defaults.get(name, every[name].default))
+            for name in order
+        ]
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {each.name: each.annotation for each in parameters}
+        return run
+
+    return expand
 
 
 # --------------------------------------------------------------------------------------
 # Parse the values of options.
-
-
-def given_options(**values: Any) -> dict[str, Any]:
-    """Return the options that the user gave.
-
-    Examples
-    --------
-    >>> given_options(gate_probability=0.99, noise_at_rest=None)
-    {'gate_probability': 0.99}
-    """
-    return {name: value for name, value in values.items() if value is not None}
-
-
-def standard_deviations(
-    motion_std: str | None, measurement_std: str | None, initial_pose_std: str | None
-) -> dict[str, tuple[float, ...]]:
-    """Parse the standard deviations that the user gave, by the names of their options.
-
-    Examples
-    --------
-    >>> standard_deviations("0.2,.1,1e-2", None, None)
-    {'motion_std': (0.2, 0.1, 0.01)}
-    >>> standard_deviations(None, "0.2,-1", None)
-    Traceback (most recent call last):
-    slamgym.experiments.command_line.program.BadInputError: --measurement-std must be \
-2 numbers >= 0 with commas between, got '0.2,-1'
-    """
-    texts = {
-        "motion_std": (motion_std, 3),
-        "measurement_std": (measurement_std, 2),
-        "initial_pose_std": (initial_pose_std, 3),
-    }
-    return {
-        name: _numbers(f"--{name.replace('_', '-')}", text, count)
-        for name, (text, count) in texts.items()
-        if text is not None
-    }
 
 
 def _numbers(option: str, text: str, count: int) -> tuple[float, ...]:
@@ -339,24 +472,7 @@ def _toml_value(text: str) -> Any:
 
 
 # --------------------------------------------------------------------------------------
-# Scenarios and controllers by the names that the user gives.
-
-
-def chosen_scenario(
-    name: str, steps: int | None, sets: Iterable[str] | None
-) -> Scenario:
-    """Load a preset or a .toml file, with the changes of ``--steps`` and ``--set``.
-
-    Raises
-    ------
-    ValueError
-        If there is no such scenario, it is a log, or a change does not fit.
-    """
-    changed = changes("--set", sets)
-    if steps is not None:
-        changed["steps"] = steps
-    _refuse_log(name)
-    return load_scenario(name).with_changes(**changed)
+# Logs and filters as the user names them.
 
 
 def _refuse_log(name: str) -> None:
@@ -368,69 +484,6 @@ def _refuse_log(name: str) -> None:
         f"{name} is no scenario (a preset or a .toml file); to filter a log: slamgym "
         f"replay {name}"
     )
-
-
-def chosen_controller(name: str, scenario: Scenario, seed: int) -> Controller:
-    """Make a controller; a random one drives the same path for the same seed.
-
-    Raises
-    ------
-    BadInputError
-        If there is no such controller.
-    """
-    if name not in CONTROLLERS:
-        hint, known = closest(name, CONTROLLERS), ", ".join(CONTROLLERS)
-        raise BadInputError(f"unknown controller '{name}'{hint} (there are {known})")
-    return make_controller(name, scenario, np.random.default_rng([seed, 1]))
-
-
-def recorded(
-    scenario: Scenario,
-    controller: str,
-    seed: int,
-    progress: Callable[[int, int], object] | None = None,
-) -> "SlamLog":
-    """Record one episode with the controller of a name; see `record_episode`."""
-    from ..logs.recording import record_episode
-
-    driver = chosen_controller(controller, scenario, seed)
-    return record_episode(scenario, driver, seed, progress=progress)
-
-
-# --------------------------------------------------------------------------------------
-# Read a log for a command, and note what its importer chose.
-
-
-def read_any_log(
-    path: Path,
-    robot: int | None = None,
-    *,
-    truth: Path | None = None,
-    noise_from_file: bool = False,
-    hide_identities: bool = False,
-) -> SlamLog:
-    """Read a log of any known format, with its truth if that is in another file.
-
-    ``hide_identities`` keeps the identities of its readings for scores alone.
-
-    Raises
-    ------
-    BadInputError
-        If a file cannot be opened, or does not fit into memory.
-    LogError
-        If one is malformed.
-    """
-    try:
-        log = read_log(path, robot=robot, truth=truth, noise_from_file=noise_from_file)
-    except OSError as error:
-        reason, file = error.strerror or error, error.filename or path
-        hint = ""
-        if str(path) in list_presets():
-            hint = f"; {path} is a scenario: slamgym run {path}"
-        raise BadInputError(f"cannot read the log {file}: {reason}{hint}") from error
-    except MemoryError as error:
-        raise BadInputError(f"the log {path} does not fit into memory") from error
-    return without_identities(log) if hide_identities else log
 
 
 def note_choices(log: SlamLog, reporter: Reporter) -> None:
@@ -462,49 +515,6 @@ def note_noise(
     ]
     if found:
         reporter.note(f"noise of {log.name}: {'; '.join(found)}")
-
-
-# --------------------------------------------------------------------------------------
-# Filters by the names that the user gives, with options in brackets.
-
-
-def chosen_filters(
-    estimators: str,
-    options: Mapping[str, Any],
-    settings: Callable[..., FilterSettings],
-) -> dict[str, FilterSettings]:
-    """Set up one or more filters, by the labels that the user gave.
-
-    Parameters
-    ----------
-    estimators : str
-        Names separated by commas, such as "ekf,invariant[iterations=3]".
-    options : mapping
-        Options of all of them; options in brackets take precedence.
-    settings : callable
-        Called with ``estimator`` and ``options``.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or one is unknown, malformed, named twice, or cannot run.
-
-    Examples
-    --------
-    >>> from functools import partial
-    >>> from slamgym.experiments.runs import settings_for_scenario
-    >>> from slamgym.sim_configs import load_scenario
-    >>> set_up = partial(settings_for_scenario, load_scenario("loop"))
-    >>> list(chosen_filters("ekf,invariant[iterations=3]", {}, set_up))
-    ['ekf', 'invariant[iterations=3]']
-    """
-    refuse_broken(estimators, options)
-    return {
-        choice.label: settings(
-            estimator=choice.name, options={**options, **choice.options}
-        )
-        for choice in estimator_choices(estimators)
-    }
 
 
 def refuse_broken(estimators: str, options: Mapping[str, Any] | None = None) -> None:

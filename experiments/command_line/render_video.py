@@ -4,45 +4,40 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from . import options
-from .options import assignments
+from ...envs.controllers import Controller
+from ...sim_configs import Scenario
+from ..runs.filter_settings import FilterSettings, settings_for_scenario
+from .options import Options, ScenarioName, option, refuse_broken, takes
 from .program import command
+from .reporter import Tick
 
 if TYPE_CHECKING:
-    from ...envs.controllers import Controller
     from ...envs.landmark_world import LandmarkWorldEnv, Observation
     from ...estimator.interface import SlamEstimator
-    from ...sim_configs import Scenario
-    from ..runs.filter_settings import FilterSettings
-    from .reporter import Tick
 
 _DURATION = 12.0  # [s] of a film by default
 _SLOWEST, _FASTEST = 4.0, 30.0  # [frames/s]
 
 
 @command
+@takes("out estimator option_texts seed steps controller set_ fps as_json")
 def render(
-    scenario: options.ScenarioName,
+    scenario: ScenarioName,
     *,
-    out: Annotated[Path, options.option("FILE", "The .gif or .mp4 file to write.")],
+    given: Options,
+    out: Annotated[Path, option("FILE", "The .gif or .mp4 file to write.")],
     estimator: Annotated[
-        str | None,
-        options.option(
+        str,
+        option(
             "--estimator -e NAME",
             'The filter whose belief is drawn, or "none".',
             "invariant",
         ),
-    ] = None,
-    option: options.EstimatorOptions = None,
-    seed: options.Seed = 0,
-    steps: options.Steps = None,
-    controller: options.ControllerName = "open_loop",
-    set_: options.ScenarioChanges = None,
+    ] = "invariant",
     fps: Annotated[
         float | None,
-        options.option("N", "Frames (steps) per second.", "so that it lasts 12 s"),
+        option("N", "Frames (steps) per second.", "so that it lasts 12 s"),
     ] = None,
-    as_json: options.AsJson = False,
 ) -> None:
     """Film an episode as .gif or .mp4.
 
@@ -55,37 +50,32 @@ def render(
     slamgym render corridor --out corridor.mp4 --fps 20 --controller waypoints
     """
     from ...envs.rendering import check_video, write_video
-    from ..runs.filter_settings import settings_for_scenario
-    from .options import chosen_controller, chosen_scenario, refuse_broken
-    from .reporter import Reporter
     from .run_files import warm_up
 
-    world = chosen_scenario(scenario, steps, set_)
-    shown = estimator or "invariant"
-    chosen = assignments("--option", option)
-    settings = None
-    if shown != "none":
-        refuse_broken(shown, chosen)
-        settings = settings_for_scenario(world, estimator=shown, options=chosen)
-    reporter = Reporter(as_json=as_json)
-    driver = chosen_controller(controller, world, seed)
+    world = given.scenario(scenario)
+    chosen, settings = given.filter_options(), None
+    if estimator != "none":
+        refuse_broken(estimator, chosen)
+        settings = settings_for_scenario(world, estimator=estimator, options=chosen)
+    reporter = given.reporter()
+    driver = given.driver(world)
     speed = fps or min(max(world.steps / _DURATION, _SLOWEST), _FASTEST)
     check_video(out, speed)
     if settings is not None:
         warm_up(settings, reporter)
     with reporter.progress("filming") as tick:
-        write_video(_frames(world, settings, driver, seed, tick), out, fps=speed)
+        write_video(_frames(world, settings, driver, given.seed, tick), out, fps=speed)
     frames = world.steps + 1
     reporter.show(f"Wrote {out}: {frames} frames, {speed:.3g} per second")
     reporter.finish({"out": str(out), "frames": frames, "fps": speed})
 
 
 def _frames(
-    scenario: "Scenario",
-    settings: "FilterSettings | None",
-    driver: "Controller",
+    scenario: Scenario,
+    settings: FilterSettings | None,
+    driver: Controller,
     seed: int,
-    tick: "Tick",
+    tick: Tick,
 ) -> Iterator[Any]:
     """Yield the frames of an episode, arrays (height, width, 3) of uint8."""
     import gymnasium

@@ -160,23 +160,19 @@ def without_identities(log: SlamLog) -> SlamLog:
     (None, array([4]))
     """
     events = tuple(
-        _hidden(event) if isinstance(event, Scan) else event for event in log.events
+        replace(event, landmark_ids=None, true_ids=true_ids_of(event))
+        if isinstance(event, Scan)
+        else event
+        for event in log.events
     )
     return replace(log, events=events, header=log.header | {"identities": "false"})
 
 
 def hides_identities(log: SlamLog) -> bool:
     """Whether some scan of a log has no identities."""
-    scans = (event for event in log.events if isinstance(event, Scan))
-    return any(scan.landmark_ids is None for scan in scans)
+    return any(scan.landmark_ids is None for scan in log.scans)
 
 
 def true_ids_of(scan: Scan) -> IntArray | None:
     """Return the true landmark of each reading, hidden or not; None if unknown."""
     return scan.landmark_ids if scan.true_ids is None else scan.true_ids
-
-
-def _hidden(scan: Scan) -> Scan:
-    if scan.landmark_ids is None:
-        return scan
-    return replace(scan, landmark_ids=None, true_ids=true_ids_of(scan))

@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Literal, NamedTuple, cast, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,6 +108,11 @@ class SlamLog:
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "ground_truth", truth)
         object.__setattr__(self, "events", tuple(self.events))
+
+    @property
+    def scans(self) -> list[Scan]:
+        """The scans among its events."""
+        return [event for event in self.events if isinstance(event, Scan)]
 
 
 def read_slamlog(path: str | PathLike[str]) -> SlamLog:
@@ -475,27 +480,21 @@ class EventRecorder:
         self._time = t
 
     def _check_same_kind(self, line: LogLine, reading: Reading) -> None:
-        first = self._readings[0]
-        if (first.landmark_id is None) != (reading.landmark_id is None):
-            raise line.error("ids in all rows of a scan or in none", "both")
-        if (first.size is None) != (reading.size is None):
-            raise line.error("sizes in all rows of a scan or in none", "both")
-        if (first.true_id is None) != (reading.true_id is None):
-            raise line.error("true ids in all rows of a scan or in none", "both")
+        columns = {"landmark_id": "ids", "size": "sizes", "true_id": "true ids"}
+        for name, what in columns.items():
+            first = getattr(self._readings[0], name)
+            if (first is None) != (getattr(reading, name) is None):
+                raise line.error(f"{what} in all rows of a scan or in none", "both")
 
     def _close_scan(self) -> None:
         if not self._readings:
             return
         times, ids, bearings, ranges, sizes, true = zip(*self._readings, strict=True)
-        self._events.append(
-            Scan(
-                t=times[0],
-                measurements=np.column_stack([bearings, ranges]),
-                landmark_ids=None if ids[0] is None else np.array(ids, dtype=np.int64),
-                sizes=None if sizes[0] is None else np.array(sizes, dtype=np.float64),
-                true_ids=None if true[0] is None else np.array(true, dtype=np.int64),
-            )
-        )
+        readings = np.column_stack([bearings, ranges])
+        known: list[Any] = [  # of all readings or of none
+            None if column[0] is None else column for column in (ids, sizes, true)
+        ]
+        self._events.append(Scan(times[0], readings, *known))
         self._readings.clear()
         self._seen.clear()
 

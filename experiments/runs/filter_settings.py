@@ -34,8 +34,9 @@ from ...estimator.support.argument_checks import refuse_large_belief
 from ...estimator.support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ...sim_configs import Scenario
 from ...suggestions import closest
+from ..logs.ground_truth import hides_identities
 from ..logs.recording import log_header
-from ..logs.slamlog import LogError, Scan, SlamLog
+from ..logs.slamlog import LogError, SlamLog
 
 if TYPE_CHECKING:
     from .simulated_runs import SimulatedRuns
@@ -278,12 +279,9 @@ def _header_options(
     options: dict[str, Any] = {}
     if not _flag(name, "noise_at_rest", header.get("noise_at_rest", "false")):
         options["noise_at_rest"] = False
-    if "range_std_per_metre" in header:
-        key = "range_std_per_metre"
-        options[key] = _number(name, key, header[key])
-    if "bearing_std_metres" in header:
-        key = "bearing_std_metres"
-        options[key] = _number(name, key, header[key])
+    for key in ("range_std_per_metre", "bearing_std_metres"):
+        if key in header:
+            options[key] = _number(name, key, header[key])
     accepted = registry.accepted_options(factory, options)
     if options.get("bearing_std_metres") and "bearing_std_metres" not in accepted:
         raise ValueError(
@@ -296,10 +294,7 @@ def _header_options(
 def _needed_options(log: SlamLog, header: Mapping[str, str]) -> dict[str, Any]:
     """Turn management on if the log does not identify all readings."""
     identified = _flag(log.name, "identities", header.get("identities", "true"))
-    scans = (event for event in log.events if isinstance(event, Scan))
-    if identified and all(scan.landmark_ids is not None for scan in scans):
-        return {}
-    return {"management": True}
+    return {} if identified and not hides_identities(log) else {"management": True}
 
 
 def _number(name: str, key: str, text: str) -> float:
@@ -396,7 +391,11 @@ options={'iterations': 3})
             "estimators must be names, labels, or labels mapped to classes, "
             f"got {estimators!r}"
         )
-    choices = _choices(estimators)
+    if isinstance(estimators, Mapping):
+        choices = [_labelled(label, what) for label, what in estimators.items()]
+    else:
+        several = [estimators] if isinstance(estimators, str) else estimators
+        choices = [choice for one in several for choice in _unlabelled(one)]
     if not choices:
         raise ValueError("estimators must name at least one, got none")
     labels = [choice.label for choice in choices]
@@ -408,37 +407,23 @@ options={'iterations': 3})
     return tuple(choices)
 
 
-def _choices(
-    estimators: str | Iterable[str | EstimatorFactory] | Mapping[str, Any],
-) -> list[EstimatorChoice]:
-    if isinstance(estimators, Mapping):
-        return [_labelled(label, what) for label, what in estimators.items()]
-    several = [estimators] if isinstance(estimators, str) else estimators
-    return [choice for one in several for choice in _unlabelled(one)]
-
-
 def _unlabelled(what: Any) -> list[EstimatorChoice]:
     """Read names separated by commas, or a class, whose name is then its label."""
     if isinstance(what, str):
-        return [_read(label) for label in split_labels(what)]
+        return [_labelled(label, label) for label in split_labels(what)]
     label = getattr(what, "__name__", None)
     if not (callable(what) and label):
         raise ValueError(f"estimators must be names or classes, got {what!r}")
     return [_labelled(label, what)]
 
 
-def _read(label: str) -> EstimatorChoice:
-    name, options = read_label(label)
-    return EstimatorChoice(label, OFFLINE.get(name, name), options)
-
-
 def _labelled(label: str, what: Any) -> EstimatorChoice:
+    options: Mapping[str, Any] = {}
     if isinstance(what, str):
-        return _read(what)._replace(label=label)
-    if isinstance(what, tuple) and len(what) == 2:
-        name, options = what
-        return EstimatorChoice(label, _name_of(label, name), options)
-    return EstimatorChoice(label, _name_of(label, what))
+        what, options = read_label(what)
+    elif isinstance(what, tuple) and len(what) == 2:
+        what, options = what
+    return EstimatorChoice(label, _name_of(label, what), options)
 
 
 def _name_of(label: str, what: str | Callable[..., Any]) -> str:
@@ -472,19 +457,11 @@ def refuse_large_map(log: SlamLog, estimator: SlamEstimator) -> None:
     MemoryError
         With the required and the available memory.
     """
-    scans = [event.landmark_ids for event in log.events if isinstance(event, Scan)]
-    named = [ids for ids in scans if ids is not None]
-    if not named:
-        return
-    landmarks = len(np.unique(np.concatenate(named)))
-    _refuse_beyond_limit(landmarks, estimator)
-    if not isinstance(estimator, SupportsMemoryEstimate):
-        return
-    refuse_beyond_memory(
-        f"a map of the {landmarks} landmarks that {log.name} reads",
-        estimator.memory_for(landmarks) + covariance_bytes(landmarks),
-        "take fewer steps, or landmarks",
-    )
+    named = [scan.landmark_ids for scan in log.scans if scan.landmark_ids is not None]
+    if named:
+        landmarks = len(np.unique(np.concatenate(named)))
+        what = f"a map of the {landmarks} landmarks that {log.name} reads"
+        _refuse_maps([landmarks], estimator, what, "take fewer steps, or landmarks")
 
 
 def refuse_large_maps(
@@ -509,22 +486,28 @@ def refuse_large_maps(
         With the required and the available memory.
     """
     read = runs.identified().visible.any(axis=1).sum(axis=1).tolist()  # by each run
-    _refuse_beyond_limit(max(read), estimator)
-    if not isinstance(estimator, SupportsMemoryEstimate):
-        return
-    maps = [estimator.memory_for(landmarks) for landmarks in read]
-    beliefs = sum(covariance_bytes(landmarks) for landmarks in read)
-    refuse_beyond_memory(
-        f"a block of {len(read)} runs that read up to {max(read)} landmarks each",
-        beliefs + (sum(maps) if at_once else max(maps)),
-        "take a smaller block_size, or fewer steps",
-    )
+    what = f"a block of {len(read)} runs that read up to {max(read)} landmarks each"
+    way_out = "take a smaller block_size, or fewer steps"
+    _refuse_maps(read, estimator, what, way_out, at_once=at_once)
 
 
-def _refuse_beyond_limit(landmarks: int, estimator: SlamEstimator) -> None:
-    """Refuse a run with more landmarks than the filter's belief may hold."""
+def _refuse_maps(
+    landmarks: Sequence[int],
+    estimator: SlamEstimator,
+    what: str,
+    way_out: str,
+    *,
+    at_once: bool = False,
+) -> None:
+    """Refuse runs with so many landmarks each, if belief or memory cannot hold them."""
     if isinstance(estimator, SupportsBeliefLimit):
-        refuse_large_belief(landmarks, estimator.belief_limit, "take fewer steps")
+        most = estimator.belief_limit
+        refuse_large_belief(max(landmarks), most, "take fewer steps")
+    if isinstance(estimator, SupportsMemoryEstimate):
+        maps = [estimator.memory_for(count) for count in landmarks]
+        beliefs = sum(covariance_bytes(count) for count in landmarks)
+        need = beliefs + (sum(maps) if at_once else max(maps))
+        refuse_beyond_memory(what, need, way_out)
 
 
 # --------------------------------------------------------------------------------------

@@ -150,7 +150,14 @@ def replay(
         for number, step in enumerate(steps):
             with _naming_time(log, step):
                 show_truth(number)
-                report = _take(step, log, estimator, recorder, decisions)
+                for row in step.motions:
+                    for odometry, dt in predictions(row, log.motion):
+                        estimator.predict(odometry, dt)
+                predicted, report = marginal_without_joining(estimator, ()), None
+                if step.scan is not None:
+                    report = estimator.update(step.scan.measurements, _ids(step.scan))
+                    decisions.add(report, true_ids_of(step.scan))
+                recorder.add(predicted, report)
             watch(number, estimator, report)
             progress(number + 1, len(steps))
     made = decisions.result() if hides_identities(log) else None
@@ -201,34 +208,9 @@ def _truth_source(
     landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
     if poses is None or not np.isfinite(poses).all():
         return _unwatched
-    if not _seen(log) <= landmarks.keys():
+    if not landmarks.keys() >= set(chain(*(_ids(scan) or () for scan in log.scans))):
         return _unwatched
     return lambda step: estimator.observe_truth(poses[step], landmarks)
-
-
-def _seen(log: SlamLog) -> set[int]:
-    """Return the ids of the landmarks that the log has readings of."""
-    scans = (event for event in log.events if isinstance(event, Scan))
-    return set(chain.from_iterable(_ids(scan) or () for scan in scans))
-
-
-def _take(
-    step: Step,
-    log: SlamLog,
-    estimator: SlamEstimator,
-    recorder: RunRecorder,
-    decisions: DecisionRecorder,
-) -> UpdateReport | None:
-    for row in step.motions:
-        for odometry, dt in predictions(row, log.motion):
-            estimator.predict(odometry, dt)
-    predicted = marginal_without_joining(estimator, ())
-    report = None
-    if step.scan is not None:
-        report = estimator.update(step.scan.measurements, _ids(step.scan))
-        decisions.add(report, true_ids_of(step.scan))
-    recorder.add(predicted, report)
-    return report
 
 
 @contextlib.contextmanager
@@ -340,7 +322,7 @@ class RunRecorder:
         return RunTrace(
             estimator=name,
             t=times,
-            time_unit="steps" if _counts_steps(times) else "s",
+            time_unit="steps" if (times == np.arange(len(times))).all() else "s",
             frame=belief.frame,
             predicted_poses=self._predicted.poses,
             predicted_pose_covariances=self._predicted.covariances,
@@ -387,10 +369,6 @@ class _PoseTrack:
     def put(self, step: int, belief: Belief) -> None:
         self.poses[step] = belief.pose
         self.covariances[step] = belief.pose_covariance
-
-
-def _counts_steps(times: Array) -> bool:
-    return bool((times == np.arange(len(times))).all())
 
 
 class MapHistory(Sequence[MapEstimate]):

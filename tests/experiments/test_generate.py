@@ -22,7 +22,7 @@ from presets import PRESETS
 from slamgym.envs.controllers import CONTROLLERS
 from slamgym.experiments.command_line import reporter
 from slamgym.experiments.command_line.generate import generate as generate_command
-from slamgym.experiments.command_line.options import recorded
+from slamgym.experiments.command_line.options import Options
 from slamgym.experiments.command_line.program import InterruptedRunError
 from slamgym.experiments.jobs import claimed
 from slamgym.experiments.logs.slamlog import write_slamlog
@@ -86,7 +86,8 @@ def test_an_episode_is_the_log_that_slamgym_run_makes_of_its_seed(
     scenario = load_scenario(preset).with_changes(steps=40)
     for drive in drive_episodes(scenario, controller, (3, 9)):
         write_slamlog(to_slamlog(drive), tmp_path / "here.csv")
-        alone = recorded(scenario, controller, drive.seed)
+        given = Options(controller=controller, seed=drive.seed)
+        alone = given.record(scenario)
         write_slamlog(alone, tmp_path / "there.csv")
         here, there = (tmp_path / "here.csv"), (tmp_path / "there.csv")
         assert here.read_bytes() == there.read_bytes()

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from slamgym.experiments import noise_study as many_runs
+from slamgym.experiments import monte_carlo as package
 from slamgym.experiments.command_line.noise_study import effects_study, write_study
 from slamgym.experiments.command_line.reporter import Reporter
 from slamgym.experiments.monte_carlo import monte_carlo
@@ -110,7 +110,7 @@ def test_runs_have_failed_where_the_report_says_so(monkeypatch):
     results["nis"].loc[{"run": 1, "step": 7}] = np.nan
     results["pose_nees_invariant"].loc[{"run": 2, "step": 9}] = 1e200
     results["position_error"].loc[{"run": 3, "step": 9}] = 1e7  # far off, yet a number
-    monkeypatch.setattr(many_runs, "monte_carlo", lambda *_, **__: results)
+    monkeypatch.setattr(package, "monte_carlo", lambda *_, **__: results)
     reference = noise_effects("six_landmarks", "ekf", 4)[0]
     scores = scores_of(results, "ekf", "invariant")
     assert reference.failed == len(scores.failures) == 2

@@ -9,7 +9,7 @@ import jobs_to_kill
 import psutil
 import pytest
 
-from slamgym.experiments.command_line.options import recorded
+from slamgym.experiments.command_line.options import Options
 from slamgym.experiments.command_line.output_folder import STAGING
 from slamgym.experiments.command_line.program import (
     TerminationError,
@@ -128,7 +128,7 @@ LONG = {
 def city_log(tmp_path_factory):
     """Return a log that takes every command a minute or more."""
     world = load_scenario("city").with_changes(steps=2000)
-    log = recorded(world, "open_loop", 0, lambda *_: None)
+    log = Options().record(world, lambda *_: None)
     file = tmp_path_factory.mktemp("logs") / "city.csv"
     write_slamlog(log, file)
     return file
