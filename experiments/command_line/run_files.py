@@ -6,14 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
 from rich.text import Text
 
 from .. import figures
 from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
 from ..runs.filter_settings import FilterSettings
-from ..runs.log_replay import Replay, replay
+from ..runs.log_replay import replay
 from ..runs.summary import summarise
 from ..runs.trace import RunTrace
 from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
@@ -98,15 +97,29 @@ def filter_and_write(
     """
     if every_step is None:
         every_step = sum(1 for _ in steps_of(log)) <= _FEW_STEPS + 1
-    runs, frames = [], []
+    runs, viewed = [], []
     for label, settings in filters.items():
-        frames.append(RunFrames(log))
-        run = _filtered(log, label, settings, every_step, reporter, frames[-1])
+        frames = RunFrames(log)
+        warm_up(settings, reporter)
+        with reporter.progress("filtering") as tick:
+            run = replay(
+                log,
+                settings.make(log.start),
+                name=label,
+                keep_history=every_step,
+                progress=tick,
+                watch=frames.watch,
+            )
         runs.append(run)
-    _draw([run.trace for run in runs], folder, every_step, reporter, walls)
-    viewed = [
-        ViewedRun(run.trace, kept) for run, kept in zip(runs, frames, strict=True)
-    ]
+        viewed.append(ViewedRun(run.trace, frames))
+    traces = [run.trace for run in runs]
+    with reporter.progress("drawing") as tick:
+        write_figures(
+            folder, traces[0], every_step=every_step, progress=tick, walls=walls
+        )
+        if len(traces) > 1:
+            compared = figures.comparison_figure(traces, walls)
+            figures.save_figure(compared, folder / "comparison.png", dpi=150)
     write_run_page(folder / "run.html", log, viewed, walls=walls)
     if rerun is not None:
         write_rerun(rerun, log, viewed, walls=walls)
@@ -116,42 +129,6 @@ def filter_and_write(
         for run, settings in zip(runs, filters.values(), strict=True)
     ]
     return write_summary(folder, {**summaries[0], "others": summaries[1:]})
-
-
-def _draw(
-    traces: Sequence[RunTrace],
-    folder: Path,
-    every_step: bool,
-    reporter: Reporter,
-    walls: Sequence[Sequence[float]],
-) -> None:
-    """Write the figures of the first trace, and one that compares several."""
-    first, *others = traces
-    with reporter.progress("drawing") as tick:
-        write_figures(folder, first, every_step=every_step, progress=tick, walls=walls)
-        if others:
-            compared = figures.comparison_figure(traces, walls)
-            figures.save_figure(compared, folder / "comparison.png", dpi=150)
-
-
-def _filtered(
-    log: SlamLog,
-    label: str,
-    settings: FilterSettings,
-    every_step: bool,
-    reporter: Reporter,
-    frames: RunFrames,
-) -> Replay:
-    warm_up(settings, reporter)
-    with reporter.progress("filtering") as tick:
-        return replay(
-            log,
-            settings.make(log.start),
-            name=label,
-            keep_history=every_step,
-            progress=tick,
-            watch=frames.watch,
-        )
 
 
 def write_figures(
@@ -197,35 +174,17 @@ def write_figures(
 def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
     """Print a run's landmarks, key figures and files."""
     title = heading("", summary["log"], " filtered by ", summary["estimator"])
-    reporter.show(
-        title,
-        landmark_table(summary),
-        "",
-        key_figures(summary),
-        "",
-        *_comparison(summary),
-        *_association(summary),
-        *_warnings(summary),
-        written(str(place), summary["files"]),
-    )
+    reporter.show(title, landmark_table(summary), "", key_figures(summary), "")
+    if summary["others"]:
+        runs = (summary, *summary["others"])
+        reporter.show(comparison_table({run["estimator"]: run for run in runs}), "")
+    if summary["association"] is not None:
+        reporter.show(association_table(summary["association"]), "")
+    if summary["warnings"]:
+        warnings = (Text(f"Warning: {text}", "yellow") for text in summary["warnings"])
+        reporter.show(*warnings, "")
+    reporter.show(written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
-
-
-def _comparison(summary: dict[str, Any]) -> tuple[Table | str, ...]:
-    if not summary["others"]:
-        return ()
-    runs = (summary, *summary["others"])
-    return comparison_table({run["estimator"]: run for run in runs}), ""
-
-
-def _association(summary: dict[str, Any]) -> tuple[Table | str, ...]:
-    scores = summary["association"]
-    return () if scores is None else (association_table(scores), "")
-
-
-def _warnings(summary: dict[str, Any]) -> tuple[Text | str, ...]:
-    lines = [Text(f"Warning: {text}", "yellow") for text in summary["warnings"]]
-    return (*lines, "") if lines else ()
 
 
 # --------------------------------------------------------------------------------------

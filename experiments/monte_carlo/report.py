@@ -17,12 +17,13 @@ from rich.table import Table
 from rich.text import Text
 
 from ...evaluation.consistency_report import FEW_AVERAGES
+from ...evaluation.diagnosis import p_text
 from ...sim_configs.atomic_file import replace_when_written
 from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, PALE, TEAL, page_environment
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
 from .runner import ASSUMED_FILE, python_call
 from .summary import NOTHING, Entry, measures, number, percent
-from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT, p_text
+from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT
 
 _LARGE = 1e5  # written without three decimals
 _FEW = 3  # estimators; a headline counts more of them

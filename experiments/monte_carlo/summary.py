@@ -137,8 +137,9 @@ def summarise_estimator(
     """
     found = _computed(scores, frame)
     claimed = found["heading_std_end"]["claimed"]
+    report = _report_of(scores, frame) if scores.good.sum() > 1 else None
     return {
-        **_verdict(scores, _decide(scores, frame), claimed, knowable),
+        **_verdict(scores, report, claimed, knowable),
         "good_runs": int(scores.good.sum()),
         "failed_runs": [failure._asdict() for failure in scores.failures],
         "failure_groups": failure_groups(scores.failures),
@@ -200,13 +201,6 @@ def consistency_of(
         known = ", ".join(labels_of(results))
         raise ValueError(f"estimator must be one of {known}, got '{estimator}'")
     return _report_of(scores_of(results, estimator, frame), frame)
-
-
-def _decide(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport | None:
-    """Test the successful runs, if there are enough."""
-    if scores.good.sum() < 2:
-        return None
-    return _report_of(scores, frame)
 
 
 def _report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
