@@ -142,7 +142,8 @@ class Scene:
         for legend in self._figure.legends[:]:
             legend.remove()
         moving = self._moving
-        named: list[Artist] = [arrow_key(INK, INK, "robot"), moving.path, *self._still]
+        robot = Line2D([], [], ls="", marker=">", color=INK, ms=7, label="robot")
+        named: list[Artist] = [robot, moving.path, *self._still]
         named.append(moving.readings)
         if self._scenario.sensor.clutter > 0:
             named.append(moving.clutter)
@@ -381,11 +382,6 @@ def wall_lines(walls: ArrayLike, width: float, **style: Any) -> LineCollection:
 
 def _points(marker: str, colour: str, label: str) -> Line2D:
     return Line2D([], [], ls="", marker=marker, ms=4, color=colour, label=label)
-
-
-def arrow_key(face: str, edge: str, label: str) -> Line2D:
-    """Return the legend entry of an arrow-shaped robot."""
-    return Line2D([], [], ls="", marker=">", mfc=face, mec=edge, ms=7, label=label)
 
 
 def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)

@@ -34,7 +34,8 @@ def landmark_table(summary: dict[str, Any]) -> Table:
     known = any(row["euclidean"] is not None for row in rows)
     shown, caption = rows, None
     if len(rows) > _MOST_ROWS:
-        shown = _worst_rows(summary)
+        count = _FEWER if summary.get("others") else _WORST
+        shown = sorted(rows, key=_distance, reverse=True)[:count]
         which = ("first", "largest errors")[known]
         caption = Text(
             f"the {len(shown)} {which} of {len(rows)}; all: summary.json", "dim"
@@ -65,12 +66,6 @@ def _table(
         side: Literal["left", "right"] = "left" if heading in texts else "right"
         table.add_column(Text(heading), justify=side)
     return table
-
-
-def _worst_rows(summary: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return some landmarks with the largest errors, fewer beside other filters."""
-    count = _FEWER if summary.get("others") else _WORST
-    return sorted(summary["landmarks"], key=_distance, reverse=True)[:count]
 
 
 def _distance(row: Mapping[str, float | None]) -> tuple[float, float]:

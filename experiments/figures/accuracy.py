@@ -26,6 +26,7 @@ from .style import (
     GREY,
     INK,
     TEAL,
+    deviations,
     dress,
     dress_map,
     new_figure,
@@ -278,9 +279,7 @@ def errors_figure(trace: RunTrace) -> Figure:
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     if truth is not None and known:
         errors = -additive_error(truth, trace.poses)
-        std = np.sqrt(
-            np.maximum(np.diagonal(trace.pose_covariances, axis1=1, axis2=2), 0)
-        )
+        std = deviations(trace.pose_covariances)
         for k, (label, name) in enumerate(_ROWS):
             _draw_error(axes[k], trace.t, errors[:, k], std[:, k])
             axes[k].set_ylabel(label)
@@ -438,7 +437,7 @@ def correlations(covariance: Array) -> Array:
     array([[1. , 0.5],
            [0.5, 1. ]])
     """
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    std = deviations(covariance)
     std = np.where(std > 0, std, np.nan)
     return np.asarray(np.clip(covariance / std[:, None] / std, -1.0, 1.0))
 
@@ -463,7 +462,7 @@ def _draw_correlations(
     for line in (axes.axhline, axes.axvline):  # between pose and landmarks
         line(2.5, color="white", lw=1.5 if few else 0.6)
     if few:
-        _write_deviations(axes, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+        _write_deviations(axes, deviations(covariance))
     return image
 
 

@@ -38,6 +38,7 @@ from .style import (
     INK,
     ORANGE,
     TEAL,
+    deviations,
     dress_map,
     legend_below,
     new_figure,
@@ -268,7 +269,7 @@ LATER = EllipseKind("landmark later, 3σ", "#128a3a", fill=0.16, width=1.5)
 _FORMER = EllipseKind("landmark in between", LATER.colour, width=0.6, alpha=0.35)
 
 _MOST_POSES = 60  # ellipses along the path; longer runs show every second, third, …
-_MOST_FORMER = 300  # green ellipses of earlier steps
+_MOST_FORMER = 300  # green ellipses of earlier steps; large maps show fewer steps
 _SHORTEST_SIDE = 0.55  # of a map, as a share of its longest
 
 
@@ -348,17 +349,13 @@ class MapPicture:
         now = trace.map_at(step)
         set_ellipses(artists.later, now.means, now.covariances)
         artists.estimates.set_data(*now.means.T)
-        former = [trace.map_at(k) for k in self._former_steps(step)]
+        stride = -(-trace.last_step * len(self._first_steps) // _MOST_FORMER)
+        former = [trace.map_at(k) for k in range(0, step, max(1, stride))]
         set_ellipses(
             artists.former,
             np.concatenate([np.empty((0, 2)), *(m.means for m in former)]),
             np.concatenate([np.empty((0, 2, 2)), *(m.covariances for m in former)]),
         )
-
-    def _former_steps(self, step: int) -> range:
-        """Return the earlier steps whose landmarks are shown too: few in large maps."""
-        stride = -(-self._trace.last_step * len(self._first_steps) // _MOST_FORMER)
-        return range(0, step, max(1, stride))
 
     def _add_truth(self, scale: float) -> Line2D:
         truth = self._trace.true_landmarks
@@ -448,7 +445,7 @@ def box_around(points: Array, means: Array, covariances: Array) -> Array:
     """
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     span = max(float((high - low).max()), 1e-3)
-    reach = 3 * np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
+    reach = 3 * deviations(covariances)
     lowest = (means - reach).min(axis=0, initial=np.inf)
     highest = (means + reach).max(axis=0, initial=-np.inf)
     low = np.maximum(np.minimum(low, lowest), low - span / 3)

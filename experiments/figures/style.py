@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -110,6 +111,12 @@ def write_title(
     return above, below
 
 
+def deviations(covariances: Array) -> Array:
+    """Return the standard deviations (..., n) of covariances (..., n, n)."""
+    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+
+
 def legend_below(figure: Figure, keys: Sequence[Artist], columns: int) -> None:
     """Put a legend of lines and ellipses below the axes."""
     figure.legend(
@@ -151,8 +158,3 @@ def page_environment(
         keep_trailing_newline=True,
         undefined=StrictUndefined,
     )
-
-
-def page_template(folder: Path, name: str) -> Template:
-    """Return a template of a folder; see :func:`page_environment`."""
-    return page_environment(folder).get_template(name)

@@ -22,7 +22,7 @@ from ...sim_configs.atomic_file import replace_when_written
 from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, PALE, TEAL, page_environment
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
 from .runner import ASSUMED_FILE, python_call
-from .summary import NOTHING, Entry, measures, number, percent
+from .summary import NOTHING, measures, number, percent
 from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT
 
 _LARGE = 1e5  # written without three decimals
@@ -109,11 +109,6 @@ def headline(summary: dict[str, Any]) -> str:
     return f"{summary['scenario']}: {said}"
 
 
-def _bad_run(summary: dict[str, Any]) -> str:
-    scores = [entry["association"] for entry in summary["estimators"].values()]
-    return "" if None in scores else f" {bad_run_text(scores[0])}"
-
-
 def _files(summary: dict[str, Any]) -> dict[str, str]:
     """Return the scenario files that the page shows, by their titles."""
     files = {f"The scenario, {summary['scenario']}.toml": summary["scenario_toml"]}
@@ -187,12 +182,13 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
     """
     entries = summary["estimators"]
     headings, key = headings_and_key(list(entries))
+    note = "Averages over runs and steps; heading and RMSE are root mean squares."
     table = Table(
         title=Text(
             f"{summary['scenario']}: {summary['runs']} runs of {summary['steps']} "
             f"steps, seed {summary['seed']}"
         ),
-        caption=Text(f"{key}\n{_caption(entries)}".strip()),
+        caption=Text(f"{key}\n{note}{_bad_run(summary)}".strip()),
         caption_justify="left",
         pad_edge=False,
         box=None,
@@ -211,20 +207,15 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
     return table
 
 
-def _caption(entries: dict[str, Entry]) -> str:
-    text = "Averages over runs and steps; heading and RMSE are root mean squares."
-    scores = next((entry["association"] for entry in entries.values()), None)
-    if scores is None:
-        return text
-    return f"{text} {bad_run_text(scores)}"
-
-
-def bad_run_text(scores: dict[str, Any]) -> str:
-    """Write what a bad run is."""
+def _bad_run(summary: dict[str, Any]) -> str:
+    """Write what a bad run is, after a space; empty where identities are known."""
+    scores = [entry["association"] for entry in summary["estimators"].values()]
+    if None in scores:
+        return ""
     return (
-        "A run is bad if it failed, or if its path error is more than "
-        f"{scores['bad_runs']['margin']:g} m above that of the same filter with known "
-        "identities."
+        " A run is bad if it failed, or if its path error is more than "
+        f"{scores[0]['bad_runs']['margin']:g} m above that of the same filter with "
+        "known identities."
     )
 
 

@@ -558,24 +558,19 @@ def efficiency_summary(scores: EstimatorScores) -> dict[str, Any] | None:
     """
     if "position_bound" not in scores.results:
         return None
-    found = {"pose": None, "heading": None, "map": _of_the_map(scores)}
-    if scores.nis_per_degree is None:
-        return found
-    pairs = {
-        "pose": ("position_bound", "position_error_invariant"),
-        "heading": ("heading_bound", "heading_error"),
-    }
-    each = {
-        name: efficiency(scores.over_time(bound), scores.over_time(error) ** 2)
-        for name, (bound, error) in pairs.items()
-    }
-    return found | {name: _entry(value) for name, value in each.items()}
-
-
-def _of_the_map(scores: EstimatorScores) -> dict[str, Any] | None:
     bound, error = scores.per_run("map_bound"), scores.per_run("map_error_centred")
     known = np.isfinite(bound) & np.isfinite(error)
-    return _entry(efficiency(bound[known], error[known] ** 2))
+    of_the_map = efficiency(bound[known], error[known] ** 2)
+    found = {"pose": None, "heading": None, "map": _entry(of_the_map)}
+    if scores.nis_per_degree is None:
+        return found
+    for name, *pair in (
+        ("pose", "position_bound", "position_error_invariant"),
+        ("heading", "heading_bound", "heading_error"),
+    ):
+        bound, error = map(scores.over_time, pair)
+        found[name] = _entry(efficiency(bound, error**2))
+    return found
 
 
 def _entry(found: Efficiency) -> dict[str, Any] | None:
