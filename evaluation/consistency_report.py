@@ -136,6 +136,10 @@ class ConsistencyReport:
         frame, grid, near = f"{self.frame} frame", self.family, self.equivalence
         low, high = EQUIVALENCE_MARGIN
         needed = ", ".join(f"{factor:g}: {runs}" for factor, runs in self.runs_needed)
+        innovations = (
+            _sentence("NIS over all scans, χ²", "ratio", self.nis),
+            _sentence("NIS whiteness, Ljung-Box", "Q", self.whiteness),
+        )
         return (
             *self.warnings(),
             _sentence(f"Final step, {frame}, χ²", "ratio", self.final_step),
@@ -145,7 +149,7 @@ class ConsistencyReport:
             f"{grid.rejected.sum()} rejected; band [{grid.interval.low:.3f}, "
             f"{grid.interval.high:.3f}]: {_outcome(grid.accepted)} "
             f"(rejects a consistent filter in at most {grid.error_rate:.0%}).",
-            *self._innovation_sentences(),
+            *(() if self.nis is _NOTHING else innovations),
             f"Equivalence, {frame}: the 90 % interval of the ratio is "
             f"[{near.interval.low:.3f}, {near.interval.high:.3f}]; inside "
             f"[{low:g}, {high:g}]: {near.verdict} (claims consistency wrongly in at "
@@ -153,15 +157,6 @@ class ConsistencyReport:
             f"Per-run ratios, {frame}: mean {self.mean_ratio:.3f}, median "
             f"{self.median_ratio:.3f}, {self.share_above_3:.1%} of the runs above 3.",
             f"Runs that find covariances too small by a factor in 90 %: {needed}.",
-        )
-
-    def _innovation_sentences(self) -> tuple[str, ...]:
-        """Return the sentences on the NIS, none without innovations."""
-        if self.nis is _NOTHING:
-            return ()
-        return (
-            _sentence("NIS over all scans, χ²", "ratio", self.nis),
-            _sentence("NIS whiteness, Ljung-Box", "Q", self.whiteness),
         )
 
 

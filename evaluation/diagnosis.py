@@ -185,7 +185,7 @@ def _of_the_noise(guilty: list[Finding], errors: Errors) -> Diagnosis:
     others = dict.fromkeys(f.cause for f in guilty[1:] if f.cause != first.cause)
     also = f"; also {', '.join(others)}" if others else ""
     sentence = (
-        f"{first.cause}: {first.text} ({_p_text(first.p_value)}){also}; {errors.text}."
+        f"{first.cause}: {first.text} ({p_text(first.p_value)}){also}; {errors.text}."
     )
     return Diagnosis(first.cause, first.p_value, sentence, tuple(others))
 
@@ -200,32 +200,22 @@ def _of_the_filter(
     """Return the answer for a filter that assumes the right noise."""
     spurious = None if knowledge is None else spurious_knowledge(knowledge)
     p_value = smallest_adjusted(errors, spurious, blame)
-    ratio_text = errors.text
     if p_value >= FILTER_RATE:
         return _of_consistent_errors(p_value, nis_ratio, blame)
+    what = f"the noise is what it assumes, but {errors.text}"
     is_association = blame is not None and blame.p_value < _ERROR_RATE
-    if _is_cautious(errors, is_association=is_association):
-        sentence = f"cannot tell: the noise is what it assumes, but {ratio_text}."
-        return Diagnosis(CANNOT_TELL, p_value, sentence)
+    only_by_comparison = is_association and errors.p_value >= FILTER_RATE
+    if errors.ratio < 1 and not only_by_comparison:
+        return Diagnosis(CANNOT_TELL, p_value, f"cannot tell: {what}.")
     if blame is not None and (is_association or not blame.is_paired):
         return _of_the_association(blame, errors)
-    doubt = _doubt(errors, nis_ratio, early)
-    return _of_large_errors(p_value, ratio_text, doubt, _claims(knowledge, spurious))
-
-
-def _is_cautious(errors: Errors, *, is_association: bool) -> bool:
-    """Whether the errors are too small, and not only compared with known identities."""
-    return errors.ratio < 1 and not (is_association and errors.p_value >= FILTER_RATE)
-
-
-def _of_large_errors(
-    p_value: float, ratio_text: str, doubt: str, claims: str
-) -> Diagnosis:
-    """Return the answer for errors too large: linearisation, unless in doubt."""
-    what = f"the noise is what it assumes, but {ratio_text}"
-    if doubt:
+    if doubt := _doubt(errors, nis_ratio, early):
         return Diagnosis(CANNOT_TELL, p_value, f"cannot tell: {what}{doubt}.")
-    sentence = f"linearisation: {what} ({_p_text(p_value)}){claims}."
+    claims = ""
+    if knowledge is not None and spurious is not None and spurious < _ERROR_RATE:
+        share = f"{knowledge.mean():.2g}"
+        claims = f"; it claims {share} of the least possible variance of its heading"
+    sentence = f"linearisation: {what} ({p_text(p_value)}){claims}."
     return Diagnosis(LINEARISATION, p_value, sentence)
 
 
@@ -263,30 +253,28 @@ def _innovations_text(nis_ratio: float) -> str:
     )
 
 
-def _claims(knowledge: Array | None, spurious: float | None) -> str:
-    """State the share of the least possible variance, if it is too small."""
-    if knowledge is None or spurious is None or spurious >= _ERROR_RATE:
-        return ""
-    share = f"{knowledge.mean():.2g}"
-    return f"; it claims {share} of the least possible variance of its heading"
-
-
 def _of_the_association(blame: Blame, errors: Errors) -> Diagnosis:
-    ratio_text = errors.text
     if blame.p_value < _ERROR_RATE:
         sentence = (
             f"association: {blame.share:.0%} of the runs give readings to wrong "
-            f"landmarks, and {blame.text} ({_p_text(blame.p_value)}); {ratio_text}."
+            f"landmarks, and {blame.text} ({p_text(blame.p_value)}); {errors.text}."
         )
         return Diagnosis(ASSOCIATION, blame.p_value, sentence)
     sentence = (
-        f"cannot tell: the noise is what it assumes, and {ratio_text}, but runs with "
+        f"cannot tell: the noise is what it assumes, and {errors.text}, but runs with "
         "more wrong associations err no more than others."
     )
     return Diagnosis(CANNOT_TELL, errors.p_value, sentence)
 
 
-def _p_text(p_value: float) -> str:
+def p_text(p_value: float) -> str:
+    """Write a p-value with two digits.
+
+    Examples
+    --------
+    >>> p_text(0.0), p_text(0.0123)
+    ('p < 1e-16', 'p = 0.012')
+    """
     return "p < 1e-16" if p_value < 1e-16 else f"p = {p_value:.2g}"
 
 

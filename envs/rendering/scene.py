@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Polygon
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
+from numpy.typing import ArrayLike
 from PIL import ImageFont
 
 from ...arrays import Array, BoolArray
@@ -83,7 +84,7 @@ class Scene:
 
     def _show_robot(self, pose: Array, collision: bool) -> None:
         moving, colour = self._moving, ALARM if collision else INK
-        moving.arrow.set_xy(self._arrow_at(pose))
+        moving.arrow.set_xy(arrow_at(pose, self._arrow_length()))
         moving.arrow.set_facecolor(colour)
         moving.body.set_offsets(pose[:2])
         moving.body.set_edgecolor(colour)
@@ -123,7 +124,7 @@ class Scene:
         spread = np.einsum("iaib->iab", blocks)  # marginal covariance of each landmark
         moving.map.set_data(*landmarks.T)
         set_ellipses(moving.map_ellipses, landmarks, spread)
-        moving.estimate.set_xy(self._arrow_at(belief.pose))
+        moving.estimate.set_xy(arrow_at(belief.pose, self._arrow_length()))
         spread = np.asarray(belief.pose_covariance)[None, :2, :2]
         set_ellipses(moving.pose_ellipse, belief.pose[None, :2], spread)
 
@@ -141,15 +142,18 @@ class Scene:
         for legend in self._figure.legends[:]:
             legend.remove()
         moving = self._moving
-        named: list[Artist] = [arrow_key(INK, INK, "robot"), moving.path, *self._still]
+        robot = Line2D([], [], ls="", marker=">", color=INK, ms=7, label="robot")
+        named: list[Artist] = [robot, moving.path, *self._still]
         named.append(moving.readings)
         if self._scenario.sensor.clutter > 0:
             named.append(moving.clutter)
         if self._view_is_limited():
             named.append(moving.view)
         if self._legend_has_belief:
-            named.append(ellipse_key(POSE, "pose belief, 3σ"))
-            named.append(ellipse_key(MAP, "landmark belief, 3σ"))
+            named.append(EllipseKind("pose belief, 3σ", POSE, fill=0.14).legend_key())
+            named.append(
+                EllipseKind("landmark belief, 3σ", MAP, fill=0.14).legend_key()
+            )
         self._figure.legend(
             handles=named,
             handler_map=ELLIPSE_HANDLER,
@@ -165,11 +169,6 @@ class Scene:
     def _arrow_length(self) -> float:
         left, right = self._limits.x
         return max(_ARROW_SHARE * (right - left), 0.8 * self._scenario.robot.radius)
-
-    def _arrow_at(self, pose: Array) -> Array:
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        shape = self._arrow_length() * _ARROW @ np.array([[cos, sin], [-sin, cos]])
-        return np.asarray(pose[:2] + shape)
 
     def _view_is_limited(self) -> bool:
         sensor = self._scenario.sensor
@@ -252,19 +251,18 @@ def add_still(axes: Axes, scenario: Scenario, landmarks: Array) -> list[Artist]:
     )
     if not scenario.walls:
         return [crosses]
-    walls = LineCollection(
-        list(np.reshape(scenario.walls, (-1, 2, 2))),
-        colors=WALL,
-        linewidths=2.5,
-        capstyle="round",
-        label="wall",
-    )
+    walls = wall_lines(scenario.walls, 2.5)
     axes.add_collection(walls)
     return [crosses, walls]
 
 
 def add_moving(axes: Axes, radius: float) -> MovingArtists:
     """Create the moving artists without data; `radius` is that of the robot [m]."""
+
+    def ellipses(colour: str, fill: float) -> EllipseCollection:
+        twice = [True, True]  # a single ellipse is not measured first, slowly
+        return EllipseKind("", colour, fill=fill).empty(axes, antialiaseds=twice)
+
     moving = MovingArtists(
         view=Polygon(
             NO_POINT,
@@ -277,11 +275,11 @@ def add_moving(axes: Axes, radius: float) -> MovingArtists:
         readings=_points("o", RAY, "reading"),
         clutter=_points("x", ALARM, "clutter"),
         path=Line2D([], [], color=INK, linewidth=1.4, alpha=0.8, label="true path"),
-        map_ellipses=_ellipses(axes, MAP, fill=0.13),
+        map_ellipses=ellipses(MAP, 0.13),
         map=_points(".", MAP, ""),
-        pose_ellipse=_ellipses(axes, POSE, fill=0.15),
-        body=_ellipses(axes, INK, fill=0.12),
-        halo=_ellipses(axes, ALARM, fill=0.2),
+        pose_ellipse=ellipses(POSE, 0.15),
+        body=ellipses(INK, 0.12),
+        halo=ellipses(ALARM, 0.2),
         arrow=Polygon(NO_POINT, fc=INK, ec="white", lw=0.7),
         estimate=Polygon(NO_POINT, fc="none", ec=POSE, lw=1.5),
         alarm=_title(0.64, "right", "collision", ALARM),
@@ -301,48 +299,89 @@ def _title(x: float, align: str, text: str, colour: str = INK) -> Text:
     return title
 
 
-def _ellipses(axes: Axes, colour: str, fill: float) -> EllipseCollection:
-    return EllipseCollection(
-        [],
-        [],
-        [],
-        units="xy",
-        offsets=np.empty((0, 2)),
-        offset_transform=axes.transData,
-        facecolors=[(*to_rgba(colour)[:3], fill)],
-        edgecolors=colour,
-        linewidths=1.2,
-        antialiaseds=[
-            True,
-            True,
-        ],  # two: a single ellipse is not measured first, slowly
-    )
+class EllipseKind(NamedTuple):
+    """The style of one kind of ellipses in the picture and in the legend."""
+
+    label: str
+    colour: str
+    line: str | tuple[float, tuple[float, ...]] = "-"
+    fill: float = 0.0
+    width: float = 1.2
+    alpha: float = 1.0
+
+    def empty(self, axes: Axes, scale: float = 1.0, **style: Any) -> EllipseCollection:
+        """Return an empty collection in data coordinates of axes, not added to them."""
+        return EllipseCollection(
+            [],
+            [],
+            [],
+            units="xy",
+            offsets=np.empty((0, 2)),
+            offset_transform=axes.transData,
+            facecolors=[to_rgba(self.colour, self.fill)],
+            edgecolors=[to_rgba(self.colour, self.alpha)],
+            linestyles=[self.line],
+            linewidths=self.width * scale,
+            label=self.label,
+            **style,
+        )
+
+    def add_to(self, axes: Axes, scale: float = 1.0) -> EllipseCollection:
+        """Add an empty collection."""
+        shown = self.empty(axes, scale)
+        axes.add_collection(shown, autolim=False)
+        return shown
+
+    def draw(self, axes: Axes, means: Array, covariances: Array) -> None:
+        """Add 3σ ellipses: means (n, 2) [m], covariances (n, 2, 2)."""
+        set_ellipses(self.add_to(axes), means, covariances)
+
+    def legend_key(self) -> Ellipse:
+        """Return the key for a legend drawn with `ELLIPSE_HANDLER`."""
+        return Ellipse(
+            (0, 0),
+            1,
+            1,
+            facecolor=to_rgba(self.colour, self.fill),
+            edgecolor=to_rgba(self.colour, self.alpha),
+            linestyle=self.line,
+            linewidth=self.width,
+            label=self.label,
+        )
 
 
 def set_ellipses(shown: EllipseCollection, means: Array, covariances: Array) -> None:
-    """Show the 3σ ellipses of n positions: means (n, 2) [m], covariances (n, 2, 2)."""
-    outline = covariance_ellipses(covariances)
+    """Set the 3σ ellipses of n positions: means (n, 2) [m], covariances (n, 2, 2)."""
+    outline = covariance_ellipses(np.reshape(covariances, (-1, 2, 2)))
     shown.set(
-        offsets=means,
+        offsets=np.reshape(means, (-1, 2)),
         widths=outline.widths,
         heights=outline.heights,
         angles=np.degrees(outline.angles),  # matplotlib's unit
     )
 
 
+def arrow_at(pose: Array, size: float) -> Array:
+    """Return the outline of an arrow-shaped robot, shape (4, 2) [m]."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    turn = np.array([[cos, sin], [-sin, cos]])
+    return np.asarray(pose[:2] + size * _ARROW @ turn)
+
+
+def wall_lines(walls: ArrayLike, width: float, **style: Any) -> LineCollection:
+    """Return the lines of walls, rows (x0, y0, x1, y1) [m]."""
+    return LineCollection(
+        list(np.reshape(walls, (-1, 2, 2))),
+        colors=WALL,
+        linewidths=width,
+        capstyle="round",
+        label="wall",
+        **style,
+    )
+
+
 def _points(marker: str, colour: str, label: str) -> Line2D:
     return Line2D([], [], ls="", marker=marker, ms=4, color=colour, label=label)
-
-
-def arrow_key(face: str, edge: str, label: str) -> Line2D:
-    """Return the legend entry of an arrow-shaped robot."""
-    return Line2D([], [], ls="", marker=">", mfc=face, mec=edge, ms=7, label=label)
-
-
-def ellipse_key(colour: str, label: str, fill: float = 0.14) -> Ellipse:
-    """Return the legend entry of an ellipse, to be drawn with `ELLIPSE_HANDLER`."""
-    face = to_rgba(colour, fill)
-    return Ellipse((0, 0), 1, 1, fc=face, ec=colour, lw=1.2, label=label)
 
 
 def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)

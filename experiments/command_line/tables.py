@@ -3,7 +3,7 @@
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.table import Table
 from rich.text import Text
@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from ..noise_study import NoiseEffect, NoiseRun
 
 
-_FATES = (
-    ("rejected", "rejected by the gate"),
-    ("skipped", "too close"),
-    ("tentative", "of unconfirmed ones"),
-    ("ambiguous", "ambiguous"),
-)
+_FATES = {
+    "rejected": "rejected by the gate",
+    "skipped": "too close",
+    "tentative": "of unconfirmed ones",
+    "ambiguous": "ambiguous",
+}
+_CHANGES = {name: name for name in ("confirmed", "removed", "merged")}
 _MOST_ROWS = 10  # landmarks; larger maps show the worst ones
 _WORST, _FEWER = 5, 3  # of them; fewer above the table of several filters
 _WIDTH = 80  # of a terminal
@@ -32,23 +33,16 @@ def landmark_table(summary: dict[str, Any]) -> Table:
     known = any(row["euclidean"] is not None for row in rows)
     shown, caption = rows, None
     if len(rows) > _MOST_ROWS:
-        shown = _worst_rows(summary)
+        count = _FEWER if summary.get("others") else _WORST
+        shown = sorted(rows, key=_distance, reverse=True)[:count]
         which = ("first", "largest errors")[known]
         caption = Text(
             f"the {len(shown)} {which} of {len(rows)}; all: summary.json", "dim"
         )
-    table = Table(
-        title="Landmarks, with their distances from the truth" * known or "Landmarks",
-        title_justify="left",
-        caption=caption,
-        caption_justify="left",
-        box=None,
-        pad_edge=False,
-    )
+    title = "Landmarks, with their distances from the truth" * known or "Landmarks"
     headings = ["id", "x [m]", "y [m]"]
     headings += ["Euclidean [m]", "Mahalanobis [σ]"] if known else []
-    for heading in headings:
-        table.add_column(Text(heading), justify="right")
+    table = _table(headings, title=title, caption=caption)
     for row in shown:
         cells = [str(row["id"]), _number(row["x"], 4), _number(row["y"], 4)]
         distances = [_number(row["euclidean"], 7), _number(row["mahalanobis"], 5)]
@@ -56,10 +50,21 @@ def landmark_table(summary: dict[str, Any]) -> Table:
     return table
 
 
-def _worst_rows(summary: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return some landmarks with the largest errors, fewer beside other filters."""
-    count = _FEWER if summary.get("others") else _WORST
-    return sorted(summary["landmarks"], key=_distance, reverse=True)[:count]
+def _table(
+    headings: Sequence[str], texts: Sequence[str] = ("",), **options: Any
+) -> Table:
+    """Return a table without rows; all columns but `texts` are of numbers."""
+    table = Table(
+        title_justify="left",
+        caption_justify="left",
+        box=None,
+        pad_edge=False,
+        **options,
+    )
+    for heading in headings:
+        side: Literal["left", "right"] = "left" if heading in texts else "right"
+        table.add_column(Text(heading), justify=side)
+    return table
 
 
 def _distance(row: Mapping[str, float | None]) -> tuple[float, float]:
@@ -76,16 +81,9 @@ def heading(*parts: str) -> Text:
     return text.append("\n")
 
 
-def key_figures(summary: dict[str, Any]) -> Table:
-    """Lay out the few numbers that describe the quality of a run."""
-    return named_rows(_figures(summary))
-
-
 def named_rows(rows: Sequence[tuple[str, str]], title: str | None = None) -> Table:
     """Lay out rows of a name and a text."""
-    table = Table(
-        title=title, title_justify="left", box=None, show_header=False, pad_edge=False
-    )
+    table = _table((), title=title, show_header=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
     for name, text in rows:
@@ -93,12 +91,16 @@ def named_rows(rows: Sequence[tuple[str, str]], title: str | None = None) -> Tab
     return table
 
 
-def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    readings = summary["readings"]
+def key_figures(summary: dict[str, Any]) -> Table:
+    """Lay out the few numbers that describe the quality of a run."""
+    counts, size = summary["readings"], f"{len(summary['landmarks'])} landmarks"
+    readings = (
+        f"{counts['associated']} of known landmarks, {counts['added']} of new ones"
+    )
     rows = [
         ("steps", f"{summary['steps']}, with {summary['scans']} scans"),
-        ("readings", _readings(readings)),
-        ("map", _map(summary["map_changes"], len(summary["landmarks"]))),
+        ("readings", _and_counts(readings, counts, _FATES)),
+        ("map", _and_counts(size, summary["map_changes"], _CHANGES)),
         ("final pose", _pose(summary["pose"], summary["pose_covariance"])),
     ]
     are_compared = bool(summary.get("others"))  # a table of its own has these
@@ -112,23 +114,13 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
     ):
         if summary[key] is not None:
             rows.append((name, _ratio(summary[key], hint)))
-    return rows
+    return named_rows(rows)
 
 
-def _readings(counts: dict[str, int]) -> str:
-    text = f"{counts['associated']} of known landmarks, {counts['added']} of new ones"
-    for fate, words in _FATES:
-        if counts[fate]:
-            text += f", {counts[fate]} {words}"
-    return text
-
-
-def _map(changes: dict[str, int], landmarks: int) -> str:
-    text = f"{landmarks} landmarks"
-    for change in ("confirmed", "removed", "merged"):
-        if changes[change]:
-            text += f", {changes[change]} {change}"
-    return text
+def _and_counts(text: str, counts: dict[str, int], words: Mapping[str, str]) -> str:
+    """Append the counts that are not 0."""
+    found = [f"{counts[key]} {word}" for key, word in words.items() if counts[key]]
+    return ", ".join([text, *found])
 
 
 def _pose(pose: Sequence[float | None], covariance: Sequence[Sequence[float]]) -> str:
@@ -187,15 +179,8 @@ def comparison_table(columns: Mapping[str, Mapping[str, Any]]) -> Table:
     from ..monte_carlo.report import headings_and_key
 
     headings, key_of_headings = headings_and_key(list(columns))
-    table = Table(
-        caption=Text(key_of_headings) if key_of_headings else None,
-        caption_justify="left",
-        box=None,
-        pad_edge=False,
-    )
-    table.add_column("")
-    for heading in headings:
-        table.add_column(Text(heading), justify="right")
+    caption = Text(key_of_headings) if key_of_headings else None
+    table = _table(["", *headings], caption=caption)
     for name, key, kind in (
         ("path error, raw [m RMS]", "ate", "raw"),
         ("path error, aligned [m RMS]", "ate", "aligned"),
@@ -249,18 +234,15 @@ def association_table(scores: dict[str, Any]) -> Table:
     scores : dict
         As in :func:`slamgym.experiments.runs.summary.association_summary`.
     """
-    title = "Association"
+    title, found = "Association", scores["gospa"]
     if scores["resolution"]:
         title += f", landmarks nearer than {scores['resolution']:g} m counted as one"
-    return named_rows(_rows(scores), title)
-
-
-def _rows(scores: dict[str, Any]) -> list[tuple[str, str]]:
-    found = scores["gospa"]
-    rows = [("GOSPA of the map", _gospa(found, "aligned") + " once best fitted")]
-    rows.append(("… raw", f"{_gospa(found, 'raw')}; cut-off {found['cutoff']:g} m"))
+    of_the_map = [
+        ("GOSPA of the map", _gospa(found["aligned"]) + " once best fitted"),
+        ("… raw", f"{_gospa(found['raw'])}; cut-off {found['cutoff']:g} m"),
+    ]
     if scores["correct"] is None:
-        return rows
+        return named_rows(of_the_map, title)
     readings = (
         f"{scores['correct']} correct, {scores['wrong']} wrong, {scores['missed']} "
         f"not used, {scores['clutter_used']} of clutter used"
@@ -270,27 +252,22 @@ def _rows(scores: dict[str, Any]) -> list[tuple[str, str]]:
         f"{scores['ghost']} of clutter"
     )
     size = f"{scores['map_size']}; {scores['true_map_size']} were seen often enough"
-    shares = f"{_share(scores['precision'])}, recall {_share(scores['recall'])}"
-    return [
+    shares = f"{_number(scores['precision'], 3)}, recall {_number(scores['recall'], 3)}"
+    of_readings = [
         ("readings", readings),
         ("new landmarks", new),
         ("map size", size),
         ("precision", shares),
-        *rows,
     ]
+    return named_rows(of_readings + of_the_map, title)
 
 
-def _gospa(found: dict[str, Any], which: str) -> str:
-    parts = found[which]
+def _gospa(parts: dict[str, Any]) -> str:
     return (
         f"{significant(parts['distance'])} m: {parts['missed_count']} missed, "
         f"{parts['false_count']} false, localisation "
         f"{significant(parts['localisation'] ** 0.5)} m"
     )
-
-
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
 
 
 # --------------------------------------------------------------------------------------
@@ -312,7 +289,9 @@ def runs_table(runs: "Sequence[NoiseRun]") -> Table:
     title = "Final 3σ areas and RMS errors; for NEES and NIS, 1 is expected"
     rows: list[dict[str, Any]] = [run.row._asdict() for run in runs]
     shown = [key for key in _COLUMNS if any(row[key] is not None for row in rows)]
-    table = _table("noise", "value", title=title)
+    table = _table((), title=title)
+    for name in ("noise", "value"):
+        table.add_column(name, no_wrap=True)
     for key in shown:
         table.add_column(Text(_COLUMNS[key]), justify="right", no_wrap=True)
     for run, row in zip(runs, rows, strict=True):
@@ -328,12 +307,10 @@ def effects_table(name: str, runs: int, effects: "Sequence[NoiseEffect]") -> Tab
     labels = list(dict.fromkeys(effect.estimator for effect in effects))
     headings, key = headings_and_key(labels)
     note = "± is the standard error. noise_study.csv holds further figures."
-    table = _table(
-        "changed",
-        "noise",
-        title=f"{name}, {runs} runs each: NEES / 3 of the pose; 1 is expected",
-        caption=f"{key}\n{note}".strip(),
-    )
+    title = f"{name}, {runs} runs each: NEES / 3 of the pose; 1 is expected"
+    table = _table((), title=title, caption=Text(f"{key}\n{note}".strip()))
+    for column in ("changed", "noise"):
+        table.add_column(column, no_wrap=True)
     for heading in headings:
         table.add_column(Text(heading), justify="right", overflow="fold")
     rows: dict[tuple[str, Variation], list[str]] = {}
@@ -342,20 +319,6 @@ def effects_table(name: str, runs: int, effects: "Sequence[NoiseEffect]") -> Tab
         rows.setdefault((effect.changed, variation), []).append(_cell(effect))
     for (changed, variation), cells in rows.items():
         table.add_row(changed, "" if changed == "nothing" else str(variation), *cells)
-    return table
-
-
-def _table(*names: str, title: str, caption: str | None = None) -> Table:
-    table = Table(
-        title=title,
-        caption=None if caption is None else Text(caption),
-        title_justify="left",
-        caption_justify="left",
-        box=None,
-        pad_edge=False,
-    )
-    for name in names:
-        table.add_column(name, no_wrap=True)
     return table
 
 
@@ -380,10 +343,10 @@ _VERDICTS = {
 
 def noise_table(summary: dict[str, Any]) -> Table:
     """Lay out the standard deviations with their intervals."""
-    table = Table(box=None, pad_edge=False)
-    for heading in ("noise", "before", "most likely", "95 % interval", "suggested", ""):
-        is_text = heading in ("noise", "")
-        table.add_column(Text(heading), justify="left" if is_text else "right")
+    table = _table(
+        ("noise", "before", "most likely", "95 % interval", "suggested", ""),
+        texts=("noise", ""),
+    )
     suggested = _noise_by_name(summary["runs"]["suggested"]["settings"])
     for row in summary["noise"]:
         table.add_row(
@@ -399,9 +362,8 @@ def noise_table(summary: dict[str, Any]) -> Table:
 
 def noise_comparison_table(summary: dict[str, Any]) -> Table:
     """Lay out the results of filters under each noise."""
-    table, runs = Table(box=None, pad_edge=False), summary["runs"]
-    for heading in ("", *runs):
-        table.add_column(Text(heading), justify="right" if heading else "left")
+    runs = summary["runs"]
+    table = _table(("", *runs))
     for name, path in (
         ("log likelihood", ("log_likelihood",)),
         ("readings rejected", ("readings", "rejected")),

@@ -14,19 +14,21 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from ...arrays import Array, BoolArray
+from ...envs.rendering.scene import EllipseKind
 from ...estimator.models.rigid_motion import additive_error
 from ...evaluation.trajectory_error import LandmarkDistances, landmark_distances
 from ..runs.trace import RunTrace
 from . import style
-from .maps import Walls, box_around, draw_walls, wall_ends
+from .maps import Walls, box_around, draw_walls, shared_limits, wall_ends
 from .style import (
     ALARM,
     BLUE,
     GREY,
     INK,
     TEAL,
-    EllipseKind,
+    deviations,
     dress,
+    dress_map,
     new_figure,
     write_title,
 )
@@ -70,9 +72,7 @@ def truth_figure(trace: RunTrace, walls: Walls = ()) -> Figure:
         area, *beside = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
         names = [f"l{i}" for i in trace.landmark_ids[landmarks]]
         _draw_distances(beside[0], beside[1], distances, names, room=tall)
-    dress(area)
-    area.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
-    area.set(xlabel="x [m]", ylabel="y [m]")
+    dress_map(area, limits)
     keys = draw_against_truth(area, trace) + draw_walls(area, walls)
     write_title(area, "Estimate and ground truth", _summary(trace, poses, distances))
     style.legend_below(figure, keys, columns=len(keys))
@@ -100,8 +100,7 @@ def truth_limits(trace: RunTrace, walls: Walls = ()) -> Array:
 def draw_against_truth(axes: Axes, trace: RunTrace) -> list[Artist]:
     """Draw estimates, truth and the lines between them; return the legend's keys."""
     poses, landmarks = _known(trace.true_poses), _known(trace.true_landmarks)
-    shown = _LANDMARK.add_to(axes)
-    style.set_ellipses(shown, trace.landmarks, trace.landmark_covariances)
+    _LANDMARK.draw(axes, trace.landmarks, trace.landmark_covariances)
     axes.plot(*trace.landmarks.T, ".", color=TEAL, ms=4)
     (path,) = axes.plot(
         *trace.poses[:, :2].T, color=style.BLUE, lw=1.6, label="estimated path"
@@ -226,7 +225,7 @@ def comparison_figure(traces: Sequence[RunTrace], walls: Walls = ()) -> Figure:
     """
     if len(traces) < 2:
         raise ValueError(f"traces must be of two filters or more, got {len(traces)}")
-    limits = _common_limits(traces, walls)
+    limits = shared_limits([truth_limits(trace, walls) for trace in traces])
     width, height = limits[1] - limits[0]
     rows = -(-len(traces) // _COLUMNS)
     figure = style.new_figure(11.0, (4.9 * height / width + 0.8) * rows + 0.7)
@@ -235,9 +234,8 @@ def comparison_figure(traces: Sequence[RunTrace], walls: Walls = ()) -> Figure:
         if k >= len(traces):
             axes.set_axis_off()
             continue
-        style.dress(axes)
-        axes.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
-        axes.set(xlabel="x [m]", ylabel="y [m]" if k % _COLUMNS == 0 else "")
+        ylabel = "y [m]" if k % _COLUMNS == 0 else ""
+        dress_map(axes, limits, labels=("x [m]", ylabel))
         keys = draw_against_truth(axes, traces[k]) + draw_walls(axes, walls)
         name = traces[k].estimator
         title = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
@@ -255,18 +253,6 @@ def honesty(trace: RunTrace) -> str:
     inside = int((distances.mahalanobis <= 3).sum())
     rms = np.sqrt(np.mean(distances.euclidean**2))
     return f"{inside} of {count} landmarks inside 3σ  ·  map error {rms:.2g} m RMS"
-
-
-def _common_limits(traces: Sequence[RunTrace], walls: Walls) -> Array:
-    boxes = np.array([truth_limits(trace, walls) for trace in traces])
-    low, high = boxes[0]
-    room = 0.5 * float((high - low).max())
-    return np.stack(
-        [
-            np.maximum(boxes[:, 0].min(axis=0), low - room),
-            np.minimum(boxes[:, 1].max(axis=0), high + room),
-        ]
-    )
 
 
 # --------------------------------------------------------------------------------------
@@ -293,9 +279,7 @@ def errors_figure(trace: RunTrace) -> Figure:
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     if truth is not None and known:
         errors = -additive_error(truth, trace.poses)
-        std = np.sqrt(
-            np.maximum(np.diagonal(trace.pose_covariances, axis1=1, axis2=2), 0)
-        )
+        std = deviations(trace.pose_covariances)
         for k, (label, name) in enumerate(_ROWS):
             _draw_error(axes[k], trace.t, errors[:, k], std[:, k])
             axes[k].set_ylabel(label)
@@ -453,7 +437,7 @@ def correlations(covariance: Array) -> Array:
     array([[1. , 0.5],
            [0.5, 1. ]])
     """
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    std = deviations(covariance)
     std = np.where(std > 0, std, np.nan)
     return np.asarray(np.clip(covariance / std[:, None] / std, -1.0, 1.0))
 
@@ -478,7 +462,7 @@ def _draw_correlations(
     for line in (axes.axhline, axes.axvline):  # between pose and landmarks
         line(2.5, color="white", lw=1.5 if few else 0.6)
     if few:
-        _write_deviations(axes, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+        _write_deviations(axes, deviations(covariance))
     return image
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
@@ -19,7 +19,13 @@ from PIL import Image
 
 from ...arrays import Array
 from ...envs.rendering import BlittedFigure
-from ...envs.rendering.scene import ELLIPSE_HANDLER, WALL
+from ...envs.rendering.scene import (
+    ELLIPSE_HANDLER,
+    EllipseKind,
+    arrow_at,
+    set_ellipses,
+    wall_lines,
+)
 from ...estimator.models.rigid_motion import rotation
 from ...evaluation.trajectory_error import PositionAccuracy, poses_at
 from ...sim_configs.atomic_file import replace_when_written
@@ -32,11 +38,10 @@ from .style import (
     INK,
     ORANGE,
     TEAL,
-    EllipseKind,
-    dress,
+    deviations,
+    dress_map,
     legend_below,
     new_figure,
-    set_ellipses,
     write_title,
 )
 
@@ -130,7 +135,7 @@ def noise_study_figure(runs: Sequence[tuple[str, RunTrace]]) -> Figure:
     """
     if len(runs) < 2:
         raise ValueError(f"runs must hold a reference and a variation, got {len(runs)}")
-    limits = _shared_limits([trace for _, trace in runs])
+    limits = shared_limits([map_limits(trace) for _, trace in runs])
     rows = 1 + len(runs) // 2
     width, height = limits[1] - limits[0]
     figure = new_figure(7.6, (3.15 * height / width + 0.55) * rows + 0.4)
@@ -176,8 +181,7 @@ def _map_parts(trace: RunTrace, walls: Walls) -> _MapParts:
     width, height = limits[1] - limits[0]
     figure = new_figure(7.2, 6.4 * height / width + 1.5)
     axes = figure.add_subplot()
-    _prepare(axes, limits)
-    axes.set(xlabel="x [m]", ylabel="y [m]")
+    dress_map(axes, limits)
     picture = MapPicture(axes, trace)
     keys = picture.legend_keys() + draw_walls(axes, walls)
     legend_below(figure, keys, columns=3)
@@ -217,24 +221,19 @@ def _outcome(trace: RunTrace) -> str:
     return f"{size}, errors {np.sqrt(np.nanmean(error**2)):.2g} m RMS"
 
 
-def _prepare(axes: Axes, limits: Array, *, size: float = 10.0) -> None:
-    dress(axes, size=size)
-    axes.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
-
-
 def _draw_panel(axes: Axes, title: str, trace: RunTrace, limits: Array) -> MapPicture:
-    _prepare(axes, limits, size=9)
+    dress_map(axes, limits, size=9, labels=("", ""))
     picture = MapPicture(axes, trace, scale=0.75)
     picture.show(trace.last_step)
     write_title(axes, title, _outcome(trace), size=10)
     return picture
 
 
-def _shared_limits(traces: Sequence[RunTrace]) -> Array:
-    """Return a box around all maps, but at most twice as wide as the reference."""
-    low, high = map_limits(traces[0])
+def shared_limits(limits: Sequence[Array]) -> Array:
+    """Return a box around boxes, but at most twice as wide as the first one."""
+    boxes = np.array(limits)
+    low, high = boxes[0]
     room = 0.5 * float((high - low).max())
-    boxes = np.array([map_limits(trace) for trace in traces])
     return np.stack(
         [
             np.maximum(boxes[:, 0].min(axis=0), low - room),
@@ -270,9 +269,8 @@ LATER = EllipseKind("landmark later, 3σ", "#128a3a", fill=0.16, width=1.5)
 _FORMER = EllipseKind("landmark in between", LATER.colour, width=0.6, alpha=0.35)
 
 _MOST_POSES = 60  # ellipses along the path; longer runs show every second, third, …
-_MOST_FORMER = 300  # green ellipses of earlier steps
+_MOST_FORMER = 300  # green ellipses of earlier steps; large maps show fewer steps
 _SHORTEST_SIDE = 0.55  # of a map, as a share of its longest
-_ARROW = np.array([[1.0, 0.0], [-0.75, 0.7], [-0.35, 0.0], [-0.75, -0.7]])
 
 
 class _Artists(NamedTuple):
@@ -328,7 +326,9 @@ class MapPicture:
             trace.poses[steps, :2],
             trace.pose_covariances[steps, :2, :2],
         )
-        artists.robot.set_xy(self._arrow_at(trace.poses[step]))
+        (left, right), (low, high) = self._axes.get_xlim(), self._axes.get_ylim()
+        size = 0.018 * max(right - left, high - low)
+        artists.robot.set_xy(arrow_at(trace.poses[step], size))
         self._show_landmarks(step)
 
     def legend_keys(self) -> list[Artist]:
@@ -349,24 +349,12 @@ class MapPicture:
         now = trace.map_at(step)
         set_ellipses(artists.later, now.means, now.covariances)
         artists.estimates.set_data(*now.means.T)
-        former = [trace.map_at(k) for k in self._former_steps(step)]
+        stride = -(-trace.last_step * len(self._first_steps) // _MOST_FORMER)
+        former = [trace.map_at(k) for k in range(0, step, max(1, stride))]
         set_ellipses(
             artists.former,
             np.concatenate([np.empty((0, 2)), *(m.means for m in former)]),
             np.concatenate([np.empty((0, 2, 2)), *(m.covariances for m in former)]),
-        )
-
-    def _former_steps(self, step: int) -> range:
-        """Return the earlier steps whose landmarks are shown too: few in large maps."""
-        stride = -(-self._trace.last_step * len(self._first_steps) // _MOST_FORMER)
-        return range(0, step, max(1, stride))
-
-    def _arrow_at(self, pose: Array) -> Array:
-        (left, right), (low, high) = self._axes.get_xlim(), self._axes.get_ylim()
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        size = 0.018 * max(right - left, high - low)
-        return np.asarray(
-            pose[:2] + size * _ARROW @ np.array([[cos, sin], [-sin, cos]])
         )
 
     def _add_truth(self, scale: float) -> Line2D:
@@ -457,7 +445,7 @@ def box_around(points: Array, means: Array, covariances: Array) -> Array:
     """
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     span = max(float((high - low).max()), 1e-3)
-    reach = 3 * np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
+    reach = 3 * deviations(covariances)
     lowest = (means - reach).min(axis=0, initial=np.inf)
     highest = (means + reach).max(axis=0, initial=-np.inf)
     low = np.maximum(np.minimum(low, lowest), low - span / 3)
@@ -483,14 +471,7 @@ def draw_walls(axes: Axes, walls: Walls) -> list[Artist]:
     """Draw walls, and return the keys of a legend: none without walls."""
     if not len(walls):
         return []
-    lines = LineCollection(
-        list(wall_ends(walls).reshape(-1, 2, 2)),
-        colors=WALL,
-        linewidths=2.2,
-        capstyle="round",
-        zorder=1.5,
-        label="wall",
-    )
+    lines = wall_lines(wall_ends(walls), 2.2, zorder=1.5)
     axes.add_collection(lines, autolim=False)
     return [lines]
 
@@ -519,9 +500,7 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
     width, height = limits[1] - limits[0]
     figure = style.new_figure(7.2, 6.2 * height / width + 1.6)
     axes = figure.add_subplot()
-    dress(axes)
-    axes.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
-    axes.set(xlabel="x [m]", ylabel="y [m]")
+    dress_map(axes, limits)
     (filtered,) = axes.plot(
         *trace.poses[:, :2].T, color=ORANGE, lw=1.0, label=f"filter: {trace.estimator}"
     )
@@ -529,11 +508,8 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
         *smoothed.poses[:, :2].T, color=style.BLUE, lw=1.4, label="smoother"
     )
     chosen = np.arange(0, len(drive.poses), -(-len(drive.poses) // _MOST_POSES))
-    covariances = drive.pose_covariances[chosen, :2, :2]
-    style.set_ellipses(_POSE.add_to(axes), drive.poses[chosen, :2], covariances)
-    style.set_ellipses(
-        _LANDMARK.add_to(axes), drive.landmarks, drive.landmark_covariances
-    )
+    _POSE.draw(axes, drive.poses[chosen, :2], drive.pose_covariances[chosen, :2, :2])
+    _LANDMARK.draw(axes, drive.landmarks, drive.landmark_covariances)
     axes.plot(*drive.landmarks.T, ".", color=TEAL, ms=3)
     keys: list[Artist] = [path, filtered, _POSE.legend_key(), _LANDMARK.legend_key()]
     accuracy = path_accuracy(smoothed.log, trace.t, smoothed.poses)

@@ -2,22 +2,18 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import EllipseCollection
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 
 from ...arrays import Array
-from ...envs.rendering import covariance_ellipses
 from ...envs.rendering.scene import ELLIPSE_HANDLER, PlainTextFigure
 from ...sim_configs.atomic_file import replace_when_written
 
@@ -81,6 +77,19 @@ def dress(axes: Axes, *, size: float = 10.0) -> None:
         label.set(fontsize=size, color=INK)
 
 
+def dress_map(
+    axes: Axes,
+    limits: Array,
+    *,
+    size: float = 10.0,
+    labels: tuple[str, str] = ("x [m]", "y [m]"),
+) -> None:
+    """Apply the common style to axes of a map with limits, shape (2, 2) [m]."""
+    dress(axes, size=size)
+    axes.set(aspect="equal", xlim=limits[:, 0], ylim=limits[:, 1])
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+
+
 def write_title(
     axes: Axes, title: str, subtitle: str = "", *, size: float = 11.0
 ) -> tuple[Text, Text]:
@@ -102,57 +111,10 @@ def write_title(
     return above, below
 
 
-class EllipseKind(NamedTuple):
-    """The style of one kind of ellipses in the picture and in the legend."""
-
-    label: str
-    colour: str
-    line: str | tuple[float, tuple[float, ...]] = "-"
-    fill: float = 0.0
-    width: float = 1.2
-    alpha: float = 1.0
-
-    def add_to(self, axes: Axes, scale: float = 1.0) -> EllipseCollection:
-        """Add an empty collection in data coordinates."""
-        shown = EllipseCollection(
-            [],
-            [],
-            [],
-            units="xy",
-            offsets=np.empty((0, 2)),
-            offset_transform=axes.transData,
-            facecolors=[to_rgba(self.colour, self.fill)],
-            edgecolors=[to_rgba(self.colour, self.alpha)],
-            linestyles=[self.line],
-            linewidths=self.width * scale,
-            label=self.label,
-        )
-        axes.add_collection(shown, autolim=False)
-        return shown
-
-    def legend_key(self) -> Ellipse:
-        """Return the key for a legend drawn with `ELLIPSE_HANDLER`."""
-        return Ellipse(
-            (0, 0),
-            1,
-            1,
-            facecolor=to_rgba(self.colour, self.fill),
-            edgecolor=to_rgba(self.colour, self.alpha),
-            linestyle=self.line,
-            linewidth=self.width,
-            label=self.label,
-        )
-
-
-def set_ellipses(shown: EllipseCollection, means: Array, covariances: Array) -> None:
-    """Set the 3σ ellipses of n positions: means (n, 2) [m], covariances (n, 2, 2)."""
-    outline = covariance_ellipses(np.reshape(covariances, (-1, 2, 2)))
-    shown.set(
-        offsets=np.reshape(means, (-1, 2)),
-        widths=outline.widths,
-        heights=outline.heights,
-        angles=np.degrees(outline.angles),  # matplotlib's unit
-    )
+def deviations(covariances: Array) -> Array:
+    """Return the standard deviations (..., n) of covariances (..., n, n)."""
+    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
 def legend_below(figure: Figure, keys: Sequence[Artist], columns: int) -> None:
@@ -196,8 +158,3 @@ def page_environment(
         keep_trailing_newline=True,
         undefined=StrictUndefined,
     )
-
-
-def page_template(folder: Path, name: str) -> Template:
-    """Return a template of a folder; see :func:`page_environment`."""
-    return page_environment(folder).get_template(name)

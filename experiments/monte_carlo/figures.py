@@ -96,13 +96,9 @@ def nees_figure(shown: Shown, frame: ErrorFrame, summary: dict[str, Any]) -> Fig
         _mark_grid(axes, summary["estimators"][scores.label]["decisions"], look)
         extremes.append(average)
     everything = np.concatenate(extremes)
-    dress(axes)
     if everything.max() > _LOG_FROM or everything.min() < 1 / _LOG_FROM:
         log_ticks(axes, "y")
-    axes.margins(x=0.01)
-    axes.set(xlabel="step", ylabel="ANEES / 3")
-    legend_above(figure, axes)
-    return figure
+    return _finished(figure, axes, "ANEES / 3")
 
 
 def runs_figure(shown: Shown, frame: ErrorFrame) -> Figure:
@@ -180,10 +176,15 @@ def rmse_figure(shown: Shown) -> Figure:
         bound = shown[0][0].over_time("position_bound_raw").mean(axis=0)
         least = thinned(shown[0][0].steps, np.sqrt(bound))
         axes.plot(*least, color=GREY, ls=":", lw=1.5, label="bound of any filter")
+    axes.set_ylim(bottom=0)
+    return _finished(figure, axes, "RMS error, raw [m]")
+
+
+def _finished(figure: Figure, axes: Axes, ylabel: str) -> Figure:
+    """Dress and label the axes of a number over the steps."""
     dress(axes)
     axes.margins(x=0.01)
-    axes.set_ylim(bottom=0)
-    axes.set(xlabel="step", ylabel="RMS error, raw [m]")
+    axes.set(xlabel="step", ylabel=ylabel)
     legend_above(figure, axes)
     return figure
 

@@ -1,6 +1,6 @@
 """Run one filter over many simulated runs: in a batch if possible, else one by one."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
@@ -137,9 +137,11 @@ def _one_by_one(
     try:
         slam = settings.make(runs.initial_poses[run])
         recorder = DecisionRecorder(slam)
-        pass_truth = _truth_source(slam, runs, run)
+        observer = slam if isinstance(slam, SupportsTruth) else None
+        landmarks = dict(enumerate(runs.landmarks[run]))
         for step in range(runs.visible.shape[1]):
-            pass_truth(step)
+            if observer is not None:
+                observer.observe_truth(runs.true_poses[run, step], landmarks)
             belief = _step(slam, runs, run, step, trace, recorder)
             if not _finite(trace, (run, step)):
                 return Failure(step, _NOT_FINITE)
@@ -153,20 +155,6 @@ def _one_by_one(
     if runs.true_ids is not None and (made := recorder.result()) is not None:
         decisions[run] = made
     return None
-
-
-def _truth_source(
-    slam: SlamEstimator, runs: SimulatedRuns, run: int
-) -> Callable[[int], None]:
-    """Return the function that passes the truth of a step to an observing filter."""
-    if not isinstance(slam, SupportsTruth):
-        return _unobserved
-    landmarks = dict(enumerate(runs.landmarks[run]))
-    return lambda step: slam.observe_truth(runs.true_poses[run, step], landmarks)
-
-
-def _unobserved(_: int) -> None:
-    """Pass nothing."""
 
 
 def _step(

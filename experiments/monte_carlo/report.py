@@ -2,13 +2,12 @@
 
 import html
 import io
-import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from string import ascii_uppercase
-from typing import Any, NamedTuple
+from typing import Any
 
 import xarray as xr
 from markupsafe import Markup
@@ -18,13 +17,14 @@ from rich.table import Table
 from rich.text import Text
 
 from ...evaluation.consistency_report import FEW_AVERAGES
+from ...evaluation.diagnosis import p_text
 from ...sim_configs.atomic_file import replace_when_written
 from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, PALE, TEAL, page_environment
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
 from .runner import ASSUMED_FILE, python_call
-from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT, in_degrees, p_text
+from .summary import NOTHING, measures, number, percent
+from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT
 
-_NOTHING = "–"
 _LARGE = 1e5  # written without three decimals
 _FEW = 3  # estimators; a headline counts more of them
 
@@ -75,7 +75,7 @@ def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         "few_averages": FEW_AVERAGES,
         "kinds": KINDS,
         "signs": {CONSISTENT: "✓", NEARLY: "≈", NOT_CONSISTENT: "✗"},
-        "outcomes": {True: "accepted", False: "rejected", None: _NOTHING},
+        "outcomes": {True: "accepted", False: "rejected", None: NOTHING},
         "inside": {CONSISTENT: "yes", NOT_CONSISTENT: "no, outside"},
         "breakable": _breakable,
         "extreme": _extreme,
@@ -109,11 +109,6 @@ def headline(summary: dict[str, Any]) -> str:
     return f"{summary['scenario']}: {said}"
 
 
-def _bad_run(summary: dict[str, Any]) -> str:
-    scores = [entry["association"] for entry in summary["estimators"].values()]
-    return "" if None in scores else f" {bad_run_text(scores[0])}"
-
-
 def _files(summary: dict[str, Any]) -> dict[str, str]:
     """Return the scenario files that the page shows, by their titles."""
     files = {f"The scenario, {summary['scenario']}.toml": summary["scenario_toml"]}
@@ -144,7 +139,7 @@ def _extreme(found: float | list[float]) -> float:
 
 def _p_value(p_value: float | None) -> str:
     if p_value is None:
-        return _NOTHING
+        return NOTHING
     return p_text(p_value).removeprefix("p ").removeprefix("= ")
 
 
@@ -152,7 +147,7 @@ def _interval(ends: Iterable[float | None]) -> str:
     """Write an interval of numbers >= 0; a dash where unknown."""
     known = [max(end, 0.0) for end in ends if end is not None]
     if len(known) < 2:
-        return _NOTHING
+        return NOTHING
     written = [f"{end:.3f}" if end < _LARGE else number(end) for end in known]
     return f"[{', '.join(written)}]"
 
@@ -174,150 +169,7 @@ def escaped(value: object) -> Markup:
 # --------------------------------------------------------------------------------------
 # The table of a Monte Carlo: one row per measure, one column per estimator.
 
-Entry = dict[str, Any]
 _STYLES = {"good": "green", "bad": "red", "open": "yellow"}
-_LEAST_BOUND = math.radians(0.1)  # of a heading that is shown
-
-
-class Measure(NamedTuple):
-    """One row of the table."""
-
-    name: str
-    right: str
-    """Value of a consistent filter, or lower bound; else empty."""
-    of: Callable[[Entry], str]
-    """Writes the cell of one estimator from its entry in the summary."""
-
-
-def measures(summary: dict[str, Any]) -> list[Measure]:
-    """List the rows that follow the verdict.
-
-    Parameters
-    ----------
-    summary : dict
-        Result of ``summarise_monte_carlo``.
-    """
-    frame, runs = summary["frame"], summary["runs"]
-    other = "additive" if frame == "invariant" else "invariant"
-    knowable = summary["knowable_heading_std"]
-    least = f"≥ {in_degrees(knowable)}" if knowable >= _LEAST_BOUND else ""
-
-    def at(
-        *keys: str, write: Callable[[float], str] = number
-    ) -> Callable[[Entry], str]:
-        return lambda entry: _cell(entry, keys, write)
-
-    return [
-        Measure(f"NEES / 3, {frame} frame", "1", at("pose_nees", frame, "mean")),
-        Measure("… at the end", "1", at("pose_nees", frame, "end")),
-        Measure("… of the median run", "≲ 1", at("median_run")),
-        Measure("… runs above 3", "few", at("share_above_3", write=percent)),
-        Measure(
-            "… steps in the 95 % band",
-            "varies",
-            at("pose_nees", frame, "share_inside_band", write=percent),
-        ),
-        Measure(f"NEES / 3, {other} frame", "", at("pose_nees", other, "mean")),
-        Measure("NEES of the heading", "1", at("heading_nees", "mean")),
-        Measure("NIS / degrees of freedom", "1", at("nis")),
-        Measure(
-            "heading at the end, claimed",
-            least,
-            at("heading_std_end", "claimed", write=in_degrees),
-        ),
-        Measure(
-            "… true error",
-            "= claimed",
-            at("heading_std_end", "true", write=in_degrees),
-        ),
-        Measure("… RMSE over all steps", "", at("rmse", "heading", write=in_degrees)),
-        *(
-            Measure(f"efficiency of the {name}", "≤ 1", _efficiency(key))
-            for name, key in (("position", "pose"), ("heading",) * 2, ("map",) * 2)
-        ),
-        Measure("path (ATE), raw [m]", "", at("ate", "raw")),
-        Measure("… aligned [m]", "", at("ate", "aligned")),
-        Measure("landmark RMSE, raw [m]", "", at("landmark_rmse", "raw")),
-        Measure("… aligned [m]", "", at("landmark_rmse", "aligned")),
-        *_association_measures(summary),
-        Measure(
-            f"failed runs of {runs}", "0", lambda entry: str(len(entry["failed_runs"]))
-        ),
-    ]
-
-
-def _efficiency(key: str) -> Callable[[Entry], str]:
-    """Return what writes bound by mean squared error, with its 95 % interval."""
-
-    def write(entry: Entry) -> str:
-        found = (entry.get("efficiency") or {}).get(key)
-        if found is None:
-            return _NOTHING
-        reach = found["interval"][1]
-        spread = "" if reach is None else f" ± {reach - found['value']:.2f}"
-        return f"{found['value']:.2f}{spread}"
-
-    return write
-
-
-def _association_measures(summary: dict[str, Any]) -> list[Measure]:
-    """List the rows of a world that hides identities."""
-    entries = [entry["association"] for entry in summary["estimators"].values()]
-    if None in entries:
-        return []
-
-    def at(
-        *keys: str, write: Callable[[float], str] = number
-    ) -> Callable[[Entry], str]:
-        return lambda entry: _cell(entry["association"], keys, write)
-
-    cutoff, runs = entries[0]["gospa"]["cutoff"], summary["runs"]
-    size = entries[0]["true_map_size"]
-    true_size = "" if size is None else number(size)
-    return [
-        Measure("path (ATE), median run, raw [m]", "", at("median_ate", "hidden")),
-        Measure("… with known identities [m]", "", at("median_ate", "known")),
-        Measure(f"GOSPA of the map, {cutoff:g} m, raw [m]", "", _gospa("raw")),
-        Measure("… aligned [m]", "", _gospa("aligned")),
-        Measure("… landmarks missed, false", "0, 0", _missed_and_false),
-        Measure("landmarks in the map", true_size, at("map_size")),
-        Measure("… new ones correct", true_size, at("new_correct")),
-        Measure("… duplicates", "0", at("duplicate")),
-        Measure("… of clutter", "0", at("ghost")),
-        Measure("readings given right", "", at("correct")),
-        Measure("… wrong", "0", at("wrong")),
-        Measure("… not used", "0", at("missed")),
-        Measure("… clutter used", "0", at("clutter_used")),
-        Measure("precision", "1", at("precision", write=share)),
-        Measure("recall", "1", at("recall", write=share)),
-        Measure(
-            f"bad runs of {runs}",
-            "0",
-            lambda entry: str(entry["association"]["bad_runs"]["count"]),
-        ),
-    ]
-
-
-def _gospa(which: str) -> Callable[[Entry], str]:
-    keys = ("association", "gospa", which, "distance")
-    return lambda entry: _cell(entry, keys, number)
-
-
-def _missed_and_false(entry: Entry) -> str:
-    found = entry["association"]["gospa"]["aligned"]
-    keys = ("missed_count", "false_count")
-    return ", ".join(_cell(found, (key,), number) for key in keys)
-
-
-def share(value: float) -> str:
-    """Write a share that should be 1.
-
-    Examples
-    --------
-    >>> share(0.98765), share(1.0)
-    ('.988', '1.000')
-    """
-    return f"{value:.3f}".removeprefix("0")
 
 
 def monte_carlo_table(summary: dict[str, Any]) -> Table:
@@ -330,12 +182,13 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
     """
     entries = summary["estimators"]
     headings, key = headings_and_key(list(entries))
+    note = "Averages over runs and steps; heading and RMSE are root mean squares."
     table = Table(
         title=Text(
             f"{summary['scenario']}: {summary['runs']} runs of {summary['steps']} "
             f"steps, seed {summary['seed']}"
         ),
-        caption=Text(f"{key}\n{_caption(entries)}".strip()),
+        caption=Text(f"{key}\n{note}{_bad_run(summary)}".strip()),
         caption_justify="left",
         pad_edge=False,
         box=None,
@@ -354,54 +207,16 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
     return table
 
 
-def _caption(entries: dict[str, Entry]) -> str:
-    text = "Averages over runs and steps; heading and RMSE are root mean squares."
-    scores = next((entry["association"] for entry in entries.values()), None)
-    if scores is None:
-        return text
-    return f"{text} {bad_run_text(scores)}"
-
-
-def bad_run_text(scores: dict[str, Any]) -> str:
-    """Write what a bad run is."""
+def _bad_run(summary: dict[str, Any]) -> str:
+    """Write what a bad run is, after a space; empty where identities are known."""
+    scores = [entry["association"] for entry in summary["estimators"].values()]
+    if None in scores:
+        return ""
     return (
-        "A run is bad if it failed, or if its path error is more than "
-        f"{scores['bad_runs']['margin']:g} m above that of the same filter with known "
-        "identities."
+        " A run is bad if it failed, or if its path error is more than "
+        f"{scores[0]['bad_runs']['margin']:g} m above that of the same filter with "
+        "known identities."
     )
-
-
-def number(value: float) -> str:
-    """Write a number with three digits.
-
-    Examples
-    --------
-    >>> number(1.0), number(0.01234), number(12345.6), number(1e9)
-    ('1.00', '0.0123', '12346', '1e+09')
-    """
-    if abs(value) >= 1e6:
-        return f"{value:.0e}"
-    size = math.floor(math.log10(abs(value))) if value else 0
-    return f"{value:.{min(max(2 - size, 0), 6)}f}"
-
-
-def percent(share: float) -> str:
-    """Write a share as a percentage.
-
-    Examples
-    --------
-    >>> percent(0.0), percent(0.005), percent(0.7303)
-    ('0 %', '0.5 %', '73 %')
-    """
-    shown = 100 * share
-    return f"{shown:.2g} %" if shown < 99.5 else f"{shown:.0f} %"
-
-
-def _cell(entry: Entry, keys: tuple[str, ...], write: Callable[[float], str]) -> str:
-    value: Any = entry
-    for key in keys:
-        value = value[key]
-    return _NOTHING if value is None else write(value)
 
 
 # --------------------------------------------------------------------------------------

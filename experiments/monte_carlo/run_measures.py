@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...estimator.interface import Belief
 from ...estimator.models.bearing_range import wrap_angle
-from ...estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame, invariant_error
+from ...estimator.models.rigid_motion import ERROR_FRAMES, invariant_error
 from ...evaluation import nees
 from ...evaluation.association_scores import AssociationScores, Gospa
 from ...evaluation.error_bound import PosteriorBound, invariant_squares
-from ...evaluation.nees import pose_nees
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...evaluation.trajectory_error import ellipse_areas, position_accuracy
 from ...sim_configs import Scenario
 from ..runs.filter_settings import FilterSettings
 from ..runs.simulated_runs import SimulatedRuns
-from ..runs.trace import RunAssociation, TrueLandmarks, compare_association
+from ..runs.trace import TrueLandmarks, compare_association
 from .filtered_runs import Failure, FilteredRuns, filter_runs
 
 Block = dict[str, NDArray[np.generic]]
@@ -100,7 +99,10 @@ MAPS = ("raw", "aligned")
 
 PREFIX = "association_"
 
-MEANINGS: dict[str, str] = {
+KNOWN_IDS_NEES = "known_ids_nees"
+"""Followed by the error frame."""
+
+_ASSOCIATION: dict[str, str] = {
     **{f"{PREFIX}{name}": f"{name.replace('_', ' ')}, see docs" for name in COUNTS},
     f"{PREFIX}precision": "share of right ones among readings given to landmarks",
     f"{PREFIX}recall": "share of right ones among readings of landmarks",
@@ -111,23 +113,16 @@ MEANINGS: dict[str, str] = {
     },
     KNOWN_IDS_ATE: "path error of the same filter with known identities, raw [m]",
 }
-"""Of the variables that only a world without identities has; nan where unknown."""
 
-
-HIDDEN_VARIABLES: dict[str, Variable] = VARIABLES | {
-    name: Variable(RUN, "f8", meaning) for name, meaning in MEANINGS.items()
+HIDDEN_VARIABLES: dict[str, Variable] = {
+    **VARIABLES,
+    **{name: Variable(RUN, "f8", meaning) for name, meaning in _ASSOCIATION.items()},
+    **{
+        f"{KNOWN_IDS_NEES}_{frame}": Variable(STEP, "f8", "NEES with known identities")
+        for frame in ERROR_FRAMES
+    },
 }
-
-
-KNOWN_IDS_NEES = "known_ids_nees"
-"""Followed by the error frame."""
-
-
-HIDDEN_VARIABLES |= {
-    f"{KNOWN_IDS_NEES}_{frame}": Variable(STEP, "f8", "NEES with known identities")
-    for frame in ERROR_FRAMES
-}
-"""Those of a world that hides identities."""
+"""Those of a world that hides identities; nan where unknown."""
 
 
 def variables_of(scenario: Scenario) -> dict[str, Variable]:
@@ -332,10 +327,6 @@ def measure_association(
     found = compare_association(
         made, truth, belief.landmark_ids, belief.landmarks, resolution=resolution
     )
-    return _values(found)
-
-
-def _values(found: RunAssociation) -> dict[str, float]:
     scores = {} if found.scores is None else found.scores.as_dict()
     parts = {"raw": found.raw, "aligned": found.aligned}
     return {
@@ -386,19 +377,12 @@ def with_known_ids(
     posed = runs.true_poses, trace.poses, trace.pose_covariances
     with np.errstate(all="ignore"):  # a diverged run may overflow
         scores = {
-            f"{KNOWN_IDS_NEES}_{frame}": _pose_nees(*posed, frame)
+            f"{KNOWN_IDS_NEES}_{frame}": np.array(
+                [
+                    nees.pose_nees(*of_run, frame=frame)
+                    for of_run in zip(*posed, strict=True)
+                ]
+            )
             for frame in ERROR_FRAMES
         }
     return {KNOWN_IDS_ATE: errors, **scores}
-
-
-def _pose_nees(
-    truth: Array, poses: Array, covariances: Array, frame: ErrorFrame
-) -> Array:
-    """Return the NEES of the pose run by run, (B, T)."""
-    return np.array(
-        [
-            pose_nees(*run, frame=frame)
-            for run in zip(truth, poses, covariances, strict=True)
-        ]
-    )

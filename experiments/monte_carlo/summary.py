@@ -2,12 +2,13 @@
 
 import json
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from ...arrays import Array
+from ...arrays import AnyArray, Array
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.association_scores import CUTOFF, Gospa
 from ...evaluation.consistency_report import ConsistencyReport, evaluate_consistency
@@ -27,6 +28,7 @@ from .verdict import (
     estimators_of,
     failure_groups,
     heading_sentence,
+    in_degrees,
     judge,
     labels_of,
     run_warnings,
@@ -133,41 +135,15 @@ def summarise_estimator(
         ``unused_readings``, the share of readings of known identity that corrected
         nothing and added no landmark, None where identities are hidden.
     """
-    heading = _heading_std_end(scores)
-    per_run = scores.ratios(frame).mean(axis=1)
+    found = _computed(scores, frame)
+    claimed = found["heading_std_end"]["claimed"]
+    report = _report_of(scores, frame) if scores.good.sum() > 1 else None
     return {
-        **_verdict(scores, _decide(scores, frame), heading["claimed"], knowable),
+        **_verdict(scores, report, claimed, knowable),
         "good_runs": int(scores.good.sum()),
         "failed_runs": [failure._asdict() for failure in scores.failures],
         "failure_groups": failure_groups(scores.failures),
-        "pose_nees": {name: _nees(scores, name) for name in _FRAMES},
-        "position_nees": {
-            name: mean(scores.over_time(f"position_nees_{name}") / POINT_FREEDOM)
-            for name in _FRAMES
-        },
-        "median_run": finite(np.median(per_run) if len(per_run) else np.nan),
-        "share_above_3": mean(per_run > POSE_FREEDOM),
-        "heading_nees": {
-            "mean": mean(scores.over_time("heading_nees")),
-            "end": mean(scores.over_time("heading_nees")[:, -1]),
-        },
-        "nees_end": _nees_at_the_end(scores, frame),
-        "nis": scores.nis_per_degree,
-        "heading_std_end": heading,
-        "rmse": {
-            "position": root_mean_square(scores.over_time("position_error")),
-            "position_end": root_mean_square(scores.over_time("position_error")[:, -1]),
-            "heading": root_mean_square(scores.over_time("heading_error")),
-        },
-        "ate": _raw_and_aligned(scores, "ate"),
-        "landmark_rmse": _raw_and_aligned(scores, "landmark_rmse"),
-        "landmark_mahalanobis": root_mean_square(
-            scores.per_run("landmark_mahalanobis")
-        ),
-        "area": {
-            "pose": mean(scores.per_run("pose_area")),
-            "landmark": mean(scores.per_run("landmark_area")),
-        },
+        **found,
         "efficiency": efficiency_summary(scores),
         "diagnosis": diagnosis_summary(scores, frame),
         "association": association_summary(scores),
@@ -227,13 +203,6 @@ def consistency_of(
     return _report_of(scores_of(results, estimator, frame), frame)
 
 
-def _decide(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport | None:
-    """Test the successful runs, if there are enough."""
-    if scores.good.sum() < 2:
-        return None
-    return _report_of(scores, frame)
-
-
 def _report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
     nees = scores.results[f"pose_nees_{frame}"].values[:, 1:].copy()
     nees[~scores.good] = np.nan
@@ -247,33 +216,6 @@ def _report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
     )
 
 
-def _nees(scores: EstimatorScores, frame: ErrorFrame) -> dict[str, float | None]:
-    ratios = scores.ratios(frame)
-    if not len(ratios):
-        return {"mean": None, "end": None, "share_inside_band": None}
-    average = ratios.mean(axis=0)
-    low, high = np.array(average_band(len(ratios), POSE_FREEDOM)) / POSE_FREEDOM
-    return {
-        "mean": mean(average),
-        "end": finite(average[-1]),
-        "share_inside_band": mean((average > low) & (average < high)),
-    }
-
-
-def _nees_at_the_end(
-    scores: EstimatorScores, frame: ErrorFrame
-) -> dict[str, float | None]:
-    """Divide NEES of maps by their degrees of freedom, which depend on the map."""
-    state = scores.per_run(f"state_nees_{frame}")
-    relative = scores.per_run("relative_map_nees")
-    each = scores.per_run(f"landmark_nees_{frame}")
-    return {
-        "state": quotient(state, scores.per_run("state_dof")),
-        "landmarks": quotient(each, np.full(each.shape, POINT_FREEDOM)),
-        "relative_map": quotient(relative, scores.per_run("relative_map_dof")),
-    }
-
-
 def _unused_readings(scores: EstimatorScores) -> float | None:
     """Divide the readings that a gate or the least range rejected by all readings."""
     if KNOWN_IDS_ATE in scores.results:
@@ -284,18 +226,262 @@ def _unused_readings(scores: EstimatorScores) -> float | None:
     return quotient(readings - corrected - added, readings)
 
 
-def _heading_std_end(scores: EstimatorScores) -> dict[str, float | None]:
-    return {
-        "claimed": root_mean_square(scores.over_time("heading_std")[:, -1]),
-        "true": root_mean_square(scores.over_time("heading_error")[:, -1]),
-    }
+# --------------------------------------------------------------------------------------
+# The measures of an estimator: each is declared once, for the summary and all tables.
+
+Entry = dict[str, Any]
+Computation = Callable[[EstimatorScores], float | None]
+
+NOTHING = "–"
+"""In place of a number that is unknown."""
+_LEAST_BOUND = math.radians(0.1)  # of a heading that is shown
 
 
-def _raw_and_aligned(scores: EstimatorScores, name: str) -> dict[str, float | None]:
-    return {
-        "raw": root_mean_square(scores.per_run(name)),
-        "aligned": root_mean_square(scores.per_run(f"{name}_aligned")),
-    }
+def number(value: float) -> str:
+    """Write a number with three digits.
+
+    Examples
+    --------
+    >>> number(1.0), number(0.01234), number(12345.6), number(1e9)
+    ('1.00', '0.0123', '12346', '1e+09')
+    """
+    if abs(value) >= 1e6:
+        return f"{value:.0e}"
+    size = math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:.{min(max(2 - size, 0), 6)}f}"
+
+
+def percent(share: float) -> str:
+    """Write a share as a percentage.
+
+    Examples
+    --------
+    >>> percent(0.0), percent(0.005), percent(0.7303)
+    ('0 %', '0.5 %', '73 %')
+    """
+    shown = 100 * share
+    return f"{shown:.2g} %" if shown < 99.5 else f"{shown:.0f} %"
+
+
+def share(value: float) -> str:
+    """Write a share that should be 1.
+
+    Examples
+    --------
+    >>> share(0.98765), share(1.0)
+    ('.988', '1.000')
+    """
+    return f"{value:.3f}".removeprefix("0")
+
+
+def _missed_and_false(found: dict[str, float | None]) -> str:
+    counts = found["missed_count"], found["false_count"]
+    return ", ".join(NOTHING if count is None else number(count) for count in counts)
+
+
+def _count(found: list[Any]) -> str:
+    return str(len(found))
+
+
+def _with_error(found: dict[str, Any]) -> str:
+    """Write a number and half the width of its interval, if that is known."""
+    reach = found["interval"][1]
+    spread = "" if reach is None else f" ± {reach - found['value']:.2f}"
+    return f"{found['value']:.2f}{spread}"
+
+
+class Measure(NamedTuple):
+    """A number of one estimator: its computation, and its row in tables."""
+
+    path: str
+    """Its keys in the entry of an estimator, joined by dots."""
+    compute: Computation | None = None
+    """None for a part of an entry that is computed as a whole."""
+    name: str = ""
+    """Title of its row; tables omit a measure without one."""
+    right: str = ""
+    """Value of a consistent filter, or lower bound; else empty."""
+    write: Callable[[Any], str] = number
+
+    def of(self, entry: Entry) -> str:
+        """Write the cell of one estimator from its entry in the summary."""
+        value: Any = entry
+        for key in self.path.split("."):
+            value = None if value is None else value[key]
+        return NOTHING if value is None else self.write(value)
+
+
+def _declared(frame: ErrorFrame) -> list[Measure]:
+    """List all measures in the order of tables, for decisions in an error frame."""
+    other: ErrorFrame = "additive" if frame == "invariant" else "invariant"
+    row, root = Measure, root_mean_square
+    # fmt: off
+    return [
+        row(f"pose_nees.{frame}.mean", _anees(frame), f"NEES / 3, {frame} frame", "1"),
+        row(f"pose_nees.{frame}.end", _anees(frame, -1), "… at the end", "1"),
+        *(row(f"position_nees.{name}", _position_nees(name)) for name in _FRAMES),
+        row("median_run", _averages(_median, frame), "… of the median run", "≲ 1"),
+        row("share_above_3", _averages(lambda each: mean(each > POSE_FREEDOM), frame),
+            "… runs above 3", "few", percent),
+        row(f"pose_nees.{frame}.share_inside_band", _inside_band(frame),
+            "… steps in the 95 % band", "varies", percent),
+        row(f"pose_nees.{other}.mean", _anees(other), f"NEES / 3, {other} frame"),
+        row(f"pose_nees.{other}.end", _anees(other, -1)),
+        row(f"pose_nees.{other}.share_inside_band", _inside_band(other)),
+        row("heading_nees.mean", _steps(mean, "heading_nees"),
+            "NEES of the heading", "1"),
+        row("heading_nees.end", _end(mean, "heading_nees")),
+        row("nees_end.state", _by_freedom(f"state_nees_{frame}", "state_dof")),
+        row("nees_end.landmarks", _by_freedom(f"landmark_nees_{frame}")),
+        row("nees_end.relative_map",
+            _by_freedom("relative_map_nees", "relative_map_dof")),
+        row("nis", lambda scores: scores.nis_per_degree,
+            "NIS / degrees of freedom", "1"),
+        row("heading_std_end.claimed", _end(root, "heading_std"),
+            "heading at the end, claimed", "{least}", in_degrees),
+        row("heading_std_end.true", _end(root, "heading_error"),
+            "… true error", "= claimed", in_degrees),
+        row("rmse.position", _steps(root, "position_error")),
+        row("rmse.position_end", _end(root, "position_error")),
+        row("rmse.heading", _steps(root, "heading_error"),
+            "… RMSE over all steps", "", in_degrees),
+        row("efficiency.pose", None, "efficiency of the position", "≤ 1", _with_error),
+        row("efficiency.heading", None,
+            "efficiency of the heading", "≤ 1", _with_error),
+        row("efficiency.map", None, "efficiency of the map", "≤ 1", _with_error),
+        row("ate.raw", _runs(root, "ate"), "path (ATE), raw [m]"),
+        row("ate.aligned", _runs(root, "ate_aligned"), "… aligned [m]"),
+        row("landmark_rmse.raw", _runs(root, "landmark_rmse"),
+            "landmark RMSE, raw [m]"),
+        row("landmark_rmse.aligned", _runs(root, "landmark_rmse_aligned"),
+            "… aligned [m]"),
+        row("landmark_mahalanobis", _runs(root, "landmark_mahalanobis")),
+        row("area.pose", _runs(mean, "pose_area")),
+        row("area.landmark", _runs(mean, "landmark_area")),
+        *(row(f"association.{path}", None, *shown) for path, *shown in _ASSOCIATION),
+        row("failed_runs", None, "failed runs of {runs}", "0", _count),
+    ]
+    # fmt: on
+
+
+_ASSOCIATION: tuple[tuple[Any, ...], ...] = (
+    ("median_ate.hidden", "path (ATE), median run, raw [m]"),
+    ("median_ate.known", "… with known identities [m]"),
+    ("gospa.raw.distance", "GOSPA of the map, {cutoff:g} m, raw [m]"),
+    ("gospa.aligned.distance", "… aligned [m]"),
+    ("gospa.aligned", "… landmarks missed, false", "0, 0", _missed_and_false),
+    ("map_size", "landmarks in the map", "{true_size}"),
+    ("new_correct", "… new ones correct", "{true_size}"),
+    ("duplicate", "… duplicates", "0"),
+    ("ghost", "… of clutter", "0"),
+    ("correct", "readings given right"),
+    ("wrong", "… wrong", "0"),
+    ("missed", "… not used", "0"),
+    ("clutter_used", "… clutter used", "0"),
+    ("precision", "precision", "1", share),
+    ("recall", "recall", "1", share),
+    ("bad_runs.count", "bad runs of {runs}", "0", str),
+)
+"""Rows of a world that hides identities, of :func:`association_summary`."""
+
+
+def measures(summary: dict[str, Any]) -> list[Measure]:
+    """List the rows of a table that follow the verdict.
+
+    Parameters
+    ----------
+    summary : dict
+        Result of ``summarise_monte_carlo``.
+    """
+    knowable = summary["knowable_heading_std"]
+    least = f"≥ {in_degrees(knowable)}" if knowable >= _LEAST_BOUND else ""
+    facts = {"runs": summary["runs"], "least": least}
+    scores = [entry["association"] for entry in summary["estimators"].values()]
+    if None not in scores:
+        size = scores[0]["true_map_size"]
+        facts["true_size"] = "" if size is None else number(size)
+        facts["cutoff"] = scores[0]["gospa"]["cutoff"]
+    return [
+        measure._replace(
+            name=measure.name.format(**facts), right=measure.right.format(**facts)
+        )
+        for measure in _declared(summary["frame"])
+        if measure.name and not (None in scores and "association" in measure.path)
+    ]
+
+
+def _computed(scores: EstimatorScores, frame: ErrorFrame) -> Entry:
+    """Compute the measures that are not parts of a larger entry."""
+    entry: Entry = {"pose_nees": {name: {} for name in _FRAMES}}
+    for measure in _declared(frame):
+        if measure.compute is not None:
+            *keys, last = measure.path.split(".")
+            place = entry
+            for key in keys:
+                place = place.setdefault(key, {})
+            place[last] = measure.compute(scores)
+    return entry
+
+
+Statistic = Callable[[AnyArray], float | None]
+
+
+def _steps(statistic: Statistic, name: str) -> Computation:
+    """Return the computation of a statistic over all runs and steps that count."""
+    return lambda scores: statistic(scores.over_time(name))
+
+
+def _end(statistic: Statistic, name: str) -> Computation:
+    return lambda scores: statistic(scores.over_time(name)[:, -1])
+
+
+def _runs(statistic: Statistic, name: str) -> Computation:
+    return lambda scores: statistic(scores.per_run(name))
+
+
+def _averages(statistic: Statistic, frame: ErrorFrame) -> Computation:
+    """Return the computation of a statistic over the runs' averages of NEES / 3."""
+    return lambda scores: statistic(scores.ratios(frame).mean(axis=1))
+
+
+def _anees(frame: ErrorFrame, first: int | None = None) -> Computation:
+    """Return the computation of ANEES / 3 over the steps from `first` on."""
+
+    def compute(scores: EstimatorScores) -> float | None:
+        ratios = scores.ratios(frame)
+        return mean(ratios.mean(axis=0)[first:]) if len(ratios) else None
+
+    return compute
+
+
+def _inside_band(frame: ErrorFrame) -> Computation:
+    """Return the computation of the share of steps with ANEES in its 95 % band."""
+
+    def compute(scores: EstimatorScores) -> float | None:
+        ratios = scores.ratios(frame)
+        if not len(ratios):
+            return None
+        average = ratios.mean(axis=0)
+        low, high = np.array(average_band(len(ratios), POSE_FREEDOM)) / POSE_FREEDOM
+        return mean((average > low) & (average < high))
+
+    return compute
+
+
+def _position_nees(frame: ErrorFrame) -> Computation:
+    name = f"position_nees_{frame}"
+    return lambda scores: mean(scores.over_time(name) / POINT_FREEDOM)
+
+
+def _by_freedom(name: str, dof: str = "") -> Computation:
+    """Return the computation of a NEES at the end by its degrees of freedom."""
+
+    def compute(scores: EstimatorScores) -> float | None:
+        values = scores.per_run(name)
+        freedom = scores.per_run(dof) if dof else np.full(values.shape, POINT_FREEDOM)
+        return quotient(values, freedom)
+
+    return compute
 
 
 # --------------------------------------------------------------------------------------
@@ -372,24 +558,19 @@ def efficiency_summary(scores: EstimatorScores) -> dict[str, Any] | None:
     """
     if "position_bound" not in scores.results:
         return None
-    found = {"pose": None, "heading": None, "map": _of_the_map(scores)}
-    if scores.nis_per_degree is None:
-        return found
-    pairs = {
-        "pose": ("position_bound", "position_error_invariant"),
-        "heading": ("heading_bound", "heading_error"),
-    }
-    each = {
-        name: efficiency(scores.over_time(bound), scores.over_time(error) ** 2)
-        for name, (bound, error) in pairs.items()
-    }
-    return found | {name: _entry(value) for name, value in each.items()}
-
-
-def _of_the_map(scores: EstimatorScores) -> dict[str, Any] | None:
     bound, error = scores.per_run("map_bound"), scores.per_run("map_error_centred")
     known = np.isfinite(bound) & np.isfinite(error)
-    return _entry(efficiency(bound[known], error[known] ** 2))
+    of_the_map = efficiency(bound[known], error[known] ** 2)
+    found = {"pose": None, "heading": None, "map": _entry(of_the_map)}
+    if scores.nis_per_degree is None:
+        return found
+    for name, *pair in (
+        ("pose", "position_bound", "position_error_invariant"),
+        ("heading", "heading_bound", "heading_error"),
+    ):
+        bound, error = map(scores.over_time, pair)
+        found[name] = _entry(efficiency(bound, error**2))
+    return found
 
 
 def _entry(found: Efficiency) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ import xarray as xr
 from ...arrays import Array, BoolArray, IntArray
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.consistency_report import FEW_AVERAGES, FEW_RUNS, ConsistencyReport
-from ...evaluation.diagnosis import CANNOT_TELL, HONEST, Diagnosis, diagnose
+from ...evaluation.diagnosis import CANNOT_TELL, HONEST, Diagnosis, diagnose, p_text
 from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
 from ..runs.summary import MOST_REJECTED, NIS_RANGE, nis_suspicion
 from ..runs.trace import finite, quotient
@@ -30,7 +30,6 @@ KINDS = {CONSISTENT: "good", NEARLY: "good", NOT_CONSISTENT: "bad", NOT_SHOWN: "
 
 _ERROR_RATE = 0.05
 _DECIDING = 3  # final step, time averages and grid share the error rate
-_SMALLEST_P = 1e-16
 _MARGIN = f"[{EQUIVALENCE_MARGIN.low:g}, {EQUIVALENCE_MARGIN.high:g}]"
 _INSIDE = f"lies inside {_MARGIN}"
 _TOO_SURE = 0.9
@@ -122,18 +121,6 @@ def in_degrees(angle: float) -> str:
     degrees = abs(math.degrees(angle))
     size = math.floor(math.log10(degrees)) if degrees else 0
     return f"{degrees:.{min(max(1 - size, 0), 6)}f}°"
-
-
-def p_text(p_value: float) -> str:
-    """Write a p-value with two digits.
-
-    Examples
-    --------
-    >>> p_text(0.0), p_text(0.0123)
-    ('p < 1e-16', 'p = 0.012')
-    """
-    small = p_value < _SMALLEST_P
-    return f"p < {_SMALLEST_P:g}" if small else f"p = {p_value:.2g}"
 
 
 def _verdict_on_successes(report: ConsistencyReport) -> Verdict:

@@ -113,7 +113,7 @@ class _Writer:
         colour: Any,
     ) -> None:
         self._rerun, self._recording, self._run = rerun, recording, run
-        self._scans, self._colour = scans, colour
+        self._scans, self._colour, self._log = scans, colour, recording.log
         self._name = rerun.escape_entity_path_part(run.trace.estimator)
 
     def write(self, steps: Sequence[int]) -> None:
@@ -204,9 +204,6 @@ class _Writer:
             labels=list(labels),
             show_labels=False,
         )
-
-    def _log(self, place: str, content: Any) -> None:
-        self._recording.log(place, content)
 
 
 def _raised(points: Array) -> Array:

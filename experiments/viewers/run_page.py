@@ -20,7 +20,7 @@ from ...estimator.map_management.map_editor import view_map
 from ...evaluation.hypothesis_tests import chi_square_limits
 from ...sim_configs.atomic_file import replace_when_written
 from ..figures.accuracy import nis_band
-from ..figures.style import page_template
+from ..figures.style import deviations, page_environment
 from ..logs.ground_truth import true_ids_of
 from ..logs.recording import steps_of
 from ..logs.slamlog import Scan, SlamLog
@@ -86,15 +86,19 @@ def _page(log: SlamLog, runs: Sequence[ViewedRun], walls: list[list[float]]) -> 
         "bands": {"nees": [q / 3 for q in chi_square_limits(3, (1 - _SHARE) / 2)]},
         "arrays": packed.table,
     }
-    return page_template(_PARTS, "page.html").render(
-        title=f"{log.name}: {', '.join(names)}",
-        notes=_notes(steps, runs),
-        several=len(runs) > 1,
-        style=Markup((_PARTS / "page.css").read_text("utf-8")),
-        script=Markup(script),
-        script_hash=_hash(f"\n{script}\n"),
-        facts=_inline_json(facts),
-        arrays=packed.text(),
+    return (
+        page_environment(_PARTS)
+        .get_template("page.html")
+        .render(
+            title=f"{log.name}: {', '.join(names)}",
+            notes=_notes(steps, runs),
+            several=len(runs) > 1,
+            style=Markup((_PARTS / "page.css").read_text("utf-8")),
+            script=Markup(script),
+            script_hash=_hash(f"\n{script}\n"),
+            facts=_inline_json(facts),
+            arrays=packed.text(),
+        )
     )
 
 
@@ -148,7 +152,7 @@ def _pack_maps(packed: PackedArrays, prefix: str, maps: Sequence[MapFrame]) -> N
     for axis, name in enumerate("xy"):
         means = [position_codes(frame.means[:, axis]) for frame in maps]
         packed.put_frames(f"{prefix}{name}", means, "int32")
-        std = [deviation_codes(_std(frame.covariances)[:, axis]) for frame in maps]
+        std = [deviation_codes(deviations(kept.covariances)[:, axis]) for kept in maps]
         packed.put_frames(f"{prefix}std_{name}", std, "int16")
     rho = [np.round(_rho(frame.covariances) * 32000) for frame in maps]
     packed.put_frames(f"{prefix}rho", rho, "int16")
@@ -169,7 +173,7 @@ def _pack_poses(
 ) -> None:
     """Pack poses, NEES of the pose by 3, and NIS by its degrees of freedom."""
     poses, covariances = trace.poses[steps], trace.pose_covariances[steps]
-    std = _std(covariances)
+    std = deviations(covariances)
     for k, name in enumerate(("x", "y", "theta")):
         packed.put(f"{prefix}pose.{name}", poses[:, k], "float32")
         packed.put(f"{prefix}pose.std_{name}", std[:, k], "float32")
@@ -195,14 +199,9 @@ def _pack_correlations(
     packed.put_frames(f"{prefix}pairs.value", values, "uint8")
 
 
-def _std(covariances: Array) -> Array:
-    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
-    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
-
-
 def _rho(covariances: Array) -> Array:
     """Return the correlation of x and y, 0 where one is certain."""
-    std = _std(covariances)
+    std = deviations(covariances)
     scale = std[:, 0] * std[:, 1]
     known = np.isfinite(scale) & (scale > 0)
     rho = np.divide(covariances[:, 0, 1], scale, out=np.zeros(len(std)), where=known)
@@ -595,11 +594,10 @@ class ThinnedSteps(Generic[_Item]):
     def put(self, step: int, item: _Item, size: int) -> None:
         """Keep the item of a step that is due."""
         self.items[step], self._sizes[step] = item, size
-        while len(self.items) > 2 and self._is_full():
+        while len(self.items) > 2 and (
+            len(self.items) > self._most_steps + 1
+            or sum(self._sizes.values()) > self._most_size
+        ):
             self.stride *= 2
             for old in [k for k in self.items if not self.is_due(k)]:
                 del self.items[old], self._sizes[old]
-
-    def _is_full(self) -> bool:
-        too_many = len(self.items) > self._most_steps + 1
-        return too_many or sum(self._sizes.values()) > self._most_size
