@@ -257,7 +257,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
         self._ended = self._ended & ~worlds
         if self._renderers:
             landmarks = self._worlds.landmarks
-            for world in np.flatnonzero(worlds):
+            for world in np.flatnonzero(worlds).tolist():
                 self._renderers[world].begin(landmarks[world])
             self._show(worlds)
 
@@ -266,7 +266,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
         if not self._renderers:
             return
         batch = self._worlds
-        for world in np.flatnonzero(worlds):
+        for world in np.flatnonzero(worlds).tolist():
             mask, ids = batch.mask[world], batch.landmark_ids
             self._renderers[world].add(
                 batch.poses[world].copy(),

@@ -363,14 +363,13 @@ class DrawnWorlds:
 def _starts(
     scenarios: list[Scenario], keys: WordArray
 ) -> tuple[ComplexArray, Array, Array]:
-    landmarks, poses, estimates = [], [], []
-    for row, scenario in enumerate(scenarios):
-        starts, key = EpisodeStarts(scenario), keys[row : row + 1]
-        landmarks.append(starts.landmarks(key)[0])
-        pose, estimate = starts.poses(key)
-        poses.append(pose[0])
-        estimates.append(estimate[0])
-    return np.array(landmarks), np.array(poses), np.array(estimates)
+    rows = []
+    for scenario, key in zip(scenarios, keys, strict=True):
+        starts = EpisodeStarts(scenario)
+        parts = starts.landmarks(key[None]), *starts.poses(key[None])
+        rows.append([part[0] for part in parts])
+    landmarks, poses, estimates = map(np.array, zip(*rows, strict=True))
+    return landmarks, poses, estimates
 
 
 class MixedWorlds:
