@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -18,14 +18,18 @@ from ..arrays import AnyArray, Array, BoolArray, ComplexArray, IntArray
 from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
 from ..envs.vector import LandmarkWorldVectorEnv
-from ..estimator.filters.batch import BatchBeliefs, BatchStorage, can_batch
-from ..estimator.filters.ekf import EkfSlam
+from ..estimator.filters.batch import BatchBeliefs, BatchStorage
 from ..jit import jit
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, AssociationRecord, split_settings
-from .belief_features import belief_storage, live_storage
-from .belief_observation import SeparateFilters, choose_filters, update_filters
-from .estimator_choice import EstimatorChoice, checked_belief, choose_estimator
+from .belief_observation import (
+    Filters,
+    SeparateFilters,
+    choose_filters,
+    scan_of_one,
+    update_filters,
+)
+from .estimator_choice import EstimatorChoice, choose_estimator
 from .wall_routes import AgentKnowledge
 
 Observation = dict[str, Any]
@@ -154,26 +158,24 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         super().__init__(scenario, render_mode=render_mode, **changes)
         self.task = ActiveSlamTask(self.scenario, weights, form=form)
         self.observation_space = self.task.observation_space
-        self._by_id = self.scenario.sensor.identities
-        self._record = None if self._by_id else AssociationRecord(1)
+        rows, by_id = self.scenario.landmarks.count, self.scenario.sensor.identities
         self._estimator = choose_estimator(
-            estimator,
-            self.scenario,
-            estimator_options,
-            rows=self.scenario.landmarks.count,
+            estimator, self.scenario, estimator_options, rows=rows
         )
+        self._filters = SeparateFilters(
+            [self._estimator], rows, by_id=by_id, live=render_mode is None
+        )
+        self._explorers = Explorers(self._filters, self.task)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode with a new map, and take the first scan."""
         observation, info = super().reset(seed=seed, options=options)
-        self._estimator.reset(self.start_estimate, self.scenario.start.std)
-        if self._record is not None:
-            self._record.begin(_ONE_WORLD)
-        beliefs = self._update(observation, info, step=0)
-        self.task.begin(beliefs, _ONE_WORLD)
-        return self._output(beliefs, info, ~_ONE_WORLD)
+        self._explorers.begin(self.start_estimate[None], _ONE_WORLD)
+        self._scan(observation, info, moved=~_ONE_WORLD)
+        self.task.begin(self._filters.storage(), _ONE_WORLD)
+        return self._output(info, ~_ONE_WORLD)
 
     def step(
         self, action: ArrayLike
@@ -185,15 +187,13 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         ValueError
             If the action is not two finite numbers. The world does not change.
         """
-        step = self._steps() + 1
+        self._steps()  # refuses to step before `reset`
         observation, _, _, _, info = super().step(action)
-        self._estimator.predict(observation["odometry"])
-        beliefs = self._update(observation, info, step=step)
+        self._scan(observation, info, moved=_ONE_WORLD)
+        beliefs, collision = self._filters.storage(), np.array([info["collision"]])
         actions = np.asarray(action, dtype=np.float64)[None]
-        collision = np.array([info["collision"]])
         outcome = self.task.proceed(beliefs, _ONE_WORLD, actions, collision)
-        ended = outcome.terminated | outcome.truncated
-        seen, info = self._output(beliefs, info, ended)
+        seen, info = self._output(info, outcome.terminated | outcome.truncated)
         ends = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return seen, float(outcome.rewards[0]), *ends, info
 
@@ -218,41 +218,25 @@ class ActiveSlamEnv(LandmarkWorldEnv):
             raise ResetNeeded("call reset first: there is no episode yet")
         return int(self.task.episodes.steps[0])
 
-    def _update(
-        self, observation: Observation, info: Mapping[str, Any], *, step: int
-    ) -> BatchStorage:
-        """Update the estimator with one scan; return its belief."""
-        mask = observation["mask"]
-        seen = np.flatnonzero(mask)
-        if self._record is not None:
-            self._record.add(_ONE_WORLD, info["landmark_ids"][None], mask[None])
-        ids = seen.tolist() if self._by_id else None
-        self._estimator.update(observation["landmarks"][seen], ids)
-        count = self.scenario.landmarks.count
-        if self.render_mode is None and can_batch(self._estimator):
-            return live_storage(cast("EkfSlam", self._estimator), count)
-        belief = checked_belief(self._estimator, step)
-        self.show_belief(belief)
-        return belief_storage(belief, count, by_id=self._by_id)
+    def _scan(
+        self, observation: Observation, info: Mapping[str, Any], *, moved: BoolArray
+    ) -> None:
+        """Update the filter with one scan."""
+        true_ids = info.get("landmark_ids")
+        scan = scan_of_one(observation)
+        self._explorers.scan(
+            scan, _ONE_WORLD, moved, None if true_ids is None else true_ids[None]
+        )
+        if self.render_mode is not None:
+            self.show_belief(self._filters.belief(0))
 
     def _output(
-        self, beliefs: BatchStorage, info: dict[str, Any], ended: BoolArray
+        self, info: dict[str, Any], ended: BoolArray
     ) -> tuple[Observation, dict[str, Any]]:
         rows = self.task.observations()
-        error = map_rmse if self._by_id else matched_rmse
-        rmse = float(error(beliefs, self._landmarks[None])[0])
-        success = bool(self.task.outcome.success[0])
-        counts: dict[str, Any] = {
-            "mapped": int(self.task.mapped[0]),
-            "known": int(self.task.known[0]),
-            "success": success,
-            "true_rmse": rmse,
-            "honest_success": success and rmse <= self.task.weights.accuracy,
-        }
-        if self._record is not None:
-            scores = self._record.scores([self._estimator], ended)
-            counts |= {key: float(score[0]) for key, score in scores.items()}
-        return {key: row[0] for key, row in rows.items()}, {**info, **counts}
+        infos = self._explorers.infos(self._landmarks[None], ended)
+        more = {key: values.item() for key, values in infos.items()}
+        return {key: row[0] for key, row in rows.items()}, {**info, **more}
 
 
 # --------------------------------------------------------------------------------------
@@ -314,13 +298,15 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         self.task = ActiveSlamTask(self.scenario, weights, num_envs, form)
         self.single_observation_space = self.task.observation_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        count = self.scenario.landmarks.count
         self._filters = choose_filters(
-            estimator, self.scenario, num_envs, count, estimator_options
+            estimator,
+            self.scenario,
+            num_envs,
+            self.scenario.landmarks.count,
+            estimator_options,
         )
-        by_id = self.scenario.sensor.identities
+        self._explorers = Explorers(self._filters, self.task)
         self._all = np.ones(num_envs, dtype=np.bool_)
-        self._record = None if by_id else AssociationRecord(num_envs)
 
     def beliefs(self) -> BatchBeliefs:
         """Return the present beliefs of all filters."""
@@ -330,8 +316,8 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
 
     def _reward(self, actions: ArrayLike, moving: BoolArray) -> tuple[Array, BoolArray]:
         if np.count_nonzero(moving) < self.num_envs:
-            self._begin_filters(~moving)
-        self._filter(self._all, moving)
+            self._explorers.begin(self._worlds.start_estimates, ~moving)
+        self._scan(self._all, moving)
         outcome = self.task.proceed(
             self._filters.storage(), moving, actions, self._worlds.collisions
         )
@@ -340,22 +326,14 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
     def _begin(self, worlds: BoolArray, seeds: Sequence[int | None] = ()) -> None:
         """Start episodes in some worlds, each with its first scan."""
         super()._begin(worlds, seeds)
-        self._begin_filters(worlds)
-        self._filter(worlds, ~worlds)
+        self._explorers.begin(self._worlds.start_estimates, worlds)
+        self._scan(worlds, ~worlds)
         self.task.begin(self._filters.storage(), worlds)
 
-    def _begin_filters(self, worlds: BoolArray) -> None:
-        if self._record is not None:
-            self._record.begin(worlds)
-        estimates = self._worlds.start_estimates
-        self._filters.reset(estimates, self.scenario.start.std, runs=worlds)
-
-    def _filter(self, worlds: BoolArray, moved: BoolArray) -> None:
+    def _scan(self, worlds: BoolArray, moved: BoolArray) -> None:
+        """Update the filters of some worlds with one scan each."""
         observations = super()._observations()
-        if self._record is not None:
-            true_ids: Any = self._worlds.landmark_ids
-            self._record.add(worlds, true_ids, observations["mask"])
-        update_filters(self._filters, observations, worlds, moved=moved)
+        self._explorers.scan(observations, worlds, moved, self._worlds.landmark_ids)
         if self.render_mode is not None:
             self.show_beliefs(list(map(self._filters.belief, range(self.num_envs))))
 
@@ -367,19 +345,72 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         return {key: rows.copy() for key, rows in observations.items()}
 
     def _infos(self) -> dict[str, Any]:
-        beliefs, success = self._filters.storage(), self.task.outcome.success.copy()
+        landmarks = self._worlds.complex_landmarks
+        return {**super()._infos(), **self._explorers.infos(landmarks, self._ended)}
+
+
+# --------------------------------------------------------------------------------------
+# What the single and the vector environment share.
+
+
+class Explorers:
+    """The filters of B worlds, and what `info` reveals about them.
+
+    Parameters
+    ----------
+    filters : Filters
+        Filter i is that of world i.
+    task : ActiveSlamTask
+        The task of these worlds.
+    """
+
+    def __init__(self, filters: Filters, task: ActiveSlamTask) -> None:
+        self._filters, self._task = filters, task
+        by_id = task.scenario.sensor.identities
+        self._record = None if by_id else AssociationRecord(len(task.mapped))
+
+    def begin(self, estimates: Array, worlds: BoolArray) -> None:
+        """Start the filters of some worlds, (B,), at estimates (B, 3)."""
+        if self._record is not None:
+            self._record.begin(worlds)
+        std = self._task.scenario.start.std
+        self._filters.reset(estimates, std, runs=worlds)
+
+    def scan(
+        self,
+        observations: Mapping[str, AnyArray],
+        worlds: BoolArray,
+        moved: BoolArray,
+        true_ids: IntArray | None,
+    ) -> None:
+        """Update the filters of some worlds; see `SeparateFilters.update`."""
+        if self._record is not None and true_ids is not None:
+            self._record.add(worlds, true_ids, observations["mask"])
+        update_filters(self._filters, observations, worlds, moved=moved)
+
+    def infos(self, landmarks: ComplexArray, ended: BoolArray) -> dict[str, AnyArray]:
+        """Return the entries of `info` besides those of the world, each (B,).
+
+        Parameters
+        ----------
+        landmarks : complex ndarray, shape (B, N)
+            True positions x + iy [m].
+        ended : bool ndarray, shape (B,)
+            Worlds whose episode is over.
+        """
+        task, beliefs = self._task, self._filters.storage()
+        success = task.outcome.success.copy()
         error = map_rmse if self._record is None else matched_rmse
-        rmse = error(beliefs, self._worlds.complex_landmarks)
-        infos = {
-            **super()._infos(),
-            "mapped": self.task.mapped,
-            "known": self.task.known,
+        rmse = error(beliefs, landmarks)
+        infos: dict[str, AnyArray] = {
+            "mapped": task.mapped,
+            "known": task.known,
             "success": success,
             "true_rmse": rmse,
-            "honest_success": success & (rmse <= self.task.weights.accuracy),
+            "honest_success": success & (rmse <= task.weights.accuracy),
         }
         if self._record is not None and isinstance(self._filters, SeparateFilters):
-            infos |= self._record.scores(self._filters.filters, self._ended)
+            infos |= self._record.scores(self._filters.filters, ended)
         return infos
 
 

@@ -444,20 +444,12 @@ def write_lobes(lobes: Lobes, unit: float, densities: Array) -> None:
     """Write the densities of all eight directions."""
     total, xx, xy, ahead, ahead_left, left, left_behind = lobes
     half = 0.5 * total
-    write_opposites(ahead, xx, unit, densities, 0)
-    write_opposites(ahead_left, half + xy, unit, densities, 1)
-    write_opposites(left, total - xx, unit, densities, 2)
-    write_opposites(left_behind, half - xy, unit, densities, 3)
-
-
-@njit_internal
-def write_opposites(
-    part: float, total: float, unit: float, densities: Array, k: int
-) -> None:
-    """Write the densities of direction k, and of the opposite one: the remainder."""
-    ahead, behind = max(0.5 * part, 0.0), max(0.5 * (total - part), 0.0)
-    densities[k] = ahead / (ahead + unit)
-    densities[k + SECTORS // 2] = behind / (behind + unit)
+    wholes = xx, half + xy, total - xx, half - xy
+    for k, part in enumerate((ahead, ahead_left, left, left_behind)):
+        # of direction k, and of the opposite one: the remainder
+        near, far = max(0.5 * part, 0.0), max(0.5 * (wholes[k] - part), 0.0)
+        densities[k] = near / (near + unit)
+        densities[k + SECTORS // 2] = far / (far + unit)
 
 
 @njit_internal

@@ -136,9 +136,11 @@ class ActiveSlamTask:
             },
             **{key: ((count, size), np.dtype(float)) for key, size in _SIZES.items()},
         }
+        if rows := self._form.rows:
+            self._forms["landmarks"] = (count, rows, len(FEATURES)), np.dtype(float)
+            self._forms["mask"] = (count, rows), np.dtype(np.bool_)
         self._all = np.ones(count, dtype=np.bool_)
         self._rows: dict[str, AnyArray] = {}
-        self._sets: dict[str, AnyArray] = {}
         self.episodes = Episodes(
             np.zeros((count, cells), dtype=np.bool_),
             np.zeros(count, dtype=np.int64),
@@ -157,8 +159,6 @@ class ActiveSlamTask:
         """Begin episodes in some worlds, (B,), after their first scan."""
         rows = self._rows or self._empty_rows()
         self._rows = {key: row.copy() for key, row in rows.items()}
-        sets = self._sets or self._empty_sets()
-        self._sets = {key: row.copy() for key, row in sets.items()}
         self.outcome.success[worlds] = False
         self.mapped, self.known = self.mapped.copy(), self.known.copy()
         self._advance(beliefs, worlds, ~worlds)
@@ -174,7 +174,7 @@ class ActiveSlamTask:
 
         The others begin episodes, after their first scan.
         """
-        self._rows, self._sets = self._empty_rows(), self._empty_sets()
+        self._rows = self._empty_rows()
         self.outcome = _no_outcome(self._shape[0])
         self.mapped, self.known = np.empty((2, self._shape[0]), dtype=np.int64)
         self._advance(beliefs, self._all, moving, actions, collisions)
@@ -184,10 +184,10 @@ class ActiveSlamTask:
         """Return the observations of all worlds: arrays that no later step changes."""
         count = self._shape[0]
         flat = {
-            key: row if row.ndim == 2 else row.reshape(count, -1)
+            key: row if row.ndim == 2 or key == "landmarks" else row.reshape(count, -1)
             for key, row in self._rows.items()
         }
-        return self._form.cast({**flat, **self._sets})
+        return self._form.cast(flat)
 
     def _advance(
         self,
@@ -198,7 +198,8 @@ class ActiveSlamTask:
         collisions: BoolArray | None = None,
     ) -> None:
         rows = tuple(self._rows.values())
-        first = len(rows) - len(_SIZES)
+        last = len(rows) - 2 * bool(self._form.rows)
+        first = last - len(_SIZES)
         worlds_now: tuple[Any, ...] = (  # a `Worlds`
             tuple(beliefs),
             np.asarray(actions, dtype=np.float64),
@@ -207,21 +208,14 @@ class ActiveSlamTask:
             tuple(self.outcome),
             (self.mapped, self.known),
             rows[:first],
-            rows[first:],
+            rows[first:last],
         )
         plan = self.grid.plan
         advance(worlds, moving, worlds_now, plan, self._rules, self._scratch)
-        if self._sets:
-            write_landmark_sets(worlds, beliefs, self.episodes.known, self._sets)
-
-    def _empty_sets(self) -> dict[str, AnyArray]:
-        shape = self._shape[0], self._form.rows
-        if not self._form.rows:
-            return {}
-        return {
-            "landmarks": np.zeros((*shape, len(FEATURES))),
-            "mask": np.zeros(shape, dtype=np.bool_),
-        }
+        if self._form.rows:
+            landmarks, mask = rows[last:]
+            known = self.episodes.known
+            write_landmark_sets(worlds, worlds_now[0], known, landmarks, mask)
 
     def _empty_rows(self) -> dict[str, AnyArray]:
         return {key: np.empty(*form) for key, form in self._forms.items()}

@@ -15,7 +15,6 @@ to the robot than in the map.
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
 from ..envs.controllers import planned_path
-from ..estimator.filters.batch import BatchSlam, BatchStorage
+from ..estimator.filters.batch import BatchStorage
 from ..estimator.filters.ekf import EkfSlam
 from ..estimator.kernels.kalman_gain import largest_variance
 from ..estimator.models.bearing_range import wrap_angle_jit
@@ -210,46 +209,6 @@ def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
     for landmark, slot in gaussian.slots.items():
         slots[0, landmark] = slot
     return BatchStorage(gaussian.mean[None], gaussian.covariance[None], slots)
-
-
-def update_batch(
-    filters: BatchSlam,
-    observations: Mapping[str, AnyArray],
-    worlds: BoolArray,
-    *,
-    moved: BoolArray,
-) -> None:
-    """Update the filters of some worlds with one observation each.
-
-    Parameters
-    ----------
-    filters : BatchSlam
-        One filter for each of B worlds.
-    observations : mapping
-        The batched observation of a landmark world, each key with a leading axis B.
-    worlds : bool ndarray, shape (B,)
-        Worlds whose filters are updated.
-    moved : bool ndarray, shape (B,)
-        Which of them have moved; the others take the scan from their start.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If a filter fails; the message names its world.
-    """
-    filters.step(
-        observations["odometry"],
-        observations["landmarks"],
-        observations["mask"],
-        moved.astype(np.float64),
-        runs=worlds,
-    )
-    failed = filters.failed_at >= 0
-    if np.count_nonzero(failed):
-        raise np.linalg.LinAlgError(
-            f"the filter of world {int(np.argmax(failed))} has failed: its belief or "
-            "measurement_std is degenerate, or its observation is not finite"
-        )
 
 
 # --------------------------------------------------------------------------------------

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, SupportsFloat
+from collections.abc import Mapping, Sequence
+from typing import Any, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
@@ -16,25 +16,35 @@ from gymnasium.vector.utils import batch_space
 from ..arrays import AnyArray, Array, BoolArray
 from ..envs import LandmarkWorldEnv
 from ..envs.vector.landmark_world_vector import final_infos
-from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage
+from ..estimator.filters.batch import (
+    BatchBeliefs,
+    BatchSlam,
+    BatchStorage,
+    can_batch,
+)
+from ..estimator.filters.ekf import EkfSlam
+from ..estimator.registry import find_estimator, make_batch, read_label
 from ..estimator.support import argument_checks
 from ..sim_configs import Scenario
 from .belief_features import (
     belief_features,
     belief_space,
     belief_storage,
-    update_batch,
+    live_storage,
     world_bounds,
 )
 from .estimator_choice import (
     BeliefOfMap,
     EstimatorChoice,
+    FollowingEstimator,
     checked_belief,
-    choose_batch,
     choose_estimator,
+    noise_options,
 )
 
 Observation = dict[str, Any]
+
+_ONE_WORLD = np.ones(1, dtype=np.bool_)
 
 
 class BeliefObservation(
@@ -96,60 +106,50 @@ class BeliefObservation(
         )
         super().__init__(env)
         self.scenario = scenario_of(env)
-        self._rows = count_landmark_rows(self.scenario, max_landmarks)
-        self._by_id = self.scenario.sensor.identities
+        rows = count_landmark_rows(self.scenario, max_landmarks)
         self._bounds = world_bounds(self.scenario)
-        self._estimator = choose_estimator(
-            estimator, self.scenario, estimator_options, rows=self._rows
+        slam = choose_estimator(estimator, self.scenario, estimator_options, rows=rows)
+        self._filters = SeparateFilters(
+            [slam], rows, by_id=self.scenario.sensor.identities
         )
-        self.observation_space = with_belief(env.observation_space, self._rows)
-        self._belief: BeliefOfMap | None = None
-        self._storage: BatchStorage | None = None
-        self._steps = 0
+        self.observation_space = with_belief(env.observation_space, rows)
 
     @property
     def belief(self) -> BeliefOfMap:
         """The present belief of the estimator."""
-        if self._belief is None:
-            raise gymnasium.error.ResetNeeded("call reset first: there is no belief")
-        return self._belief
+        belief = self._filters.belief(0)
+        if belief is None:
+            raise ResetNeeded("call reset first: there is no belief")
+        return belief
 
     @property
     def beliefs(self) -> BatchBeliefs:
         """The present belief as arrays of a fixed size, with B = 1."""
-        if self._storage is None:
-            raise gymnasium.error.ResetNeeded("call reset first: there is no belief")
-        return self._storage.beliefs()
+        _ = self.belief  # refuses before `reset`
+        return self._filters.beliefs()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; the estimator starts from the start estimate."""
         observation, info = self.env.reset(seed=seed, options=options)
-        world = self.env.get_wrapper_attr("start_estimate")
-        self._estimator.reset(world, self.scenario.start.std)
-        self._steps = 0
-        return self._update(observation), info
+        estimate = self.env.get_wrapper_attr("start_estimate")
+        self._filters.reset(estimate[None], self.scenario.start.std, runs=_ONE_WORLD)
+        return self._update(observation, moved=~_ONE_WORLD), info
 
     def step(
         self, action: Any
     ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the world, then predict and update."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._estimator.predict(observation["odometry"])
-        self._steps += 1
-        return self._update(observation), reward, terminated, truncated, info
+        seen = self._update(observation, moved=_ONE_WORLD)
+        return seen, reward, terminated, truncated, info
 
-    def _update(self, observation: Observation) -> Observation:
-        seen = np.flatnonzero(observation["mask"])
-        ids = seen.tolist() if self._by_id else None
-        self._estimator.update(observation["landmarks"][seen], ids)
-        belief = checked_belief(self._estimator, self._steps)
-        self._belief = belief
-        self._storage = belief_storage(belief, self._rows, by_id=self._by_id)
+    def _update(self, observation: Observation, *, moved: BoolArray) -> Observation:
+        self._filters.update(scan_of_one(observation), _ONE_WORLD, moved=moved)
         if self.env.render_mode is not None:
-            self.env.get_wrapper_attr("show_belief")(belief)
-        features = belief_features(self._storage, self._bounds)
+            self.env.get_wrapper_attr("show_belief")(self.belief)
+        features = belief_features(self._filters.storage(), self._bounds)
         return with_features(
             observation, {key: row[0] for key, row in features.items()}
         )
@@ -347,52 +347,37 @@ def _padded(rows: AnyArray, more: int) -> AnyArray:
 
 
 class SeparateFilters:
-    """Filters side by side, for vector worlds that hide identities.
+    """Filters side by side: any filter of one world, and all that associate.
 
-    Batches do not associate; these filters are managed and do.
+    Batches neither associate nor run filters of other libraries.
 
     Parameters
     ----------
-    estimator : str
-        Registered name or "module:Class".
-    scenario : Scenario
-        Source of the noise settings.
-    runs : int
-        B, the number of worlds.
+    filters : sequence of FollowingEstimator, length B
+        Filter i is that of world i.
     rows : int
         N, the most landmarks in a map.
-    options : mapping, optional
-        Further options of the filters.
-
-    Raises
-    ------
-    ValueError
-        If the name is unknown, or an option does not fit.
+    by_id : bool
+        Whether readings carry identities; see `belief_storage`.
+    live : bool
+        Whether filters that could run in batches show their own arrays. Then their
+        beliefs are neither copied nor checked.
     """
 
     def __init__(
         self,
-        estimator: str,
-        scenario: Scenario,
-        runs: int,
+        filters: Sequence[FollowingEstimator],
         rows: int,
-        options: Mapping[str, Any] | None = None,
+        *,
+        by_id: bool = False,
+        live: bool = False,
     ) -> None:
-        if not isinstance(estimator, str):
-            raise ValueError(
-                "estimator must be a registered name for vector environments, "
-                f"got {estimator!r}"
-            )
-        self.filters = [
-            choose_estimator(estimator, scenario, options, rows=rows)
-            for _ in range(runs)
-        ]
-        """Filter i is that of world i."""
-        self._steps = np.zeros(runs, dtype=np.int64)
-        capacity = 3 + 2 * rows
-        self._means = np.zeros((runs, capacity))
-        self._covariances = np.zeros((runs, capacity, capacity))
-        self._slots = np.full((runs, rows), -1, dtype=np.int64)
+        self.filters = filters
+        self._rows, self._by_id = rows, by_id
+        self._live = [live and can_batch(slam) for slam in filters]
+        self._steps = [0] * len(filters)
+        self._beliefs: list[BeliefOfMap | None] = [None] * len(filters)
+        self._stored: list[Any] = [None] * len(filters)  # `BatchStorage`, B = 1
 
     def reset(self, poses: Array, pose_std: Any, *, runs: BoolArray) -> None:
         """Start new runs in some worlds, at poses (B, 3) with deviations (3,)."""
@@ -424,24 +409,33 @@ class SeparateFilters:
                 slam.predict(observations["odometry"][run])
                 self._steps[run] += 1
             seen = np.flatnonzero(observations["mask"][run])
-            slam.update(observations["landmarks"][run][seen], None)
-            belief = checked_belief(slam, int(self._steps[run]))
-            stored = belief_storage(belief, self._slots.shape[1], by_id=False)
-            self._means[run] = stored.means[0]
-            self._covariances[run] = stored.covariances[0]
-            self._slots[run] = stored.slots[0]
+            ids = seen.tolist() if self._by_id else None
+            slam.update(observations["landmarks"][run][seen], ids)
+            if self._live[run]:
+                self._stored[run] = live_storage(cast("EkfSlam", slam), self._rows)
+                continue
+            self._beliefs[run] = belief = checked_belief(slam, self._steps[run])
+            self._stored[run] = belief_storage(belief, self._rows, by_id=self._by_id)
 
     def storage(self) -> BatchStorage:
         """Return the arrays of the beliefs; they change with the next update."""
-        return BatchStorage.of(self._means, self._covariances, self._slots)
+        if len(self._stored) == 1:
+            one: BatchStorage = self._stored[0]
+            return one
+        return BatchStorage(*map(np.concatenate, zip(*self._stored, strict=True)))
 
-    def belief(self, run: int) -> BeliefOfMap:
-        """Return the belief of one world."""
-        return checked_belief(self.filters[run], int(self._steps[run]))
+    def belief(self, run: int) -> BeliefOfMap | None:
+        """Return the belief of one world; None before its first scan."""
+        return self._beliefs[run]
 
     def beliefs(self) -> BatchBeliefs:
         """Return the beliefs of all worlds side by side, as a snapshot."""
         return self.storage().beliefs()
+
+
+def scan_of_one(observation: Observation) -> dict[str, AnyArray]:
+    """Return an observation of a landmark world as a batch of one."""
+    return {key: observation[key][None] for key in ("landmarks", "mask", "odometry")}
 
 
 Filters = BatchSlam | SeparateFilters
@@ -456,15 +450,48 @@ def choose_filters(
 ) -> Filters:
     """Make a batch of filters; where the scenario hides identities, separate ones.
 
+    A batch has one thread: a step takes less time than starting another thread.
+
+    Parameters
+    ----------
+    estimator : str
+        Registered name or "module:Class".
+    scenario : Scenario
+        Source of the noise settings.
+    runs : int
+        B, the number of worlds.
+    rows : int
+        N, the most landmarks in a map.
+    options : mapping, optional
+        Further options of the filters.
+
     Raises
     ------
     ValueError
         If the name is unknown, an option does not fit, or the filter cannot run in
         batches and must.
     """
-    choose = choose_batch if scenario.sensor.identities else SeparateFilters
-    filters: Filters = choose(estimator, scenario, runs, rows, options)
-    return filters
+    if not isinstance(estimator, str):
+        raise ValueError(
+            "estimator must be a registered name for vector environments, "
+            f"got {estimator!r}"
+        )
+    if not scenario.sensor.identities:
+        filters = [
+            choose_estimator(estimator, scenario, options, rows=rows)
+            for _ in range(runs)
+        ]
+        return SeparateFilters(filters, rows)
+    known = noise_options(find_estimator(read_label(estimator).name), scenario)
+    return make_batch(
+        estimator,
+        runs=runs,
+        landmarks=rows,
+        motion_std=scenario.motion.std,
+        measurement_std=scenario.sensor.std,
+        threads=1,
+        **{**known, **(options or {})},
+    )
 
 
 def update_filters(
@@ -474,8 +501,26 @@ def update_filters(
     *,
     moved: BoolArray,
 ) -> None:
-    """Update the filters of some worlds; see `SeparateFilters.update`."""
+    """Update the filters of some worlds; see `SeparateFilters.update`.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a filter of a batch fails; the message names its world.
+    """
     if isinstance(filters, SeparateFilters):
         filters.update(observations, worlds, moved=moved)
-    else:
-        update_batch(filters, observations, worlds, moved=moved)
+        return
+    filters.step(
+        observations["odometry"],
+        observations["landmarks"],
+        observations["mask"],
+        moved.astype(np.float64),
+        runs=worlds,
+    )
+    failed = filters.failed_at >= 0
+    if np.count_nonzero(failed):
+        raise np.linalg.LinAlgError(
+            f"the filter of world {int(np.argmax(failed))} has failed: its belief or "
+            "measurement_std is degenerate, or its observation is not finite"
+        )

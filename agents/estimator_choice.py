@@ -13,12 +13,10 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, BoolArray
 from ..envs.rendering import BeliefLike
-from ..estimator.filters.batch import BatchSlam
 from ..estimator.map_management.policy import LandmarkPolicy, as_policy
 from ..estimator.registry import (
     accepted_options,
     find_estimator,
-    make_batch,
     make_estimator,
     read_label,
 )
@@ -121,39 +119,6 @@ def _bounded(management: Any, rows: int | None) -> LandmarkPolicy | Literal[Fals
     return replace(policy, capacity=rows) if policy.capacity is None else policy
 
 
-def choose_batch(
-    estimator: str,
-    scenario: Scenario,
-    runs: int,
-    landmarks: int,
-    options: Mapping[str, Any] | None = None,
-) -> BatchSlam:
-    """Make a batch of a registered estimator with the noise settings of a world.
-
-    It has one thread: a step takes less time than starting another thread.
-
-    Raises
-    ------
-    ValueError
-        If the name is unknown, or the estimator cannot run in batches.
-    """
-    if not isinstance(estimator, str):
-        raise ValueError(
-            "estimator must be a registered name for vector environments, "
-            f"got {estimator!r}"
-        )
-    known = noise_options(find_estimator(read_label(estimator).name), scenario)
-    return make_batch(
-        estimator,
-        runs=runs,
-        landmarks=landmarks,
-        motion_std=scenario.motion.std,
-        measurement_std=scenario.sensor.std,
-        threads=1,
-        **{**known, **(options or {})},
-    )
-
-
 def noise_options(factory: Callable[..., Any], scenario: Scenario) -> dict[str, Any]:
     """Return the noise settings of a world that a factory accepts."""
     settings = {
@@ -204,60 +169,22 @@ def checked_belief(estimator: FollowingEstimator, step: int) -> BeliefOfMap:
             f"got {type(belief).__name__} without {missing[0]}"
         )
     arrays = {part: np.asarray(parts[part]) for part in _ARRAYS}
-    checked: BeliefOfMap = belief
-    if _is_sound(len(belief.landmark_ids), *arrays.values()):
-        return checked
-    shapes = partial(_wrong_shape, count=len(belief.landmark_ids))
-    _refuse_problem(arrays, shapes, TypeError, name, step)
-    _refuse_problem(arrays, _wrong_number, ValueError, name, step)
-    return checked
-
-
-def _refuse_problem(
-    arrays: Mapping[str, AnyArray],
-    problem_of: Callable[[str, AnyArray], str | None],
-    error: type[Exception],
-    name: str,
-    step: int,
-) -> None:
-    """Raise an error about the first part with a problem."""
+    count = len(belief.landmark_ids)
+    size = 3 + 2 * count
+    shapes = ((3,), (3, 3), (count, 2), (size, size))
+    for (part, array), shape in zip(arrays.items(), shapes, strict=True):
+        if array.shape != shape and not 0 == array.size == math.prod(shape):
+            what = part if part == "landmarks" else f"a {part}"
+            raise TypeError(
+                f"{name} must have {what} of shape {shape} with {count} landmarks, "
+                f"got {array.shape} at step {step}"
+            )
     for part, array in arrays.items():
-        problem = problem_of(part, array)
+        problem = _wrong_number(part, array)
         if problem:
-            raise error(f"{name} must {problem} at step {step}")
-
-
-def _is_sound(
-    count: int,
-    pose: AnyArray,
-    pose_covariance: AnyArray,
-    landmarks: AnyArray,
-    covariance: AnyArray,
-) -> bool:
-    """Return whether shapes and numbers are certainly right: a quick look."""
-    parts = pose, pose_covariance, landmarks, covariance
-    size = 3 + 2 * count
-    if [part.shape for part in parts] != [(3,), (3, 3), (count, 2), (size, size)]:
-        return False
-    if not all(np.isfinite(part).all() for part in parts):
-        return False
-    return bool(min(pose_covariance.diagonal().min(), covariance.diagonal().min()) >= 0)
-
-
-def _wrong_shape(part: str, values: AnyArray, count: int) -> str | None:
-    """Return the message for a wrong shape of a part of a belief, or None."""
-    size = 3 + 2 * count
-    shapes = {
-        "pose": (3,),
-        "pose_covariance": (3, 3),
-        "landmarks": (count, 2),
-        "covariance": (size, size),
-    }
-    shape = shapes[part]
-    if values.shape == shape or 0 == values.size == math.prod(shape):
-        return None
-    what = part if part == "landmarks" else f"a {part}"
-    return f"have {what} of shape {shape} with {count} landmarks, got {values.shape}"
+            raise ValueError(f"{name} must {problem} at step {step}")
+    checked: BeliefOfMap = belief
+    return checked
 
 
 def _wrong_number(part: str, values: AnyArray) -> str | None:

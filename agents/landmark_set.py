@@ -19,7 +19,6 @@ import numpy as np
 from gymnasium import spaces
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
-from ..estimator.filters.batch import BatchStorage
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..jit import jit, njit_internal
 from ..sim_configs.field_types import unknown_choice
@@ -117,35 +116,28 @@ class ObservationForm:
         }
 
 
-def write_landmark_sets(
-    worlds: BoolArray, beliefs: BatchStorage, known: BoolArray, sets: dict[str, Any]
-) -> None:
-    """Write the landmarks of some worlds, (B,), as sets.
-
-    Parameters
-    ----------
-    beliefs : BatchStorage
-        Of B worlds.
-    known : bool ndarray, shape (B, N)
-        Which landmarks are known accurately enough.
-    sets : dict
-        ``landmarks``, shape (B, R, 15), with the columns of `FEATURES`, and ``mask``,
-        shape (B, R). The nearest landmarks come first; rows without one are 0.
-    """
-    means, covariances, slots = beliefs
-    _write_sets(
-        worlds, (means, covariances, slots), known, sets["landmarks"], sets["mask"]
-    )
-
-
 @jit
-def _write_sets(
+def write_landmark_sets(
     worlds: BoolArray,
     beliefs: tuple[Array, Array, IntArray],
     known: BoolArray,
     landmarks: Array,
     mask: BoolArray,
 ) -> None:
+    """Write the landmarks of some worlds, (B,), as sets.
+
+    Parameters
+    ----------
+    beliefs : tuple
+        The arrays of a `BatchStorage`, of B worlds.
+    known : bool ndarray, shape (B, N)
+        Which landmarks are known accurately enough.
+    landmarks : ndarray, shape (B, R, 15)
+        For the columns of `FEATURES`. The nearest landmarks come first; rows without
+        one are 0.
+    mask : bool ndarray, shape (B, R)
+        For the rows with a landmark.
+    """
     means, covariances, slots = beliefs
     distances = np.empty(slots.shape[1])
     for b in range(len(worlds)):

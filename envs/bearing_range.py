@@ -18,13 +18,14 @@ import numpy as np
 
 from ..arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ..sim_configs import Scenario
-from ..sim_configs.scenario import Sensor
-from .noise_streams import SensorNoise, largest_noise
+from .noise_streams import SensorNoise, SensorSettings, largest_noise
 from .robot import wrap_bearings
 
 _PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
 _UNSEEN = np.array(0.0)
 _LAST = np.array(np.inf)  # sorts after every other row
+
+Limit = float | Array | None
 
 
 class AnonymousScan(NamedTuple):
@@ -36,29 +37,6 @@ class AnonymousScan(NamedTuple):
     """Rows with a reading, shape (…, M)."""
     landmark_ids: IntArray
     """The true landmark of each row, -1 for clutter and empty rows, shape (…, M)."""
-
-
-class Reach(NamedTuple):
-    """What sensors see, and their range error; arrays (…, 1) of worlds that differ."""
-
-    max_range: Array | None
-    """[m]; None for no limit."""
-    half_view: Array | None
-    """Half the field of view [rad]; None for no limit."""
-    range_std: float | Array
-    """σr at range 0 [m]."""
-    growth: float | Array
-    """k in σr(r) = σr + k r."""
-
-    @classmethod
-    def of(cls, sensor: Sensor) -> "Reach":
-        """Return the reach of one world's sensor."""
-        return cls(
-            _limit(sensor.max_range, above=math.inf),
-            _limit(sensor.field_of_view / 2, above=math.pi),
-            sensor.std[1],
-            sensor.range_std_per_metre,
-        )
 
 
 class BearingRangeSensor:
@@ -76,7 +54,10 @@ class BearingRangeSensor:
 
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
-        self._reach, self._grows = Reach.of(sensor), sensor.range_std_per_metre > 0
+        self._max_range: Limit = _limit(sensor.max_range, above=math.inf)
+        self._half_view: Limit = _limit(sensor.field_of_view / 2, above=math.pi)
+        self._grows = sensor.range_std_per_metre > 0
+        self._settings = SensorSettings.of(sensor)
         faults = scenario.present_faults
         self._bias = _bias(faults.bearing_bias, faults.range_bias)
         largest = largest_noise(faults.sensor_dof) * sensor.std[0]
@@ -91,7 +72,7 @@ class BearingRangeSensor:
         position: ComplexArray,
         inverse_heading: ComplexArray,
         noise: SensorNoise,
-        reach: Reach | None = None,
+        settings: SensorSettings | None = None,
     ) -> tuple[Array, BoolArray]:
         """Measure the landmarks from one pose per world.
 
@@ -109,7 +90,7 @@ class BearingRangeSensor:
             cos θ - i sin θ.
         noise : SensorNoise
             Noise of this step.
-        reach : Reach, optional
+        settings : SensorSettings, optional
             Of each world, where worlds differ.
 
         Returns
@@ -120,7 +101,9 @@ class BearingRangeSensor:
             Landmarks that the sensor reads.
         """
         error, nearest, _, _ = noise
-        reach = reach or self._reach
+        max_range, half_view = self._max_range, self._half_view
+        if settings is not None:
+            max_range, half_view = settings.max_range, settings.field_of_view / 2
         relative = (landmarks - position) * inverse_heading
         readings = np.empty(error.shape)  # without noise at first
         y, x = relative.imag, relative.real
@@ -128,10 +111,14 @@ class BearingRangeSensor:
             y, x = y.copy(), x.copy()
         bearings = np.arctan2(y, x, readings[0])
         np.abs(relative, readings[1])
-        mask = _in_view(readings, nearest, reach)
+        mask = _in_view(readings, nearest, max_range, half_view)
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
-        readings += self._scaled(error, readings[1], reach)
+        if self._grows:
+            settings = settings or self._settings
+            std = settings.range_std + settings.growth * readings[1]
+            error = np.stack([error[0], error[1] * std])
+        readings += error
         if self._bias is not None:
             bearings += self._bias[0]
             readings[1] += self._bias[1]
@@ -141,21 +128,16 @@ class BearingRangeSensor:
             readings = np.where(mask, readings, _UNSEEN)
         return readings, mask
 
-    def _scaled(self, error: Array, ranges: Array, reach: Reach) -> Array:
-        """Scale the range error where its standard deviation grows with the range."""
-        if not self._grows:
-            return error
-        std = reach.range_std + reach.growth * ranges
-        return np.stack([error[0], error[1] * std])
 
-
-def _in_view(readings: Array, nearest: Array, reach: Reach) -> BoolArray:
+def _in_view(
+    readings: Array, nearest: Array, max_range: Limit, half_view: Limit
+) -> BoolArray:
     """Return which noise-free readings, (2, …, N), the sensor can take."""
     mask: BoolArray = readings[1] > nearest
-    if reach.max_range is not None:
-        mask &= readings[1] <= reach.max_range
-    if reach.half_view is not None:
-        mask &= np.abs(readings[0]) <= reach.half_view
+    if max_range is not None:
+        mask &= readings[1] <= max_range
+    if half_view is not None:
+        mask &= np.abs(readings[0]) <= half_view
     return mask
 
 

@@ -12,7 +12,7 @@ from typing import Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from ..arrays import Array, BoolArray, IndexArray, IntArray, WordArray
+from ..arrays import Array, IntArray, WordArray
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import Sensor
 from .streams import (
@@ -82,121 +82,39 @@ class NoiseRows(Generic[Row]):
         return self._to_come.pop()
 
 
-class UnitDraws(NamedTuple):
-    """Random numbers for the sensor before any scaling, for K steps or K worlds.
+class SensorSettings(NamedTuple):
+    """Settings of the sensors of K worlds that differ, or of one world, K = 1.
 
-    A field that the scenario does not need is None and is not drawn.
+    Numbers are columns, shape (K, 1), or plain for one world.
     """
-
-    measurement: Array
-    """Standard normal, shape (2, K, N)."""
-    dropout: Array | None
-    """Uniform, shape (K, N)."""
-    clutter: Array | None
-    """Uniform, one for the count and two for each row, shape (K, 1 + 2 C)."""
-    order: Array | None
-    """Uniform, shape (K, N + C)."""
-
-
-def unit_widths(scenario: Scenario) -> tuple[int, int, int, int]:
-    """Count the random numbers of each field of `UnitDraws` per step.
-
-    Examples
-    --------
-    >>> from slamgym.sim_configs import load_scenario
-    >>> unit_widths(load_scenario("dropout"))[:2]
-    (24, 12)
-    """
-    sensor, count = scenario.sensor, scenario.landmarks.count
-    hidden, rows = not sensor.identities, sensor.max_clutter
-    return (
-        2 * count,
-        count if sensor.dropout else 0,
-        1 + 2 * rows if hidden and sensor.clutter else 0,
-        count + rows if hidden else 0,
-    )
-
-
-class SensorScales(NamedTuple):
-    """Settings of the sensor: numbers, or arrays (K, 1) of K worlds that differ."""
 
     scale: Array
-    """Of unit noise, shape (2, 1, 1) or (2, K, 1); (σβ, σr) [rad, m], 1 instead of σr
-    where that grows with the range."""
+    """Of unit noise, shape (K, 2); (σβ, σr) [rad, m], 1 instead of σr where that grows
+    with the range."""
     range_std: float | Array
     """σr at range 0 [m]."""
     growth: float | Array
     """k in σr(r) = σr + k r; of K worlds, zero in all or none."""
     dropout: float | Array
     counts_below: Array
-    """P(at most k false readings), shape (C,) or (K, C)."""
+    """P(at most k false readings), shape (K, C)."""
     max_range: float | Array
     field_of_view: float | Array
 
     @classmethod
-    def of(cls, sensor: Sensor) -> "SensorScales":
+    def of(cls, sensor: Sensor) -> "SensorSettings":
         """Return the settings of one world."""
         bearing_std, std = sensor.std
         range_std = 1.0 if sensor.range_std_per_metre else std
         return cls(
-            np.array([[[bearing_std]], [[range_std]]]),
+            np.array([[bearing_std, range_std]]),
             std,
             sensor.range_std_per_metre,
             sensor.dropout,
-            _poisson_cdf(sensor.clutter, sensor.max_clutter),
+            _poisson_cdf(sensor.clutter, sensor.max_clutter)[None],
             sensor.max_range,
             sensor.field_of_view,
         )
-
-
-class SensorNoiseModel:
-    """Scales unit draws to the noise of a scenario's sensor.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Source of the sensor's settings.
-    """
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._sensor = sensor = scenario.sensor
-        faults = scenario.present_faults
-        self._degrees, self._bias = faults.sensor_dof, faults.range_bias
-        self._grows = sensor.range_std_per_metre > 0
-        self._nearest = np.nextafter(sensor.min_range, -1.0)
-        self._scales = SensorScales.of(sensor)
-
-    def apply(
-        self, draws: UnitDraws, scales: SensorScales | None = None
-    ) -> SensorNoise:
-        """Scale the draws of some steps or worlds, perhaps with scales of their own."""
-        sensor, unit = self._sensor, heavy_tails(draws.measurement, self._degrees)
-        scales = scales or self._scales
-        growth = scales.growth if self._grows else None
-        nearest = _nearest_readable(unit[1], scales.range_std, growth, self._bias)
-        np.maximum(nearest, self._nearest, out=nearest)
-        if draws.dropout is not None:
-            nearest[draws.dropout < scales.dropout] = np.inf
-        if sensor.identities:
-            return unit * scales.scale, nearest, None, None
-        return unit * scales.scale, nearest, self._clutter(draws, scales), draws.order
-
-    def _clutter(self, draws: UnitDraws, scales: SensorScales) -> Array:
-        """Draw false readings, uniform over the visible bearings and ranges.
-
-        One number per step determines their count, two more determine (β, r) of each
-        reserved row. Returns (β, r), shape (2, K, C), zeros in empty rows.
-        """
-        sensor, rows = self._sensor, self._sensor.max_clutter
-        if draws.clutter is None:
-            return np.zeros((*draws.measurement.shape[:-1], rows))
-        drawn = draws.clutter
-        counts = (scales.counts_below <= drawn[..., :1]).sum(axis=-1, keepdims=True)
-        width = scales.max_range - sensor.min_range
-        bearings = (drawn[..., 1::2] - 0.5) * scales.field_of_view
-        ranges = scales.max_range - drawn[..., 2::2] * width  # above min_range
-        present = np.arange(rows) < counts
-        return np.where(present, np.stack([bearings, ranges]), 0.0)
 
 
 class WorldNoise:
@@ -212,11 +130,18 @@ class WorldNoise:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        normal, *widths = unit_widths(scenario)
-        self._landmarks = normal // 2
-        self._uniform = list(zip((DROPOUT, CLUTTER, ORDER), widths, strict=True))
-        self._model = SensorNoiseModel(scenario)
-        self._motion_dof = scenario.present_faults.motion_dof
+        self._sensor = sensor = scenario.sensor
+        self._faults = scenario.present_faults
+        self._landmarks = count = scenario.landmarks.count
+        hidden, rows = not sensor.identities, sensor.max_clutter
+        self._widths = {  # of uniform numbers per step; one and two for each false row
+            DROPOUT: count if sensor.dropout else 0,
+            CLUTTER: 1 + 2 * rows if hidden and sensor.clutter else 0,
+            ORDER: count + rows if hidden else 0,
+        }
+        self._grows = sensor.range_std_per_metre > 0
+        self._nearest = np.nextafter(sensor.min_range, -1.0)
+        self._settings = SensorSettings.of(sensor)
         self._motion_std = np.array(scenario.motion.std)
 
     def motion(
@@ -233,22 +158,48 @@ class WorldNoise:
         """
         unit = np.empty((len(steps), 3))
         draw_normals(keys, steps, MOTION, unit[None])
-        noise: Array = heavy_tails(unit, self._motion_dof)
+        noise: Array = heavy_tails(unit, self._faults.motion_dof)
         return noise * (self._motion_std if std is None else std)
 
     def sensor(
-        self, keys: WordArray, steps: IntArray, scales: SensorScales | None = None
+        self, keys: WordArray, steps: IntArray, settings: SensorSettings | None = None
     ) -> SensorNoise:
         """Draw the sensor noise; see `motion`."""
+        settings = settings or self._settings
         unit = np.empty((2, len(steps), self._landmarks))
         draw_normals(keys, steps, MEASUREMENT, unit)
-        uniform: list[Array | None] = []
-        for stream, width in self._uniform:
-            drawn = np.empty((len(steps), width)) if width else None
-            if drawn is not None:
-                draw_uniforms(keys, steps, stream, drawn)
-            uniform.append(drawn)
-        return self._model.apply(UnitDraws(unit, *uniform), scales)
+        unit = heavy_tails(unit, self._faults.sensor_dof)
+        dropout, clutter, order = (
+            _uniform(keys, steps, stream, width)
+            for stream, width in self._widths.items()
+        )
+        growth, bias = settings.growth if self._grows else None, self._faults.range_bias
+        nearest = _nearest_readable(unit[1], settings.range_std, growth, bias)
+        np.maximum(nearest, self._nearest, out=nearest)
+        if dropout is not None:
+            nearest[dropout < settings.dropout] = np.inf
+        error = unit * settings.scale.T[:, :, None]
+        if order is None:
+            return error, nearest, None, None
+        return error, nearest, self._clutter(len(steps), clutter, settings), order
+
+    def _clutter(
+        self, count: int, drawn: Array | None, settings: SensorSettings
+    ) -> Array:
+        """Draw false readings, uniform over the visible bearings and ranges.
+
+        One number per step determines their count, two more determine (β, r) of each
+        reserved row. Returns (β, r), shape (2, K, C), zeros in empty rows.
+        """
+        sensor, rows = self._sensor, self._sensor.max_clutter
+        if drawn is None:
+            return np.zeros((2, count, rows))
+        counts = (settings.counts_below <= drawn[..., :1]).sum(axis=-1, keepdims=True)
+        width = settings.max_range - sensor.min_range
+        bearings = (drawn[..., 1::2] - 0.5) * settings.field_of_view
+        ranges = settings.max_range - drawn[..., 2::2] * width  # above min_range
+        present = np.arange(rows) < counts
+        return np.where(present, np.stack([bearings, ranges]), 0.0)
 
     def motion_rows(self, key: WordArray) -> NoiseRows[list[float]]:
         """Return the motion noise of an episode from step 1 on, as lists of floats.
@@ -278,6 +229,15 @@ class WorldNoise:
         return cast("Iterable[SensorNoise]", zip(*rows, strict=True))
 
 
+def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array | None:
+    """Draw uniform numbers, shape (K, width), or None for no width."""
+    if not width:
+        return None
+    drawn = np.empty((len(steps), width))
+    draw_uniforms(keys, steps, stream, drawn)
+    return drawn
+
+
 def _by_step(pairs: Array | None) -> Array | None:
     """Move the axis of steps to the front."""
     return None if pairs is None else np.ascontiguousarray(pairs.transpose(1, 0, 2))
@@ -297,54 +257,9 @@ def _nearest_readable(
 def _poisson_cdf(mean: float, largest: int) -> Array:
     """Return P(at most k false readings) for k < largest, the truncation."""
     if mean == 0.0:
-        return np.empty(0)
+        return np.full(largest, np.inf)  # none
     logs = [k * math.log(mean) - mean - math.lgamma(k + 1) for k in range(largest)]
     return np.cumsum(np.exp(logs))
-
-
-class VectorNoise:
-    """Draws the noise of B worlds, step by step.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        The scenario of every world.
-    count : int
-        B.
-    """
-
-    def __init__(self, scenario: Scenario, count: int) -> None:
-        self._noise = WorldNoise(scenario)
-        self._keys = np.zeros((count, 2), dtype=np.uint64)
-        self._steps = np.zeros(count, dtype=np.int64)
-
-    def begin(self, worlds: IndexArray, keys: WordArray) -> None:
-        """Begin the episodes with these keys, (b, 2), in some worlds, (b,).
-
-        The start, step 0, has sensor noise but no motion noise.
-        """
-        self._keys[worlds] = keys
-        self._steps[worlds] = 0
-
-    def advance(self, moving: BoolArray | None) -> None:
-        """Go to the next step in the worlds that move (None: all)."""
-        self._steps += 1 if moving is None else moving
-
-    def motion(self, std: Array | None = None) -> Array:
-        """Return (εx, εy, εα) of this step, shape (B, 3) [m, m, rad].
-
-        `std`, (B, 3), holds where worlds differ.
-        """
-        return self._noise.motion(self._keys, self._steps, std)
-
-    def sensor(
-        self, worlds: IndexArray | slice | None, scales: SensorScales | None = None
-    ) -> SensorNoise:
-        """Return the sensor noise of this step in some worlds (None: all)."""
-        keys, steps = self._keys, self._steps
-        if worlds is not None:
-            keys, steps = keys[worlds], steps[worlds]
-        return self._noise.sensor(keys, steps, scales)
 
 
 # --------------------------------------------------------------------------------------

@@ -4,10 +4,11 @@ A command is (d, α): drive d straight ahead [m], then turn by α [rad].
 """
 
 import math
-from typing import Annotated, Literal, Self
+from collections.abc import Iterator
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from ..arrays import Array
 from .field_types import Command, Count, Part, Positive, broken_rule
@@ -81,14 +82,12 @@ class SpiralSequence(Part):
     turns: Positive = Field(description="number of full turns")
     speed: Positive = Field(description="speed along the spiral [m/s]")
 
-    @model_validator(mode="after")
-    def _check_radii(self) -> Self:
+    def _broken_rules(self) -> Iterator[str]:
         if self.outer_radius < self.inner_radius:
-            raise broken_rule(
+            yield (
                 f"outer_radius must be >= inner_radius = {self.inner_radius}, "
                 f"got {self.outer_radius}"
             )
-        return self
 
     def cycle(self, dt: float) -> Array:
         """Turn by α = d / r; the radius r grows with the angle turned so far."""

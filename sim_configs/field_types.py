@@ -6,7 +6,7 @@ Number types refuse strings, booleans and NaN; they accept integers for floats.
 import math
 from collections.abc import Iterable
 from reprlib import repr as short_repr
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, Self, cast
 
 from pydantic import (
     AfterValidator,
@@ -44,6 +44,16 @@ class Part(BaseModel):
                         {"key": str(key), "suggestion": suggestion},
                     )
         return table
+
+    @model_validator(mode="after")
+    def _check_rules(self) -> Self:
+        for message in self._broken_rules():
+            raise broken_rule(message)
+        return self
+
+    def _broken_rules(self) -> Iterable[str]:
+        """Yield a message for each broken rule between fields; the first is raised."""
+        return ()
 
 
 def broken_rule(message: str) -> PydanticCustomError:
@@ -117,39 +127,28 @@ CountOrZero = Annotated[_Integer, Field(ge=0), expect("an integer >= 0"), BOUNDE
 
 Seed = Annotated[_Integer, Field(ge=0), expect("an integer >= 0")]
 
-Point = Annotated[
-    tuple[_Number, _Number], expect("2 finite numbers (x, y) [m]"), BOUNDED
-]
-Pose = Annotated[
-    tuple[_Number, _Number, _Number],
-    expect("3 finite numbers (x, y, θ) [m, m, rad]"),
-    BOUNDED,
-]
+_Two = tuple[_Number, _Number]
+_Three = tuple[_Number, _Number, _Number]
+_Four = tuple[_Number, _Number, _Number, _Number]
+_ThreeStds = tuple[_NotNegative, _NotNegative, _NotNegative]
+_TwoStds = tuple[_NotNegative, _NotNegative]
+
+Point = Annotated[_Two, expect("2 finite numbers (x, y) [m]"), BOUNDED]
+Pose = Annotated[_Three, expect("3 finite numbers (x, y, θ) [m, m, rad]"), BOUNDED]
 Bounds = Annotated[
-    tuple[_Number, _Number, _Number, _Number],
-    expect("4 finite numbers (xmin, ymin, xmax, ymax) [m]"),
-    BOUNDED,
+    _Four, expect("4 finite numbers (xmin, ymin, xmax, ymax) [m]"), BOUNDED
 ]
-Wall = Annotated[
-    tuple[_Number, _Number, _Number, _Number],
-    expect("4 finite numbers (x0, y0, x1, y1) [m]"),
-    BOUNDED,
-]
+Wall = Annotated[_Four, expect("4 finite numbers (x0, y0, x1, y1) [m]"), BOUNDED]
 PoseStd = Annotated[
-    tuple[_NotNegative, _NotNegative, _NotNegative],
-    expect("3 finite numbers >= 0 (σx, σy, σθ) [m, m, rad]"),
-    BOUNDED,
+    _ThreeStds, expect("3 finite numbers >= 0 (σx, σy, σθ) [m, m, rad]"), BOUNDED
 ]
 MotionStd = Annotated[
-    tuple[_NotNegative, _NotNegative, _NotNegative],
-    expect("3 finite numbers >= 0 (σx, σy, σα) [m, m, rad]"),
-    BOUNDED,
+    _ThreeStds, expect("3 finite numbers >= 0 (σx, σy, σα) [m, m, rad]"), BOUNDED
 ]
 MeasurementStd = Annotated[
-    tuple[_NotNegative, _NotNegative],
-    expect("2 finite numbers >= 0 (σβ, σr) [rad, m]"),
-    BOUNDED,
+    _TwoStds, expect("2 finite numbers >= 0 (σβ, σr) [rad, m]"), BOUNDED
 ]
+Ends = Annotated[_Two, expect("2 finite numbers, low and high"), BOUNDED]
 Command = Annotated[
     tuple[_Number, _Number, Annotated[_Integer, Field(ge=1)]],
     expect("(d [m], α [rad], times): 2 finite numbers and an integer >= 1"),

@@ -1,9 +1,10 @@
 """Landmark layouts as data, and the positions that they describe."""
 
-from typing import Annotated, Literal, Self
+from collections.abc import Iterator
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from ..arrays import Array
 from .field_types import (
@@ -15,7 +16,6 @@ from .field_types import (
     Positive,
     ScenarioError,
     Seed,
-    broken_rule,
 )
 
 TRIES_PER_LANDMARK = 2000
@@ -131,14 +131,12 @@ class StreetsLayout(_Layout):
         """Number of landmarks."""
         return 4 * self.per_front * self.columns * self.rows
 
-    @model_validator(mode="after")
-    def _check_width(self) -> Self:
+    def _broken_rules(self) -> Iterator[str]:
         if self.width >= self.side:
-            raise broken_rule(
+            yield (
                 f"width must be < side = {self.side}, to leave room for blocks, "
                 f"got {self.width}"
             )
-        return self
 
     def place(self, rng: np.random.Generator) -> Array:
         """Return the positions: the four fronts of a block, copied to every block."""
@@ -166,14 +164,10 @@ class RandomLayout(_Layout):
         description="seed of the layout; without it every episode draws a new one",
     )
 
-    @model_validator(mode="after")
-    def _check_bounds(self) -> Self:
+    def _broken_rules(self) -> Iterator[str]:
         left, bottom, right, top = self.bounds
         if not (left < right and bottom < top):
-            raise broken_rule(
-                f"bounds must have xmin < xmax and ymin < ymax, got {self.bounds}"
-            )
-        return self
+            yield f"bounds must have xmin < xmax and ymin < ymax, got {self.bounds}"
 
     @property
     def is_redrawn(self) -> bool:

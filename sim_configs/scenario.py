@@ -1,11 +1,11 @@
 """The complete description of a simulated world, as one immutable value."""
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Protocol, Self
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError
 
 from ..arrays import LARGEST, LARGEST_EPISODE, LARGEST_MAP, LARGEST_RANGE_GROWTH, Array
 from ..suggestions import closest
@@ -13,6 +13,7 @@ from .controls import CircleSequence, ControlSequence, command_cycle
 from .field_types import (
     BOUNDED,
     CountOrZero,
+    Ends,
     Finite,
     Flag,
     MeasurementStd,
@@ -29,7 +30,6 @@ from .field_types import (
     Text,
     UnknownKeywordError,
     Wall,
-    broken_rule,
     error_lines,
     expect,
 )
@@ -112,14 +112,12 @@ class Motion(Part):
         default=True, description="whether a step with the command (0, 0) has noise too"
     )
 
-    @model_validator(mode="after")
-    def _check_encoders(self) -> Self:
+    def _broken_rules(self) -> Iterator[str]:
         if self.noise_in == "odometry" and self.std[1] != 0:
-            raise broken_rule(
+            yield (
                 "std must have σy = 0 with noise_in = 'odometry', since encoders read "
                 f"no sideways motion, got {self.std}"
             )
-        return self
 
 
 # --------------------------------------------------------------------------------------
@@ -127,12 +125,6 @@ class Motion(Part):
 #
 # Noise is multiplied by factors that are uniform in their logarithm. All other settings
 # are uniform between two ends. The number of landmarks never changes.
-
-_Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-
-Ends = Annotated[
-    tuple[_Finite, _Finite], expect("2 finite numbers, low and high"), BOUNDED
-]
 
 Factors = Annotated[
     tuple[Positive, Positive], expect("2 finite factors > 0, low and high")
@@ -182,30 +174,22 @@ class Sensor(Part):
         description="whether readings carry landmark identities",
     )
 
-    @model_validator(mode="after")
-    def _check_reach(self) -> Self:
+    def _broken_rules(self) -> Iterator[str]:
         if self.min_range >= self.max_range:
-            raise broken_rule(
+            yield (
                 f"min_range must be < max_range = {self.max_range}, "
                 f"got {self.min_range}"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _check_clutter(self) -> Self:
-        if self.clutter == 0:
-            return self
-        if self.identities or math.isinf(self.max_range):
-            raise broken_rule(
+        if self.clutter and (self.identities or math.isinf(self.max_range)):
+            yield (
                 "clutter must be 0 unless identities = false and max_range is finite, "
                 f"got {self.clutter}"
             )
         if self.max_clutter < self.clutter:
-            raise broken_rule(
+            yield (
                 f"max_clutter must be >= clutter = {self.clutter} "
                 f"(better mean + 4 √mean), got {self.max_clutter}"
             )
-        return self
 
 
 class Start(Part):
@@ -227,15 +211,6 @@ class Start(Part):
             description="which of the two starts is drawn around `pose`",
         )
     )
-
-
-class Tables(Protocol):
-    """The tables of a scenario to which ranges apply."""
-
-    motion: Motion
-    sensor: Sensor
-    start: Start
-    landmarks: LandmarkLayout
 
 
 class Randomise(Part):
@@ -269,16 +244,14 @@ class Randomise(Part):
         description="largest shift of each landmark along x and along y [m]",
     )
 
-    @model_validator(mode="after")
-    def _check_order(self) -> Self:
+    def _broken_rules(self) -> Iterator[str]:
         for name, ends in self:
             if isinstance(ends, tuple) and ends[0] > ends[1]:
-                raise broken_rule(f"{name} must have low <= high, got {ends}")
-        return self
+                yield f"{name} must have low <= high, got {ends}"
 
     def changes(
         self,
-        scenario: Tables,
+        scenario: "Scenario",
         shares: Mapping[str, float],
         directions: Array,
     ) -> dict[str, Any]:
@@ -370,55 +343,49 @@ class Scenario(Part):
         """The faults of the world, all zero where the scenario has none."""
         return self.faults or _NO_FAULTS
 
-    @model_validator(mode="after")
-    def _check_walls(self) -> Self:
+    def _broken_rules(self) -> Iterator[str]:
+        yield from self._broken_sizes()
+        yield from self._broken_limits()
+        yield from self._broken_ranges()
+
+    def _broken_sizes(self) -> Iterator[str]:
         for index, (x0, y0, x1, y1) in enumerate(self.walls):
             if (x0, y0) == (x1, y1):
-                raise broken_rule(
-                    f"walls[{index}] must have a length > 0, got {self.walls[index]}"
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _check_sizes(self) -> Self:
+                yield f"walls[{index}] must have a length > 0, got {self.walls[index]}"
         for name, count, most in (
             ("steps", self.steps, LARGEST_EPISODE),
             ("landmarks", self.landmarks.count, LARGEST_MAP),
             ("sensor.max_clutter", self.sensor.max_clutter, LARGEST_MAP),
         ):
             if count > most:
-                raise broken_rule(f"{name} must be at most {most}, got {count}")
+                yield f"{name} must be at most {most}, got {count}"
         for name in ("max_speed", "max_turn_rate"):
             limit = getattr(self.robot, name)
             if limit * self.dt > LARGEST:
-                raise broken_rule(
+                yield (
                     f"robot.{name} must not exceed {LARGEST:g} / dt, so that no step "
                     f"is longer, got {limit} with dt = {self.dt}"
                 )
-        return self
 
-    @model_validator(mode="after")
-    def _check_limits(self) -> Self:
+    def _broken_limits(self) -> Iterator[str]:
         fastest = np.abs(command_cycle(self.controls, self.dt)).max(axis=0) / self.dt
         for name, unit, asked in zip(
             ("max_speed", "max_turn_rate"), ("m/s", "rad/s"), fastest, strict=True
         ):
             limit = getattr(self.robot, name)
             if asked > limit * (1 + 1e-9):
-                raise broken_rule(
+                yield (
                     f"controls must stay within robot.{name} = {limit} {unit}, "
                     f"got {asked:.6g} {unit}"
                 )
-        return self
 
-    @model_validator(mode="after")
-    def _check_ranges(self) -> Self:
+    def _broken_ranges(self) -> Iterator[str]:
         """Check both ends of all ranges; every rule is a bound and holds in between."""
         ranges = self.randomise
         if ranges is None:
-            return self
+            return
         if ranges.landmark_shift and self.landmarks.is_redrawn:
-            raise broken_rule(
+            yield (
                 "randomise.landmark_shift must be 0 where every episode has new "
                 f"landmarks anyway, got {ranges.landmark_shift}"
             )
@@ -427,11 +394,8 @@ class Scenario(Part):
             try:
                 self.drawn_at(dict.fromkeys(RANGES, share), unmoved)
             except ValueError as error:
-                raise broken_rule(
-                    "randomise must give valid scenarios, but at the "
-                    f"{end} ends {error}"
-                ) from None
-        return self
+                at = f"at the {end} ends {error}"
+                yield f"randomise must give valid scenarios, but {at}"
 
     def __repr__(self) -> str:
         return (
@@ -555,7 +519,7 @@ def _map_changes(layout: LandmarkLayout, scale: float, shifts: Array) -> dict[st
     if layout.layout == "random" and layout.is_redrawn:
         corners = np.reshape(layout.bounds, (2, 2))
         bounds = _scaled(corners, scale).ravel().tolist()
-        return {"bounds": bounds, "min_distance": scale * layout.min_distance}
+        return {"bounds": tuple(bounds), "min_distance": scale * layout.min_distance}
     positions = place_landmarks(layout, np.random.default_rng(0))  # draws nothing
     points = _scaled(positions, scale) + shifts
     return {"layout": "points", "points": points.tolist()}
@@ -577,14 +541,12 @@ def _sensor_changes(sensor: Sensor, drawn: dict[str, float]) -> dict[str, Any]:
 
 def _start_changes(start: Start, drawn: dict[str, float]) -> dict[str, Any]:
     names = ("start_x", "start_y", "start_heading")
-    pose = [
-        drawn.get(name, value) for name, value in zip(names, start.pose, strict=True)
-    ]
-    return {"pose": pose, "std": _times(start.std, drawn.get("start_std", 1.0))}
+    pose = map(drawn.get, names, start.pose)
+    return {"pose": tuple(pose), "std": _times(start.std, drawn.get("start_std", 1.0))}
 
 
-def _times(stds: tuple[float, ...], factor: float) -> list[float]:
-    return [factor * std for std in stds]
+def _times(stds: tuple[float, ...], factor: float) -> tuple[float, ...]:
+    return tuple(factor * std for std in stds)
 
 
 RANGES = tuple(name for name in Randomise.model_fields if name != "landmark_shift")

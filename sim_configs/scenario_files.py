@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import Array
 from ..suggestions import closest
 from .atomic_file import naming_file
-from .field_types import Part, ScenarioError
+from .field_types import ScenarioError
 from .scenario import RANGES, Scenario
 
 _FOLDER = Path(__file__).parent
@@ -222,12 +222,11 @@ def copied_draw(
     changes = scenario.randomise.changes(scenario, shares, directions)
     if "layout" in changes.get("landmarks", {}):
         return scenario.with_changes(**changes)
-    tables: dict[str, Part] = {}
-    for key, table in changes.items():
-        if table is not None:
-            values = {name: _as_tuple(value) for name, value in table.items()}
-            tables[key] = getattr(scenario, key).model_copy(update=values)
-    return scenario.model_copy(update={**tables, "randomise": None})
+    tables = {
+        key: table and getattr(scenario, key).model_copy(update=table)
+        for key, table in changes.items()
+    }
+    return scenario.model_copy(update=tables)
 
 
 def widest_scenario(scenario: Scenario) -> Scenario:
@@ -236,7 +235,3 @@ def widest_scenario(scenario: Scenario) -> Scenario:
         return scenario
     unmoved = np.zeros((scenario.landmarks.count, 2))
     return scenario.drawn_at(dict.fromkeys(RANGES, 1.0), unmoved)
-
-
-def _as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value

@@ -61,7 +61,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
     ((3, 28, 2), (3, 3))
     """
 
-    _renderer: VectorRenderer | None = None  # for close after a failed constructor
+    _renderers: Sequence[EpisodeRenderer] = ()  # for close after a failed constructor
 
     def __init__(
         self,
@@ -89,7 +89,10 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
         self.render_mode = render_mode
         if render_mode is not None:
             fps = float(self.metadata["render_fps"])
-            self._renderer = VectorRenderer(self.scenario, render_mode, fps, num_envs)
+            self._renderers = [
+                EpisodeRenderer(self.scenario, render_mode, fps)
+                for _ in range(num_envs)
+            ]
         self._steps = episode_steps(self.scenario, max_episode_steps)
         self._worlds = WorldBatch(self.scenario, num_envs)
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
@@ -152,8 +155,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
         else:
             self._worlds.step(actions)
         self._steps_left -= 1
-        if self._renderer is not None:
-            self._renderer.add(self._worlds, moving)
+        self._show(moving)
         if np.count_nonzero(resetting):
             self._note_begun(resetting)
         rewards, terminated = self._reward(actions, moving)
@@ -169,20 +171,32 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
     def render(self) -> tuple[ImageArray, ...] | None:
         """Return a frame of each world in mode "rgb_array", else None."""
         self._begun_worlds()
-        if self._renderer is None:
+        if not self._renderers:
             logger.warn("render shows nothing without a render_mode")
+        if self.render_mode != "rgb_array":
             return None
-        return self._renderer.draw() if self.render_mode == "rgb_array" else None
+        frames = (renderer.draw() for renderer in self._renderers)
+        return tuple(frame for frame in frames if frame is not None)
 
     def show_beliefs(self, beliefs: Sequence[BeliefLike | None]) -> None:
-        """Show belief i in the following frames of world i; None hides it."""
-        if self._renderer is not None:
-            self._renderer.show_beliefs(beliefs)
+        """Show belief i in the following frames of world i; None hides it.
+
+        Raises
+        ------
+        ValueError
+            If there is not one belief per world, and a window or frames.
+        """
+        if self._renderers and len(beliefs) != self.num_envs:
+            raise ValueError(
+                f"beliefs must be {self.num_envs}, one per world, got {len(beliefs)}"
+            )
+        for renderer, belief in zip(self._renderers, beliefs, strict=False):
+            renderer.show_belief(belief)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the windows, if there are any."""
-        if self._renderer is not None:
-            self._renderer.close()
+        for renderer in self._renderers:
+            renderer.close()
 
     @property
     def drawn_scenarios(self) -> list[Scenario]:
@@ -241,8 +255,25 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
     def _note_begun(self, worlds: BoolArray) -> None:
         self._steps_left[worlds] = self._steps
         self._ended = self._ended & ~worlds
-        if self._renderer is not None:
-            self._renderer.begin(self._worlds, worlds)
+        if self._renderers:
+            landmarks = self._worlds.landmarks
+            for world in np.flatnonzero(worlds).tolist():
+                self._renderers[world].begin(landmarks[world])
+            self._show(worlds)
+
+    def _show(self, worlds: BoolArray) -> None:
+        """Show the present state of some worlds."""
+        if not self._renderers:
+            return
+        batch = self._worlds
+        for world in np.flatnonzero(worlds).tolist():
+            mask, ids = batch.mask[world], batch.landmark_ids
+            self._renderers[world].add(
+                batch.poses[world].copy(),
+                batch.measurements[world][mask],
+                bool(batch.collisions[world]),
+                None if ids is None else ids[world][mask] < 0,
+            )
 
     def _reward(self, actions: ArrayLike, moving: BoolArray) -> tuple[Array, BoolArray]:
         """Return the rewards of a step, and which episodes it terminates.
@@ -398,63 +429,3 @@ def episode_steps(scenario: Scenario, most: int | None) -> int:
     if isinstance(most, bool) or not isinstance(most, int) or most < 1:
         raise ValueError(f"max_episode_steps must be a whole number >= 1, got {most!r}")
     return min(most, scenario.steps)
-
-
-class VectorRenderer:
-    """One `EpisodeRenderer` per world.
-
-    Parameters
-    ----------
-    scenario, mode, fps
-        As in `EpisodeRenderer`.
-    count : int
-        Number of worlds.
-    """
-
-    def __init__(self, scenario: Scenario, mode: str, fps: float, count: int) -> None:
-        self._renderers = [EpisodeRenderer(scenario, mode, fps) for _ in range(count)]
-
-    def begin(self, batch: WorldBatch, worlds: BoolArray) -> None:
-        """Start an episode in these worlds, and add its first state."""
-        landmarks = batch.landmarks
-        for world in np.flatnonzero(worlds):
-            self._renderers[world].begin(landmarks[world])
-        self.add(batch, worlds)
-
-    def add(self, batch: WorldBatch, worlds: BoolArray) -> None:
-        """Add the present state of these worlds."""
-        ids = batch.landmark_ids
-        for world in np.flatnonzero(worlds):
-            mask = batch.mask[world]
-            self._renderers[world].add(
-                batch.poses[world].copy(),
-                batch.measurements[world][mask],
-                bool(batch.collisions[world]),
-                None if ids is None else ids[world][mask] < 0,
-            )
-
-    def draw(self) -> tuple[ImageArray, ...]:
-        """Draw a frame of every world."""
-        frames = (renderer.draw() for renderer in self._renderers)
-        return tuple(frame for frame in frames if frame is not None)
-
-    def show_beliefs(self, beliefs: Sequence[BeliefLike | None]) -> None:
-        """Show belief i in the following frames of world i; None hides it.
-
-        Raises
-        ------
-        ValueError
-            If there is not one belief per world.
-        """
-        if len(beliefs) != len(self._renderers):
-            raise ValueError(
-                f"beliefs must be {len(self._renderers)}, one per world, "
-                f"got {len(beliefs)}"
-            )
-        for renderer, belief in zip(self._renderers, beliefs, strict=True):
-            renderer.show_belief(belief)
-
-    def close(self) -> None:
-        """Close the windows and free the figures. Further calls have no effect."""
-        for renderer in self._renderers:
-            renderer.close()

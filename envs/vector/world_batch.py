@@ -20,9 +20,9 @@ from ...arrays import (
 )
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import widest_scenario
-from ..bearing_range import BearingRangeSensor, Reach, hide_identities
+from ..bearing_range import BearingRangeSensor, hide_identities
 from ..landmark_world import LandmarkWorldEnv, Observation
-from ..noise_streams import SensorScales, VectorNoise
+from ..noise_streams import SensorSettings, WorldNoise
 from ..robot import UnicycleBodies, VectorOdometrySensor
 from ..spaces import clipped_actions, count_rows
 from ..streams import EpisodeStarts, drawn_scenarios, episode_keys
@@ -87,7 +87,9 @@ class WorldBatch:
         self.count = count
         self._drawn = DrawnWorlds(scenario, count) if scenario.randomise else None
         self._starts, widest = EpisodeStarts(scenario), widest_scenario(scenario)
-        self._noise = VectorNoise(widest, count)
+        self._noise = WorldNoise(widest)
+        self._keys = np.zeros((count, 2), dtype=np.uint64)
+        self._steps = np.zeros(count, dtype=np.int64)
         self._sensor = BearingRangeSensor(widest)
         self._odometer = VectorOdometrySensor(scenario, count)
         robot = scenario.robot
@@ -161,7 +163,7 @@ class WorldBatch:
         self._check_number(generators)
         keys = episode_keys([generators[world] for world in chosen.tolist()])
         poses, estimates = self._start(chosen, keys)
-        self._noise.begin(chosen, keys)
+        self._keys[chosen], self._steps[chosen] = keys, 0  # a start has sensor noise
         self._start_estimates = _replaced(self._start_estimates, chosen, estimates)
         self._bodies.place(chosen, poses)
         self.poses = self._bodies.poses()
@@ -211,7 +213,7 @@ class WorldBatch:
         if generators is not None:
             self._check_number(generators)
         clipped = clipped_actions(actions, self._limits, moving)
-        self._noise.advance(moving)
+        self._steps += 1 if moving is None else moving
         self._drive(clipped * self.scenario.dt, moving)
         if moving is not None and generators is not None:
             self._begin(np.flatnonzero(~moving), generators)
@@ -241,8 +243,9 @@ class WorldBatch:
         return np.flatnonzero(chosen)
 
     def _drive(self, commands: Array, moving: BoolArray | None) -> None:
-        std = None if self._drawn is None else self._drawn.motion_std()
-        slip, error = self._odometer.split_noise(commands, self._noise.motion(std))
+        std = None if self._drawn is None else self._drawn.motion_std
+        noise = self._noise.motion(self._keys, self._steps, std)
+        slip, error = self._odometer.split_noise(commands, noise)
         share = self._bodies.drive(commands, slip, moving)
         odometry = self._odometer.read(commands, share, error)
         collisions = np.zeros(self.count, np.bool_) if share is None else share < 1.0
@@ -274,14 +277,21 @@ class WorldBatch:
         return np.concatenate(measurements), np.concatenate(masks), all_ids
 
     def _scan(self, worlds: IndexArray | slice | None = None) -> Scan:
-        scales = reach = None
-        if self._drawn is not None:
-            scales, reach = self._drawn.sensor_scales(worlds), self._drawn.reach(worlds)
-        bodies, noise = self._bodies, self._noise.sensor(worlds, scales)
-        poses = self._landmarks, bodies.position, bodies.inverse_heading
+        bodies, drawn = self._bodies, self._drawn
+        settings = None if drawn is None else drawn.settings
+        keys, steps, landmarks = self._keys, self._steps, self._landmarks
+        position, inverse_heading = bodies.position, bodies.inverse_heading
         if worlds is not None:
-            poses = poses[0][worlds], poses[1][worlds], poses[2][worlds]
-        readings, mask = self._sensor.scan(*poses, noise, reach)
+            keys, steps, landmarks = keys[worlds], steps[worlds], landmarks[worlds]
+            position, inverse_heading = position[worlds], inverse_heading[worlds]
+            if settings is not None:
+                settings = SensorSettings(
+                    *(np.asarray(each)[worlds] for each in settings)
+                )
+        noise = self._noise.sensor(keys, steps, settings)
+        readings, mask = self._sensor.scan(
+            landmarks, position, inverse_heading, noise, settings
+        )
         ids = None
         if self._hides_identities:
             readings, mask, ids = hide_identities(readings, mask, noise)
@@ -300,8 +310,6 @@ def _replaced(old: AnyArray, worlds: IndexArray, value: Any) -> AnyArray:
 # --------------------------------------------------------------------------------------
 # The settings of worlds that draw their own from ranges, as arrays.
 
-Rows = IndexArray | slice | None
-
 
 class DrawnWorlds:
     """The scenarios that B worlds drew for their episodes.
@@ -317,17 +325,20 @@ class DrawnWorlds:
     ----------
     scenarios : list of Scenario, length B
         The present draws.
+    motion_std : ndarray, shape (B, 3)
+        Their (σx, σy, σα) [m, m, rad].
+    settings : SensorSettings
+        Those of their sensors.
     """
 
     def __init__(self, scenario: Scenario, count: int) -> None:
         self._family = scenario
         self.scenarios = [scenario] * count
-        self._motion_std = np.zeros((count, 3))
-        self._reach = Reach(*(np.zeros((count, 1)) for _ in Reach._fields))
-        clutter = np.zeros((count, scenario.sensor.max_clutter))
-        numbers = {name: np.zeros((count, 1)) for name in SensorScales._fields}
-        arrays = {"scale": np.zeros((2, count, 1)), "counts_below": clutter}
-        self._scales = SensorScales(**{**numbers, **arrays})
+        self.motion_std = np.zeros((count, 3))
+        columns = {name: np.zeros((count, 1)) for name in SensorSettings._fields}
+        columns["scale"] = np.zeros((count, 2))
+        columns["counts_below"] = np.zeros((count, scenario.sensor.max_clutter))
+        self.settings = SensorSettings(**columns)
 
     def begin(
         self, worlds: IndexArray, keys: WordArray
@@ -342,52 +353,23 @@ class DrawnWorlds:
         drawn = drawn_scenarios(self._family, keys)
         for world, scenario in zip(worlds.tolist(), drawn, strict=True):
             self.scenarios[world] = scenario
-            self._motion_std[world] = scenario.motion.std
-            _set_rows(self._reach, Reach.of(scenario.sensor), world)
-            scales = SensorScales.of(scenario.sensor)
-            self._scales.scale[:, world, 0] = scales.scale[:, 0, 0]
-            below = scales.counts_below if scenario.sensor.clutter else np.inf
-            self._scales.counts_below[world] = below
-            _set_rows(self._scales[1:4], scales[1:4], world)
-            _set_rows(self._scales[5:], scales[5:], world)
+            self.motion_std[world] = scenario.motion.std
+            values = SensorSettings.of(scenario.sensor)
+            for column, value in zip(self.settings, values, strict=True):
+                np.asarray(column)[world] = value
         return _starts(drawn, keys)
-
-    def motion_std(self) -> Array:
-        """Return (σx, σy, σα) of every world, (B, 3) [m, m, rad]."""
-        return self._motion_std
-
-    def sensor_scales(self, worlds: Rows) -> SensorScales:
-        """Return the scales of the noise of some worlds (None: all)."""
-        if worlds is None:
-            return self._scales
-        scale, *others = map(np.asarray, self._scales)
-        return SensorScales(scale[:, worlds], *(array[worlds] for array in others))
-
-    def reach(self, worlds: Rows) -> Reach:
-        """Return the reach of the sensors of some worlds (None: all)."""
-        if worlds is None:
-            return self._reach
-        return Reach(*(np.asarray(array)[worlds] for array in self._reach))
-
-
-def _set_rows(arrays: Sequence[object], values: Sequence[object], world: int) -> None:
-    """Write the values of a world; no limit is an infinite one."""
-    for array, value in zip(arrays, values, strict=True):
-        assert isinstance(array, np.ndarray)
-        array[world] = np.inf if value is None else value
 
 
 def _starts(
     scenarios: list[Scenario], keys: WordArray
 ) -> tuple[ComplexArray, Array, Array]:
-    landmarks, poses, estimates = [], [], []
-    for row, scenario in enumerate(scenarios):
-        starts, key = EpisodeStarts(scenario), keys[row : row + 1]
-        landmarks.append(starts.landmarks(key)[0])
-        pose, estimate = starts.poses(key)
-        poses.append(pose[0])
-        estimates.append(estimate[0])
-    return np.array(landmarks), np.array(poses), np.array(estimates)
+    rows = []
+    for scenario, key in zip(scenarios, keys, strict=True):
+        starts = EpisodeStarts(scenario)
+        parts = starts.landmarks(key[None]), *starts.poses(key[None])
+        rows.append([part[0] for part in parts])
+    landmarks, poses, estimates = map(np.array, zip(*rows, strict=True))
+    return landmarks, poses, estimates
 
 
 class MixedWorlds:
