@@ -18,7 +18,7 @@ from .models.rigid_motion import (
     invariant_covariance,
     invariant_error,
 )
-from .support.undo import Undo
+from .support.undo import Recall, Undo
 
 __all__ = [
     "Belief",
@@ -414,6 +414,17 @@ def checkpoint(estimator: SlamEstimator, *, motion: bool = False) -> Undo:
     if isinstance(estimator, SupportsCheckpoint):
         return estimator.checkpoint(motion=motion)
     return partial(restore, estimator, estimator.state_dict())
+
+
+def before_update(
+    estimator: SlamEstimator,
+) -> tuple[Undo, Recall[UpdateReport] | None, Callable[[], Undo]]:
+    """Return the last arguments of :func:`.undo.carried_out` for the next update."""
+    recall = estimator.recall() if hasattr(estimator, "recall") else None
+    if recall is None:
+        return checkpoint(estimator), None, partial(checkpoint, estimator)
+    bookmark: Callable[[], Undo] = estimator.bookmark  # type: ignore[attr-defined]
+    return bookmark(), recall, bookmark
 
 
 def restore(estimator: SlamEstimator, state: Mapping[str, Any]) -> None:
