@@ -411,8 +411,9 @@ def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
 
 def checkpoint(estimator: SlamEstimator, *, motion: bool = False) -> Undo:
     """Return what takes back later calls; ``motion``: only those of predict."""
-    if isinstance(estimator, SupportsCheckpoint):
-        return estimator.checkpoint(motion=motion)
+    if hasattr(estimator, "checkpoint"):  # faster than isinstance
+        undo: Undo = estimator.checkpoint(motion=motion)
+        return undo
     return partial(restore, estimator, estimator.state_dict())
 
 

@@ -168,9 +168,10 @@ class GaussianMap:
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later changes; ``motion``: only those of the pose."""
         undo_places, arrays, n = self.bookmark(), self.arrays, self.size
-        mean, P, reference = parts = self.used
-        if motion:
-            parts = mean[:3], reference[:3], P[:3], P[:, :3]
+        mean, P, reference = arrays
+        parts: Sequence[Array] = (mean[:3], reference[:3], P[:3, :n], P[:n, :3])
+        if not motion:
+            parts = self.used
         saved = [part.copy() for part in parts]
 
         def undo() -> None:

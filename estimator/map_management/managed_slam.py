@@ -321,7 +321,16 @@ class ManagedSlam:
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later calls; ``motion``: only those of predict."""
         undo_filter = checkpoint(self._filter, motion=motion)
-        return undo_all(undo_filter, self._undo_records(motion=motion))
+        if not motion:
+            return undo_all(undo_filter, self._undo_records())
+        records = self._candidates, self._recent.motions
+
+        def undo() -> None:
+            undo_filter()
+            self._editor.expire()
+            self._candidates, self._recent.motions = records
+
+        return undo
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
@@ -332,11 +341,11 @@ class ManagedSlam:
         self._report = None
         return before_update(self._filter)[1] and (lambda: self._report)
 
-    def _undo_records(self, *, motion: bool = False) -> Undo:
+    def _undo_records(self) -> Undo:
         """Return what takes back later changes of all but the filter."""
         candidates, report = self._candidates, self._report
         undo_parts = undo_all(
-            *(() if motion else (self._pruner.checkpoint(),)),
+            self._pruner.checkpoint(),
             self._recent.checkpoint(),
             self._editor.checkpoint(),
         )

@@ -129,9 +129,11 @@ def contents(*objects: object) -> Undo:
     return undo
 
 
+_CHANGED_IN_PLACE = frozenset((np.ndarray, list, dict, set))
+
+
 def _kept(value: object) -> object:
-    is_changed_in_place = isinstance(value, np.ndarray | list | dict | set)
-    return copy(value) if is_changed_in_place else value
+    return copy(value) if type(value) in _CHANGED_IN_PLACE else value
 
 
 def _to_the_end(undo: Undo) -> None:

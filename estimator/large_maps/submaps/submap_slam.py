@@ -221,6 +221,9 @@ class SubmapSlam(SubmapQueries):
         motion = argument_checks.pair("odometry", odometry)
         argument_checks.duration(dt)
         self._claim_folder()
+        if self._neighbourhood.is_empty:
+            self._active.filter.predict(motion, dt)
+            return
         with undone_on_error(self.checkpoint(motion=True)):
             self._active.filter.predict(motion, dt)
             self._neighbourhood.predict(motion, dt)
@@ -263,8 +266,9 @@ class SubmapSlam(SubmapQueries):
                 self._close()
             return self._active.filter.update(readings, ids)
 
-        then, recall = partial(self._follow, readings, ids), self._active.filter.recall()
-        return carried_out(correct, then, self.bookmark(), recall, self.bookmark)
+        slam, then = self._active.filter, partial(self._follow, readings, ids)
+        undo = self.bookmark() if self._graph.is_overdue else slam.bookmark()
+        return carried_out(correct, then, undo, slam.recall(), self.bookmark)
 
     def _follow(
         self, readings: Array, ids: list[int], report: UpdateReport
