@@ -18,7 +18,7 @@ from .models.rigid_motion import (
     invariant_covariance,
     invariant_error,
 )
-from .support.undo import Undo
+from .support.undo import Recall, Undo
 
 __all__ = [
     "Belief",
@@ -411,9 +411,21 @@ def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
 
 def checkpoint(estimator: SlamEstimator, *, motion: bool = False) -> Undo:
     """Return what takes back later calls; ``motion``: only those of predict."""
-    if isinstance(estimator, SupportsCheckpoint):
-        return estimator.checkpoint(motion=motion)
+    if hasattr(estimator, "checkpoint"):  # faster than isinstance
+        undo: Undo = estimator.checkpoint(motion=motion)
+        return undo
     return partial(restore, estimator, estimator.state_dict())
+
+
+def before_update(
+    estimator: SlamEstimator,
+) -> tuple[Undo, Recall[UpdateReport] | None, Callable[[], Undo]]:
+    """Return the last arguments of :func:`.undo.carried_out` for the next update."""
+    recall = estimator.recall() if hasattr(estimator, "recall") else None
+    if recall is None:
+        return checkpoint(estimator), None, partial(checkpoint, estimator)
+    bookmark: Callable[[], Undo] = estimator.bookmark  # type: ignore[attr-defined]
+    return bookmark(), recall, bookmark
 
 
 def restore(estimator: SlamEstimator, state: Mapping[str, Any]) -> None:

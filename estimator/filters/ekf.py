@@ -24,7 +24,7 @@ from ..models.rigid_motion import ErrorFrame
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
-from ..support.undo import Undo
+from ..support.undo import Recall, Undo
 from .gaussian_map import (
     GaussianMap,
     ScanWorkspace,
@@ -152,6 +152,10 @@ class MapFilter:
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later calls; ``motion``: only those of predict."""
         return self.map.checkpoint(motion=motion)
+
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls, as far as no kernel has run."""
+        return self.map.bookmark()
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""
@@ -328,6 +332,10 @@ class EkfSlam(MapFilter):
         if status != DONE:
             self._refuse(status, readings, ids)
         return workspace.report(nis, ids, used)
+
+    def recall(self) -> Recall[UpdateReport] | None:
+        """Return what tells the report of the next update, once it is absorbed."""
+        return self._workspace.watch()
 
     @property
     def motion_values(self) -> Array:

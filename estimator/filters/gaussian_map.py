@@ -12,12 +12,14 @@ import numpy as np
 from ...arrays import Array, IntArray
 from ..interface import Belief, MapView, UpdateReport
 from ..kernels.kalman_gain import (
+    ABSORBED,
     ADDED,
     BLOCK,
     COLUMN,
     GATED,
     INNOVATION,
     JACOBIAN,
+    MEAN_BEFORE,
     META_WIDTH,
     NEAR,
     OUTCOME,
@@ -25,6 +27,7 @@ from ..kernels.kalman_gain import (
     SKIPPED,
     SLOT,
     USED,
+    WHITE,
     BeliefArrays,
     Rules,
     Workspace,
@@ -35,7 +38,7 @@ from ..kernels.kalman_gain import (
 from ..models.rigid_motion import ErrorFrame
 from ..support import saved_states
 from ..support.memory_limit import aligned_zeros, landmarks_that_fit
-from ..support.undo import Undo
+from ..support.undo import Recall, Undo
 from .landmark_merging import coincide
 
 FIRST_ALLOCATION = 8  # landmarks
@@ -164,20 +167,25 @@ class GaussianMap:
 
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later changes; ``motion``: only those of the pose."""
-        arrays, slots = self.arrays, self.slots
-        mean, P, reference = self.used
+        undo_places, arrays, n = self.bookmark(), self.arrays, self.size
+        mean, P, reference = arrays
+        parts: Sequence[Array] = (mean[:3], reference[:3], P[:3, :n], P[:n, :3])
         if not motion:
-            copies = BeliefArrays(mean.copy(), P.copy(), reference.copy())
-            return partial(self._refill, self.capacity, copies, slots)
-        parts = mean[:3], reference[:3], P[:3], P[:, :3]
+            parts = self.used
         saved = [part.copy() for part in parts]
 
         def undo() -> None:
-            self._become(arrays, slots)
+            undo_places()
+            for array in arrays:
+                array[n:] = array.T[n:] = 0.0
             for part, before in zip(parts, saved, strict=True):
                 part[...] = before
 
         return undo
+
+    def bookmark(self) -> Undo:
+        """Return what takes back later changes, but for those made by kernels."""
+        return partial(self._become, self.arrays, self.slots)
 
     @property
     def used(self) -> BeliefArrays:
@@ -383,7 +391,22 @@ class ScanWorkspace:
         places[:] = slots
         if new:
             gaussian.expect(ids, places)
+        self._ids = ids
         return size
+
+    def watch(self) -> Recall[ScanReport]:
+        """Return what tells the report of the next update, once it is absorbed."""
+        if self.readings:
+            self.arrays.rows[MEAN_BEFORE, ABSORBED] = 0.0
+        return self._recalled
+
+    def _recalled(self) -> ScanReport | None:
+        if not (self.readings and self.arrays.rows[MEAN_BEFORE, ABSORBED]):
+            return None
+        ids, first = list(self._ids), self._first_row
+        used = int((self.ledger[OUTCOME, : len(ids)] == USED).sum())
+        white = self.arrays.rows[first : first + 2 * used, WHITE]
+        return self.report(float(white @ white), ids, used)
 
     def report(self, nis: float, ids: list[int], used: int) -> ScanReport:
         """Return the report of the last update, on copies of what it has left."""

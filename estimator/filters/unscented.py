@@ -84,6 +84,9 @@ class UnscentedSlam(EkfSlam):
             skipped_ids=(*compress(ids, skipped), *added.skipped_ids),
         )
 
+    def recall(self) -> None:
+        """Return nothing: no kernel absorbs the whole scan."""
+
     def _expected_range(self, landmark_id: int) -> float:
         """Return the expected range of a landmark [m]; infinite for a new one."""
         if landmark_id not in self.map.slots:

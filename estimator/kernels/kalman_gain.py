@@ -432,7 +432,8 @@ CORRECTION = 0  # δ
 TRANSPORT = 1  # v of the transport T = I + v e_θᵀ
 PRIOR_MEAN = 2  # before this correction
 HEADING = 3  # P[:, θ]
-MEAN_BEFORE = 4  # before the scan
+MEAN_BEFORE = 4  # before the scan; its last entry is the next one
+ABSORBED = -1  # 1 once the belief has taken in the scan
 
 # The stacked system follows: two rows (bearing, range) for each reading in use.  Such a
 # row begins with its row of A and ends with META_WIDTH more columns, which are counted

@@ -12,6 +12,7 @@ from ..models.bearing_range import (
 )
 from ..models.unicycle_motion import drive_jit
 from .kalman_gain import (
+    ABSORBED,
     ADDED,
     AT_ESTIMATE,
     AT_REFERENCE,
@@ -109,6 +110,7 @@ def update_belief(
         return failed // 2, used, 0.0
     nis = squared_whitened(rows, rules.iterations, used)
     add_landmarks(belief, size, readings, count, rules, ledger)
+    rows[MEAN_BEFORE, ABSORBED] = 1.0
     return DONE, used, nis
 
 

@@ -17,7 +17,14 @@ from ..interface import Belief, MapView, ScanDecisions, SlamEstimator, UpdateRep
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
-from ..support.undo import Undo, contents, undo_all, undone_on_error
+from ..support.undo import (
+    Undo,
+    attributes,
+    carried_out,
+    contents,
+    undo_all,
+    undone_on_error,
+)
 from .managed_slam import ManagedSlam
 from .policy import LandmarkPolicy, as_policy
 
@@ -49,6 +56,10 @@ class Hypothesis:
     cost: float
     """−2 ln of its probability, relative to the best hypothesis."""
     slam: ManagedSlam
+
+
+Step = tuple[UpdateReport, list[Hypothesis], list[ManagedSlam]]
+"""Report of the best hypothesis, the hypotheses after a scan, and all their filters."""
 
 
 def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -146,7 +157,7 @@ class HypothesisSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self.best.reset(pose, pose_std)
             self._keep([Hypothesis(0.0, self.best)])
 
@@ -171,7 +182,11 @@ class HypothesisSlam:
             That of the most probable hypothesis.
         """
         readings = argument_checks.scan(measurements)
-        with undone_on_error(self.checkpoint()):
+        recall, one = self.best.recall(), len(self.hypotheses) == 1
+        begun = [self.bookmark() if recall and one else self.checkpoint()]
+
+        def advance() -> Step:
+            nonlocal one
             if landmark_ids is None:
                 options = self._options(readings)
             else:
@@ -180,17 +195,39 @@ class HypothesisSlam:
                     (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
                     for k, h in enumerate(self.hypotheses)
                 ]
+            if one and len(options) > 1:
+                begun.insert(0, self.checkpoint())
+                one = False
             return self._advance(readings, options)
+
+        def absorbed() -> Step | None:
+            report = recall() if recall and one else None
+            return report and (report, self.hypotheses, [])
+
+        return carried_out(
+            advance,
+            self._follow,
+            lambda: undo_all(*begun)(),
+            recall and absorbed,
+            self._undo_own,
+        )
+
+    def _follow(self, step: Step) -> UpdateReport:
+        """Continue with the hypotheses of a step; return its report."""
+        report, hypotheses, slams = step
+        least = hypotheses[0].cost
+        self._keep([Hypothesis(h.cost - least, h.slam) for h in hypotheses], slams)
+        return report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise landmarks on request; only the best hypothesis continues."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self.best.remove(landmark_ids)
             self._keep(self.hypotheses[:1])
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two landmarks on request; only the best hypothesis continues."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self.best.merge(kept, gone)
             self._keep(self.hypotheses[:1])
 
@@ -226,7 +263,7 @@ class HypothesisSlam:
         costs = saved_states.array("costs", state["costs"], (-1,)).tolist()
         if not costs or min(costs) < 0:
             raise ValueError(f"state['costs'] must be numbers >= 0, got {costs}")
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             loaded = [Hypothesis(cost, self._pool.fresh()) for cost in costs]
             for k, hypothesis in enumerate(loaded):
                 hypothesis.slam.load_state_dict(without_prefix(state, str(k)))
@@ -234,15 +271,15 @@ class HypothesisSlam:
 
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later calls; ``motion``: only those of predict."""
-        hypotheses = self.hypotheses
-        undo_slams = [h.slam.checkpoint(motion=motion) for h in hypotheses]
-        undo_parts = undo_all(*undo_slams, self._pool.checkpoint())
+        undo_slams = [h.slam.checkpoint(motion=motion) for h in self.hypotheses]
+        return undo_all(*undo_slams, self._undo_own())
 
-        def undo() -> None:
-            undo_parts()
-            self.hypotheses = hypotheses
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls, as far as no kernel has run."""
+        return undo_all(*(h.slam.bookmark() for h in self.hypotheses), self._undo_own())
 
-        return undo
+    def _undo_own(self) -> Undo:
+        return undo_all(attributes(self), self._pool.checkpoint())
 
     def _options(self, readings: Array) -> list[Option]:
         """Return cost, hypothesis and association of the best, the cheapest first."""
@@ -267,23 +304,20 @@ class HypothesisSlam:
             for slam, is_first in zip(slams, first, strict=True)
         ]
 
-    def _advance(self, readings: Array, options: Sequence[Option]) -> UpdateReport:
-        """Continue with the options whose filter succeeds; return the first report."""
+    def _advance(self, readings: Array, options: Sequence[Option]) -> Step:
+        """Return the hypotheses of the options whose filter succeeds."""
         plans = [complete() for _, _, complete in options]
         slams = self._branches([k for _, k, _ in options])
         reports, kept, errors = [], [], []
         for (cost, *_), plan, slam in zip(options, plans, slams, strict=True):
             try:
-                reports.append(slam.take(readings, plan))
+                reports.append(slam.take(readings, lambda plan=plan: plan))
                 kept.append(Hypothesis(cost, slam))
             except (np.linalg.LinAlgError, MemoryError) as error:
                 errors.append(error)
         if not kept:
             raise errors[0]
-        kept = distinct(kept)
-        least = kept[0].cost
-        self._keep([Hypothesis(h.cost - least, h.slam) for h in kept], slams)
-        return reports[0]
+        return reports[0], distinct(kept), slams
 
     def _keep(
         self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()

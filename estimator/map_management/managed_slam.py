@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from ..interface import (
     SupportsLocalView,
     SupportsTruth,
     UpdateReport,
+    before_update,
     checkpoint,
     optional_members,
     restore,
@@ -37,7 +39,7 @@ from ..support import argument_checks, saved_states
 from ..support import argument_checks as pair_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
-from ..support.undo import Undo, undo_all, undone_on_error
+from ..support.undo import Recall, Undo, carried_out, undo_all, undone_on_error
 from .map_editor import CachedEditor, edit_map, is_near, mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
@@ -110,6 +112,7 @@ class ManagedSlam:
         self._editor = CachedEditor(edit_map(self._filter, merging=merging))
         self._pruner = MapPruner(self._policy, self._editor, self._sensor.noise)
         self._candidates = Candidates()
+        self._report: UpdateReport | None = None
         window = self._policy.confirm[1] if self._policy.backdate else 0
         self._recent = RecentScans(
             self._filter, self._editor, window, self._policy.pair_gate
@@ -141,7 +144,7 @@ class ManagedSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._filter.reset(pose, pose_std)
             self._editor.expire()
             self._pruner.forget()
@@ -183,10 +186,9 @@ class ManagedSlam:
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
-        with undone_on_error(self.checkpoint()):
-            if landmark_ids is None:
-                return self.take(readings, self.alternatives(readings)[0][1]())
-            return self.take(readings, self.as_given(readings, landmark_ids))
+        if landmark_ids is None:
+            return self.take(readings, lambda: self.alternatives(readings)[0][1]())
+        return self.take(readings, partial(self.as_given, readings, landmark_ids))
 
     def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
         """Associate readings (m, 2) by their identities."""
@@ -211,10 +213,43 @@ class ManagedSlam:
         views = self._editor.map_view(), other._editor.map_view()
         return np.array_equal(labels, others) and is_near(*views, tolerance)
 
-    def take(self, readings: Array, plan: ScanAssociation) -> UpdateReport:
+    def take(
+        self, readings: Array, associate: Callable[[], ScanAssociation]
+    ) -> UpdateReport:
         """Correct the belief with readings (m, 2) as associated, then prune the map."""
-        missed = self._pruner.expected(readings) - plan.explained
-        report = self._recent.update(readings, plan)
+        undo_filter, recall, _ = before_update(self._filter)
+        undo = self._editor.checkpoint() if recall else self._undo_records()
+        follow: Callable[[UpdateReport], UpdateReport]
+        repeats = False
+
+        def correct() -> UpdateReport:
+            nonlocal follow, repeats
+            plan = associate()
+            missed = self._pruner.expected(readings) - plan.explained
+            scans, first = self._recent.with_scan(readings, plan)
+            follow = partial(self._follow, readings, plan, missed, scans, first)
+            repeats = first is not None
+            return self._recent.feed(scans, first, plan)
+
+        return carried_out(
+            correct,
+            lambda report: follow(report),
+            undo_all(undo_filter, undo),
+            recall and (lambda: None if repeats else recall()),
+            self.bookmark,
+        )
+
+    def _follow(
+        self,
+        readings: Array,
+        plan: ScanAssociation,
+        missed: set[int],
+        scans: list[RecentScan],
+        first: int | None,
+        report: UpdateReport,
+    ) -> UpdateReport:
+        """Do what follows an update of the filter; return the report of all."""
+        self._recent.note_scan(plan, scans, first, report)
         self._editor.expire()
         self._candidates = plan.candidates
         seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
@@ -222,7 +257,7 @@ class ManagedSlam:
         removed, merged = self._pruner.prune(readings, plan, seen, missed)
         self._recent.note_edits(removed, merged)
         made = self.decisions[-1]
-        return report.replace(
+        self._report = report.replace(
             removed_ids=tuple(removed),
             merged_ids=tuple(merged),
             confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
@@ -230,17 +265,18 @@ class ManagedSlam:
             tentative_rows=tuple(plan.tentative_rows),
             ambiguous_rows=tuple(plan.ambiguous_rows),
         )
+        return self._report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise mapped landmarks by hand, shape (n,); all else stays."""
         ids = argument_checks.mapped_identities(landmark_ids, self._slots)
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._recent.note_edits(self._pruner.remove(ids), ())
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two mapped landmarks by hand; both identities then name the first."""
         pair_checks.two_landmarks(kept, gone, self._slots)
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._pruner.merger.join([(kept, gone)])
             self._recent.note_edits((), [(kept, gone)])
 
@@ -275,7 +311,7 @@ class ManagedSlam:
         entries = [k for k in self._remembered() if k.count(".") < 2]
         saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._pruner.load_state_dict(without_prefix(state, "landmarks"))
             self._recent.load_state_dict(without_prefix(state, "recent"))
             self._filter.load_state_dict(without_prefix(state, "filter"))
@@ -284,17 +320,39 @@ class ManagedSlam:
 
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later calls; ``motion``: only those of predict."""
-        candidates = self._candidates
+        undo_filter = checkpoint(self._filter, motion=motion)
+        if not motion:
+            return undo_all(undo_filter, self._undo_records())
+        records = self._candidates, self._recent.motions
+
+        def undo() -> None:
+            undo_filter()
+            self._editor.expire()
+            self._candidates, self._recent.motions = records
+
+        return undo
+
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls, as far as no kernel has run."""
+        return undo_all(before_update(self._filter)[0], self._undo_records())
+
+    def recall(self) -> Recall[UpdateReport] | None:
+        """Return what tells the report of the next update, once it is absorbed."""
+        self._report = None
+        return before_update(self._filter)[1] and (lambda: self._report)
+
+    def _undo_records(self) -> Undo:
+        """Return what takes back later changes of all but the filter."""
+        candidates, report = self._candidates, self._report
         undo_parts = undo_all(
-            checkpoint(self._filter, motion=motion),
-            *(() if motion else (self._pruner.checkpoint(),)),
+            self._pruner.checkpoint(),
             self._recent.checkpoint(),
             self._editor.checkpoint(),
         )
 
         def undo() -> None:
             undo_parts()
-            self._candidates = candidates
+            self._candidates, self._report = candidates, report
 
         return undo
 
@@ -402,27 +460,40 @@ class RecentScans:
                 merged=(*last.merged, *merged),
             )
 
-    def update(self, readings: Array, plan: ScanAssociation) -> UpdateReport:
-        """Update the filter with a scan, and with earlier sightings if any."""
+    def with_scan(
+        self, readings: Array, plan: ScanAssociation
+    ) -> tuple[list[RecentScan], int | None]:
+        """Return the last scans with a new one, and the first to repeat, if any."""
         row_ids, labels = tuple(plan.row_ids), tuple(plan.labels)
         scan = RecentScan(plan.scan, self.motions, readings, row_ids, labels)
         if not self._window:
-            report = scan.feed(self._slam)
-            self.decisions.append(_decided(plan, report))
-            return report
+            return [scan], None
         if scan.begins:
             scan = replace(scan, before=self._slam.state_dict())
         scans = [*self.scans, scan][-self._window - 1 :]
-        first = _relabel(scans, plan.confirmed)
+        return scans, _relabel(scans, plan.confirmed)
+
+    def feed(
+        self, scans: list[RecentScan], first: int | None, plan: ScanAssociation
+    ) -> UpdateReport:
+        """Update the filter with the last scan, and with earlier sightings if any."""
         if first is None:
-            report = scan.feed(self._slam)
-        else:
-            report = self._apply_earlier(scans, first, {*plan.confirmed})
-        self.scans, self.motions = scans, ()
+            return scans[-1].feed(self._slam)
+        return self._apply_earlier(scans, first, {*plan.confirmed})
+
+    def note_scan(
+        self,
+        plan: ScanAssociation,
+        scans: list[RecentScan],
+        first: int | None,
+        report: UpdateReport,
+    ) -> None:
+        """Remember a scan that the filter has taken in."""
+        if self._window:
+            self.scans, self.motions = list(scans), ()
         self.decisions.append(_decided(plan, report))
         if first is not None:
             self._revise_decisions(scans[first:-1])
-        return report
 
     def _revise_decisions(self, scans: Sequence[RecentScan]) -> None:
         """Note the landmarks that the readings of earlier scans belong to now."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,13 +14,21 @@ from ..interface import (
     MapView,
     SlamEstimator,
     UpdateReport,
+    before_update,
     checkpoint,
     optional_members,
 )
 from ..map_management.map_editor import edit_map, mapped_ids, marginal, view_map
 from ..registry import accepted_options, find_estimator, make_estimator, read_label
 from ..support import argument_checks, saved_states
-from ..support.undo import Undo, contents, undo_all, undone_on_error
+from ..support.undo import (
+    Undo,
+    attributes,
+    carried_out,
+    contents,
+    undo_all,
+    undone_on_error,
+)
 from .batch_smoother import SmoothedDrive, robust_kernel, smooth
 from .drive import Drive
 
@@ -97,17 +106,18 @@ class RecordedSlam:
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
     ) -> UpdateReport:
         """Update the filter with one scan, and record the readings that it used."""
-        with undone_on_error(self.checkpoint()):
-            report = self._slam.update(measurements, landmark_ids)
-            self._record_scan(measurements, landmark_ids, report)
-        return report
+        undo, recall, _ = before_update(self._slam)
+        step = partial(self._slam.update, measurements, landmark_ids)
+        then = partial(self._record_scan, measurements, landmark_ids)
+        undo_all_ = undo_all(undo, attributes(self))
+        return carried_out(step, then, undo_all_, recall, partial(attributes, self))
 
     def _record_scan(
         self,
         measurements: ArrayLike,
         landmark_ids: Sequence[int] | None,
         report: UpdateReport,
-    ) -> None:
+    ) -> UpdateReport:
         decided = report.row_ids or (() if landmark_ids is None else landmark_ids)
         unused = {*report.rejected_ids, *report.skipped_ids}
         used = {
@@ -119,6 +129,7 @@ class RecordedSlam:
             self._record("merge", kept, gone)
         if report.removed_ids:
             self._record("forget", report.removed_ids)
+        return report
 
     def remove(self, landmark_ids: Sequence[int]) -> None:
         """Marginalise landmarks, and drop their readings from the drive."""

@@ -3,11 +3,17 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
+from typing import TypeVar
 
 import numpy as np
 
+Result = TypeVar("Result")
+Answer = TypeVar("Answer")
+
 Undo = Callable[[], None]
 """What takes back later changes; it may be called more than once."""
+Recall = Callable[[], Result | None]
+"""What tells the result of a step, or None as long as the step is not done."""
 
 
 @contextmanager
@@ -17,6 +23,58 @@ def undone_on_error(undo: Undo) -> Iterator[None]:
         yield
     except BaseException:
         _to_the_end(undo)
+        raise
+
+
+def carried_out(
+    step: Callable[[], Result],
+    then: Callable[[Result], Answer],
+    undo: Undo,
+    recall: Recall[Result] | None,
+    bookmark: Callable[[], Undo],
+) -> Answer:
+    """Return ``then(step())``; an interrupt finds nothing done, or both.
+
+    A compiled kernel changes a covariance in one call.  To take this back would need a
+    copy of the covariance before every step; instead, what follows is brought to its
+    end before the interrupt is passed on.
+
+    Parameters
+    ----------
+    step : callable
+        Its last change is made by a kernel.
+    then : callable
+        What follows, from the result of the step.
+    undo : callable
+        Takes back the step, as long as the kernel has not run.
+    recall : callable or None
+        Tells the result of the step once the kernel has run; None: ``undo`` can take
+        back all.
+    bookmark : callable
+        Returns what takes back ``then``.
+    """
+    result: Result | None = None
+    undo_then: Undo | None = None
+
+    def settle() -> None:
+        nonlocal result, undo_then
+        if result is None and recall is not None:
+            result = recall()
+        if result is None or recall is None:
+            undo()
+            return
+        if undo_then is None:
+            undo_then = bookmark()
+        undo_then()
+        then(result)
+
+    try:
+        result = step()
+        if recall is not None:
+            undo_then = bookmark()
+        return then(result)
+    except BaseException:
+        _to_the_end(settle)
         raise
 
 
@@ -71,9 +129,11 @@ def contents(*objects: object) -> Undo:
     return undo
 
 
+_CHANGED_IN_PLACE = frozenset((np.ndarray, list, dict, set))
+
+
 def _kept(value: object) -> object:
-    is_changed_in_place = isinstance(value, np.ndarray | list | dict | set)
-    return copy(value) if is_changed_in_place else value
+    return copy(value) if type(value) in _CHANGED_IN_PLACE else value
 
 
 def _to_the_end(undo: Undo) -> None:

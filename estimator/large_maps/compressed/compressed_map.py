@@ -73,7 +73,7 @@ class CompressedMap:
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self.filter.remove([i for i in ids if i in self.local])
             self._drop(ids)
 
@@ -171,7 +171,7 @@ class CompressedMap:
             hurried=hurried,
         )
         self._strip = self._handover.next_strip
-        self._begin(covariance, in_place=not whole)
+        self._begin(covariance)
 
     def work(self, rank: int, age: int, *, hurried: bool) -> None:
         """Do a part of the deferred work.
@@ -199,14 +199,12 @@ class CompressedMap:
             self._handover.advance(self.deferred, self.deferred.width // BLOCK)
             self._handover = None
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later changes; ``motion``: only those of the pose.
+    def bookmark(self) -> Undo:
+        """Return what takes back later changes, but for those made by kernels.
 
         A handover may be further than before: its results do not depend on the time.
         """
-        undo_filter = self.filter.checkpoint(motion=motion)
-        if motion:
-            return undo_filter
+        undo_filter = self.filter.bookmark()
         return undo_all(undo_filter, self.deferred.checkpoint(), attributes(self))
 
     @property
@@ -262,7 +260,7 @@ class CompressedMap:
         self.slots = {i: slot for i, slot in self.slots.items() if i not in gone}
         self.local = {i: None for i in self.local if i not in gone}
 
-    def _begin(self, rows: Array, *, in_place: bool) -> None:
+    def _begin(self, rows: Array) -> None:
         """Load the local map with these covariance rows (a, a - 3) into the filter."""
         columns = self._columns(list(self.local))
         whole = len(self.local) == len(self.slots)
@@ -275,7 +273,6 @@ class CompressedMap:
             rows,
             self._references[columns],
             [*range(LOWEST_ID, LOWEST_ID + self._virtual), *self.local],
-            in_place=in_place,
         )
 
     def _make_room(self) -> None:

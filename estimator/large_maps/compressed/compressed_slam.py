@@ -22,7 +22,14 @@ from ...support import argument_checks, saved_states
 from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
-from ...support.undo import Undo, attributes, undo_all, undone_on_error
+from ...support.undo import (
+    Recall,
+    Undo,
+    attributes,
+    carried_out,
+    undo_all,
+    undone_on_error,
+)
 from . import compressed_map as active_set
 from .compressed_map import CompressedMap, checked_state, extra_landmarks
 from .deferred_covariance import stored_bytes
@@ -142,18 +149,22 @@ class CompressedEkfSlam:
         readings = argument_checks.scan(measurements)
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_reserved(ids)
-        counters = self._extra, self._age, self._rests
-        with undone_on_error(self.checkpoint()):
+
+        def correct() -> UpdateReport:
             if (np.abs(readings) <= LARGEST).all():  # otherwise refused
-                mapped = [i for i in ids if i in self._map.slots]
-                counters = self._choose_local_map(mapped)
-            report = self._map.filter.update(readings, ids)
-            self._extra, self._age, self._rests = counters
-            self._map.add(report.added_ids)
-            if report.degrees_of_freedom:
-                self._age += 1
-                rank = report.degrees_of_freedom + 1
-                self._map.work(rank, self._age, hurried=not self._rests)
+                self._choose_local_map([i for i in ids if i in self._map.slots])
+            return self._map.filter.update(readings, ids)
+
+        undo, recall = self.bookmark(), self.recall()
+        return carried_out(correct, self._follow, undo, recall, self.bookmark)
+
+    def _follow(self, report: UpdateReport) -> UpdateReport:
+        """Do what follows an update of the filter; return its report."""
+        self._map.add(report.added_ids)
+        if report.degrees_of_freedom:
+            self._age += 1
+            rank = report.degrees_of_freedom + 1
+            self._map.work(rank, self._age, hurried=not self._rests)
         return report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
@@ -193,7 +204,7 @@ class CompressedEkfSlam:
         """
         kept, gone = pair_checks.landmark_pairs(pairs, self._map.slots)
         ids, local = [*kept, *gone], self._map.local
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             if not all(i in local for i in ids):
                 size = max(self._local_size or 0, len(local), len(ids))
                 self._map.change_local_map(ids, size, hurried=not self._rests)
@@ -270,20 +281,26 @@ class CompressedEkfSlam:
 
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later calls; ``motion``: only those of predict."""
-        return undo_all(self._map.checkpoint(motion=motion), attributes(self))
+        undo_filter = self._map.filter.checkpoint(motion=motion)
+        return undo_filter if motion else undo_all(self.bookmark(), undo_filter)
 
-    def _choose_local_map(self, required: Sequence[int]) -> tuple[int, int, int]:
-        """Begin a new phase if the scan needs it or the local map is too large.
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls, as far as no kernel has run."""
+        return undo_all(self._map.bookmark(), attributes(self))
 
-        Return the counters ``_extra``, ``_age`` and ``_rests`` after it.
-        """
+    def recall(self) -> Recall[UpdateReport] | None:
+        """Return what tells the report of the next update, once it is absorbed."""
+        return self._map.filter.recall()
+
+    def _choose_local_map(self, required: Sequence[int]) -> None:
+        """Begin a new phase if the scan needs it or the local map is too large."""
         if self._local_size is not None and len(required) > self._local_size:
             raise ValueError(
                 f"local_size must be >= {len(required)}, the mapped landmarks of one "
                 f"scan, got {self._local_size}"
             )
         if self._is_adequate(required):
-            return self._extra, self._age, self._rests
+            return
         rests, extra = max(self._rests - 1, 0), self._extra
         if self._age >= active_set.SHORT_PHASE and self._map.deferred.is_up_to_date:
             rests = 2  # one short phase does not matter, several leave too much work
@@ -293,7 +310,7 @@ class CompressedEkfSlam:
             small = self._map.is_small
             size = mapped if small else max(len(required), 4) + extra
         self._map.change_local_map(required, size, hurried=not rests)
-        return extra, 0, rests
+        self._extra, self._age, self._rests = extra, 0, rests
 
     def _is_adequate(self, required: Sequence[int]) -> bool:
         """Return whether the local map holds these landmarks and is not too large."""

@@ -401,14 +401,14 @@ def write_columns(
 
 @jit
 def fill_extended(
-    covariance: Array, before: int, pose: Array, rows: Array, virtual: int, step: int
+    covariance: Array, pose: Array, rows: Array, virtual: int, step: int
 ) -> None:
     """Put a local map and the extension of a phase into the covariance of a filter.
 
     Parameters
     ----------
     covariance : ndarray, shape (capacity, capacity)
-        Overwritten; its first ``before`` rows and columns were in use.
+        Zeros.
     pose : ndarray, shape (3, 3)
         Covariance of the pose.
     rows : ndarray, shape (a, a - 3)
@@ -417,8 +417,6 @@ def fill_extended(
     virtual, step : int
         Number of columns of the extension; every ``step``-th belongs to a coordinate.
     """
-    size = max(before, len(rows) + virtual)
-    covariance[:size, :size] = 0.0
     for i in range(len(rows)):
         for j in range(i + 1):
             value = pose[i, j] if i < 3 else rows[j, i - 3]

@@ -38,9 +38,6 @@ from .deferred_covariance import (
     unpivot,
 )
 
-# A filter's arrays may be larger than needed by this factor.
-_ROOMY = 3
-
 
 class Phase(NamedTuple):
     """The parts of the filter's belief at the end of a phase."""
@@ -64,8 +61,6 @@ def begin_phase(
     rows: Array,
     reference: Array,
     ids: list[int],
-    *,
-    in_place: bool,
 ) -> None:
     """Replace the map of a filter by the extension, followed by a local map.
 
@@ -79,25 +74,19 @@ def begin_phase(
         Covariance of pose and local landmarks with these; the lower half is used.
     ids : list of int
         Identities of the virtual landmarks, if any, then of the local ones.
-    in_place : bool
-        Whether the old arrays may be overwritten.
     """
     gaussian, size = slam.map, 3 + 2 * len(ids)
-    before = gaussian.size
     pose, pose_mean = gaussian.covariance[:3, :3].copy(), gaussian.mean[:3].copy()
     fixed = gaussian.reference[:3].copy()
-    if not (in_place and size < gaussian.capacity <= _ROOMY * size):
-        gaussian.allocate(len(ids), more=len(ids) // 2)
-        before = 0
+    gaussian.allocate(len(ids), more=len(ids) // 2)
     virtual = size - len(rows)
     step = 2 if virtual == 2 * len(rows) else 1
     for array, head, tail in (
         (gaussian.mean, pose_mean, mean),
         (gaussian.reference, fixed, reference),
     ):
-        array[:before] = 0.0
         array[:3], array[3 + virtual : size] = head, tail
-    fill_extended(gaussian.covariance, before, pose, rows, virtual, step)
+    fill_extended(gaussian.covariance, pose, rows, virtual, step)
     gaussian.relabel(ids)
 
 

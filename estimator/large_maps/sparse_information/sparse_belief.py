@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import inf
 from typing import NamedTuple
@@ -11,7 +12,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
-from ...support.undo import Undo, contents, undone_on_error
+from ...support.undo import Undo, attributes, contents, undone_on_error
 from ..elimination import RestFactor
 from ..multifrontal import SchurComplement, pairs
 from .local_information import (
@@ -47,6 +48,8 @@ class SparseBelief:
     """Number of landmarks to eliminate around the local map."""
     enlarged: bool = False
     """Whether the first number was too small."""
+    saved: list[Undo] = field(default_factory=list, repr=False)
+    """What takes back the update under way: the last of these."""
     rest: RestFactor | None = field(default=None, repr=False)
     """Factor of all landmarks except the local ones, if known."""
 
@@ -69,6 +72,9 @@ class SparseBelief:
 
     def add(self, ids: Sequence[int], slots: Sequence[int]) -> None:
         """Assign slots to new landmarks."""
+        if not ids:
+            return
+        self._save()
         self.slots.update(zip(ids, slots, strict=True))
         self.free = [slot for slot in self.free if slot not in slots]
         self.map_.grow(len(self.slots) + len(self.free))
@@ -83,6 +89,21 @@ class SparseBelief:
             self.rest = None  # the map no longer keeps the nodes of a factor
 
         return undo
+
+    @contextmanager
+    def undone_on_error(self) -> Iterator[None]:
+        """Take back an update that fails; a checkpoint is made where the map changes."""
+        saved = self.saved = [attributes(self)]
+        try:
+            with undone_on_error(lambda: saved[-1]()):
+                yield
+        finally:
+            self.saved = []
+
+    def _save(self) -> None:
+        """Make a checkpoint before the first change of the map in an update."""
+        if len(self.saved) == 1:
+            self.saved.append(self.checkpoint())
 
     def choose_local_map(self, ids: Sequence[int], *, exact: bool) -> None:
         """Choose a new local map if a scan needs it or the old one is too large.
@@ -193,6 +214,7 @@ class SparseBelief:
 
     def _change_local_map(self, slots: IntArray, count: float) -> None:
         """Write the local map back, and begin another one."""
+        self._save()
         old, pose = self.local.slots, self.pose
         write_back(self.map_, self.local)
         self.rest = None

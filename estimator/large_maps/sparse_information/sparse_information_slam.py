@@ -15,7 +15,7 @@ from ...models.bearing_range import wrap_angle
 from ...support import argument_checks, saved_states
 from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
-from ...support.undo import Undo, attributes, undo_all, undone_on_error
+from ...support.undo import Undo, attributes, undo_all
 from ..elimination import RestFactor
 from ..multifrontal import Factor, SchurComplement, SubsetFactor
 from .local_information import (
@@ -158,7 +158,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         argument_checks.refuse_unusable(readings, ids)
         if not ids:
             return UpdateReport()
-        with undone_on_error(self._belief.checkpoint()):
+        with self._belief.undone_on_error():
             self._belief.choose_local_map(ids, exact=self._is_exact)
             result = self._process(readings, ids)
             while result.largest_residual > self._tolerance:

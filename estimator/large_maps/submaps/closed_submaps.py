@@ -18,7 +18,7 @@ from ...interface import Belief, MapView, UpdateReport
 from ...models.rigid_motion import ErrorFrame
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
-from ...support.undo import Undo, contents, undo_all
+from ...support.undo import Undo, attributes, undo_all
 from .factor import Gaussian, retract
 from .joining import (
     FrameInitialisation,
@@ -296,14 +296,14 @@ class Neighbourhood:
         copy = self._copy
         if copy is None or not copy.region.covers(copy.slam.map.mean[:2], within):
             copy = self._renewed(max(within, *self._reaches))
-        self._reaches[-1] = max(within, self._reaches[-1])
+        self._reaches = [*self._reaches[:-1], max(within, self._reaches[-1])]
         return copy.slam.map_view()
 
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later calls; ``motion``: only those of predict."""
         if self._copy is None:
-            return contents(self)
-        return undo_all(self._copy.slam.checkpoint(motion=motion), contents(self))
+            return attributes(self)
+        return undo_all(self._copy.slam.checkpoint(motion=motion), attributes(self))
 
     def renew(self) -> None:
         """Replace the copy, if there is one and the submaps can be joined."""
@@ -315,6 +315,11 @@ class Neighbourhood:
         """Move the robot."""
         if self._copy is not None:
             self._copy.slam.predict(odometry, dt)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no copy."""
+        return self._copy is None
 
     def update(
         self, measurements: ArrayLike, ids: LandmarkIds | None, report: UpdateReport

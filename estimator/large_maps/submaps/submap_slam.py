@@ -17,7 +17,14 @@ from ...interface import Belief, MapView, UpdateReport, describe_map
 from ...support import argument_checks, saved_states
 from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
-from ...support.undo import Undo, attributes, undo_all, undone_on_error
+from ...support.undo import (
+    Recall,
+    Undo,
+    attributes,
+    carried_out,
+    undo_all,
+    undone_on_error,
+)
 from .closed_submaps import ClosedSubmaps, Neighbourhood, Region, merged
 from .graph import ORIGIN, ActiveSubmap, Chain, ClosingRule, SubmapGraph
 from .joining import summarise
@@ -214,6 +221,9 @@ class SubmapSlam(SubmapQueries):
         motion = argument_checks.pair("odometry", odometry)
         argument_checks.duration(dt)
         self._claim_folder()
+        if self._neighbourhood.is_empty:
+            self._active.filter.predict(motion, dt)
+            return
         with undone_on_error(self.checkpoint(motion=True)):
             self._active.filter.predict(motion, dt)
             self._neighbourhood.predict(motion, dt)
@@ -250,13 +260,20 @@ class SubmapSlam(SubmapQueries):
         refuse_link_names(ids)
         argument_checks.refuse_unusable(readings, ids)
         self._claim_folder()
-        with undone_on_error(self.checkpoint()):
-            return self._take(readings, ids)
 
-    def _take(self, readings: Array, ids: list[int]) -> UpdateReport:
-        if self._graph.is_overdue:
-            self._close()
-        report = self._active.filter.update(readings, ids)
+        def correct() -> UpdateReport:
+            if self._graph.is_overdue:
+                self._close()
+            return self._active.filter.update(readings, ids)
+
+        slam, then = self._active.filter, partial(self._follow, readings, ids)
+        undo = self.bookmark() if self._graph.is_overdue else slam.bookmark()
+        return carried_out(correct, then, undo, slam.recall(), self.bookmark)
+
+    def _follow(
+        self, readings: Array, ids: list[int], report: UpdateReport
+    ) -> UpdateReport:
+        """Do what follows an update of the active submap; return the report."""
         index = self._graph.index
         new = tuple(i for i in report.added_ids if i not in index)
         index.add(new)
@@ -266,6 +283,7 @@ class SubmapSlam(SubmapQueries):
         if len(readings) and self._rule.closes(self._active):
             with suppress(OSError):  # the next scan tries again, and raises
                 self._close()
+        self._report = report
         return report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
@@ -351,6 +369,20 @@ class SubmapSlam(SubmapQueries):
             *(() if motion else (self._graph.checkpoint(),)),
             attributes(self),
         )
+
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls, as far as no kernel has run."""
+        return undo_all(
+            self._active.filter.bookmark(),
+            self._neighbourhood.checkpoint(),
+            self._graph.checkpoint(),
+            attributes(self),
+        )
+
+    def recall(self) -> Recall[UpdateReport] | None:
+        """Return what tells the report of the next update, once it is absorbed."""
+        self._report: UpdateReport | None = None
+        return lambda: self._report
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state as arrays, without submaps in a folder.
