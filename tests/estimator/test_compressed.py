@@ -255,6 +255,17 @@ def test_a_merge_is_that_of_the_full_filter(base, jumping):
     assert_equal_beliefs(slam.belief(), full.belief())
 
 
+def test_landmarks_added_after_a_removal_have_places_of_their_own():
+    slam, full = CompressedEkfSlam(*NOISE), EkfSlam(*NOISE)
+    readings = np.column_stack([np.linspace(-1, 1, 6), np.full(6, 4.0)])
+    for each in (slam, full):
+        each.update(readings[:3], [0, 1, 2])
+        each.remove([1])
+        each.update(readings[3:], [3, 4, 5])  # the first of these in the place of 1
+    assert sorted(slam.state_dict()["slots"]) == [0, 1, 2, 3, 4]
+    assert_equal_beliefs(slam.belief(), full.belief())
+
+
 def test_a_landmark_removed_and_seen_again_is_a_new_one():
     slam = run(CompressedEkfSlam(*NOISE), wander(200, 150))
     first, last = slam.landmark_ids[0], slam.local_ids[-1]

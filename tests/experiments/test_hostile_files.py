@@ -16,7 +16,11 @@ import pytest
 
 from slamgym.envs.rendering.scene import _title
 from slamgym.estimator import make_estimator
-from slamgym.experiments.command_line.output_folder import output_folder, write_summary
+from slamgym.experiments.command_line.output_folder import (
+    STAGING,
+    output_folder,
+    write_summary,
+)
 from slamgym.experiments.command_line.program import BadInputError
 from slamgym.experiments.figures.style import new_figure
 from slamgym.experiments.logs.importers import read_log
@@ -195,7 +199,7 @@ def test_a_full_disk_names_the_folder_and_leaves_what_was_there(tmp_path):
 
 
 @pytest.mark.parametrize("error", [PermissionError("no"), KeyboardInterrupt()])
-def test_a_folder_that_cannot_be_replaced_is_put_back(error, tmp_path, monkeypatch):
+def test_a_file_that_cannot_be_replaced_is_kept(error, tmp_path, monkeypatch):
     out, replace = tmp_path / "out", Path.replace
 
     def write(text):
@@ -204,7 +208,7 @@ def test_a_folder_that_cannot_be_replaced_is_put_back(error, tmp_path, monkeypat
             write_summary(folder, {})
 
     def refuse(source, target):
-        if source.suffix == ".partial":
+        if STAGING in source.parts:
             raise error
         return replace(source, target)
 

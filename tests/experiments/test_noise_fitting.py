@@ -41,6 +41,7 @@ from slamgym.experiments.noise_fitting.scoring import (
 from slamgym.experiments.noise_fitting.search import LogLikelihood, noise_of
 from slamgym.experiments.noise_fitting.summary import options_line
 from slamgym.experiments.runs import replay, settings_for, summarise
+from slamgym.experiments.runs.own_files import files_below
 from slamgym.sim_configs import action_sequence, load_scenario
 
 MOTION, SENSOR = (0.05, 0.03, 0.02), (0.02, 0.08)
@@ -518,10 +519,7 @@ def test_the_command_writes_the_noise_into_the_header_and_nothing_else(tmp_path)
     result = run(path, "--write", "--json", "--out", out)
     assert result.exit_code == 0, result.output
     summary = json.loads(result.stdout)
-    assert sorted(file.name for file in out.iterdir()) == [
-        "innovations.png",
-        "summary.json",
-    ]
+    assert sorted(files_below(out)) == ["innovations.png", "summary.json"]
     after = path.read_text()
     changed = set(before.splitlines()) ^ set(after.splitlines())
     keys = {line.split(":")[0].removeprefix("# ") for line in changed}

@@ -64,8 +64,8 @@ class CompressedMap:
         """Assign slots to landmarks that the filter has added."""
         if not ids:
             return
-        count, reused = len(self.slots), self.free[: -len(ids) - 1 : -1]
-        fresh = range(count, count + len(ids) - len(reused))
+        reused = self.free[: -len(ids) - 1 : -1]
+        fresh = range(len(self.slots) + len(reused), len(self.slots) + len(ids))
         self.slots = self.slots | dict(zip(ids, [*reused, *fresh], strict=True))
         self.free = self.free[: len(self.free) - len(reused)]
         self.local = self.local | dict.fromkeys(ids)
