@@ -65,7 +65,8 @@ class CompressedMap:
         if not ids:
             return
         reused = self.free[: -len(ids) - 1 : -1]
-        fresh = range(len(self.slots) + len(reused), len(self.slots) + len(ids))
+        first = len(self.slots) + len(self.free)
+        fresh = range(first, first + len(ids) - len(reused))
         self.slots = self.slots | dict(zip(ids, [*reused, *fresh], strict=True))
         self.free = self.free[: len(self.free) - len(reused)]
         self.local = self.local | dict.fromkeys(ids)
