@@ -120,6 +120,14 @@ def fuzzer(request, record_property):
 
 
 @pytest.fixture
+def own_registry(monkeypatch):
+    """Forget at the end of a test the estimators that it registers."""
+    from slamgym.estimator import registry
+
+    monkeypatch.setattr(registry, "_factories", dict(registry._factories))
+
+
+@pytest.fixture
 def public_logs():
     """Return the folder of public logs, which are not part of the repository."""
     folder = os.environ.get("SLAMGYM_DATA", "")

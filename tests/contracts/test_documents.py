@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import slamgym
-from slamgym.estimator import list_estimators, make_estimator, registry
+from slamgym.estimator import list_estimators, make_estimator
 from slamgym.sim_configs import list_presets
 
 ROOT = Path(__file__).parents[2]
@@ -68,7 +68,6 @@ def reader(first_run, tmp_path, monkeypatch):
     shutil.copytree(first_run, tmp_path / "results" / "first_run")
     shutil.copy(first_run / "log.csv", tmp_path / "drive.csv")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "_factories", dict(registry._factories))
     noise = {"motion_std": (0.25, 0.1, 0.1), "measurement_std": (0.01, 0.08)}
     return {"__name__": "reader", "estimator": make_estimator("ekf", **noise)}
 

@@ -11,6 +11,7 @@ import pytest
 from drives import MEASUREMENT_STD
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from inner_parts import map_of
 from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
@@ -365,7 +366,7 @@ def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
         slam.predict(odometry)
         done.append(0)
         slam.update(readings, ids)
-        waiting.append(slam._map.deferred.pending_rank)
+        waiting.append(map_of(slam).deferred.pending_rank)
     full = 2 * seen * (2 * count) ** 2 / 2
     assert max(done) < 2 * full
     assert sum(step > 0 for step in done) > 5
@@ -572,8 +573,8 @@ def test_a_filter_that_was_continued_from_a_saved_state_begins_phases_alike():
         near = each.local_ids
         run(each, drive[60:])
         assert each.local_ids != near
-        size = each._map.filter.map.size
-        for array in (each._map.filter.map.mean, each._map.filter.map.covariance):
+        size = map_of(each).filter.map.size
+        for array in (map_of(each).filter.map.mean, map_of(each).filter.map.covariance):
             assert not array[size:].any()
-        assert not each._map.filter.map.covariance[:, size:].any()
+        assert not map_of(each).filter.map.covariance[:, size:].any()
     assert_same_bits(slam.belief(), other.belief())

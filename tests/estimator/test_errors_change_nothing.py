@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from inner_parts import map_of
 
 from slamgym.estimator import list_estimators, make_estimator
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
@@ -149,7 +150,7 @@ def test_an_update_that_fails_after_the_local_map_changed_is_taken_back(
 
     with monkeypatch.context() as patch:
         if name == "compressed":
-            patch.setattr(type(slam._map.filter), "update", fail)
+            patch.setattr(type(map_of(slam).filter), "update", fail)
         else:
             patch.setattr(type(slam), "_process", fail)
             patch.setattr(

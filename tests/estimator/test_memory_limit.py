@@ -130,12 +130,20 @@ def test_a_belief_that_memory_does_not_hold_is_refused(leave):
     assert slam.belief([1, 2]).landmark_ids == (1, 2)
 
 
+@pytest.fixture
+def _system(tmp_path, monkeypatch):
+    """Read what a folder tells of the machine and its container."""
+    monkeypatch.setattr(psutil, "PROCFS_PATH", str(tmp_path))
+    monkeypatch.setattr(memory_limit, "_CONTAINER", tmp_path)
+
+
+@pytest.mark.usefixtures("_system")
 @pytest.mark.parametrize(
     ("limit", "current", "expected"),
     [("max", "9", 4096e3), ("3000000", "2500000", 900e3), (None, None, 4096e3)],
 )
 def test_what_is_available_is_that_of_machine_and_container(
-    limit, current, expected, tmp_path, monkeypatch
+    limit, current, expected, tmp_path
 ):
     sizes = {"MemTotal": 9000, "MemFree": 1000, "MemAvailable": 4000}
     others = ("Buffers", "Cached", "Shmem", "Active", "Inactive", "Slab")
@@ -146,14 +154,11 @@ def test_what_is_available_is_that_of_machine_and_container(
         (tmp_path / "memory.max").write_text(f"{limit}\n")
         (tmp_path / "memory.current").write_text(f"{current}\n")
         (tmp_path / "memory.stat").write_text("anon 2100000\nfile 400000\n")
-    monkeypatch.setattr(psutil, "PROCFS_PATH", str(tmp_path))
-    monkeypatch.setattr(memory_limit, "_CONTAINER", tmp_path)
     assert memory_limit.available_memory() == expected
 
 
-def test_where_the_system_does_not_tell_nothing_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(psutil, "PROCFS_PATH", str(tmp_path))
-    monkeypatch.setattr(memory_limit, "_CONTAINER", tmp_path)
+@pytest.mark.usefixtures("_system")
+def test_where_the_system_does_not_tell_nothing_is_refused():
     assert memory_limit.available_memory() == np.inf
     memory_limit.refuse_beyond_memory("a map", 1e15, "take less")
 

@@ -26,7 +26,6 @@ from slamgym.experiments.command_line.options import recorded
 from slamgym.experiments.command_line.program import InterruptedRunError
 from slamgym.experiments.logs.slamlog import write_slamlog
 from slamgym.experiments.trajectories import driven_episodes, generate
-from slamgym.experiments.trajectories import formats as npz
 from slamgym.experiments.trajectories import generate as shard_work
 from slamgym.experiments.trajectories import manifest as shard_folder
 from slamgym.experiments.trajectories.driven_episodes import drive_episodes
@@ -326,15 +325,16 @@ def test_whole_shards_are_not_driven_again(tmp_path, monkeypatch):
 def test_an_error_while_writing_leaves_whole_shards_and_no_rests(tmp_path, monkeypatch):
     written = []
 
-    def write_two(trajectories, path, write=npz.write):
+    def write_two(trajectories, path):
         path.write_text("half")
         if len(written) == 2:
             raise OSError("disk full")
         written.append(path)
-        write(trajectories, path)
+        npz.write(trajectories, path)
 
+    npz = FORMATS["npz"]
     with monkeypatch.context() as patch:
-        patch.setattr(npz, "write", write_two)
+        patch.setitem(FORMATS, "npz", npz._replace(write=write_two))
         with pytest.raises(OSError, match="disk full"):
             small(tmp_path / "out")
     names = sorted(entry.name for entry in (tmp_path / "out").iterdir())
