@@ -917,7 +917,7 @@ def test_submaps_may_lie_in_a_folder(here, without_pictures):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
 @pytest.mark.parametrize("form", [(), ("--json",)])
 def test_a_command_works_in_any_encoding(encoding, form, log):
     code = "from slamgym.experiments.command_line.app import main; main()"
