@@ -4,6 +4,7 @@ import gc
 import os
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -120,11 +121,12 @@ def fuzzer(request, record_property):
 
 
 @pytest.fixture
-def own_registry(monkeypatch):
+def own_registry():
     """Forget at the end of a test the estimators that it registers."""
     from slamgym.estimator import registry
 
-    monkeypatch.setattr(registry, "_factories", dict(registry._factories))
+    with patch.dict(registry._factories):
+        yield
 
 
 @pytest.fixture

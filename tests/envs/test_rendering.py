@@ -61,7 +61,7 @@ def moving_parts(renderer):
 
 
 def figure_of(renderer):
-    return scene_of(renderer)._figure
+    return scene_of(renderer).moving[0].figure
 
 
 def share_of_different_pixels(one, other):

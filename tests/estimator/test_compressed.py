@@ -8,11 +8,12 @@ from pathlib import Path
 import forked
 import numpy as np
 import pytest
+from comparison import assert_same_bits
 from drives import MEASUREMENT_STD
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from inner_parts import map_of
-from town_drives import TOWN_MOTION_STD, map_all, wander
+from inner_parts import map_of, spied
+from town_drives import TOWN_MOTION_STD, map_all, run, wander
 
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
 from slamgym.estimator.interface import Belief
@@ -71,19 +72,6 @@ def assert_equal_beliefs(one, other):
     assert one.frame == other.frame
     np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=1e-9)
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-10)
-
-
-def assert_same_bits(one, other):
-    assert one.landmark_ids == other.landmark_ids
-    np.testing.assert_array_equal(one.mean, other.mean)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
-
-
-def run(slam, drive):
-    for odometry, readings, ids in drive:
-        slam.predict(odometry)
-        slam.update(readings, ids)
-    return slam
 
 
 def follow_both(
@@ -353,14 +341,13 @@ def test_a_state_is_shared_with_nobody():
 @pytest.mark.parametrize("jumping", [False, True])
 def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
     count, seen = 400, 10
-    apply, done = DeferredCovariance._apply, []
+    done = []
 
-    def counted(self, k):
+    def count_numbers(self, k):
         done[-1] += len(self._pending[0].signs) * self._blocks[k].size
-        apply(self, k)
 
     slam = map_all(CompressedEkfSlam(*NOISE), count)
-    monkeypatch.setattr(DeferredCovariance, "_apply", counted)
+    spied(monkeypatch, DeferredCovariance, "_apply", count_numbers)
     waiting = []
     for odometry, readings, ids in wander(count, 150, seen=seen, jumping=jumping):
         slam.predict(odometry)
@@ -376,14 +363,13 @@ def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_a_change_of_the_local_map_is_spread_over_steps(base, monkeypatch):
     """After a long phase, no step exchanges more than a quarter of the blocks."""
-    exchange, done = Handover._exchange, []
+    done = []
 
-    def counted(self, stored, blocks):
+    def count_blocks(self, stored, blocks):
         done[-1] += len(blocks)
-        exchange(self, stored, blocks)
 
     slam = map_all(CompressedEkfSlam(*NOISE, base=base, local_size=40), 600)
-    monkeypatch.setattr(Handover, "_exchange", counted)
+    spied(monkeypatch, Handover, "_exchange", count_blocks)
     for odometry, readings, ids in wander(600, 80):
         slam.predict(odometry)
         done.append(0)

@@ -376,32 +376,26 @@ def test_a_reading_at_an_expected_range_below_the_minimum_is_skipped(case):
 
 @pytest.mark.parametrize("case", FAMILY)
 @pytest.mark.parametrize("at", ["expected", "reading"])
-def test_range_noise_reaches_every_filter(case, at):
-    small = make(case)
-    large = make(case, range_std_per_metre=0.5, range_noise_at=at)
-    for each in (small, large):
-        tell_truth(each, np.zeros(3))
-        each.update(np.array([(0.3, 6.0), (1.0, 9.0)]), [0, 1])
-        each.predict((0.0, 0.0))
-    scan = np.array([(0.3, 3.0), (1.0, 4.5)])
-    plain = small.update(scan, [0, 1]).innovation_covariance
-    noisy = large.update(scan, [0, 1]).innovation_covariance
-    assert noisy[1, 1] > plain[1, 1] + (2.0 if at == "reading" else 4.0)
-
-
-@pytest.mark.parametrize("case", FAMILY)
-@pytest.mark.parametrize("at", ["expected", "reading"])
-def test_bearing_noise_in_metres_reaches_every_filter(case, at):
+@pytest.mark.parametrize(
+    ("noise", "row", "least"),
+    [
+        ({"range_std_per_metre": 0.5}, 1, {"expected": 4.0, "reading": 2.0}),
+        ({"bearing_std_metres": 3.0}, 0, {"expected": 0.2, "reading": 0.9}),
+    ],
+)
+def test_noise_that_depends_on_the_range_reaches_every_filter(
+    case, at, noise, row, least
+):
     variances = []
-    for metres in (0.0, 3.0):
-        slam = make(case, bearing_std_metres=metres, range_noise_at=at)
+    for options in ({}, noise):
+        slam = make(case, range_noise_at=at, **options)
         tell_truth(slam, np.zeros(3))
         slam.update(np.array([(0.3, 6.0), (1.0, 9.0)]), [0, 1])
         slam.predict((0.0, 0.0))
         scan = np.array([(0.3, 3.0), (1.0, 4.5)])
         S = slam.update(scan, [0, 1]).innovation_covariance
-        variances.append(S[0, 0])
-    assert variances[1] > variances[0] + (0.9 if at == "reading" else 0.2)
+        variances.append(S[row, row])
+    assert variances[1] > variances[0] + least[at]
 
 
 @pytest.mark.parametrize("case", FAMILY)

@@ -5,9 +5,10 @@ from functools import partial
 import forked
 import numpy as np
 import pytest
+from comparison import assert_same_bits
 from dense_ekf import DenseEkf
 from drives import MEASUREMENT_STD
-from town_drives import map_all, wander
+from town_drives import map_all, run, wander
 
 from slamgym.estimator import (
     EkfSlam,
@@ -44,13 +45,6 @@ MOTION_STD = (0.02, 0.01, 0.01)
 NOISE = (MOTION_STD, MEASUREMENT_STD)
 
 
-def run(slam, drive):
-    for odometry, readings, ids in drive:
-        slam.predict(odometry)
-        slam.update(readings, ids)
-    return slam
-
-
 def exact_circle(laps, *, count=24, seen=6, start_std=(0.1, 0.1, 0.05)):
     """Readings and odometry without any noise: every filter's mean is the truth."""
     rng = np.random.default_rng(4)
@@ -62,12 +56,6 @@ def exact_circle(laps, *, count=24, seen=6, start_std=(0.1, 0.1, 0.05)):
         pose = predict_pose(pose, odometry).pose
         near = np.argsort(((landmarks - pose[:2]) ** 2).sum(axis=1))[:seen]
         yield odometry, predict_measurement(pose, landmarks[near]).measurement, near
-
-
-def assert_same_bits(one, other):
-    assert one.landmark_ids == other.landmark_ids
-    np.testing.assert_array_equal(one.mean, other.mean)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from inner_parts import (
     graph_of,
     neighbourhood_of,
     present_submap,
+    spied,
 )
 from scipy.stats import chi2
 from test_submaps import (
@@ -427,13 +428,8 @@ def assert_as_joined(slam, tolerance):
 
 def surveys_of(slam):
     """Return a list that grows with every look at the joined map, by its reach."""
-    survey, reaches = neighbourhood_of(slam)._joined_region, []
-
-    def counted(reach):
-        reaches.append(reach)
-        return survey(reach)
-
-    neighbourhood_of(slam)._joined_region = counted
+    reaches, patch = [], pytest.MonkeyPatch()  # of one filter alone, to its end
+    spied(patch, neighbourhood_of(slam), "_joined_region", reaches.append)
     return reaches
 
 

@@ -3,11 +3,13 @@
 import forked
 import numpy as np
 import pytest
+from comparison import assert_same_bits
 from inner_parts import cached_submaps, closed_submaps, graph_of, present_submap
 from numeric_jacobian import numeric_jacobian
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.sparse import csc_array
+from town_drives import run
 
 from slamgym.estimator import EkfSlam, check_estimator
 from slamgym.estimator.large_maps.elimination import SubmapElimination, dissect
@@ -51,22 +53,9 @@ def made(scale=1.0, **options):
     return SubmapSlam(scale * MOTION_STD, scale * MEASUREMENT_STD, **options)
 
 
-def run(slam, drive):
-    for odometry, readings, ids, _ in drive:
-        slam.predict(odometry)
-        slam.update(readings, ids)
-    return slam
-
-
 @pytest.fixture(scope="module")
 def driven():
     return run(made(), laps())
-
-
-def assert_same_bits(one, other):
-    assert one.landmark_ids == other.landmark_ids
-    np.testing.assert_array_equal(one.mean, other.mean)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
 @pytest.mark.parametrize("base", BASES)

@@ -171,7 +171,7 @@ def message_of(command):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "number"),
-    zip(LONG, cycle([signal.SIGINT, signal.SIGTERM]), strict=False),
+    list(zip(LONG, cycle([signal.SIGINT, signal.SIGTERM]), strict=False)),
 )
 def test_a_command_that_computes_ends_in_time(here, city_log, command, number):
     here.with_name("city.csv").symlink_to(city_log)

@@ -34,3 +34,14 @@ def map_of(slam):
 def filters_of(slam):
     """Return the pool of filters of a filter with several hypotheses."""
     return slam._pool
+
+
+def spied(monkeypatch, owner, name, note):
+    """Call a function with the arguments of a method before every call of it."""
+    method = getattr(owner, name)
+
+    def noted(*arguments):
+        note(*arguments)
+        return method(*arguments)
+
+    monkeypatch.setattr(owner, name, noted)
