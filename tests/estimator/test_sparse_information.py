@@ -45,6 +45,16 @@ MOTION_STD = (0.02, 0.01, 0.01)
 NOISE = (MOTION_STD, MEASUREMENT_STD)
 
 
+def matrix_of(state):
+    """Return the information matrix of a saved state, its local part filled in."""
+    matrix = InformationMatrix()
+    matrix.load_state_dict(
+        {k: state[f"matrix_{k}"] for k in ("counts", "links", "blocks")}
+    )
+    matrix.replace(state["local_slots"], state["local_information"])
+    return matrix
+
+
 def exact_circle(laps, *, count=24, seen=6, start_std=(0.1, 0.1, 0.05)):
     """Readings and odometry without any noise: every filter's mean is the truth."""
     rng = np.random.default_rng(4)
@@ -280,11 +290,7 @@ def test_marginals_are_blocks_of_the_dense_inverse():
         part.covariance, whole.covariance[np.ix_(columns, columns)], atol=1e-12
     )
     state = slam.state_dict()  # the same from the matrices themselves
-    matrix = InformationMatrix()
-    matrix.load_state_dict(
-        {k: state[f"matrix_{k}"] for k in ("counts", "links", "blocks")}
-    )
-    matrix.replace(state["local_slots"], state["local_information"])
+    matrix = matrix_of(state)
     slots = np.array(
         [
             dict(zip(state["landmark_ids"], state["slots"], strict=True))[i]
@@ -608,11 +614,7 @@ def test_readings_are_blind_to_a_turn_of_the_map_at_its_first_estimates(base, bo
     )
     run(slam, wander(300, 150))
     state = slam.state_dict()
-    matrix = InformationMatrix()
-    matrix.load_state_dict(
-        {k: state[f"matrix_{k}"] for k in ("counts", "links", "blocks")}
-    )
-    matrix.replace(state["local_slots"], state["local_information"])
+    matrix = matrix_of(state)
     slots = state["slots"]
     first = state["first"].reshape(-1, 2)
     first[state["local_slots"]] = state["local_first"].reshape(-1, 2)

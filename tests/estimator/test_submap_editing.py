@@ -346,17 +346,6 @@ def test_around_the_robot_it_believes_what_the_joined_map_does():
     assert closed > 5
 
 
-def test_looking_around_changes_nothing_in_the_submaps():
-    watched, silent = made(), made()
-    for odometry, readings, ids, _ in laps():
-        for slam in (watched, silent):
-            slam.predict(odometry)
-            slam.update(readings, ids)
-        watched.local_view(5.0)
-    assert_same_bits(watched.belief(), silent.belief())
-    assert_same_bits(watched.local_belief(), silent.local_belief())
-
-
 def wide_laps(steps, seed=0):
     """A long loop past many landmarks, of which few are near."""
     landmarks = np.random.default_rng(1).uniform(-60, 60, (400, 2))

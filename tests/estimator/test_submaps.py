@@ -220,7 +220,7 @@ def test_a_landmark_is_added_once_however_many_submaps_hold_it():
     assert sum(len(o.slots) for o in closed_submaps(slam).summaries) > 3 * len(added)
 
 
-def test_asking_for_the_belief_leaves_no_trace():
+def test_asking_for_the_belief_or_a_view_leaves_no_trace():
     asked, silent = made(), made()
     for odometry, readings, ids, _ in laps():
         for slam in (asked, silent):
@@ -228,6 +228,7 @@ def test_asking_for_the_belief_leaves_no_trace():
             slam.update(readings, ids)
         asked.belief()
         asked.local_belief()
+        asked.local_view(5.0)
     assert_same_bits(asked.belief(), silent.belief())
     assert_same_bits(asked.local_belief(), silent.local_belief())
 
