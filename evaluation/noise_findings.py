@@ -11,8 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2, norm
-from scipy.stats import t as student
+from scipy.special import chdtr, chdtrc, ndtr, stdtr
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.bearing_range import wrap_angle
@@ -123,8 +122,8 @@ def _tests(channel: str, total: Array, runs: int) -> Iterator[Finding]:
 
 
 def _size(channel: str, count: float, variance: float) -> Finding:
-    below = chi2.cdf((count - 1) * variance, count - 1)
-    above = chi2.sf((count - 1) * variance, count - 1)
+    below = chdtr(count - 1, (count - 1) * variance)
+    above = chdtrc(count - 1, (count - 1) * variance)
     which = "too small" if variance > 1 else "too large"
     return Finding(
         f"{_NOISE[channel]} {which}",
@@ -138,7 +137,7 @@ def _size(channel: str, count: float, variance: float) -> Finding:
 def _bias(channel: str, found: dict[str, float], variance: float, runs: int) -> Finding:
     bias = found["slope"] / found["leverage"]
     strength = bias**2 * found["leverage"] / max(variance, 1e-12)
-    p_value = 2 * student.sf(np.sqrt(strength), found["count"] - 1)
+    p_value = 2 * stdtr(found["count"] - 1, -np.sqrt(strength))
     return Finding(
         _BIASES[channel],
         float(p_value),
@@ -174,7 +173,7 @@ def _tails(
         found["fourth"] - 4 * mean * found["third"] + 6 * mean**2 * found["second"]
     ) / count - 3 * mean**4
     kurtosis = fourth / second**2
-    p_value = float(2 * norm.sf(abs(_kurtosis_score(kurtosis, count))))
+    p_value = float(2 * ndtr(-abs(_kurtosis_score(kurtosis, count))))
     return Finding(
         HEAVY_TAILS,
         p_value,

@@ -12,6 +12,7 @@ from ..suggestions import closest
 from .controls import CircleSequence, ControlSequence, command_cycle
 from .field_types import (
     BOUNDED,
+    DIVISIBLE,
     CountOrZero,
     Ends,
     Finite,
@@ -131,10 +132,15 @@ Factors = Annotated[
 ]
 
 
-_Angle = Annotated[Positive, Field(le=2 * math.pi), expect("a number in (0, 2π] [rad]")]
+_Angle = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False, gt=0, le=2 * math.pi),
+    DIVISIBLE,
+    expect("a number in (0, 2π] [rad]"),
+]
 _RangeGrowth = Annotated[
-    NotNegative,
-    Field(le=LARGEST_RANGE_GROWTH),
+    float,
+    Field(strict=True, allow_inf_nan=False, ge=0, le=LARGEST_RANGE_GROWTH),
     expect(f"a number from 0 to {LARGEST_RANGE_GROWTH:g}"),
 ]
 

@@ -4,6 +4,7 @@ import gc
 import os
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -117,6 +118,15 @@ def fuzzer(request, record_property):
     fuzzer = Fuzzer(options("--fuzz-seconds"), options("--fuzz-seed"))
     yield fuzzer
     record_property("inputs", fuzzer.inputs)
+
+
+@pytest.fixture
+def own_registry():
+    """Forget at the end of a test the estimators that it registers."""
+    from slamgym.estimator import registry
+
+    with patch.dict(registry._factories):
+        yield
 
 
 @pytest.fixture

@@ -242,9 +242,10 @@ class KernelCache:
         for folder in (cache_folder(), _private_folder()):
             content = _read(folder / name) if folder else None
             if content:
-                known, result = pickle.loads(content)
-                if known == signature:
-                    return _RESULT._rebuild(target_context, *result)
+                with contextlib.suppress(ImportError, AttributeError):  # a type moved
+                    known, result = pickle.loads(content)
+                    if known == signature:
+                        return _RESULT._rebuild(target_context, *result)
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:

@@ -7,6 +7,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
+from comparison import same
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
@@ -24,20 +25,6 @@ KEYWORDS = {
     "mapping": {"scenario": PLAIN},
     "changes": {"scenario": SCENARIO, "steps": 7, "sensor": {"max_range": 2.5}},
 }
-
-
-def same(value, other):
-    """Assert equality of keys, types, shapes and bits."""
-    if isinstance(value, dict):
-        assert set(value) == set(other)
-        for key in value:
-            same(value[key], other[key])
-    elif isinstance(value, tuple | list):
-        for each, its in zip(value, other, strict=True):
-            same(each, its)
-    else:
-        np.testing.assert_array_equal(value, other)
-        assert np.asarray(value).dtype == np.asarray(other).dtype
 
 
 def drive(env, shape=(2,), steps=9):

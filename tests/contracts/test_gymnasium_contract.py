@@ -5,6 +5,7 @@ import json
 import gymnasium as gym
 import numpy as np
 import pytest
+from comparison import same
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
@@ -16,12 +17,6 @@ from slamgym.sim_configs import action_sequence, list_presets, load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
 HIDDEN = {"scenario": "hidden_identities"}
-
-
-def same(observation, other):
-    assert list(observation) == list(other)
-    for key in observation:
-        np.testing.assert_array_equal(observation[key], other[key])
 
 
 FEW = {"six_landmarks", "hidden_identities", "active_rooms"}

@@ -121,6 +121,30 @@ def test_a_callee_that_moves_to_another_module_is_compiled_anew(kernels):
     assert answer(kernels) == (7, 0)
 
 
+PAIR = """
+    from typing import NamedTuple
+
+    class Pair(NamedTuple):
+        a: float
+        b: float
+"""
+
+
+@pytest.mark.slow
+def test_a_kernel_is_compiled_anew_if_the_type_of_an_argument_moves(kernels):
+    code = """
+        from {} import Pair
+        from caller import answer
+        print(answer(Pair(1.0, 3.0)), sum(answer.stats.cache_hits.values()))
+    """
+    write(kernels, callee=CALLEE.replace("* x", "* x.b"), before=PAIR)
+    assert answer(kernels, code.format("before")) == (7, 0)
+    assert answer(kernels, code.format("before")) == (7, 1)
+    (kernels / "before.py").unlink()
+    write(kernels, after=PAIR)
+    assert answer(kernels, code.format("after")) == (7, 0)
+
+
 @pytest.mark.slow
 def test_equal_kernels_in_two_checkouts_are_compiled_once(kernels, tmp_path):
     assert answer(kernels, run=python) == (7, 0)

@@ -8,6 +8,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from comparison import same
 from gymnasium.vector import AutoresetMode, VectorWrapper
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
@@ -44,19 +45,6 @@ def dummy(count=3, **changes):
     return DummyVecEnv(
         [lambda: gym.make(ID, disable_env_checker=True, **changes)] * count
     )
-
-
-def same(value, other):
-    if isinstance(value, dict):
-        assert set(value) == set(other)
-        for key in value:
-            same(value[key], other[key])
-    elif isinstance(value, list):
-        for each, its in zip(value, other, strict=True):
-            same(each, its)
-    else:
-        np.testing.assert_array_equal(value, other)
-        assert np.asarray(value).dtype == np.asarray(other).dtype
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from worlds import RANDOM_MAP
 
 from slamgym.envs.bearing_range import BearingRangeSensor, LineOfSight, hide_identities
 from slamgym.envs.noise_streams import WorldNoise
@@ -11,13 +12,7 @@ from slamgym.envs.streams import episode_keys
 from slamgym.sim_configs import load_scenario
 
 BASE = load_scenario("six_landmarks").with_changes(
-    landmarks={
-        "layout": "random",
-        "count": 40,
-        "bounds": [-9, -9, 9, 9],
-        "min_distance": 0.2,
-        "seed": 1,
-    }
+    landmarks={**RANDOM_MAP, "count": 40, "min_distance": 0.2, "seed": 1}
 )
 COUNT = BASE.landmarks.count
 POSE = (0.7, -0.4, 2.2)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from numpy_streams import first_key, normals, philox
+from worlds import RANDOM_MAP
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.sim_configs import (
@@ -20,13 +21,6 @@ from slamgym.sim_configs import (
 )
 
 WALLS = [[5.0, -2.0, 5.0, 2.0], [-4.0, 4.0, 9.0, 4.5]]
-RANDOM_MAP = {
-    "layout": "random",
-    "count": 30,
-    "bounds": [-9, -9, 9, 9],
-    "min_distance": 0.1,
-    "seed": None,
-}
 ROAMING = {
     "dt": 0.5,
     "steps": 1000,
@@ -293,20 +287,17 @@ def test_ten_times_the_motion_noise_leaves_the_sensor_noise_unchanged():
     assert np.isnan(gaps).mean() < 0.01
 
 
-def test_the_start_stream_draws_the_truth_around_the_estimate():
-    env = make(start={"pose": [1, 2, 3], "std": [0.1, 0.2, 0.3], "drawn": "truth"})
+@pytest.mark.parametrize("drawn", ["truth", "estimate"])
+def test_the_start_stream_draws_the_truth_or_the_estimate_around_the_other(drawn):
+    env = make(start={"pose": [1, 2, 3], "std": [0.1, 0.2, 0.3], "drawn": drawn})
     _, info = env.reset(seed=4)
-    drawn = [1, 2, 3] + noise_of(4, "start", 3)[0] * [0.1, 0.2, 0.3]
-    np.testing.assert_array_equal(info["pose"], drawn)
-    assert env.start_estimate.tolist() == [1, 2, 3]
-
-
-def test_the_start_stream_draws_the_estimate_around_the_truth():
-    env = make(start={"pose": [1, 2, 3], "std": [0.1, 0.2, 0.3], "drawn": "estimate"})
-    _, info = env.reset(seed=4)
-    drawn = [1, 2, 3] + noise_of(4, "start", 3)[0] * [0.1, 0.2, 0.3]
-    np.testing.assert_array_equal(env.start_estimate, drawn)
-    assert info["pose"].tolist() == [1, 2, 3]
+    random, given = info["pose"], env.start_estimate
+    if drawn == "estimate":
+        random, given = given, random
+    np.testing.assert_array_equal(
+        random, [1, 2, 3] + noise_of(4, "start", 3)[0] * [0.1, 0.2, 0.3]
+    )
+    assert given.tolist() == [1, 2, 3]
 
 
 def test_a_random_map_is_thrown_from_the_map_stream():

@@ -9,6 +9,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import FlattenObservation, RecordEpisodeStatistics
+from worlds import WALLS
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.envs.vector import FlattenBatch
@@ -17,7 +18,6 @@ from slamgym.sim_configs import list_presets, load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
 WORLDS, STEPS, SEED = 5, 200, 3
-WALLS = [[5.0, -2.0, 5.0, 2.0], [-4.0, 4.0, 9.0, 4.5], [1.0, -3.0, 3.0, -3.0]]
 EVERYTHING = {
     "scenario": "hidden_identities",
     "steps": 70,

@@ -48,8 +48,20 @@ def renderer():
     renderer.close()
 
 
+def drawing_of(renderer):
+    return renderer._drawing
+
+
 def scene_of(renderer):
-    return renderer._drawing.scene
+    return drawing_of(renderer).scene
+
+
+def moving_parts(renderer):
+    return scene_of(renderer)._moving
+
+
+def figure_of(renderer):
+    return scene_of(renderer).moving[0].figure
 
 
 def share_of_different_pixels(one, other):
@@ -99,7 +111,7 @@ def test_blitted_frame_is_nearly_that_of_a_full_draw(renderer):
     blitted = renderer.render(moment)
     for artist in scene_of(renderer).moving:
         artist.set_animated(False)
-    canvas = scene_of(renderer)._figure.canvas
+    canvas = figure_of(renderer).canvas
     with canvas.callbacks.blocked(signal="draw_event"):  # draws no moving part twice
         canvas.draw()
     full = np.asarray(canvas.buffer_rgba())[..., :3]
@@ -120,19 +132,19 @@ def test_blitting_is_several_times_faster_than_drawing_everything(renderer):
             times.append(time.thread_time() - start)
         return min(times)
 
-    assert fastest(renderer._drawing.blitted.outdate) > 2.5 * fastest(lambda: None)
+    assert fastest(drawing_of(renderer).blitted.outdate) > 2.5 * fastest(lambda: None)
 
 
 def test_rays_of_exact_readings_end_at_the_landmarks(renderer):
     renderer.render(snapshot())
-    segments = np.array(scene_of(renderer)._moving.rays.get_segments())
+    segments = np.array(moving_parts(renderer).rays.get_segments())
     np.testing.assert_allclose(segments[:, 1], LANDMARKS, atol=1e-12)
     np.testing.assert_allclose(segments[:, 0], np.tile([2.0, 1.0], (5, 1)))
 
 
 def test_belief_is_drawn_as_ellipses_of_three_sigma(renderer):
     renderer.render(snapshot(belief=FixedBelief()))
-    moving = scene_of(renderer)._moving
+    moving = moving_parts(renderer)
     for shown, means, blocks in (
         (moving.pose_ellipse, [FixedBelief.pose[:2]], [np.diag([0.2, 0.1])]),
         (
@@ -150,7 +162,7 @@ def test_belief_is_drawn_as_ellipses_of_three_sigma(renderer):
 def test_belief_disappears_when_it_is_withdrawn(renderer):
     renderer.render(snapshot(belief=FixedBelief()))
     renderer.render(snapshot())
-    moving = scene_of(renderer)._moving
+    moving = moving_parts(renderer)
     assert not moving.map_ellipses.get_visible()
     assert not moving.estimate.get_visible()
 
@@ -161,12 +173,12 @@ def test_belief_without_landmarks_is_drawn(renderer):
         covariance = FixedBelief.pose_covariance
 
     renderer.render(snapshot(belief=Lost()))
-    assert len(scene_of(renderer)._moving.map_ellipses.get_widths()) == 0
+    assert len(moving_parts(renderer).map_ellipses.get_widths()) == 0
 
 
 def test_arrow_points_along_the_heading(renderer):
     renderer.render(snapshot((2.0, 1.0, 2.1)))
-    tip = scene_of(renderer)._moving.arrow.get_xy()[0] - [2.0, 1.0]
+    tip = moving_parts(renderer).arrow.get_xy()[0] - [2.0, 1.0]
     assert np.arctan2(tip[1], tip[0]) == pytest.approx(2.1)
 
 
@@ -174,15 +186,15 @@ def test_collision_is_shown(renderer):
     calm = renderer.render(snapshot())
     hit = renderer.render(snapshot(collision=True))
     assert share_of_different_pixels(calm, hit) > 0.001
-    assert scene_of(renderer)._moving.alarm.get_text() == "collision"
-    assert scene_of(renderer)._moving.alarm.get_visible()
+    assert moving_parts(renderer).alarm.get_text() == "collision"
+    assert moving_parts(renderer).alarm.get_visible()
 
 
 def test_field_of_view_is_a_wedge_about_the_heading():
     narrow = SIX.with_changes(sensor={"field_of_view": 1.0, "max_range": 4.0})
     renderer = WorldRenderer(narrow, LANDMARKS, "rgb_array", size_px=200)
     renderer.render(snapshot((2.0, 1.0, 0.5)))
-    outline = scene_of(renderer)._moving.view.get_xy() - [2.0, 1.0]
+    outline = moving_parts(renderer).view.get_xy() - [2.0, 1.0]
     distance = np.linalg.norm(outline, axis=1)
     bearing = np.arctan2(*outline[distance > 1].T[::-1]) - 0.5
     assert distance.max() == pytest.approx(4.0)
@@ -192,12 +204,12 @@ def test_field_of_view_is_a_wedge_about_the_heading():
 
 def test_unlimited_view_is_not_drawn(renderer):
     renderer.render(snapshot())
-    assert np.isnan(scene_of(renderer)._moving.view.get_xy()).all()
+    assert np.isnan(moving_parts(renderer).view.get_xy()).all()
 
 
 def test_clock_tells_step_and_time(renderer):
     renderer.render(snapshot(step=7, time=21.0))
-    assert scene_of(renderer)._moving.clock.get_text() == "step 7/29   21.0 s"
+    assert moving_parts(renderer).clock.get_text() == "step 7/29   21.0 s"
 
 
 def ink(artist):
@@ -227,7 +239,7 @@ def test_texts_stay_inside_the_figure_and_apart(sensor, walls):
     scenario = SIX.with_changes(sensor=sensor, walls=walls)
     renderer = WorldRenderer(scenario, LANDMARKS, "rgb_array")
     renderer.render(snapshot(belief=FixedBelief(), collision=True))
-    figure = scene_of(renderer)._figure
+    figure = figure_of(renderer)
     legend = figure.legends[0].get_window_extent()
     assert figure.bbox.x0 <= legend.x0
     assert legend.x1 <= figure.bbox.x1
@@ -242,7 +254,7 @@ def test_texts_stay_inside_the_figure_and_apart(sensor, walls):
 
 def test_axes_are_in_metres_of_equal_length(renderer):
     renderer.render(snapshot())
-    axes = scene_of(renderer)._axes
+    axes = figure_of(renderer).axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
     scale = axes.transData.transform([[0, 0], [1, 1]])
     assert np.ptp(scale, axis=0)[0] == pytest.approx(np.ptp(scale, axis=0)[1])
@@ -281,9 +293,9 @@ def test_view_follows_a_robot_that_leaves_it_and_returns_with_the_episode():
 def test_frame_after_leaving_the_view_shows_the_robot(renderer):
     renderer.render(snapshot())
     renderer.render(snapshot((90.0, -20.0, 0.0)))
-    picture = scene_of(renderer)
-    pixel = picture._axes.transData.transform([90.0, -20.0])
-    assert picture._axes.bbox.contains(*pixel)
+    axes = figure_of(renderer).axes[0]
+    pixel = axes.transData.transform([90.0, -20.0])
+    assert axes.bbox.contains(*pixel)
 
 
 def test_world_of_one_point_has_a_view():
@@ -437,7 +449,7 @@ def test_walls_that_hide_nothing_do_not_cut_the_view():
         )
         renderer = WorldRenderer(world, LANDMARKS, "rgb_array", size_px=200)
         renderer.render(snapshot((2.0, 1.0, 0.5)))
-        outline = scene_of(renderer)._moving.view.get_xy()
+        outline = moving_parts(renderer).view.get_xy()
         assert outline[:, 0].max() == pytest.approx(farthest, abs=0.01)
 
 
@@ -462,19 +474,19 @@ def test_clutter_is_marked_apart_from_readings():
     renderer = WorldRenderer(world, LANDMARKS, "rgb_array", size_px=200)
     clutter = np.array([False, True, False, False, True])
     renderer.render(snapshot(clutter=clutter))
-    moving = scene_of(renderer)._moving
+    moving = moving_parts(renderer)
     np.testing.assert_allclose(
         np.transpose(moving.clutter.get_data()), LANDMARKS[clutter]
     )
     np.testing.assert_allclose(
         np.transpose(moving.readings.get_data()), LANDMARKS[~clutter]
     )
-    labels = [t.get_text() for t in scene_of(renderer)._figure.legends[0].get_texts()]
+    labels = [t.get_text() for t in figure_of(renderer).legends[0].get_texts()]
     assert "clutter" in labels
 
 
 def test_the_legend_shows_beliefs_as_ellipses(renderer):
     renderer.render(snapshot(belief=FixedBelief()))
-    legend = scene_of(renderer)._figure.legends[0]
+    legend = figure_of(renderer).legends[0]
     ellipses = [key for key in legend.legend_handles if isinstance(key, Ellipse)]
     assert len(ellipses) == 2

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
+from worlds import RANDOM_MAP, WALLS
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.robot import WallContacts
@@ -14,19 +15,11 @@ from slamgym.envs.vector import WorldBatch
 from slamgym.sim_configs import list_presets, load_scenario
 
 WORLDS, STEPS, SEED = 5, 400, 11
-WALLS = [[5.0, -2.0, 5.0, 2.0], [-4.0, 4.0, 9.0, 4.5], [1.0, -3.0, 3.0, -3.0]]
-MAP = {
-    "layout": "random",
-    "count": 30,
-    "bounds": [-9, -9, 9, 9],
-    "min_distance": 0.1,
-    "seed": None,
-}
 ROAMING = load_scenario("six_landmarks").with_changes(
     dt=0.5,
     steps=60,
     motion={"std": [0.05, 0.03, 0.04]},
-    landmarks=MAP,
+    landmarks=RANDOM_MAP,
     controls={"sequence": "circle", "radius": 3.0, "speed": 0.8},
 )
 HALF_BLIND = {"occlusion": True, "max_range": 8.0, "field_of_view": 3.0, "dropout": 0.2}

@@ -511,16 +511,12 @@ def test_a_module_that_fails_at_its_import_is_named(tmp_path, monkeypatch):
         make_estimator("fails_at_import:Mine", **NOISE)
 
 
+@pytest.mark.usefixtures("own_registry")
 def test_a_registered_estimator_is_made_by_name():
     class Mine(EkfSlam):
         pass
 
     register_estimator("mine_for_this_test", Mine)
-    try:
-        assert isinstance(make_estimator("mine_for_this_test", **NOISE), Mine)
-    finally:
-        from slamgym.estimator import registry
-
-        del registry._factories["mine_for_this_test"]
+    assert isinstance(make_estimator("mine_for_this_test", **NOISE), Mine)
     with pytest.raises(TypeError, match="factory must be callable"):
         register_estimator("nothing", 3)

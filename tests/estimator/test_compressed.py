@@ -8,10 +8,12 @@ from pathlib import Path
 import forked
 import numpy as np
 import pytest
+from comparison import assert_same_bits
 from drives import MEASUREMENT_STD
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from town_drives import TOWN_MOTION_STD, map_all, wander
+from inner_parts import map_of, spied
+from town_drives import TOWN_MOTION_STD, map_all, run, wander
 
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
 from slamgym.estimator.interface import Belief
@@ -70,19 +72,6 @@ def assert_equal_beliefs(one, other):
     assert one.frame == other.frame
     np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=1e-9)
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-10)
-
-
-def assert_same_bits(one, other):
-    assert one.landmark_ids == other.landmark_ids
-    np.testing.assert_array_equal(one.mean, other.mean)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
-
-
-def run(slam, drive):
-    for odometry, readings, ids in drive:
-        slam.predict(odometry)
-        slam.update(readings, ids)
-    return slam
 
 
 def follow_both(
@@ -255,6 +244,17 @@ def test_a_merge_is_that_of_the_full_filter(base, jumping):
     assert_equal_beliefs(slam.belief(), full.belief())
 
 
+def test_landmarks_added_after_a_removal_have_places_of_their_own():
+    slam, full = CompressedEkfSlam(*NOISE), EkfSlam(*NOISE)
+    readings = np.column_stack([np.linspace(-1, 1, 6), np.full(6, 4.0)])
+    for each in (slam, full):
+        each.update(readings[:3], [0, 1, 2])
+        each.remove([1])
+        each.update(readings[3:], [3, 4, 5])  # the first of these in the place of 1
+    assert sorted(slam.state_dict()["slots"]) == [0, 1, 2, 3, 4]
+    assert_equal_beliefs(slam.belief(), full.belief())
+
+
 def test_a_landmark_removed_and_seen_again_is_a_new_one():
     slam = run(CompressedEkfSlam(*NOISE), wander(200, 150))
     first, last = slam.landmark_ids[0], slam.local_ids[-1]
@@ -341,20 +341,19 @@ def test_a_state_is_shared_with_nobody():
 @pytest.mark.parametrize("jumping", [False, True])
 def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
     count, seen = 400, 10
-    apply, done = DeferredCovariance._apply, []
+    done = []
 
-    def counted(self, k):
+    def count_numbers(self, k):
         done[-1] += len(self._pending[0].signs) * self._blocks[k].size
-        apply(self, k)
 
     slam = map_all(CompressedEkfSlam(*NOISE), count)
-    monkeypatch.setattr(DeferredCovariance, "_apply", counted)
+    spied(monkeypatch, DeferredCovariance, "_apply", count_numbers)
     waiting = []
     for odometry, readings, ids in wander(count, 150, seen=seen, jumping=jumping):
         slam.predict(odometry)
         done.append(0)
         slam.update(readings, ids)
-        waiting.append(slam._map.deferred.pending_rank)
+        waiting.append(map_of(slam).deferred.pending_rank)
     full = 2 * seen * (2 * count) ** 2 / 2
     assert max(done) < 2 * full
     assert sum(step > 0 for step in done) > 5
@@ -364,14 +363,13 @@ def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_a_change_of_the_local_map_is_spread_over_steps(base, monkeypatch):
     """After a long phase, no step exchanges more than a quarter of the blocks."""
-    exchange, done = Handover._exchange, []
+    done = []
 
-    def counted(self, stored, blocks):
+    def count_blocks(self, stored, blocks):
         done[-1] += len(blocks)
-        exchange(self, stored, blocks)
 
     slam = map_all(CompressedEkfSlam(*NOISE, base=base, local_size=40), 600)
-    monkeypatch.setattr(Handover, "_exchange", counted)
+    spied(monkeypatch, Handover, "_exchange", count_blocks)
     for odometry, readings, ids in wander(600, 80):
         slam.predict(odometry)
         done.append(0)
@@ -561,8 +559,8 @@ def test_a_filter_that_was_continued_from_a_saved_state_begins_phases_alike():
         near = each.local_ids
         run(each, drive[60:])
         assert each.local_ids != near
-        size = each._map.filter.map.size
-        for array in (each._map.filter.map.mean, each._map.filter.map.covariance):
+        size = map_of(each).filter.map.size
+        for array in (map_of(each).filter.map.mean, map_of(each).filter.map.covariance):
             assert not array[size:].any()
-        assert not each._map.filter.map.covariance[:, size:].any()
+        assert not map_of(each).filter.map.covariance[:, size:].any()
     assert_same_bits(slam.belief(), other.belief())

@@ -148,30 +148,24 @@ def test_no_noise_at_rest_where_asked():
     assert slam.belief().covariance[0, 0] > 0
 
 
-def test_range_noise_grows_with_the_range():
-    slam = make(range_std_per_metre=0.1)
-    slam.update([(0.0, 10.0)], [0])
-    variance = slam.belief().covariance[3, 3]
-    assert variance == pytest.approx((MEASUREMENT_STD[1] + 1.0) ** 2)
+RANGE_AND_BEARING = [  # of 0.1 m per metre, and of 0.3 m across
+    ({"range_std_per_metre": 0.1}, 1, 1.0, (1.0, 0.5)),
+    ({"bearing_std_metres": 0.3}, 0, 10.0, (0.03, 0.06)),
+]
 
 
-def test_range_noise_is_that_of_the_expected_range_or_of_the_one_read():
-    variances = {}
-    for at in ("expected", "reading"):
-        slam = make(range_std_per_metre=0.1, range_noise_at=at)
+@pytest.mark.parametrize(("noise", "row", "lever", "added"), RANGE_AND_BEARING)
+def test_noise_is_that_of_the_expected_range_or_of_the_one_read(
+    noise, row, lever, added
+):
+    for at, more in zip(("expected", "reading"), added, strict=True):
+        slam = make(**noise, range_noise_at=at)
         slam.update([(0.0, 10.0)], [0])
-        prior = slam.belief().covariance[3, 3]
+        prior = slam.belief().covariance[4 - row, 4 - row] / lever**2
+        assert prior == pytest.approx((MEASUREMENT_STD[row] + added[0]) ** 2)
         S = slam.update([(0.0, 5.0)], [0]).innovation_covariance
-        variances[at] = S[1, 1] - prior
-    assert variances["expected"] == pytest.approx((MEASUREMENT_STD[1] + 1.0) ** 2)
-    assert variances["reading"] == pytest.approx((MEASUREMENT_STD[1] + 0.5) ** 2)
-
-
-def test_bearing_noise_shrinks_with_the_range_by_a_part_in_metres():
-    slam = make(bearing_std_metres=0.3)
-    slam.update([(0.0, 10.0)], [0])
-    variance = slam.belief().covariance[4, 4]
-    assert variance == pytest.approx((10 * MEASUREMENT_STD[0] + 0.3) ** 2)
+        variance = S[row, row] - prior
+        assert variance == pytest.approx((MEASUREMENT_STD[row] + more) ** 2)
 
 
 def test_noise_of_positions_has_the_same_size_in_all_directions():
@@ -179,18 +173,6 @@ def test_noise_of_positions_has_the_same_size_in_all_directions():
     slam.update([(0.7, 10.0), (-2.0, 0.5)], [0, 1])
     expected = 0.09 * np.eye(4)
     np.testing.assert_allclose(slam.belief().covariance[3:, 3:], expected, atol=1e-12)
-
-
-def test_bearing_noise_is_that_of_the_expected_range_or_of_the_one_read():
-    variances = {}
-    for at in ("expected", "reading"):
-        slam = make(bearing_std_metres=0.3, range_noise_at=at)
-        slam.update([(0.0, 10.0)], [0])
-        prior = slam.belief().covariance[4, 4] / 10.0**2
-        S = slam.update([(0.0, 5.0)], [0]).innovation_covariance
-        variances[at] = S[0, 0] - prior
-    assert variances["expected"] == pytest.approx((MEASUREMENT_STD[0] + 0.03) ** 2)
-    assert variances["reading"] == pytest.approx((MEASUREMENT_STD[0] + 0.06) ** 2)
 
 
 def test_gate_rejects_an_outlier_and_reports_it():

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from inner_parts import map_of
 
 from slamgym.estimator import list_estimators, make_estimator
+from slamgym.estimator.large_maps.sparse_information.sparse_belief import SparseBelief
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.unicycle_motion import predict_pose
@@ -149,11 +151,11 @@ def test_an_update_that_fails_after_the_local_map_changed_is_taken_back(
 
     with monkeypatch.context() as patch:
         if name == "compressed":
-            patch.setattr(type(slam._map.filter), "update", fail)
+            patch.setattr(type(map_of(slam).filter), "update", fail)
         else:
             patch.setattr(type(slam), "_process", fail)
             patch.setattr(
-                type(slam._belief),
+                SparseBelief,
                 "choose_local_map",
                 lambda self, ids, exact: self.enlarge_elimination(),
             )

@@ -76,6 +76,14 @@ def tell_truth(slam, pose, landmarks=TRUE_MAP):
         slam.observe_truth(pose, landmarks)
 
 
+def drive_all(seed, steps, *slams):
+    for odometry, readings, truth in drive(seed, steps):
+        for slam in slams:
+            tell_truth(slam, truth)
+            slam.predict(odometry)
+            slam.update(readings, IDS)
+
+
 def test_every_registered_estimator_is_in_the_family():
     assert {name for name, *_ in FAMILY.values()} == set(list_estimators())
 
@@ -133,8 +141,8 @@ def test_before_any_correction_the_belief_is_the_ekfs(case):
     start = (0.05, 0.05, 0.0) if certain_heading else START_STD
     settings = {"motion_std": motion, "initial_pose_std": start}
     slam, ekf = make(case, **settings), make("ekf", **settings)
-    pose = np.zeros(3)
-    tell_truth(slam, pose, {})
+    pose, told = np.zeros(3), {}
+    tell_truth(slam, pose, told)
     for k in range(12):
         # The truth told to `ideal` is this noise-free drive, so it linearises there.
         pose = pose + np.array([0.5 * np.cos(pose[2]), 0.5 * np.sin(pose[2]), 0.2])
@@ -142,7 +150,8 @@ def test_before_any_correction_the_belief_is_the_ekfs(case):
         where = pose[:2] + reading[0, 1] * np.array(
             [np.cos(pose[2] + reading[0, 0]), np.sin(pose[2] + reading[0, 0])]
         )
-        tell_truth(slam, pose, {**getattr(slam, "_true_landmarks", {}), k: where})
+        told[k] = where
+        tell_truth(slam, pose, dict(told))
         for each in (slam, ekf):
             each.predict((0.5, 0.2))
             each.update(reading, [k])
@@ -279,10 +288,7 @@ def test_invariant_filter_on_a_single_iteration_is_the_plain_one():
 def test_saved_state_continues_bit_for_bit(case, tmp_path):
     slam, restored = make(case), make(case)
     tell_truth(slam, np.zeros(3))
-    for odometry, readings, truth in drive(3, 15):
-        tell_truth(slam, truth)
-        slam.predict(odometry)
-        slam.update(readings, IDS)
+    drive_all(3, 15, slam)
     np.savez(tmp_path / "state.npz", **slam.state_dict())
     with np.load(tmp_path / "state.npz") as state:
         restored.load_state_dict(state)
@@ -293,21 +299,14 @@ def test_saved_state_continues_bit_for_bit(case, tmp_path):
 def test_reset_equals_a_new_filter(case):
     slam, fresh = make(case), make(case)
     tell_truth(slam, np.ones(3))
-    for odometry, readings, truth in drive(3, 5):
-        tell_truth(slam, truth)
-        slam.predict(odometry)
-        slam.update(readings, IDS)
+    drive_all(3, 5, slam)
     slam.reset((0, 0, 0), (0, 0, 0))
     drive_both(slam, fresh)
 
 
 def drive_both(slam, other):
     """Feed two filters the same, and expect the same to the last bit."""
-    for odometry, readings, truth in drive(9, 15):
-        for each in (slam, other):
-            tell_truth(each, truth)
-            each.predict(odometry)
-            each.update(readings, IDS)
+    drive_all(9, 15, slam, other)
     slam, other = slam.belief(), other.belief()
     np.testing.assert_array_equal(slam.mean, other.mean)
     np.testing.assert_array_equal(slam.covariance, other.covariance)
@@ -376,32 +375,26 @@ def test_a_reading_at_an_expected_range_below_the_minimum_is_skipped(case):
 
 @pytest.mark.parametrize("case", FAMILY)
 @pytest.mark.parametrize("at", ["expected", "reading"])
-def test_range_noise_reaches_every_filter(case, at):
-    small = make(case)
-    large = make(case, range_std_per_metre=0.5, range_noise_at=at)
-    for each in (small, large):
-        tell_truth(each, np.zeros(3))
-        each.update(np.array([(0.3, 6.0), (1.0, 9.0)]), [0, 1])
-        each.predict((0.0, 0.0))
-    scan = np.array([(0.3, 3.0), (1.0, 4.5)])
-    plain = small.update(scan, [0, 1]).innovation_covariance
-    noisy = large.update(scan, [0, 1]).innovation_covariance
-    assert noisy[1, 1] > plain[1, 1] + (2.0 if at == "reading" else 4.0)
-
-
-@pytest.mark.parametrize("case", FAMILY)
-@pytest.mark.parametrize("at", ["expected", "reading"])
-def test_bearing_noise_in_metres_reaches_every_filter(case, at):
+@pytest.mark.parametrize(
+    ("noise", "row", "least"),
+    [
+        ({"range_std_per_metre": 0.5}, 1, {"expected": 4.0, "reading": 2.0}),
+        ({"bearing_std_metres": 3.0}, 0, {"expected": 0.2, "reading": 0.9}),
+    ],
+)
+def test_noise_that_depends_on_the_range_reaches_every_filter(
+    case, at, noise, row, least
+):
     variances = []
-    for metres in (0.0, 3.0):
-        slam = make(case, bearing_std_metres=metres, range_noise_at=at)
+    for options in ({}, noise):
+        slam = make(case, range_noise_at=at, **options)
         tell_truth(slam, np.zeros(3))
         slam.update(np.array([(0.3, 6.0), (1.0, 9.0)]), [0, 1])
         slam.predict((0.0, 0.0))
         scan = np.array([(0.3, 3.0), (1.0, 4.5)])
         S = slam.update(scan, [0, 1]).innovation_covariance
-        variances.append(S[0, 0])
-    assert variances[1] > variances[0] + (0.9 if at == "reading" else 0.2)
+        variances.append(S[row, row])
+    assert variances[1] > variances[0] + least[at]
 
 
 @pytest.mark.parametrize("case", FAMILY)

@@ -28,6 +28,7 @@ from slamgym.experiments.runs.summary import summarise
 MANAGEABLE = list_estimators()
 
 IDS = list(range(6))
+SMALL = {"submap_size": 9, "extent_limit": 2.0}  # many submaps in a short drive
 AROUND = FieldOfView(30.0)
 NEAREST = {"association": "nearest", "backdate": False}
 """The simplest association, of which these tests know every decision."""
@@ -119,13 +120,17 @@ def test_every_managed_filter_keeps_the_contract(name, management):
     assert check_estimator(partial(make_estimator, name, management=management)) == ()
 
 
-@pytest.mark.parametrize("name", MANAGEABLE)
-def test_with_identities_the_default_policy_changes_nothing(name):
-    managed, bare = make(name), make(name, management=None)
-    for odometry, readings, _ in drive(0, 20):
+@pytest.mark.parametrize(
+    ("name", "steps", "options"),
+    [*((name, 20, {}) for name in MANAGEABLE), ("submaps", 40, SMALL)],
+)
+def test_with_identities_the_default_policy_changes_nothing(name, steps, options):
+    managed, bare = (make(name, policy, **options) for policy in (True, None))
+    for odometry, readings, _ in drive(0, steps):
         for slam in (managed, bare):
             slam.predict(odometry)
         assert managed.update(readings, IDS).nis == bare.update(readings, IDS).nis
+    assert options != SMALL or bare.closed_count > 5
     assert same(managed.belief(), bare.belief())
 
 
@@ -410,12 +415,12 @@ def in_band(nees, dof):
     return low < np.mean(nees) < high
 
 
-def merged_runs(name, start_std, runs=100, steps=40):
+def merged_runs(name, start_std, runs=100, steps=40, **options):
     """Drives in which landmark 0 gets another name for the second half."""
     policy = LandmarkPolicy(merge_within=2.0)
     errors, merges = [], 0
     for seed in range(runs):
-        slam = make(name, policy, initial_pose_std=start_std)
+        slam = make(name, policy, initial_pose_std=start_std, **options)
         steps_of_run = list(drive(seed, steps, start_std=start_std))
         for step, (odometry, readings, _) in enumerate(steps_of_run):
             slam.predict(odometry)
@@ -423,15 +428,21 @@ def merged_runs(name, start_std, runs=100, steps=40):
             report = slam.update(readings, [first, *IDS[1:]])
             merges += len(report.merged_ids)
         errors.append(state_nees(slam.belief(), steps_of_run[-1][2], SIX))
-    return np.array(errors), merges / runs
+    return np.array(errors), merges / runs, slam
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "start_std"), [("ekf", (0, 0, 0)), ("invariant", (0.1, 0.1, 0.1))]
+    ("name", "start_std", "options"),
+    [
+        ("ekf", (0, 0, 0), {}),
+        ("invariant", (0.1, 0.1, 0.1), {}),
+        ("submaps", (0, 0, 0), {"runs": 20, **SMALL}),
+    ],
 )
-def test_merging_true_duplicates_keeps_the_filter_consistent(name, start_std):
-    nees, merges = merged_runs(name, start_std)
+def test_merging_true_duplicates_keeps_the_filter_consistent(name, start_std, options):
+    nees, merges, slam = merged_runs(name, start_std, **options)
+    assert name != "submaps" or slam.filter.closed_count > 7
     assert merges > 0.95
     assert in_band(nees, 15)
 
@@ -747,23 +758,10 @@ def test_the_replay_sees_the_same_with_and_without_a_door_to_parts():
 # --- a filter that joins its map only when it is asked ---
 
 
-SMALL = {"submap_size": 9, "extent_limit": 2.0}  # many submaps in a short drive
-
-
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_managed_submaps_keep_the_contract_also_when_they_are_closed(base):
     options = {"base": base, "management": TIDY, **SMALL}
     assert check_estimator(partial(make_estimator, "submaps", **options)) == ()
-
-
-def test_with_identities_the_default_policy_changes_nothing_in_closed_submaps():
-    managed, bare = (make("submaps", m, **SMALL) for m in (True, None))
-    for odometry, readings, _ in drive(0, 40):
-        for slam in (managed, bare):
-            slam.predict(odometry)
-        assert managed.update(readings, IDS).nis == bare.update(readings, IDS).nis
-    assert bare.closed_count > 5
-    assert same(managed.belief(), bare.belief())
 
 
 @pytest.mark.slow
@@ -816,24 +814,6 @@ def test_a_saved_run_in_submaps_goes_on_bit_for_bit(tmp_path, folder):
     if not folder:
         final = second.state_dict()
         assert all(np.array_equal(v, final[k]) for k, v in whole.state_dict().items())
-
-
-@pytest.mark.slow
-def test_merging_true_duplicates_keeps_submaps_consistent():
-    """Landmark 0 gets another name halfway, after submaps were closed."""
-    errors, merges, runs, steps = [], 0, 20, 40
-    for seed in range(runs):
-        slam = make("submaps", LandmarkPolicy(merge_within=2.0), **SMALL)
-        steps_of_run = list(drive(seed, steps))
-        for step, (odometry, readings, _) in enumerate(steps_of_run):
-            slam.predict(odometry)
-            first = 0 if step < steps // 2 else 6
-            report = slam.update(readings, [first, *IDS[1:]])
-            merges += len(report.merged_ids)
-        errors.append(state_nees(slam.belief(), steps_of_run[-1][2], SIX))
-    assert slam.filter.closed_count > 7
-    assert merges / runs > 0.95
-    assert in_band(np.array(errors), 15)
 
 
 @pytest.mark.slow

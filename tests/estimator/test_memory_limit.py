@@ -5,6 +5,7 @@ import re
 import numpy as np
 import psutil
 import pytest
+from comparison import assert_same_bits
 from town_drives import TOWN_MOTION_STD, map_all, town, wander
 
 from slamgym.estimator import EkfSlam, IteratedEkfSlam, SubmapSlam
@@ -45,12 +46,6 @@ def scans(count):
         yield readings[first : first + 50], range(1000 + first, 1050 + first)
 
 
-def assert_same(one, other):
-    assert one.landmark_ids == other.landmark_ids
-    np.testing.assert_array_equal(one.mean, other.mean)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
-
-
 def grow_until_refused(slam, count):
     """Return how many scans a filter took, and what it said of the next one."""
     for taken, (readings, ids) in enumerate(scans(count)):
@@ -72,12 +67,12 @@ def test_a_map_beyond_memory_is_refused_and_the_filter_goes_on(name, leave):
     leave(np.inf)
     for readings, ids in list(scans(2000))[:taken]:
         untroubled.update(readings, ids)
-    assert_same(refused.belief(), untroubled.belief())
+    assert_same_bits(refused.belief(), untroubled.belief())
     for odometry, readings, ids in wander(200, 5):
         for each in (refused, untroubled):
             each.predict(odometry)
             each.update(readings, ids)
-    assert_same(refused.belief(), untroubled.belief())
+    assert_same_bits(refused.belief(), untroubled.belief())
 
 
 def test_a_full_filter_takes_room_for_what_fits_and_no_more(leave):
@@ -130,12 +125,20 @@ def test_a_belief_that_memory_does_not_hold_is_refused(leave):
     assert slam.belief([1, 2]).landmark_ids == (1, 2)
 
 
+@pytest.fixture
+def _system(tmp_path, monkeypatch):
+    """Read what a folder tells of the machine and its container."""
+    monkeypatch.setattr(psutil, "PROCFS_PATH", str(tmp_path))
+    monkeypatch.setattr(memory_limit, "_CONTAINER", tmp_path)
+
+
+@pytest.mark.usefixtures("_system")
 @pytest.mark.parametrize(
     ("limit", "current", "expected"),
     [("max", "9", 4096e3), ("3000000", "2500000", 900e3), (None, None, 4096e3)],
 )
 def test_what_is_available_is_that_of_machine_and_container(
-    limit, current, expected, tmp_path, monkeypatch
+    limit, current, expected, tmp_path
 ):
     sizes = {"MemTotal": 9000, "MemFree": 1000, "MemAvailable": 4000}
     others = ("Buffers", "Cached", "Shmem", "Active", "Inactive", "Slab")
@@ -146,14 +149,11 @@ def test_what_is_available_is_that_of_machine_and_container(
         (tmp_path / "memory.max").write_text(f"{limit}\n")
         (tmp_path / "memory.current").write_text(f"{current}\n")
         (tmp_path / "memory.stat").write_text("anon 2100000\nfile 400000\n")
-    monkeypatch.setattr(psutil, "PROCFS_PATH", str(tmp_path))
-    monkeypatch.setattr(memory_limit, "_CONTAINER", tmp_path)
     assert memory_limit.available_memory() == expected
 
 
-def test_where_the_system_does_not_tell_nothing_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(psutil, "PROCFS_PATH", str(tmp_path))
-    monkeypatch.setattr(memory_limit, "_CONTAINER", tmp_path)
+@pytest.mark.usefixtures("_system")
+def test_where_the_system_does_not_tell_nothing_is_refused():
     assert memory_limit.available_memory() == np.inf
     memory_limit.refuse_beyond_memory("a map", 1e15, "take less")
 

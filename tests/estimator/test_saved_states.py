@@ -6,6 +6,7 @@ import pickle
 import forked
 import numpy as np
 import pytest
+from comparison import digest
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator import list_estimators, make_estimator
@@ -67,13 +68,6 @@ def driven(name, managed):
     for k in range(5):
         step(slam, k)
     return slam
-
-
-def digest(slam):
-    return {
-        key: (str(np.asarray(value).dtype), np.asarray(value).tolist())
-        for key, value in slam.state_dict().items()
-    }
 
 
 def broken(value):

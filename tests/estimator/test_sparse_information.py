@@ -5,9 +5,10 @@ from functools import partial
 import forked
 import numpy as np
 import pytest
+from comparison import assert_same_bits
 from dense_ekf import DenseEkf
 from drives import MEASUREMENT_STD
-from town_drives import map_all, wander
+from town_drives import map_all, run, wander
 
 from slamgym.estimator import (
     EkfSlam,
@@ -44,11 +45,14 @@ MOTION_STD = (0.02, 0.01, 0.01)
 NOISE = (MOTION_STD, MEASUREMENT_STD)
 
 
-def run(slam, drive):
-    for odometry, readings, ids in drive:
-        slam.predict(odometry)
-        slam.update(readings, ids)
-    return slam
+def matrix_of(state):
+    """Return the information matrix of a saved state, its local part filled in."""
+    matrix = InformationMatrix()
+    matrix.load_state_dict(
+        {k: state[f"matrix_{k}"] for k in ("counts", "links", "blocks")}
+    )
+    matrix.replace(state["local_slots"], state["local_information"])
+    return matrix
 
 
 def exact_circle(laps, *, count=24, seen=6, start_std=(0.1, 0.1, 0.05)):
@@ -62,12 +66,6 @@ def exact_circle(laps, *, count=24, seen=6, start_std=(0.1, 0.1, 0.05)):
         pose = predict_pose(pose, odometry).pose
         near = np.argsort(((landmarks - pose[:2]) ** 2).sum(axis=1))[:seen]
         yield odometry, predict_measurement(pose, landmarks[near]).measurement, near
-
-
-def assert_same_bits(one, other):
-    assert one.landmark_ids == other.landmark_ids
-    np.testing.assert_array_equal(one.mean, other.mean)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
 @pytest.mark.parametrize(
@@ -292,11 +290,7 @@ def test_marginals_are_blocks_of_the_dense_inverse():
         part.covariance, whole.covariance[np.ix_(columns, columns)], atol=1e-12
     )
     state = slam.state_dict()  # the same from the matrices themselves
-    matrix = InformationMatrix()
-    matrix.load_state_dict(
-        {k: state[f"matrix_{k}"] for k in ("counts", "links", "blocks")}
-    )
-    matrix.replace(state["local_slots"], state["local_information"])
+    matrix = matrix_of(state)
     slots = np.array(
         [
             dict(zip(state["landmark_ids"], state["slots"], strict=True))[i]
@@ -620,11 +614,7 @@ def test_readings_are_blind_to_a_turn_of_the_map_at_its_first_estimates(base, bo
     )
     run(slam, wander(300, 150))
     state = slam.state_dict()
-    matrix = InformationMatrix()
-    matrix.load_state_dict(
-        {k: state[f"matrix_{k}"] for k in ("counts", "links", "blocks")}
-    )
-    matrix.replace(state["local_slots"], state["local_information"])
+    matrix = matrix_of(state)
     slots = state["slots"]
     first = state["first"].reshape(-1, 2)
     first[state["local_slots"]] = state["local_first"].reshape(-1, 2)

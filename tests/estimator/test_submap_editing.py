@@ -3,6 +3,14 @@
 import forked
 import numpy as np
 import pytest
+from inner_parts import (
+    cached_submaps,
+    closed_submaps,
+    graph_of,
+    neighbourhood_of,
+    present_submap,
+    spied,
+)
 from scipy.stats import chi2
 from test_submaps import (
     LANDMARKS,
@@ -48,11 +56,13 @@ def part_of(belief, ids):
 
 def holders(slam):
     """Which submaps hold each landmark, the present one being the last."""
-    slots = [set(o.slots.tolist()) for o in slam._graph.closed.summaries]
-    slots.append(set(slam._graph.index.slots_of(slam._active.names).tolist()))
+    slots = [set(o.slots.tolist()) for o in closed_submaps(slam).summaries]
+    slots.append(
+        set(graph_of(slam).index.slots_of(present_submap(slam).names).tolist())
+    )
     return {
         i: [k for k, held in enumerate(slots) if slot in held]
-        for i, slot in slam._graph.index.items()
+        for i, slot in graph_of(slam).index.items()
     }
 
 
@@ -112,10 +122,10 @@ def test_a_removed_landmark_goes_on_to_tie_submaps_together(base):
 def test_what_only_the_present_submap_holds_makes_room():
     slam = run(made(submap_size=20), laps(12))
     alone = list(slam.landmark_ids[:3])
-    before = len(slam._active)
+    before = len(present_submap(slam))
     slam.remove(alone)
     assert alone
-    assert len(slam._active) == before - len(alone)
+    assert len(present_submap(slam)) == before - len(alone)
 
 
 def test_a_removed_landmark_that_is_seen_again_is_a_new_one():
@@ -337,17 +347,6 @@ def test_around_the_robot_it_believes_what_the_joined_map_does():
     assert closed > 5
 
 
-def test_looking_around_changes_nothing_in_the_submaps():
-    watched, silent = made(), made()
-    for odometry, readings, ids, _ in laps():
-        for slam in (watched, silent):
-            slam.predict(odometry)
-            slam.update(readings, ids)
-        watched.local_view(5.0)
-    assert_same_bits(watched.belief(), silent.belief())
-    assert_same_bits(watched.local_belief(), silent.local_belief())
-
-
 def wide_laps(steps, seed=0):
     """A long loop past many landmarks, of which few are near."""
     landmarks = np.random.default_rng(1).uniform(-60, 60, (400, 2))
@@ -419,13 +418,8 @@ def assert_as_joined(slam, tolerance):
 
 def surveys_of(slam):
     """Return a list that grows with every look at the joined map, by its reach."""
-    survey, reaches = slam._neighbourhood._joined_region, []
-
-    def counted(reach):
-        reaches.append(reach)
-        return survey(reach)
-
-    slam._neighbourhood._joined_region = counted
+    reaches, patch = [], pytest.MonkeyPatch()  # of one filter alone, to its end
+    spied(patch, neighbourhood_of(slam), "_joined_region", reaches.append)
     return reaches
 
 
@@ -501,7 +495,10 @@ def test_where_there_are_too_many_it_claims_no_more_than_it_holds(monkeypatch):
     for odometry, readings, ids, _ in wide_laps(120):
         slam.predict(odometry)
         slam.update(readings, ids)
-        held, extent = set(slam.local_view(25.0).ids), slam._neighbourhood._copy.region
+        held, extent = (
+            set(slam.local_view(25.0).ids),
+            neighbourhood_of(slam)._copy.region,
+        )
         whole = slam.belief()
         away = np.hypot(*(whole.landmarks - whole.pose[:2]).T)
         cut += len(held) < len(whole.landmark_ids)
@@ -524,7 +521,7 @@ def test_it_looks_farther_by_how_far_the_map_may_have_drifted():
         slam.update(readings, ids)
         if slam.closed_count > closed:  # the robot is where the present frame begins
             drift = 3 * np.sqrt(np.trace(slam.belief([]).covariance[:2, :2]))
-            _, extent = slam._graph.joined_region(5.0)
+            _, extent = graph_of(slam).joined_region(5.0)
             assert extent.slack == pytest.approx(drift, rel=1e-6)
             assert extent.slack > 0.1
             least = extent.radius - extent.slack
@@ -564,7 +561,7 @@ def test_it_goes_on_where_the_file_of_a_submap_is_lost(tmp_path):
     few = [(u, z[:5], ids[:5], pose) for u, z, ids, pose in drive]
     run(slam, few[:60])
     slam.local_view(8.0)
-    slam._graph.closed.store._cache.clear()
+    cached_submaps(slam).clear()
     (tmp_path / "run" / "submap_000001.npy").unlink()
     closed = slam.closed_count
     run(slam, few[60:])
@@ -630,13 +627,14 @@ def test_an_edited_run_continues_bit_for_bit(tmp_path, base, on_disk, cut):
     other = made(**options, submap_size=9)
     with np.load(tmp_path / "state.npz") as state:
         other.load_state_dict(state)
-    assert other._neighbourhood._reaches == slam._neighbourhood._reaches
-    assert max(other._neighbourhood._reaches) > 0
+    reaches, same = (neighbourhood_of(each)._reaches for each in (slam, other))
+    assert reaches == same
+    assert max(reaches) > 0
     assert_same_bits(slam.belief(), other.belief())
     edited_run(slam, drive, start=cut)
     edited_run(other, drive, start=cut)
     assert slam.closed_count == other.closed_count > 4
-    assert slam._graph.closed.renamed
+    assert closed_submaps(slam).renamed
     assert states_agree(slam, other)
     assert_same_bits(slam.belief(), other.belief())
     assert_same_bits(

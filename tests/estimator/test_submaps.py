@@ -3,10 +3,13 @@
 import forked
 import numpy as np
 import pytest
+from comparison import assert_same_bits
+from inner_parts import cached_submaps, closed_submaps, graph_of, present_submap
 from numeric_jacobian import numeric_jacobian
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.sparse import csc_array
+from town_drives import run
 
 from slamgym.estimator import EkfSlam, check_estimator
 from slamgym.estimator.large_maps.elimination import SubmapElimination, dissect
@@ -50,22 +53,9 @@ def made(scale=1.0, **options):
     return SubmapSlam(scale * MOTION_STD, scale * MEASUREMENT_STD, **options)
 
 
-def run(slam, drive):
-    for odometry, readings, ids, _ in drive:
-        slam.predict(odometry)
-        slam.update(readings, ids)
-    return slam
-
-
 @pytest.fixture(scope="module")
 def driven():
     return run(made(), laps())
-
-
-def assert_same_bits(one, other):
-    assert one.landmark_ids == other.landmark_ids
-    np.testing.assert_array_equal(one.mean, other.mean)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
 @pytest.mark.parametrize("base", BASES)
@@ -119,7 +109,7 @@ def dense_join(slam):
 
     For a base filter whose error is additive; every submap is closed.
     """
-    submaps = [slam._graph.closed.store.load(k) for k in range(slam.closed_count)]
+    submaps = [closed_submaps(slam).store.load(k) for k in range(slam.closed_count)]
     count, known = len(submaps), len(slam.landmark_ids)
     roots = [np.linalg.cholesky(np.linalg.inv(s.covariance)).T for s in submaps]
 
@@ -136,7 +126,7 @@ def dense_join(slam):
     belief = slam.belief()
     guess = np.concatenate([np.zeros(3 * count), belief.landmarks.ravel()])
     guess[: 3 * count] = (
-        slam._graph.closed.join(slam._graph.chain.joined).frames[1:].ravel()
+        closed_submaps(slam).join(graph_of(slam).chain.joined).frames[1:].ravel()
     )
     guess += 1e-3 * np.random.default_rng(0).standard_normal(len(guess))
     x = least_squares(errors, guess, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
@@ -150,13 +140,13 @@ def test_the_joined_map_is_the_dense_least_squares_solution():
     drive = list(laps(60))
     run(slam, drive)
     if slam.local_ids:
-        slam._graph.close()  # all of them are closed
+        graph_of(slam).close()  # all of them are closed
     mean, covariance = dense_join(slam)
     belief = slam.belief()
     mean[2] = wrap_angle(mean[2])
     std = np.sqrt(np.diag(covariance))
     assert slam.closed_count > 8
-    assert any(np.diff([len(o.slots) for o in slam._graph.closed.summaries]))
+    assert any(np.diff([len(o.slots) for o in closed_submaps(slam).summaries]))
     np.testing.assert_allclose((belief.mean - mean) / std, 0, atol=1e-4)
     scaled = (belief.covariance - covariance) / np.outer(std, std)
     np.testing.assert_allclose(scaled, 0, atol=1e-4)
@@ -199,7 +189,7 @@ def test_a_part_of_the_belief_is_that_part_of_the_whole(driven):
 def test_the_frame_of_the_present_submap_is_the_chain_of_the_others():
     std = np.array([0.1, 0.2, 0.05])
     slam = run(made(base="ekf", initial_pose_std=std), laps(50))
-    submaps = [slam._graph.closed.store.load(k) for k in range(slam.closed_count)]
+    submaps = [closed_submaps(slam).store.load(k) for k in range(slam.closed_count)]
 
     def end(parts):
         pose = parts[:3]
@@ -209,7 +199,7 @@ def test_the_frame_of_the_present_submap_is_the_chain_of_the_others():
             pose = pose + turn @ step
         return pose
 
-    present = slam._active.filter.belief()
+    present = present_submap(slam).filter.belief()
     parts = [START, *(submap.mean[:3] for submap in submaps), present.pose]
     noise = [np.diag(std**2), *(submap.covariance[:3, :3] for submap in submaps)]
     G = numeric_jacobian(end, np.concatenate(parts))
@@ -227,10 +217,10 @@ def test_a_landmark_is_added_once_however_many_submaps_hold_it():
         slam.predict(odometry)
         added += slam.update(readings, ids).added_ids
     assert tuple(added) == slam.landmark_ids
-    assert sum(len(o.slots) for o in slam._graph.closed.summaries) > 3 * len(added)
+    assert sum(len(o.slots) for o in closed_submaps(slam).summaries) > 3 * len(added)
 
 
-def test_asking_for_the_belief_leaves_no_trace():
+def test_asking_for_the_belief_or_a_view_leaves_no_trace():
     asked, silent = made(), made()
     for odometry, readings, ids, _ in laps():
         for slam in (asked, silent):
@@ -238,6 +228,7 @@ def test_asking_for_the_belief_leaves_no_trace():
             slam.update(readings, ids)
         asked.belief()
         asked.local_belief()
+        asked.local_view(5.0)
     assert_same_bits(asked.belief(), silent.belief())
     assert_same_bits(asked.local_belief(), silent.local_belief())
 
@@ -271,14 +262,14 @@ def test_a_submap_uses_nothing_of_what_came_before_it():
     assert one.closed_count == other.closed_count > 3
     for k in range(1, one.closed_count):
         for part, same in zip(
-            one._graph.closed.store.load(k),
-            other._graph.closed.store.load(k),
+            closed_submaps(one).store.load(k),
+            closed_submaps(other).store.load(k),
             strict=True,
         ):
             if part.dtype != np.int64:
                 np.testing.assert_array_equal(part, same)
     assert not np.array_equal(
-        one._graph.closed.store.load(0).mean, other._graph.closed.store.load(0).mean
+        closed_submaps(one).store.load(0).mean, closed_submaps(other).store.load(0).mean
     )
 
 
@@ -450,7 +441,7 @@ def test_submaps_on_disk_are_those_in_memory_and_few_are_cache(tmp_path):
     slam = run(made(folder=tmp_path / "run", submap_size=5), fewer(drive))
     other = run(made(submap_size=5), fewer(drive))
     assert slam.closed_count > CACHE_SIZE + 3
-    assert len(slam._graph.closed.store._cache) == CACHE_SIZE
+    assert len(cached_submaps(slam)) == CACHE_SIZE
     assert_same_bits(slam.belief(), other.belief())
     assert slam.nbytes < other.nbytes
     assert len(list((tmp_path / "run").glob("submap_*.npy"))) == slam.closed_count

@@ -14,7 +14,7 @@ import jobs_to_kill
 import matplotlib as mpl
 import pytest
 
-from slamgym.envs.rendering.scene import _title
+from slamgym.envs.rendering.scene import add_axes
 from slamgym.estimator import make_estimator
 from slamgym.experiments.command_line.output_folder import (
     STAGING,
@@ -89,7 +89,7 @@ def test_an_import_path_that_is_none_is_refused_by_name(path):
 
 def test_a_name_with_broken_mathematics_is_drawn():
     figure = mpl.figure.Figure()
-    figure.add_artist(_title(0.1, "left", r"$\frac{$"))
+    add_axes(figure, r"$\frac{$")
     figure.canvas.draw()
 
 
@@ -199,7 +199,7 @@ def test_a_full_disk_names_the_folder_and_leaves_what_was_there(tmp_path):
 
 
 @pytest.mark.parametrize("error", [PermissionError("no"), KeyboardInterrupt()])
-def test_a_folder_that_cannot_be_replaced_is_put_back(error, tmp_path, monkeypatch):
+def test_a_file_that_cannot_be_replaced_is_kept(error, tmp_path, monkeypatch):
     out, replace = tmp_path / "out", Path.replace
 
     def write(text):

@@ -19,7 +19,7 @@ import pytest
 import xarray as xr
 
 from slamgym.envs.controllers import make_controller
-from slamgym.estimator import Belief, EkfSlam, make_estimator, registry
+from slamgym.estimator import Belief, EkfSlam, make_estimator
 from slamgym.evaluation import AssociationScores, Gospa
 from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.command_line.monte_carlo import connected
@@ -389,11 +389,6 @@ def test_only_parts_of_one_job_are_merged(tmp_path):
         merge_blocks([tmp_path / "a"], tmp_path / "c")
     with pytest.raises(ValueError, match="first_run must be a multiple"):
         monte_carlo("six_landmarks", "ekf", 20, first_run=5)
-
-
-@pytest.fixture
-def own_registry(monkeypatch):
-    monkeypatch.setattr(registry, "_factories", dict(registry._factories))
 
 
 @pytest.mark.usefixtures("own_registry")

@@ -406,7 +406,7 @@ def test_a_word_has_one_colour_on_terminal_and_page():
     styles = {"good": "green", "bad": "red", "open": "yellow"}
     for word, kind in KINDS.items():
         summary["estimators"]["ekf"]["verdict"] = word
-        cell = monte_carlo_table(summary).columns[2]._cells[0]
+        cell = next(monte_carlo_table(summary).columns[2].cells)
         assert (str(cell), cell.style) == (word, styles[kind])
         page = html_report(typical(), summary)
         assert f'<li class="{kind}"><h3><span>ekf</span>' in page

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import slamgym
 from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import chi2
-from typer.testing import CliRunner
+from slamgym.experiments.runs.own_files import files_below
 
 from slamgym.envs.controllers import OpenLoop
-from slamgym.experiments.command_line.app import main
 from slamgym.experiments.logs import (
     OdometryRow,
     Scan,
@@ -505,23 +505,16 @@ def test_a_filter_off_the_kernels_is_refused():
         fit_noise(log, settings_for(log, estimator="unscented"))
 
 
-def run(*arguments):
-    return CliRunner().invoke(main, ["fit-noise", *map(str, arguments)])
-
-
 @pytest.mark.slow
 def test_the_command_writes_the_noise_into_the_header_and_nothing_else(tmp_path):
     path, out = tmp_path / "log.csv", tmp_path / "out"
     log = a_log(steps=80)
     write_slamlog(log, path)
     before = path.read_text()
-    result = run(path, "--write", "--json", "--out", out)
+    result = slamgym("fit-noise", path, "--write", "--json", "--out", out)
     assert result.exit_code == 0, result.output
     summary = json.loads(result.stdout)
-    assert sorted(file.name for file in out.iterdir()) == [
-        "innovations.png",
-        "summary.json",
-    ]
+    assert sorted(files_below(out)) == ["innovations.png", "summary.json"]
     after = path.read_text()
     changed = set(before.splitlines()) ^ set(after.splitlines())
     keys = {line.split(":")[0].removeprefix("# ") for line in changed}
@@ -559,7 +552,7 @@ def test_a_diverging_fit_is_one_line_of_the_command_and_writes_nothing(tmp_path)
 
     write_slamlog(with_readings(a_log(steps=20), absurd), path)
     before = path.read_bytes()
-    result = run(path, "--out", out, "--write")
+    result = slamgym("fit-noise", path, "--out", out, "--write")
     assert result.exit_code != 0
     assert result.stderr.splitlines()[-1].startswith("slamgym: ")
     assert "the fit diverges: under the most likely noise" in result.stderr
@@ -570,12 +563,12 @@ def test_a_diverging_fit_is_one_line_of_the_command_and_writes_nothing(tmp_path)
 def test_bad_input_of_the_command_is_one_line_and_writes_nothing(tmp_path):
     path, out = tmp_path / "log.csv", tmp_path / "out"
     write_slamlog(SlamLog("empty", events=(OdometryRow(1.0, 1.0, 0.1, 1.0),)), path)
-    result = run(path, "--out", out, "--write")
+    result = slamgym("fit-noise", path, "--out", out, "--write")
     assert result.exit_code == 2
     assert result.stderr.splitlines()[-1].startswith("slamgym: empty holds no scan")
     assert not out.exists()
     text = tmp_path / "data.txt"
     text.write_text("VERTEX2 0 0 0 0\n")
-    refused = run(text, "--write", "--out", out)
+    refused = slamgym("fit-noise", text, "--write", "--out", out)
     assert refused.exit_code == 2
     assert not out.exists()

@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from itertools import cycle
 
 import forked
 import jobs_to_kill
@@ -168,8 +169,10 @@ def message_of(command):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("command", LONG)
+@pytest.mark.parametrize(
+    ("command", "number"),
+    list(zip(LONG, cycle([signal.SIGINT, signal.SIGTERM]), strict=False)),
+)
 def test_a_command_that_computes_ends_in_time(here, city_log, command, number):
     here.with_name("city.csv").symlink_to(city_log)
     child = begin(here, *LONG[command].split())

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import slamgym
 from drives import MEASUREMENT_STD, MOTION_STD, drive
-from typer.testing import CliRunner
 
 from slamgym.estimator.smoother import Drive, SmoothedDrive, smooth
-from slamgym.experiments.command_line.app import main
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog, write_slamlog
 from slamgym.experiments.runs.filter_settings import SMOOTHER, settings_for
 from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
@@ -141,10 +140,6 @@ def here(tmp_path, monkeypatch):
     write_slamlog(a_log(), tmp_path / "little.csv")
     write_slamlog(a_log(scans=False), tmp_path / "blind.csv")
     return tmp_path
-
-
-def slamgym(*arguments):
-    return CliRunner().invoke(main, list(arguments))
 
 
 def test_the_command_writes_a_picture_and_the_numbers(here):

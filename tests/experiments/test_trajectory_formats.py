@@ -1,6 +1,5 @@
 """Every file format gives back what was written, and other programs read it too."""
 
-import hashlib
 import json
 import sys
 import warnings
@@ -10,6 +9,7 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from comparison import tree
 from presets import PRESETS
 
 from slamgym.experiments.logs.importers import read_log
@@ -65,16 +65,6 @@ def shard(layout, folder):
 
 def wrapped(angles):
     return np.mod(angles + np.pi, 2 * np.pi) - np.pi
-
-
-def tree(path):
-    """Digest every file of a shard, by its path below."""
-    files = [path] if path.is_file() else sorted(path.rglob("*"))
-    return {
-        str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest()
-        for file in files
-        if file.is_file()
-    }
 
 
 @pytest.mark.parametrize("preset", WORLDS.values(), ids=WORLDS)

@@ -64,28 +64,20 @@ def before(log, end):
     return replace(log, events=tuple(event for event in log.events if event.t < end))
 
 
-@pytest.fixture(scope="module", params=[("ekf", WHOLE), ("invariant", BEGINNING)])
-def case(request, log):
-    """Return a log, its summary, and what is expected."""
-    name, expected = request.param
-    part = before(log, expected.end)
-    return part, filtered(part, POLICY, name), expected
-
-
 @pytest.mark.slow
-def test_management_keeps_the_map_small_and_the_path_true(case):
-    _, summary, expected = case
+@pytest.mark.parametrize(
+    ("name", "expected"), [("ekf", WHOLE), ("invariant", BEGINNING)]
+)
+def test_management_keeps_the_map_small_and_the_path_true(log, name, expected):
+    part = before(log, expected.end)
+    summary = filtered(part, POLICY, name)
     least, most = expected.landmarks
     assert least <= len(summary["landmarks"]) <= most
     assert summary["map_changes"]["most"] <= most
     assert summary["map_changes"]["removed"] > expected.removed
     assert summary["ate"]["aligned"] < expected.ate
 
-
-@pytest.mark.slow
-def test_every_reading_is_accounted_for(case):
-    part, summary, _ = case
-    counts = summary["readings"]
+    counts = summary["readings"]  # every one is accounted for
     scans = [event for event in part.events if isinstance(event, Scan)]
     fates = ("associated", "added", "tentative", "ambiguous", "skipped", "rejected")
     assert sum(counts[fate] for fate in fates) == sum(

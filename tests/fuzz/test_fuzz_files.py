@@ -78,23 +78,29 @@ def test_damaged_scenario_files_are_refused_or_read(fuzzer, tmp_path):
     fuzzer.check(load, texts, edits, few=40, saved=saved)
 
 
-@pytest.fixture
-def job(tmp_path):
-    """Return the folder of a Monte Carlo, and its job as text."""
-    folder = tmp_path / "job"
-    monte_carlo("six_landmarks", "ekf", 2, block_size=1, out=folder).close()
-    return folder, (folder / "job.json").read_text()
-
-
-def test_damaged_jobs_are_refused_or_go_on(fuzzer, job):
-    folder, text = job
+def check_damaged(fuzzer, file, use, few):
+    """Use a JSON file after edits of its text, or with other values in its tree."""
+    text = file.read_text()
     tree = json.loads(text)
 
-    def use(changes, path, value, by_text):
+    def damage(changes, path, value, by_text):
         changed = edited(text, changes)
         if not by_text:
             changed = json.dumps(replaced(tree, path, value))
-        (folder / "job.json").write_text(changed, encoding="utf-8")
+        file.write_text(changed, encoding="utf-8")
+        use()
+
+    deep = [("line", 0, 0, DEEP), ("drop line", 0, 0, "")]
+    saved = [(deep, [0], 0, True)]
+    some = (edits, paths, strange_values(), st.booleans())
+    fuzzer.check(damage, *some, few=few, saved=saved)
+
+
+def test_damaged_jobs_are_refused_or_go_on(fuzzer, tmp_path):
+    folder = tmp_path / "job"
+    monte_carlo("six_landmarks", "ekf", 2, block_size=1, out=folder).close()
+
+    def use():
         for call in (
             lambda: monte_carlo("six_landmarks", "ekf", 2, block_size=1, out=folder),
             lambda: load_results(folder),
@@ -108,50 +114,20 @@ def test_damaged_jobs_are_refused_or_go_on(fuzzer, job):
                 if hasattr(result, "close"):
                     result.close()
 
-    deep = [("line", 0, 0, DEEP), ("drop line", 0, 0, "")]
-    fuzzer.check(
-        use,
-        edits,
-        paths,
-        strange_values(),
-        st.booleans(),
-        few=6,
-        saved=[(deep, [0], 0, True)],
-    )
-
-
-@pytest.fixture
-def data_set(tmp_path):
-    """Return a folder of trajectories, and its manifest as text."""
-    folder = tmp_path / "data"
-    world = load_scenario("six_landmarks").with_changes(steps=4)
-    generate_trajectories(world, folder, episodes=2, episodes_per_shard=1)
-    return folder, (folder / "manifest.json").read_text()
+    check_damaged(fuzzer, folder / "job.json", use, few=6)
 
 
 @pytest.mark.filterwarnings("ignore:.*is not finished")
-def test_damaged_manifests_are_refused_or_read(fuzzer, data_set):
-    folder, text = data_set
-    tree = json.loads(text)
+def test_damaged_manifests_are_refused_or_read(fuzzer, tmp_path):
+    folder = tmp_path / "data"
+    world = load_scenario("six_landmarks").with_changes(steps=4)
+    generate_trajectories(world, folder, episodes=2, episodes_per_shard=1)
 
-    def use(changes, path, value, by_text):
-        changed = edited(text, changes)
-        if not by_text:
-            changed = json.dumps(replaced(tree, path, value))
-        (folder / "manifest.json").write_text(changed, encoding="utf-8")
+    def use():
         try:
             for trajectory in load_trajectories(folder):
                 assert trajectory.scenario.steps
         except (ValueError, OSError) as error:
             assert str(error)
 
-    deep = [("line", 0, 0, DEEP), ("drop line", 0, 0, "")]
-    fuzzer.check(
-        use,
-        edits,
-        paths,
-        strange_values(),
-        st.booleans(),
-        few=25,
-        saved=[(deep, [0], 0, True)],
-    )
+    check_damaged(fuzzer, folder / "manifest.json", use, few=25)

@@ -4,6 +4,7 @@ import copy
 
 import numpy as np
 import pytest
+from comparison import digest
 from fuzzing import STRANGE, numbers, sane, strange_values
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
@@ -43,14 +44,6 @@ scans = st.lists(
     ),
     max_size=5,
 )
-
-
-def digest(slam):
-    """The whole state, to the bit."""
-    return {
-        key: (str(np.asarray(value).dtype), np.asarray(value).tobytes())
-        for key, value in slam.state_dict().items()
-    }
 
 
 def is_extreme(value):

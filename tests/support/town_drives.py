@@ -48,3 +48,11 @@ def map_all(slam, count):
     for first in range(0, count, 50):
         slam.update(readings[first : first + 50], range(count)[first : first + 50])
     return slam
+
+
+def run(slam, drive):
+    """Feed a filter with (odometry, readings, ids, …) of a drive; return it."""
+    for odometry, readings, ids, *_ in drive:
+        slam.predict(odometry)
+        slam.update(readings, ids)
+    return slam
