@@ -8,6 +8,15 @@ demand.  ``sparse_cholesky`` factorises the sparse matrices of the latter two.  
 folder, the module ``…_slam`` holds the public filter.
 """
 
-from lazy_loader import attach_stub
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+from ...public_names import attach
+
+if TYPE_CHECKING:
+    from .compressed.compressed_slam import CompressedEkfSlam as CompressedEkfSlam
+    from .sparse_information.sparse_information_slam import (
+        SparseInformationSlam as SparseInformationSlam,
+    )
+    from .submaps.submap_slam import SubmapSlam as SubmapSlam
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)

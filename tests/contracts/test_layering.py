@@ -72,7 +72,7 @@ STRANGERS = {
     ("estimator", "sim_configs"),
 }
 EVALUATION_KNOWS = {"models", "support", "interface"}
-MAY_IMPORT = {  # besides the standard library and lazy_loader
+MAY_IMPORT = {  # besides the standard library
     "sim_configs": {"numpy", "pydantic", "pydantic_core"},
     "envs": {"numpy", "scipy", "gymnasium", "pymunk"},
     "estimator": {"numpy", "scipy", "numba", "psutil"},
@@ -149,7 +149,7 @@ def may_import(module):
     room = room_in("", module)
     if room not in MAY_IMPORT:
         return None
-    more = {"lazy_loader"} | set(sys.stdlib_module_names)
+    more = set(sys.stdlib_module_names)
     if module.removeprefix("envs.rendering.") in DRAWING:
         more |= DRAWING_LIBRARIES
     if module.startswith("estimator.peers."):
