@@ -1,4 +1,8 @@
-"""Active SLAM: explore an unknown map until every landmark is known accurately."""
+"""Active SLAM: explore an unknown map until every landmark is known accurately.
+
+`ActiveSlamEnv` is the task in one world, and `ActiveSlamVectorEnv` in many, simulated
+together and with batched filters.
+"""
 
 from __future__ import annotations
 
@@ -254,9 +258,6 @@ class ActiveSlamEnv(LandmarkWorldEnv):
             counts |= {key: float(score[0]) for key, score in scores.items()}
         return {key: row[0] for key, row in rows.items()}, {**info, **counts}
 
-
-# --------------------------------------------------------------------------------------
-# Active SLAM in many worlds, simulated together and with batched filters.
 
 Observations = dict[str, AnyArray]
 

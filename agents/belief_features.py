@@ -253,9 +253,7 @@ def update_batch(
 
 
 # --------------------------------------------------------------------------------------
-# Compiled kernels of `belief_features`: one pass over all worlds.
-#
-# Symbols are those of `belief_features`.
+# The kernels: one pass over all worlds.
 
 Rectangle = tuple[float, float, float, float]
 

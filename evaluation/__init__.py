@@ -1,8 +1,9 @@
 """How good an estimate is: numbers in, verdicts out.
 
-``trajectory_error``, ``nees``, ``association_scores`` and ``gospa`` measure.
-``hypothesis_tests``, ``whiteness`` and ``time_average_tests`` test with known error
-rates.  ``consistency_report`` collects the tests on one filter.
+``trajectory_error``, ``nees`` and ``association_scores`` measure, and ``error_bound``
+computes the least possible error.  ``hypothesis_tests`` tests with known error rates,
+``noise_findings`` tests the noise of a world, and ``diagnosis`` names the cause of an
+inconsistency.  ``consistency_report`` collects the tests on one filter.
 """
 
 from typing import TYPE_CHECKING

@@ -5,6 +5,7 @@
 * :mod:`~slamgym.experiments.figures` draws a run: map, errors, covariance.
 * :mod:`~slamgym.experiments.monte_carlo` tests the consistency of filters in many runs.
 * :mod:`~slamgym.experiments.noise_study` scales each noise, in one run or in many.
+* :mod:`~slamgym.experiments.noise_fitting` fits the noise of logs.
 * :mod:`~slamgym.experiments.trajectories` generates data sets of trajectories.
 * :mod:`~slamgym.experiments.viewers` writes a run as a web page, or for rerun.
 

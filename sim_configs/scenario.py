@@ -1,4 +1,10 @@
-"""The complete description of a simulated world, as one immutable value."""
+"""The complete description of a simulated world, as one immutable value: `Scenario`.
+
+Its tables stand above it: `Faults`, `Motion`, `Sensor`, `Start`, `Robot`, and
+`Randomise`, the ranges from which every episode may draw a world of its own. Noise is
+multiplied by factors that are uniform in their logarithm. All other settings are
+uniform between two ends. The number of landmarks never changes.
+"""
 
 import math
 from collections.abc import Mapping
@@ -34,9 +40,6 @@ from .field_types import (
     expect,
 )
 from .layouts import LandmarkLayout, place_landmarks
-
-# --------------------------------------------------------------------------------------
-# Tables of a scenario: start, robot, motion noise, sensor and faults.
 
 _Degrees = Annotated[
     float,
@@ -121,12 +124,6 @@ class Motion(Part):
             )
         return self
 
-
-# --------------------------------------------------------------------------------------
-# Ranges in a scenario from which every episode draws a world of its own.
-#
-# Noise is multiplied by factors that are uniform in their logarithm. All other settings
-# are uniform between two ends. The number of landmarks never changes.
 
 _Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 

@@ -1,4 +1,7 @@
-"""A Gaussian over robot pose and landmarks, in arrays that grow with the map."""
+"""A Gaussian over robot pose and landmarks, in arrays that grow with the map.
+
+`GaussianMap` adds, removes and merges landmarks, and saves its state.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Update of one belief by one scan, compiled: screen, correct, map new landmarks."""
+"""Update of one belief by one scan, compiled: screen, correct, map new landmarks.
+
+`update_belief` takes in one scan, and `predict` one odometry reading. The functions
+between them are the parts of the update in the order of their use.
+"""
 
 from typing import NamedTuple
 
@@ -147,7 +151,7 @@ def update_belief(
 
 
 # --------------------------------------------------------------------------------------
-# Screening of one scan, compiled: minimum range, chi-square gate, nearness.
+# Screening: minimum range, chi-square gate, nearness.
 
 
 @njit_internal
@@ -263,7 +267,7 @@ def is_too_near(mean: Array, covariance: Array, column: int) -> bool:
 
 
 # --------------------------------------------------------------------------------------
-# One correction of a belief, compiled: linearise, condition, compose; iterated.
+# One correction: linearise, condition, compose; iterated.
 
 
 @njit_inlined
@@ -367,7 +371,7 @@ def copy_covariance(source: Array, target: Array, size: int) -> None:
 
 
 # --------------------------------------------------------------------------------------
-# Linearisation of one reading, compiled: its rows of H and its innovation.
+# Linearisation of one reading.
 #
 # For a reading of the landmark in columns c, c+1 of the state only five columns of H
 # differ from zero: (x, y, θ, c, c+1).  A row of H is stored as these five entries.
@@ -423,7 +427,7 @@ def _project(reference: Array, column: int, H: Array) -> None:
 
 
 # --------------------------------------------------------------------------------------
-# Corrections in the invariant error frame, compiled: of the mean and of P.
+# Corrections in the invariant error frame: of the mean and of P.
 
 
 @njit_internal
@@ -468,10 +472,6 @@ def transport(covariance: Array, rows: Array, size: int) -> None:
         for j in range(i + 1):
             moved = fma(v_i, c[j], covariance[i, j])
             covariance[i, j] = fma(rest, v[j], moved)
-
-
-# --------------------------------------------------------------------------------------
-# Landmark initialisation from one reading, compiled.
 
 
 @njit_internal
@@ -519,7 +519,7 @@ def add_landmark(
 
 
 # --------------------------------------------------------------------------------------
-# Prediction by one odometry reading, compiled; symbols as in the motion model.
+# Prediction; symbols as in the motion model.
 
 
 @jit

@@ -4,8 +4,9 @@
 robot in each step, and defers the update of the rest.  ``sparse_information`` stores a
 sparse information matrix, and limits its links by discarding odometry information.
 ``submaps`` builds independent local maps in frames of their own, and joins them on
-demand.  ``sparse_cholesky`` factorises the sparse matrices of the latter two.  In each
-folder, the module ``…_slam`` holds the public filter.
+demand.  In each folder, the module ``…_slam`` holds the public filter.
+``multifrontal`` factorises the sparse matrices of the latter two, and ``elimination``
+chooses the order in which their unknowns are eliminated.
 """
 
 from typing import TYPE_CHECKING

@@ -1,7 +1,9 @@
 """The batch smoother: all poses and landmarks of a whole drive at once.
 
-``drive`` records the data, ``batch_smoother`` finds the most likely poses and landmarks
-by Levenberg-Marquardt, and ``smoothed_drive`` answers for them and their covariances.
+``drive`` records the data, and ``batch_smoother`` finds the most likely poses and
+landmarks, and answers for them and their covariances.  ``optimiser`` runs
+Levenberg-Marquardt; ``elimination`` solves each of its steps.  ``recorded_slam``
+records the drive of a filter.
 """
 
 from typing import TYPE_CHECKING

@@ -282,9 +282,8 @@ def _change_pose(
 
 
 # --------------------------------------------------------------------------------------
-# Go back over the eliminated poses, forwards in time, compiled.
-#
-# With the step δ_l of the landmarks, in the symbols of :mod:`.elimination`::
+# Go back over the eliminated poses, forwards in time, with the step δ_l of the
+# landmarks::
 #
 #     δ_k = q − U (Uᵀ (Λ q − λ) + W δ_l),    q = G δ_{k−1} + s
 #

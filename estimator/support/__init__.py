@@ -1,4 +1,4 @@
-"""Argument checks, memory limits and compilation, shared by all estimators."""
+"""Argument checks, saved states, memory limits and undo, shared by all estimators."""
 
 from typing import TYPE_CHECKING
 

@@ -31,10 +31,6 @@ __all__ = [
 ]
 
 
-# --------------------------------------------------------------------------------------
-# ``slamgym scenarios`` and ``slamgym estimators``: list worlds and filters.
-
-
 @command
 def scenarios(as_json: options.AsJson = False) -> None:
     """List the scenarios.

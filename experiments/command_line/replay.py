@@ -1,4 +1,4 @@
-"""``slamgym replay``: filter a log, compare with the truth, draw."""
+"""``slamgym replay`` and ``slamgym smooth``: filter or smooth a log, compare, draw."""
 
 from functools import partial
 from pathlib import Path
@@ -105,10 +105,6 @@ def replay(
         )
     note_noise(drive, next(iter(filters.values())), {*stds, *given}, reporter)
     show_run(summary, place, reporter)
-
-
-# --------------------------------------------------------------------------------------
-# ``slamgym smooth``: all poses and landmarks of a log at once, with a picture.
 
 
 @command

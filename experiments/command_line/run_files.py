@@ -1,4 +1,4 @@
-"""Filter a log: the files of the run, and its printed results."""
+"""Filter a log for a command: `filter_and_write` writes and prints a run's results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -226,10 +226,6 @@ def _association(summary: dict[str, Any]) -> tuple[Table | str, ...]:
 def _warnings(summary: dict[str, Any]) -> tuple[Text | str, ...]:
     lines = [Text(f"Warning: {text}", "yellow") for text in summary["warnings"]]
     return (*lines, "") if lines else ()
-
-
-# --------------------------------------------------------------------------------------
-# Compile a filter by its first steps.
 
 
 def warm_up(settings: FilterSettings, reporter: Reporter) -> None:

@@ -1,4 +1,9 @@
-"""Figure of the distances of a run's path and map from ground truth."""
+"""Figures of a run's accuracy: distances from the truth, errors, and covariance.
+
+`truth_figure` draws path and map beside the truth, `comparison_figure` the maps of
+several filters, `errors_figure` errors and innovations, and `covariance_figure` the
+correlations of the state.
+"""
 
 import math
 from collections.abc import Sequence
@@ -199,9 +204,6 @@ def _summary(
     return "  ·  ".join(parts)
 
 
-# --------------------------------------------------------------------------------------
-# Figure of the final maps of several filters side by side.
-
 _COLUMNS = 2
 _LONGEST = 52  # characters of a title
 
@@ -268,9 +270,6 @@ def _common_limits(traces: Sequence[RunTrace], walls: Walls) -> Array:
         ]
     )
 
-
-# --------------------------------------------------------------------------------------
-# Figure of a run's errors and innovations against its covariances.
 
 _ROWS = (("x error [m]", "x"), ("y error [m]", "y"), ("θ error [rad]", "θ"))
 _LOG_FROM = 8.0  # times the band's upper bound: larger NIS needs a logarithmic axis
@@ -391,9 +390,6 @@ def _legend_above(axes: Axes, columns: int) -> None:
         borderaxespad=0.2,
     )
 
-
-# --------------------------------------------------------------------------------------
-# Figure of the covariance of the whole state at the begin and end of a run.
 
 _MOST_LABELS = 30  # rows; larger maps name only some of their landmarks
 _UNDEFINED = "#c9ced4"

@@ -1,7 +1,8 @@
 """Run filters many times over a scenario, and test their consistency.
 
-scenario → simulated runs → filtered runs → run measures → result blocks → results
-→ scores → summary, table, plots, html report
+``runner`` does the whole job: simulated runs → ``filtered_runs`` → ``run_measures``
+→ ``results``.  ``verdict`` and ``summary`` judge the results, and ``figures`` and
+``report`` show them.
 """
 
 from typing import TYPE_CHECKING

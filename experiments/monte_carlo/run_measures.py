@@ -1,6 +1,8 @@
-"""Measure the errors and the consistency of every run of a Monte Carlo.
+"""Measure the errors and the consistency of every run of a Monte Carlo: `measure_runs`.
 
-Each run is measured by itself, so its figures do not depend on the other runs.
+Each run is measured by itself, so its figures do not depend on the other runs. With
+hidden identities, a run is bad if it fails, or if its path error is more than `MARGIN`
+above that of the same filter with known identities on the same readings.
 """
 
 from collections.abc import Mapping
@@ -85,12 +87,6 @@ VARIABLES: dict[str, Variable] = {
     "message": Variable(RUN, "U", "why"),
 }
 
-
-# --------------------------------------------------------------------------------------
-# Measure how well a run associated readings without identity.
-#
-# A run is bad if it fails, or if its path error is more than `MARGIN` above that of the
-# same filter with known identities on the same readings.
 
 COUNTS = AssociationScores._fields
 

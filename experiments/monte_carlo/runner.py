@@ -1,8 +1,9 @@
 """Run several estimators over many runs of a scenario, on the same random numbers.
 
 Run i of a job with seed s is simulated in the world of seed s + i. It depends on
-nothing else, such as the number of runs, estimators or workers. Runs are simulated,
-filtered and measured in blocks; a worker computes one block at a time.
+nothing else, such as the number of runs, estimators or workers. `monte_carlo`
+simulates, filters and measures runs in blocks; a worker computes one block at a time.
+`engage_workers` starts processes, threads, or a cluster.
 """
 
 from __future__ import annotations
@@ -283,9 +284,6 @@ def _span(first_run: int, runs: int, block_size: int) -> Span:
     return Span(first_run, runs)
 
 
-# --------------------------------------------------------------------------------------
-# Engage the workers of a long job: processes, threads, or a cluster.
-
 Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed
 Workers = Callable[[Iterable[Call]], Iterable[Any]]
 
@@ -390,9 +388,6 @@ def _call(call: Call) -> Any:
     function, arguments, options = call
     return function(*arguments, **options)
 
-
-# --------------------------------------------------------------------------------------
-# Write the Python call that reproduces the results of a Monte Carlo.
 
 ASSUMED_FILE = "assumed.toml"
 

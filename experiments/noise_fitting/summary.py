@@ -1,4 +1,4 @@
-"""Evaluate a fitted noise: replay the log before and after, and summarise."""
+"""Evaluate a fitted noise: replay the log before and after, summarise, and draw."""
 
 from __future__ import annotations
 
@@ -117,9 +117,6 @@ def _row(noise: FittedNoise) -> dict[str, Any]:
         key: row[key] if math.isfinite(row[key]) else None for key in ("low", "high")
     }
 
-
-# --------------------------------------------------------------------------------------
-# Figure of innovations before and after a fit of the noise.
 
 BAND = 1.96
 SHOWN = 6.0  # standard deviations; what lies beyond is drawn at the edge

@@ -1,4 +1,7 @@
-"""The files that slamgym wrote to a folder, with the proof that nobody changed them."""
+"""The files that slamgym wrote to a folder, with the proof that nobody changed them.
+
+`locked_folder` lets one process at a time write to a folder.
+"""
 
 import contextlib
 import hashlib
@@ -106,9 +109,6 @@ def set_aside(path: Path, reason: str) -> None:
     path.replace(aside)
     warnings.warn(f"{path} {reason}; it is moved to {aside.name}", stacklevel=2)
 
-
-# --------------------------------------------------------------------------------------
-# Lock a folder, so that one process at a time writes to it.
 
 WRITER = ".slamgym_writer"
 """The lock file; it names the process that writes to the folder."""

@@ -1,6 +1,8 @@
 """Generate data sets of trajectories, written in shards, and read them.
 
-controllers → driven episodes → trajectory → formats → shard folder, manifest → dataset
+``generate`` does the whole job: ``driven_episodes`` → ``trajectory`` → ``formats``
+→ ``manifest``, which also reads the data sets.  ``g2o``, ``parquet`` and
+``minari_dataset`` are formats of their own.
 """
 
 from typing import TYPE_CHECKING

@@ -369,9 +369,6 @@ def _content(shard: Path) -> dict[str, bytes]:
     }
 
 
-# --------------------------------------------------------------------------------------
-# Options of a data set that depend on its format or its scenario.
-
 _MOST_EPISODES = 100
 _MOST_MEMORY = 256e6  # [bytes] of a shard
 

@@ -1,9 +1,9 @@
-"""The manifest of a data set of trajectories, for checks and for reproduction.
+"""A data set of trajectories: its manifest, its folder, and how it is read.
 
 A data set is a folder of shards with ``manifest.json``. The manifest names the job
 (scenario, controller, seed, numbers, format), the versions that determine its bits, and
 every shard with its SHA-256. It holds no date and no path: the same job gives the same
-bytes.
+bytes. `load_trajectories` reads the trajectories one after the other.
 """
 
 import contextlib
@@ -352,9 +352,6 @@ def _remove(path: Path) -> None:
         time.sleep(_BETWEEN)
     shutil.rmtree(path)
 
-
-# --------------------------------------------------------------------------------------
-# Read generated trajectories one after the other.
 
 _DAMAGED = ("raise", "skip")
 

@@ -7,7 +7,6 @@ A package lists its public names once, as imports below ``if TYPE_CHECKING:`` in
 import ast
 import sys
 import warnings
-from collections.abc import Callable
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -19,7 +18,7 @@ from typing import Any
 import lazy_loader
 
 
-def attach(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], Any]:
+def attach(package: str) -> Any:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
 
     Parameters
@@ -30,7 +29,7 @@ def attach(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]],
     names: dict[str, list[str]] = {}
     for name, module in listed(Path(str(sys.modules[package].__file__))).items():
         names.setdefault(module, []).append(name)
-    return lazy_loader.attach(package, names.pop("", ()), names)  # type: ignore[no-any-return]
+    return lazy_loader.attach(package, names.pop("", ()), names)
 
 
 def listed(file: Path) -> dict[str, str]:

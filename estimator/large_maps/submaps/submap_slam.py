@@ -1,4 +1,7 @@
-"""SLAM in submaps: a map of any size as many small ones, joined on demand."""
+"""SLAM in submaps: a map of any size as many small ones, joined on demand.
+
+`SubmapSlam` is the public filter. `SubmapQueries` is the part of it that only reads.
+"""
 
 from __future__ import annotations
 
