@@ -118,7 +118,7 @@ def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> N
         The key of each row.
     steps : int64 ndarray, shape (K,)
     stream : int
-        Its number, see `episodes`.
+        Its number, as `MOTION`.
     out : ndarray, shape (H, K, W)
         Contiguous. Row k of part h takes the numbers h W to (h + 1) W of its step.
     """

@@ -1,7 +1,7 @@
 """Landmark-SLAM estimators: numbers in, beliefs out.
 
-``predict`` → ``update`` → ``belief``.  Every filter stands
-behind the interface of ``interface``, and ``registry`` makes them by name.
+``predict`` → ``update`` → ``belief``.  ``interface`` defines these calls, and
+``registry`` makes estimators by name.
 """
 
 from typing import TYPE_CHECKING

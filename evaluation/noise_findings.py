@@ -76,7 +76,7 @@ def noise_findings(sums: Array) -> list[Finding]:
     Parameters
     ----------
     sums : ndarray, shape (B, 5, 7)
-        Of :func:`.noise_findings.noise_sums`.
+        Of :func:`noise_sums`.
 
     References
     ----------

@@ -92,8 +92,7 @@ def update_belief(
         reading's landmark in the map.  On return its other rows are filled, and SLOT
         holds the places of added landmarks, too.
     rows, before, prior
-        A :class:`.kalman_gain.Workspace`.  On return :func:`.scan_update.record` reads
-        the rows.
+        A :class:`.kalman_gain.Workspace`.  On return :func:`copy_scan` reads the rows.
     rule_values
         The filter's rules, as :func:`.kalman_gain.as_rules` reads them.
 

@@ -14,7 +14,7 @@ q = G δ_{k−1} + s, with noise w ~ N(0, I), is eliminated by minimising over w
 
 and pose k by writing q in terms of pose k − 1.  E is never inverted: directions
 without noise, and a start that is known, are exact.  What remains, C and η, is the
-Schur complement of the landmarks.  :mod:`.elimination` goes back, forwards in time.
+Schur complement of the landmarks.  :func:`substitute` goes back, forwards in time.
 This is the backward information filter of a two-pass smoother [1]_ with the landmarks
 as parameters.
 

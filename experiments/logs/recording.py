@@ -51,7 +51,7 @@ def record_episode(
     SlamLog
         The log; it starts at the initial pose of filters. The header holds the noise as
         ``motion_std``, ``measurement_std`` and ``start_sigma``, where
-        :func:`~slamgym.experiments.runs.settings_for` finds it. If the scenario hides
+        :func:`~slamgym.experiments.settings_for` finds it. If the scenario hides
         identities, scans have true ids instead of ids.
 
     Examples

@@ -145,7 +145,7 @@ def monte_carlo(
         Number of runs in a block.
     first_run : int
         Leave the runs below it to other machines; a multiple of ``block_size``. See
-        :func:`~slamgym.experiments.monte_carlo.merge_blocks`.
+        :func:`~slamgym.experiments.merge_blocks`.
     fresh : bool
         Whether to remove what an earlier job left in ``out``.
     resolution : float
