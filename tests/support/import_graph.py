@@ -100,6 +100,19 @@ def libraries(module):
     return found
 
 
+def code_lines(module):
+    """Return how many lines are neither blank nor comment nor docstring."""
+    text = FILES[module].read_text()
+    docstrings = {
+        line
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        for line in range(node.lineno, node.end_lineno + 1)
+    }
+    lines = enumerate(map(str.strip, text.splitlines()), 1)
+    return sum(bool(x) and x[0] != "#" and n not in docstrings for n, x in lines)
+
+
 @cache
 def graph():
     """Return the modules that each module imports."""
