@@ -8,32 +8,23 @@ subclasses differ in where they linearise and in their error frame: `InvariantEk
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, partial
-from itertools import compress
 from math import inf, log1p
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array, IntArray
+from ...arrays import Array
 from ..interface import Belief, MapView, UpdateReport, describe_filter
 from ..kernels.kalman_gain import (
-    ADDED,
     ADDITIVE,
     AT_ESTIMATE,
     AT_REFERENCE,
-    GATED,
     INVARIANT,
-    NEAR,
-    OUTCOME,
     PROJECTED,
-    SKIPPED,
-    SLOT,
-    USED,
     Rules,
 )
-from ..kernels.scan_update import DONE, NOT_USABLE, ScanRecord, predict, update_belief
+from ..kernels.scan_update import DONE, NOT_USABLE, predict, update_belief
 from ..models.rigid_motion import ErrorFrame
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
@@ -327,28 +318,21 @@ class EkfSlam(MapFilter):
             before.
         """
         readings = argument_checks.scan(measurements)
-        count = len(readings)
+        count, workspace = len(readings), self._workspace
         ids = argument_checks.given_identities(landmark_ids, count, self)
-        slots = self.map.slots_of(ids)
-        new, size = slots.count(-1), self.map.size
-        self._make_room(count, new)
-        ledger = self._workspace.ledger
-        ledger[SLOT, :count] = slots
-        if new:
-            self.map.expect(ids, ledger[SLOT, :count])
+        size = workspace.place(self.map, ids)
         status, used, nis = self._update_belief(  # the only change of the belief
             *self.map.arrays,
             size,
             readings,
             count,
-            ledger,
-            *self._workspace.arrays,
+            workspace.ledger,
+            *workspace.arrays,
             self.rule_values,
         )
         if status != DONE:
             self._refuse(status, readings, ids)
-        left = self._workspace.copies(used, count)
-        return ScanReport(nis, ids, left, sequential=self.rules.sequential)
+        return workspace.report(nis, ids, used)
 
     @property
     def motion_values(self) -> Array:
@@ -360,11 +344,6 @@ class EkfSlam(MapFilter):
         self.rule_values = np.array(rules)
         self._workspace = ScanWorkspace(rules)
         self.map.copies = covariances_for(rules)
-
-    def _make_room(self, readings: int, new: int) -> None:
-        """Grow the arrays where a scan with this many new landmarks overflows them."""
-        self.map.make_room(new)
-        self._workspace.make_room(readings, self.map.capacity)
 
     def _refuse(self, status: int, readings: Array, ids: list[int]) -> NoReturn:
         """Raise the error of an update that failed."""
@@ -613,83 +592,3 @@ class MotionNoise(NamedTuple):
         if not (self.at_rest or distance or turn):
             return self.variance * 0.0
         return self.variance * dt
-
-
-class ScanReport(UpdateReport):
-    """The results of one scan, from the arrays that its kernel has left; a snapshot.
-
-    Parameters
-    ----------
-    nis : float
-        νᵀ S⁻¹ ν.
-    ids : list of int
-        Landmark of each reading.
-    copies : tuple of ndarray
-        The parts of a :class:`ScanRecord`.
-    sequential : bool
-        Whether readings were linearised one after the other.
-    """
-
-    _ids: list[int]
-    _copies: tuple[Array, IntArray]
-    _sequential: bool
-
-    def __init__(
-        self,
-        nis: float,
-        ids: list[int],
-        copies: tuple[Array, IntArray],
-        *,
-        sequential: bool,
-    ) -> None:
-        parts = self.__dict__
-        parts["nis"], parts["_ids"] = nis, ids
-        parts["_copies"], parts["_sequential"] = copies, sequential
-
-    @property
-    def _record(self) -> ScanRecord:
-        return ScanRecord(*self._copies)
-
-    @cached_property
-    def degrees_of_freedom(self) -> int:
-        """Of the NIS: twice the number of associated readings."""
-        return len(self._record.rows)
-
-    @cached_property
-    def associated_ids(self) -> tuple[int, ...]:
-        """Mapped landmarks whose readings corrected the belief."""
-        return self._with_outcome(USED)
-
-    @cached_property
-    def added_ids(self) -> tuple[int, ...]:
-        """Landmarks that entered the map."""
-        return self._with_outcome(ADDED)
-
-    @cached_property
-    def rejected_ids(self) -> tuple[int, ...]:
-        """Mapped landmarks whose readings the chi-square gate rejected."""
-        return self._with_outcome(GATED)
-
-    @cached_property
-    def skipped_ids(self) -> tuple[int, ...]:
-        """Landmarks whose readings are too close to use."""
-        return self._with_outcome(SKIPPED)
-
-    @cached_property
-    def near_ids(self) -> tuple[int, ...]:
-        """Mapped landmarks within 10 σ of the robot."""
-        return tuple(compress(self._ids, self._record.ledger[NEAR].tolist()))
-
-    @cached_property
-    def innovation(self) -> Array:
-        """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
-        return self._record.innovation
-
-    @property
-    def factor(self) -> Callable[[], Array]:
-        """The function that returns L, shape (2m, 2m), L Lᵀ = S."""
-        return partial(self._record.joint_factor, sequential=self._sequential)
-
-    def _with_outcome(self, outcome: int) -> tuple[int, ...]:
-        chosen = self._record.ledger[OUTCOME] == outcome
-        return tuple(compress(self._ids, chosen.tolist()))

@@ -1,23 +1,33 @@
 """A Gaussian over robot pose and landmarks, in arrays that grow with the map.
 
-`GaussianMap` adds, removes and merges landmarks, and saves its state.
+`GaussianMap` adds, removes and merges landmarks, and saves its state. `ScanWorkspace`
+holds the arrays of one scan, and a `ScanReport` its results.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import repeat
+from itertools import compress, repeat
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array, ComplexArray, IntArray
-from ..interface import Belief, MapView
+from ...arrays import Array, IntArray
+from ..interface import Belief, MapView, UpdateReport
 from ..kernels.kalman_gain import (
+    ADDED,
     BLOCK,
+    COLUMN,
+    GATED,
+    INNOVATION,
+    JACOBIAN,
+    META_WIDTH,
+    NEAR,
     OUTCOME,
+    ROOT,
+    SKIPPED,
+    SLOT,
     USED,
     BeliefArrays,
     Rules,
@@ -26,11 +36,11 @@ from ..kernels.kalman_gain import (
     new_workspace,
     prior_system,
 )
-from ..kernels.scan_update import copy_scan
-from ..models.rigid_motion import ErrorFrame, left_jacobian
+from ..models.rigid_motion import ErrorFrame
 from ..support import saved_states
 from ..support.memory_limit import aligned_zeros, landmarks_that_fit
 from ..support.undo import Undo
+from .landmark_merging import coincide
 
 FIRST_ALLOCATION = 8  # landmarks
 
@@ -354,10 +364,36 @@ class ScanWorkspace:
         self._first_row = prior_system(height, self._rules.iterations)
         self.readings, self.capacity = room, capacity
 
-    def copies(self, used: int, readings: int) -> tuple[Array, IntArray]:
-        """Return copies of what the last update has left, for a :class:`ScanRecord`."""
-        ledger, first = self.ledger[:, :readings], self._first_row
-        return copy_scan(self.arrays.rows, ledger, used, first)
+    def place(self, gaussian: GaussianMap, ids: Sequence[int]) -> int:
+        """Write the slots of a scan's landmarks to the ledger, with room for new ones.
+
+        Parameters
+        ----------
+        gaussian : GaussianMap
+            The map that the next update changes; it expects the new landmarks.
+        ids : sequence of int
+            The landmark of each reading.
+
+        Returns
+        -------
+        int
+            Length of the state.
+        """
+        slots, size = gaussian.slots_of(ids), gaussian.size
+        new = slots.count(-1)
+        gaussian.make_room(new)
+        self.make_room(len(ids), gaussian.capacity)
+        places = self.ledger[SLOT, : len(ids)]
+        places[:] = slots
+        if new:
+            gaussian.expect(ids, places)
+        return size
+
+    def report(self, nis: float, ids: list[int], used: int) -> ScanReport:
+        """Return the report of the last update, on copies of what it has left."""
+        ledger, first = self.ledger[:, : len(ids)], self._first_row
+        left = copy_scan(self.arrays.rows, ledger, used, first)
+        return ScanReport(nis, ids, left, sequential=self._rules.sequential)
 
     def failed_reading(self, status: int, readings: int) -> int:
         """Return the reading whose innovation covariance could not be factored."""
@@ -390,190 +426,142 @@ def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:
     )
 
 
-# --------------------------------------------------------------------------------------
-# Merge landmarks of a Gaussian map: their offset, and the condition that it is 0.
-#
-# Pure functions of mean (3 + 2n,) and covariance P (3 + 2n, 3 + 2n) in the order
-# (x, y, θ, l1x, l1y, …); a landmark is named by its slot 0 … n − 1.
+class ScanRecord(NamedTuple):
+    """The stacked system of one scan, copied out of the workspace."""
 
-MOST_ITERATIONS = 50
-TURN_TOLERANCE = 1e-13
-"""Iterations of a turn end when it changes by less [rad]."""
-
-
-class ConditionedMap(NamedTuple):
-    """Mean and covariance of robot and map after conditioning."""
-
-    mean: Array
-    """Shape (3 + 2n,)."""
-    covariance: Array
-    """Shape (3 + 2n, 3 + 2n), of the additive error."""
-
-
-class Separation(NamedTuple):
-    """Offset of two landmarks and its covariance."""
-
-    offset: Array
-    """D = l_i − l_j, shape (2,) [m]."""
-    covariance: Array
-    """C, shape (2, 2) [m²]."""
+    rows: Array  # (2m, at least 3 + 2m + META_WIDTH)
+    ledger: IntArray  # (LEDGER_HEIGHT, readings), its columns counted in these rows
 
     @property
-    def squared(self) -> float:
-        """Dᵀ C⁻¹ D: χ² of 2 degrees of freedom if both are one; ∞ if C is singular."""
-        (a, b), (_, c) = self.covariance
-        determinant = a * c - b * b
-        if not determinant > 0:
-            return np.inf
-        x, y = self.offset
-        return float((c * x * x - 2 * b * x * y + a * y * y) / determinant)
+    def innovation(self) -> Array:
+        """Innovations ν, shape (m, 2)."""
+        return self.rows[:, INNOVATION].reshape(-1, 2)
 
-    @property
-    def largest_std(self) -> float:
-        """Standard deviation in the most uncertain direction [m]."""
-        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance)[-1], 0.0)))
+    def joint_factor(self, *, sequential: bool) -> Array:
+        """Return L of S = L Lᵀ, shape (2m, 2m), lower triangular.
+
+        Off its diagonal blocks L = H Aᵀ, since Q is diagonal; or 0 where readings were
+        linearised one after the other.
+        """
+        rows, count = self.rows, len(self.rows)
+        H = rows[:, JACOBIAN : JACOBIAN + 5]
+        factor = np.zeros((count, count))
+        if not sequential:
+            columns = np.repeat(self.ledger[COLUMN, : count // 2], 2)
+            every = np.arange(count)
+            pose = H[:, :3] @ rows[:, :3].T
+            x = H[every, 3, None] * rows[:, columns].T
+            y = H[every, 4, None] * rows[:, columns + 1].T
+            factor = np.tril(pose + x + y)
+        for k in range(0, count, 2):
+            factor[k : k + 2, k : k + 2] = rows[k : k + 2, ROOT : ROOT + 2]
+        return factor
 
 
-def separation(mean: Array, covariance: Array, one: int, other: int) -> Separation:
-    """Return the offset of two landmarks and its covariance.
+def copy_scan(
+    rows: Array, ledger: IntArray, used: int, first: int
+) -> tuple[Array, IntArray]:
+    """Copy the parts of a :class:`ScanRecord` out of the workspace.
 
-    ::
-
-        D = l_i − l_j,    C = P_ii + P_jj − P_ij − P_ji
+    Where the map is much larger than the scan, the copy has only the columns of the
+    pose and of the landmarks read.
 
     Parameters
     ----------
-    mean, covariance : ndarray
-        The map; entries behind it are ignored.
-    one, other : int
-        Slots i and j.
+    rows : ndarray
+        Of the workspace.
+    ledger : ndarray of int64
+        One column for each reading of the scan.
+    used : int
+        Number of readings in use.
+    first : int
+        Row at which the system linearised at the prior begins.
     """
-    i, j = slice(3 + 2 * one, 5 + 2 * one), slice(3 + 2 * other, 5 + 2 * other)
-    cross = covariance[i, j]
-    spread = covariance[i, i] + covariance[j, j] - cross - cross.T
-    return Separation(mean[i] - mean[j], spread)
+    found, kept = rows[first : first + 2 * used], ledger.copy()
+    if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
+        return found.copy(), kept
+    columns = ledger[COLUMN, :used]
+    landmarks = np.stack([columns, columns + 1], axis=1).ravel()
+    chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-META_WIDTH, 0)])
+    kept[COLUMN, :used] = 3 + 2 * np.arange(used)
+    return found[:, chosen], kept
 
 
-def coincide(
-    mean: Array,
-    covariance: Array,
-    one: int | Sequence[int],
-    other: int | Sequence[int],
-    *,
-    frame: ErrorFrame = "additive",
-    reference: Array | None = None,
-) -> ConditionedMap:
-    """Condition a map on two of its landmarks being one, or on several such pairs.
-
-    The condition is a measurement 0 = l_i − l_j without noise.  With D = l̂_i − l̂_j::
-
-        H = [… −J D …  I … −I …],   S = H P Hᵀ = L Lᵀ,   A = L⁻¹ H P
-        δ = −Aᵀ L⁻¹ M D,    P ← P − Aᵀ A
-
-    The columns are those of θ, l_i and l_j.  The condition holds no information about a
-    rotation of the whole map, and neither must H.  Its heading column is therefore
-    −J D, with D taken at the points where the filter linearises.  The additive EKF has
-    no heading column, since the condition is linear in its error, and M = 1.  In the
-    invariant frame δ is composed with the state and P follows, as in
-    :class:`~slamgym.estimator.InvariantEkfSlam`.  There the condition
-    R(t) D + V(t) (ξ_i − ξ_j) = 0 holds for M = V(−t)⁻¹, where t is the turn in δ, which
-    is found by iteration.  Several pairs have their rows of D and H below each other.
+class ScanReport(UpdateReport):
+    """The results of one scan, from the arrays that its kernel has left; a snapshot.
 
     Parameters
     ----------
-    mean, covariance : ndarray
-        The map.
-    one, other : int or sequence of int
-        Slots i and j of the two landmarks, or of each pair.
-    frame : {"additive", "invariant"}
-        Error frame of the filter.
-    reference : ndarray, shape (3 + 2n,), optional
-        Points at which the filter linearises, where not at its estimate.
-
-    Returns
-    -------
-    ConditionedMap
-        Both landmarks of a pair have the same mean and covariance in it; drop either.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If C is not positive definite.
-
-    Examples
-    --------
-    Two equally good estimates of one landmark meet halfway, with half the variance:
-
-    >>> P = np.diag([0, 0, 0, 1.0, 1.0, 1.0, 1.0])
-    >>> mean, P = coincide(np.array([0, 0, 0, 4.0, 0, 6.0, 0]), P, 0, 1)
-    >>> mean[3:], P.diagonal()[3:]
-    (array([5., 0., 5., 0.]), array([0.5, 0.5, 0.5, 0.5]))
+    nis : float
+        νᵀ S⁻¹ ν.
+    ids : list of int
+        Landmark of each reading.
+    copies : tuple of ndarray
+        The parts of a :class:`ScanRecord`.
+    sequential : bool
+        Whether readings were linearised one after the other.
     """
-    i, j = _columns(one), _columns(other)
-    offset = mean[i] - mean[j]
-    rows = covariance[i] - covariance[j]
-    if frame == "invariant" or reference is not None:
-        at = mean if reference is None else reference
-        lever = (at[i] - at[j]).reshape(-1, 2)[:, ::-1] * (1.0, -1.0)
-        lever = lever.ravel()
-        rows = rows + np.outer(lever, covariance[2])
-        S = rows[:, i] - rows[:, j] + np.outer(rows[:, 2], lever)
-    else:
-        S = rows[:, i] - rows[:, j]
-    L = np.linalg.cholesky((S + S.T) / 2)
-    gains = np.linalg.solve(L, rows)
-    P = covariance - gains.T @ gains
-    if frame == "additive":
-        return ConditionedMap(mean - gains.T @ np.linalg.solve(L, offset), P)
-    shift = _turned_shift(L, gains, offset)
-    return _composed(mean, P, shift)
 
+    _ids: list[int]
+    _copies: tuple[Array, IntArray]
+    _sequential: bool
 
-def _turned_shift(
-    L: NDArray[np.floating], gains: NDArray[np.floating], offset: Array
-) -> Array:
-    """Return δ, iterated until its turn is the one at which M was computed."""
-    points, turn = offset[::2] + 1j * offset[1::2], 0.0
-    for _ in range(MOST_ITERATIONS):
-        seen = points / left_jacobian(np.array(-turn))
-        flat = np.column_stack([seen.real, seen.imag]).ravel()
-        white = np.linalg.solve(L, flat)
-        before, turn = turn, float(-gains[:, 2] @ white)
-        if abs(turn - before) <= TURN_TOLERANCE:
-            break
-    return np.asarray(-gains.T @ white)
+    def __init__(
+        self,
+        nis: float,
+        ids: list[int],
+        copies: tuple[Array, IntArray],
+        *,
+        sequential: bool,
+    ) -> None:
+        parts = self.__dict__
+        parts["nis"], parts["_ids"] = nis, ids
+        parts["_copies"], parts["_sequential"] = copies, sequential
 
+    @property
+    def _record(self) -> ScanRecord:
+        return ScanRecord(*self._copies)
 
-def _columns(slots: int | Sequence[int]) -> IntArray:
-    """Return the columns of landmarks in the state."""
-    first = 3 + 2 * np.atleast_1d(np.asarray(slots, dtype=np.int64))
-    return np.asarray((first[:, None] + np.arange(2)).ravel())
+    @cached_property
+    def degrees_of_freedom(self) -> int:
+        """Of the NIS: twice the number of associated readings."""
+        return len(self._record.rows)
 
+    @cached_property
+    def associated_ids(self) -> tuple[int, ...]:
+        """Mapped landmarks whose readings corrected the belief."""
+        return self._with_outcome(USED)
 
-def _composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
-    """Compose an invariant correction with the state, and transform P to match.
+    @cached_property
+    def added_ids(self) -> tuple[int, ...]:
+        """Landmarks that entered the map."""
+        return self._with_outcome(ADDED)
 
-    ::
+    @cached_property
+    def rejected_ids(self) -> tuple[int, ...]:
+        """Mapped landmarks whose readings the chi-square gate rejected."""
+        return self._with_outcome(GATED)
 
-        q ← R(t) q + V(t) (δq − t J q),    θ ← θ + t,    t = δθ
-        P ← T P Tᵀ,    T = I + v e_θᵀ,    v = J (q⁺ − q)
-    """
-    turn = shift[2]
-    points, moves = _points(mean), _points(shift)
-    turned = np.exp(1j * turn) * points
-    moved = turned + left_jacobian(turn) * (moves - 1j * turn * points)
-    way = _state(1j * (moved - points), 0.0)
-    cross = np.outer(way, covariance[2])
-    P = covariance + (cross + cross.T) + covariance[2, 2] * np.outer(way, way)
-    return ConditionedMap(_state(moved, mean[2] + turn), P)
+    @cached_property
+    def skipped_ids(self) -> tuple[int, ...]:
+        """Landmarks whose readings are too close to use."""
+        return self._with_outcome(SKIPPED)
 
+    @cached_property
+    def near_ids(self) -> tuple[int, ...]:
+        """Mapped landmarks within 10 σ of the robot."""
+        return tuple(compress(self._ids, self._record.ledger[NEAR].tolist()))
 
-def _points(state: Array) -> ComplexArray:
-    """Robot position and landmarks as complex numbers, shape (1 + n,)."""
-    plane = np.delete(state, 2).reshape(-1, 2)
-    return np.asarray(plane[:, 0] + 1j * plane[:, 1])
+    @cached_property
+    def innovation(self) -> Array:
+        """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
+        return self._record.innovation
 
+    @property
+    def factor(self) -> Callable[[], Array]:
+        """The function that returns L, shape (2m, 2m), L Lᵀ = S."""
+        return partial(self._record.joint_factor, sequential=self._sequential)
 
-def _state(points: ComplexArray, heading: float) -> Array:
-    flat = np.column_stack([points.real, points.imag]).ravel()
-    return np.insert(flat, 2, heading)
+    def _with_outcome(self, outcome: int) -> tuple[int, ...]:
+        chosen = self._record.ledger[OUTCOME] == outcome
+        return tuple(compress(self._ids, chosen.tolist()))

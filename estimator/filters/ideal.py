@@ -139,7 +139,7 @@ class IdealEkfSlam(EkfSlam):
         if self.rules.linearisation == AT_TRUTH and landmark_ids is not None:
             readings = argument_checks.scan(measurements)
             ids = argument_checks.identities(landmark_ids, len(readings))
-            self._make_room(len(readings), len(readings))
+            self.map.make_room(len(readings))
             self._check_told(ids, self._true_landmarks)
             column = self.map.size
             for i, distance in zip(ids, readings[:, 1], strict=False):

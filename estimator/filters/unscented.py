@@ -73,7 +73,7 @@ class UnscentedSlam(EkfSlam):
         )
         mapped = np.array([i in self.map.slots for i in ids], dtype=bool)
         known, skipped = mapped & usable, mapped & ~usable
-        self._make_room(len(ids), len(ids))  # it may raise: before anything changes
+        self.map.make_room(len(ids))  # it may raise: before anything changes
         corrected, others = UpdateReport(), list(compress(ids, ~mapped))
         with undone_on_error(self.checkpoint()):
             if known.any():

@@ -6,8 +6,8 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
-from .kalman_gain import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT, as_rules
-from .scan_update import DONE, predict, update_belief, usable
+from .kalman_gain import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT
+from .scan_update import DONE, as_rules, predict, update_belief, usable
 
 NEVER = -1
 
@@ -62,7 +62,7 @@ def drive_runs(
     motion_values : ndarray, shape (4,)
         The variances (σx², σy², σα²), and 1 if a robot at rest has motion noise too.
     rule_values
-        As :func:`.kalman_gain.as_rules` reads them.
+        As :func:`.scan_update.as_rules` reads them.
     """
     runs, data = RunArrays(*run_arrays), StepData(*step_data)
     poses, pose_covariances, nis, degrees_of_freedom = trace

@@ -22,11 +22,11 @@ from .kalman_gain import (
     BeliefArrays,
     Rules,
     Workspace,
-    as_rules,
     prior_system_jit,
 )
 from .scan_update import (
     DONE,
+    as_rules,
     bearing_variance,
     linearise,
     own_covariance,
@@ -91,7 +91,7 @@ def follow_drive(
     noise_at_rest : bool
         Whether odometry of exactly (0, 0) has motion noise.
     rule_values
-        As :func:`.kalman_gain.as_rules` reads them; those of the sensor's noise are
+        As :func:`.scan_update.as_rules` reads them; those of the sensor's noise are
         overwritten.
     start
         Mean (3,) and covariance (3, 3) of the first pose.

@@ -1,8 +1,9 @@
-"""Kalman gain and covariance update for many readings at once, compiled: `absorb`.
+"""Kalman gain and update of mean and covariance, for many readings at once, compiled.
 
-``system`` holds two rows for each reading, from the row FIRST of the workspace on.
-`Workspace` and the constants above it describe them.  The covariance has room for whole
-vector registers (`BeliefArrays`), and the rows are up to 4 entries longer.
+`absorb` computes gain and covariance, and `compose` the state. ``system`` holds two
+rows for each reading, from the row FIRST of the workspace on. `Workspace` and the
+constants above it describe them.  The covariance has room for whole vector registers
+(`BeliefArrays`), and the rows are up to 4 entries longer.
 """
 
 import math
@@ -12,6 +13,7 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import fma, njit_inlined, njit_internal
+from ..models.rigid_motion import turn_coefficients_jit
 from ..support.memory_limit import aligned_zeros
 
 # Share of a variance below which the remainder counts as rounding.
@@ -20,12 +22,6 @@ SINGULAR = 1e-14
 # Above this size of the state, one pass over P costs more than a triangular solve.
 LARGE = 250
 BLOCK = 6  # readings absorbed at a time below it
-
-
-@njit_internal
-def block_of(size: int, readings: int) -> int:
-    """Return how many readings to absorb at a time: few while P fits the caches."""
-    return BLOCK if size <= LARGE else max(readings, 1)
 
 
 @njit_internal
@@ -256,6 +252,73 @@ def mirror(covariance: Array, size: int) -> None:
                 covariance[b, a] = covariance[a, b]
 
 
+@njit_internal
+def squared_whitened(rows: Array, iterations: int, used: int) -> float:
+    """Return the NIS νᵀ S⁻¹ ν of the readings in use, linearised at the prior."""
+    nis, first = 0.0, prior_system_jit(len(rows), iterations)
+    for row in range(first, first + 2 * used):
+        nis += rows[row, WHITE] * rows[row, WHITE]
+    return nis
+
+
+# --------------------------------------------------------------------------------------
+# The correction of the state: δ is composed with the mean, and P follows.
+
+
+@njit_internal
+def compose(mean: Array, rows: Array, size: int, frame: int) -> None:
+    """Compose the correction δ with the mean, by the error frame."""
+    if frame == INVARIANT:
+        retract(mean, rows, size)
+        return
+    for j in range(size):
+        mean[j] += rows[CORRECTION, j]
+
+
+@njit_internal
+def retract(mean: Array, rows: Array, size: int) -> None:
+    """Compose an invariant correction δ with the state, in place of adding it.
+
+    With t = δθ and every point q, the robot's position and each landmark::
+
+        q⁺ = R(t) q + V(t) (δq − t J q),    θ⁺ = θ + t
+
+    with R, V and J of :mod:`..models.rigid_motion`.  The row TRANSPORT becomes
+    v = J (q⁺ − q), 0 at θ, for :func:`transport`.
+    """
+    delta, v = rows[CORRECTION], rows[TRANSPORT]
+    t = delta[2]
+    cos, sin, even, odd = turn_coefficients_jit(t)
+    for i in range(-1, size // 2 - 1):
+        c = 3 + 2 * i if i >= 0 else 0  # the pose first, then the landmarks
+        x, y = mean[c], mean[c + 1]
+        ux, uy = delta[c] + t * y, delta[c + 1] - t * x
+        mean[c] = cos * x - sin * y + even * ux - odd * uy
+        mean[c + 1] = sin * x + cos * y + odd * ux + even * uy
+        v[c], v[c + 1] = y - mean[c + 1], mean[c] - x
+    mean[2] += t
+    v[2] = 0.0
+
+
+@njit_internal
+def transport(covariance: Array, rows: Array, size: int) -> None:
+    """P ← T P Tᵀ with T = I + v e_θᵀ and v in the row TRANSPORT; lower half only.
+
+    P is constant in invariant coordinates; T reads it at the corrected estimate.  The
+    row HEADING is overwritten with c = P[:, θ].
+    """
+    v, c = rows[TRANSPORT], rows[HEADING]
+    for j in range(size):
+        c[j] = covariance[2, j] if j < 2 else covariance[j, 2]
+    variance = c[2]
+    for i in range(size):
+        v_i = v[i]
+        rest = c[i] + variance * v_i
+        for j in range(i + 1):
+            moved = fma(v_i, c[j], covariance[i, j])
+            covariance[i, j] = fma(rest, v[j], moved)
+
+
 # --------------------------------------------------------------------------------------
 # Log determinants of covariances, compiled.
 
@@ -357,28 +420,6 @@ class Rules(NamedTuple):
 FIRST_STD = Rules._fields.index("bearing_std")
 """Column of the first of the four standard deviations of a reading in the rules."""
 AFTER_STDS = Rules._fields.index("min_range")
-
-
-@njit_inlined
-def as_rules(values: Array) -> Rules:
-    """Read rules from the array ``numpy.array(rules)``.
-
-    Python passes one array faster than a tuple of twelve numbers.
-    """
-    return Rules(
-        int(values[0]),
-        int(values[1]),
-        int(values[2]),
-        values[3] > 0,
-        values[4] > 0,
-        values[5],
-        values[6],
-        values[7],
-        values[8],
-        values[9],
-        values[10],
-        values[11] > 0,
-    )
 
 
 # --------------------------------------------------------------------------------------

@@ -1,59 +1,53 @@
 """Update of one belief by one scan, compiled: screen, correct, map new landmarks.
 
-`update_belief` takes in one scan, and `predict` one odometry reading. The functions
-between them are the parts of the update in the order of their use.
+`update_belief` takes in one scan, and `predict` one odometry reading.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
 from ...arrays import LARGEST, Array, IntArray
-from ...jit import fma, jit, njit_inlined, njit_internal
+from ...jit import jit, njit_inlined, njit_internal
 from ..models.bearing_range import (
     expected_reading_jit,
     located_jit,
     reading_slopes_jit,
     wrap_angle_jit,
 )
-from ..models.rigid_motion import turn_coefficients_jit
 from ..models.unicycle_motion import drive_jit
 from .kalman_gain import (
     ADDED,
     AT_ESTIMATE,
     AT_REFERENCE,
     AT_TRUTH,
+    BLOCK,
     COLUMN,
     CORRECTION,
     FIRST,
     GATED,
-    HEADING,
     INNOVATION,
     INVARIANT,
     JACOBIAN,
+    LARGE,
     MEAN_BEFORE,
-    META_WIDTH,
     NEAR,
     OUTCOME,
     PRIOR_MEAN,
     PROJECTED,
     READING,
-    ROOT,
     SKIPPED,
     SLOT,
-    TRANSPORT,
     USED,
     VARIANCE,
-    WHITE,
     BeliefArrays,
     Rules,
     Workspace,
     absorb,
-    as_rules,
-    block_of,
+    compose,
     mirror,
     prior_system_jit,
+    squared_whitened,
     times,
+    transport,
 )
 
 # Status of an update, where it is not the reading that failed.
@@ -92,9 +86,9 @@ def update_belief(
         reading's landmark in the map.  On return its other rows are filled, and SLOT
         holds the places of added landmarks, too.
     rows, before, prior
-        A :class:`.kalman_gain.Workspace`.  On return :func:`copy_scan` reads the rows.
+        A :class:`.kalman_gain.Workspace`, which then holds the record of the scan.
     rule_values
-        The filter's rules, as :func:`.kalman_gain.as_rules` reads them.
+        The filter's rules, as :func:`as_rules` reads them.
 
     Returns
     -------
@@ -113,7 +107,29 @@ def update_belief(
         if not (usable(readings[k, 0]) and usable(readings[k, 1])):
             return NOT_USABLE, 0, 0.0
     used = screen(belief, readings, count, rules, rows, ledger)
-    repeated = rules.sequential or rules.iterations > 1
+    failed = correct_or_restore(belief, size, ledger, rules, workspace, used)
+    if failed >= 0:
+        return failed // 2, used, 0.0
+    nis = squared_whitened(rows, rules.iterations, used)
+    add_landmarks(belief, size, readings, count, rules, ledger)
+    return DONE, used, nis
+
+
+@njit_inlined
+def correct_or_restore(
+    belief: BeliefArrays,
+    size: int,
+    ledger: IntArray,
+    rules: Rules,
+    workspace: Workspace,
+    used: int,
+) -> int:
+    """Correct the belief by the readings in use, or leave it as it was.
+
+    Returns -1, or the row whose innovation covariance is not positive definite.  What
+    such a row could spoil is copied first: where P changes before the last row is read.
+    """
+    rows, repeated = workspace.rows, rules.sequential or rules.iterations > 1
     spoilable = repeated or used > block_of(size, used)
     if spoilable:
         copy_covariance(belief.covariance, workspace.before, size)
@@ -127,11 +143,20 @@ def update_belief(
                 copy_covariance(workspace.before, belief.covariance, size)
                 for j in range(size):
                     belief.mean[j] = rows[MEAN_BEFORE, j]
-            return failed // 2, used, 0.0
-    nis = 0.0
-    first = prior_system_jit(len(rows), rules.iterations)
-    for row in range(first, first + 2 * used):
-        nis += rows[row, WHITE] * rows[row, WHITE]
+            return failed
+    return -1
+
+
+@njit_inlined
+def add_landmarks(
+    belief: BeliefArrays,
+    size: int,
+    readings: Array,
+    count: int,
+    rules: Rules,
+    ledger: IntArray,
+) -> None:
+    """Append the landmarks seen first, and write their slots to the ledger."""
     for k in range(count):
         if ledger[OUTCOME, k] == ADDED:
             add_landmark(
@@ -146,7 +171,28 @@ def update_belief(
             )
             ledger[SLOT, k] = (size - 3) // 2
             size += 2
-    return DONE, used, nis
+
+
+@njit_inlined
+def as_rules(values: Array) -> Rules:
+    """Read rules from the array ``numpy.array(rules)``.
+
+    Python passes one array faster than a tuple of twelve numbers.
+    """
+    return Rules(
+        int(values[0]),
+        int(values[1]),
+        int(values[2]),
+        values[3] > 0,
+        values[4] > 0,
+        values[5],
+        values[6],
+        values[7],
+        values[8],
+        values[9],
+        values[10],
+        values[11] > 0,
+    )
 
 
 # --------------------------------------------------------------------------------------
@@ -269,6 +315,12 @@ def is_too_near(mean: Array, covariance: Array, column: int) -> bool:
 # One correction: linearise, condition, compose; iterated.
 
 
+@njit_internal
+def block_of(size: int, readings: int) -> int:
+    """Return how many readings to absorb at a time: few while P fits the caches."""
+    return BLOCK if size <= LARGE else max(readings, 1)
+
+
 @njit_inlined
 def correct(
     belief: BeliefArrays,
@@ -325,16 +377,6 @@ def correct(
         transport(covariance, rows, size)
     mirror(covariance, size)
     return -1
-
-
-@njit_internal
-def compose(mean: Array, rows: Array, size: int, frame: int) -> None:
-    """Compose the correction δ with the mean, by the error frame."""
-    if frame == INVARIANT:
-        retract(mean, rows, size)
-        return
-    for j in range(size):
-        mean[j] += rows[CORRECTION, j]
 
 
 @njit_internal
@@ -423,54 +465,6 @@ def _project(reference: Array, column: int, H: Array) -> None:
         H[i, 2] -= seen
         H[i, 3] += seen * half_y
         H[i, 4] -= seen * half_x
-
-
-# --------------------------------------------------------------------------------------
-# Corrections in the invariant error frame: of the mean and of P.
-
-
-@njit_internal
-def retract(mean: Array, rows: Array, size: int) -> None:
-    """Compose an invariant correction δ with the state, in place of adding it.
-
-    With t = δθ and every point q, the robot's position and each landmark::
-
-        q⁺ = R(t) q + V(t) (δq − t J q),    θ⁺ = θ + t
-
-    with R, V and J of :mod:`..models.rigid_motion`.  The row TRANSPORT becomes
-    v = J (q⁺ − q), 0 at θ, for :func:`transport`.
-    """
-    delta, v = rows[CORRECTION], rows[TRANSPORT]
-    t = delta[2]
-    cos, sin, even, odd = turn_coefficients_jit(t)
-    for i in range(-1, size // 2 - 1):
-        c = 3 + 2 * i if i >= 0 else 0  # the pose first, then the landmarks
-        x, y = mean[c], mean[c + 1]
-        ux, uy = delta[c] + t * y, delta[c + 1] - t * x
-        mean[c] = cos * x - sin * y + even * ux - odd * uy
-        mean[c + 1] = sin * x + cos * y + odd * ux + even * uy
-        v[c], v[c + 1] = y - mean[c + 1], mean[c] - x
-    mean[2] += t
-    v[2] = 0.0
-
-
-@njit_internal
-def transport(covariance: Array, rows: Array, size: int) -> None:
-    """P ← T P Tᵀ with T = I + v e_θᵀ and v in the row TRANSPORT; lower half only.
-
-    P is constant in invariant coordinates; T reads it at the corrected estimate.  The
-    row HEADING is overwritten with c = P[:, θ].
-    """
-    v, c = rows[TRANSPORT], rows[HEADING]
-    for j in range(size):
-        c[j] = covariance[2, j] if j < 2 else covariance[j, 2]
-    variance = c[2]
-    for i in range(size):
-        v_i = v[i]
-        rest = c[i] + variance * v_i
-        for j in range(i + 1):
-            moved = fma(v_i, c[j], covariance[i, j])
-            covariance[i, j] = fma(rest, v[j], moved)
 
 
 @njit_internal
@@ -576,64 +570,3 @@ def propagate(
     P[1, 0] += cos * sin * (along - across)
     P[0, 1] = P[1, 0]
     P[2, 2] += motion_variance[2]
-
-
-class ScanRecord(NamedTuple):
-    """The stacked system of one scan, copied out of the workspace."""
-
-    rows: Array  # (2m, at least 3 + 2m + META_WIDTH)
-    ledger: IntArray  # (LEDGER_HEIGHT, readings), its columns counted in these rows
-
-    @property
-    def innovation(self) -> Array:
-        """Innovations ν, shape (m, 2)."""
-        return self.rows[:, INNOVATION].reshape(-1, 2)
-
-    def joint_factor(self, *, sequential: bool) -> Array:
-        """Return L of S = L Lᵀ, shape (2m, 2m), lower triangular.
-
-        Off its diagonal blocks L = H Aᵀ, since Q is diagonal; or 0 where readings were
-        linearised one after the other.
-        """
-        rows, count = self.rows, len(self.rows)
-        H = rows[:, JACOBIAN : JACOBIAN + 5]
-        factor = np.zeros((count, count))
-        if not sequential:
-            columns = np.repeat(self.ledger[COLUMN, : count // 2], 2)
-            every = np.arange(count)
-            pose = H[:, :3] @ rows[:, :3].T
-            x = H[every, 3, None] * rows[:, columns].T
-            y = H[every, 4, None] * rows[:, columns + 1].T
-            factor = np.tril(pose + x + y)
-        for k in range(0, count, 2):
-            factor[k : k + 2, k : k + 2] = rows[k : k + 2, ROOT : ROOT + 2]
-        return factor
-
-
-def copy_scan(
-    rows: Array, ledger: IntArray, used: int, first: int
-) -> tuple[Array, IntArray]:
-    """Copy the parts of a :class:`ScanRecord` out of the workspace.
-
-    Where the map is much larger than the scan, the copy has only the columns of the
-    pose and of the landmarks read.
-
-    Parameters
-    ----------
-    rows : ndarray
-        Of the workspace.
-    ledger : ndarray of int64
-        One column for each reading of the scan.
-    used : int
-        Number of readings in use.
-    first : int
-        Row at which the system linearised at the prior begins.
-    """
-    found, kept = rows[first : first + 2 * used], ledger.copy()
-    if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
-        return found.copy(), kept
-    columns = ledger[COLUMN, :used]
-    landmarks = np.stack([columns, columns + 1], axis=1).ravel()
-    chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-META_WIDTH, 0)])
-    kept[COLUMN, :used] = 3 + 2 * np.arange(used)
-    return found[:, chosen], kept

@@ -26,7 +26,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..filters.ekf import EkfSlam
-from ..filters.gaussian_map import coincide, without_landmarks
+from ..filters.gaussian_map import without_landmarks
+from ..filters.landmark_merging import coincide
 from ..interface import (
     Belief,
     MapView,

@@ -33,8 +33,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...jit import jit, njit_internal
-from ..kernels.kalman_gain import as_rules
-from ..kernels.scan_update import bearing_variance, range_variance
+from ..kernels.scan_update import as_rules, bearing_variance, range_variance
 from ..models.bearing_range import (
     expected_reading_jit,
     reading_slopes_jit,

@@ -15,8 +15,8 @@ from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..filters.ekf import InvariantEkfSlam
 from ..interface import Belief
-from ..kernels.kalman_gain import Rules, as_rules
-from ..kernels.scan_update import bearing_variance, range_variance
+from ..kernels.kalman_gain import Rules
+from ..kernels.scan_update import as_rules, bearing_variance, range_variance
 from ..models.bearing_range import (
     expected_reading_jit,
     located_jit,

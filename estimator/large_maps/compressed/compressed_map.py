@@ -68,8 +68,9 @@ class CompressedMap:
         """Assign slots to landmarks that the filter has added."""
         if not ids:
             return
-        count, reused = len(self.slots), self.free[: -len(ids) - 1 : -1]
-        fresh = range(count, count + len(ids) - len(reused))
+        reused = self.free[: -len(ids) - 1 : -1]
+        first = len(self.slots) + len(self.free)
+        fresh = range(first, first + len(ids) - len(reused))
         self.slots = self.slots | dict(zip(ids, [*reused, *fresh], strict=True))
         self.free = self.free[: len(self.free) - len(reused)]
         self.local = self.local | dict.fromkeys(ids)
