@@ -1,4 +1,8 @@
-"""Active SLAM: explore an unknown map until every landmark is known accurately."""
+"""Active SLAM: explore an unknown map until every landmark is known accurately.
+
+`ActiveSlamEnv` is the task in one world, and `ActiveSlamVectorEnv` in many, simulated
+together and with batched filters.
+"""
 
 from __future__ import annotations
 
@@ -238,9 +242,6 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         more = {key: values.item() for key, values in infos.items()}
         return {key: row[0] for key, row in rows.items()}, {**info, **more}
 
-
-# --------------------------------------------------------------------------------------
-# Active SLAM in many worlds, simulated together and with batched filters.
 
 Observations = dict[str, AnyArray]
 

@@ -1,4 +1,8 @@
-"""The rules of active SLAM, for one world or for many."""
+"""The rules of active SLAM, for one world or for many: reward, end and scores.
+
+`ActiveSlamTask` advances the episodes; `AssociationRecord` scores the association of
+filters without identities.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
@@ -256,9 +260,6 @@ def _no_outcome(count: int) -> StepOutcome:
     no = np.zeros((3, count), dtype=np.bool_)
     return StepOutcome(np.zeros(count), no[0], no[1], no[2])
 
-
-# --------------------------------------------------------------------------------------
-# How well filters of agents associate readings without identity, by episode.
 
 SCORES = ("precision", "recall", "duplicate", "ghost")
 """Entries of `AssociationScores` that `info` reveals."""

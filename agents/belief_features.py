@@ -212,9 +212,7 @@ def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
 
 
 # --------------------------------------------------------------------------------------
-# Compiled kernels of `belief_features`: one pass over all worlds.
-#
-# Symbols are those of `belief_features`.
+# The kernels: one pass over all worlds.
 
 Rectangle = tuple[float, float, float, float]
 

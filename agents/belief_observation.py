@@ -1,4 +1,7 @@
-"""An estimator in the loop: its belief becomes part of the observation."""
+"""An estimator in the loop: its belief becomes part of the observation.
+
+`BeliefObservation` wraps one world, and `BeliefObservationVector` many.
+"""
 
 from __future__ import annotations
 
@@ -193,9 +196,6 @@ def with_features(observation: Observation, features: Mapping[str, Any]) -> Obse
     both = {**observation, **features}
     return {key: both[key] for key in sorted(both)}
 
-
-# --------------------------------------------------------------------------------------
-# Filters in the loop of many worlds: beliefs become part of the observations.
 
 Observations = dict[str, AnyArray]
 Infos = dict[str, Any]

@@ -1,8 +1,10 @@
-"""Routes around walls, for agents that drive to goals.
+"""Routes around walls, for agents that drive to goals, and what they know of the floor.
 
 The shortest way between two points of a floor with inner walls passes ends of walls. A
-robot keeps a distance from them, so the routes run over points around the ends: a
-visibility graph. On a floor without inner walls every route is straight.
+robot keeps a distance from them, so the `WallRoutes` run over points around the ends: a
+visibility graph. On a floor without inner walls every route is straight. The
+`AgentKnowledge` of an agent is its belief and a `CoverageGrid`: it knows the walls, but
+neither the landmarks nor its true pose.
 
 Symbols
 -------
@@ -228,11 +230,6 @@ def wall_clearance(
     """Return the distances of points (…) from the nearest wall of (W,) [m]."""
     return np.asarray(wall_distances(points, starts, ends - starts).min(axis=-1))
 
-
-# --------------------------------------------------------------------------------------
-# The floor of a bounded world: its cells and walls, and what the sensor sees of it.
-#
-# An agent knows the walls but not the landmarks. Poses are estimates.
 
 __all__ = ["SECTORS", "CoverageGrid"]
 

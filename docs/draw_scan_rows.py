@@ -22,7 +22,7 @@ COLOURS = {
     "linearise": "#a6cee3",
     "absorb": "#b2df8a",
     "retract, transport": "#cab2d6",
-    "correct, update_belief": "#fb9a99",
+    "correct, correct_or_restore": "#fb9a99",
 }
 STATE = 14  # columns drawn for the state
 READINGS = 3
@@ -44,9 +44,9 @@ def state_rows() -> list[Part]:
     rows = (
         (layout.CORRECTION, "CORRECTION   δ", "absorb"),
         (layout.TRANSPORT, "TRANSPORT   v", "retract, transport"),
-        (layout.PRIOR_MEAN, "PRIOR_MEAN", "correct, update_belief"),
+        (layout.PRIOR_MEAN, "PRIOR_MEAN", "correct, correct_or_restore"),
         (layout.HEADING, "HEADING   P[:, θ]", "retract, transport"),
-        (layout.MEAN_BEFORE, "MEAN_BEFORE", "correct, update_belief"),
+        (layout.MEAN_BEFORE, "MEAN_BEFORE", "correct, correct_or_restore"),
     )
     return [Part(row, 0, 1, STATE, text, writer) for row, text, writer in rows]
 

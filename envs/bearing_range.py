@@ -1,5 +1,8 @@
 """The bearing-range sensor: which landmarks it sees, and its readings.
 
+`BearingRangeSensor` measures the landmarks in view; `LineOfSight` finds those that a
+wall hides, and `hide_identities` shuffles readings without identity.
+
 Symbols
 -------
 p = (x, y, θ)  true robot pose in the world frame [m, m, rad]
@@ -190,9 +193,6 @@ def _take(rows: Array, places: IndexArray) -> Array:
         return rows[:, places]  # 20 µs faster
     return np.take_along_axis(rows, places[None], axis=-1)
 
-
-# --------------------------------------------------------------------------------------
-# Occlusion: which landmarks a wall hides from the robot.
 
 _MOUNTED = 1e-6  # a landmark this near to the line of a wall is mounted on it [m]
 

@@ -259,9 +259,6 @@ class VectorOpenLoop:
         return np.array(self._actions[:, step % self._actions.shape[1]])
 
 
-# --------------------------------------------------------------------------------------
-# A correlated random walk: speed and turn rate change slowly and at random.
-
 _BLOCK = 128  # steps of noise drawn ahead
 
 
@@ -402,9 +399,6 @@ class VectorRandomWalk:
         angles[each(math.hypot, dx, dy) <= self._reach] = 0.0
         return angles
 
-
-# --------------------------------------------------------------------------------------
-# Waypoint control: turn towards the next point, then drive to it.
 
 _ALIGNED = 0.3  # heading error below which the robot drives while it turns [rad]
 
@@ -560,10 +554,6 @@ class VectorWaypoints:
         places = np.minimum(self._next, self._points.shape[1] - 1)
         dx, dy = (self._points[self._robots, places] - positions).T
         return dx, dy, each(math.hypot, dx, dy)
-
-
-# --------------------------------------------------------------------------------------
-# The path of a scenario's controls without noise and walls.
 
 
 def planned_path(scenario: Scenario) -> Array:

@@ -1,8 +1,9 @@
 """Noise of the sensor and the motion: one random stream per source.
 
-Every step of every stream has its own random numbers in a fixed layout. So the settings
-of one source do not affect the noise of another, the length of a block has no effect,
-and a world has the same noise alone and among others.
+`WorldNoise` scales the noise of one world to its scenario, and `VectorNoise` that of
+many. Every step of every stream has its own random numbers in a fixed layout. So the
+settings of one source do not affect the noise of another, the length of a block has no
+effect, and a world has the same noise alone and among others.
 """
 
 import math

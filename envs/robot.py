@@ -1,6 +1,24 @@
-"""The robot's body in the physics engine: it drives, turns and stops at walls.
+"""The simulated robot: its body, its walls, its odometry and the drive equation.
 
-Symbols are those of `drive_equation`.
+`UnicycleBody` drives, turns and stops at walls in the physics engine; `UnicycleBodies`
+moves many robots in numpy. `OdometrySensor` decides which noise disturbs the motion,
+and what the encoders report.
+
+Symbols
+-------
+p = (x, y, θ)     true robot pose in the world frame [m, m, rad]
+u = (d, α)        command: distance driven, then heading turned [m, rad]
+ε = (εx, εy, εα)  slip, in the frame of the old heading [m, m, rad]
+
+::
+
+    x' = x + (d + εx) cos θ - εy sin θ
+    y' = y + (d + εx) sin θ + εy cos θ
+    θ' = θ + (α + εα)
+
+The filters' motion model and their arithmetic on angles are separate code in
+`estimator`, which `envs` does not import. A simulator that shared the filter's model
+could not reveal an error in it.
 """
 
 from __future__ import annotations
@@ -293,12 +311,6 @@ def _has_ends_apart(segment: Wall, other: Wall) -> bool:
     return first * last <= 0.0
 
 
-# --------------------------------------------------------------------------------------
-# The bodies of many robots in numpy: the vector form of `UnicycleBody`.
-#
-# Symbols are those of `drive_equation`.
-
-
 class UnicycleBodies:
     """B round bodies, each in its own world.
 
@@ -399,25 +411,6 @@ def _as_pairs(numbers: ComplexArray) -> Array:
     return numbers.view(np.float64)
 
 
-# --------------------------------------------------------------------------------------
-# The drive equation of the simulated robot.
-#
-# Symbols
-# -------
-# p = (x, y, θ)     true robot pose in the world frame [m, m, rad]
-# u = (d, α)        command: distance driven, then heading turned [m, rad]
-# ε = (εx, εy, εα)  slip, in the frame of the old heading [m, m, rad]
-#
-# ::
-#
-#     x' = x + (d + εx) cos θ - εy sin θ
-#     y' = y + (d + εx) sin θ + εy cos θ
-#     θ' = θ + (α + εα)
-#
-# The filters' motion model is separate code in `estimator`, which `envs` does not
-# import. A simulator that shared the filter's model could not reveal an error in it.
-
-
 def displacement(
     forward: Number, sideways: Number, cos: Number, sin: Number
 ) -> tuple[Number, Number]:
@@ -444,12 +437,7 @@ def displacement(
 
 
 # --------------------------------------------------------------------------------------
-# The odometry: which noise disturbs the motion, and what the encoders report.
-#
-# Symbols
-# -------
-# u = (d, α)        command: distance driven, then heading turned [m, rad]
-# ε = (εx, εy, εα)  motion noise in the robot's own frame [m, m, rad]
+# The odometry.
 #
 # With ``noise_in = "motion"`` the robot slips and the odometry reports the command.
 # With ``"odometry"`` the robot follows the command and the encoders have the noise.
@@ -580,12 +568,6 @@ class VectorOdometrySensor:
         odometry: Array = commands + error
         return odometry
 
-
-# --------------------------------------------------------------------------------------
-# Wrapping of angles to [-π, π).
-#
-# Worlds have their own arithmetic: `envs` imports nothing of `estimator`. A simulator
-# that shared the filter's models could not reveal an error in them.
 
 Number = TypeVar("Number", float, Array)
 

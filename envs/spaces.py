@@ -100,9 +100,6 @@ def _farthest_landmark(scenario: Scenario) -> float:
     return float(np.hypot(*away.T).max()) + drawn + scenario.steps * step
 
 
-# --------------------------------------------------------------------------------------
-# Checks and clipping of actions, for one world or for many.
-
 _REAL_NUMBERS = "efd" + np.typecodes["AllInteger"]
 
 

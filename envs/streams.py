@@ -1,4 +1,10 @@
-"""Random numbers by position: any number of any stream of an episode, in any order."""
+"""Random numbers by position: any number of any stream of an episode, in any order.
+
+`episode_keys` names the episodes, and `EpisodeStarts` draws their start and map.
+`draw_normals` and `draw_uniforms` fill arrays with the numbers of many steps or worlds
+in one compiled pass. Below them are the transformations of random words to numbers,
+and the generator of the words, `random_block`.
+"""
 
 from collections.abc import Sequence
 from math import log, sqrt
@@ -11,9 +17,6 @@ from ..sim_configs import Scenario, place_landmarks
 from ..sim_configs.layouts import TRIES_PER_LANDMARK, RandomLayout
 from ..sim_configs.scenario import RANGES
 from ..sim_configs.scenario_files import copied_draw
-
-# --------------------------------------------------------------------------------------
-# The keys and streams of episodes, and what is drawn at their start.
 
 # the independent streams of an episode: plain integers, which numba takes quickly
 START, MAP, MOTION, MEASUREMENT, DROPOUT, CLUTTER, ORDER, DRAWN = range(8)
@@ -105,10 +108,6 @@ class EpisodeStarts:
         return out.view(np.complex128)[..., 0]
 
 
-# --------------------------------------------------------------------------------------
-# Draw the numbers of many steps or worlds in one compiled pass.
-
-
 @jit
 def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> None:
     """Fill an array with standard normal numbers, row k from step ``steps[k]``.
@@ -119,7 +118,7 @@ def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> N
         The key of each row.
     steps : int64 ndarray, shape (K,)
     stream : int
-        Its number, see `episodes`.
+        Its number, as `MOTION`.
     out : ndarray, shape (H, K, W)
         Contiguous. Row k of part h takes the numbers h W to (h + 1) W of its step.
     """
@@ -215,20 +214,6 @@ def _is_free(placed: Array, x: float, y: float, nearest: float) -> bool:
             return False
     return True
 
-
-# --------------------------------------------------------------------------------------
-# Philox4x64-10: four random words from a key and a position, without any state.
-#
-# Symbols
-# -------
-# key = (k0, k1)          names an episode
-# position = (b, t, s)    block b of step t of stream s; a block has four words
-#
-# The words are those of ``numpy.random.Philox(key=key, counter=[0, t, s, 0])``, which
-# takes the blocks b = 1, 2, … in turn.
-#
-# Source: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC
-# 2011, section 3.
 
 Word = np.uint64
 
@@ -350,6 +335,20 @@ def _far_tail(r: float) -> float:
     lower = lower * r + 1.0
     return upper / lower
 
+
+# --------------------------------------------------------------------------------------
+# Philox4x64-10: four random words from a key and a position, without any state.
+#
+# Symbols
+# -------
+# key = (k0, k1)          names an episode
+# position = (b, t, s)    block b of step t of stream s; a block has four words
+#
+# The words are those of ``numpy.random.Philox(key=key, counter=[0, t, s, 0])``, which
+# takes the blocks b = 1, 2, … in turn.
+#
+# Source: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC
+# 2011, section 3.
 
 Block = tuple[Word, Word, Word, Word]
 

@@ -1,4 +1,8 @@
-"""The interface of every estimator, and of what only some of them can do."""
+"""The interface of every estimator, `SlamEstimator`, and what passes through it.
+
+`Belief` is the estimate and `UpdateReport` the result of one scan. The other protocols
+describe what only some estimators can do.
+"""
 
 from __future__ import annotations
 

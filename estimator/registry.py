@@ -1,4 +1,7 @@
-"""Make estimators by name, also those that users register."""
+"""Make estimators by name, also those that users register: `make_estimator`.
+
+A label names a filter and its options, as "invariant[iterations=3]".
+"""
 
 from __future__ import annotations
 
@@ -303,9 +306,6 @@ _factories |= {
 }
 _factories |= {name: peer.path for name, peer in PEERS.items()}
 
-
-# --------------------------------------------------------------------------------------
-# The text that names a filter and its options, as "invariant[iterations=3]".
 
 _LABEL = re.compile(r"(?P<name>[^\[\],]+)(\[(?P<options>.*)\])?", re.DOTALL)
 _BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)")

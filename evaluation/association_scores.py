@@ -1,5 +1,7 @@
 """How well readings without identity were associated, by their true landmarks.
 
+`score_association` counts the decisions of a run, and `gospa` scores its map.
+
 The identity of a mapped landmark is the true landmark of the reading that confirmed it,
 the one with which it entered the map.  Every reading counts once, by the decision that
 stands at the end of the run::

@@ -1,18 +1,16 @@
-"""Name the cause if a filter is not consistent, from many runs.
+"""Name the cause if a filter is not consistent, from many runs: `diagnose`.
 
 The tests answer two questions in this order.
 
 1. Do odometry and readings have the noise that the filter assumes?  With the truth,
    all noise values are known (:mod:`.noise_findings`).  A wrong standard deviation, a
-   bias and heavy tails are tested separately: a bias changes the
-   mean, a wrong deviation the variance, and heavy tails the kurtosis.
-2. If so, do the covariances agree with the errors?  If not, the cause is in the filter:
-   its association if identities are hidden, otherwise its linearisation.  Linearisation
-   does not change the size of the innovations, and its errors accumulate.  If the
-   innovations are wrong too, or the errors are as wrong in the first steps as later,
-   it is not the cause, and the answer is "cannot tell".
-
-The tests of the second question are those of :mod:`.verdict`.
+   bias and heavy tails are tested separately: a bias changes the mean, a wrong
+   deviation the variance, and heavy tails the kurtosis.
+2. If so, do the covariances agree with the errors (`errors_of`)?  If not, the cause is
+   in the filter: its association if identities are hidden, otherwise its linearisation.
+   Linearisation does not change the size of the innovations, and its errors accumulate.
+   If the innovations are wrong too, or the errors are as wrong in the first steps as
+   later, it is not the cause, and the answer is "cannot tell".
 """
 
 from __future__ import annotations
@@ -91,7 +89,7 @@ def diagnose(
     Parameters
     ----------
     noise : array_like, shape (M, 5, 7)
-        Of :func:`~slamgym.evaluation.noise_findings`, of M runs.
+        Of :func:`~slamgym.evaluation.noise_sums`, of M runs.
     nees, heading_nees : array_like, shape (M, K)
         NEES of the pose (3 degrees) in the filter's own error frame, and of the
         heading (1 degree), after each of K steps; nan at leading steps without one. A

@@ -1,7 +1,11 @@
 """Tests of the actual noise of a world: its size, its mean and its tails.
 
-In a world without faults, the standardised noise is independent and standard normal.
-Every test here therefore has a known distribution for any number of runs or steps.
+If the truth is known, all noise values are known: the motion noise is the true motion
+minus the odometry, and the sensor noise is the reading minus the true bearing or range.
+`noise_sums` divides each by the standard deviation that the filter assumes. In a world
+without faults, the resulting numbers are independent and standard normal, over time as
+well as over runs. Every test of `noise_findings` therefore has a known distribution for
+any number of runs or steps.
 """
 
 from __future__ import annotations
@@ -25,15 +29,6 @@ _NOISE = {
     "range": "range noise",
 }
 
-
-# --------------------------------------------------------------------------------------
-# The actual noise of a world, divided by the noise that a filter assumes.
-#
-# If the truth is known, all noise values are known: the motion noise is the true motion
-# minus the odometry, and the sensor noise is the reading minus the true bearing or
-# range. Each is divided by the standard deviation that the filter assumes. In a world
-# without faults, the resulting numbers are independent and standard normal, over time
-# as well as over runs.
 
 CHANNELS = ("along", "sideways", "turn", "bearing", "range")
 """The five noises: εx, εy, εα of the motion, εβ, εr of the readings."""
@@ -80,7 +75,7 @@ def noise_findings(sums: Array) -> list[Finding]:
     Parameters
     ----------
     sums : ndarray, shape (B, 5, 7)
-        Of :func:`.noise_findings.noise_sums`.
+        Of :func:`noise_sums`.
 
     References
     ----------

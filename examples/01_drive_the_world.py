@@ -19,8 +19,7 @@ import gymnasium as gym
 from matplotlib.image import imsave
 
 import slamgym  # noqa: F401 (registers slamgym/LandmarkWorld-v0)
-from slamgym.envs.controllers import Waypoints
-from slamgym.sim_configs import load_scenario
+from slamgym import Waypoints, load_scenario
 
 CORNERS = [(12.0, 0.0), (12.0, 12.0), (0.0, 12.0), (0.0, 2.0)]
 PICTURE = Path("results/01_drive_the_world.png")

@@ -18,9 +18,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from slamgym.envs import LandmarkWorldEnv
-from slamgym.estimator import SlamEstimator, make_estimator
-from slamgym.estimator.models import wrap_angle
+from slamgym import LandmarkWorldEnv, make_estimator
+from slamgym.estimator import SlamEstimator, wrap_angle
 from slamgym.sim_configs import action_sequence
 
 Array = NDArray[np.float64]

@@ -21,11 +21,19 @@ overconfident.
 import sys
 from pathlib import Path
 
-from slamgym.envs.controllers import OpenLoop
-from slamgym.experiments.figures import map_figure, save_figure
-from slamgym.experiments.logs import SlamLog, read_log, record_episode, write_slamlog
-from slamgym.experiments.runs import Replay, landmark_table, replay, settings_for
-from slamgym.sim_configs import action_sequence, load_scenario
+from slamgym import load_scenario, read_log, replay
+from slamgym.envs import OpenLoop
+from slamgym.experiments import (
+    Replay,
+    SlamLog,
+    landmark_table,
+    map_figure,
+    record_episode,
+    save_figure,
+    settings_for,
+    write_slamlog,
+)
+from slamgym.sim_configs import action_sequence
 
 RESULTS = Path("results")
 

@@ -16,12 +16,16 @@ It prints the table and writes ``results/04_noise_study.png``.  The command
 
 from pathlib import Path
 
-from slamgym.envs.controllers import OpenLoop
-from slamgym.experiments.figures import noise_study_figure, save_figure
-from slamgym.experiments.logs import record_episode
-from slamgym.experiments.noise_study import study_log
-from slamgym.experiments.runs import settings_for
-from slamgym.sim_configs import action_sequence, load_scenario
+from slamgym import load_scenario
+from slamgym.envs import OpenLoop
+from slamgym.experiments import (
+    noise_study_figure,
+    record_episode,
+    save_figure,
+    settings_for,
+    study_log,
+)
+from slamgym.sim_configs import action_sequence
 
 PICTURE = Path("results/04_noise_study.png")
 

@@ -24,19 +24,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slamgym import Belief, UpdateReport, check_estimator
 from slamgym.estimator import (
-    Belief,
     EstimatorContractError,
-    UpdateReport,
-    check_estimator,
-)
-from slamgym.estimator.models import (
+    argument_checks,
     locate_landmark,
     predict_measurement,
     predict_pose,
     wrap_angle,
 )
-from slamgym.estimator.support import argument_checks
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,7 @@ from matplotlib.backend_bases import KeyEvent
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slamgym.envs import LandmarkWorldEnv
-from slamgym.estimator import make_estimator
-from slamgym.sim_configs import Scenario, load_scenario
+from slamgym import LandmarkWorldEnv, Scenario, load_scenario, make_estimator
 
 ARROWS = {
     "up": (1.0, 0.0),

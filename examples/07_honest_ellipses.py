@@ -26,9 +26,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.rendering import write_video
-from slamgym.estimator import Belief, SlamEstimator, make_estimator
+from slamgym import Belief, LandmarkWorldEnv, make_estimator
+from slamgym.envs import write_video
+from slamgym.estimator import SlamEstimator
 from slamgym.evaluation import landmark_distances
 from slamgym.sim_configs import action_sequence
 

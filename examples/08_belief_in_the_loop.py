@@ -24,8 +24,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from slamgym import Waypoints
 from slamgym.agents import BeliefObservation, BeliefObservationVector, InformationReward
-from slamgym.envs.controllers import Waypoints
 
 PICTURE = Path("results/08_belief_in_the_loop.png")
 ROUND = [(6, -6), (6, 6), (-6, 6), (-6, -6)]

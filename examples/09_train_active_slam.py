@@ -33,19 +33,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slamgym.agents import BASELINES, ActiveSlamEnv, ActiveSlamVectorEnv, make_baseline
-from slamgym.agents.active_slam import Observation
-from slamgym.agents.active_slam_scores import (
-    HELD_OUT,
-    Episode,
-    Policy,
-    baseline_policy,
-    difference_lines,
-    mean_of,
-    run_episodes,
-    score_table,
+from slamgym.agents import (
+    BASELINES,
+    ActiveSlamEnv,
+    ActiveSlamVectorEnv,
+    make_baseline,
 )
-from slamgym.envs.vector import FlattenBatch, to_stable_baselines
+from slamgym.agents import active_slam_scores as scores
+from slamgym.envs import FlattenBatch, to_stable_baselines
 
 FOLDER = Path("results/09_train_active_slam")
 SETTINGS: dict[str, Any] = {
@@ -108,13 +103,13 @@ def train(scenario: str, steps: int, worlds: int) -> list[dict[str, float]]:
     return curve
 
 
-def load_policy(path: Path) -> Policy:
+def load_policy(path: Path) -> scores.Policy:
     """Read a saved policy; it acts deterministically."""
     from stable_baselines3 import PPO  # noqa: PLC0415 (an extra)
 
     model = PPO.load(path, device="cpu")
 
-    def act(observation: Observation, env: ActiveSlamEnv) -> NDArray[np.float64]:
+    def act(observation: dict[str, Any], env: ActiveSlamEnv) -> NDArray[np.float64]:
         flat = flatten(env.observation_space, observation)
         action, _ = model.predict(np.asarray(flat), deterministic=True)
         return np.asarray(action, dtype=np.float64)
@@ -123,19 +118,21 @@ def load_policy(path: Path) -> Policy:
 
 
 def play_everyone(
-    env: ActiveSlamEnv, policy: Policy, maps: int
-) -> dict[str, list[Episode]]:
+    env: ActiveSlamEnv, policy: scores.Policy, maps: int
+) -> dict[str, list[scores.Episode]]:
     """Run policy and baselines on the same maps, which were not used for training."""
-    seeds = range(HELD_OUT, HELD_OUT + maps)
+    seeds = range(scores.HELD_OUT, scores.HELD_OUT + maps)
     players = {"ppo": policy}
     for name in BASELINES:
         baseline = make_baseline(name, env.scenario, np.random.default_rng(0))
-        players[name] = baseline_policy(baseline)
-    return {name: run_episodes(env, each, seeds) for name, each in players.items()}
+        players[name] = scores.baseline_policy(baseline)
+    return {
+        name: scores.run_episodes(env, each, seeds) for name, each in players.items()
+    }
 
 
 def draw_curve(
-    curve: list[dict[str, float]], played: dict[str, list[Episode]]
+    curve: list[dict[str, float]], played: dict[str, list[scores.Episode]]
 ) -> Figure:
     """Draw return against steps, the baselines as lines."""
     figure = Figure((7, 4), layout="constrained")
@@ -143,7 +140,7 @@ def draw_curve(
     axes.plot([row["steps"] for row in curve], [row["return"] for row in curve], c=INK)
     end = curve[-1]["steps"] if curve else 1  # no episode may have ended yet
     for k, name in enumerate(BASELINES):
-        mean = mean_of(played[name], "total").value
+        mean = scores.mean_of(played[name], "total").value
         axes.axhline(mean, color=PALE, linestyle="--", zorder=0)
         beside = (0.6 + 0.12 * (k % 3)) * end  # lines can be close
         axes.annotate(name, (beside, mean), color="#777777", va="bottom", fontsize=9)
@@ -152,10 +149,12 @@ def draw_curve(
     return figure
 
 
-def draw_trajectories(env: ActiveSlamEnv, played: dict[str, list[Episode]]) -> Figure:
+def draw_trajectories(
+    env: ActiveSlamEnv, played: dict[str, list[scores.Episode]]
+) -> Figure:
     """Draw the paths of all policies on the first map, side by side."""
     figure = Figure((3 * len(played), 3.4), layout="constrained")
-    env.reset(seed=HELD_OUT)
+    env.reset(seed=scores.HELD_OUT)
     landmarks = env.landmarks
     for axes, (name, episodes) in zip(
         np.ravel(figure.subplots(1, len(played))), played.items(), strict=True
@@ -166,7 +165,10 @@ def draw_trajectories(env: ActiveSlamEnv, played: dict[str, list[Episode]]) -> F
 
 
 def draw_episode(
-    axes: Axes, env: ActiveSlamEnv, landmarks: NDArray[np.float64], episode: Episode
+    axes: Axes,
+    env: ActiveSlamEnv,
+    landmarks: NDArray[np.float64],
+    episode: scores.Episode,
 ) -> None:
     """Draw walls, landmarks and one path."""
     for x0, y0, x1, y1 in env.scenario.walls:
@@ -181,7 +183,7 @@ def draw_episode(
     axes.set_axis_off()
 
 
-def outcome(episode: Episode) -> str:
+def outcome(episode: scores.Episode) -> str:
     """Describe the end of an episode in a few words."""
     if episode.success:
         return f"all known in {episode.steps} steps"
@@ -228,9 +230,9 @@ def main() -> None:
         writer.writerows(curve)
     env = ActiveSlamEnv(given.scenario)
     played = play_everyone(env, load_policy(FOLDER / "policy.zip"), given.maps)
-    scores = f"{score_table(played)}\n{difference_lines(played, 'ppo')}"
-    print(f"{given.scenario}, {given.maps} maps that training never saw:\n{scores}")
-    (FOLDER / "scores.txt").write_text(scores + "\n", encoding="utf-8")
+    table = f"{scores.score_table(played)}\n{scores.difference_lines(played, 'ppo')}"
+    print(f"{given.scenario}, {given.maps} maps that training never saw:\n{table}")
+    (FOLDER / "scores.txt").write_text(table + "\n", encoding="utf-8")
     draw_curve(curve, played).savefig(FOLDER / "learning_curve.png", dpi=120)
     draw_trajectories(env, played).savefig(FOLDER / "trajectories.png", dpi=100)
     print(f"wrote {FOLDER}")

@@ -17,12 +17,8 @@ import argparse
 
 from numpy.typing import ArrayLike
 
-from slamgym.estimator import EkfSlam
-from slamgym.experiments.monte_carlo import (
-    monte_carlo,
-    summarise_monte_carlo,
-    write_html_report,
-)
+from slamgym import EkfSlam, monte_carlo
+from slamgym.experiments import summarise_monte_carlo, write_html_report
 
 
 class CautiousEkf(EkfSlam):

@@ -15,10 +15,10 @@ confirmation.
 
 import numpy as np
 
-from slamgym.envs import LandmarkWorldEnv
-from slamgym.estimator import SlamEstimator, make_estimator
+from slamgym import LandmarkWorldEnv, load_scenario, make_estimator
+from slamgym.estimator import SlamEstimator
 from slamgym.evaluation import score_association
-from slamgym.sim_configs import action_sequence, load_scenario
+from slamgym.sim_configs import action_sequence
 
 POLICIES = {
     "nearest": {"association": "nearest", "backdate": False},

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.distributions import Normal
 
-from slamgym.envs.vector import FlattenBatch
+from slamgym.envs import FlattenBatch
 
 FOLDER = Path("results/12_ppo_in_one_file")
 ROLLOUT = 64  # steps of every world between two updates

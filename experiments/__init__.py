@@ -5,12 +5,44 @@
 * :mod:`~slamgym.experiments.figures` draws a run: map, errors, covariance.
 * :mod:`~slamgym.experiments.monte_carlo` tests the consistency of filters in many runs.
 * :mod:`~slamgym.experiments.noise_study` scales each noise, in one run or in many.
+* :mod:`~slamgym.experiments.noise_fitting` fits the noise of logs.
 * :mod:`~slamgym.experiments.trajectories` generates data sets of trajectories.
 * :mod:`~slamgym.experiments.viewers` writes a run as a web page, or for rerun.
 
 The command line ``slamgym`` is ``command_line``.
 """
 
-from lazy_loader import attach_stub
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+from ..public_names import attach
+
+if TYPE_CHECKING:
+    from . import figures as figures
+    from . import logs as logs
+    from . import monte_carlo as monte_carlo
+    from . import noise_fitting as noise_fitting
+    from . import noise_study as noise_study
+    from . import runs as runs
+    from . import trajectories as trajectories
+    from . import viewers as viewers
+    from .figures import *
+    from .logs import *
+    from .monte_carlo import consistency_of as consistency_of
+    from .monte_carlo import load_results as load_results
+    from .monte_carlo import merge_blocks as merge_blocks
+    from .monte_carlo import summarise_monte_carlo as summarise_monte_carlo
+    from .monte_carlo import write_html_report as write_html_report
+    from .noise_fitting import *
+    from .noise_study import NoiseEffect as NoiseEffect
+    from .noise_study import NoiseRow as NoiseRow
+    from .noise_study import NoiseRun as NoiseRun
+    from .noise_study import noise_effects as noise_effects
+    from .noise_study import noise_effects_figure as noise_effects_figure
+    from .noise_study import scaled_scenario as scaled_scenario
+    from .noise_study import study_log as study_log
+    from .noise_study import study_scenario as study_scenario
+    from .runs import *
+    from .trajectories import *
+    from .viewers import *
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)

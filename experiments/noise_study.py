@@ -1,10 +1,14 @@
-"""The noise study of one run: each noise times 10 and divided by 10, in turn.
+"""The noise study: each noise times 10 and divided by 10, in turn.
 
-Section 3.2 of the CMU 16-833 EKF-SLAM homework. For a log, only the filter's assumed
-noise changes: the readings stay as they are, so a wrong σ shows as a belief that is too
-wide or too narrow. For a scenario, world and filter change together, with the same
-random numbers: the filter's assumption stays right, and the study shows what a better
-or worse robot would achieve.
+`study_log` and `study_scenario` study one run, as section 3.2 of the CMU 16-833
+EKF-SLAM homework asks. For a log, only the filter's assumed noise changes: the readings
+stay as they are, so a wrong σ shows as a belief that is too wide or too narrow. For a
+scenario, world and filter change together, with the same random numbers: the filter's
+assumption stays right, and the study shows what a better or worse robot would achieve.
+
+`noise_effects` studies many runs, with standard errors. A σ changes in the world and in
+what the filters assume ("both", so that they stay right), in the world alone, or in the
+filters alone, which then trust their odometry or their sensor too much or too little.
 """
 
 from __future__ import annotations
@@ -171,13 +175,6 @@ def _measured(done: Replay, variation: Variation, settings: FilterSettings) -> N
     return NoiseRun(f"{variation}{value}", row, trace)
 
 
-# --------------------------------------------------------------------------------------
-# The noise study over many runs, with standard errors.
-#
-# Each σ of `SIGMAS` is multiplied and divided by 10, in turn: in the world and in what
-# the filters assume ("both", so that they stay right), in the world alone, or in the
-# filters alone, which then trust their odometry or their sensor too much or too little.
-
 Changed = Literal["both", "world", "filter"]
 CHANGED: tuple[Changed, ...] = get_args(Changed)
 
@@ -238,7 +235,7 @@ def noise_effects(
     scenario : Scenario, mapping, str or Path
         The reference.
     estimators, runs, seed, jobs, backend
-        As in :func:`~slamgym.experiments.monte_carlo.monte_carlo`.
+        As in :func:`~slamgym.monte_carlo`.
     changed : iterable of {"both", "world", "filter"}
         Where a noise changes.
     progress : callable, optional
@@ -330,9 +327,6 @@ def _effect(place: str, variation: Variation, scores: EstimatorScores) -> NoiseE
     )
 
 
-# --------------------------------------------------------------------------------------
-# The variations of a noise study: each noise times 10 and divided by 10, in turn.
-
 FACTORS = (10.0, 0.1)
 
 
@@ -370,9 +364,6 @@ def scaled_scenario(scenario: Scenario, sigma: str, factor: float) -> Scenario:
         motion={"std": scaled.motion_std}, sensor={"std": scaled.measurement_std}
     )
 
-
-# --------------------------------------------------------------------------------------
-# The figure of a noise study over many runs.
 
 _TITLES = {
     "both": ("World and filter change", "the filter assumes the right noise"),

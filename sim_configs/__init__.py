@@ -1,5 +1,18 @@
 """What to simulate, as data: validated scenarios, and presets in TOML files."""
 
-from lazy_loader import attach_stub
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+from ..public_names import attach
+
+if TYPE_CHECKING:
+    from .field_types import ScenarioError as ScenarioError
+    from .layouts import place_landmarks as place_landmarks
+    from .scenario import Robot as Robot
+    from .scenario import Scenario as Scenario
+    from .scenario import action_sequence as action_sequence
+    from .scenario_files import drawn_scenario as drawn_scenario
+    from .scenario_files import list_presets as list_presets
+    from .scenario_files import load_scenario as load_scenario
+    from .scenario_files import save_scenario as save_scenario
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -1,6 +1,7 @@
 """Types of scenario fields: strict numbers whose error messages name the expectation.
 
-Number types refuse strings, booleans and NaN; they accept integers for floats.
+Number types refuse strings, booleans and NaN; they accept integers for floats. The
+mistakes of a scenario become one `ScenarioError`.
 """
 
 import math

@@ -1,4 +1,10 @@
-"""The complete description of a simulated world, as one immutable value."""
+"""The complete description of a simulated world, as one immutable value: `Scenario`.
+
+Its tables stand above it: `Faults`, `Motion`, `Sensor`, `Start`, `Robot`, and
+`Randomise`, the ranges from which every episode may draw a world of its own. Noise is
+multiplied by factors that are uniform in their logarithm. All other settings are
+uniform between two ends. The number of landmarks never changes.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -35,9 +41,6 @@ from .field_types import (
     expect,
 )
 from .layouts import LandmarkLayout, place_landmarks
-
-# --------------------------------------------------------------------------------------
-# Tables of a scenario: start, robot, motion noise, sensor and faults.
 
 _Degrees = Annotated[
     float,
@@ -120,12 +123,6 @@ class Motion(Part):
                 f"no sideways motion, got {self.std}"
             )
 
-
-# --------------------------------------------------------------------------------------
-# Ranges in a scenario from which every episode draws a world of its own.
-#
-# Noise is multiplied by factors that are uniform in their logarithm. All other settings
-# are uniform between two ends. The number of landmarks never changes.
 
 Factors = Annotated[
     tuple[Positive, Positive], expect("2 finite factors > 0, low and high")

@@ -1,4 +1,8 @@
-"""Scenarios on disk: presets, TOML files and their JSON schema."""
+"""Scenarios on disk: presets, TOML files and their JSON schema.
+
+`load_scenario` reads a preset or a file, and `save_scenario` writes one.
+`drawn_scenario` draws the world of one episode from the ranges of a scenario.
+"""
 
 import json
 import re

@@ -9,7 +9,7 @@ from PIL import Image
 from sphinx.util.display import status_iterator
 
 from slamgym.agents import make_baseline
-from slamgym.envs.controllers import OpenLoop
+from slamgym.envs import OpenLoop
 from slamgym.sim_configs import Scenario, action_sequence, list_presets, load_scenario
 
 FRAMES = 40

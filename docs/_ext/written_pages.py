@@ -31,24 +31,9 @@ PACKAGES: tuple[ModuleType, ...] = (
     evaluation,
     sim_configs,
     envs,
-    envs.controllers,
     agents,
-    experiments.logs,
-    experiments.runs,
-    experiments.monte_carlo,
-    experiments.noise_study,
-    experiments.trajectories,
-    experiments.figures,
-    experiments.viewers,
-    estimator.association,
-    estimator.filters,
-    estimator.large_maps,
-    estimator.map_management,
-    estimator.models,
-    estimator.smoother,
-    envs.robot,
-    envs.rendering,
-    envs.vector,
+    experiments,
+    slamgym,
 )
 """A name stands under the first package that has it."""
 
@@ -160,7 +145,8 @@ def names_page(package: str, names: list[str]) -> str:
     environments = {cls.__name__: page for page, (cls, _) in ENVIRONMENTS.items()}
     constants = [name for name in names if not callable(getattr(module, name))]
     described = {*environments, *constants}
-    rows = "\n".join(f"   {name}" for name in names if name not in described)
+    parts = public_names_by_part(module, [n for n in names if n not in described])
+    tables = "\n\n".join(_table(part, found) for part, found in sorted(parts.items()))
     data = "\n\n".join(_constant(package, name) for name in constants)
     pages = "\n".join(
         f"* :doc:`{name} <../{environments[name]}>`"
@@ -176,14 +162,31 @@ def names_page(package: str, names: list[str]) -> str:
 
 {pages}
 
+{tables}
+
+{data}
+"""
+
+
+def public_names_by_part(module: ModuleType, names: list[str]) -> dict[str, list[str]]:
+    """Return the names of a package by the module or folder that has them."""
+    parts: dict[str, list[str]] = {}
+    for name in names:
+        home = getattr(module, name).__module__.removeprefix(f"{module.__name__}.")
+        parts.setdefault(home.split(".")[0], []).append(name)
+    return parts
+
+
+def _table(part: str, names: list[str]) -> str:
+    rows = "\n".join(f"   {name}" for name in names)
+    return f"""{part}
+{"-" * len(part)}
+
 .. autosummary::
    :toctree: names
    :nosignatures:
 
-{rows}
-
-{data}
-"""
+{rows}"""
 
 
 def _constant(package: str, name: str) -> str:
@@ -213,9 +216,7 @@ def api_index(listed: dict[str, list[str]]) -> str:
         for name in slamgym.__all__
         if not inspect.ismodule(thing := getattr(slamgym, name))
     )
-    rows = "\n".join(
-        f"   {package.removeprefix('slamgym.')} <{package}>" for package in listed
-    )
+    rows = "\n".join(f"   {package} <{package}>" for package in listed)
     return f"""Public names
 ============
 

@@ -32,9 +32,8 @@ This tutorial does the same in Python, with a simulated drive through the homewo
 # landmarks inside a loop of 29 long steps.
 
 from slamgym import load_scenario, replay
-from slamgym.envs.controllers import OpenLoop
-from slamgym.experiments.logs import record_episode
-from slamgym.experiments.runs import landmark_table, settings_for
+from slamgym.envs import OpenLoop
+from slamgym.experiments import landmark_table, record_episode, settings_for
 
 world = load_scenario("six_landmarks")
 log = record_episode(world, OpenLoop.for_scenario(world), seed=0)
@@ -45,7 +44,7 @@ print(log.name, "with", len(log.events), "rows of odometry and scans")
 # -------
 # The textbook filter of the homework is ``ekf``. ``settings_for`` takes the noise from the log's header.
 
-from slamgym.experiments.figures import covariance_figure, map_figure, truth_figure
+from slamgym.experiments import covariance_figure, map_figure, truth_figure
 
 settings = settings_for(log, estimator="ekf")
 run = replay(log, settings.make(log.start))
@@ -82,8 +81,7 @@ correlations = covariance_figure(run.trace)
 # times 10 and divided by 10. NIS and NEES are printed per degree of freedom, so 1 is expected. If a σ is too large, the
 # ellipses are too wide, and both are below 1. If it is too small, the truth lies outside the ellipses, and both are above 1.
 
-from slamgym.experiments.figures import noise_study_figure
-from slamgym.experiments.noise_study import study_log
+from slamgym.experiments import noise_study_figure, study_log
 
 runs = study_log(log, settings)
 for study in runs:

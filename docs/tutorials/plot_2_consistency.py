@@ -31,8 +31,7 @@ check_estimator(CautiousEkf)
 # All filters receive the same readings. A command does the same for a class in the file ``my_filters.py``,
 # and writes a report: ``slamgym monte-carlo six_landmarks -e ekf,invariant,my_filters:CautiousEkf --runs 100``.
 
-from slamgym import monte_carlo
-from slamgym.experiments.monte_carlo import consistency_of
+from slamgym import consistency_of, monte_carlo
 
 filters = {"ekf": "ekf", "cautious": CautiousEkf, "invariant": "invariant"}
 results = monte_carlo("six_landmarks", filters, runs=100)

@@ -12,8 +12,8 @@ drives around a square. It returns to the start whenever the standard deviation 
 import gymnasium
 import numpy as np
 
+from slamgym import Waypoints
 from slamgym.agents import BeliefObservation, InformationReward
-from slamgym.envs.controllers import Waypoints
 
 world = gymnasium.make("slamgym/LandmarkWorld-v0", scenario="active_medium")
 believing = BeliefObservation(world, estimator="invariant")

@@ -35,8 +35,7 @@ Path("corner.csv").write_text(LOG)
 # ``slamgym replay corner.csv --motion-std .1,.05,.05 --measurement-std .02,.05``.
 
 from slamgym import InvariantEkfSlam, read_log, replay
-from slamgym.experiments.figures import map_figure
-from slamgym.experiments.runs import landmark_table
+from slamgym.experiments import landmark_table, map_figure
 
 log = read_log("corner.csv")
 run = replay(log, InvariantEkfSlam((0.1, 0.05, 0.05), (0.02, 0.05)))
@@ -52,8 +51,7 @@ picture = map_figure(run.trace)
 # A filter processes the readings one after the other. The smoother estimates all poses and landmarks of the log at once
 # (``slamgym smooth corner.csv``). :doc:`/limits` compares their accuracy.
 
-from slamgym.experiments.figures import smoothed_figure
-from slamgym.experiments.runs import settings_for, smooth_log
+from slamgym.experiments import settings_for, smooth_log, smoothed_figure
 
 settings = settings_for(
     log,

@@ -1,4 +1,8 @@
-"""The input of the renderer: plain arrays, without matplotlib."""
+"""The input of the renderer, as plain arrays without matplotlib: `RenderState`.
+
+The functions below it compute what is drawn: the limits of the axes, the area that the
+sensor sees, and the ellipses of a belief.
+"""
 
 from __future__ import annotations
 

@@ -400,9 +400,6 @@ def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)
 ELLIPSE_HANDLER = {Ellipse: HandlerPatch(patch_func=_lying_ellipse)}
 
 
-# --------------------------------------------------------------------------------------
-# A line of text that changes in every frame, drawn faster than `Text`.
-
 _POINTS = 11.0
 
 

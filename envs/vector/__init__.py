@@ -1,5 +1,14 @@
 """Many worlds at once: native vector environments, batches and their wrappers."""
 
-from lazy_loader import attach_stub
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+from ...public_names import attach
+
+if TYPE_CHECKING:
+    from .landmark_world_vector import LandmarkWorldVectorEnv as LandmarkWorldVectorEnv
+    from .world_batch import MixedWorlds as MixedWorlds
+    from .world_batch import WorldBatch as WorldBatch
+    from .wrappers import FlattenBatch as FlattenBatch
+    from .wrappers import to_stable_baselines as to_stable_baselines
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -1,4 +1,8 @@
-"""Many landmark worlds as one native vector environment of Gymnasium."""
+"""Many landmark worlds as one native vector environment of Gymnasium.
+
+`LandmarkWorldVectorEnv` steps a batch of worlds. The functions below it apply
+Gymnasium's rules for seeds, reset masks and infos of vector environments.
+"""
 
 from __future__ import annotations
 
@@ -312,10 +316,6 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
                 f"worlds {np.flatnonzero(ended).tolist()} have ended: reset them first "
                 '(options={"reset_mask": …})'
             )
-
-
-# --------------------------------------------------------------------------------------
-# Gymnasium's rules for the episodes of vector environments: seeds, masks, infos.
 
 
 def world_seeds(

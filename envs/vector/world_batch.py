@@ -1,4 +1,8 @@
-"""Many worlds of one scenario, simulated together in numpy."""
+"""Many worlds, simulated together in numpy: those of one scenario in a `WorldBatch`.
+
+`MixedWorlds` are worlds that draw their own settings from the ranges of a scenario;
+`DrawnWorlds` holds these settings as arrays.
+"""
 
 from __future__ import annotations
 
@@ -305,10 +309,6 @@ def _replaced(old: AnyArray, worlds: IndexArray, value: Any) -> AnyArray:
     new = old.copy()
     new[worlds] = value
     return new
-
-
-# --------------------------------------------------------------------------------------
-# The settings of worlds that draw their own from ranges, as arrays.
 
 
 class DrawnWorlds:

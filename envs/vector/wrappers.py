@@ -1,6 +1,8 @@
-"""Vector environments in the interface of Stable-Baselines3.
+"""Wrappers of vector environments that process the whole batch at once.
 
-The first call imports Stable-Baselines3, which slamgym does not require.
+`to_stable_baselines` converts a vector environment to the interface of
+Stable-Baselines3, which its first call imports and slamgym does not require.
+`FlattenBatch` flattens observations.
 """
 
 import importlib
@@ -205,9 +207,6 @@ def _common(options: list[Info]) -> Info | None:
         raise ValueError("options must be the same for all worlds")
     return options[0] or None
 
-
-# --------------------------------------------------------------------------------------
-# Wrappers of vector environments that process the whole batch at once.
 
 Infos = dict[str, Any]
 

@@ -1,4 +1,8 @@
-"""Assign the readings of a scan to landmarks of a map, by one of several methods."""
+"""Assign the readings of a scan to landmarks of a map, by one of several methods.
+
+`assign_scan` applies the method that the `AssociationPolicy` names: the nearest
+neighbour, or the most likely joint assignment.
+"""
 
 from __future__ import annotations
 
@@ -164,9 +168,6 @@ def _slots(
     slots[paired] = explained[marks[paired]]
     return np.asarray(slots, dtype=np.int64)
 
-
-# --------------------------------------------------------------------------------------
-# The policy by which readings are associated and new landmarks confirmed.
 
 ASSOCIATIONS = ("auto", "nearest", "joint", "compatibility", "hypotheses")
 
@@ -458,8 +459,7 @@ def nearest_neighbours(
 #
 # A depth-first branch and bound decides one reading after the other.  A pair conditions
 # the expected readings of all landmarks.  By the chain rule of the Gaussian, the cost
-# of
-# an assignment is the sum of the costs of its pairs, each given the pairs before it::
+# of an assignment is the sum of the costs of its pairs, each given the pairs before::
 #
 #     h ← h + K (z − h),  C ← C − K C,    K = C Hⱼᵀ (Cⱼⱼ + Q)⁻¹,    C = H P Hᵀ
 #

@@ -1,7 +1,8 @@
 """Associate each row of a scan with a landmark, a candidate for one, or neither.
 
-An association changes no belief.  It takes effect after the filter has accepted the
-scan.
+`associate` assigns readings to landmarks of the map, and the others to tentative
+landmarks. An association changes no belief.  It takes effect after the filter has
+accepted the scan.
 """
 
 from __future__ import annotations
@@ -173,8 +174,7 @@ class ScanAssociation:
 # The cost of landmarks that a scan should have shown and did not.
 #
 # An assignment that leaves a landmark without a reading, although the sensor sees it
-# with
-# probability P_D, is less likely by the factor 1 − P_D::
+# with probability P_D, is less likely by the factor 1 − P_D::
 #
 #     cost = −2 Σ ln(1 − P_D(β, r))
 #

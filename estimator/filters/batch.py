@@ -1,4 +1,8 @@
-"""Many independent runs of one filter at once, on the kernels of the single filter."""
+"""Many independent runs of one filter at once, on the kernels of the single filter.
+
+`BatchSlam` runs them. The functions below it check its arguments; `BatchBeliefs` and
+`BatchTrace` are its results.
+"""
 
 from __future__ import annotations
 
@@ -347,7 +351,7 @@ def _of(part: slice, arrays: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 # --------------------------------------------------------------------------------------
-# Checks of the arguments of a batch of runs.
+# The arguments of a batch of runs, checked, and its results.
 
 
 def step_data(

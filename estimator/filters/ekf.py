@@ -1,4 +1,9 @@
-"""EKF-SLAM: the standard filter, on the shared kernels."""
+"""The family of EKF-SLAM filters on the shared kernels, and their settings.
+
+`MapFilter` predicts and updates for all of them. `EkfSlam` is the standard filter. Its
+subclasses differ in where they linearise and in their error frame: `InvariantEkfSlam`,
+`FirstEstimatesEkfSlam`, `ObservabilityConstrainedEkfSlam` and `IteratedEkfSlam`.
+"""
 
 from __future__ import annotations
 

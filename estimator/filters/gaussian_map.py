@@ -1,4 +1,8 @@
-"""A Gaussian over robot pose and landmarks, in arrays that grow with the map."""
+"""A Gaussian over robot pose and landmarks, in arrays that grow with the map.
+
+`GaussianMap` adds, removes and merges landmarks, and saves its state. `ScanWorkspace`
+holds the arrays of one scan, and a `ScanReport` its results.
+"""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def coincide(
     −J D, with D taken at the points where the filter linearises.  The additive EKF has
     no heading column, since the condition is linear in its error, and M = 1.  In the
     invariant frame δ is composed with the state and P follows, as in
-    :class:`~slamgym.estimator.filters.ekf.InvariantEkfSlam`.  There the condition
+    :class:`~slamgym.estimator.InvariantEkfSlam`.  There the condition
     R(t) D + V(t) (ξ_i − ξ_j) = 0 holds for M = V(−t)⁻¹, where t is the turn in δ, which
     is found by iteration.  Several pairs have their rows of D and H below each other.
 

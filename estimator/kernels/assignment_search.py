@@ -1,8 +1,9 @@
 """Search for the cheapest joint assignments of a scan, compiled.
 
-:mod:`slamgym.estimator.association.scan_assignments` has the equations.  Depth d of the
-search tree decides the reading ``order[d]``.  The expected readings given the pairs so
-far stand at ``level[d]`` of ``shifts`` and ``joints``.
+:mod:`slamgym.estimator.association.scan_assignments` has the equations.
+`search_assignments` decides at depth d of the search tree the reading ``order[d]``.
+The expected readings given the pairs so far stand at ``level[d]`` of ``shifts`` and
+``joints``. `search_clique` finds the largest set of landmark pairs that agree.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def drive_runs(
     motion_values : ndarray, shape (4,)
         The variances (σx², σy², σα²), and 1 if a robot at rest has motion noise too.
     rule_values
-        As :func:`.kalman_gain.as_rules` reads them.
+        As :func:`.scan_update.as_rules` reads them.
     """
     runs, data = RunArrays(*run_arrays), StepData(*step_data)
     poses, pose_covariances, nis, degrees_of_freedom = trace

@@ -91,7 +91,7 @@ def follow_drive(
     noise_at_rest : bool
         Whether odometry of exactly (0, 0) has motion noise.
     rule_values
-        As :func:`.kalman_gain.as_rules` reads them; those of the sensor's noise are
+        As :func:`.scan_update.as_rules` reads them; those of the sensor's noise are
         overwritten.
     start
         Mean (3,) and covariance (3, 3) of the first pose.

@@ -1,7 +1,8 @@
 """Predicted beliefs after given plans, compiled.
 
-Every plan starts from a copy of a belief. Its steps are those of a real filter: the
-expected readings have innovations of zero, so that only the covariance changes.
+In `imagine_plans`, every plan starts from a copy of a belief. Its steps are those of a
+real filter: the expected readings have innovations of zero, so that only the covariance
+changes.
 """
 
 from __future__ import annotations

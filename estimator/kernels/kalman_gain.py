@@ -1,9 +1,9 @@
-"""Kalman gain and covariance update for many readings at once, compiled.
+"""Kalman gain and update of mean and covariance, for many readings at once, compiled.
 
-``system`` holds two rows for each reading, from the row FIRST of the workspace on:
-:mod:`.kalman_gain` lists their columns.  The covariance has room for whole vector
-registers (:class:`.kalman_gain.BeliefArrays`), and the rows are up to 4 entries
-longer.
+`absorb` computes gain and covariance, and `compose` the state. ``system`` holds two
+rows for each reading, from the row FIRST of the workspace on. `Workspace` and the
+constants above it describe them.  The covariance has room for whole vector registers
+(`BeliefArrays`), and the rows are up to 4 entries longer.
 """
 
 import math

@@ -1,4 +1,7 @@
-"""Update of one belief by one scan, compiled: screen, correct, map new landmarks."""
+"""Update of one belief by one scan, compiled: screen, correct, map new landmarks.
+
+`update_belief` takes in one scan, and `predict` one odometry reading.
+"""
 
 import numpy as np
 
@@ -86,7 +89,7 @@ def update_belief(
     rows, before, prior
         A :class:`.kalman_gain.Workspace`, which then holds the record of the scan.
     rule_values
-        The filter's rules, as :func:`.kalman_gain.as_rules` reads them.
+        The filter's rules, as :func:`as_rules` reads them.
 
     Returns
     -------
@@ -195,7 +198,7 @@ def as_rules(values: Array) -> Rules:
 
 
 # --------------------------------------------------------------------------------------
-# Screening of one scan, compiled: minimum range, chi-square gate, nearness.
+# Screening: minimum range, chi-square gate, nearness.
 
 
 @njit_internal
@@ -311,7 +314,7 @@ def is_too_near(mean: Array, covariance: Array, column: int) -> bool:
 
 
 # --------------------------------------------------------------------------------------
-# One correction of a belief, compiled: linearise, condition, compose; iterated.
+# One correction: linearise, condition, compose; iterated.
 
 
 @njit_internal
@@ -411,7 +414,7 @@ def copy_covariance(source: Array, target: Array, size: int) -> None:
 
 
 # --------------------------------------------------------------------------------------
-# Linearisation of one reading, compiled: its rows of H and its innovation.
+# Linearisation of one reading.
 #
 # For a reading of the landmark in columns c, c+1 of the state only five columns of H
 # differ from zero: (x, y, θ, c, c+1).  A row of H is stored as these five entries.
@@ -466,10 +469,6 @@ def _project(reference: Array, column: int, H: Array) -> None:
         H[i, 4] -= seen * half_x
 
 
-# --------------------------------------------------------------------------------------
-# Landmark initialisation from one reading, compiled.
-
-
 @njit_internal
 def add_landmark(
     belief: BeliefArrays,
@@ -515,7 +514,7 @@ def add_landmark(
 
 
 # --------------------------------------------------------------------------------------
-# Prediction by one odometry reading, compiled; symbols as in the motion model.
+# Prediction; symbols as in the motion model.
 
 
 @jit

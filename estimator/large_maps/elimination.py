@@ -1,12 +1,15 @@
-"""Elimination of all landmarks except the local map, with reuse between local maps.
+"""Elimination of the unknowns of a large sparse map, and its order.
 
-Each node of a :class:`LandmarkDissection` eliminates its own landmarks, after those of
-its descendants (:mod:`.multifrontal`).  Landmarks of the local map are not eliminated:
-they remain in the fronts up to the root, where the update is −C, the Schur complement
-without Λ_LL.
+`LandmarkElimination` eliminates all landmarks except the local map from a sparse
+information matrix.  Each node of a :class:`LandmarkDissection` eliminates its own
+landmarks, after those of its descendants (:mod:`.multifrontal`).  Landmarks of the
+local map are not eliminated: they remain in the fronts up to the root, where the update
+is −C, the Schur complement without Λ_LL.  Nodes that do not depend on the local map are
+cached.  When the local map changes, only the nodes above the old and the new local map
+are computed again.
 
-Nodes that do not depend on the local map are cached.  When the local map changes, only
-the nodes above the old and the new local map are computed again.
+`SubmapElimination` solves the least-squares problem of joined submaps in the same way,
+part by part of the tree that `dissect` returns.
 """
 
 from __future__ import annotations
@@ -455,9 +458,6 @@ def with_ancestors(nodes: IntArray) -> set[int]:
         front = {node >> 1 for node in front} - found - {0}
     return found
 
-
-# --------------------------------------------------------------------------------------
-# Sparse least squares over submaps: normal equations, factorised part by part.
 
 Quadratic = tuple[Array, Array, float]
 """(H, g, c) of the function c − 2 gᵀ x + xᵀ H x."""

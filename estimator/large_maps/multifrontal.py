@@ -1,12 +1,14 @@
 """Sparse Cholesky factorisation by small dense fronts (multifrontal method).
 
-A sparse symmetric positive definite H is factorised node by node, children first
-[1]_.  A node eliminates its unknowns p from the front, the dense sum of its own
-entries of H and of its children's updates; r are the other unknowns of the front::
+A sparse symmetric positive definite H is factorised node by node (`eliminate`),
+children first [1]_.  A node eliminates its unknowns p from the front, the dense sum of
+its own entries of H and of its children's updates; r are the other unknowns of the
+front::
 
     front = [H_pp H_pr; · H_rr],   L Lᵀ = H_pp,   X = L⁻¹ H_pr,   update = H_rr − Xᵀ X
 
 The update is the Schur complement of H_pp, and is added to the parent's front.
+`eliminate_subset` eliminates landmarks around a local map from an `InformationMatrix`.
 
 References
 ----------
@@ -328,10 +330,6 @@ def _sparse_solver(information: csc_array) -> Solver:
     return lambda right: np.asarray(factor.solve(np.ascontiguousarray(right)))
 
 
-# --------------------------------------------------------------------------------------
-# The sum of a front and the updates of its children, compiled.
-
-
 @jit
 def add_update(top: Array, rest: Array, at: IntArray, update: Array) -> None:
     """Add a child's update (r, r) to the rows and columns ``at`` (r,) of a front.
@@ -350,9 +348,6 @@ def add_update(top: Array, rest: Array, at: IntArray, update: Array) -> None:
             else:
                 rest[row - p, column - p] += update[i, j]
 
-
-# --------------------------------------------------------------------------------------
-# A large sparse information matrix over landmarks, stored row by row.
 
 _ARRAY_OBJECTS = 220
 """Memory of two empty array objects [bytes]."""
@@ -532,10 +527,6 @@ def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:
         blocks[order], blocks[mirrored].transpose(0, 2, 1), rtol=1e-9, atol=0
     ):
         raise ValueError("state['matrix_blocks'] must be a symmetric matrix")
-
-
-# --------------------------------------------------------------------------------------
-# Where the coordinates of landmarks stand in a map's arrays.
 
 
 def pairs(places: Sequence[int] | IntArray) -> IntArray:

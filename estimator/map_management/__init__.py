@@ -3,6 +3,15 @@
 ``policy`` states the rules, and ``managed_slam`` applies them around any filter.
 """
 
-from lazy_loader import attach_stub
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+from ...public_names import attach
+
+if TYPE_CHECKING:
+    from .hypotheses import HypothesisSlam as HypothesisSlam
+    from .hypotheses import manage as manage
+    from .managed_slam import ManagedSlam as ManagedSlam
+    from .policy import FieldOfView as FieldOfView
+    from .policy import LandmarkPolicy as LandmarkPolicy
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)

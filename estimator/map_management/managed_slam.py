@@ -1,4 +1,9 @@
-"""Manage the landmarks of any filter by a policy."""
+"""Manage the landmarks of any filter by a policy: `ManagedSlam`.
+
+A managed filter associates readings without identity, confirms tentative landmarks,
+and prunes its map after each scan. `RecentScans` repeats the last scans once a landmark
+is confirmed.
+"""
 
 from __future__ import annotations
 
@@ -628,9 +633,6 @@ def _drop_contradicted(
                 return True
     return False
 
-
-# --------------------------------------------------------------------------------------
-# One of the last scans of a run, kept so that it can be repeated.
 
 ENTRIES = ["number", "motions", "readings", "row_ids", "labels", "removed", "merged"]
 """What the saved state of a scan holds, beside the state of the filter."""

@@ -1,7 +1,8 @@
-"""Edit the map of any filter: remove landmarks, merge two of them.
+"""Edit the map of any filter: remove landmarks, merge two of them, read parts of it.
 
-Filters that keep the arrays of :class:`EkfSlam` are edited in place, without a copy of
-the whole covariance.  Others may support some of these, each by itself:
+`edit_map` returns an editor, and `view_map` reads the map.  Filters that keep the
+arrays of :class:`EkfSlam` are edited in place, without a copy of the whole covariance.
+Others may support some of these, each by itself:
 
 * ``belief(landmark_ids)`` returns the marginal of the pose and these landmarks;
 * ``landmark_ids`` lists the mapped landmarks in the order of the belief;

@@ -1,5 +1,16 @@
 """Motion and measurement models: values, Jacobians and their compiled twins."""
 
-from lazy_loader import attach_stub
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+from ...public_names import attach
+
+if TYPE_CHECKING:
+    from .bearing_range import LandmarkLocation as LandmarkLocation
+    from .bearing_range import MeasurementPrediction as MeasurementPrediction
+    from .bearing_range import locate_landmark as locate_landmark
+    from .bearing_range import predict_measurement as predict_measurement
+    from .bearing_range import wrap_angle as wrap_angle
+    from .unicycle_motion import MotionPrediction as MotionPrediction
+    from .unicycle_motion import predict_pose as predict_pose
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -18,9 +18,6 @@ import numpy as np
 from ...arrays import Array
 from ...jit import njit_inlined, njit_internal
 
-# --------------------------------------------------------------------------------------
-# Arithmetic on angles in radians.
-
 Angle = TypeVar("Angle", float, Array)
 
 

@@ -1,4 +1,4 @@
-"""Rigid motions of the plane: composition of poses, and the exponential of SE(2).
+"""Rigid motions of the plane: composition of poses, SE(2), and errors of a belief.
 
 Symbols
 -------
@@ -98,13 +98,11 @@ turn_coefficients_jit = njit_inlined(turn_coefficients)
 #
 # Additive: e = x − x̂, the heading wrapped.  Invariant: the coordinates of SE_{1+n}(2),
 # in which a turn of the whole map is a straight line.  With t = θ − θ̂ and every point
-# q,
-# the robot's position and each landmark::
+# q, the robot's position and each landmark::
 #
 #     ξ_θ = t,    ξ_q = V(t)⁻¹ (q − R(t) q̂),    to first order  ξ = D e
-#     D = I − (J q̂; 0 at θ) e_θᵀ,    J = [0 −1; 1 0]
+#     D = I − (J q̂; 0 at θ) e_θᵀ
 #
-# where V(t) = [sin t, −(1 − cos t); 1 − cos t, sin t] / t (Barrau and Bonnabel, 2015).
 # Where the heading is uncertain, positions are spread over an arc: a banana in additive
 # coordinates, an ellipse in these.  States are (x, y, θ, l1x, l1y, …).
 
@@ -190,9 +188,6 @@ def _state(points: ComplexArray, heading: Array) -> Array:
     flat = pairs.reshape(*points.shape[:-1], -1)
     return np.concatenate([flat[..., :2], heading[..., None], flat[..., 2:]], axis=-1)
 
-
-# --------------------------------------------------------------------------------------
-# Repair what rounding does to a covariance that was computed as T P Tᵀ.
 
 __all__ = ["as_covariance"]
 

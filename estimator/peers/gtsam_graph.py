@@ -1,6 +1,8 @@
-"""A graph of GTSAM that grows by a pose and a scan at every step.
+"""GTSAM's smoothers on a graph that grows by a pose and a scan at every step.
 
-In GTSAM's coordinates of a pose, which are those of the robot's own frame::
+`GtsamSlam` builds the graph; its subclasses solve it incrementally, with a fixed lag,
+or in a batch.  In GTSAM's coordinates of a pose, which are those of the robot's own
+frame::
 
     t = t̂ + R(θ̂) v,    θ = θ̂ + ω
 

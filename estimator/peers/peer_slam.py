@@ -1,4 +1,7 @@
-"""What the adapters share: settings, arguments, and the report of an update."""
+"""What the adapters of other libraries share: settings, arguments, and reports.
+
+`PeerSlam` is the base of all adapters, and `KalmanPeer` that of Kalman filters.
+"""
 
 from __future__ import annotations
 
@@ -275,10 +278,6 @@ def _with_landmarks(state: Moments, new: Readings) -> Moments:
         rows = slice(n + 2 * k, n + 2 * k + 2)
         grown[rows, rows] += (of_reading * new.variances[k]) @ of_reading.T
     return Moments(np.concatenate([mean, found.position.ravel()]), grown)
-
-
-# --------------------------------------------------------------------------------------
-# The motion and the measurement model over pose and map as one vector.
 
 
 def moved_state(mean: Array, odometry: Array) -> tuple[Array, Array]:

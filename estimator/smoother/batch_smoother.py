@@ -1,4 +1,7 @@
-"""Smooth a drive: the most likely poses and landmarks given all its readings."""
+"""Smooth a drive: the most likely poses and landmarks given all its readings.
+
+`smooth` finds them, and the `SmoothedDrive` that it returns computes covariances.
+"""
 
 from __future__ import annotations
 
@@ -384,10 +387,6 @@ class SmoothedDrive:
             f"SmoothedDrive of {len(self.poses)} poses and {len(self.landmarks)} "
             f"landmarks, cost {self.cost:.6g} after {self.iterations} iterations"
         )
-
-
-# --------------------------------------------------------------------------------------
-# Find the smoother in an estimator that may be managed.
 
 
 def smoother_in(slam: SlamEstimator) -> SupportsSmoothing | None:

@@ -1,4 +1,7 @@
-"""Record the data of a whole drive: motions, scans and the noise of both."""
+"""Record the data of a whole drive: motions, scans and the noise of both.
+
+A `Drive` is the input of the smoother, and `DriveArrays` is its form for kernels.
+"""
 
 from __future__ import annotations
 
@@ -358,10 +361,6 @@ def landmark_order(ids: IntArray, firsts: IntArray) -> tuple[IntArray, IntArray]
     poses = np.arange(len(firsts) - 1)
     met = np.searchsorted(-last_poses, -poses, side="right")
     return found[by_last], 2 * met
-
-
-# --------------------------------------------------------------------------------------
-# The path of a smoothed drive between its poses: after every reading of odometry.
 
 
 def path_between(poses: Array, motions: Sequence[Motion], noise: MotionNoise) -> Array:

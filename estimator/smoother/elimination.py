@@ -14,7 +14,7 @@ q = G δ_{k−1} + s, with noise w ~ N(0, I), is eliminated by minimising over w
 
 and pose k by writing q in terms of pose k − 1.  E is never inverted: directions
 without noise, and a start that is known, are exact.  What remains, C and η, is the
-Schur complement of the landmarks.  :mod:`.elimination` goes back, forwards in time.
+Schur complement of the landmarks.  :func:`substitute` goes back, forwards in time.
 This is the backward information filter of a two-pass smoother [1]_ with the landmarks
 as parameters.
 
@@ -281,9 +281,8 @@ def _change_pose(
 
 
 # --------------------------------------------------------------------------------------
-# Go back over the eliminated poses, forwards in time, compiled.
-#
-# With the step δ_l of the landmarks, in the symbols of :mod:`.elimination`::
+# Go back over the eliminated poses, forwards in time, with the step δ_l of the
+# landmarks::
 #
 #     δ_k = q − U (Uᵀ (Λ q − λ) + W δ_l),    q = G δ_{k−1} + s
 #

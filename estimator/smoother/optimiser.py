@@ -1,4 +1,8 @@
-"""Levenberg-Marquardt over all poses and landmarks of a drive."""
+"""Levenberg-Marquardt over all poses and landmarks of a drive: `Optimiser`.
+
+`filter_drive` provides the initial values by an invariant filter, and `relocate` moves
+landmarks out of local minima.
+"""
 
 from __future__ import annotations
 
@@ -368,10 +372,6 @@ def _cost_at(
         squared += (z[1] - distance) ** 2 / range_variance(rules, z[1])
         total += robust_loss(squared, robust[0], robust[1])
     return total
-
-
-# --------------------------------------------------------------------------------------
-# Poses and landmarks to start the smoother from, by an invariant filter.
 
 
 def filter_drive(

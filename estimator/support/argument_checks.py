@@ -296,9 +296,6 @@ def _is_finite(value: float) -> bool:
     return isinstance(value, float | np.number) and isfinite(value)
 
 
-# --------------------------------------------------------------------------------------
-# Checks of landmarks that are to be merged in pairs.
-
 _WHOLE = (int, np.integer)
 
 

@@ -1,4 +1,8 @@
-"""Refuse a covariance that does not fit into memory, before it is filled."""
+"""Refuse a covariance that does not fit into memory, before it is filled.
+
+`usable_cores` and `share_out` share work over threads, for compiled functions that
+release the interpreter.
+"""
 
 from __future__ import annotations
 
@@ -113,9 +117,6 @@ def landmarks_that_fit(least: int, wished: int, copies: int = 1) -> int:
     most = wished if free == inf else int((sqrt(free / copies / 8) - 3) / 2)
     return max(least, min(wished, most))
 
-
-# --------------------------------------------------------------------------------------
-# Share work over threads, for compiled functions that release the interpreter.
 
 # Small shares: a thread whose core is busy then delays the others little.
 SHARES_PER_THREAD = 8

@@ -127,10 +127,6 @@ def _refuse_other_shape(
         raise ValueError(f"state[{name!r}] must have shape {wanted}, got shape {given}")
 
 
-# --------------------------------------------------------------------------------------
-# Saved states inside saved states, distinguished by a prefix of their keys.
-
-
 def with_prefix(name: str, state: Mapping[str, Any]) -> dict[str, Any]:
     """Return a state whose keys begin with a name and a dot.
 

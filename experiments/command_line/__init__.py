@@ -1,4 +1,4 @@
-"""The command line ``slamgym``, one module per command."""
+"""The command line ``slamgym``: ``app`` collects the commands of the other modules."""
 
 from .app import main
 

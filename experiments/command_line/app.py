@@ -25,10 +25,6 @@ __all__ = [
 ]
 
 
-# --------------------------------------------------------------------------------------
-# ``slamgym scenarios`` and ``slamgym estimators``: list worlds and filters.
-
-
 @command
 @takes("as_json")
 def scenarios(*, given: Options) -> None:

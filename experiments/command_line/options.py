@@ -1,4 +1,8 @@
-"""The arguments and options that several commands share, each with its help."""
+"""The arguments and options that several commands share, and how their values are read.
+
+Each annotated type is one option with its help. The functions below them parse values
+and choose scenarios, logs and filters by the names that the user gives.
+"""
 
 # ruff: noqa: RUF009 (what `_shared` returns is a field)
 

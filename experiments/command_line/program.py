@@ -1,4 +1,7 @@
-"""The program ``slamgym``, and the decorator by which a command joins it."""
+"""The program ``slamgym``, and the decorator by which a command joins it: `command`.
+
+A command ends with one line on standard error and an exit code, whatever happens.
+"""
 
 import contextlib
 import inspect
@@ -24,9 +27,6 @@ from ...sim_configs.atomic_file import unfinished
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-
-# --------------------------------------------------------------------------------------
-# Errors of the command line: one line on standard error, and an exit code.
 
 FAILURE, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 

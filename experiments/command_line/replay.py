@@ -1,4 +1,4 @@
-"""``slamgym replay``: filter a log, compare with the truth, draw."""
+"""``slamgym replay`` and ``slamgym smooth``: filter or smooth a log, compare, draw."""
 
 from dataclasses import replace
 from functools import partial
@@ -77,10 +77,6 @@ def replay(
     chosen = {*stds, *given.named_options()}
     note_noise(drive, next(iter(filters.values())), chosen, reporter)
     show_run(summary, place, reporter)
-
-
-# --------------------------------------------------------------------------------------
-# ``slamgym smooth``: all poses and landmarks of a log at once, with a picture.
 
 
 @command

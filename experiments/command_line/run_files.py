@@ -1,4 +1,4 @@
-"""Filter a log: the files of the run, and its printed results."""
+"""Filter a log for a command: `filter_and_write` writes and prints a run's results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -180,10 +180,6 @@ def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
         reporter.show(*warnings, "")
     reporter.show(written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
-
-
-# --------------------------------------------------------------------------------------
-# Compile a filter by its first steps.
 
 
 def warm_up(settings: FilterSettings, reporter: Reporter) -> None:

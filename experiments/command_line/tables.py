@@ -1,4 +1,4 @@
-"""The numbers of a run as tables for the terminal."""
+"""The results of all commands as tables for the terminal."""
 
 import math
 import textwrap
@@ -223,7 +223,7 @@ def smoothing_figures(summary: dict[str, Any]) -> Table:
 
 
 # --------------------------------------------------------------------------------------
-# The scores of a run's association as a table for the terminal.
+# Association.
 
 
 def association_table(scores: dict[str, Any]) -> Table:
@@ -271,7 +271,7 @@ def _gospa(parts: dict[str, Any]) -> str:
 
 
 # --------------------------------------------------------------------------------------
-# The results of noise studies as tables for the terminal.
+# Noise studies.
 
 _COLUMNS = {
     "pose_area": "pose\narea\n[m²]",
@@ -332,7 +332,7 @@ def _cell(effect: "NoiseEffect") -> str:
 
 
 # --------------------------------------------------------------------------------------
-# The result of a noise fit as tables for the terminal.
+# Noise fits.
 
 _VERDICTS = {
     "fitted": "",

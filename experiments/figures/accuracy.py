@@ -1,4 +1,9 @@
-"""Figure of the distances of a run's path and map from ground truth."""
+"""Figures of a run's accuracy: distances from the truth, errors, and covariance.
+
+`truth_figure` draws path and map beside the truth, `comparison_figure` the maps of
+several filters, `errors_figure` errors and innovations, and `covariance_figure` the
+correlations of the state.
+"""
 
 import math
 from collections.abc import Sequence
@@ -198,9 +203,6 @@ def _summary(
     return "  ·  ".join(parts)
 
 
-# --------------------------------------------------------------------------------------
-# Figure of the final maps of several filters side by side.
-
 _COLUMNS = 2
 _LONGEST = 52  # characters of a title
 
@@ -254,9 +256,6 @@ def honesty(trace: RunTrace) -> str:
     rms = np.sqrt(np.mean(distances.euclidean**2))
     return f"{inside} of {count} landmarks inside 3σ  ·  map error {rms:.2g} m RMS"
 
-
-# --------------------------------------------------------------------------------------
-# Figure of a run's errors and innovations against its covariances.
 
 _ROWS = (("x error [m]", "x"), ("y error [m]", "y"), ("θ error [rad]", "θ"))
 _LOG_FROM = 8.0  # times the band's upper bound: larger NIS needs a logarithmic axis
@@ -375,9 +374,6 @@ def _legend_above(axes: Axes, columns: int) -> None:
         borderaxespad=0.2,
     )
 
-
-# --------------------------------------------------------------------------------------
-# Figure of the covariance of the whole state at the begin and end of a run.
 
 _MOST_LABELS = 30  # rows; larger maps name only some of their landmarks
 _UNDEFINED = "#c9ced4"

@@ -1,4 +1,4 @@
-"""Figures of maps: after one step, after every step, and for different noise."""
+"""Figures of maps: after one step, after every step, for each noise, and smoothed."""
 
 from __future__ import annotations
 
@@ -455,9 +455,6 @@ def box_around(points: Array, means: Array, covariances: Array) -> Array:
     return np.stack([centre - size / 2, centre + size / 2])
 
 
-# --------------------------------------------------------------------------------------
-# The walls of a world in figures.
-
 Walls = Sequence[Sequence[float]]
 """Rows (x0, y0, x1, y1) [m]."""
 
@@ -475,9 +472,6 @@ def draw_walls(axes: Axes, walls: Walls) -> list[Artist]:
     axes.add_collection(lines, autolim=False)
     return [lines]
 
-
-# --------------------------------------------------------------------------------------
-# Figure of a smoothed log: truth, filter and smoother in one map.
 
 _LANDMARK = EllipseKind("smoothed landmark, 3σ", TEAL, fill=0.15)
 _POSE = EllipseKind("smoothed pose, 3σ", style.BLUE, fill=0.12, width=0.9)

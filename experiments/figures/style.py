@@ -1,4 +1,4 @@
-"""The common style of all figures, and their files."""
+"""The common style of all figures and web pages, and their files."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -130,7 +130,7 @@ def legend_below(figure: Figure, keys: Sequence[Artist], columns: int) -> None:
 
 
 # --------------------------------------------------------------------------------------
-# The common style of all web pages: their colours, and how templates are filled.
+# Web pages: their colours, and how templates are filled.
 
 _SHARED = Path(__file__).parent
 

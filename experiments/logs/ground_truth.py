@@ -1,5 +1,7 @@
 """The ground truth of a log at the times and in the order of a run.
 
+`without_identities` hides the identities of a log's readings from filters.
+
 The ground truth may be the path of an antenna at (a, b) on the robot, forward and to
 the left, which the header gives in metres as ``groundtruth_offset: a,b``::
 
@@ -138,10 +140,6 @@ def _turned(offset: Array, headings: Array) -> Array:
     return np.stack(
         [cos * offset[0] - sin * offset[1], sin * offset[0] + cos * offset[1]], axis=1
     )
-
-
-# --------------------------------------------------------------------------------------
-# Logs whose readings have no identity.
 
 
 def without_identities(log: SlamLog) -> SlamLog:

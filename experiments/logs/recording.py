@@ -1,4 +1,12 @@
-"""Drive a robot through a simulated world, and record its readings as a log."""
+"""Drive a robot through a simulated world, and record its readings as a log.
+
+`record_episode` records one. `steps_of` splits a log into the steps of a filter: a
+motion, then the scan at its end.
+
+Symbols
+-------
+u = (d, α)   odometry: drive d, then turn α [m, rad]
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -43,7 +51,7 @@ def record_episode(
     SlamLog
         The log; it starts at the initial pose of filters. The header holds the noise as
         ``motion_std``, ``measurement_std`` and ``start_sigma``, where
-        :func:`~slamgym.experiments.runs.settings_for` finds it. If the scenario hides
+        :func:`~slamgym.experiments.settings_for` finds it. If the scenario hides
         identities, scans have true ids instead of ids.
 
     Examples
@@ -134,14 +142,6 @@ def log_header(scenario: Scenario, seed: int) -> dict[str, str]:
         header["identities"] = "false"
     header["noise_at_rest"] = str(motion.noise_at_rest).lower()
     return header
-
-
-# --------------------------------------------------------------------------------------
-# Split a log into the steps of a filter: a motion, then the scan at its end.
-#
-# Symbols
-# -------
-# u = (d, α)   odometry: drive d, then turn α [m, rad]
 
 
 class Step(NamedTuple):

@@ -1,5 +1,8 @@
 """Logs of odometry and measurements in the text format ``slamlog 1``.
 
+A `SlamLog` holds events, odometry rows and scans, and the truth if it is known;
+`read_slamlog` and `write_slamlog` read and write it. Every importer returns one.
+
 A CSV file with a header of ``# key: value`` lines, the first one
 ``# format: slamlog 1``, and rows of four kinds, named by their first field::
 

@@ -1,9 +1,20 @@
 """Run filters many times over a scenario, and test their consistency.
 
-scenario → simulated runs → filtered runs → run measures → result blocks → results
-→ scores → summary, table, plots, html report
+``runner`` does the whole job: simulated runs → ``filtered_runs`` → ``run_measures``
+→ ``results``.  ``verdict`` and ``summary`` judge the results, and ``figures`` and
+``report`` show them.
 """
 
-from lazy_loader import attach_stub
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+from ...public_names import attach
+
+if TYPE_CHECKING:
+    from .report import write_html_report as write_html_report
+    from .results import load_results as load_results
+    from .results import merge_blocks as merge_blocks
+    from .runner import monte_carlo as monte_carlo
+    from .summary import consistency_of as consistency_of
+    from .summary import summarise_monte_carlo as summarise_monte_carlo
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)

@@ -345,9 +345,6 @@ def legend_above(figure: Figure, axes: Axes) -> None:
     )
 
 
-# --------------------------------------------------------------------------------------
-# Figures of innovations over many runs: their size and whiteness.
-
 _MOST_BLOCKS = 60
 _LAGS = 10
 _TAIL = 0.025

@@ -1,4 +1,8 @@
-"""Run one filter over many simulated runs: in a batch if possible, else one by one."""
+"""Run one filter over many simulated runs: in a batch if possible, else one by one.
+
+`filter_runs` filters. `bound_runs` computes the bound on the errors of any filter, and
+`noise_of_runs` the actual noise of the runs.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -218,9 +222,6 @@ def _erase(trace: BatchTrace, run: int, step: int) -> None:
         array[run, step:] = np.nan
     trace.degrees_of_freedom[run, step:] = 0
 
-
-# --------------------------------------------------------------------------------------
-# The bound on the errors of any filter in simulated runs, and their actual noise.
 
 _MANY = 6  # deviations that a displacement hardly exceeds
 

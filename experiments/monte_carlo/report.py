@@ -1,4 +1,8 @@
-"""Write the report of a Monte Carlo as one web page without other files or network."""
+"""The report of a Monte Carlo: one web page that needs no network, and a table.
+
+`write_html_report` writes the page. `monte_carlo_table` has one row per measure and one
+column per estimator, and `inline_svg` draws figures in the page's fonts and colours.
+"""
 
 import html
 import io
@@ -167,7 +171,7 @@ def escaped(value: object) -> Markup:
 
 
 # --------------------------------------------------------------------------------------
-# The table of a Monte Carlo: one row per measure, one column per estimator.
+# The table.
 
 _STYLES = {"good": "green", "bad": "red", "open": "yellow"}
 
@@ -219,9 +223,6 @@ def _bad_run(summary: dict[str, Any]) -> str:
     )
 
 
-# --------------------------------------------------------------------------------------
-# Headings of columns that are labels of estimators, however long.
-
 _ROOM = 36  # characters for all columns of a terminal of 80
 _GAP = 2
 
@@ -252,9 +253,6 @@ def headings_and_key(labels: Sequence[str]) -> tuple[list[str], str]:
     ]
     return list(letters), "\n".join(lines)
 
-
-# --------------------------------------------------------------------------------------
-# Figures as SVG inside a web page, in its fonts and colours.
 
 COLOUR_VARIABLES = {
     INK: "--ink",

@@ -1,6 +1,10 @@
-"""The results of a Monte Carlo as one dataset: estimator × run × step.
+"""The results of a Monte Carlo, a dataset estimator × run × step, and their folder.
 
-xarray and netCDF are loaded where they are used, because workers need neither.
+A folder holds ``job.json``, the description of the job, and ``blocks/runs-*.npz``.
+Each block appears complete or not at all, so that a job may be killed at any time and
+then continues after its last complete block. Blocks of one job from several machines
+may be put into one folder, and `merge_blocks` does so. xarray and netCDF are loaded
+where they are used, because workers need neither.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
-"""Measure the errors and the consistency of every run of a Monte Carlo.
+"""Measure the errors and the consistency of every run of a Monte Carlo: `measure_runs`.
 
-Each run is measured by itself, so its figures do not depend on the other runs.
+Each run is measured by itself, so its figures do not depend on the other runs. With
+hidden identities, a run is bad if it fails, or if its path error is more than `MARGIN`
+above that of the same filter with known identities on the same readings.
 """
 
 from collections.abc import Mapping
@@ -85,12 +87,6 @@ VARIABLES: dict[str, Variable] = {
 }
 
 
-# --------------------------------------------------------------------------------------
-# Measure how well a run associated readings without identity.
-#
-# A run is bad if it fails, or if its path error is more than `MARGIN` above that of the
-# same filter with known identities on the same readings.
-
 COUNTS = AssociationScores._fields
 
 KNOWN_IDS_ATE = "known_ids_ate"
@@ -149,7 +145,7 @@ def measure_runs(
     bound : PosteriorBound
         Of the errors of any filter in these runs.
     noise : ndarray, shape (B, 5, 7)
-        Sums of the noise, see :func:`~slamgym.evaluation.noise_findings`.
+        Sums of the noise, see :func:`~slamgym.evaluation.noise_sums`.
     resolution : float
         True landmarks nearer to each other count as one place [m], where identities are
         hidden.

@@ -1,8 +1,9 @@
 """Run several estimators over many runs of a scenario, on the same random numbers.
 
 Run i of a job with seed s is simulated in the world of seed s + i. It depends on
-nothing else, such as the number of runs, estimators or workers. Runs are simulated,
-filtered and measured in blocks; a worker computes one block at a time.
+nothing else, such as the number of runs, estimators or workers. `monte_carlo`
+simulates, filters and measures runs in blocks; a worker computes one block at a time.
+`engage_workers` starts processes, threads, or a cluster.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ def monte_carlo(
         Number of runs in a block.
     first_run : int
         Leave the runs below it to other machines; a multiple of ``block_size``. See
-        :func:`~slamgym.experiments.monte_carlo.merge_blocks`.
+        :func:`~slamgym.experiments.merge_blocks`.
     fresh : bool
         Whether to remove what an earlier job left in ``out``.
     resolution : float
@@ -208,9 +209,6 @@ def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:
         )
     return settings
 
-
-# --------------------------------------------------------------------------------------
-# Write the Python call that reproduces the results of a Monte Carlo.
 
 ASSUMED_FILE = "assumed.toml"
 

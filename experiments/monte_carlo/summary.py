@@ -1,4 +1,9 @@
-"""Summarise a Monte Carlo as one dictionary of plain JSON types."""
+"""Summarise a Monte Carlo as one dictionary of plain JSON types.
+
+`summarise_monte_carlo` summarises all estimators. `consistency_of` tests one estimator;
+its decisions, its efficiency and the scores of its association become entries of the
+summary.
+"""
 
 import json
 import math
@@ -484,10 +489,6 @@ def _by_freedom(name: str, dof: str = "") -> Computation:
     return compute
 
 
-# --------------------------------------------------------------------------------------
-# The test decisions on an estimator as plain JSON types.
-
-
 def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
     """Return the decisions of a report as plain JSON types.
 
@@ -540,10 +541,6 @@ def _decision(decision: HypothesisTest) -> dict[str, Any]:
     }
 
 
-# --------------------------------------------------------------------------------------
-# The efficiency of an estimator: the bound of any filter by its squared error.
-
-
 def efficiency_summary(scores: EstimatorScores) -> dict[str, Any] | None:
     """Divide the bounds by the mean squared errors, in the invariant frame.
 
@@ -580,10 +577,6 @@ def _entry(found: Efficiency) -> dict[str, Any] | None:
         "value": finite(found.value),
         "interval": [finite(end) for end in found.interval],
     }
-
-
-# --------------------------------------------------------------------------------------
-# Summarise how well readings without identity were associated in many runs.
 
 
 def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:

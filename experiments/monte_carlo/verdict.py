@@ -1,4 +1,8 @@
-"""Reduce a consistency report to one word and one sentence."""
+"""Reduce a consistency report to one word and one sentence: `judge`.
+
+Warnings about the results, and the cause of an inconsistency, are entries of the
+summary and sentences. `scores_of` selects the results that count.
+"""
 
 from __future__ import annotations
 
@@ -423,7 +427,7 @@ def _known_nees(scores: EstimatorScores, frame: ErrorFrame) -> Array | None:
 
 
 # --------------------------------------------------------------------------------------
-# Select the results of a Monte Carlo that count: successful runs, after the start.
+# The results that count: successful runs, after the start.
 #
 # The first step is a scan before any motion. If the start is certain, further leading
 # steps have no NEES; they are left out as well.

@@ -1,4 +1,8 @@
-"""Fit the noise of a log: find the noise that makes its readings most likely."""
+"""Fit the noise of a log: find the noise that makes its readings most likely.
+
+`fit_noise` fits, calibrates the sensor with the true path, and tests the whiteness of
+the innovations. `write_noise` writes the noise into the header of the log's file.
+"""
 
 from __future__ import annotations
 
@@ -200,9 +204,6 @@ def _fitted(
         record.innovations[0],
     )
 
-
-# --------------------------------------------------------------------------------------
-# Calibrate the noise of a sensor with the true path.
 
 TAILS = (0.025, 0.975)
 FACTORS = np.geomspace(0.25, 16.0, 19)
@@ -414,10 +415,6 @@ def positive_sum(correlations: Array) -> float:
     pairs = correlations[: len(correlations) // 2 * 2].reshape(-1, 2).sum(axis=1)
     ends = np.flatnonzero(pairs <= 0)
     return float(pairs[: ends[0] if len(ends) else None].sum())
-
-
-# --------------------------------------------------------------------------------------
-# Write a noise into the header of a log's file, and change nothing else.
 
 
 def refuse_other_formats(path: str | PathLike[str]) -> None:

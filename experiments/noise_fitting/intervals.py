@@ -115,8 +115,7 @@ def _widths(
 # Profile likelihood: that of one parameter, with the others fitted for each value.
 #
 # With the score g, the information I about θ, and the other parameters o, it is to
-# second
-# order ::
+# second order ::
 #
 #     ℓ_p = ℓ + ½ g_oᵀ I_oo⁻¹ g_o,    dℓ_p/dθ_i = g_i − I_io I_oo⁻¹ g_o
 #

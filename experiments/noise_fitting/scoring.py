@@ -1,5 +1,8 @@
 """Maximum likelihood of positive parameters by scoring, several values at a time.
 
+`maximise` climbs. The data of the likelihood are the events of a log (`events_of`);
+`associated_log` first associates readings without identity.
+
 Symbols
 -------
 θ      logarithms of the p parameters
@@ -219,10 +222,6 @@ def _step(here: Scores, damping: float) -> Array:
     return np.asarray(step, dtype=np.float64)
 
 
-# --------------------------------------------------------------------------------------
-# Associate the readings of a log without identities, and write them into the log.
-
-
 def associated_log(
     log: SlamLog, settings: FilterSettings, progress: Progress | None = None
 ) -> SlamLog:
@@ -294,9 +293,6 @@ def _times_after(log: SlamLog, counts: IntArray) -> Array:
     reached = np.searchsorted(until, counts)
     return np.array(times)[np.minimum(reached, len(times) - 1)]
 
-
-# --------------------------------------------------------------------------------------
-# The events of a log as arrays for the kernels: motions, readings, landmarks.
 
 Motion = tuple[float, float, float]
 Stretch = tuple[int, int]

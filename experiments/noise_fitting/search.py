@@ -1,4 +1,9 @@
-"""Search for the most likely noise, with rejected readings and noises at zero."""
+"""Search for the most likely noise, with rejected readings and noises at zero.
+
+`most_likely_noise` searches. The noise that a filter assumes is a vector of seven
+standard deviations (`ENTRIES`), and `LogLikelihood` is the likelihood of a log's
+readings as a function of it.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +40,6 @@ ROUNDS = 12  # of rejecting readings and fitting the others
 COARSE = 6  # iterations of a round after which readings are rejected anew
 FACTORS = 4.0 ** np.arange(-3, 3)  # of motion and of sensor noise, tried at the start
 
-
-# --------------------------------------------------------------------------------------
-# The noise that a filter assumes, as a vector of seven standard deviations.
 
 BEARING, RANGE, PER_METRE, IN_METRES = 3, 4, 5, 6  # columns of the sensor's noise
 
@@ -318,9 +320,6 @@ def positive_start(noise: Array, typical_range: float) -> Array:
     )
     return np.where(start > 0, start, instead)
 
-
-# --------------------------------------------------------------------------------------
-# The likelihood of a log's readings as a function of its noise.
 
 MOST_LANDMARKS = 100  # of one map
 MOST_READINGS = 12_000  # of a sample

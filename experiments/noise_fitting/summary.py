@@ -1,4 +1,4 @@
-"""Evaluate a fitted noise: replay the log before and after, and summarise."""
+"""Evaluate a fitted noise: replay the log before and after, summarise, and draw."""
 
 from __future__ import annotations
 
@@ -107,9 +107,6 @@ def _of_the_readings(fit: NoiseFit, settings: FilterSettings) -> FilterSettings:
     gate = {"gate_probability": GATE_PROBABILITY}
     return replace(settings, options=gate | options)
 
-
-# --------------------------------------------------------------------------------------
-# Figure of innovations before and after a fit of the noise.
 
 BAND = 1.96
 SHOWN = 6.0  # standard deviations; what lies beyond is drawn at the edge

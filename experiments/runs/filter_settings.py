@@ -1,4 +1,8 @@
-"""Set up an estimator for a log, from the header of the log and the user's choices."""
+"""Set up an estimator for a log, from the header of the log and the user's choices.
+
+`settings_for` returns the settings of one filter, and `estimator_choices` those that a
+Monte Carlo compares. `refuse_large_map` checks the memory before the filters run.
+"""
 
 from __future__ import annotations
 
@@ -310,9 +314,6 @@ def _flag(name: str, key: str, text: str) -> bool:
     return text == "true"
 
 
-# --------------------------------------------------------------------------------------
-# Parse which estimators a Monte Carlo compares.
-
 _PACKAGE = Path(registry.__file__).resolve().parents[1]
 OWN_NAMES = frozenset(list_estimators())
 """Names that stay those of slamgym's own estimators."""
@@ -439,10 +440,6 @@ def _name_of(label: str, what: str | Callable[..., Any]) -> str:
     return name
 
 
-# --------------------------------------------------------------------------------------
-# Check whether the maps of a job fit into memory, before the filters run.
-
-
 def refuse_large_map(log: SlamLog, estimator: SlamEstimator) -> None:
     """Refuse a log with more landmarks than memory holds for this filter.
 
@@ -510,9 +507,6 @@ def _refuse_maps(
         refuse_beyond_memory(what, need, way_out)
 
 
-# --------------------------------------------------------------------------------------
-# Check integers that files store.
-
 _LARGEST = 2**63 - 1  # of int64
 
 
@@ -535,10 +529,6 @@ def integer(name: str, value: object, least: int) -> int:
     if whole > _LARGEST:
         raise ValueError(f"{name} must be at most {_LARGEST}, got {whole}")
     return whole
-
-
-# --------------------------------------------------------------------------------------
-# Limit BLAS to one thread, which is fastest for the small products of filters.
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:

@@ -1,4 +1,7 @@
-"""Summarise a run as one dictionary of plain JSON types."""
+"""Summarise a run as one dictionary of plain JSON types: `summarise`.
+
+`run_warnings` lists what is suspicious about a run, without the truth.
+"""
 
 import json
 import math
@@ -259,9 +262,6 @@ def rmse_table(accuracy: PositionAccuracy | None) -> dict[str, float | None] | N
 def _finite_list(values: Array) -> list[float | None]:
     return [finite(value) for value in values]
 
-
-# --------------------------------------------------------------------------------------
-# Warnings about one run that need no ground truth.
 
 MOST_REJECTED = 0.05
 """Share of rejected readings above which a filter may diverge."""

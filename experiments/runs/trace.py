@@ -1,4 +1,7 @@
-"""The beliefs of one estimator at every step of one run, as plain arrays."""
+"""The beliefs of one estimator at every step of one run, as plain arrays: `RunTrace`.
+
+`compare_association` scores how the run associated readings without identity.
+"""
 
 from __future__ import annotations
 
@@ -159,9 +162,6 @@ def _shapes(steps: int, n: int) -> dict[str, tuple[int, ...]]:
         "final_covariance": (size, size),
     }
 
-
-# --------------------------------------------------------------------------------------
-# How well a run associated readings without identity: its decisions and the truth.
 
 NAMES = (*AssociationScores._fields, "precision", "recall")
 

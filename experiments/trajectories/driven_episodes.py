@@ -1,4 +1,9 @@
-"""Drive many worlds side by side, and record them as trajectories."""
+"""Drive many worlds side by side, and record them as trajectories: `drive_episodes`.
+
+`with_beliefs` adds what a filter believes during a drive. Known identities give row i
+of the map to landmark i. Where they are hidden, landmark management associates and rows
+follow the order of the filter's map.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -115,13 +120,6 @@ def _worlds(
     if scenario.randomise is None:
         return WorldBatch(scenario, len(scenarios))
     return MixedWorlds(scenarios)
-
-
-# --------------------------------------------------------------------------------------
-# What a filter believes during a drive, as arrays beside the truth.
-#
-# Known identities give row i of the map to landmark i. Where they are hidden, landmark
-# management associates and rows follow the order of the filter's map.
 
 
 def with_beliefs(trajectory: Trajectory, estimator: str) -> Trajectory:

@@ -1,8 +1,8 @@
-"""File formats of trajectories, one module each, loaded on demand.
+"""File formats of trajectories: npz, TUM and slamlog here, the others loaded on demand.
 
-A shard of some episodes is one file or one folder. Every module has `write` and `read`,
-and those of the other fields of `TrajectoryFormat` that differ from
-their defaults.
+A shard of some episodes is one file or one folder. `trajectory_format` returns how a
+format is written and read; a `TrajectoryFormat` holds its `write` and `read`, and the
+fields that differ from their defaults.
 """
 
 import json
@@ -261,10 +261,6 @@ def _increments(poses: Array) -> Array:
     return np.column_stack([dx * np.cos(heading) + dy * np.sin(heading), turns])
 
 
-# --------------------------------------------------------------------------------------
-# Compute the path from odometry alone.
-
-
 def dead_reckoning(start: Array, odometry: Array) -> Array:
     """Integrate odometry.
 
@@ -298,9 +294,6 @@ def dead_reckoning(start: Array, odometry: Array) -> Array:
         [np.cumsum([x, *along_x]), np.cumsum([y, *along_y]), headings]
     )
 
-
-# --------------------------------------------------------------------------------------
-# Estimate path and landmarks of a drive by a filter, to start an optimiser there.
 
 _ESTIMATOR = "invariant"
 

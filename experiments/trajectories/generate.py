@@ -354,9 +354,6 @@ def versions_of(job: Job) -> dict[str, str]:
     }
 
 
-# --------------------------------------------------------------------------------------
-# Options of a data set that depend on its format or its scenario.
-
 _MOST_EPISODES = 100
 _MOST_MEMORY = 256e6  # [bytes] of a shard
 

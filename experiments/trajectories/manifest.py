@@ -1,9 +1,9 @@
-"""The manifest of a data set of trajectories, for checks and for reproduction.
+"""A data set of trajectories: its manifest, its folder, and how it is read.
 
 A data set is a folder of shards with ``manifest.json``. The manifest names the job
 (scenario, controller, seed, numbers, format), the versions that determine its bits, and
 every shard with its SHA-256. It holds no date and no path: the same job gives the same
-bytes.
+bytes. `load_trajectories` reads the trajectories one after the other.
 """
 
 import hashlib
@@ -197,9 +197,6 @@ def checksum(path: Path) -> str:
     lines = [f"{sha256_of(path / name)}  {name}\n" for name in sorted(names)]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
-
-# --------------------------------------------------------------------------------------
-# Read generated trajectories one after the other.
 
 _DAMAGED = ("raise", "skip")
 

@@ -1,4 +1,8 @@
-"""Write a run of one or more filters as one web page to play, without network."""
+"""Write a run of one or more filters as one web page to play, without network.
+
+`write_run_page` writes the page. `RunFrames` keeps the map, its correlations and the
+outcomes of the readings during a replay, and `PackedArrays` makes them short text.
+"""
 
 from __future__ import annotations
 
@@ -249,9 +253,6 @@ def _inline_json(value: Any) -> Markup:
     text = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c"))
 
-
-# --------------------------------------------------------------------------------------
-# Keep the map, its correlations and the outcomes of the readings, step by step.
 
 OUTCOMES = (
     "not used",
@@ -550,9 +551,6 @@ def map_at(run: ViewedRun, step: int) -> MapFrame:
         ids=ids.astype(np.int64), means=means, covariances=covariances
     )
 
-
-# --------------------------------------------------------------------------------------
-# Items of the steps of a run, all of them or evenly spaced ones.
 
 _Item = TypeVar("_Item")
 

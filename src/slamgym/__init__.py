@@ -1,17 +1,50 @@
 """Landmark-SLAM worlds for Gymnasium, and EKF-SLAM estimators to run in them.
 
 ``import slamgym`` registers the environments.  Every other name is loaded at its first
-use; ``__init__.pyi`` lists them.  The parts are :mod:`slamgym.sim_configs`,
+use.  The parts are :mod:`slamgym.sim_configs`,
 :mod:`slamgym.envs`, :mod:`slamgym.estimator`, :mod:`slamgym.evaluation`,
 :mod:`slamgym.agents` and :mod:`slamgym.experiments`.
 """
 
+from typing import TYPE_CHECKING
+
 import gymnasium
-from lazy_loader import attach_stub
+
+from .public_names import attach
 
 __version__ = "0.1.0"
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+if TYPE_CHECKING:
+    from . import agents as agents
+    from . import envs as envs
+    from . import estimator as estimator
+    from . import evaluation as evaluation
+    from . import experiments as experiments
+    from . import sim_configs as sim_configs
+    from .envs import LandmarkWorldEnv as LandmarkWorldEnv
+    from .envs.controllers import Waypoints as Waypoints
+    from .estimator import Belief as Belief
+    from .estimator import EkfSlam as EkfSlam
+    from .estimator import InvariantEkfSlam as InvariantEkfSlam
+    from .estimator import LandmarkPolicy as LandmarkPolicy
+    from .estimator import UpdateReport as UpdateReport
+    from .estimator import check_estimator as check_estimator
+    from .estimator import list_estimators as list_estimators
+    from .estimator import make_estimator as make_estimator
+    from .estimator import register_estimator as register_estimator
+    from .estimator import smooth as smooth
+    from .evaluation import assert_consistent as assert_consistent
+    from .experiments.logs import read_log as read_log
+    from .experiments.monte_carlo import consistency_of as consistency_of
+    from .experiments.monte_carlo import monte_carlo as monte_carlo
+    from .experiments.noise_fitting import fit_noise as fit_noise
+    from .experiments.runs import replay as replay
+    from .experiments.trajectories import generate_trajectories as generate_trajectories
+    from .experiments.trajectories import load_trajectories as load_trajectories
+    from .sim_configs import Scenario as Scenario
+    from .sim_configs import load_scenario as load_scenario
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)
 
 gymnasium.register(
     id="slamgym/LandmarkWorld-v0",

@@ -31,7 +31,7 @@ Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
 
 def jit(function: Kernel) -> Kernel:
-    """Compile a kernel at its first call and keep it in :mod:`.jit`.
+    """Compile a kernel at its first call and keep it in the cache.
 
     ``fastmath`` stays off, except in :func:`njit_reordered`: a kernel gives the same
     bits when called from Python, from another kernel, in a thread, or when loaded from

@@ -4,7 +4,7 @@ import sys
 from graphlib import TopologicalSorter
 
 import pytest
-from import_graph import FILES, ROOT, graph, libraries
+from import_graph import FILES, ROOT, code_lines, graph, libraries
 
 FLOORS = {  # from the ground up; rooms of one line do not import each other
     "": """
@@ -72,7 +72,7 @@ STRANGERS = {
     ("estimator", "sim_configs"),
 }
 EVALUATION_KNOWS = {"models", "support", "interface"}
-MAY_IMPORT = {  # besides the standard library and lazy_loader
+MAY_IMPORT = {  # besides the standard library
     "sim_configs": {"numpy", "pydantic", "pydantic_core"},
     "envs": {"numpy", "scipy", "gymnasium", "pymunk"},
     "estimator": {"numpy", "scipy", "numba", "psutil"},
@@ -81,6 +81,11 @@ MAY_IMPORT = {  # besides the standard library and lazy_loader
 }
 DRAWING = {"scene", "renderer", "video"}
 DRAWING_LIBRARIES = {"matplotlib", "PIL", "imageio_ffmpeg"}
+A_FILE_EACH = (  # folders whose modules stand alone however small, and why
+    "experiments.command_line",  # a command each
+    "experiments.logs.importers",  # a format each
+    "estimator.peers",  # a library each: only such a module may import it
+)
 PEERS = {"gtsam", "filterpy", "stonesoup"}
 
 
@@ -149,7 +154,7 @@ def may_import(module):
     room = room_in("", module)
     if room not in MAY_IMPORT:
         return None
-    more = {"lazy_loader"} | set(sys.stdlib_module_names)
+    more = set(sys.stdlib_module_names)
     if module.removeprefix("envs.rendering.") in DRAWING:
         more |= DRAWING_LIBRARIES
     if module.startswith("estimator.peers."):
@@ -181,6 +186,22 @@ def test_modules_are_imported_relatively_inside_the_package():
 def test_modules_have_at_most_700_lines():
     long = {m for m, file in FILES.items() if len(file.read_text().splitlines()) > 700}
     assert not long
+
+
+def test_a_small_module_with_one_importer_is_part_of_it():
+    importers = {
+        module: [other for other, targets in graph().items() if module in targets]
+        for module in FILES
+    }
+    crumbs = {
+        module: importers[module]
+        for module, file in FILES.items()
+        if file.name != "__init__.py"
+        and not module.startswith(A_FILE_EACH)
+        and len(importers[module]) == 1
+        and code_lines(module) < 60
+    }
+    assert crumbs == {}
 
 
 def test_the_links_of_the_package_reach_every_folder():

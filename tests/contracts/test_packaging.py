@@ -62,7 +62,7 @@ def test_the_wheel_holds_every_module_and_the_data(wheel):
     sources = {
         f"slamgym/{file.relative_to(ROOT)}"
         for part in PARTS
-        for suffix in ("py", "pyi", "toml", "json", "html", "css", "js")
+        for suffix in ("py", "toml", "json", "html", "css", "js")
         for file in (ROOT / part).rglob(f"*.{suffix}")
     }
     assert sources | {f"slamgym/{name}" for name in TOP} <= inside

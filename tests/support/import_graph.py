@@ -4,6 +4,8 @@ import ast
 from functools import cache
 from pathlib import Path
 
+from slamgym.public_names import listed
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = (
     "sim_configs",
@@ -14,7 +16,7 @@ PACKAGES = (
     "experiments",
 )
 # Beside the rooms; every room may import them.
-GROUND = {"arrays", "jit", "kernel_cache", "magnitudes", "suggestions"}
+GROUND = {"arrays", "jit", "public_names", "suggestions"}
 
 
 def module_name(file):
@@ -43,39 +45,37 @@ def absolute(module, node):
 
 
 @cache
-def stub_targets():
-    """Return what each lazy name of each package stands for: module → name → module."""
-    targets = {}
-    for module, file in FILES.items():
-        stub = file.with_suffix(".pyi")
-        if stub.exists():
-            imports = (
-                node
-                for node in ast.parse(stub.read_text()).body
-                if isinstance(node, ast.ImportFrom)
-            )
-            targets[module] = {
-                alias.name: absolute(module, node)
-                for node in imports
-                for alias in node.names
-            }
-    return targets
+def public_targets():
+    """Return where each public name of each package is: package → name → module."""
+    return {
+        module: {
+            name: f"{module}.{part}".removesuffix(".")
+            for name, part in listed(file).items()
+        }
+        for module, file in FILES.items()
+        if file.name == "__init__.py"
+    }
 
 
 def defining_module(module, name):
     """Return the module that ``from module import name`` takes the name from."""
-    stubs = stub_targets()
-    if f"{module}.{name}" in FILES and name not in stubs.get(module, {}):
-        return f"{module}.{name}"
-    while name in stubs.get(module, {}) and stubs[module][name] != module:
-        module = stubs[module][name]
-    return module
+    public = public_targets()
+    while public.get(module, {}).get(name, module) != module:
+        module = public[module][name]
+    inside = f"{module}.{name}"
+    return inside if inside in FILES else module
 
 
 @cache
 def import_statements(module):
-    """Return the import statements of a module, also those in functions."""
-    nodes = ast.walk(ast.parse(FILES[module].read_text()))
+    """Return the import statements of a module, also those in functions.
+
+    The public names of a package, below ``if TYPE_CHECKING:``, are loaded on demand.
+    """
+    tree = ast.parse(FILES[module].read_text())
+    if FILES[module].name == "__init__.py":
+        tree.body = [node for node in tree.body if not isinstance(node, ast.If)]
+    nodes = ast.walk(tree)
     return [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
 
 
@@ -98,6 +98,19 @@ def libraries(module):
         elif not node.level:
             found.add(node.module.split(".")[0])
     return found
+
+
+def code_lines(module):
+    """Return how many lines are neither blank nor comment nor docstring."""
+    text = FILES[module].read_text()
+    docstrings = {
+        line
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        for line in range(node.lineno, node.end_lineno + 1)
+    }
+    lines = enumerate(map(str.strip, text.splitlines()), 1)
+    return sum(bool(x) and x[0] != "#" and n not in docstrings for n, x in lines)
 
 
 @cache

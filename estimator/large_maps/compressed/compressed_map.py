@@ -1,4 +1,8 @@
-"""A large Gaussian map whose update is deferred for all but the local landmarks."""
+"""A large Gaussian map whose update is deferred for all but the local landmarks.
+
+`CompressedMap` predicts and updates the local map; `choose_local` chooses its
+landmarks, and `checked_state` checks a saved state before anything changes.
+"""
 
 from __future__ import annotations
 
@@ -296,7 +300,7 @@ class CompressedMap:
 
 
 # --------------------------------------------------------------------------------------
-# Choice of the local landmarks of a compressed filter, and of their number.
+# Choice of the local landmarks, and of their number.
 
 LARGEST_WHOLE_MAP = 350
 """Up to this many landmarks, the local map is the whole map.
@@ -383,7 +387,7 @@ def choose_local(
 
 
 # --------------------------------------------------------------------------------------
-# Check the saved state of a compressed filter before anything changes.
+# Saved states.
 
 _LOCAL = ("mean", "covariance", "reference", "landmark_ids")
 _OWN = ("landmark_ids", "slots", "points", "references", "strip", "origin", "numbers")

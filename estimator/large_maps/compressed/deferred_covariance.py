@@ -1,4 +1,8 @@
-"""Covariance between the landmarks of a large map, with deferred downdates."""
+"""Covariance between the landmarks of a large map, with deferred downdates.
+
+`DeferredCovariance` stores blocks of the covariance. A `Downdate` is a change that is
+applied later; the compiled functions below copy rows and columns.
+"""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -284,9 +288,6 @@ def _bounds(columns: IntArray, blocks: range) -> list[int]:
     bounds: list[int] = columns.searchsorted(starts).tolist()
     return bounds
 
-
-# --------------------------------------------------------------------------------------
-# A change of a covariance that is applied later, and its saved form.
 
 _CHUNK = 128  # rows that are changed at a time
 

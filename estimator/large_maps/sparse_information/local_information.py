@@ -1,4 +1,9 @@
-"""The landmarks near the robot, conditioned on the rest of a sparse information map."""
+"""The landmarks near the robot, conditioned on the rest of a sparse information map.
+
+`begin_local_map` eliminates the landmarks around the local map, and `LocalInformation`
+holds the result. `ConditionalPose` holds the pose given the map, and `choose_local`
+chooses the local landmarks.
+"""
 
 from __future__ import annotations
 

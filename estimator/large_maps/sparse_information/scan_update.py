@@ -1,4 +1,8 @@
-"""Update of a sparse information map and the pose with one scan."""
+"""Update of a sparse information map and the pose with one scan: `process_scan`.
+
+It screens the readings, linearises them, corrects map and pose, adds landmarks, and
+limits the links of the pose.
+"""
 
 from __future__ import annotations
 

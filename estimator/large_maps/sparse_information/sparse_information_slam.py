@@ -1,4 +1,8 @@
-"""The exactly sparse extended information filter: a large map with few links."""
+"""The exactly sparse extended information filter: a large map with few links.
+
+`SparseInformationSlam` is the public filter; `as_arrays` and `checked_state` convert
+its belief to a saved state and back.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The closed submaps of a run, joined when a belief asks for them."""
+"""The closed submaps of a run, joined when a belief asks for them.
+
+`ClosedSubmaps` keeps and joins them, `Neighbourhood` follows the robot in a part of the
+joined map, and `merged` merges landmarks within a submap.
+"""
 
 from __future__ import annotations
 

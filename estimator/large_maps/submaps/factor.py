@@ -8,8 +8,7 @@ m̂, P              its mean, (last pose, landmarks) in F_k, and the covariance 
 Y                 the same quantities in the world: F_{k+1} and landmarks l relative
                   to F_k,  Y_q = R(θ_k)ᵀ (q − p_k),  Y_θ = θ_{k+1} − θ_k
 
-Points are complex numbers here (:mod:`.factor`).  The error e of m̂ against Y is
-Gaussian, N(0, P).
+Points are complex numbers here.  The error e of m̂ against Y is Gaussian, N(0, P).
 """
 
 from __future__ import annotations

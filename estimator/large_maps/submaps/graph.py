@@ -1,4 +1,8 @@
-"""The graph of a run: closed submaps, the active submap, and their common landmarks."""
+"""The graph of a run: closed submaps, the active submap, and their common landmarks.
+
+`SubmapGraph` predicts and updates the `ActiveSubmap`, closes it by the `ClosingRule`,
+and fuses it with the joined map of the closed ones (`fuse`).
+"""
 
 from __future__ import annotations
 
@@ -179,8 +183,7 @@ class SubmapGraph:
 #
 # A landmark in both has one position, which is an exact measurement of zero difference.
 # With the frame F = (p, θ) of the active submap and a landmark l in the world, and c
-# the
-# same landmark in the submap::
+# the same landmark in the submap::
 #
 #     0 = R(θ)ᵀ (l − p) − c
 #
@@ -313,9 +316,6 @@ def part_of(
     covariance = map_.covariance[rows[:, None], rows]
     return Belief(map_.mean[rows], covariance, ids, "invariant")
 
-
-# --------------------------------------------------------------------------------------
-# The submap in use: an ordinary filter in a frame of its own.
 
 ORIGIN = (0.0, 0.0, 0.0)
 

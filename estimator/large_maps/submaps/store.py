@@ -1,4 +1,7 @@
-"""Storage of closed submaps: in memory, or in a folder with a small cache."""
+"""Storage of closed submaps: in memory, or in a folder with a small cache.
+
+`LandmarkIndex` gives each landmark its slot in the whole map.
+"""
 
 import os
 import zlib

@@ -1,4 +1,7 @@
-"""SLAM in submaps: a map of any size as many small ones, joined on demand."""
+"""SLAM in submaps: a map of any size as many small ones, joined on demand.
+
+`SubmapSlam` is the public filter. `SubmapQueries` is the part of it that only reads.
+"""
 
 from __future__ import annotations
 
@@ -122,7 +125,7 @@ class SubmapSlam(SubmapQueries):
     ``belief()`` joins the submaps.  Landmarks in several submaps are the same unknown,
     which closes loops, and the frames are the sparse least-squares solution,
     linearised at one point (`joining`).  One linear update then fuses the active
-    submap (`fusion`).  The cost of a step depends on the active submap only, not
+    submap (`graph`).  The cost of a step depends on the active submap only, not
     on the size of the map.
 
     Parameters
@@ -307,7 +310,7 @@ class SubmapSlam(SubmapQueries):
         """Condition on two mapped landmarks being the same, and remove the second.
 
         The landmark then connects all submaps that hold either.  Submaps that hold both
-        are conditioned separately (`merging`).
+        are conditioned separately.
 
         Raises
         ------

@@ -3,6 +3,11 @@
 ``any_format`` recognises a format by the first line of the file.
 """
 
-from lazy_loader import attach_stub
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
+from ....public_names import attach
+
+if TYPE_CHECKING:
+    from .any_format import read_log as read_log
+else:
+    __getattr__, __dir__, __all__ = attach(__name__)

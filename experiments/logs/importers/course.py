@@ -1,7 +1,11 @@
-"""The log of the EKF-SLAM homework of CMU 16-833 (``data.txt``).
+"""Logs of courses: the homework of CMU 16-833 and the Freiburg robot mapping course.
 
-Lines alternate: readings ``β r β r …`` of all landmarks, in the same order each time,
-and odometry ``d α``, separated by white space.
+`read_course` reads ``data.txt``. Lines alternate: readings ``β r β r …`` of all
+landmarks, in the same order each time, and odometry ``d α``, separated by white space.
+
+`read_freiburg` reads ``sensor.dat`` with lines ``ODOMETRY r1 t r2`` (turn r1, drive t,
+turn r2) and ``SENSOR id range bearing``, and `read_world` the true landmarks in
+``world.dat`` with lines ``id x y``.
 """
 
 from os import PathLike
@@ -119,12 +123,6 @@ def _take_scan(recorder: EventRecorder, line: LogLine, step: int, count: int) ->
         recorder.add_reading(line, reading)
 
 
-# --------------------------------------------------------------------------------------
-# The log of the Freiburg robot mapping course (``sensor.dat`` and ``world.dat``).
-#
-# Lines ``ODOMETRY r1 t r2`` (turn r1, drive t, turn r2) and ``SENSOR id range
-# bearing``.
-
 ROW_FORMS = {"ODOMETRY": "ODOMETRY r1 t r2", "SENSOR": "SENSOR id range bearing"}
 
 
@@ -179,10 +177,6 @@ def read_freiburg(path: str | PathLike[str]) -> SlamLog:
         landmarks=landmarks,
         events=recorder.finish(),
     )
-
-
-# --------------------------------------------------------------------------------------
-# Files ``world.dat``: true landmark positions, lines ``id x y``.
 
 
 def read_world(

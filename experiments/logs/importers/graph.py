@@ -1,4 +1,11 @@
-"""Lines of a pose-landmark graph in text, as iSAM, TORO and g2o write it, by kind."""
+"""Pose-landmark graphs in text, as iSAM, TORO and g2o write them: `read_isam`.
+
+Lines ``ODOMETRY i j dx dy dθ …`` or ``EDGE2`` (pose j in the frame of pose i) and
+``LANDMARK i j x y …`` (landmark j in the frame of pose i), or ``EDGE_SE2`` and
+``EDGE_SE2_XY``. The information matrices at the ends of the lines are ignored unless
+asked for, and so are the estimates in ``VERTEX`` and ``FIX`` lines. `sort_lines` sorts
+the lines of a file by kind.
+"""
 
 from __future__ import annotations
 
@@ -157,8 +164,7 @@ def reals_at(line: LogLine, first: int, end: int | None = None) -> list[float]:
 # * g2o's ``EDGE_SE2`` and ``EDGE_SE2_XY`` lines hold the upper triangle of Ω by rows;
 #   that of an ``EDGE_SE2`` is in the frame of pose j.
 # * A file with ``VERTEX2`` lines is TORO's, whose ``EDGE2`` lines hold Ω in the order
-# xx,
-#   xy, yy, θθ, xθ, yθ.
+#   xx, xy, yy, θθ, xθ, yθ.
 
 ALIKE = 1e-3
 """Relative difference of standard deviations up to which they count as equal."""
@@ -263,9 +269,6 @@ def _spread(values: Array) -> float:
     """Return how much positive numbers differ, relative to their size."""
     return float(np.std(np.log(values)))
 
-
-# --------------------------------------------------------------------------------------
-# True poses and landmarks for a log, from a graph file that holds them.
 
 Point = tuple[float, ...]
 
@@ -373,15 +376,6 @@ def _to_world(pose: Point, dx: float, dy: float) -> tuple[float, float]:
     x, y, heading = pose
     cos, sin = math.cos(heading), math.sin(heading)
     return x + cos * dx - sin * dy, y + sin * dx + cos * dy
-
-
-# --------------------------------------------------------------------------------------
-# Read pose-landmark graphs as text, in the formats of iSAM, TORO and g2o.
-#
-# Lines ``ODOMETRY i j dx dy dθ …`` or ``EDGE2`` (pose j in the frame of pose i) and
-# ``LANDMARK i j x y …`` (landmark j in the frame of pose i), or ``EDGE_SE2`` and
-# ``EDGE_SE2_XY``. The information matrices at the ends of the lines are ignored unless
-# asked for, and so are the estimates in ``VERTEX`` and ``FIX`` lines.
 
 
 def read_isam(

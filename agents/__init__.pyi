@@ -1,7 +1,0 @@
-from .active_slam import ActiveSlamEnv as ActiveSlamEnv
-from .active_slam import ActiveSlamVectorEnv as ActiveSlamVectorEnv
-from .active_slam_baselines import BASELINES as BASELINES
-from .active_slam_baselines import make_baseline as make_baseline
-from .belief_observation import BeliefObservation as BeliefObservation
-from .belief_observation import BeliefObservationVector as BeliefObservationVector
-from .information_reward import InformationReward as InformationReward

@@ -1,7 +1,0 @@
-from .bearing_range import LandmarkLocation as LandmarkLocation
-from .bearing_range import MeasurementPrediction as MeasurementPrediction
-from .bearing_range import locate_landmark as locate_landmark
-from .bearing_range import predict_measurement as predict_measurement
-from .bearing_range import wrap_angle as wrap_angle
-from .unicycle_motion import MotionPrediction as MotionPrediction
-from .unicycle_motion import predict_pose as predict_pose

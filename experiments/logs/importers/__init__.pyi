@@ -1,1 +1,0 @@
-from .any_format import read_log as read_log
