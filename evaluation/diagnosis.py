@@ -91,7 +91,7 @@ def diagnose(
     Parameters
     ----------
     noise : array_like, shape (M, 5, 7)
-        Of :func:`~slamgym.evaluation.noise_findings`, of M runs.
+        Of :func:`~slamgym.evaluation.noise_sums`, of M runs.
     nees, heading_nees : array_like, shape (M, K)
         NEES of the pose (3 degrees) in the filter's own error frame, and of the
         heading (1 degree), after each of K steps; nan at leading steps without one. A

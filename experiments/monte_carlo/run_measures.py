@@ -149,7 +149,7 @@ def measure_runs(
     bound : PosteriorBound
         Of the errors of any filter in these runs.
     noise : ndarray, shape (B, 5, 7)
-        Sums of the noise, see :func:`~slamgym.evaluation.noise_findings`.
+        Sums of the noise, see :func:`~slamgym.evaluation.noise_sums`.
     resolution : float
         True landmarks nearer to each other count as one place [m], where identities are
         hidden.

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from slamgym.evaluation import association_scores as gospa
+from slamgym.evaluation import gospa
 
 
 def over_all_assignments(x, y, cutoff):
