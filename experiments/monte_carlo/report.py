@@ -161,7 +161,7 @@ def escaped(value: object) -> Markup:
 
     Examples
     --------
-    >>> print(escape("<b> at 5 %, [1, 2]"))
+    >>> print(escaped("<b> at 5 %, [1, 2]"))
     &lt;b&gt; at 5&nbsp;%, [1,&nbsp;2]
     """
     if isinstance(value, Markup):
