@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slamgym.evaluation import CAUSES, diagnose, noise_sums
+from slamgym.evaluation import CAUSES, diagnose
 from slamgym.evaluation.diagnosis import errors_of
 from slamgym.evaluation.hypothesis_tests import time_average_test
 from slamgym.evaluation.noise_findings import (
