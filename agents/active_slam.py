@@ -333,17 +333,13 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
 
     def _scan(self, worlds: BoolArray, moved: BoolArray) -> None:
         """Update the filters of some worlds with one scan each."""
-        observations = super()._observations()
-        self._explorers.scan(observations, worlds, moved, self._worlds.landmark_ids)
+        true_ids = self._worlds.landmark_ids
+        self._explorers.scan(super()._seen(), worlds, moved, true_ids)
         if self.render_mode is not None:
             self.show_beliefs(list(map(self._filters.belief, range(self.num_envs))))
 
-    def _observations(self) -> Observations:
-        observations = self.task.observations()
-        if self.autoreset_mode != AutoresetMode.DISABLED:
-            return observations
-        # a partial reset repeats them: the caller must not write into the originals
-        return {key: rows.copy() for key, rows in observations.items()}
+    def _seen(self) -> Observations:
+        return self.task.observations()
 
     def _infos(self) -> dict[str, Any]:
         landmarks = self._worlds.complex_landmarks
@@ -400,9 +396,8 @@ class Explorers:
             Worlds whose episode is over.
         """
         task, beliefs = self._task, self._filters.storage()
-        success = task.outcome.success.copy()
         error = map_rmse if self._record is None else matched_rmse
-        rmse = error(beliefs, landmarks)
+        success, rmse = task.outcome.success.copy(), error(beliefs, landmarks)
         infos: dict[str, AnyArray] = {
             "mapped": task.mapped,
             "known": task.known,

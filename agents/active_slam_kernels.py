@@ -253,9 +253,18 @@ def add_landmark(points: Array, k: int, mean: Array, slot: int, pose: Pose) -> i
 
 @njit_internal
 def write_nearest(points: Array, count: int, diagonal: float, goal: Array) -> None:
-    """Write the direction to the nearest point."""
-    nearest = first_smallest(points[DISTANCE], count)
-    write_direction(points, nearest, diagonal, goal)
+    """Write the direction to the nearest point: cosine, sine, distance in diagonals.
+
+    Zeros without any point.
+    """
+    goal[:] = 0.0
+    k = first_smallest(points[DISTANCE], count)
+    if k >= 0:
+        distance = points[DISTANCE, k]
+        share = 1.0 / max(distance, 1e-9)
+        goal[0] = min(max(points[AHEAD, k] * share, -1.0), 1.0)
+        goal[1] = min(max(points[ASIDE, k] * share, -1.0), 1.0)
+        goal[2] = min(distance / diagonal, 1.0)
 
 
 # --------------------------------------------------------------------------------------
@@ -344,7 +353,10 @@ def look_around(
         for c in range(len(seen)):
             seen[c] |= is_in_view(points[AHEAD, c], points[DISTANCE, c], view)
     else:
-        mark_not_hidden(pose, cells, view, seen, points)
+        for c in range(len(seen)):
+            if not seen[c] and is_in_view(points[AHEAD, c], points[DISTANCE, c], view):
+                dx, dy = cells[0, c] - x, cells[1, c] - y
+                seen[c] = not is_hidden(x, y, dx, dy, view.walls)
     unseen = 0
     for c in range(len(seen)):
         if not seen[c]:
@@ -353,19 +365,6 @@ def look_around(
             points[DISTANCE, unseen] = points[DISTANCE, c]
             unseen += 1
     return unseen
-
-
-@njit_internal
-def mark_not_hidden(
-    pose: Pose, cells: Array, view: View, seen: BoolArray, points: Array
-) -> None:
-    """Mark the cells in view that no wall hides as seen."""
-    x, y, _, _ = pose
-    for c in range(len(seen)):
-        if seen[c] or not is_in_view(points[AHEAD, c], points[DISTANCE, c], view):
-            continue
-        dx, dy = cells[0, c] - x, cells[1, c] - y
-        seen[c] = not is_hidden(x, y, dx, dy, view.walls)
 
 
 @njit_internal
@@ -473,18 +472,6 @@ def first_smallest(values: Array, count: int) -> int:
         if values[k] <= least + _TIE:
             return k
     return -1
-
-
-@njit_internal
-def write_direction(points: Array, k: int, diagonal: float, direction: Array) -> None:
-    """Write cosine, sine, and distance in diagonals of point k; zeros for k = -1."""
-    direction[:] = 0.0
-    if k >= 0:
-        distance = points[DISTANCE, k]
-        share = 1.0 / max(distance, 1e-9)
-        direction[0] = min(max(points[AHEAD, k] * share, -1.0), 1.0)
-        direction[1] = min(max(points[ASIDE, k] * share, -1.0), 1.0)
-        direction[2] = min(distance / diagonal, 1.0)
 
 
 @njit_internal

@@ -403,14 +403,17 @@ class SeparateFilters:
         moved : bool ndarray, shape (B,)
             Which of them have moved; the others take the scan from their start.
         """
-        for run in np.flatnonzero(worlds).tolist():
-            slam = self.filters[run]
+        odometry, masks = observations["odometry"], observations["mask"]
+        landmarks = observations["landmarks"]
+        for run, slam in enumerate(self.filters):
+            if not worlds[run]:
+                continue
             if moved[run]:
-                slam.predict(observations["odometry"][run])
+                slam.predict(odometry[run])
                 self._steps[run] += 1
-            seen = np.flatnonzero(observations["mask"][run])
+            (seen,) = masks[run].nonzero()
             ids = seen.tolist() if self._by_id else None
-            slam.update(observations["landmarks"][run][seen], ids)
+            slam.update(landmarks[run, seen], ids)
             if self._live[run]:
                 self._stored[run] = live_storage(cast("EkfSlam", slam), self._rows)
                 continue

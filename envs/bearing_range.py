@@ -62,7 +62,8 @@ class BearingRangeSensor:
         self._grows = sensor.range_std_per_metre > 0
         self._settings = SensorSettings.of(sensor)
         faults = scenario.present_faults
-        self._bias = _bias(faults.bearing_bias, faults.range_bias)
+        biases = np.array([faults.bearing_bias, faults.range_bias])
+        self._bias = biases if biases.any() else None
         largest = largest_noise(faults.sensor_dof) * sensor.std[0]
         largest += abs(faults.bearing_bias)
         self._may_wrap = sensor.field_of_view / 2 + largest >= math.pi
@@ -142,11 +143,6 @@ def _in_view(
     if half_view is not None:
         mask &= np.abs(readings[0]) <= half_view
     return mask
-
-
-def _bias(bearing: float, distance: float) -> Array | None:
-    """Return the biases (bearing, range), shape (2,), or None if there is none."""
-    return np.array([bearing, distance]) if bearing or distance else None
 
 
 def _limit(value: float, above: float) -> Array | None:

@@ -392,10 +392,9 @@ class Scenario(Part):
                 "randomise.landmark_shift must be 0 where every episode has new "
                 f"landmarks anyway, got {ranges.landmark_shift}"
             )
-        unmoved = np.zeros((self.landmarks.count, 2))
         for share, end in ((0.0, "low"), (1.0, "high")):
             try:
-                self.drawn_at(dict.fromkeys(RANGES, share), unmoved)
+                self.at_share(share)
             except ValueError as error:
                 at = f"at the {end} ends {error}"
                 yield f"randomise must give valid scenarios, but {at}"
@@ -445,6 +444,11 @@ class Scenario(Part):
         """Return the scenario at one point of its ranges; see `Randomise.changes`."""
         assert self.randomise is not None
         return self.with_changes(**self.randomise.changes(self, shares, directions))
+
+    def at_share(self, share: float) -> Self:
+        """Return the scenario with one share of all its ranges, landmarks unmoved."""
+        unmoved = np.zeros((self.landmarks.count, 2))
+        return self.drawn_at(dict.fromkeys(RANGES, share), unmoved)
 
     @classmethod
     def from_table(cls, table: Mapping[str, object]) -> Self:

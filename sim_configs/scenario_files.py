@@ -235,7 +235,4 @@ def copied_draw(
 
 def widest_scenario(scenario: Scenario) -> Scenario:
     """Return a scenario at the high ends of its ranges; itself without any."""
-    if scenario.randomise is None:
-        return scenario
-    unmoved = np.zeros((scenario.landmarks.count, 2))
-    return scenario.drawn_at(dict.fromkeys(RANGES, 1.0), unmoved)
+    return scenario if scenario.randomise is None else scenario.at_share(1.0)

@@ -286,13 +286,17 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
         """
         return np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
 
-    def _observations(self) -> Observations:
+    def _seen(self) -> Observations:
+        """Return the present observations; some may be those of the last step."""
         worlds = self._worlds
-        observations = {
+        return {
             "landmarks": worlds.measurements,
             "mask": worlds.mask,
             "odometry": worlds.odometry,
         }
+
+    def _observations(self) -> Observations:
+        observations = self._seen()
         if self.autoreset_mode != AutoresetMode.DISABLED:
             return observations
         # a partial reset repeats them: the caller must not write into the originals
