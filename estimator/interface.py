@@ -423,13 +423,16 @@ def checkpoint(estimator: SlamEstimator, *, motion: bool = False) -> Undo:
 
 def before_update(
     estimator: SlamEstimator,
-) -> tuple[Undo, Recall[UpdateReport] | None, Callable[[], Undo]]:
-    """Return the last arguments of :func:`.undo.carried_out` for the next update."""
+) -> tuple[Undo, Recall[UpdateReport] | None]:
+    """Return what takes back the next update, and what tells its report once absorbed.
+
+    Without the latter the former takes back the update in any state.
+    """
     recall = estimator.recall() if hasattr(estimator, "recall") else None
     if recall is None:
-        return checkpoint(estimator), None, partial(checkpoint, estimator)
-    bookmark: Callable[[], Undo] = estimator.bookmark  # type: ignore[attr-defined]
-    return bookmark(), recall, bookmark
+        return checkpoint(estimator), None
+    undo: Undo = estimator.bookmark()  # type: ignore[attr-defined]
+    return undo, recall
 
 
 def restore(estimator: SlamEstimator, state: Mapping[str, Any]) -> None:

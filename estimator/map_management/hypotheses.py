@@ -200,17 +200,15 @@ class HypothesisSlam:
                 one = False
             return self._advance(readings, options)
 
+        def undo() -> None:
+            undo_all(*begun)()
+
         def absorbed() -> Step | None:
             report = recall() if recall and one else None
             return report and (report, self.hypotheses, [])
 
-        return carried_out(
-            advance,
-            self._follow,
-            lambda: undo_all(*begun)(),
-            recall and absorbed,
-            self._undo_own,
-        )
+        told = recall and absorbed
+        return carried_out(advance, self._follow, undo, told, self._undo_own)
 
     def _follow(self, step: Step) -> UpdateReport:
         """Continue with the hypotheses of a step; return its report."""

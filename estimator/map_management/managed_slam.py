@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -191,9 +190,13 @@ class ManagedSlam:
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
-        if landmark_ids is None:
-            return self.take(readings, lambda: self.alternatives(readings)[0][1]())
-        return self.take(readings, partial(self.as_given, readings, landmark_ids))
+
+        def associate() -> ScanAssociation:
+            if landmark_ids is None:
+                return self.alternatives(readings)[0][1]()
+            return self.as_given(readings, landmark_ids)
+
+        return self.take(readings, associate)
 
     def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
         """Associate readings (m, 2) by their identities."""
@@ -222,27 +225,28 @@ class ManagedSlam:
         self, readings: Array, associate: Callable[[], ScanAssociation]
     ) -> UpdateReport:
         """Correct the belief with readings (m, 2) as associated, then prune the map."""
-        undo_filter, recall, _ = before_update(self._filter)
+        undo_filter, recall = before_update(self._filter)
         undo = self._editor.checkpoint() if recall else self._undo_records()
-        follow: Callable[[UpdateReport], UpdateReport]
+        noted: tuple[ScanAssociation, set[int], list[RecentScan], int | None]
         repeats = False
 
         def correct() -> UpdateReport:
-            nonlocal follow, repeats
+            nonlocal noted, repeats
             plan = associate()
             missed = self._pruner.expected(readings) - plan.explained
             scans, first = self._recent.with_scan(readings, plan)
-            follow = partial(self._follow, readings, plan, missed, scans, first)
+            noted = plan, missed, scans, first
             repeats = first is not None
             return self._recent.feed(scans, first, plan)
 
-        return carried_out(
-            correct,
-            lambda report: follow(report),
-            undo_all(undo_filter, undo),
-            recall and (lambda: None if repeats else recall()),
-            self.bookmark,
-        )
+        def absorbed() -> UpdateReport | None:
+            return recall() if recall and not repeats else None
+
+        def follow(report: UpdateReport) -> UpdateReport:
+            return self._follow(readings, *noted, report)
+
+        undo, told = undo_all(undo_filter, undo), recall and absorbed
+        return carried_out(correct, follow, undo, told, self.bookmark)
 
     def _follow(
         self,

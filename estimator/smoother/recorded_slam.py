@@ -106,11 +106,11 @@ class RecordedSlam:
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
     ) -> UpdateReport:
         """Update the filter with one scan, and record the readings that it used."""
-        undo, recall, _ = before_update(self._slam)
+        undo_slam, recall = before_update(self._slam)
         step = partial(self._slam.update, measurements, landmark_ids)
         then = partial(self._record_scan, measurements, landmark_ids)
-        undo_all_ = undo_all(undo, attributes(self))
-        return carried_out(step, then, undo_all_, recall, partial(attributes, self))
+        undo = undo_all(undo_slam, attributes(self))
+        return carried_out(step, then, undo, recall, partial(attributes, self))
 
     def _record_scan(
         self,

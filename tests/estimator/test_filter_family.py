@@ -1,5 +1,7 @@
 """Deterministic properties of every filter of the family."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from dense_ekf import DenseEkf
@@ -17,6 +19,7 @@ from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
 from slamgym.estimator.models.bearing_range import wrap_angle
+from slamgym.estimator.smoother.recorded_slam import RecordedSlam
 
 IDS = list(range(6))
 TRUE_MAP = dict(enumerate(SIX))
@@ -446,3 +449,36 @@ def test_beliefs_name_the_frame_of_their_error():
         "submaps",
     }
     assert isinstance(make("ekf"), EkfSlam)
+
+
+@pytest.mark.parametrize(
+    ("name", "policy"),
+    [
+        ("ekf", {"association": "nearest"}),
+        ("ekf", {"association": "hypotheses"}),
+        ("compressed", None),
+        ("submaps", None),
+        ("smoother", None),
+        ("smoother", {"association": "nearest"}),
+    ],
+)
+def test_an_update_makes_no_copy_of_the_covariance(name, policy):
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    options = {"submap_size": 400} if name == "submaps" else {}
+    if name == "smoother":
+        inside = make_estimator("ekf", **noise, management=policy)
+        slam = RecordedSlam(inside, **noise)
+    else:
+        slam = make_estimator(name, **noise, management=policy, **options)
+    around = np.linspace(-3, 3, 200)
+    scans = [[(b, 4.0 + 0.1 * k) for k, b in enumerate(around)], range(200)]
+    for _ in range(4):
+        slam.update(*scans)
+    few = scans[0][:3], range(3)
+    slam.update(*few)
+    tracemalloc.start()
+    slam.predict((0.01, 0.0))
+    slam.update(*few)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * 403**2 / 2

@@ -92,10 +92,14 @@ class SparseBelief:
 
     @contextmanager
     def undone_on_error(self) -> Iterator[None]:
-        """Take back an update that fails; a checkpoint is made where the map changes."""
+        """Take back an update that fails; save the map only where it changes."""
         saved = self.saved = [attributes(self)]
+
+        def undo() -> None:
+            saved[-1]()
+
         try:
-            with undone_on_error(lambda: saved[-1]()):
+            with undone_on_error(undo):
                 yield
         finally:
             self.saved = []
