@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 from ..association.scan_association import (
     LABEL_BITS,
     NO_LABEL,
@@ -462,27 +462,26 @@ class RecentScans:
 
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
-        state: dict[str, Any] = {
-            "motions": motion_array(self.motions),
-            "count": np.array(len(self.scans)),
-        }
+        state = saved_states.write(
+            {"motions": self.motions, "count": len(self.scans)}, WINDOW
+        )
         for k, scan in enumerate(self.scans):
             state |= with_prefix(str(k), scan.state_dict())
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        motions = motions_of(state["motions"])
-        count = saved_states.whole_number("recent.count", state["count"])
-        if count > self._window + 1:
+        saved = saved_states.read(state, WINDOW, "recent.")
+        count, most = int(saved["count"]), self._window + 1
+        if count > most:
             raise ValueError(
-                f"state['recent.count'] must be at most {self._window + 1}, got {count}"
+                f"state['recent.count'] must be at most {most}, got {count}"
             )
         self.scans = [
             RecentScan.from_state_dict(without_prefix(state, str(k)))
             for k in range(count)
         ]
-        self.motions = motions
+        self.motions = rows_of(saved["motions"])
         self.decisions = []
 
 
@@ -561,8 +560,19 @@ def _drop_contradicted(
 # --------------------------------------------------------------------------------------
 # One of the last scans of a run, kept so that it can be repeated.
 
-ENTRIES = ["number", "motions", "readings", "row_ids", "labels", "removed", "merged"]
+MOTIONS = (saved_states.NUMBERS, -1, 3)
+SCAN: saved_states.Table = {
+    "number": (saved_states.COUNTS,),
+    "motions": MOTIONS,
+    "readings": (saved_states.NUMBERS, "m", 2),
+    "row_ids": (saved_states.WHOLE, "m"),
+    "labels": (saved_states.WHOLE, "m"),
+    "removed": (saved_states.WHOLE, -1),
+    "merged": (saved_states.WHOLE, -1, 2),
+}
 """What the saved state of a scan holds, beside the state of the filter."""
+WINDOW: saved_states.Table = {"motions": MOTIONS, "count": (saved_states.COUNTS,)}
+"""What a saved state holds about the last scans, beside these."""
 
 NO_LANDMARK = np.iinfo(np.int64).min
 
@@ -622,36 +632,23 @@ class RecentScan:
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
         row_ids = [NO_LANDMARK if i is None else i for i in self.row_ids]
-        return {
-            "number": np.array(self.number),
-            "motions": motion_array(self.motions),
-            "readings": self.readings.copy(),
-            "row_ids": np.array(row_ids, dtype=np.int64),
-            "labels": np.array(self.labels, dtype=np.int64),
-            "removed": np.array(self.removed, dtype=np.int64),
-            "merged": np.array(self.merged, dtype=np.int64).reshape(-1, 2),
-            **with_prefix("before", self.before or {}),
-        }
+        saved = saved_states.write(vars(self) | {"row_ids": row_ids}, SCAN)
+        return saved | with_prefix("before", self.before or {})
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any]) -> RecentScan:
         """Restore what :meth:`state_dict` returned."""
-        saved_states.refuse_other_state(state, ENTRIES)
-        readings = saved_states.array("readings", state["readings"], (-1, 2))
-        row_ids, labels = (
-            saved_states.whole_numbers(key, state[key], (len(readings),)).tolist()
-            for key in ("row_ids", "labels")
-        )
-        merged = saved_states.whole_numbers("merged", state["merged"], (-1, 2))
+        saved = saved_states.read(state, SCAN)
+        row_ids = saved["row_ids"].tolist()
         return cls(
-            saved_states.whole_number("number", state["number"]),
-            motions_of(state["motions"]),
-            readings,
+            int(saved["number"]),
+            rows_of(saved["motions"]),
+            saved["readings"],
             tuple(None if i == NO_LANDMARK else i for i in row_ids),
-            tuple(labels),
+            tuple(saved["labels"].tolist()),
             without_prefix(state, "before") or None,
-            tuple(saved_states.whole_numbers("removed", state["removed"]).tolist()),
-            tuple((i, j) for i, j in merged.tolist()),
+            tuple(saved["removed"].tolist()),
+            rows_of(saved["merged"]),
         )
 
 
@@ -674,12 +671,6 @@ def _groups(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
     return groups
 
 
-def motion_array(motions: Sequence[Motion]) -> Array:
-    """Return motions as rows (d, α, dt), shape (k, 3)."""
-    return np.array(motions, dtype=np.float64).reshape(-1, 3)
-
-
-def motions_of(array: Any) -> tuple[Motion, ...]:
-    """Return the motions of such rows, or refuse them."""
-    rows = saved_states.array("motions", array, (-1, 3)).tolist()
-    return tuple((distance, turn, dt) for distance, turn, dt in rows)
+def rows_of(array: Array | IntArray) -> tuple[Any, ...]:
+    """Return the rows of an array as tuples."""
+    return tuple(map(tuple, array.tolist()))

@@ -24,7 +24,7 @@ from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from . import compressed_map as active_set
-from .compressed_map import CompressedMap, checked_state, extra_landmarks
+from .compressed_map import CompressedMap, extra_landmarks
 from .deferred_covariance import stored_bytes
 
 BASES: dict[str, type[EkfSlam]] = {
@@ -260,10 +260,8 @@ class CompressedEkfSlam:
 
         Of a large map the covariance of the first 200 landmarks is checked.
         """
-        name, base = type(self).__name__, type(self._map.filter).__name__
-        saved = checked_state(state, name, base, self._map.is_invariant)
         loaded = CompressedMap(self._make())
-        extra, age, rests = loaded.load(saved)
+        extra, age, rests = loaded.load_state_dict(state, type(self).__name__)
         some = loaded.belief(list(loaded.slots)[:CHECKED_LANDMARKS])
         saved_states.refuse_indefinite("the covariance of state", some.covariance)
         self._map, self._extra, self._age, self._rests = loaded, extra, age, rests
