@@ -34,11 +34,10 @@ from ..interface import (
 )
 from ..models.rigid_motion import rotation
 from ..support import argument_checks, saved_states
-from ..support import argument_checks as pair_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, undo_all, undone_on_error
-from .map_editor import CachedEditor, edit_map, is_near, mapped_ids, marginal, view_map
+from .map_editor import MapEditor, is_near, mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
 
@@ -107,9 +106,10 @@ class ManagedSlam:
             motion_std, options.get("noise_at_rest", True)
         )
         merging = self._policy.merge_within is not None
-        self._editor = CachedEditor(edit_map(self._filter, merging=merging))
+        self._editor = MapEditor(self._filter, merging=merging)
         self._pruner = MapPruner(self._policy, self._editor, self._sensor.noise)
-        self._candidates = Candidates()
+        self.candidates = Candidates()
+        """Landmarks that are not in the map yet."""
         window = self._policy.confirm[1] if self._policy.backdate else 0
         self._recent = RecentScans(
             self._filter, self._editor, window, self._policy.pair_gate
@@ -130,7 +130,7 @@ class ManagedSlam:
     @property
     def tentative_landmarks(self) -> Array:
         """Estimated positions of tentative landmarks, shape (t, 2) [m]."""
-        places = self._candidates.tentative.places
+        places = self.candidates.tentative.places
         x, y, heading = self._editor.map_view().mean[:3]
         return np.asarray(places @ rotation(heading).T + (x, y))
 
@@ -145,7 +145,7 @@ class ManagedSlam:
             self._filter.reset(pose, pose_std)
             self._editor.expire()
             self._pruner.forget()
-            self._candidates = Candidates()
+            self.candidates = Candidates()
             self._recent.forget()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
@@ -155,8 +155,8 @@ class ManagedSlam:
         with undone_on_error(self.checkpoint(motion=True)):
             self._filter.predict((distance, turn), dt)
             self._editor.expire()
-            moved = self._candidates.tentative.moved(distance, turn, variance)
-            self._candidates = replace(self._candidates, tentative=moved)
+            moved = self.candidates.tentative.moved(distance, turn, variance)
+            self.candidates = replace(self.candidates, tentative=moved)
             self._recent.note_motion(distance, turn, dt)
 
     def update(
@@ -191,7 +191,7 @@ class ManagedSlam:
     def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
         """Associate readings (m, 2) by their identities."""
         given = argument_checks.identities(landmark_ids, len(readings))
-        plan = ScanAssociation(self._policy, self._candidates, len(readings))
+        plan = ScanAssociation(self._policy, self.candidates, len(readings))
         view = self._editor.map_view(self._policy.reach(readings))
         plan.translate(given, view.mapped, self._pruner.merger.aliases)
         return plan
@@ -202,12 +202,12 @@ class ManagedSlam:
         Of those that cost more than ``ceiling`` only the most likely is of interest.
         """
         argument_checks.refuse_not_finite(readings)
-        known, view = self._candidates, self._pruner.view_for(readings)
+        known, view = self.candidates, self._pruner.view_for(readings)
         return associate(self._policy, known, readings, view, self._sensor, ceiling)
 
     def resembles(self, other: ManagedSlam, tolerance: float) -> bool:
         """Return whether another run has the same landmarks, and nearly their means."""
-        labels, others = (s._candidates.tentative.labels for s in (self, other))
+        labels, others = (s.candidates.tentative.labels for s in (self, other))
         views = self._editor.map_view(), other._editor.map_view()
         return np.array_equal(labels, others) and is_near(*views, tolerance)
 
@@ -216,7 +216,7 @@ class ManagedSlam:
         missed = self._pruner.expected(readings) - plan.explained
         report = self._recent.update(readings, plan)
         self._editor.expire()
-        self._candidates = plan.candidates
+        self.candidates = plan.candidates
         seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
         seen -= {*report.rejected_ids, *report.skipped_ids}
         removed, merged = self._pruner.prune(readings, plan, seen, missed)
@@ -239,7 +239,7 @@ class ManagedSlam:
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two mapped landmarks by hand; both identities then name the first."""
-        pair_checks.two_landmarks(kept, gone, self._slots)
+        argument_checks.two_landmarks(kept, gone, self._slots)
         with undone_on_error(self.checkpoint()):
             self._pruner.merger.join([(kept, gone)])
             self._recent.note_edits((), [(kept, gone)])
@@ -280,11 +280,11 @@ class ManagedSlam:
             self._recent.load_state_dict(without_prefix(state, "recent"))
             self._filter.load_state_dict(without_prefix(state, "filter"))
             self._editor.expire()
-            self._candidates = candidates
+            self.candidates = candidates
 
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later calls; ``motion``: only those of predict."""
-        candidates = self._candidates
+        candidates = self.candidates
         undo_parts = undo_all(
             checkpoint(self._filter, motion=motion),
             *(() if motion else (self._pruner.checkpoint(),)),
@@ -294,7 +294,7 @@ class ManagedSlam:
 
         def undo() -> None:
             undo_parts()
-            self._candidates = candidates
+            self.candidates = candidates
 
         return undo
 
@@ -304,14 +304,14 @@ class ManagedSlam:
         self._pruner.load_state_dict(other._pruner.state_dict())
         self._recent.copy_from(other._recent)
         self._editor.expire()
-        self._candidates = other._candidates
+        self.candidates = other.candidates
 
     def _remembered(self) -> dict[str, Any]:
         """Return all of the state except the filter's."""
         return {
             "estimator": np.array(type(self).__name__),
             **with_prefix("landmarks", self._pruner.state_dict()),
-            **with_prefix("tentative", self._candidates.state_dict()),
+            **with_prefix("tentative", self.candidates.state_dict()),
             **with_prefix("recent", self._recent.state_dict()),
         }
 
@@ -336,7 +336,7 @@ class RecentScans:
     ----------
     slam : SlamEstimator
         The filter.
-    editor : CachedEditor
+    editor : MapEditor
         Of its map.
     window : int
         Number of scans within which a landmark is confirmed; 0: keep no scans.
@@ -350,7 +350,7 @@ class RecentScans:
     """
 
     def __init__(
-        self, slam: SlamEstimator, editor: CachedEditor, window: int, gate: float
+        self, slam: SlamEstimator, editor: MapEditor, window: int, gate: float
     ) -> None:
         can_repeat = not isinstance(slam, SupportsTruth | SupportsLocalView)
         self._slam, self._editor = slam, editor
@@ -622,7 +622,7 @@ class RecentScan:
         row_ids[row], labels[row] = None, NO_LABEL
         return replace(self, row_ids=tuple(row_ids), labels=tuple(labels))
 
-    def edit(self, editor: CachedEditor) -> None:
+    def edit(self, editor: MapEditor) -> None:
         """Remove and merge landmarks as after the scan."""
         if self.removed:
             editor.remove(self.removed)

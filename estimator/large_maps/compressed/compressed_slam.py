@@ -19,12 +19,15 @@ from ...filters.ekf import (
 )
 from ...interface import Belief, MapView, UpdateReport, describe_filter
 from ...support import argument_checks, saved_states
-from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
-from . import compressed_map as active_set
-from .compressed_map import CompressedMap, extra_landmarks
+from .compressed_map import (
+    SHORT_PHASE,
+    SMALLEST_LOCAL_MAP,
+    CompressedMap,
+    extra_landmarks,
+)
 from .deferred_covariance import stored_bytes
 
 BASES: dict[str, type[EkfSlam]] = {
@@ -191,7 +194,7 @@ class CompressedEkfSlam:
         ValueError
             If one is not in the map or in two pairs; nothing is merged.
         """
-        kept, gone = pair_checks.landmark_pairs(pairs, self._map.slots)
+        kept, gone = argument_checks.landmark_pairs(pairs, self._map.slots)
         ids, local = [*kept, *gone], self._map.local
         with undone_on_error(self.checkpoint()):
             if not all(i in local for i in ids):
@@ -283,7 +286,7 @@ class CompressedEkfSlam:
         if self._is_adequate(required):
             return self._extra, self._age, self._rests
         rests, extra = max(self._rests - 1, 0), self._extra
-        if self._age >= active_set.SHORT_PHASE and self._map.deferred.is_up_to_date:
+        if self._age >= SHORT_PHASE and self._map.deferred.is_up_to_date:
             rests = 2  # one short phase does not matter, several leave too much work
         size, mapped = self._local_size, len(self._map.slots)
         if size is None:
@@ -300,5 +303,5 @@ class CompressedEkfSlam:
         if is_free and self._map.is_small and len(local) == mapped:
             return True
         size = len(required) + self._extra
-        size = self._local_size or max(size, active_set.SMALLEST_LOCAL_MAP)
+        size = self._local_size or max(size, SMALLEST_LOCAL_MAP)
         return all(i in local for i in required) and 2 * len(local) <= 3 * size

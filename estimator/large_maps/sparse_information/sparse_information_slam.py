@@ -13,7 +13,6 @@ from ....arrays import Array, IntArray
 from ...interface import Belief, MapView, UpdateReport, describe_filter
 from ...models.bearing_range import wrap_angle
 from ...support import argument_checks, saved_states
-from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
 from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
@@ -201,7 +200,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             If one is not in the map or both are the same; nothing is merged.
         """
-        pair_checks.two_landmarks(kept, gone, self._belief.slots)
+        argument_checks.two_landmarks(kept, gone, self._belief.slots)
         self._belief.merge(kept, gone, exact=self._is_exact)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:

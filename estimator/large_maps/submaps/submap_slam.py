@@ -15,7 +15,6 @@ from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport, describe_map
 from ...support import argument_checks, saved_states
-from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
 from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
@@ -304,7 +303,7 @@ class SubmapSlam(SubmapQueries):
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Merge several pairs (kept, gone) of landmarks; errors as :meth:`merge`."""
-        kept, gone = pair_checks.landmark_pairs(pairs, self._graph.index)
+        kept, gone = argument_checks.landmark_pairs(pairs, self._graph.index)
         pairs = list(zip(kept, gone, strict=True))
         self._claim_folder()
         with undone_on_error(self.checkpoint()):
