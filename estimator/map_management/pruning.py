@@ -103,10 +103,12 @@ class MapPruner:
 
         ``missed`` are the landmarks that this scan should have shown and did not.
         """
-        if self._policy.remove_after is None:
+        most, records = self._policy.remove_after, self._records
+        if most is None:
             return []
-        self._records.note_misses(self._records.slots(missed))
-        return self.remove(self._records.overdue(self._policy.remove_after))
+        records.misses[records.slots(missed)] += 1
+        overdue = np.flatnonzero(records.misses >= most)
+        return self.remove([records.ids[k] for k in overdue.tolist()])
 
     def close_loops(self, added: Collection[int], within: float) -> Pairs:
         """Merge landmarks around the robot with an older part of the map.
@@ -364,14 +366,6 @@ class LandmarkRecords:
     def slots(self, ids: Iterable[int]) -> IntArray:
         """Return the places of landmarks in the order of the map."""
         return np.array([self._slots[i] for i in ids], dtype=np.int64)
-
-    def note_misses(self, slots: IntArray) -> None:
-        """Count one miss of each landmark: a scan should have shown it and did not."""
-        self.misses[slots] += 1
-
-    def overdue(self, misses: int) -> list[int]:
-        """Return the landmarks missed at least ``misses`` times since last seen."""
-        return [self.ids[k] for k in np.flatnonzero(self.misses >= misses)]
 
     def join(self, kept: int, gone: int) -> None:
         """Add the records of one landmark to those of another."""

@@ -212,7 +212,8 @@ class CompressedMap:
     @property
     def is_small(self) -> bool:
         """Whether one local map may hold the whole map."""
-        return len(self.slots) <= largest_whole_map(invariant=self.is_invariant)
+        largest = LARGEST_WHOLE_INVARIANT if self.is_invariant else LARGEST_WHOLE_MAP
+        return len(self.slots) <= largest
 
     @property
     def nbytes(self) -> int:
@@ -349,11 +350,6 @@ LARGEST_RATIO, LANDMARKS_PER_RATIO = 2.5, 400
 The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
 costs a² n.
 """
-
-
-def largest_whole_map(*, invariant: bool) -> int:
-    """Return the number of landmarks up to which the local map is the whole map."""
-    return LARGEST_WHOLE_INVARIANT if invariant else LARGEST_WHOLE_MAP
 
 
 def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:

@@ -1,9 +1,7 @@
 """The sparse extended information filter.
 
-``sparse_information_slam`` is the public filter; ``sparse_belief`` holds its state and
-changes the local map, whose landmarks ``active_set`` chooses.  ``conditional_pose``
-holds the pose given the map, ``local_information`` the local map conditioned on the
-rest.  A scan passes through ``scan`` (selection), ``linearisation``, ``scan_update``
-and ``sparsification`` (correction and limits of the links).  ``marginals`` recovers
-means and covariances, and ``saved_state`` saves and checks the state.
+``sparse_information_slam`` is the public filter, and declares what it saves;
+``sparse_belief`` holds its state, changes the local map, and recovers means and
+covariances.  ``local_information`` holds the local map conditioned on the rest, and
+the pose given the map.  ``scan_update`` corrects both with a scan.
 """
