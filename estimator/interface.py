@@ -31,17 +31,10 @@ __all__ = [
     "SlamEstimator",
     "SmoothedPath",
     "SupportsBeliefLimit",
-    "SupportsCheckpoint",
     "SupportsDecisions",
     "SupportsJoin",
-    "SupportsJointMerging",
-    "SupportsLandmarkIds",
     "SupportsLocalView",
-    "SupportsMapView",
     "SupportsMemoryEstimate",
-    "SupportsMerging",
-    "SupportsRemoval",
-    "SupportsRestore",
     "SupportsSmoothing",
     "SupportsTruth",
     "UpdateReport",
@@ -144,70 +137,11 @@ class SupportsJoin(SupportsLocalView, Protocol):
 
 
 @runtime_checkable
-class SupportsMapView(Protocol):
-    """An estimator that shows its whole map without a copy."""
-
-    def map_view(self) -> MapView:
-        """Return the pose and all landmarks; valid until the next step."""
-        ...
-
-
-@runtime_checkable
-class SupportsLandmarkIds(Protocol):
-    """An estimator that lists its landmarks without computing a belief."""
-
-    @property
-    def landmark_ids(self) -> Sequence[int]:
-        """The mapped landmarks, in the order of the belief."""
-
-
-@runtime_checkable
-class SupportsRemoval(Protocol):
-    """An estimator that removes landmarks from its map."""
-
-    def remove(self, landmark_ids: Sequence[int]) -> None:
-        """Marginalise landmarks; all else is unchanged to the last bit."""
-
-
-@runtime_checkable
-class SupportsMerging(Protocol):
-    """An estimator that merges landmarks of its map."""
-
-    def merge(self, kept: int, gone: int) -> None:
-        """Condition on two landmarks being one, and remove the second."""
-
-
-@runtime_checkable
-class SupportsJointMerging(SupportsMerging, Protocol):
-    """An estimator that merges several pairs of landmarks by one measurement."""
-
-    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
-        """Condition on the landmarks (kept, gone) being one; remove the second ones."""
-
-
-@runtime_checkable
 class SupportsMemoryEstimate(Protocol):
     """An estimator that knows how much memory a map takes."""
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory that a map of this many landmarks takes [bytes]."""
-        ...
-
-
-@runtime_checkable
-class SupportsRestore(Protocol):
-    """An estimator that continues from its own states without checking them."""
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state that this process has saved."""
-
-
-@runtime_checkable
-class SupportsCheckpoint(Protocol):
-    """An estimator that can take back its own calls."""
-
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
         ...
 
 
@@ -393,29 +327,21 @@ def describe_map(landmarks: int, pose: Array, pose_covariance: Array) -> str:
     return f"{landmarks} {noun}, pose ({x} m, {y} m, {heading} rad)"
 
 
-_MEMBERS: dict[type, tuple[str, ...]] = {
-    SupportsTruth: ("observe_truth",),
-    SupportsLocalView: ("local_view",),
-    SupportsJoin: ("join",),
-    SupportsSmoothing: ("smoothed",),
-    SupportsMemoryEstimate: ("memory_for",),
-    SupportsBeliefLimit: ("belief_limit",),
-}
+_PASSED_ON = (
+    *("observe_truth", "local_view", "join", "smoothed", "memory_for"),
+    "belief_limit",
+)
 
 
 def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
     """Return what an estimator offers that a wrapper passes on unchanged, by name."""
-    return {
-        name: getattr(estimator, name)
-        for ability, names in _MEMBERS.items()
-        if isinstance(estimator, ability)
-        for name in names
-    }
+    offered = (name for name in _PASSED_ON if hasattr(estimator, name))
+    return {name: getattr(estimator, name) for name in offered}
 
 
-def checkpoint(estimator: SlamEstimator, *, motion: bool = False) -> Undo:
+def checkpoint(estimator: Any, *, motion: bool = False) -> Undo:
     """Return what takes back later calls; ``motion``: only those of predict."""
-    if hasattr(estimator, "checkpoint"):  # faster than isinstance
+    if hasattr(estimator, "checkpoint"):
         undo: Undo = estimator.checkpoint(motion=motion)
         return undo
     return partial(restore, estimator, estimator.state_dict())
@@ -435,12 +361,9 @@ def before_update(
     return undo, recall
 
 
-def restore(estimator: SlamEstimator, state: Mapping[str, Any]) -> None:
+def restore(estimator: Any, state: Mapping[str, Any]) -> None:
     """Continue from a state that this process has saved, without checks if possible."""
-    if isinstance(estimator, SupportsRestore):
-        estimator.restore(state)
-    else:
-        estimator.load_state_dict(state)
+    getattr(estimator, "restore", estimator.load_state_dict)(state)
 
 
 class _HasMarginals(Protocol):

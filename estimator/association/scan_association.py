@@ -28,7 +28,7 @@ from .scan_assignments import (
     assign_nearest,
     assign_scan,
 )
-from .tentative_landmarks import TentativeLandmarks
+from .tentative_landmarks import TENTATIVE, TentativeLandmarks
 
 NO_LABEL = -1
 
@@ -227,23 +227,6 @@ class Detections(NamedTuple):
         cost = _count(view.mean, view.covariance, is_seen, longest, self, after)
         return cost, after
 
-    def state_dict(self) -> dict[str, Array]:
-        """Return copies of all, as arrays."""
-        return {"detected": self.seen.copy(), "expected": self.expected.copy()}
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any]) -> Detections:
-        """Restore what :meth:`state_dict` returned; refuse what does not fit."""
-        shape = SECTORS, RINGS
-        seen = saved_states.array("tentative.detected", state["detected"], shape)
-        expected = saved_states.array("tentative.expected", state["expected"], shape)
-        if not ((seen >= 0) & (seen <= expected)).all():
-            raise ValueError(
-                "state['tentative.detected'] must be >= 0, and at most "
-                "state['tentative.expected']"
-            )
-        return cls(seen, expected)
-
 
 class UnexplainedDensity(NamedTuple):
     """A running average of the readings that belong to no landmark of the map.
@@ -306,34 +289,44 @@ class Candidates:
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
         waiting = [(i, scan) for i, scans in self.waiting.items() for scan in scans]
-        return {
-            **{key: value.copy() for key, value in self.tentative._asdict().items()},
-            "waiting": np.array(waiting, dtype=np.int64).reshape(-1, 2),
-            "next_id": np.array(self.next_id),
-            "scan": np.array(self.scan),
-            "density": np.array(self.density),
-            **self.detections.state_dict(),
+        found = {
+            **vars(self),
+            **self.tentative._asdict(),
+            "waiting": waiting,
+            "detected": self.detections.seen,
+            "expected": self.detections.expected,
         }
+        return saved_states.write(found, CANDIDATES)
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any]) -> Candidates:
         """Restore what :meth:`state_dict` returned; refuse what does not fit."""
+        saved = saved_states.read(state, CANDIDATES, "tentative.")
         waiting: dict[int, list[int]] = {}
-        pairs = saved_states.whole_numbers(
-            "tentative.waiting", state["waiting"], (-1, 2)
-        )
-        for landmark_id, scan in pairs.tolist():
+        for landmark_id, scan in saved["waiting"].tolist():
             waiting.setdefault(landmark_id, []).append(scan)
-        density = saved_states.array("tentative.density", state["density"], (4,))
+        density, seen, expected = (
+            saved[key] for key in ("density", "detected", "expected")
+        )
+        C = saved["covariances"]
+        if not saved_states.is_semidefinite((C + C.transpose(0, 2, 1)) / 2):
+            raise ValueError(
+                "state['tentative.covariances'] must be positive semidefinite"
+            )
         if density.min() <= 0:
             raise ValueError(f"state['tentative.density'] must be > 0, got {density}")
+        if not ((seen >= 0) & (seen <= expected)).all():
+            raise ValueError(
+                "state['tentative.detected'] must be >= 0, and at most "
+                "state['tentative.expected']"
+            )
         return cls(
-            TentativeLandmarks.from_state_dict(state),
+            TentativeLandmarks(*(saved[key] for key in TENTATIVE)),
             waiting,
-            saved_states.whole_number("tentative.next_id", state["next_id"]),
-            saved_states.whole_number("tentative.scan", state["scan"]),
+            int(saved["next_id"]),
+            int(saved["scan"]),
             UnexplainedDensity(*density.tolist()),
-            Detections.from_state_dict(state),
+            Detections(seen, expected),
         )
 
 
@@ -343,6 +336,17 @@ MEMORY = 0.98
 
 SECTORS, RINGS = 16, 8
 """Cells over the bearings, and over the ranges up to the longest reading."""
+
+CANDIDATES: saved_states.Table = {
+    **TENTATIVE,
+    "waiting": (saved_states.WHOLE, -1, 2),
+    "next_id": (saved_states.COUNTS,),
+    "scan": (saved_states.COUNTS,),
+    "density": (saved_states.NUMBERS, 4),
+    "detected": (saved_states.NUMBERS, SECTORS, RINGS),
+    "expected": (saved_states.NUMBERS, SECTORS, RINGS),
+}
+"""What a saved state holds about the landmarks that are not in the map yet."""
 
 SUREST = 0.95
 """Largest P_D: something may stand before a landmark."""

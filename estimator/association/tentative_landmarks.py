@@ -12,7 +12,6 @@ They do not depend on the belief of the filter or its frame.  A tentative landma
 is never confirmed leaves the belief unchanged.
 """
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,30 +58,6 @@ class TentativeLandmarks(NamedTuple):
             np.empty(0, np.uint64),
             np.empty(0, np.int64),
         )
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any]) -> "TentativeLandmarks":
-        """Return those whose arrays a state holds; refuse what does not fit."""
-        places = saved_states.array("tentative.places", state["places"], (-1, 2))
-        count = len(places)
-        covariances = saved_states.array(
-            "tentative.covariances", state["covariances"], (count, 2, 2)
-        )
-        symmetric = (covariances + covariances.transpose(0, 2, 1)) / 2
-        if not saved_states.is_semidefinite(symmetric):
-            raise ValueError(
-                "state['tentative.covariances'] must be positive semidefinite"
-            )
-        seen = np.asarray(state["seen"])
-        if seen.shape != (count,) or seen.dtype != np.uint64:
-            raise ValueError(
-                f"state['tentative.seen'] must be {count} unsigned integers, got "
-                f"{seen.dtype} with shape {seen.shape}"
-            )
-        labels = saved_states.whole_numbers(
-            "tentative.labels", state["labels"], (count,)
-        )
-        return cls(places, covariances, seen.copy(), labels)
 
     @property
     def sightings(self) -> IntArray:
@@ -172,3 +147,23 @@ class TentativeLandmarks(NamedTuple):
             self.seen[which],
             self.labels[which],
         )
+
+
+def _masks(name: str, value: Any, shape: tuple[int, ...]) -> Masks:
+    """Return a copy of masks (t,), or refuse them."""
+    seen = np.array(value)
+    if seen.shape != shape or seen.dtype != np.uint64:
+        raise ValueError(
+            f"state[{name!r}] must be {shape[0]} unsigned integers, got "
+            f"{seen.dtype} with shape {seen.shape}"
+        )
+    return seen
+
+
+TENTATIVE: saved_states.Table = {
+    "places": (saved_states.NUMBERS, "t", 2),
+    "covariances": (saved_states.NUMBERS, "t", 2, 2),
+    "seen": (saved_states.Kind(np.uint64, _masks), "t"),
+    "labels": (saved_states.WHOLE, "t"),
+}
+"""What a saved state holds about them, in the order of the fields."""

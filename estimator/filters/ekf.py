@@ -31,6 +31,7 @@ from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
 from ..support.undo import Recall, Undo
 from .gaussian_map import (
+    MAP_STATE,
     GaussianMap,
     ScanWorkspace,
     covariances_for,
@@ -146,9 +147,8 @@ class MapFilter:
             If the state lacks an entry, is of another estimator, or does not fit
             together; the belief is then as before.
         """
-        entries = ("covariance", "landmark_ids", "mean", "reference")
-        saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
-        self.map.load_state_dict(state)
+        name = {"estimator": type(self).__name__}
+        self.map.restore(saved_states.read(state, MAP_STATE, of=name))
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that this process has saved, without checks."""

@@ -40,8 +40,8 @@ from ..kernels.kalman_gain import (
     prior_system,
 )
 from ..models.rigid_motion import ErrorFrame
-from ..support import saved_states
 from ..support.memory_limit import aligned_zeros, landmarks_that_fit
+from ..support.saved_states import COVARIANCE, IDS, NUMBERS, Table
 from ..support.undo import Recall, Undo
 from .landmark_merging import coincide
 
@@ -277,38 +277,21 @@ class GaussianMap:
             "landmark_ids": np.array(list(self.slots), dtype=np.int64),
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned.
-
-        Raises
-        ------
-        ValueError
-            If the entries do not fit together; the map is then as before.
-        """
-        self.restore(checked_map(state))
-
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned, without checks."""
-        ids: list[int] = state["landmark_ids"].tolist()
+        ids: list[int] = np.asarray(state["landmark_ids"]).tolist()
         saved = state["mean"], state["covariance"], state["reference"]
         arrays = _filled(self._zeros(max(FIRST_ALLOCATION, len(ids))), saved)
         self._become(arrays, {i: slot for slot, i in enumerate(ids)})
 
 
-def checked_map(
-    state: Mapping[str, Any], *, semidefinite: bool = True
-) -> dict[str, Any]:
-    """Return copies of the arrays of a saved map, or refuse what does not fit."""
-    ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
-    size = 3 + 2 * len(ids)
-    return {
-        "mean": saved_states.array("mean", state["mean"], (size,)),
-        "covariance": saved_states.covariance(
-            "covariance", state["covariance"], size, semidefinite=semidefinite
-        ),
-        "reference": saved_states.array("reference", state["reference"], (size,)),
-        "landmark_ids": np.array(ids, dtype=np.int64),
-    }
+MAP_STATE: Table = {
+    "landmark_ids": (IDS, "n"),
+    "mean": (NUMBERS, "3+2n"),
+    "covariance": (COVARIANCE, "3+2n", "3+2n"),
+    "reference": (NUMBERS, "3+2n"),
+}
+"""What a saved map must be."""
 
 
 def without_landmarks(array: Array, slots: Iterable[int]) -> Array:

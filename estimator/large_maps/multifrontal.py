@@ -19,6 +19,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -495,16 +496,32 @@ class InformationMatrix:
         ValueError
             If the arrays do not fit together; the matrix is then unchanged.
         """
-        counts, links = (
-            saved_states.whole_numbers(f"matrix_{key}", state[key], (-1,), 0)
-            for key in ("counts", "links")
-        )
-        blocks = saved_states.array("matrix_blocks", state["blocks"], (-1, 2, 2))
+        saved = saved_states.read(state, ROWS, "matrix_")
+        counts, links, blocks = (saved[key] for key in ROWS)
         _check_rows(counts, links, blocks)
         ends = np.cumsum(counts)[:-1]
         self._links = [part.copy() for part in np.split(links, ends)][: len(counts)]
         self._blocks = [part.copy() for part in np.split(blocks, ends)][: len(counts)]
         self._place = np.zeros(2 * len(counts), dtype=np.int64)
+
+
+def _places(
+    name: str, value: Any, shape: tuple[int, ...], least: int | None = None
+) -> IntArray:
+    """Return whole numbers, which may be given as floats."""
+    values = saved_states.array(name, value, shape)
+    if (np.abs(values) > 2.0**53).any():
+        raise ValueError(f"state[{name!r}] must be whole numbers <= 2⁵³")
+    return saved_states.whole_numbers(name, values.astype(np.int64), shape, least)
+
+
+PLACES = saved_states.Kind(np.int64, _places)
+COUNTS = saved_states.Kind(np.int64, partial(_places, least=0))
+ROWS: saved_states.Table = {
+    "counts": (COUNTS, "m"),
+    "links": (COUNTS, -1),
+    "blocks": (saved_states.NUMBERS, -1, 2, 2),
+}
 
 
 def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:

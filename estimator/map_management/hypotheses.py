@@ -256,9 +256,9 @@ class HypothesisSlam:
             If the state lacks an entry, or is of another estimator; all is then as
             before.
         """
-        name = type(self).__name__
-        saved_states.refuse_other_state(state, ["costs"], estimator=name)
-        costs = saved_states.array("costs", state["costs"], (-1,)).tolist()
+        name = {"estimator": type(self).__name__}
+        table = {"costs": (saved_states.NUMBERS, -1)}
+        costs = saved_states.read(state, table, of=name)["costs"].tolist()
         if not costs or min(costs) < 0:
             raise ValueError(f"state['costs'] must be numbers >= 0, got {costs}")
         with undone_on_error(self.bookmark()):

@@ -15,15 +15,13 @@ passes the gate.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ..association.constellations import Constellations, TwoPlaces, match_constellations
 from ..interface import MapView
-from ..support import saved_states
 
 Pairs = list[tuple[int, int]]
 """Landmarks that are the same: (kept, gone)."""
@@ -54,7 +52,8 @@ class LoopCloser:
 
     def __init__(self, rules: Constellations | None) -> None:
         self._rules = rules
-        self._doubtful: set[int] = set()
+        self.doubtful: set[int] = set()
+        """Mapped landmarks that may be older, lost ones."""
 
     def lost(self, view: MapView) -> BoolArray:
         """Return which landmarks of a view are lost, shape (n,)."""
@@ -76,7 +75,7 @@ class LoopCloser:
 
     def is_waiting(self, added: Collection[int]) -> bool:
         """Return whether landmarks may have to be merged after some were added."""
-        return self._rules is not None and bool(added or self._doubtful)
+        return self._rules is not None and bool(added or self.doubtful)
 
     def pairs(self, view: MapView, added: Collection[int], within: float) -> Pairs:
         """Return landmarks to merge after a scan.
@@ -94,7 +93,7 @@ class LoopCloser:
             return []
         is_lost = self.lost(view)
         self._note_added(view, added, is_lost)
-        doubtful = [k for k, i in enumerate(view.ids) if i in self._doubtful]
+        doubtful = [k for k, i in enumerate(view.ids) if i in self.doubtful]
         if not doubtful:
             return []
         accurate = ACCURATE * self._rules.lost_std
@@ -103,26 +102,17 @@ class LoopCloser:
             return found
         return _recognised(view, is_lost, within, self._rules)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return all that is remembered, as arrays."""
-        return {"doubtful": np.array(sorted(self._doubtful), dtype=np.int64)}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        doubtful = saved_states.landmark_ids("landmarks.doubtful", state["doubtful"])
-        self._doubtful = set(doubtful)
-
     def _note_added(
         self, view: MapView, added: Collection[int], is_lost: BoolArray
     ) -> None:
         """Remember new landmarks that may be lost ones; forget those that are gone."""
-        self._doubtful &= set(view.mapped)
+        self.doubtful &= set(view.mapped)
         new = np.array([k for k, i in enumerate(view.ids) if i in set(added)], int)
         lost = np.flatnonzero(is_lost)
         if len(new) and len(lost):
             squared, _ = _offsets(view, new, lost)
             doubtful = new[(squared <= OFFSET_GATE).any(axis=1)]
-            self._doubtful |= {view.ids[k] for k in doubtful.tolist()}
+            self.doubtful |= {view.ids[k] for k in doubtful.tolist()}
 
 
 def _found_again(

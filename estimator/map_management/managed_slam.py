@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 from ..association.scan_association import (
     LABEL_BITS,
     NO_LABEL,
@@ -40,11 +40,10 @@ from ..interface import (
 )
 from ..models.rigid_motion import rotation
 from ..support import argument_checks, saved_states
-from ..support import argument_checks as pair_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Recall, Undo, carried_out, undo_all, undone_on_error
-from .map_editor import CachedEditor, edit_map, is_near, mapped_ids, marginal, view_map
+from .map_editor import MapEditor, is_near, mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
 
@@ -113,9 +112,10 @@ class ManagedSlam:
             motion_std, options.get("noise_at_rest", True)
         )
         merging = self._policy.merge_within is not None
-        self._editor = CachedEditor(edit_map(self._filter, merging=merging))
+        self._editor = MapEditor(self._filter, merging=merging)
         self._pruner = MapPruner(self._policy, self._editor, self._sensor.noise)
-        self._candidates = Candidates()
+        self.candidates = Candidates()
+        """Landmarks that are not in the map yet."""
         self._report: UpdateReport | None = None
         window = self._policy.confirm[1] if self._policy.backdate else 0
         self._recent = RecentScans(
@@ -137,7 +137,7 @@ class ManagedSlam:
     @property
     def tentative_landmarks(self) -> Array:
         """Estimated positions of tentative landmarks, shape (t, 2) [m]."""
-        places = self._candidates.tentative.places
+        places = self.candidates.tentative.places
         x, y, heading = self._editor.map_view().mean[:3]
         return np.asarray(places @ rotation(heading).T + (x, y))
 
@@ -152,7 +152,7 @@ class ManagedSlam:
             self._filter.reset(pose, pose_std)
             self._editor.expire()
             self._pruner.forget()
-            self._candidates = Candidates()
+            self.candidates = Candidates()
             self._recent.forget()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
@@ -162,8 +162,8 @@ class ManagedSlam:
         with undone_on_error(self.checkpoint(motion=True)):
             self._filter.predict((distance, turn), dt)
             self._editor.expire()
-            moved = self._candidates.tentative.moved(distance, turn, variance)
-            self._candidates = replace(self._candidates, tentative=moved)
+            moved = self.candidates.tentative.moved(distance, turn, variance)
+            self.candidates = replace(self.candidates, tentative=moved)
             self._recent.note_motion(distance, turn, dt)
 
     def update(
@@ -201,7 +201,7 @@ class ManagedSlam:
     def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
         """Associate readings (m, 2) by their identities."""
         given = argument_checks.identities(landmark_ids, len(readings))
-        plan = ScanAssociation(self._policy, self._candidates, len(readings))
+        plan = ScanAssociation(self._policy, self.candidates, len(readings))
         view = self._editor.map_view(self._policy.reach(readings))
         plan.translate(given, view.mapped, self._pruner.merger.aliases)
         return plan
@@ -212,12 +212,12 @@ class ManagedSlam:
         Of those that cost more than ``ceiling`` only the most likely is of interest.
         """
         argument_checks.refuse_not_finite(readings)
-        known, view = self._candidates, self._pruner.view_for(readings)
+        known, view = self.candidates, self._pruner.view_for(readings)
         return associate(self._policy, known, readings, view, self._sensor, ceiling)
 
     def resembles(self, other: ManagedSlam, tolerance: float) -> bool:
         """Return whether another run has the same landmarks, and nearly their means."""
-        labels, others = (s._candidates.tentative.labels for s in (self, other))
+        labels, others = (s.candidates.tentative.labels for s in (self, other))
         views = self._editor.map_view(), other._editor.map_view()
         return np.array_equal(labels, others) and is_near(*views, tolerance)
 
@@ -260,7 +260,7 @@ class ManagedSlam:
         """Do what follows an update of the filter; return the report of all."""
         self._recent.note_scan(plan, scans, first, report)
         self._editor.expire()
-        self._candidates = plan.candidates
+        self.candidates = plan.candidates
         seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
         seen -= {*report.rejected_ids, *report.skipped_ids}
         removed, merged = self._pruner.prune(readings, plan, seen, missed)
@@ -284,7 +284,7 @@ class ManagedSlam:
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two mapped landmarks by hand; both identities then name the first."""
-        pair_checks.two_landmarks(kept, gone, self._slots)
+        argument_checks.two_landmarks(kept, gone, self._slots)
         with undone_on_error(self.bookmark()):
             self._pruner.merger.join([(kept, gone)])
             self._recent.note_edits((), [(kept, gone)])
@@ -325,19 +325,19 @@ class ManagedSlam:
             self._recent.load_state_dict(without_prefix(state, "recent"))
             self._filter.load_state_dict(without_prefix(state, "filter"))
             self._editor.expire()
-            self._candidates = candidates
+            self.candidates = candidates
 
     def checkpoint(self, *, motion: bool = False) -> Undo:
         """Return what takes back later calls; ``motion``: only those of predict."""
         undo_filter = checkpoint(self._filter, motion=motion)
         if not motion:
             return undo_all(undo_filter, self._undo_records())
-        records = self._candidates, self._recent.motions
+        records = self.candidates, self._recent.motions
 
         def undo() -> None:
             undo_filter()
             self._editor.expire()
-            self._candidates, self._recent.motions = records
+            self.candidates, self._recent.motions = records
 
         return undo
 
@@ -352,7 +352,7 @@ class ManagedSlam:
 
     def _undo_records(self) -> Undo:
         """Return what takes back later changes of all but the filter."""
-        candidates, report = self._candidates, self._report
+        candidates, report = self.candidates, self._report
         undo_parts = undo_all(
             self._pruner.checkpoint(),
             self._recent.checkpoint(),
@@ -361,7 +361,7 @@ class ManagedSlam:
 
         def undo() -> None:
             undo_parts()
-            self._candidates, self._report = candidates, report
+            self.candidates, self._report = candidates, report
 
         return undo
 
@@ -371,14 +371,14 @@ class ManagedSlam:
         self._pruner.load_state_dict(other._pruner.state_dict())
         self._recent.copy_from(other._recent)
         self._editor.expire()
-        self._candidates = other._candidates
+        self.candidates = other.candidates
 
     def _remembered(self) -> dict[str, Any]:
         """Return all of the state except the filter's."""
         return {
             "estimator": np.array(type(self).__name__),
             **with_prefix("landmarks", self._pruner.state_dict()),
-            **with_prefix("tentative", self._candidates.state_dict()),
+            **with_prefix("tentative", self.candidates.state_dict()),
             **with_prefix("recent", self._recent.state_dict()),
         }
 
@@ -403,7 +403,7 @@ class RecentScans:
     ----------
     slam : SlamEstimator
         The filter.
-    editor : CachedEditor
+    editor : MapEditor
         Of its map.
     window : int
         Number of scans within which a landmark is confirmed; 0: keep no scans.
@@ -417,7 +417,7 @@ class RecentScans:
     """
 
     def __init__(
-        self, slam: SlamEstimator, editor: CachedEditor, window: int, gate: float
+        self, slam: SlamEstimator, editor: MapEditor, window: int, gate: float
     ) -> None:
         can_repeat = not isinstance(slam, SupportsTruth | SupportsLocalView)
         self._slam, self._editor = slam, editor
@@ -542,27 +542,26 @@ class RecentScans:
 
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
-        state: dict[str, Any] = {
-            "motions": motion_array(self.motions),
-            "count": np.array(len(self.scans)),
-        }
+        state = saved_states.write(
+            {"motions": self.motions, "count": len(self.scans)}, WINDOW
+        )
         for k, scan in enumerate(self.scans):
             state |= with_prefix(str(k), scan.state_dict())
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        motions = motions_of(state["motions"])
-        count = saved_states.whole_number("recent.count", state["count"])
-        if count > self._window + 1:
+        saved = saved_states.read(state, WINDOW, "recent.")
+        count, most = int(saved["count"]), self._window + 1
+        if count > most:
             raise ValueError(
-                f"state['recent.count'] must be at most {self._window + 1}, got {count}"
+                f"state['recent.count'] must be at most {most}, got {count}"
             )
         self.scans = [
             RecentScan.from_state_dict(without_prefix(state, str(k)))
             for k in range(count)
         ]
-        self.motions = motions
+        self.motions = rows_of(saved["motions"])
         self.decisions = []
 
 
@@ -638,8 +637,22 @@ def _drop_contradicted(
     return False
 
 
-ENTRIES = ["number", "motions", "readings", "row_ids", "labels", "removed", "merged"]
+# --------------------------------------------------------------------------------------
+# One of the last scans of a run, kept so that it can be repeated.
+
+MOTIONS = (saved_states.NUMBERS, -1, 3)
+SCAN: saved_states.Table = {
+    "number": (saved_states.COUNTS,),
+    "motions": MOTIONS,
+    "readings": (saved_states.NUMBERS, "m", 2),
+    "row_ids": (saved_states.WHOLE, "m"),
+    "labels": (saved_states.WHOLE, "m"),
+    "removed": (saved_states.WHOLE, -1),
+    "merged": (saved_states.WHOLE, -1, 2),
+}
 """What the saved state of a scan holds, beside the state of the filter."""
+WINDOW: saved_states.Table = {"motions": MOTIONS, "count": (saved_states.COUNTS,)}
+"""What a saved state holds about the last scans, beside these."""
 
 NO_LANDMARK = np.iinfo(np.int64).min
 
@@ -689,7 +702,7 @@ class RecentScan:
         row_ids[row], labels[row] = None, NO_LABEL
         return replace(self, row_ids=tuple(row_ids), labels=tuple(labels))
 
-    def edit(self, editor: CachedEditor) -> None:
+    def edit(self, editor: MapEditor) -> None:
         """Remove and merge landmarks as after the scan."""
         if self.removed:
             editor.remove(self.removed)
@@ -699,36 +712,23 @@ class RecentScan:
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
         row_ids = [NO_LANDMARK if i is None else i for i in self.row_ids]
-        return {
-            "number": np.array(self.number),
-            "motions": motion_array(self.motions),
-            "readings": self.readings.copy(),
-            "row_ids": np.array(row_ids, dtype=np.int64),
-            "labels": np.array(self.labels, dtype=np.int64),
-            "removed": np.array(self.removed, dtype=np.int64),
-            "merged": np.array(self.merged, dtype=np.int64).reshape(-1, 2),
-            **with_prefix("before", self.before or {}),
-        }
+        saved = saved_states.write(vars(self) | {"row_ids": row_ids}, SCAN)
+        return saved | with_prefix("before", self.before or {})
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any]) -> RecentScan:
         """Restore what :meth:`state_dict` returned."""
-        saved_states.refuse_other_state(state, ENTRIES)
-        readings = saved_states.array("readings", state["readings"], (-1, 2))
-        row_ids, labels = (
-            saved_states.whole_numbers(key, state[key], (len(readings),)).tolist()
-            for key in ("row_ids", "labels")
-        )
-        merged = saved_states.whole_numbers("merged", state["merged"], (-1, 2))
+        saved = saved_states.read(state, SCAN)
+        row_ids = saved["row_ids"].tolist()
         return cls(
-            saved_states.whole_number("number", state["number"]),
-            motions_of(state["motions"]),
-            readings,
+            int(saved["number"]),
+            rows_of(saved["motions"]),
+            saved["readings"],
             tuple(None if i == NO_LANDMARK else i for i in row_ids),
-            tuple(labels),
+            tuple(saved["labels"].tolist()),
             without_prefix(state, "before") or None,
-            tuple(saved_states.whole_numbers("removed", state["removed"]).tolist()),
-            tuple((i, j) for i, j in merged.tolist()),
+            tuple(saved["removed"].tolist()),
+            rows_of(saved["merged"]),
         )
 
 
@@ -751,12 +751,6 @@ def _groups(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
     return groups
 
 
-def motion_array(motions: Sequence[Motion]) -> Array:
-    """Return motions as rows (d, α, dt), shape (k, 3)."""
-    return np.array(motions, dtype=np.float64).reshape(-1, 3)
-
-
-def motions_of(array: Any) -> tuple[Motion, ...]:
-    """Return the motions of such rows, or refuse them."""
-    rows = saved_states.array("motions", array, (-1, 3)).tolist()
-    return tuple((distance, turn, dt) for distance, turn, dt in rows)
+def rows_of(array: Array | IntArray) -> tuple[Any, ...]:
+    """Return the rows of an array as tuples."""
+    return tuple(map(tuple, array.tolist()))

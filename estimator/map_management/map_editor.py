@@ -21,49 +21,23 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from ..filters.ekf import EkfSlam
 from ..filters.gaussian_map import without_landmarks
 from ..filters.landmark_merging import coincide
-from ..interface import (
-    Belief,
-    MapView,
-    SlamEstimator,
-    SupportsJoin,
-    SupportsJointMerging,
-    SupportsLandmarkIds,
-    SupportsLocalView,
-    SupportsMapView,
-    SupportsMerging,
-    SupportsRemoval,
-)
+from ..interface import Belief, MapView, SlamEstimator, SupportsJoin
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame
 from ..support.undo import Undo
 
 
-class MapEditor(Protocol):
-    """How landmark management reads and edits the map of one filter."""
+class MapEditor:
+    """Reads and edits the map of a filter; keeps its view of the map until it expires.
 
-    def map_view(self, within: float = 0.0) -> MapView:
-        """Return a view of pose and map; it is valid until the filter's next step.
-
-        Landmarks farther away than ``within`` [m] may be left out.
-        """
-        ...
-
-    def remove(self, ids: Sequence[int]) -> None:
-        """Marginalise landmarks; all else is unchanged to the last bit."""
-
-    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
-        """Condition on pairs of landmarks being one, and remove the second of each."""
-
-
-def edit_map(slam: SlamEstimator, *, merging: bool = True) -> MapEditor:
-    """Return the fastest editor of a filter's map.
+    It calls the fastest methods that the filter has.
 
     Parameters
     ----------
@@ -76,36 +50,37 @@ def edit_map(slam: SlamEstimator, *, merging: bool = True) -> MapEditor:
     TypeError
         If the filter has neither these methods nor a state that can be edited.
     """
-    can_remove, can_merge = (
-        isinstance(slam, ability) and not hides_its_belief(slam)
-        for ability in (SupportsRemoval, SupportsMerging)
-    )
-    if can_remove and (can_merge or not merging):
-        return _MethodEditor(slam)
-    can_save = hasattr(slam, "state_dict") and hasattr(slam, "load_state_dict")
-    needed = ("mean", "covariance", "landmark_ids")
-    if not can_save or not set(needed) <= set(slam.state_dict()):
-        wanted = "methods remove and merge" if merging else "method remove"
-        raise TypeError(
-            f"{type(slam).__name__} cannot be managed so: it needs the {wanted}, or "
-            f"state_dict() and load_state_dict() with {', '.join(needed)}"
-        )
-    return _StateEditor(slam)
 
-
-class CachedEditor:
-    """An editor that keeps its view of the map until the view expires."""
-
-    def __init__(self, editor: MapEditor) -> None:
-        self._editor = editor
+    def __init__(self, slam: SlamEstimator, *, merging: bool = True) -> None:
+        self._slam: Any = slam
         self._view: MapView | None = None
         self._within = 0.0
+        wanted = ("remove", "merge") if merging else ("remove",)
+        has_all = all(hasattr(slam, name) for name in wanted)
+        self._has_methods = has_all and not hides_its_belief(slam)
+        if self._has_methods:
+            return
+        can_save = hasattr(slam, "state_dict") and hasattr(slam, "load_state_dict")
+        needed = ("mean", "covariance", "landmark_ids")
+        if not can_save or not set(needed) <= set(slam.state_dict()):
+            methods = "methods remove and merge" if merging else "method remove"
+            raise TypeError(
+                f"{type(slam).__name__} cannot be managed so: it needs the {methods}, "
+                f"or state_dict() and load_state_dict() with {', '.join(needed)}"
+            )
 
     def map_view(self, within: float | None = None) -> MapView:
-        """Return the view kept, or a new one; as far as the last time by default."""
+        """Return a view of pose and map; it is valid until the filter's next step.
+
+        Landmarks farther away than ``within`` [m] may be left out; by default, this is
+        the distance of the last time.
+        """
         reach = self._within if within is None else within
         if self._view is None or reach > self._within:
-            self._view = self._editor.map_view(reach)
+            if self._has_methods and hasattr(self._slam, "local_view"):
+                self._view = self._slam.local_view(reach)
+            else:
+                self._view = view_map(self._slam)
         self._within = reach
         return self._view
 
@@ -123,50 +98,25 @@ class CachedEditor:
         self._view = None
 
     def remove(self, ids: Sequence[int]) -> None:
-        """Marginalise landmarks."""
+        """Marginalise landmarks; all else is unchanged to the last bit."""
         self.expire()
-        self._editor.remove(ids)
+        if self._has_methods:
+            self._slam.remove(ids)
+        else:
+            self._load_without(self._slam.state_dict(), ids)
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Condition on pairs of landmarks being one, and remove the second of each."""
         self.expire()
-        self._editor.merge_pairs(pairs)
-
-
-class _MethodEditor:
-    """Through the filter's own methods."""
-
-    def __init__(self, slam: Any) -> None:
-        self._slam = slam
-        self._is_local = isinstance(slam, SupportsLocalView)
-
-    def map_view(self, within: float = 0.0) -> MapView:
-        return self._slam.local_view(within) if self._is_local else view_map(self._slam)
-
-    def remove(self, ids: Sequence[int]) -> None:
-        self._slam.remove(ids)
-
-    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
-        if isinstance(self._slam, SupportsJointMerging):
+        if not self._has_methods:
+            self._merge_in_state(pairs)
+        elif hasattr(self._slam, "merge_pairs"):
             self._slam.merge_pairs(pairs)
-            return
-        for kept, gone in pairs:
-            self._slam.merge(kept, gone)
+        else:
+            for kept, gone in pairs:
+                self._slam.merge(kept, gone)
 
-
-class _StateEditor:
-    """Through the saved state, for filters without such methods."""
-
-    def __init__(self, slam: SlamEstimator) -> None:
-        self._slam = slam
-
-    def map_view(self, within: float = 0.0) -> MapView:
-        return view_map(self._slam)
-
-    def remove(self, ids: Sequence[int]) -> None:
-        self._load_without(self._slam.state_dict(), ids)
-
-    def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
+    def _merge_in_state(self, pairs: Sequence[tuple[int, int]]) -> None:
         state = self._slam.state_dict()
         order = np.asarray(state["landmark_ids"]).tolist()
         state["mean"], state["covariance"] = coincide(
@@ -193,17 +143,17 @@ class _StateEditor:
 
 def view_map(slam: SlamEstimator) -> MapView:
     """Return a view of the whole map of a filter, without a copy where possible."""
-    if isinstance(slam, EkfSlam | SupportsMapView) and not hides_its_belief(slam):
-        return slam.map_view()
+    if hasattr(slam, "map_view") and not hides_its_belief(slam):
+        view: MapView = slam.map_view()
+        return view
     belief = slam.belief()
     return MapView(belief.mean, belief.covariance, belief.landmark_ids)
 
 
 def mapped_ids(slam: SlamEstimator) -> tuple[int, ...]:
     """Return the landmarks in the map of a filter, in the order of its belief."""
-    if isinstance(slam, EkfSlam | SupportsLandmarkIds) and not hides_its_belief(slam):
-        return tuple(slam.landmark_ids)
-    return slam.belief().landmark_ids
+    ids = None if hides_its_belief(slam) else getattr(slam, "landmark_ids", None)
+    return slam.belief().landmark_ids if ids is None else tuple(ids)
 
 
 def is_near(one: MapView, other: MapView, tolerance: float) -> bool:

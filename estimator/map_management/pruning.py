@@ -103,10 +103,12 @@ class MapPruner:
 
         ``missed`` are the landmarks that this scan should have shown and did not.
         """
-        if self._policy.remove_after is None:
+        most, records = self._policy.remove_after, self._records
+        if most is None:
             return []
-        self._records.note_misses(self._records.slots(missed))
-        return self.remove(self._records.overdue(self._policy.remove_after))
+        records.misses[records.slots(missed)] += 1
+        overdue = np.flatnonzero(records.misses >= most)
+        return self.remove([records.ids[k] for k in overdue.tolist()])
 
     def close_loops(self, added: Collection[int], within: float) -> Pairs:
         """Merge landmarks around the robot with an older part of the map.
@@ -156,16 +158,36 @@ class MapPruner:
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all records, as arrays."""
-        return {
-            **self._records.state_dict(),
-            **self.merger.state_dict(),
-            **self._closer.state_dict(),
+        merger = self.merger
+        found = {
+            **vars(self._records),
+            "apart": sorted(merger.apart),
+            "aliases": list(merger.aliases.items()),
+            "doubtful": sorted(self._closer.doubtful),
         }
+        return saved_states.write(found, RECORDS)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned; refuse what does not fit."""
-        for part in (self._records, self.merger, self._closer):
-            part.load_state_dict(state)
+        saved = saved_states.read(state, RECORDS, "landmarks.")
+        apart, aliases = saved.pop("apart"), saved.pop("aliases")
+        self._closer.doubtful = set(saved.pop("doubtful"))
+        self.merger.apart = {(i, j) for i, j in apart.tolist()}
+        self.merger.aliases = dict(aliases.tolist())
+        self._records.follow(saved.pop("ids"))
+        vars(self._records).update(saved)
+
+
+RECORDS: saved_states.Table = {
+    "ids": (saved_states.IDS, "n"),
+    "sightings": (saved_states.COUNTS, "n"),
+    "misses": (saved_states.COUNTS, "n"),
+    "information": (saved_states.NUMBERS, "n", 3),
+    "apart": (saved_states.WHOLE, -1, 2),
+    "aliases": (saved_states.WHOLE, -1, 2),
+    "doubtful": (saved_states.IDS, -1),
+}
+"""What a saved state holds about the landmarks of a map."""
 
 
 class LandmarkMerger:
@@ -187,7 +209,8 @@ class LandmarkMerger:
         self, policy: LandmarkPolicy, editor: MapEditor, records: LandmarkRecords
     ) -> None:
         self._policy, self._editor, self._records = policy, editor, records
-        self._apart: set[tuple[int, int]] = set()
+        self.apart: set[tuple[int, int]] = set()
+        """Landmarks known to differ."""
         self.aliases: dict[int, int] = {}
         """Landmarks merged into others: gone to kept."""
 
@@ -198,7 +221,7 @@ class LandmarkMerger:
         places = view.landmarks[self._places(view, ids)]
         close = _distances(places, places) < 2 * self._policy.merge_within
         for i, j in np.argwhere(np.triu(close, 1)).tolist():
-            self._apart.add(_ordered(ids[i], ids[j]))
+            self.apart.add(_ordered(ids[i], ids[j]))
 
     def merge(self, seen: set[int]) -> list[tuple[int, int]]:
         """Merge landmarks just seen with their duplicates; return (kept, gone)."""
@@ -221,28 +244,13 @@ class LandmarkMerger:
             self._records.join(kept, gone)
             earlier = {i: kept for i, j in self.aliases.items() if j == gone}
             self.aliases |= {gone: kept, **earlier}
-            self._apart = {_renamed(pair, gone, kept) for pair in self._apart}
+            self.apart = {_renamed(pair, gone, kept) for pair in self.apart}
         self._records.follow(self._editor.map_view().mapped)
 
     def forget(self, ids: Iterable[int]) -> None:
         """Drop what is known about landmarks that have been removed."""
         gone = set(ids)
-        self._apart = {pair for pair in self._apart if gone.isdisjoint(pair)}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the landmarks known to differ and the aliases, as arrays."""
-        return {
-            "apart": _pairs(sorted(self._apart)),
-            "aliases": _pairs(list(self.aliases.items())),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        apart, aliases = (
-            saved_states.whole_numbers(f"landmarks.{key}", state[key], (-1, 2)).tolist()
-            for key in ("apart", "aliases")
-        )
-        self._apart, self.aliases = {(i, j) for i, j in apart}, dict(aliases)
+        self.apart = {pair for pair in self.apart if gone.isdisjoint(pair)}
 
     def _duplicate(self, seen: set[int]) -> tuple[int, int] | None:
         """Find two landmarks that are one; keep the first of them in the map."""
@@ -265,7 +273,7 @@ class LandmarkMerger:
         return np.array([places[i] for i in ids], dtype=np.int64)
 
     def _is_one(self, view: MapView, kept: int, gone: int) -> bool:
-        if _ordered(view.ids[kept], view.ids[gone]) in self._apart:
+        if _ordered(view.ids[kept], view.ids[gone]) in self.apart:
             return False
         between = separation(view.mean, view.covariance, kept, gone)
         return (
@@ -287,10 +295,6 @@ def _ordered(i: int, j: int) -> tuple[int, int]:
 def _renamed(pair: tuple[int, int], old: int, new: int) -> tuple[int, int]:
     i, j = (new if landmark_id == old else landmark_id for landmark_id in pair)
     return _ordered(i, j)
-
-
-def _pairs(pairs: Sequence[tuple[int, int]]) -> IntArray:
-    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
 class LandmarkRecords:
@@ -363,14 +367,6 @@ class LandmarkRecords:
         """Return the places of landmarks in the order of the map."""
         return np.array([self._slots[i] for i in ids], dtype=np.int64)
 
-    def note_misses(self, slots: IntArray) -> None:
-        """Count one miss of each landmark: a scan should have shown it and did not."""
-        self.misses[slots] += 1
-
-    def overdue(self, misses: int) -> list[int]:
-        """Return the landmarks missed at least ``misses`` times since last seen."""
-        return [self.ids[k] for k in np.flatnonzero(self.misses >= misses)]
-
     def join(self, kept: int, gone: int) -> None:
         """Add the records of one landmark to those of another."""
         i, j = self._slots[kept], self._slots[gone]
@@ -383,28 +379,3 @@ class LandmarkRecords:
         xx, xy, yy = self.information[self.slots(ids)[::-1]].T
         order = np.argsort(xx * yy - xy * xy, kind="stable")
         return [ids[len(ids) - 1 - k] for k in order.tolist()]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return copies of all records, as arrays."""
-        return {
-            "ids": np.array(self.ids, dtype=np.int64),
-            "sightings": self.sightings.copy(),
-            "misses": self.misses.copy(),
-            "information": self.information.copy(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned; refuse what does not fit."""
-        ids = saved_states.landmark_ids("landmarks.ids", state["ids"])
-        count = len(ids)
-        sightings, misses = (
-            saved_states.whole_numbers(f"landmarks.{key}", state[key], (count,), 0)
-            for key in ("sightings", "misses")
-        )
-        information = saved_states.array(
-            "landmarks.information", state["information"], (count, 3)
-        )
-        self.ids = tuple(ids)
-        self._slots = {i: k for k, i in enumerate(ids)}
-        self.sightings, self.misses = sightings, misses
-        self.information = information

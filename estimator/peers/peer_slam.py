@@ -207,6 +207,13 @@ class Moments(NamedTuple):
     """Shape (3 + 2n, 3 + 2n)."""
 
 
+STATE: saved_states.Table = {
+    "landmark_ids": (saved_states.IDS, "n"),
+    "mean": (saved_states.NUMBERS, "3+2n"),
+    "covariance": (saved_states.NUMBERS, "3+2n", "3+2n"),
+}
+
+
 class KalmanPeer(PeerSlam):
     """A Kalman filter of another library, its map grown by this adapter."""
 
@@ -252,15 +259,10 @@ class KalmanPeer(PeerSlam):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit."""
-        entries = ("mean", "covariance", "landmark_ids")
-        saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
-        ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
-        size = 3 + 2 * len(ids)
-        self._state = Moments(
-            saved_states.array("mean", state["mean"], (size,)),
-            saved_states.array("covariance", state["covariance"], (size, size)),
-        )
-        self._slots = {i: slot for slot, i in enumerate(ids)}
+        name = {"estimator": type(self).__name__}
+        saved = saved_states.read(state, STATE, of=name)
+        self._state = Moments(saved["mean"], saved["covariance"])
+        self._slots = {i: slot for slot, i in enumerate(saved["landmark_ids"])}
 
 
 def _with_landmarks(state: Moments, new: Readings) -> Moments:

@@ -18,7 +18,7 @@ from ..interface import (
     checkpoint,
     optional_members,
 )
-from ..map_management.map_editor import edit_map, mapped_ids, marginal, view_map
+from ..map_management.map_editor import MapEditor, mapped_ids, marginal, view_map
 from ..registry import accepted_options, find_estimator, make_estimator, read_label
 from ..support import argument_checks, saved_states
 from ..support.undo import (
@@ -74,7 +74,7 @@ class RecordedSlam:
     def __init__(self, slam: SlamEstimator, **noise: Any) -> None:
         Drive(**noise)  # refuses what it cannot smooth
         self._slam, self._noise = slam, noise
-        self._editor = edit_map(slam)
+        self._editor = MapEditor(slam)
         self._last: Event | None = None
         for name, member in optional_members(slam).items():
             setattr(self, name, member)

@@ -1,9 +1,10 @@
-"""Checks of saved states, with messages that name the entry."""
+"""Declared saved states: what each entry must be, checked by name before it is used."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,86 @@ from .argument_checks import as_floats, identities
 
 ROUNDING = 1e-9
 """Tolerance of a negative eigenvalue, relative to the trace, or to 1 if it is less."""
+
+
+Size = int | str
+"""A length, or a letter for one: "n", or "3+2n" for 3 + 2n.  Its first use sets it."""
+
+
+class Kind(NamedTuple):
+    """What the numbers of an entry are."""
+
+    dtype: type[np.generic]
+    """As they are saved."""
+    checked: Callable[[str, Any, tuple[int, ...]], Any]
+    """Returns a copy of a value by its name and shape, or refuses it."""
+
+
+Table = Mapping[str, tuple[Kind, *tuple[Size, ...]]]
+"""The kind and the shape of each entry of a state, in the order of the checks."""
+
+
+def read(
+    state: Mapping[str, Any],
+    table: Table,
+    prefix: str = "",
+    *,
+    of: Mapping[str, str] | None = None,
+    **sizes: int,
+) -> dict[str, Any]:
+    """Return copies of the entries that a table declares, or refuse one by its name.
+
+    Parameters
+    ----------
+    state : mapping
+        The saved state, or a part of one.
+    table : mapping
+        What its entries must be.
+    prefix : str
+        Precedes their keys in messages.
+    of : mapping, optional
+        Classes that the state must name, by their keys.
+    **sizes : int
+        Those known beforehand.
+
+    Examples
+    --------
+    >>> table = {"ids": (IDS, "n"), "mean": (NUMBERS, "3+2n")}
+    >>> read({"ids": np.array([7]), "mean": np.zeros(5)}, table)["ids"]
+    [7]
+    >>> read({"ids": np.array([7]), "mean": np.zeros(4)}, table)
+    Traceback (most recent call last):
+    ValueError: state['mean'] must have shape (5,), got shape (4,)
+    """
+    refuse_other_state(state, table, **(of or {}))
+    found = {}
+    for key, (kind, *shape) in table.items():
+        lengths = tuple(_length(size, sizes) for size in shape)
+        found[key] = kind.checked(prefix + key, state[key], lengths)
+        for size, length in zip(shape, np.shape(found[key]), strict=True):
+            sizes.setdefault(str(size), length)
+    return found
+
+
+def write(values: Mapping[str, Any], table: Table) -> dict[str, Any]:
+    """Return copies of the entries that a table declares, as arrays."""
+    saved = {}
+    for key, (kind, *shape) in table.items():
+        array = np.array(values[key], dtype=kind.dtype)
+        if array.ndim < len(shape):  # an empty list of rows
+            array = array.reshape([_length(size, {}) for size in shape])
+        saved[key] = array
+    return saved
+
+
+def _length(size: Size, known: Mapping[str, int]) -> int:
+    """Return a length, -1 if it is not known yet."""
+    if isinstance(size, int):
+        return size
+    first, _, rest = size.rpartition("+")
+    factor, name = rest[:-1], rest[-1]
+    length = known.get(name, -1)
+    return length if length < 0 else int(first or 0) + int(factor or 1) * length
 
 
 def refuse_other_state(
@@ -43,13 +124,18 @@ def array(name: str, value: Any, shape: tuple[int, ...] | None = None) -> Array:
     return numbers.copy()
 
 
-def covariance(name: str, value: Any, size: int, *, semidefinite: bool = True) -> Array:
-    """Return a copy of a symmetric (size, size) array, positive semidefinite or not."""
-    P = array(name, value, (size, size))
+def symmetric(name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    """Return a copy of a symmetric array, or refuse it."""
+    P = array(name, value, shape)
     if not np.array_equal(P, P.T):
         raise ValueError(f"state[{name!r}] must be symmetric")
-    if semidefinite:
-        refuse_indefinite(f"state[{name!r}]", P)
+    return P
+
+
+def covariance(name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    """Return a copy of a symmetric, positive semidefinite array, or refuse it."""
+    P = symmetric(name, value, shape)
+    refuse_indefinite(f"state[{name!r}]", P)
     return P
 
 
@@ -97,23 +183,18 @@ def whole_numbers(
     return numbers.astype(np.int64)
 
 
-def whole_number(name: str, value: Any, least: int = 0) -> int:
-    """Return a whole number of a state, or refuse it."""
-    return int(whole_numbers(name, value, (), least))
-
-
-def landmark_ids(name: str, value: Any) -> list[int]:
+def landmark_ids(name: str, value: Any, shape: tuple[int, ...] = (-1,)) -> list[int]:
     """Return identities without repetition as Python integers, or refuse them."""
-    ids = whole_numbers(name, value).tolist()
+    ids = whole_numbers(name, value, shape).tolist()
     if len(set(ids)) < len(ids):
         raise ValueError(f"state[{name!r}] must not repeat an identity, got {ids}")
     return identities(ids, len(ids))
 
 
-def flag(name: str, value: Any) -> bool:
+def flag(name: str, value: Any, shape: tuple[int, ...] = ()) -> bool:
     """Return a truth value of a state, or refuse it."""
     given = np.asarray(value)
-    if given.shape != () or given.dtype.kind not in "biuf" or given not in (0, 1):
+    if given.shape != shape or given.dtype.kind not in "biuf" or given not in (0, 1):
         raise ValueError(f"state[{name!r}] must be True or False, got {value!r}")
     return bool(given)
 
@@ -127,18 +208,33 @@ def _refuse_other_shape(
         raise ValueError(f"state[{name!r}] must have shape {wanted}, got shape {given}")
 
 
-def with_prefix(name: str, state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a state whose keys begin with a name and a dot.
+NUMBERS = Kind(np.float64, array)
+SYMMETRIC = Kind(np.float64, symmetric)
+COVARIANCE = Kind(np.float64, covariance)
+WHOLE = Kind(np.int64, whole_numbers)
+COUNTS = Kind(np.int64, partial(whole_numbers, least=0))
+IDS = Kind(np.int64, landmark_ids)
+FLAG = Kind(np.bool_, flag)
+
+
+# --------------------------------------------------------------------------------------
+# Saved states inside saved states, distinguished by a prefix of their keys.
+
+
+def with_prefix(name: str, state: Mapping[str, Any], mark: str = ".") -> dict[str, Any]:
+    """Return a state whose keys begin with a name and a dot, or another mark.
 
     Examples
     --------
     >>> with_prefix("filter", {"mean": 1})
     {'filter.mean': 1}
     """
-    return {f"{name}.{key}": value for key, value in state.items()}
+    return {f"{name}{mark}{key}": value for key, value in state.items()}
 
 
-def without_prefix(state: Mapping[str, Any], name: str) -> dict[str, Any]:
+def without_prefix(
+    state: Mapping[str, Any], name: str, mark: str = "."
+) -> dict[str, Any]:
     """Return the part of a state that :func:`with_prefix` has given this name."""
-    start = f"{name}."
+    start = name + mark
     return {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}

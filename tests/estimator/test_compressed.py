@@ -27,7 +27,7 @@ from slamgym.estimator.large_maps.compressed.deferred_covariance import (
     DeferredCovariance,
 )
 from slamgym.estimator.large_maps.compressed.phase_update import Handover
-from slamgym.estimator.map_management.map_editor import edit_map
+from slamgym.estimator.map_management.map_editor import MapEditor
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from growing_maps_peers import FullWithDsyrk
@@ -239,7 +239,7 @@ def test_a_merge_is_that_of_the_full_filter(base, jumping):
             assert len(twice) > 1
             for i in twice:
                 slam.merge(i, i + count)
-                edit_map(full).merge_pairs([(i, i + count)])
+                MapEditor(full).merge_pairs([(i, i + count)])
             assert_equal_beliefs(slam.belief(), full.belief())
     assert_equal_beliefs(slam.belief(), full.belief())
 

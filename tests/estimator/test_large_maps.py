@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from slamgym.estimator import make_estimator
 from slamgym.estimator.filters.landmark_merging import separation
-from slamgym.estimator.map_management.map_editor import edit_map
+from slamgym.estimator.map_management.map_editor import MapEditor
 from slamgym.estimator.map_management.policy import LandmarkPolicy
 from slamgym.evaluation.nees import normalised_squared_error, state_nees
 from slamgym.experiments.monte_carlo import (
@@ -283,7 +283,7 @@ def test_removal_changes_no_other_marginal_near_or_far(way):
     before = slam.belief()
     gone = list(before.landmark_ids[1::3])
     stays = [i for i in before.landmark_ids if i not in gone]
-    edit_map(slam).remove(gone)
+    MapEditor(slam).remove(gone)
     after = slam.belief()
     assert set(after.landmark_ids) == set(stays)
     rows = [

@@ -9,7 +9,7 @@ from scipy.optimize import root
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
 from slamgym.estimator.filters.gaussian_map import without_landmarks
 from slamgym.estimator.filters.landmark_merging import coincide, separation
-from slamgym.estimator.map_management.map_editor import edit_map, marginal
+from slamgym.estimator.map_management.map_editor import MapEditor, marginal
 from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
 
 MANAGEABLE = list_estimators()
@@ -155,7 +155,7 @@ def test_what_cannot_differ_cannot_be_merged():
 def test_removal_changes_no_other_marginal(name):
     slam = driven(name)
     before = slam.belief()
-    edit_map(slam).remove([4, 1])
+    MapEditor(slam).remove([4, 1])
     after = slam.belief()
     assert after.landmark_ids == (0, 2, 3, 5)
     kept = np.r_[0:5, 7:11, 13:15]
@@ -171,7 +171,7 @@ def test_removal_changes_no_other_marginal(name):
 )
 def test_a_removed_landmark_is_not_missed_by_the_rest(name):
     removed, kept = driven(name), driven(name)
-    edit_map(removed).remove([2])
+    MapEditor(removed).remove([2])
     others = [0, 1, 3, 4, 5]
     for odometry, readings, _ in drive(8, 30):
         for slam in (removed, kept):
@@ -193,7 +193,7 @@ def volume(belief):
 def test_merging_keeps_the_information_of_both(name):
     slam = doubled(name)
     before = [volume(marginal(slam, [i])) for i in (0, 6)]
-    edit_map(slam).merge_pairs([(0, 6)])
+    MapEditor(slam).merge_pairs([(0, 6)])
     assert slam.belief().landmark_ids == tuple(IDS)
     assert volume(marginal(slam, [0])) < min(before) - 0.1
     assert np.linalg.eigvalsh(slam.belief().covariance).min() > 0
@@ -211,7 +211,7 @@ def test_merging_tells_no_filter_that_knows_better_its_heading(name):
     truth = np.array([(0.5, 6.0), (0.5, 6.0), (-1.0, 3.0)])
     for _ in range(20):
         slam.update(truth + MEASUREMENT_STD * rng.standard_normal((3, 2)), [0, 1, 2])
-    edit_map(slam).merge_pairs([(0, 1)])
+    MapEditor(slam).merge_pairs([(0, 1)])
     for _ in range(20):
         noise = MEASUREMENT_STD * rng.standard_normal((2, 2))
         slam.update(truth[1:] + noise, [0, 2])
@@ -234,7 +234,7 @@ def test_a_filter_of_ones_own_is_edited_through_its_state():
 
     boxed, open_one = Boxed(doubled("ekf")), doubled("ekf")
     for slam in (boxed, open_one):
-        door = edit_map(slam)
+        door = MapEditor(slam)
         door.merge_pairs([(0, 6)])
         door.remove([3])
     assert boxed.belief().landmark_ids == open_one.belief().landmark_ids
@@ -253,7 +253,7 @@ def test_a_filter_whose_map_cannot_be_edited_is_refused():
             return {"blob": np.zeros(1)}
 
     with pytest.raises(TypeError, match=r"Sealed cannot be managed so.* with mean"):
-        edit_map(Sealed(MOTION_STD, MEASUREMENT_STD))
+        MapEditor(Sealed(MOTION_STD, MEASUREMENT_STD))
 
 
 @pytest.mark.parametrize("name", MANAGEABLE)

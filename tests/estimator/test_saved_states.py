@@ -236,3 +236,11 @@ def test_whole_numbers_beyond_those_of_floats_are_refused():
     state["around_slots"] = np.array([2.0**63])
     with pytest.raises(ValueError, match="around_slots'] must be whole numbers <= 2⁵³"):
         slam.load_state_dict(state)
+
+
+def test_places_in_a_column_are_refused_by_name():
+    slam = driven("sparse_information", False)
+    state = slam.state_dict()
+    column = state["local_slots"][:, None]
+    with pytest.raises(ValueError, match=r"state\['local_slots'\] must have shape"):
+        slam.load_state_dict(state | {"local_slots": column})

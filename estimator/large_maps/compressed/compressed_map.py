@@ -7,18 +7,19 @@ landmarks, and `checked_state` checks a saved state before anything changes.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
-from ...filters.gaussian_map import checked_map
+from ...filters.gaussian_map import MAP_STATE
 from ...interface import Belief
 from ...support import saved_states
 from ...support.argument_checks import LOWEST_ID
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
+from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from ..multifrontal import pairs
 from .deferred_covariance import BLOCK, DeferredCovariance, subtract, symmetric
@@ -214,7 +215,8 @@ class CompressedMap:
     @property
     def is_small(self) -> bool:
         """Whether one local map may hold the whole map."""
-        return len(self.slots) <= largest_whole_map(invariant=self.is_invariant)
+        largest = LARGEST_WHOLE_INVARIANT if self.is_invariant else LARGEST_WHOLE_MAP
+        return len(self.slots) <= largest
 
     @property
     def nbytes(self) -> int:
@@ -229,34 +231,65 @@ class CompressedMap:
         self.finish_handover()
         near = [self.slots[i] for i in self.local]
         invalid = pairs([*near, *self.free])  # arrays hold rests of these
-        arrays = {
-            "points": self._points.copy(),
-            "references": self._references.copy(),
-            "strip": self._strip.copy(),
+        local = with_prefix("local", self.filter.state_dict(), "_")
+        found = {
+            "landmark_ids": list(self.slots),
+            "slots": list(self.slots.values()),
+            "points": self._points,
+            "references": self._references,
+            "strip": self._strip,
+            "origin": self._origin,
+            "numbers": [self._virtual, *numbers, *self.free],
         }
-        for array in arrays.values():
-            array[..., invalid[invalid < array.shape[-1]]] = 0.0
-        local = {f"local_{k}": v for k, v in self.filter.state_dict().items()}
-        return {
-            "base": local.pop("local_estimator"),
-            "landmark_ids": np.array(list(self.slots), dtype=np.int64),
-            "slots": np.array(list(self.slots.values()), dtype=np.int64),
-            **arrays,
-            "origin": self._origin.copy(),
-            "numbers": np.array([self._virtual, *numbers, *self.free]),
-            **local,
-            **{f"far_{k}": v for k, v in self.deferred.state_dict(invalid).items()},
-        }
+        state = {"base": local.pop("local_estimator")}
+        state |= saved_states.write(found, STATE)
+        for key in ("points", "references", "strip"):
+            state[key][..., invalid[invalid < state[key].shape[-1]]] = 0.0
+        far = self.deferred.state_dict(invalid)
+        return state | local | with_prefix("far", far, "_")
 
-    def load(self, saved: SavedState) -> list[int]:
-        """Replace the state by a saved one; return the numbers of the caller."""
-        self.filter.restore(saved.local)
-        self.deferred, self.slots, self.local = saved.far, saved.slots, saved.near
-        self._points, self._references, self._strip, self._origin = saved.arrays
-        self._handover = None
-        self._virtual, *numbers = saved.numbers[:4]
-        self.free = saved.numbers[4:]
-        return numbers
+    def load_state_dict(self, state: Mapping[str, Any], name: str) -> list[int]:
+        """Fill an empty map with a saved one; return the numbers of the caller.
+
+        Raises
+        ------
+        ValueError
+            If the state is not of the estimator of this name, or does not fit
+            together.
+        """
+        entries = [*STATE, *(f"local_{k}" for k in LOCAL)]
+        entries += [f"far_{k}" for k in self.deferred.state_dict()]
+        base = type(self.filter).__name__
+        saved_states.refuse_other_state(state, entries, estimator=name, base=base)
+        local_ids = state["local_landmark_ids"]
+        local_ids = saved_states.landmark_ids("local_landmark_ids", local_ids)
+        self.deferred.load_state_dict(without_prefix(state, "far", "_"))
+        width = self.deferred.width
+        saved = saved_states.read(state, STATE, w=width)
+        ids, slots, numbers = (
+            list(map(int, saved[key])) for key in ("landmark_ids", "slots", "numbers")
+        )
+        _check_slots(slots, numbers, len(ids), len(local_ids))
+        local = saved_states.read(without_prefix(state, "local", "_"), LOCAL)
+        self._virtual, *counters = numbers[:COUNTERS]
+        self.free = numbers[COUNTERS:]
+        self.slots = dict(zip(ids, slots, strict=True))
+        self.local = dict.fromkeys(local_ids[self._virtual :])
+        self._points, self._references = saved["points"], saved["references"]
+        self._strip, self._origin = saved["strip"], saved["origin"]
+        rows = virtual_landmarks(len(self._strip), self.is_invariant)
+        if self._virtual and rows != self._virtual:
+            raise ValueError(
+                f"state['strip'] must fit {self._virtual} virtual landmarks and "
+                f"{width} columns, got shape {self._strip.shape}"
+            )
+        own = np.r_[0:3, 3 + 2 * self._virtual : len(local["mean"])]
+        P = local["covariance"][np.ix_(own, own)]
+        saved_states.refuse_indefinite("state['local_covariance']", P)
+        if not self.local.keys() <= self.slots.keys():
+            raise ValueError("state['local_landmark_ids'] must be among landmark_ids")
+        self.filter.restore(local)
+        return counters
 
     def _drop(self, ids: Sequence[int]) -> None:
         gone = set(ids)
@@ -321,11 +354,6 @@ costs a² n.
 """
 
 
-def largest_whole_map(*, invariant: bool) -> int:
-    """Return the number of landmarks up to which the local map is the whole map."""
-    return LARGEST_WHOLE_INVARIANT if invariant else LARGEST_WHOLE_MAP
-
-
 def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
     """Return the number of landmarks of the next local map beyond those of a scan.
 
@@ -387,60 +415,23 @@ def choose_local(
 
 
 # --------------------------------------------------------------------------------------
-# Saved states.
+# The saved state of a compressed filter.
 
-_LOCAL = ("mean", "covariance", "reference", "landmark_ids")
-_OWN = ("landmark_ids", "slots", "points", "references", "strip", "origin", "numbers")
-
-
+STATE: saved_states.Table = {
+    "landmark_ids": (saved_states.IDS, "n"),
+    "slots": (saved_states.COUNTS, -1),
+    "points": (saved_states.NUMBERS, "w"),
+    "references": (saved_states.NUMBERS, "w"),
+    "strip": (saved_states.NUMBERS, -1, "w"),
+    "origin": (saved_states.NUMBERS, 2),
+    "numbers": (saved_states.COUNTS, -1),
+}
+LOCAL: saved_states.Table = {
+    **MAP_STATE,
+    "covariance": (saved_states.SYMMETRIC, "3+2n", "3+2n"),
+}
 COUNTERS = 4
 """Numbers before the free slots: virtual landmarks, extra ones, age, rest."""
-
-
-class SavedState(NamedTuple):
-    """The attributes of a compressed filter, read from a saved state."""
-
-    local: dict[str, Any]
-    far: DeferredCovariance
-    slots: dict[int, int]
-    near: dict[int, None]
-    arrays: tuple[Array, Array, Array, Array]  # points, references, strip, origin
-    numbers: list[int]
-
-
-def checked_state(
-    state: Mapping[str, Any], name: str, base: str, invariant: bool
-) -> SavedState:
-    """Read what ``CompressedEkfSlam.state_dict`` returned; refuse what does not fit."""
-    far = DeferredCovariance()
-    entries = [*_OWN, *(f"local_{k}" for k in _LOCAL)]
-    entries += [f"far_{k}" for k in far.state_dict()]
-    saved_states.refuse_other_state(state, entries, estimator=name, base=base)
-    far.load_state_dict({k: state[f"far_{k}"] for k in far.state_dict()})
-    ids, local_ids = (
-        saved_states.landmark_ids(key, state[key])
-        for key in ("landmark_ids", "local_landmark_ids")
-    )
-    slots, numbers = (
-        saved_states.whole_numbers(key, state[key], (-1,), 0).tolist()
-        for key in ("slots", "numbers")
-    )
-    _check_slots(slots, numbers, len(ids), len(local_ids))
-    saved = SavedState(
-        checked_map({k: state[f"local_{k}"] for k in _LOCAL}, semidefinite=False),
-        far,
-        dict(zip(ids, slots, strict=True)),
-        dict.fromkeys(local_ids[numbers[0] :]),
-        (
-            _vector(state, "points", far.width),
-            _vector(state, "references", far.width),
-            saved_states.array("strip", state["strip"], (-1, far.width)),
-            _vector(state, "origin", 2),
-        ),
-        numbers,
-    )
-    _check_fit(saved, invariant)
-    return saved
 
 
 def _check_slots(
@@ -463,22 +454,3 @@ def _check_slots(
             "state['slots'] and the free ones in state['numbers'] must be 0, 1, … "
             f"without repetition, got {slots} and {free}"
         )
-
-
-def _vector(state: Mapping[str, Any], key: str, size: int) -> Array:
-    return saved_states.array(key, state[key], (size,))
-
-
-def _check_fit(saved: SavedState, invariant: bool) -> None:
-    strip, virtual, width = saved.arrays[2], saved.numbers[0], saved.far.width
-    rows = virtual_landmarks(len(strip), invariant)
-    if virtual and rows != virtual:
-        raise ValueError(
-            f"state['strip'] must fit {virtual} virtual landmarks and {width} columns, "
-            f"got shape {strip.shape}"
-        )
-    own = np.r_[0:3, 3 + 2 * virtual : len(saved.local["mean"])]
-    covariance = saved.local["covariance"][np.ix_(own, own)]
-    saved_states.refuse_indefinite("state['local_covariance']", covariance)
-    if not set(saved.near) <= set(saved.slots):
-        raise ValueError("state['local_landmark_ids'] must be among landmark_ids")

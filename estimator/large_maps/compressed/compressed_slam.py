@@ -19,7 +19,6 @@ from ...filters.ekf import (
 )
 from ...interface import Belief, MapView, UpdateReport, describe_filter
 from ...support import argument_checks, saved_states
-from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
 from ...support.undo import (
@@ -30,8 +29,12 @@ from ...support.undo import (
     undo_all,
     undone_on_error,
 )
-from . import compressed_map as active_set
-from .compressed_map import CompressedMap, checked_state, extra_landmarks
+from .compressed_map import (
+    SHORT_PHASE,
+    SMALLEST_LOCAL_MAP,
+    CompressedMap,
+    extra_landmarks,
+)
 from .deferred_covariance import stored_bytes
 
 BASES: dict[str, type[EkfSlam]] = {
@@ -202,7 +205,7 @@ class CompressedEkfSlam:
         ValueError
             If one is not in the map or in two pairs; nothing is merged.
         """
-        kept, gone = pair_checks.landmark_pairs(pairs, self._map.slots)
+        kept, gone = argument_checks.landmark_pairs(pairs, self._map.slots)
         ids, local = [*kept, *gone], self._map.local
         with undone_on_error(self.bookmark()):
             if not all(i in local for i in ids):
@@ -271,10 +274,8 @@ class CompressedEkfSlam:
 
         Of a large map the covariance of the first 200 landmarks is checked.
         """
-        name, base = type(self).__name__, type(self._map.filter).__name__
-        saved = checked_state(state, name, base, self._map.is_invariant)
         loaded = CompressedMap(self._make())
-        extra, age, rests = loaded.load(saved)
+        extra, age, rests = loaded.load_state_dict(state, type(self).__name__)
         some = loaded.belief(list(loaded.slots)[:CHECKED_LANDMARKS])
         saved_states.refuse_indefinite("the covariance of state", some.covariance)
         self._map, self._extra, self._age, self._rests = loaded, extra, age, rests
@@ -302,7 +303,7 @@ class CompressedEkfSlam:
         if self._is_adequate(required):
             return
         rests, extra = max(self._rests - 1, 0), self._extra
-        if self._age >= active_set.SHORT_PHASE and self._map.deferred.is_up_to_date:
+        if self._age >= SHORT_PHASE and self._map.deferred.is_up_to_date:
             rests = 2  # one short phase does not matter, several leave too much work
         size, mapped = self._local_size, len(self._map.slots)
         if size is None:
@@ -319,5 +320,5 @@ class CompressedEkfSlam:
         if is_free and self._map.is_small and len(local) == mapped:
             return True
         size = len(required) + self._extra
-        size = self._local_size or max(size, active_set.SMALLEST_LOCAL_MAP)
+        size = self._local_size or max(size, SMALLEST_LOCAL_MAP)
         return all(i in local for i in required) and 2 * len(local) <= 3 * size

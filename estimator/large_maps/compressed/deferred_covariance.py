@@ -218,16 +218,17 @@ class DeferredCovariance:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from what :meth:`state_dict` returned, or refuse it unchanged."""
-        flat = saved_states.array("far_covariance", state["covariance"], (-1,))
+        table = {"covariance": (saved_states.NUMBERS, -1)}
+        flat = saved_states.read(state, table, "far_")["covariance"]
         count = round(np.sqrt(2 * flat.size / BLOCK**2 + 0.25) - 0.5)
         if flat.size != BLOCK**2 * count * (count + 1) // 2:
             raise ValueError(
                 "the stored covariance must be whole blocks of rows, got shape "
                 f"{flat.shape}"
             )
-        pending = saved_downdates(state, BLOCK * count)
-        progress = saved_states.array("far_progress", state["progress"], (3,)).tolist()
-        under_way, done, credit = progress
+        saved = saved_states.read(state, PENDING, "far_", w=BLOCK * count)
+        pending = _downdates(saved)
+        under_way, done, credit = progress = saved["progress"].tolist()
         if not (
             under_way in (0, 1) and done in range(count + 1) and credit >= 0
         ) or under_way > len(pending):
@@ -299,19 +300,22 @@ class Downdate(NamedTuple):
     signs: Array  # s, shape (rank,), each 1 or -1
 
 
-def saved_downdates(state: Mapping[str, Any], width: int) -> list[Downdate]:
+PENDING: saved_states.Table = {
+    "pending_signs": (saved_states.NUMBERS, "r"),
+    "pending_root": (saved_states.NUMBERS, "w", "r"),
+    "pending_shapes": (saved_states.COUNTS, -1, 2),
+    "progress": (saved_states.NUMBERS, 3),
+}
+"""What a saved state holds about downdates."""
+
+
+def _downdates(saved: Mapping[str, Any]) -> list[Downdate]:
     """Return the pending downdates of a state, or refuse them."""
-    signs = saved_states.array("far_pending_signs", state["pending_signs"], (-1,))
-    root = saved_states.array(
-        "far_pending_root", state["pending_root"], (width, len(signs))
-    )
-    shapes = saved_states.whole_numbers(
-        "far_pending_shapes", state["pending_shapes"], (-1, 2), 0
-    )
-    if shapes[:, 1].sum() != len(signs) or (shapes[:, 0] > width).any():
+    signs, root, shapes, _ = (saved[key] for key in PENDING)
+    if shapes[:, 1].sum() != len(signs) or (shapes[:, 0] > len(root)).any():
         raise ValueError(
             f"state['far_pending_shapes'] must add up to a rank of {len(signs)} in "
-            f"{width} rows, got {shapes.tolist()}"
+            f"{len(root)} rows, got {shapes.tolist()}"
         )
     if not np.isin(signs, (-1, 1)).all():
         raise ValueError("state['far_pending_signs'] must be 1 or -1")

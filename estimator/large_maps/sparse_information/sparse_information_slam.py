@@ -17,11 +17,11 @@ from ....arrays import Array, IntArray
 from ...interface import Belief, MapView, UpdateReport, describe_filter
 from ...models.bearing_range import wrap_angle
 from ...support import argument_checks, saved_states
-from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
+from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import Undo, attributes, undo_all
 from ..elimination import RestFactor
-from ..multifrontal import Factor, SchurComplement, SubsetFactor
+from ..multifrontal import PLACES, ROWS, Factor, SchurComplement, SubsetFactor
 from .local_information import (
     ConditionalPose,
     FixedLandmarks,
@@ -204,7 +204,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             If one is not in the map or both are the same; nothing is merged.
         """
-        pair_checks.two_landmarks(kept, gone, self._belief.slots)
+        argument_checks.two_landmarks(kept, gone, self._belief.slots)
         self._belief.merge(kept, gone, exact=self._is_exact)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
@@ -314,24 +314,53 @@ range_noise_at, gate_probability, noise_at_rest, min_range
 # --------------------------------------------------------------------------------------
 # Conversion of a sparse belief to arrays, and checks of such arrays.
 
-_PARTS = {
-    "matrix": ("counts", "links", "blocks"),
-    "local": ("slots", "points", "first", "information", "start"),
-    "around": ("slots", "border", "response", "complement"),
-    "outer": ("slots", "response", "residual", "scale"),
-    "pose": ("mean", "gain", "covariance", "reference"),
+
+def _reach(name: str, value: Any, _: tuple[int, ...]) -> float:
+    """Return a number > 0, which may be infinite."""
+    reach = argument_checks.as_floats(f"state[{name!r}]", value)
+    if reach.shape != (1,) or not reach[0] > 0:
+        raise ValueError(f"state[{name!r}] must be a number > 0, got {value!r}")
+    return float(reach[0])
+
+
+NUMBERS, COUNTS = saved_states.NUMBERS, saved_states.COUNTS
+STATE: saved_states.Table = {
+    "landmark_ids": (saved_states.IDS, "n"),
+    "slots": (COUNTS, -1),
+    "free": (COUNTS, -1),
+    "nodes": (COUNTS, "m"),
+    "parted": (COUNTS,),
+    "origin": (NUMBERS, 2),
+    "reach": (saved_states.Kind(np.float64, _reach),),
+    "widened": (saved_states.FLAG,),
+    "points": (NUMBERS, "2m"),
+    "first": (NUMBERS, "2m"),
+    "residual": (NUMBERS, "2m"),
+    **with_prefix("matrix", ROWS, "_"),
+    "local_slots": (PLACES, "k"),
+    "local_points": (NUMBERS, "2k"),
+    "local_first": (NUMBERS, "2k"),
+    "local_information": (NUMBERS, "2k", "2k"),
+    "local_start": (NUMBERS, "c"),
+    "around_slots": (PLACES, -1),
+    "around_border": (PLACES, "c"),
+    "around_response": (NUMBERS, -1, "c"),
+    "around_complement": (NUMBERS, "c", "c"),
+    "outer_slots": (PLACES, "o"),
+    "outer_response": (NUMBERS, "2o", "c"),
+    "outer_residual": (NUMBERS, "2o"),
+    "outer_scale": (NUMBERS, "o", 2, 2),
+    "pose_mean": (NUMBERS, 3),
+    "pose_gain": (NUMBERS, 3, "2k"),
+    "pose_covariance": (NUMBERS, 3, 3),
+    "pose_reference": (NUMBERS, 2),
 }
-_MAP = ("points", "first", "residual")
-_OTHERS = ("landmark_ids", "slots", "free", "nodes", "parted")
-_LOCAL_MAP = ("origin", "reach", "widened")
-_WHOLE_NUMBERS = {"counts", "links", "border", "slots"}
-_LARGEST_WHOLE = 2.0**53
 
 
 def as_arrays(belief: SparseBelief, name: str, base: str) -> dict[str, Any]:
     """Return copies of the whole state, as arrays."""
     map_, local = belief.map_, belief.local
-    dissection = map_.elimination.dissection
+    dissection, size = map_.elimination.dissection, 2 * len(map_.information)
     dissection.grow(len(map_.information))
     parts = {
         "local": local,
@@ -339,25 +368,25 @@ def as_arrays(belief: SparseBelief, name: str, base: str) -> dict[str, Any]:
         "outer": local.fixed,
         "pose": belief.pose,
     }
-    return {
-        "estimator": np.array(name),
-        "base": np.array(base),
-        "landmark_ids": np.array(list(belief.slots), dtype=np.int64),
-        "slots": np.array(list(belief.slots.values()), dtype=np.int64),
-        "free": np.array(belief.free, dtype=np.int64),
-        "nodes": dissection.nodes.copy(),
-        "parted": np.array(dissection.dissected),
-        "origin": belief.origin.copy(),
-        "reach": np.array(float(belief.count)),
-        "widened": np.array(belief.enlarged),
-        **{k: getattr(map_, k)[: 2 * len(map_.information)].copy() for k in _MAP},
-        **{f"matrix_{k}": v for k, v in map_.information.state_dict().items()},
-        **{
-            f"{prefix}_{key}": getattr(part, key).copy()
-            for prefix, part in parts.items()
-            for key in _PARTS[prefix]
-        },
+    found = {
+        "landmark_ids": list(belief.slots),
+        "slots": list(belief.slots.values()),
+        "free": belief.free,
+        "nodes": dissection.nodes,
+        "parted": dissection.dissected,
+        "origin": belief.origin,
+        "reach": belief.count,
+        "widened": belief.enlarged,
+        "points": map_.points[:size],
+        "first": map_.first[:size],
+        "residual": map_.residual[:size],
+        **with_prefix("matrix", map_.information.state_dict(), "_"),
     }
+    for key in STATE.keys() - found.keys():
+        part, _, attribute = key.partition("_")
+        found[key] = getattr(parts[part], attribute)
+    names = {"estimator": np.array(name), "base": np.array(base)}
+    return names | saved_states.write(found, STATE)
 
 
 def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelief:
@@ -368,33 +397,50 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
     ValueError
         If the state is of another estimator, incomplete or inconsistent.
     """
-    entries = [f"{prefix}_{key}" for prefix, keys in _PARTS.items() for key in keys]
-    entries += [*_OTHERS, *_MAP, *_LOCAL_MAP]
-    saved_states.refuse_other_state(state, entries, estimator=name, base=base)
+    table = dict(sorted(STATE.items(), key=lambda item: item[1][0].dtype is np.float64))
+    # Whole numbers are read first, because the shapes of the others follow from them.
+    saved = saved_states.read(state, table, of={"estimator": name, "base": base})
+    matrix, local, around, outer, pose = (
+        without_prefix(saved, part, "_")
+        for part in ("matrix", "local", "around", "outer", "pose")
+    )
     map_ = SparseMap()
-    map_.information.load_state_dict(_part(state, "matrix"))
+    map_.information.load_state_dict(matrix)
     count = len(map_.information)
-    slots, free = _slots(state, count)
-    map_.points, map_.first, map_.residual = (
-        saved_states.array(key, state[key], (2 * count,)) for key in _MAP
-    )
-    pose = ConditionalPose(**_part(state, "pose"))
-    of_local = _part(state, "local")
-    local = LocalInformation(
-        **of_local,
-        eliminated=_eliminated(map_, of_local["slots"], _part(state, "around")),
-        fixed=FixedLandmarks(**_part(state, "outer")),
-    )
-    _check_shapes(local, pose)
-    _check_slots(local, count)
-    _load_dissection(state, map_, local.slots)
-    origin = saved_states.array("origin", state["origin"], (2,))
-    reach = argument_checks.as_floats("state['reach']", state["reach"])
-    if reach.shape != (1,) or not reach[0] > 0:
-        raise ValueError(f"state['reach'] must be a number > 0, got {state['reach']!r}")
-    widened = saved_states.flag("widened", state["widened"])
+    slots, free = _slots(saved, count)
+    map_.points, map_.first = saved["points"], saved["first"]
+    map_.residual = saved["residual"]
+    rows, wanted = len(around["response"]), 2 * len(around["slots"])
+    if rows not in (0, wanted):
+        raise ValueError(
+            f"state['around_response'] must have 0 or {wanted} rows, got {rows}"
+        )
+    for key, end in (
+        ("local_slots", count),
+        ("around_slots", count),
+        ("outer_slots", count),
+        ("around_border", 2 * len(local["slots"])),
+    ):
+        places = saved[key]
+        if len(places) and not 0 <= places.min() <= places.max() < end:
+            raise ValueError(
+                f"state[{key!r}] must lie in [0, {end}), got {places.min()} to "
+                f"{places.max()}"
+            )
+    _load_dissection(saved, map_, local["slots"])
     belief = SparseBelief(
-        slots, free, map_, local, pose, origin, float(reach[0]), widened
+        slots,
+        free,
+        map_,
+        LocalInformation(
+            **local,
+            eliminated=_eliminated(map_, local["slots"], around),
+            fixed=FixedLandmarks(**outer),
+        ),
+        ConditionalPose(**pose),
+        saved["origin"],
+        saved["reach"],
+        saved["widened"],
     )
     _check_definite(belief)
     return belief
@@ -412,12 +458,9 @@ def _check_definite(belief: SparseBelief) -> None:
     saved_states.refuse_indefinite("the covariance of the pose of state", pose)
 
 
-def _slots(state: Mapping[str, Any], count: int) -> tuple[dict[int, int], list[int]]:
-    ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
-    slots, free = (
-        saved_states.whole_numbers(key, state[key], (-1,), 0).tolist()
-        for key in ("slots", "free")
-    )
+def _slots(saved: Mapping[str, Any], count: int) -> tuple[dict[int, int], list[int]]:
+    ids = saved["landmark_ids"]
+    slots, free = saved["slots"].tolist(), saved["free"].tolist()
     if sorted(slots + free) != list(range(count)) or len(ids) != len(slots):
         raise ValueError(
             f"state['slots'] and state['free'] must share out the {count} rows of the "
@@ -438,72 +481,19 @@ def _eliminated(
 
 
 def _load_dissection(
-    state: Mapping[str, Any], map_: SparseMap, local: IntArray
+    saved: Mapping[str, Any], map_: SparseMap, local: IntArray
 ) -> None:
     """Load the elimination order; insert landmarks that it does not contain."""
-    matrix, count = map_.information, len(map_.information)
-    nodes = saved_states.whole_numbers("nodes", state["nodes"], (count,), 0)
+    matrix, nodes = map_.information, saved["nodes"]
     if (nodes >= 2**50).any():
         raise ValueError(
             f"state['nodes'] must be whole numbers in [0, 2⁵⁰), got {nodes.max()}"
         )
     dissection = map_.elimination.dissection
     dissection.nodes = nodes
-    dissection.dissected = saved_states.whole_number("parted", state["parted"])
+    dissection.dissected = int(saved["parted"])
     others = np.setdiff1d(np.flatnonzero(dissection.nodes == 0), local)
     others = others[matrix.is_filled(others)]
     if len(others):
         dissection.revise(matrix, map_.first, others)
     dissection.check(matrix, local)
-
-
-def _part(state: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Return copies of the entries with a prefix, all of them finite numbers."""
-    part: dict[str, Any] = {}
-    for key in _PARTS[prefix]:
-        values = saved_states.array(f"{prefix}_{key}", state[f"{prefix}_{key}"])
-        if key not in _WHOLE_NUMBERS:
-            part[key] = values
-            continue
-        if (np.abs(values) > _LARGEST_WHOLE).any():
-            raise ValueError(f"state['{prefix}_{key}'] must be whole numbers <= 2⁵³")
-        part[key] = values.astype(np.int64)
-    return part
-
-
-def _check_shapes(local: LocalInformation, pose: ConditionalPose) -> None:
-    eliminated, fixed = local.eliminated, local.fixed
-    k, c = 2 * len(local.slots), len(eliminated.border)
-    h = 2 * len(eliminated.slots) if len(eliminated.response) else 0
-    o = 2 * len(fixed.slots)
-    for name, array, shape in (
-        ("pose_mean", pose.mean, (3,)),
-        ("pose_gain", pose.gain, (3, k)),
-        ("pose_covariance", pose.covariance, (3, 3)),
-        ("pose_reference", pose.reference, (2,)),
-        ("local_points", local.points, (k,)),
-        ("local_first", local.first, (k,)),
-        ("local_information", local.information, (k, k)),
-        ("local_start", local.start, (c,)),
-        ("around_response", eliminated.response, (h, c)),
-        ("around_complement", eliminated.complement, (c, c)),
-        ("outer_response", fixed.response, (o, c)),
-        ("outer_residual", fixed.residual, (o,)),
-        ("outer_scale", fixed.scale, (o // 2, 2, 2)),
-    ):
-        if array.shape != shape:
-            raise ValueError(f"state[{name!r}] must be {shape}, got {array.shape}")
-
-
-def _check_slots(local: LocalInformation, count: int) -> None:
-    for name, slots, end in (
-        ("local_slots", local.slots, count),
-        ("around_slots", local.eliminated.slots, count),
-        ("outer_slots", local.fixed.slots, count),
-        ("around_border", local.eliminated.border, 2 * len(local.slots)),
-    ):
-        if len(slots) and not 0 <= slots.min() <= slots.max() < end:
-            raise ValueError(
-                f"state[{name!r}] must lie in [0, {end}), got {slots.min()} to "
-                f"{slots.max()}"
-            )

@@ -49,6 +49,8 @@ class ClosedSubmaps:
         Slots of merged landmarks, and the slots that replace them.
     summaries : sequence of SubmapSummary, optional
         Of the submaps in the store.
+    initialisation : FrameInitialisation, optional
+        Their frames, as far as they are known.
     """
 
     def __init__(
@@ -57,13 +59,14 @@ class ClosedSubmaps:
         frame: ErrorFrame,
         renamed: Mapping[int, int] | None = None,
         summaries: Sequence[SubmapSummary] = (),
+        initialisation: FrameInitialisation | None = None,
     ) -> None:
         self.store, self._frame = store, frame
         self.renamed = dict(renamed or {})
         self.summaries = list(summaries)
         self.slots: set[int] = set().union(*(s.slots.tolist() for s in summaries))
         """Slots of the landmarks in the submaps, including links."""
-        self._initialisation = FrameInitialisation()
+        self._initialisation = initialisation or FrameInitialisation()
         self._joined: JoinedMap | None = None
         self._whole: tuple[IntArray, Gaussian] | None = None
 
@@ -87,9 +90,8 @@ class ClosedSubmaps:
         """Return the same submaps with one more, which is stored."""
         self.store.append(submap)
         summaries = [*self.summaries, summarise(submap)]
-        longer = ClosedSubmaps(self.store, self._frame, self.renamed, summaries)
-        longer._initialisation = self._initialisation.copy()
-        return longer
+        frames = FrameInitialisation(self._initialisation.blocks)
+        return ClosedSubmaps(self.store, self._frame, self.renamed, summaries, frames)
 
     def checkpoint(self) -> Undo:
         """Return what takes back which submaps are stored."""

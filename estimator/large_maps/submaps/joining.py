@@ -10,7 +10,7 @@ orientation.  Frame 0 is the start of the run, and fixed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -222,16 +222,15 @@ class FrameInitialisation:
     """Initial frames, with a cache of joined blocks.
 
     The result depends only on the arguments, not on the cache.
+
+    Parameters
+    ----------
+    blocks : mapping, optional
+        The cache of one for fewer submaps.
     """
 
-    def __init__(self) -> None:
-        self._blocks: dict[tuple[int, int], Array] = {}
-
-    def copy(self) -> FrameInitialisation:
-        """Return one with the same cache, for more submaps."""
-        copied = FrameInitialisation()
-        copied._blocks = dict(self._blocks)
-        return copied
+    def __init__(self, blocks: Mapping[tuple[int, int], Array] | None = None) -> None:
+        self.blocks = dict(blocks or {})
 
     def frames(
         self, summaries: Sequence[SubmapSummary], known: Array, refine: Refine
@@ -264,7 +263,7 @@ class FrameInitialisation:
         self, summaries: Sequence[SubmapSummary], a: int, b: int, refine: Refine
     ) -> Array:
         """Return the frames a to b relative to frame a."""
-        if (a, b) not in self._blocks:
+        if (a, b) not in self.blocks:
             if b - a <= LARGEST_COMPOSED:
                 frames = [np.zeros(3)]
                 for summary in summaries[a:b]:
@@ -275,9 +274,9 @@ class FrameInitialisation:
                 left = self._block(summaries, a, middle, refine)
                 right = self._block(summaries, middle, b, refine)
                 rough = _merged(summaries, a, left, right)
-                del self._blocks[a, middle], self._blocks[middle, b]
-            self._blocks[a, b] = refine(a, b, rough)
-        return self._blocks[a, b]
+                del self.blocks[a, middle], self.blocks[middle, b]
+            self.blocks[a, b] = refine(a, b, rough)
+        return self.blocks[a, b]
 
 
 def points_seen(summaries: Sequence[SubmapSummary], frames: Array, count: int) -> Array:

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 from uuid import uuid4
 
 import numpy as np
@@ -38,27 +38,6 @@ class Submap(NamedTuple):
     """Last pose, where the next submap begins, and landmarks, shape (3 + 2n,)."""
     covariance: Array
     """Covariance of the error in its filter's frame, shape (3 + 2n, 3 + 2n)."""
-
-
-class SubmapStore(Protocol):
-    """Storage of closed submaps."""
-
-    def __len__(self) -> int: ...
-
-    def append(self, submap: Submap) -> None:
-        """Append a submap."""
-
-    def truncate(self, count: int) -> None:
-        """Forget all submaps but the first ``count``."""
-
-    def load(self, index: int) -> Submap:
-        """Return a submap; its arrays must not be modified."""
-        ...
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the submaps [bytes]."""
-        ...
 
 
 class MemoryStore:
@@ -252,6 +231,9 @@ class FolderStore:
                 f"files and no {MARKER} of {FORMAT!r}"
             )
         return lines[1].removeprefix("run ")
+
+
+SubmapStore = MemoryStore | FolderStore
 
 
 def _written(submap: Submap) -> bytes:

@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,8 +18,8 @@ from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport, describe_map
 from ...support import argument_checks, saved_states
-from ...support import argument_checks as pair_checks
 from ...support.argument_checks import LandmarkIds
+from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import (
     Recall,
     Undo,
@@ -324,7 +324,7 @@ class SubmapSlam(SubmapQueries):
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Merge several pairs (kept, gone) of landmarks; errors as :meth:`merge`."""
-        kept, gone = pair_checks.landmark_pairs(pairs, self._graph.index)
+        kept, gone = argument_checks.landmark_pairs(pairs, self._graph.index)
         pairs = list(zip(kept, gone, strict=True))
         self._claim_folder()
         with undone_on_error(self.checkpoint()):
@@ -392,8 +392,8 @@ class SubmapSlam(SubmapQueries):
 
         A filter that loads the state reads them from the folder, which must not change.
         """
-        neighbourhood = self._neighbourhood.state_dict()
-        return as_arrays(type(self).__name__, self._graph, neighbourhood)
+        vicinity = self._neighbourhood.state_dict()
+        return as_arrays(type(self).__name__, self._graph, vicinity)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, as `EkfSlam.load_state_dict`.
@@ -404,15 +404,13 @@ class SubmapSlam(SubmapQueries):
             Also if the folder does not hold the submaps of the state, or holds the run
             of another filter; the belief is then unchanged.
         """
-        saved = checked_state(state, type(self).__name__, self._active, self._folder)
-        neighbourhood = self._neighbourhood.restored(saved.neighbourhood)
-        landmarks, chain, closed = saved.landmarks, saved.chain, saved.closed
+        graph = saved_graph(state, type(self).__name__, self._active, self._folder)
+        near = self._neighbourhood.restored(without_prefix(state, "vicinity", "_"))
         with undone_on_error(self.checkpoint()):
-            self._active.filter.load_state_dict(saved.local)
-            self._graph = SubmapGraph(landmarks, chain, closed, self._active)
-            self._neighbourhood = neighbourhood
-            if isinstance(closed.store, FolderStore):
-                self._folder = closed.store
+            self._active.filter.load_state_dict(without_prefix(state, "local", "_"))
+            self._graph, self._neighbourhood = graph, near
+            if isinstance(graph.closed.store, FolderStore):
+                self._folder = graph.closed.store
 
     def _claim_folder(self) -> None:
         if self._folder is not None:
@@ -429,26 +427,18 @@ class SubmapSlam(SubmapQueries):
 # --------------------------------------------------------------------------------------
 # Conversion of a run in submaps to arrays, and checks of such arrays.
 
-SHAPES = {
-    "start": (4, 3),
-    "present": (4, 3),
-    "joined": (-1, 3),
+STATE: saved_states.Table = {
+    "landmark_ids": (saved_states.IDS, "n"),
+    "slot_count": (saved_states.COUNTS,),
+    "submap_count": (saved_states.COUNTS,),
+    "chain_start": (saved_states.NUMBERS, 4, 3),
+    "chain_present": (saved_states.NUMBERS, 4, 3),
+    "chain_joined": (saved_states.NUMBERS, -1, 3),
 }
 
 
-class SavedRun(NamedTuple):
-    """Contents of a saved state."""
-
-    local: dict[str, Any]
-    neighbourhood: dict[str, Any]
-    """Empty if ``local_view`` was never called."""
-    landmarks: LandmarkIndex
-    chain: Chain
-    closed: ClosedSubmaps
-
-
 def as_arrays(
-    name: str, graph: SubmapGraph, neighbourhood: Mapping[str, Any]
+    name: str, graph: SubmapGraph, vicinity: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return copies of the whole state; submaps in a folder by their checksums."""
     index, closed, store = graph.index, graph.closed, graph.closed.store
@@ -464,25 +454,24 @@ def as_arrays(
         "submap_count": np.array(len(store)),
         "run": np.array(""),
     }
-    state |= {f"local_{key}": value for key, value in local.items()}
-    state |= {f"vicinity_{key}": value for key, value in neighbourhood.items()}
-    state |= {f"chain_{key}": value for key, value in graph.chain.state_dict().items()}
+    state |= with_prefix("local", local, "_") | with_prefix("vicinity", vicinity, "_")
+    state |= with_prefix("chain", graph.chain.state_dict(), "_")
     if isinstance(store, FolderStore):
         digests = np.array(store.digests, dtype=np.int64)
         return state | {"run": np.array(store.run), "digests": digests}
     for k in range(len(store)):
-        for key, part in zip(Submap._fields, store.load(k), strict=True):
-            state[f"submap_{k}_{key}"] = part.copy()
+        saved = {key: part.copy() for key, part in store.load(k)._asdict().items()}
+        state |= with_prefix(f"submap_{k}", saved, "_")
     return state
 
 
-def checked_state(
+def saved_graph(
     state: Mapping[str, Any],
     name: str,
     active: ActiveSubmap,
     folder: FolderStore | None,
-) -> SavedRun:
-    """Return the contents of a state that :func:`as_arrays` saved.
+) -> SubmapGraph:
+    """Return the graph of a state that :func:`as_arrays` saved.
 
     Parameters
     ----------
@@ -500,13 +489,19 @@ def checked_state(
     ValueError
         If the state is incomplete or inconsistent.
     """
-    entries = ["landmark_ids", "slots", "slot_count", "renamed", "submap_count", "run"]
-    entries += ["local_estimator", *(f"chain_{key}" for key in SHAPES)]
+    entries = [*STATE, "slots", "renamed", "run", "local_estimator"]
     base = type(active.filter).__name__
     saved_states.refuse_other_state(state, entries, estimator=name, base=base)
-    index = _index(state)
-    count = saved_states.whole_number("submap_count", state["submap_count"])
-    chain = _chain(state, count)
+    saved = saved_states.read(state, STATE)
+    index = _index(state, saved["landmark_ids"], int(saved["slot_count"]))
+    count = int(saved["submap_count"])
+    if not 1 <= (rows := len(saved["chain_joined"])) <= count + 1:
+        raise ValueError(
+            f"state['chain_joined'] must have 1 to {count + 1} rows, got {rows}"
+        )
+    for key in ("chain_start", "chain_present"):
+        P = (saved[key][1:] + saved[key][1:].T) / 2
+        saved_states.refuse_indefinite(f"state[{key!r}]", P)
     store = _store(state, count, folder)
     pairs = _numbers(state, "renamed", index.count).reshape(-1, 2)
     renamed = dict(zip(*pairs.T.tolist(), strict=True))
@@ -516,13 +511,16 @@ def checked_state(
         _check(submap, k, index.count)
         summaries.append(summarise(merged(submap, renamed, active.frame)))
     closed = ClosedSubmaps(store, active.frame, renamed, summaries)
-    local = _part(state, "local_")
-    _check_names(local, index, closed)
-    return SavedRun(local, _part(state, "vicinity_"), index, chain, closed)
-
-
-def _part(state: Mapping[str, Any], start: str) -> dict[str, Any]:
-    return {k.removeprefix(start): v for k, v in state.items() if k.startswith(start)}
+    names = saved_states.landmark_ids(
+        "local_landmark_ids", state.get("local_landmark_ids", ())
+    )
+    links = index.links(names)
+    if unknown := {i for i in links if slot_of_link(i) not in closed.slots}:
+        raise ValueError(
+            f"state['local_landmark_ids'] must be in the map, got {min(unknown)}"
+        )
+    chain = Chain.restored(without_prefix(saved, "chain", "_"))
+    return SubmapGraph(index, chain, closed, active)
 
 
 def _numbers(state: Mapping[str, Any], key: str, limit: int) -> IntArray:
@@ -532,11 +530,9 @@ def _numbers(state: Mapping[str, Any], key: str, limit: int) -> IntArray:
     return numbers
 
 
-def _index(state: Mapping[str, Any]) -> LandmarkIndex:
+def _index(state: Mapping[str, Any], ids: list[int], count: int) -> LandmarkIndex:
     """Return the landmarks of the map with their slots."""
-    ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
     refuse_link_names(ids)
-    count = saved_states.whole_number("slot_count", state["slot_count"])
     slots = _numbers(state, "slots", count).ravel()
     if len(slots) != len(ids) or (np.diff(slots) <= 0).any():
         raise ValueError(
@@ -544,37 +540,6 @@ def _index(state: Mapping[str, Any]) -> LandmarkIndex:
             f"landmark_ids, got {slots.tolist()}"
         )
     return LandmarkIndex(dict(zip(ids, slots.tolist(), strict=True)), count)
-
-
-def _check_names(
-    local: Mapping[str, Any], index: LandmarkIndex, closed: ClosedSubmaps
-) -> None:
-    """Raise a ValueError if the active submap holds landmarks not in the map."""
-    names = saved_states.landmark_ids(
-        "local_landmark_ids", local.get("landmark_ids", ())
-    )
-    links = index.links(names)
-    if unknown := {i for i in links if slot_of_link(i) not in closed.slots}:
-        raise ValueError(
-            f"state['local_landmark_ids'] must be in the map, got {min(unknown)}"
-        )
-
-
-def _chain(state: Mapping[str, Any], count: int) -> Chain:
-    arrays = {}
-    for key, shape in SHAPES.items():
-        name = f"chain_{key}"
-        array = saved_states.array(name, state[name], shape)
-        if key == "joined":
-            if not 1 <= len(array) <= count + 1:
-                raise ValueError(
-                    f"state[{name!r}] must have 1 to {count + 1} rows, got {len(array)}"
-                )
-        else:
-            P = (array[1:] + array[1:].T) / 2
-            saved_states.refuse_indefinite(f"state[{name!r}]", P)
-        arrays[key] = array
-    return Chain.restored(arrays)
 
 
 def _store(
