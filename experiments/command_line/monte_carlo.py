@@ -20,7 +20,6 @@ from .options import (
     refuse_broken,
     takes,
 )
-from .output_folder import as_json_text, default_folder
 from .program import FAILURE, BadInputError, command, interruptible
 
 
@@ -104,6 +103,7 @@ def monte_carlo(
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
     from ..monte_carlo.verdict import diagnosis_lines
     from ..runs.own_files import replace_own
+    from .output_folder import as_json_text, default_folder
     from .tables import written
 
     world = given.scenario(scenario)
