@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from .controllers import make_vector_controller as make_vector_controller
     from .controllers import planned_path as planned_path
     from .landmark_world import LandmarkWorldEnv as LandmarkWorldEnv
-    from .noise_streams import SensorNoiseModel as SensorNoiseModel
+    from .noise_streams import SensorSettings as SensorSettings
     from .rendering import *
     from .robot import OdometrySensor as OdometrySensor
     from .robot import UnicycleBodies as UnicycleBodies

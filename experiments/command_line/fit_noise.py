@@ -3,9 +3,7 @@
 from typing import Annotated
 
 from .. import figures, noise_fitting
-from ..runs.filter_settings import noise_or_assumed, settings_for
 from .options import LogFile, Options, note_choices, option, takes
-from .output_folder import default_folder, output_folder, write_summary
 from .program import command
 
 
@@ -42,6 +40,8 @@ def fit_noise(
     slamgym fit-noise MRCLAM_Dataset6 --robot 3 --estimator ekf
     """
     from ..noise_fitting.fit import refuse_other_formats, write_noise
+    from ..runs.filter_settings import noise_or_assumed, settings_for
+    from .output_folder import default_folder, output_folder, write_summary
     from .tables import advice, heading, noise_comparison_table, noise_table, written
 
     reporter = given.reporter()

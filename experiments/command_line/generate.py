@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 from .. import trajectories
 from .monte_carlo import connected
 from .options import Options, ScenarioName, option, refuse_broken, takes
-from .output_folder import default_folder
 from .program import command, interruptible
 
 if TYPE_CHECKING:
@@ -86,6 +85,8 @@ def generate(
     slamgym generate hidden_identities --episodes 100 --estimator invariant
     slamgym generate loop --episodes 9 --set randomise.motion_std=[0.5,2]
     """
+    from .output_folder import default_folder
+
     world = given.scenario(scenario)
     if estimator is not None:
         refuse_broken(estimator)

@@ -20,7 +20,6 @@ from .options import (
     refuse_broken,
     takes,
 )
-from .output_folder import as_json_text, default_folder
 from .program import FAILURE, BadInputError, command, interruptible
 
 
@@ -104,6 +103,7 @@ def monte_carlo(
     from ..monte_carlo.report import monte_carlo_table, write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
     from ..monte_carlo.verdict import diagnosis_lines
+    from .output_folder import as_json_text, default_folder
     from .tables import written
 
     world = given.scenario(scenario)

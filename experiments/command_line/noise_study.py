@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from ...estimator.registry import split_labels
 from ...sim_configs import Scenario, list_presets
 from ...sim_configs.atomic_file import naming_file
 from ...suggestions import closest
 from .. import figures
-from ..runs.filter_settings import FilterSettings, settings_for, settings_for_scenario
 from .options import (
     Options,
     note_choices,
@@ -24,7 +22,6 @@ from .options import (
     takes,
     with_options,
 )
-from .output_folder import default_folder, output_folder, write_summary
 from .program import BadInputError, command, way_to_set
 from .reporter import Reporter
 
@@ -32,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..noise_study import NoiseEffect, NoiseRow, NoiseRun
+    from ..runs.filter_settings import FilterSettings
 
 _LOG, _SCENARIO = "a log", "a scenario"
 _ONE_RUN, _MANY_RUNS = "one run of a scenario", "a scenario with --runs above 1"
@@ -102,7 +100,9 @@ def noise_study(
     slamgym noise-study loop -e 'invariant[iterations=3]'
     slamgym noise-study six_landmarks --runs 100 -e ekf,invariant
     """
+    from ...estimator.registry import split_labels
     from ..noise_study import study_log, study_scenario
+    from ..runs.filter_settings import settings_for, settings_for_scenario
 
     is_scenario = _is_scenario(source)
     kinds = (_SCENARIO, _ONE_RUN if runs == 1 else _MANY_RUNS)
@@ -172,7 +172,7 @@ class Study(NamedTuple):
 def one_run_study(
     name: str,
     estimator: str,
-    settings: FilterSettings,
+    settings: "FilterSettings",
     study: "Callable[..., list[NoiseRun]]",
 ) -> Study:
     """Prepare the study of a log or of one run of a scenario."""
@@ -236,6 +236,7 @@ def effects_study(
 
 def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
     """Run a study, write its figure, table and summary, and print its results."""
+    from .output_folder import default_folder, output_folder, write_summary
     from .tables import written
 
     place = out or default_folder("noise-study", *study.names)

@@ -14,22 +14,20 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
 import typer
 
-from ...envs.controllers import CONTROLLERS, Controller, make_controller
-from ...estimator.check_estimator import find_breaches, listed
-from ...estimator.registry import find_estimator, read_label
 from ...sim_configs import Scenario, list_presets, load_scenario
 from ...suggestions import closest
-from ..logs.ground_truth import without_identities
-from ..logs.importers import read_log
-from ..logs.slamlog import SlamLog
-from ..runs.filter_settings import FilterSettings, estimator_choices
 from .program import BadInputError, BrokenFilterError
 from .reporter import Reporter
+
+if TYPE_CHECKING:
+    from ...envs.controllers import Controller
+    from ..logs.slamlog import SlamLog
+    from ..runs.filter_settings import FilterSettings
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -238,7 +236,7 @@ class Options:
         _refuse_log(name)
         return load_scenario(name).with_changes(**changed)
 
-    def driver(self, scenario: Scenario) -> Controller:
+    def driver(self, scenario: Scenario) -> "Controller":
         """Make the controller; a random one drives the same path for the same seed.
 
         Raises
@@ -246,6 +244,8 @@ class Options:
         BadInputError
             If there is no such controller.
         """
+        from ...envs.controllers import CONTROLLERS, make_controller
+
         if self.controller not in CONTROLLERS:
             hint, known = closest(self.controller, CONTROLLERS), ", ".join(CONTROLLERS)
             raise BadInputError(
@@ -258,14 +258,14 @@ class Options:
         self,
         scenario: Scenario,
         progress: Callable[[int, int], object] | None = None,
-    ) -> SlamLog:
+    ) -> "SlamLog":
         """Record one episode with the controller; see `record_episode`."""
         from ..logs.recording import record_episode
 
         driver = self.driver(scenario)
         return record_episode(scenario, driver, self.seed, progress=progress)
 
-    def read(self, path: Path) -> SlamLog:
+    def read(self, path: Path) -> "SlamLog":
         """Read a log of any known format, with its truth if that is in another file.
 
         Raises
@@ -275,6 +275,9 @@ class Options:
         LogError
             If one is malformed.
         """
+        from ..logs.ground_truth import without_identities
+        from ..logs.importers import read_log
+
         try:
             log = read_log(
                 path,
@@ -333,8 +336,8 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
         return self.named_options() | assignments("--option", self.option_texts)
 
     def filters(
-        self, settings: Callable[..., FilterSettings]
-    ) -> dict[str, FilterSettings]:
+        self, settings: "Callable[..., FilterSettings]"
+    ) -> "dict[str, FilterSettings]":
         """Set up the filters by their labels; options in brackets take precedence.
 
         Parameters
@@ -355,6 +358,8 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
         >>> list(Options(labels="ekf,invariant[iterations=3]").filters(set_up))
         ['ekf', 'invariant[iterations=3]']
         """
+        from ..runs.filter_settings import estimator_choices
+
         options = self.filter_options()
         refuse_broken(self.labels, options)
         return {
@@ -490,7 +495,7 @@ def _refuse_log(name: str) -> None:
     )
 
 
-def note_choices(log: SlamLog, reporter: Reporter) -> None:
+def note_choices(log: "SlamLog", reporter: Reporter) -> None:
     """Note what the importer of a log omitted, and where its noise is from."""
     if "left_out" in log.header:
         reporter.note(f"left out of the log: {log.header['left_out']}")
@@ -499,7 +504,10 @@ def note_choices(log: SlamLog, reporter: Reporter) -> None:
 
 
 def note_noise(
-    log: SlamLog, settings: FilterSettings, given: Collection[str], reporter: Reporter
+    log: "SlamLog",
+    settings: "FilterSettings",
+    given: Collection[str],
+    reporter: Reporter,
 ) -> None:
     """Note the noise of a log's filter, without what the user gave."""
     options = {
@@ -538,6 +546,10 @@ def refuse_broken(estimators: str, options: Mapping[str, Any] | None = None) -> 
     ValueError
         If a label is unknown or malformed.
     """
+    from ...estimator.check_estimator import find_breaches, listed
+    from ...estimator.registry import find_estimator
+    from ..runs.filter_settings import estimator_choices
+
     for _, name, own in estimator_choices(estimators):
         if ":" in name and not name.startswith("slamgym."):
             given = {**(options or {}), **own}
@@ -557,6 +569,8 @@ def with_options(label: str, texts: Sequence[str]) -> str:
     >>> with_options("ekf[iterations=3]", ["iterations=1", "landmark_init=full"])
     'ekf[iterations=3,landmark_init="full"]'
     """
+    from ...estimator.registry import read_label
+
     _, own = read_label(label)
     given = assignments("--option", texts)
     more = [

@@ -4,16 +4,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from ...envs.controllers import Controller
 from ...sim_configs import Scenario
-from ..runs.filter_settings import FilterSettings, settings_for_scenario
 from .options import Options, ScenarioName, option, refuse_broken, takes
 from .program import command
 from .reporter import Tick
 
 if TYPE_CHECKING:
+    from ...envs.controllers import Controller
     from ...envs.landmark_world import LandmarkWorldEnv, Observation
     from ...estimator.interface import SlamEstimator
+    from ..runs.filter_settings import FilterSettings
 
 _DURATION = 12.0  # [s] of a film by default
 _SLOWEST, _FASTEST = 4.0, 30.0  # [frames/s]
@@ -50,6 +50,7 @@ def render(
     slamgym render corridor --out corridor.mp4 --fps 20 --controller waypoints
     """
     from ...envs.rendering import check_video, write_video
+    from ..runs.filter_settings import settings_for_scenario
     from .run_files import warm_up
 
     world = given.scenario(scenario)
@@ -72,8 +73,8 @@ def render(
 
 def _frames(
     scenario: Scenario,
-    settings: FilterSettings | None,
-    driver: Controller,
+    settings: "FilterSettings | None",
+    driver: "Controller",
     seed: int,
     tick: Tick,
 ) -> Iterator[Any]:

@@ -7,9 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ...estimator.registry import read_label
 from .. import figures, runs
-from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
 from .options import (
     LogFile,
     Options,
@@ -19,7 +17,6 @@ from .options import (
     option,
     takes,
 )
-from .output_folder import default_folder, output_folder, write_summary
 from .program import command
 
 
@@ -63,6 +60,8 @@ def replay(
     slamgym replay results/loop-invariant/log.csv --estimator ekf,invariant
     slamgym replay graph.txt --truth true.g2o --noise-from-file
     """
+    from ..runs.filter_settings import settings_for
+    from .output_folder import default_folder, output_folder
     from .run_files import check_rerun, filter_and_write, show_run
 
     reporter = given.reporter()
@@ -107,6 +106,9 @@ def smooth(
     slamgym smooth sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
     slamgym smooth log.csv -e 'invariant[gate_probability=0.999]' --robust huber
     """
+    from ...estimator.registry import read_label
+    from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
+    from .output_folder import default_folder, output_folder, write_summary
     from .tables import heading, smoothing_figures, smoothing_table, written
 
     name, own = read_label(given.estimator)

@@ -4,9 +4,7 @@ import shlex
 from functools import partial
 
 from ...sim_configs import save_scenario
-from ..runs.filter_settings import settings_for_scenario
 from .options import Options, ScenarioName, takes, tested_filters, with_options
-from .output_folder import default_folder, output_folder
 from .program import command
 
 
@@ -32,6 +30,8 @@ def run(scenario: ScenarioName, *, given: Options) -> None:
     slamgym run hidden_identities -e invariant --resolution 0.5
     slamgym run mine.toml --controller random --estimator mine:MyFilter
     """
+    from ..runs.filter_settings import settings_for_scenario
+    from .output_folder import default_folder, output_folder
     from .run_files import check_rerun, filter_and_write, show_run
 
     world = given.scenario(scenario)
