@@ -123,10 +123,10 @@ def test_a_module_that_moved_can_be_imported_with_a_warning(old):
 
 @pytest.mark.filterwarnings("ignore:slamgym.envs.sensors:DeprecationWarning")
 def test_names_of_a_module_that_moved_are_those_of_its_new_place():
-    from slamgym.envs.sensors import BearingRangeSensor, SensorNoiseModel
+    from slamgym.envs.sensors import BearingRangeSensor, OdometrySensor
 
     assert BearingRangeSensor is slamgym.envs.BearingRangeSensor
-    assert SensorNoiseModel is slamgym.envs.SensorNoiseModel
+    assert OdometrySensor is slamgym.envs.OdometrySensor
     with pytest.raises(ImportError, match="no_such_name"):
         from slamgym.envs.sensors import no_such_name  # noqa: F401
 
