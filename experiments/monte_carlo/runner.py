@@ -9,14 +9,18 @@ simulates, filters and measures runs in blocks; a worker computes one block at a
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from ...envs.spaces import count_rows
 from ...estimator import registry
 from ...estimator.interface import SupportsTruth
+from ...estimator.support.memory_limit import usable_cores
 from ...sim_configs import Scenario, load_scenario
 from ..jobs import Progress, blocks_of, complete, engage_workers
 from ..runs.filter_settings import (
@@ -43,6 +47,7 @@ if TYPE_CHECKING:
 
 
 BLOCK_SIZE = 64
+_MOST_BYTES, _BYTES_OF_READING = 2**28, 17
 
 
 def monte_carlo(
@@ -180,8 +185,16 @@ class _Work:
         for name, factory in self.factories.items():
             if ":" not in name and not registry.is_registered(name):
                 registry.register_estimator(name, factory)
-        world, first = self.job.scenario, self.job.seed + block.start
-        runs = simulate_runs(world, len(block), first, only_read=True)
+        size = runs_at_once(self.job.scenario)
+        starts = range(block.start, block.stop, size)
+        spans = [range(k, min(k + size, block.stop)) for k in starts]
+        return [
+            joined(parts) for parts in zip(*map(self._measured, spans), strict=True)
+        ]
+
+    def _measured(self, span: range) -> list[Block]:
+        world, first = self.job.scenario, self.job.seed + span.start
+        runs = simulate_runs(world, len(span), first, only_read=True)
         bound = bound_runs(world, runs)
         noise = noise_of_runs(world, self.job.assumed, runs)
         parts = []
@@ -194,6 +207,25 @@ class _Work:
                 part |= with_known_ids(settings, runs, self.threads)
             parts.append(part)
         return parts
+
+
+def runs_at_once(scenario: Scenario) -> int:
+    """Return how many runs to hold in memory: few where they have many readings.
+
+    Examples
+    --------
+    >>> runs_at_once(load_scenario("six_landmarks")) > BLOCK_SIZE
+    True
+    """
+    readings = (scenario.steps + 1) * count_rows(scenario)
+    return max(usable_cores(), _MOST_BYTES // (readings * _BYTES_OF_READING))
+
+
+def joined(parts: Sequence[Block]) -> Block:
+    """Return the measures of all runs of some parts of a block."""
+    if len(parts) == 1:
+        return parts[0]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:

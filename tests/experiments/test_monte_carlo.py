@@ -24,7 +24,7 @@ from slamgym.evaluation import AssociationScores, Gospa
 from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.command_line.monte_carlo import connected
 from slamgym.experiments.logs.recording import record_episode
-from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
+from slamgym.experiments.monte_carlo import monte_carlo, runner, summarise_monte_carlo
 from slamgym.experiments.monte_carlo.filtered_runs import (
     bound_runs,
     filter_runs,
@@ -746,3 +746,13 @@ def test_estimators_may_be_names_and_classes():
 def test_estimators_that_are_neither_names_nor_classes_are_refused():
     with pytest.raises(ValueError, match="must be names or classes, got 3"):
         monte_carlo("six_landmarks", ["ekf", 3], 2)
+
+
+@pytest.mark.parametrize("world", ["six_landmarks", "hidden_identities"])
+def test_runs_computed_a_few_at_once_are_those_computed_together(world, monkeypatch):
+    scenario = load_scenario(world).with_changes(steps=12)
+    together = monte_carlo(scenario, "ekf,robocentric", 5, 300)
+    monkeypatch.setattr(runner, "runs_at_once", lambda scenario: 2)
+    xr.testing.assert_identical(
+        monte_carlo(scenario, "ekf,robocentric", 5, 300), together
+    )
