@@ -238,38 +238,27 @@ class ManagedSlam:
             return recall() if recall and not repeats else None
 
         def follow(report: UpdateReport) -> UpdateReport:
-            return self._follow(readings, *noted, report)
+            plan, missed, scans, first = noted
+            self._recent.note_scan(plan, scans, first, report)
+            self._editor.expire()
+            self._candidates = plan.candidates
+            seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
+            seen -= {*report.rejected_ids, *report.skipped_ids}
+            removed, merged = self._pruner.prune(readings, plan, seen, missed)
+            self._recent.note_edits(removed, merged)
+            made = self.decisions[-1]
+            self._report = report.replace(
+                removed_ids=tuple(removed),
+                merged_ids=tuple(merged),
+                confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
+                row_ids=tuple(plan.row_ids),
+                tentative_rows=tuple(plan.tentative_rows),
+                ambiguous_rows=tuple(plan.ambiguous_rows),
+            )
+            return self._report
 
         undo, told = undo_all(undo_filter, undo), recall and absorbed
         return carried_out(correct, follow, undo, told, self.bookmark)
-
-    def _follow(
-        self,
-        readings: Array,
-        plan: ScanAssociation,
-        missed: set[int],
-        scans: list[RecentScan],
-        first: int | None,
-        report: UpdateReport,
-    ) -> UpdateReport:
-        """Do what follows an update of the filter; return the report of all."""
-        self._recent.note_scan(plan, scans, first, report)
-        self._editor.expire()
-        self._candidates = plan.candidates
-        seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
-        seen -= {*report.rejected_ids, *report.skipped_ids}
-        removed, merged = self._pruner.prune(readings, plan, seen, missed)
-        self._recent.note_edits(removed, merged)
-        made = self.decisions[-1]
-        self._report = report.replace(
-            removed_ids=tuple(removed),
-            merged_ids=tuple(merged),
-            confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
-            row_ids=tuple(plan.row_ids),
-            tentative_rows=tuple(plan.tentative_rows),
-            ambiguous_rows=tuple(plan.ambiguous_rows),
-        )
-        return self._report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise mapped landmarks by hand, shape (n,); all else stays."""
