@@ -74,6 +74,10 @@ def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return chosen
 
 
+def _the_plan(plan: ScanAssociation) -> ScanAssociation:
+    return plan
+
+
 class HypothesisSlam:
     """A managed filter that follows several associations side by side.
 
@@ -205,7 +209,7 @@ class HypothesisSlam:
 
         def absorbed() -> Step | None:
             report = recall() if recall and one else None
-            return report and (report, self.hypotheses, [])
+            return None if report is None else (report, self.hypotheses, [])
 
         told = recall and absorbed
         return carried_out(advance, self._follow, undo, told, self._undo_own)
@@ -309,7 +313,7 @@ class HypothesisSlam:
         reports, kept, errors = [], [], []
         for (cost, *_), plan, slam in zip(options, plans, slams, strict=True):
             try:
-                reports.append(slam.take(readings, lambda plan=plan: plan))
+                reports.append(slam.take(readings, partial(_the_plan, plan)))
                 kept.append(Hypothesis(cost, slam))
             except (np.linalg.LinAlgError, MemoryError) as error:
                 errors.append(error)

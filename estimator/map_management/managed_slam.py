@@ -8,16 +8,14 @@ is confirmed.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array, IntArray
+from ...arrays import Array
 from ..association.scan_association import (
-    LABEL_BITS,
-    NO_LABEL,
     Candidates,
     Option,
     ScanAssociation,
@@ -30,8 +28,6 @@ from ..interface import (
     MapView,
     ScanDecisions,
     SlamEstimator,
-    SupportsLocalView,
-    SupportsTruth,
     UpdateReport,
     before_update,
     checkpoint,
@@ -46,6 +42,7 @@ from ..support.undo import Recall, Undo, carried_out, undo_all, undone_on_error
 from .map_editor import MapEditor, is_near, mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
+from .recent_scans import RecentScan, RecentScans
 
 
 class ManagedSlam:
@@ -243,38 +240,27 @@ class ManagedSlam:
             return recall() if recall and not repeats else None
 
         def follow(report: UpdateReport) -> UpdateReport:
-            return self._follow(readings, *noted, report)
+            plan, missed, scans, first = noted
+            self._recent.note_scan(plan, scans, first, report)
+            self._editor.expire()
+            self.candidates = plan.candidates
+            seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
+            seen -= {*report.rejected_ids, *report.skipped_ids}
+            removed, merged = self._pruner.prune(readings, plan, seen, missed)
+            self._recent.note_edits(removed, merged)
+            made = self.decisions[-1]
+            self._report = report.replace(
+                removed_ids=tuple(removed),
+                merged_ids=tuple(merged),
+                confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
+                row_ids=tuple(plan.row_ids),
+                tentative_rows=tuple(plan.tentative_rows),
+                ambiguous_rows=tuple(plan.ambiguous_rows),
+            )
+            return self._report
 
         undo, told = undo_all(undo_filter, undo), recall and absorbed
         return carried_out(correct, follow, undo, told, self.bookmark)
-
-    def _follow(
-        self,
-        readings: Array,
-        plan: ScanAssociation,
-        missed: set[int],
-        scans: list[RecentScan],
-        first: int | None,
-        report: UpdateReport,
-    ) -> UpdateReport:
-        """Do what follows an update of the filter; return the report of all."""
-        self._recent.note_scan(plan, scans, first, report)
-        self._editor.expire()
-        self.candidates = plan.candidates
-        seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
-        seen -= {*report.rejected_ids, *report.skipped_ids}
-        removed, merged = self._pruner.prune(readings, plan, seen, missed)
-        self._recent.note_edits(removed, merged)
-        made = self.decisions[-1]
-        self._report = report.replace(
-            removed_ids=tuple(removed),
-            merged_ids=tuple(merged),
-            confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
-            row_ids=tuple(plan.row_ids),
-            tentative_rows=tuple(plan.tentative_rows),
-            ambiguous_rows=tuple(plan.ambiguous_rows),
-        )
-        return self._report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise mapped landmarks by hand, shape (n,); all else stays."""
@@ -384,373 +370,3 @@ class ManagedSlam:
 
     def __repr__(self) -> str:
         return f"Managed {self._filter!r}"
-
-
-# --------------------------------------------------------------------------------------
-# The last scans of a run, kept to repeat them once a landmark is confirmed.
-#
-# The sightings before the confirming one are readings of the new landmark, too.  To
-# apply them, the filter goes back to its state before the first of them and repeats the
-# scans since then, with the new landmark in them.  Where a sighting contradicts the
-# ones before it, given the other readings of its scan, those before it were clutter or
-# of another landmark: they are dropped, and the scans are repeated once more.
-
-
-class RecentScans:
-    """Feeds the scans of a run to a filter, and repeats the last ones where needed.
-
-    Parameters
-    ----------
-    slam : SlamEstimator
-        The filter.
-    editor : MapEditor
-        Of its map.
-    window : int
-        Number of scans within which a landmark is confirmed; 0: keep no scans.
-    gate : float
-        Largest νᵀ S⁻¹ ν of a sighting, given the other readings of its scan.
-
-    Notes
-    -----
-    No scans are kept of filters for large maps, whose states are expensive to copy, and
-    of those that need the truth at every step.
-    """
-
-    def __init__(
-        self, slam: SlamEstimator, editor: MapEditor, window: int, gate: float
-    ) -> None:
-        can_repeat = not isinstance(slam, SupportsTruth | SupportsLocalView)
-        self._slam, self._editor = slam, editor
-        self._window, self._gate = window if can_repeat else 0, gate
-        self.forget()
-
-    def forget(self) -> None:
-        """Start a new run."""
-        self.scans: list[RecentScan] = []
-        self.motions: tuple[Motion, ...] = ()
-        self.decisions: list[ScanDecisions] = []
-        """About every scan since the start, or since a saved state was loaded."""
-
-    def copy_from(self, other: RecentScans) -> None:
-        """Continue from the scans of another run with the same kind of filter."""
-        self.scans, self.motions = list(other.scans), other.motions
-        self.decisions = list(other.decisions)
-
-    def checkpoint(self) -> Undo:
-        """Return what takes back later changes of what is remembered."""
-        scans, motions, decisions = list(self.scans), self.motions, self.decisions
-        count, newest = len(decisions), decisions[-self._window - 1 :]
-
-        def undo() -> None:
-            decisions[count - len(newest) :] = newest
-            self.scans, self.motions, self.decisions = list(scans), motions, decisions
-
-        return undo
-
-    def note_motion(self, distance: float, turn: float, dt: float) -> None:
-        """Remember a motion since the last scan."""
-        if self._window:
-            self.motions += ((distance, turn, dt),)
-
-    def note_edits(
-        self, removed: Sequence[int], merged: Sequence[tuple[int, int]]
-    ) -> None:
-        """Remember which landmarks were removed and merged after the last scan."""
-        if self.decisions and (removed or merged):
-            made = self.decisions[-1]
-            self.decisions[-1] = made._replace(
-                removed=(*made.removed, *removed), merged=(*made.merged, *merged)
-            )
-        if self.scans and (removed or merged):
-            last = self.scans[-1]
-            self.scans[-1] = replace(
-                last,
-                removed=(*last.removed, *removed),
-                merged=(*last.merged, *merged),
-            )
-
-    def with_scan(
-        self, readings: Array, plan: ScanAssociation
-    ) -> tuple[list[RecentScan], int | None]:
-        """Return the last scans with a new one, and the first to repeat, if any."""
-        row_ids, labels = tuple(plan.row_ids), tuple(plan.labels)
-        scan = RecentScan(plan.scan, self.motions, readings, row_ids, labels)
-        if not self._window:
-            return [scan], None
-        if scan.begins:
-            scan = replace(scan, before=self._slam.state_dict())
-        scans = [*self.scans, scan][-self._window - 1 :]
-        return scans, _relabel(scans, plan.confirmed)
-
-    def feed(
-        self, scans: list[RecentScan], first: int | None, plan: ScanAssociation
-    ) -> UpdateReport:
-        """Update the filter with the last scan, and with earlier sightings if any."""
-        if first is None:
-            return scans[-1].feed(self._slam)
-        return self._apply_earlier(scans, first, {*plan.confirmed})
-
-    def note_scan(
-        self,
-        plan: ScanAssociation,
-        scans: list[RecentScan],
-        first: int | None,
-        report: UpdateReport,
-    ) -> None:
-        """Remember a scan that the filter has taken in."""
-        if self._window:
-            self.scans, self.motions = list(scans), ()
-        self.decisions.append(_decided(plan, report))
-        if first is not None:
-            self._revise_decisions(scans[first:-1])
-
-    def _revise_decisions(self, scans: Sequence[RecentScan]) -> None:
-        """Note the landmarks that the readings of earlier scans belong to now."""
-        newest = self.scans[-1].number
-        for scan in scans:
-            place = len(self.decisions) - 1 - (newest - scan.number)
-            if place >= 0:
-                made = self.decisions[place]
-                pairs = zip(made.row_ids, scan.row_ids, scan.labels, strict=True)
-                ids = tuple(new if label != NO_LABEL else i for i, new, label in pairs)
-                self.decisions[place] = made._replace(row_ids=ids)
-
-    def _apply_earlier(
-        self, scans: list[RecentScan], first: int, confirmed: set[int]
-    ) -> UpdateReport:
-        """Repeat the scans since one until no sighting contradicts those before it."""
-        reports = self._repeat(scans, first)
-        while _drop_contradicted(scans, reports, confirmed, self._gate):
-            reports = self._repeat(scans, first)
-        return reports[-1]
-
-    def _repeat(self, scans: list[RecentScan], first: int) -> list[UpdateReport]:
-        """Repeat the scans since one, and renew the states kept before them."""
-        before = scans[first].before
-        assert before is not None  # a tentative landmark begins here
-        restore(self._slam, before)
-        self._editor.expire()
-        reports = [scans[first].feed(self._slam)]
-        for k in range(first + 1, len(scans)):
-            scans[k - 1].edit(self._editor)
-            for distance, turn, dt in scans[k].motions:
-                self._slam.predict((distance, turn), dt)
-            if scans[k].before is not None:
-                scans[k] = replace(scans[k], before=self._slam.state_dict())
-            reports.append(scans[k].feed(self._slam))
-        return reports
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return all as arrays."""
-        state = saved_states.write(
-            {"motions": self.motions, "count": len(self.scans)}, WINDOW
-        )
-        for k, scan in enumerate(self.scans):
-            state |= with_prefix(str(k), scan.state_dict())
-        return state
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        saved = saved_states.read(state, WINDOW, "recent.")
-        count, most = int(saved["count"]), self._window + 1
-        if count > most:
-            raise ValueError(
-                f"state['recent.count'] must be at most {most}, got {count}"
-            )
-        self.scans = [
-            RecentScan.from_state_dict(without_prefix(state, str(k)))
-            for k in range(count)
-        ]
-        self.motions = rows_of(saved["motions"])
-        self.decisions = []
-
-
-def _decided(plan: ScanAssociation, report: UpdateReport) -> ScanDecisions:
-    """Return the outcome of each row of a scan."""
-    new = {*report.added_ids, *plan.confirmed}.difference(report.skipped_ids)
-    unused = {*report.rejected_ids, *report.skipped_ids} - new
-    row_ids = tuple(None if i in unused else i for i in plan.row_ids)
-    return ScanDecisions(
-        row_ids, tuple(i for i in row_ids if i in new and i is not None)
-    )
-
-
-def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | None:
-    """Give confirmed landmarks their earlier sightings.
-
-    Parameters
-    ----------
-    scans : list of RecentScan
-        The scans kept, the present one last.
-    confirmed : mapping of int to int
-        Label of each landmark confirmed in the present scan.
-
-    Returns
-    -------
-    int or None
-        Index of the first scan to repeat, if any: of those before which the state of
-        the filter was kept.
-    """
-    names = {label: i for i, label in confirmed.items() if label != NO_LABEL}
-    starts = [k for k, scan in enumerate(scans[:-1]) if scan.before is not None]
-    shown = [k for k in starts if not names.keys().isdisjoint(scans[k].labels)]
-    if not shown:
-        return None
-    for k in range(shown[0], len(scans) - 1):
-        pairs = zip(scans[k].row_ids, scans[k].labels, strict=True)
-        ids = tuple(names.get(label, i) for i, label in pairs)
-        scans[k] = replace(scans[k], row_ids=ids)
-    return shown[0]
-
-
-def _drop_contradicted(
-    scans: list[RecentScan],
-    reports: Sequence[UpdateReport],
-    confirmed: set[int],
-    gate: float,
-) -> bool:
-    """Drop the sightings before one that contradicts them; return whether any were.
-
-    Parameters
-    ----------
-    scans : list of RecentScan
-        The scans kept.
-    reports : sequence of UpdateReport
-        Of the last ones of them.
-    confirmed : set of int
-        The landmarks confirmed in the present scan.
-    gate : float
-        Largest νᵀ S⁻¹ ν of a sighting, given the other readings of its scan.
-    """
-    first = len(scans) - len(reports)
-    for k, report in enumerate(reports):
-        if len(report.innovation) != len(report.associated_ids):
-            continue  # of a filter that reports no innovations
-        for landmark_id in confirmed.intersection(report.associated_ids):
-            earlier = scans[first : first + k]
-            if (
-                any(landmark_id in scan.row_ids for scan in earlier)
-                and report.squared_given_others(landmark_id) > gate
-            ):
-                scans[first : first + k] = [s.without(landmark_id) for s in earlier]
-                return True
-    return False
-
-
-# --------------------------------------------------------------------------------------
-# One of the last scans of a run, kept so that it can be repeated.
-
-MOTIONS = (saved_states.NUMBERS, -1, 3)
-SCAN: saved_states.Table = {
-    "number": (saved_states.COUNTS,),
-    "motions": MOTIONS,
-    "readings": (saved_states.NUMBERS, "m", 2),
-    "row_ids": (saved_states.WHOLE, "m"),
-    "labels": (saved_states.WHOLE, "m"),
-    "removed": (saved_states.WHOLE, -1),
-    "merged": (saved_states.WHOLE, -1, 2),
-}
-"""What the saved state of a scan holds, beside the state of the filter."""
-WINDOW: saved_states.Table = {"motions": MOTIONS, "count": (saved_states.COUNTS,)}
-"""What a saved state holds about the last scans, beside these."""
-
-NO_LANDMARK = np.iinfo(np.int64).min
-
-Motion = tuple[float, float, float]
-"""(d, α) [m, rad] and dt."""
-
-
-@dataclass(frozen=True)
-class RecentScan:
-    """One scan, the motion before it, and its association."""
-
-    number: int
-    motions: tuple[Motion, ...]
-    readings: Array
-    """Rows (β, r), shape (m, 2)."""
-    row_ids: tuple[int | None, ...]
-    """Landmark of each row, None where the filter does not use it."""
-    labels: tuple[int, ...]
-    """Label of the tentative landmark of each row, or `NO_LABEL`."""
-    before: Mapping[str, Any] | None = None
-    """State of the filter before the scan, where a tentative landmark begins in it."""
-    removed: tuple[int, ...] = ()
-    """Landmarks removed after it."""
-    merged: tuple[tuple[int, int], ...] = ()
-    """Landmarks merged after it: (kept, gone)."""
-
-    @property
-    def begins(self) -> bool:
-        """Whether a tentative landmark is seen here for the first time."""
-        return any(
-            label != NO_LABEL and label >> LABEL_BITS == self.number
-            for label in self.labels
-        )
-
-    def feed(self, slam: SlamEstimator) -> UpdateReport:
-        """Update a filter with the rows that it uses."""
-        rows = [row for row, i in enumerate(self.row_ids) if i is not None]
-        ids = [i for i in self.row_ids if i is not None]
-        return slam.update(self.readings[rows], ids)
-
-    def without(self, landmark_id: int) -> RecentScan:
-        """Return the scan with the reading of a landmark, if any, left out."""
-        if landmark_id not in self.row_ids:
-            return self
-        row = self.row_ids.index(landmark_id)
-        row_ids, labels = list(self.row_ids), list(self.labels)
-        row_ids[row], labels[row] = None, NO_LABEL
-        return replace(self, row_ids=tuple(row_ids), labels=tuple(labels))
-
-    def edit(self, editor: MapEditor) -> None:
-        """Remove and merge landmarks as after the scan."""
-        if self.removed:
-            editor.remove(self.removed)
-        for pairs in _groups(self.merged):
-            editor.merge_pairs(pairs)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return all as arrays."""
-        row_ids = [NO_LANDMARK if i is None else i for i in self.row_ids]
-        saved = saved_states.write(vars(self) | {"row_ids": row_ids}, SCAN)
-        return saved | with_prefix("before", self.before or {})
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any]) -> RecentScan:
-        """Restore what :meth:`state_dict` returned."""
-        saved = saved_states.read(state, SCAN)
-        row_ids = saved["row_ids"].tolist()
-        return cls(
-            int(saved["number"]),
-            rows_of(saved["motions"]),
-            saved["readings"],
-            tuple(None if i == NO_LANDMARK else i for i in row_ids),
-            tuple(saved["labels"].tolist()),
-            without_prefix(state, "before") or None,
-            tuple(saved["removed"].tolist()),
-            rows_of(saved["merged"]),
-        )
-
-
-def _groups(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
-    """Split pairs into groups in which each landmark occurs once.
-
-    Examples
-    --------
-    >>> _groups([(0, 4), (1, 5), (0, 6)])
-    [[(0, 4), (1, 5)], [(0, 6)]]
-    """
-    groups: list[list[tuple[int, int]]] = []
-    used: set[int] = set()
-    for pair in pairs:
-        if not groups or not used.isdisjoint(pair):
-            groups.append([])
-            used = set()
-        groups[-1].append(pair)
-        used.update(pair)
-    return groups
-
-
-def rows_of(array: Array | IntArray) -> tuple[Any, ...]:
-    """Return the rows of an array as tuples."""
-    return tuple(map(tuple, array.tolist()))

@@ -199,6 +199,7 @@ class SubmapSlam(SubmapQueries):
         self._rule = ClosingRule.checked(submap_size, heading_limit, extent_limit)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self._folder = None if folder is None else FolderStore(folder)
+        self._report: UpdateReport | None = None
         self._begin(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
@@ -384,7 +385,7 @@ class SubmapSlam(SubmapQueries):
 
     def recall(self) -> Recall[UpdateReport] | None:
         """Return what tells the report of the next update, once it is absorbed."""
-        self._report: UpdateReport | None = None
+        self._report = None
         return lambda: self._report
 
     def state_dict(self) -> dict[str, Any]:
