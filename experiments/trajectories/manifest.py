@@ -153,7 +153,7 @@ def _manifest(table: dict[str, Any]) -> Manifest:
             raise ValueError(f"a shard must be named without a folder, got {name!r}")
     job, shards = table["job"], table["shards"]
     texts = ["scenario", "controller", "format"]
-    if job.get("estimator") is not None:
+    if "estimator" in job and job["estimator"] is not None:
         texts.append("estimator")
     job = _checked(job, texts, seed=0, episodes=1, episodes_per_shard=1)
     shards = [

@@ -63,7 +63,7 @@ def first_run(tmp_path_factory):
 
 
 @pytest.fixture
-def reader(first_run, tmp_path, monkeypatch):
+def reader(first_run, tmp_path, monkeypatch, own_registry):
     """Stand where a reader stands: in a folder with a first run and some drive.csv."""
     shutil.copytree(first_run, tmp_path / "results" / "first_run")
     shutil.copy(first_run / "log.csv", tmp_path / "drive.csv")

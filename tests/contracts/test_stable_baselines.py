@@ -65,7 +65,7 @@ def test_it_steps_as_a_dummy_of_single_worlds_does(changes, sb3):
         same(*map(dict, observations))
         same(*rewards)
         same(*dones)
-        same(*infos)
+        same(*([dict(sorted(info.items())) for info in each] for each in infos))
         same(vectors[0].reset_infos, vectors[1].reset_infos)
         ends += dones[0].sum()
     assert ends == 9

@@ -9,9 +9,9 @@ from commands import slamgym
 from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import chi2
-from slamgym.experiments.runs.own_files import files_below
 
 from slamgym.envs.controllers import OpenLoop
+from slamgym.experiments.jobs import files_below
 from slamgym.experiments.logs import (
     OdometryRow,
     Scan,
