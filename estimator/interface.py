@@ -350,7 +350,7 @@ def checkpoint(estimator: Any, *, motion: bool = False) -> Undo:
 def before_update(
     estimator: SlamEstimator,
 ) -> tuple[Undo, Recall[UpdateReport] | None]:
-    """Return what takes back the next update, and what tells its report once absorbed.
+    """Return what takes back the next update, and what returns its report when done.
 
     Without the latter the former takes back the update in any state.
     """

@@ -339,7 +339,7 @@ class EkfSlam(MapFilter):
         return workspace.report(nis, ids, used)
 
     def recall(self) -> Recall[UpdateReport] | None:
-        """Return what tells the report of the next update, once it is absorbed."""
+        """Return a function that gives the report of the next update when done."""
         return self._workspace.watch()
 
     @property

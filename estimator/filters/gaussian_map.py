@@ -382,7 +382,7 @@ class ScanWorkspace:
         return size
 
     def watch(self) -> Recall[ScanReport]:
-        """Return what tells the report of the next update, once it is absorbed."""
+        """Return a function that gives the report of the next update when done."""
         if self.readings:
             self.arrays.rows[MEAN_BEFORE, ABSORBED] = 0.0
         return self._recalled

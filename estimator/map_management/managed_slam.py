@@ -332,7 +332,7 @@ class ManagedSlam:
         return undo_all(before_update(self._filter)[0], self._undo_records())
 
     def recall(self) -> Recall[UpdateReport] | None:
-        """Return what tells the report of the next update, once it is absorbed."""
+        """Return a function that gives the report of the next update when done."""
         self._report = None
         return before_update(self._filter)[1] and (lambda: self._report)
 

@@ -1,6 +1,6 @@
 """Edit the map of any filter: remove landmarks, merge two of them, read parts of it.
 
-`edit_map` returns an editor, and `view_map` reads the map.  Filters that keep the
+`MapEditor` edits the map, and `view_map` reads it.  Filters that keep the
 arrays of :class:`EkfSlam` are edited in place, without a copy of the whole covariance.
 Others may support some of these, each by itself:
 

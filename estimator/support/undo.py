@@ -13,7 +13,7 @@ Answer = TypeVar("Answer")
 Undo = Callable[[], None]
 """What takes back later changes; it may be called more than once."""
 Recall = Callable[[], Result | None]
-"""What tells the result of a step, or None as long as the step is not done."""
+"""Returns the result of a step, or None as long as the step is not done."""
 
 
 @contextmanager
@@ -48,7 +48,7 @@ def carried_out(
     undo : callable
         Takes back the step, as long as the kernel has not run.
     recall : callable or None
-        Tells the result of the step once the kernel has run; None: ``undo`` can take
+        Returns the result of the step once the kernel has run; None: ``undo`` can take
         back all.
     bookmark : callable
         Returns what takes back ``then``.

@@ -290,7 +290,7 @@ class CompressedEkfSlam:
         return undo_all(self._map.bookmark(), attributes(self))
 
     def recall(self) -> Recall[UpdateReport] | None:
-        """Return what tells the report of the next update, once it is absorbed."""
+        """Return a function that gives the report of the next update when done."""
         return self._map.filter.recall()
 
     def _choose_local_map(self, required: Sequence[int]) -> None:

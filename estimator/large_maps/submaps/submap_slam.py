@@ -384,7 +384,7 @@ class SubmapSlam(SubmapQueries):
         )
 
     def recall(self) -> Recall[UpdateReport] | None:
-        """Return what tells the report of the next update, once it is absorbed."""
+        """Return a function that gives the report of the next update when done."""
         self._report = None
         return lambda: self._report
 
