@@ -32,6 +32,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         large_maps peers
         registry
         smoother
+        covariance_checks
         check_estimator
     """,
     "estimator.large_maps": """
