@@ -152,6 +152,9 @@ def monte_carlo(
         for label, entry in summary["estimators"].items()
         for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
     ]
+    if share := results.attrs.get(monte_carlo.SMALL_NOISE_SHARE):
+        text = f"Runs with less noise, which show causes, took {share:.0%} of the time."
+        sentences.append(Text(text))
     reporter.show(monte_carlo_table(summary), "", *sentences, "")
     if summary["notes"]:
         reporter.show(*map(Text, summary["notes"]), "")

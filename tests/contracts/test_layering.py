@@ -60,8 +60,8 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         filtered_runs
         run_measures
         results
-        runner
         verdict
+        runner
         summary
         figures
         report
