@@ -128,8 +128,8 @@ def diagnose(
         NEES of the pose of the same filter on the same readings with known identities.
         With it, the effect of wrong associations is found in single runs.
     small_noise : SmallNoise, optional
-        Without it, linearisation and a wrong model cannot be told apart, and the
-        answer is "cannot tell".
+        Without it, linearisation, a wrong model and a wrong covariance look alike, and
+        the answer is "cannot tell".
     rejected : bool
         Whether another test has rejected the filter, so that it is not "honest".
 
@@ -181,7 +181,18 @@ def diagnose(
         return Diagnosis(CANNOT_TELL, p_value, text)
     what = f"{before}{errors.text} ({p_text(p_value)})"
     what += _also(knowledge, spurious, nis_ratio)
-    return _of_the_filter(what, p_value, pose, heading, small_noise)
+    if small_noise is None:
+        cause, text = (
+            CANNOT_TELL,
+            (
+                "The cause is the linearisation, a wrong model or a wrong covariance; the "
+                "same runs with a tenth of the noise would show it."
+            ),
+        )
+    else:
+        cause, text = excess_of(pose, heading, small_noise, nis_ratio or 0.0)
+    repeat = runs_to_repeat(pose, heading) if cause == CANNOT_TELL else 0
+    return Diagnosis(cause, p_value, f"{cause}: {what}. {text}", repeat=repeat)
 
 
 def _blamed(
@@ -256,22 +267,6 @@ def _of_the_noise(guilty: list[Finding], errors: Errors) -> Diagnosis:
         f"{first.cause}: {first.text} ({p_text(first.p_value)}){also}; {errors.text}."
     )
     return Diagnosis(first.cause, first.p_value, sentence, tuple(others))
-
-
-def _of_the_filter(
-    what: str, p_value: float, pose: Array, heading: Array, small: SmallNoise | None
-) -> Diagnosis:
-    """Answer by what is left of the excess with less noise."""
-    repeat = runs_to_repeat(pose, heading)
-    if small is None:
-        text = (
-            f"cannot tell: {what}. The cause is the linearisation, a wrong model or a "
-            "wrong covariance; the same runs with a tenth of the noise would show it."
-        )
-        return Diagnosis(CANNOT_TELL, p_value, text, repeat=repeat)
-    cause, text = excess_of(pose, heading, small)
-    repeat = repeat if cause == CANNOT_TELL else 0
-    return Diagnosis(cause, p_value, f"{cause}: {what}. {text}.", repeat=repeat)
 
 
 def _of_consistent_errors(
@@ -438,7 +433,9 @@ def runs_to_repeat(pose: Array, heading: Array) -> int:
     return min(max(needed, few), len(pose))
 
 
-def excess_of(pose: Array, heading: Array, small: SmallNoise) -> tuple[str, str]:
+def excess_of(
+    pose: Array, heading: Array, small: SmallNoise, nis_ratio: float = 0.0
+) -> tuple[str, str]:
     """Compare the errors of the same runs with much and with little noise.
 
     With the average NEES per degree a of a run and b with less noise, the excess b − 1
@@ -452,13 +449,15 @@ def excess_of(pose: Array, heading: Array, small: SmallNoise) -> tuple[str, str]
         As for `errors_of`.
     small : SmallNoise
         Of the same runs.
+    nis_ratio : float
+        Sum of all NIS divided by their degrees of freedom.  Linearisation hardly
+        changes the size of innovations.
 
     Returns
     -------
     cause : str
         `LINEARISATION`, `WRONG_COVARIANCE`, `WRONG_MODEL` or `CANNOT_TELL`.
     sentence : str
-        Without a full stop.
     """
     errors, lost = errors_of(pose, heading), lost_runs(pose)
     repeated = np.asarray(small.nees, float) / POSE
@@ -466,39 +465,56 @@ def excess_of(pose: Array, heading: Array, small: SmallNoise) -> tuple[str, str]
         repeated = np.asarray(small.heading_nees, float)
     is_known = np.isfinite(repeated)
     if is_known.sum() < _FEWEST_OF_A_KIND:
-        return CANNOT_TELL, "Too few runs succeed with less noise"
+        return CANNOT_TELL, "Too few runs succeed with less noise."
     many, few = _averages(pose, heading)[is_known], repeated[is_known]
-    sign = 1.0 if errors.ratio > 1 else -1.0
-    before, after = sign * (many - 1), sign * (few - 1)
-    chosen = np.ones(len(few), np.bool_)
-    if np.median(many) <= _CLEARLY and lost[is_known].sum() >= _FEWEST_LOST:
-        chosen = lost[is_known]
-    if np.median(many[chosen]) > _CLEARLY:
-        share = after[chosen] / before[chosen]
-        grows = np.mean(share > GROWS) > _MOST
-        shrinks = np.mean(share < SHRINKS) > _MOST
-        stays = np.mean((share >= SHRINKS) & (share <= GROWS)) > _MOST
-    else:
-        grows = _is_positive(few - 1 - GROWS * abs(before.mean()))
-        shrinks = _is_positive(SHRINKS * before - after)
-        stays = _is_positive(after - SHRINKS * before) and not grows
+    change = _change(many, few, lost[is_known], 1.0 if errors.ratio > 1 else -1.0)
     ratio = float(few.mean())
     remains = ratio > LEAST_RATIO and _beyond_margin(few) < _ERROR_RATE
     share = "a tenth" if small.factor == 0.1 else f"{100 * small.factor:.0f} %"
     found = f"With {share} of the noise, the squared errors are {ratio:.3g} times"
-    if grows:
+    if change == "grows":
         return WRONG_MODEL, (
             f"{found}, and thus do not shrink with it: a model of the filter is wrong, "
-            "such as a bias, a sign, an offset or a delay"
+            "such as a bias, a sign, an offset or a delay."
         )
-    if shrinks and not remains:
-        return LINEARISATION, f"{found}, so the excess vanishes with the noise"
-    if stays or (shrinks and small.factor <= SMALLEST_NOISE):
+    if change == "stays" or (
+        change == "shrinks" and remains and small.factor <= SMALLEST_NOISE
+    ):
         return WRONG_COVARIANCE, (
             f"{found}, so the excess stays: a Jacobian or a covariance of the filter "
-            "is wrong"
+            "is wrong."
         )
-    return CANNOT_TELL, f"{found}, which does not show the cause"
+    if change != "shrinks" or remains:
+        return CANNOT_TELL, f"{found}, which does not show the cause."
+    if nis_ratio > np.sqrt(max(errors.ratio, 1.0)):
+        return CANNOT_TELL, (
+            f"{found}, but the innovations are too large for linearisation: is an "
+            "angle not wrapped?"
+        )
+    return LINEARISATION, f"{found}, so the excess vanishes with the noise."
+
+
+def _change(many: Array, few: Array, lost: BoolArray, sign: float) -> str:
+    """Return whether the excess "grows", "shrinks" or "stays", else ""."""
+    before, after = sign * (many - 1), sign * (few - 1)
+    chosen = np.ones(len(few), np.bool_)
+    if np.median(many) <= _CLEARLY and lost.sum() >= _FEWEST_LOST:
+        chosen = lost
+    if np.median(many[chosen]) > _CLEARLY:
+        share = after[chosen] / before[chosen]
+        shows = {
+            "grows": share > GROWS,
+            "shrinks": share < SHRINKS,
+            "stays": (share >= SHRINKS) & (share <= GROWS),
+        }
+        for change, runs in shows.items():
+            if runs.mean() > _MOST:
+                return change
+    if _is_positive(few - 1 - GROWS * abs(before.mean())):
+        return "grows"
+    if _is_positive(after - SHRINKS * before):
+        return "stays"
+    return "shrinks" if _is_positive(SHRINKS * before - after) else ""
 
 
 def _averages(pose: Array, heading: Array) -> Array:

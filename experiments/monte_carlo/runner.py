@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 BLOCK_SIZE = 64
 LESS_NOISE = 0.1, SMALLEST_NOISE
-"""Factors of all noise, of which the second is used if the first decides nothing."""
+"""Factors of all noise; the second is used if the first decides nothing."""
 SMALL_NOISE_SHARE = "small_noise_share"
 """Attribute of results, but of no file: share of the time for runs with less noise."""
 EACH_RUN = "estimator", "run"
@@ -210,7 +210,7 @@ def _repeated(
     dict
         `SMALL_NOISE`, shape (estimators, runs); empty if nothing is repeated.
     dict
-        `SMALL_NOISE_SHARE` of the time, of which the results took some seconds.
+        `SMALL_NOISE_SHARE` of the time; the results took the given seconds.
     """
     begun = perf_counter()
     shape = len(job.estimators), len(asked)

@@ -235,6 +235,16 @@ def test_an_excess_of_which_a_part_remains_is_repeated_with_still_less_noise():
     assert "With 1 % of the noise" in last.sentence
 
 
+def test_an_excess_with_very_large_innovations_is_not_of_the_linearisation():
+    scores = wrong(11, 40.0)
+    small = less_noise(scores, 0.001)
+    found = diagnose(**scores, small_noise=small, nis_ratio=6.0)
+    assert found.cause == "linearisation"
+    found = diagnose(**scores, small_noise=small, nis_ratio=7.0)
+    assert found.cause == "cannot tell"
+    assert found.sentence.endswith("is an angle not wrapped?")
+
+
 def test_a_cautious_filter_has_a_cause_too():
     scores = wrong(13, 0.5)
     assert diagnose(**scores).cause == "cannot tell"
