@@ -64,6 +64,10 @@ _ERROR_RATE = 0.05
 LARGEST_NIS = 1.15
 """NIS per degree from which on a filter does not use the noise that it is given."""
 FEWEST_RUNS = 20
+_WITHOUT_SMALL_NOISE = (
+    "The cause is the linearisation, a wrong model or a wrong covariance; the same runs "
+    "with a tenth of the noise would show it."
+)
 
 
 class Diagnosis(NamedTuple):
@@ -182,13 +186,7 @@ def diagnose(
     what = f"{before}{errors.text} ({p_text(p_value)})"
     what += _also(knowledge, spurious, nis_ratio)
     if small_noise is None:
-        cause, text = (
-            CANNOT_TELL,
-            (
-                "The cause is the linearisation, a wrong model or a wrong covariance; the "
-                "same runs with a tenth of the noise would show it."
-            ),
-        )
+        cause, text = CANNOT_TELL, _WITHOUT_SMALL_NOISE
     else:
         cause, text = excess_of(pose, heading, small_noise, nis_ratio or 0.0)
     repeat = runs_to_repeat(pose, heading) if cause == CANNOT_TELL else 0
