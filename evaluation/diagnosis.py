@@ -65,8 +65,8 @@ LARGEST_NIS = 1.15
 """NIS per degree from which on a filter does not use the noise that it is given."""
 FEWEST_RUNS = 20
 _WITHOUT_SMALL_NOISE = (
-    "The cause is the linearisation, a wrong model or a wrong covariance; the same runs "
-    "with a tenth of the noise would show it."
+    "The cause is the linearisation, a wrong model or a wrong covariance; the same "
+    "runs with a tenth of the noise would show it."
 )
 
 
