@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import forked
 import numpy as np
 import pytest
 from comparison import assert_same_bits
@@ -311,7 +310,7 @@ def test_what_waits_far_from_the_robot_is_within_the_tolerance():
         for tolerance in (0.0, 1e-3, 1e-6)
     )
     worst = {loose: 0.0, tight: 0.0}
-    for step, each in enumerate(wander(6000, 900, seed=1)):
+    for step, each in enumerate(wander(6000, 600, seed=1)):
         for slam in (exact, loose, tight):
             run(slam, [each])
         if step % 150 == 149:
@@ -359,26 +358,6 @@ def test_removing_landmarks_changes_nothing_about_the_others():
     report = slam.update([(0.1, 3.0), (0.5, 4.0)], gone[:2])  # into their old places
     assert report.added_ids == tuple(gone[:2])
     assert len(slam.belief().landmark_ids) == len(stays) + 2
-
-
-def continued(saved, steps):
-    slam = SparseInformationSlam(*NOISE, active_bound=12)
-    slam.load_state_dict(np.load(saved))
-    return run(slam, list(wander(1000, 400))[steps:]).belief()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("steps", [137, 301])
-def test_another_process_continues_with_the_same_bits(tmp_path, steps):
-    drive = list(wander(1000, 400))
-    slam = run(SparseInformationSlam(*NOISE, active_bound=12), drive[:steps])
-    slam.belief([])  # asking leaves no trace
-    np.savez(tmp_path / "saved.npz", **slam.state_dict())
-    run(slam, drive[steps:])
-    result = forked.result_of(continued, tmp_path / "saved.npz", steps)
-    belief = slam.belief()
-    assert len(belief.landmark_ids) > 1.3 * len(slam.local_ids)
-    assert_same_bits(result, belief)
 
 
 def test_a_saved_state_that_does_not_fit_is_refused_and_nothing_changes():
@@ -628,7 +607,7 @@ def test_readings_are_blind_to_a_turn_of_the_map_at_its_first_estimates(base, bo
 @pytest.mark.slow
 def test_in_the_loop_constrained_jacobians_make_relocating_honest():
     # Seven times overconfident as ekf, with four landmarks that may be linked.
-    world, runs = load_scenario("loop"), 3
+    world, runs = load_scenario("loop"), 2
     data, nees = simulate_runs(world, runs, 0), []
     for run_ in range(runs):
         slam = SparseInformationSlam(

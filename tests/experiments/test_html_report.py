@@ -203,14 +203,13 @@ def call_on(page, folder):
 
 
 @pytest.mark.usefixtures("_no_figures_in_reports")
-@pytest.mark.parametrize("changes", [{}, {"steps": 5}, {"name": "my_own"}])
-@pytest.mark.parametrize("assumed", [False, True])
 @pytest.mark.parametrize(
-    "estimators",
+    ("changes", "assumed", "estimators"),
     [
-        "ekf,invariant",
-        "invariant[iterations=3]",
-        {"mine": ("ekf", {"gate_probability": 0.99})},
+        ({}, False, "ekf,invariant"),
+        ({"steps": 5}, True, "invariant[iterations=3]"),
+        ({"name": "my_own"}, False, {"mine": ("ekf", {"gate_probability": 0.99})}),
+        ({}, True, {"mine": ("ekf", {"gate_probability": 0.99})}),
     ],
 )
 def test_the_call_on_the_page_makes_the_same_results(
