@@ -425,7 +425,7 @@ class SeparateFilters:
         if len(self._stored) == 1:
             one: BatchStorage = self._stored[0]
             return one
-        return BatchStorage(*map(np.concatenate, zip(*self._stored, strict=True)))
+        return BatchStorage.of(*map(np.concatenate, zip(*self._stored, strict=True)))
 
     def belief(self, run: int) -> BeliefOfMap | None:
         """Return the belief of one world; None before its first scan."""

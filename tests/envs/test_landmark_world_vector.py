@@ -9,12 +9,13 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import FlattenObservation, RecordEpisodeStatistics
+from presets import KINDS
 from worlds import WALLS
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.envs.vector import FlattenBatch
 from slamgym.envs.vector.landmark_world_vector import LandmarkWorldVectorEnv
-from slamgym.sim_configs import list_presets, load_scenario
+from slamgym.sim_configs import load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
 WORLDS, STEPS, SEED = 5, 200, 3
@@ -29,7 +30,7 @@ EVERYTHING = {
 # All of it, with 10,000 landmarks, is compared in `test_world_batch`.
 CORNER = {"columns": 10, "rows": 10}
 WORLDS_TO_TEST = {
-    **{name: {"scenario": name} for name in list_presets() if name != "city"},
+    **{name: {"scenario": name} for name in KINDS},
     "a corner of the city": {
         "scenario": "city",
         "landmarks": CORNER,

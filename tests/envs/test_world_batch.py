@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
+from presets import KINDS
 from worlds import RANDOM_MAP, WALLS
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.robot import WallContacts
 from slamgym.envs.vector import WorldBatch
-from slamgym.sim_configs import list_presets, load_scenario
+from slamgym.sim_configs import load_scenario
 
 WORLDS, STEPS, SEED = 5, 200, 11
 ROAMING = load_scenario("six_landmarks").with_changes(
@@ -77,7 +78,7 @@ VARIANTS = {
     "faulty encoders": {"faults": FAULTS, "motion": ENCODERS},
     "encoders": {"motion": ENCODERS, "start": {"drawn": "estimate", "std": [1, 1, 1]}},
 }
-SCENARIOS = {name: load_scenario(name) for name in list_presets()} | {
+SCENARIOS = {name: load_scenario(name) for name in (*KINDS, "city")} | {
     name: ROAMING.with_changes(**changes) for name, changes in VARIANTS.items()
 }
 

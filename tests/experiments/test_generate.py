@@ -47,7 +47,7 @@ from slamgym.experiments.trajectories.manifest import (
     load_trajectories,
     read_manifest,
 )
-from slamgym.sim_configs import list_presets, load_scenario
+from slamgym.sim_configs import load_scenario
 
 LOOP = load_scenario("loop").with_changes(steps=30)
 KILLS = int(os.environ.get("SLAMGYM_TEST_KILLS", "1"))
@@ -72,7 +72,7 @@ def format_or_skip(name):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_an_episode_is_the_log_that_slamgym_run_makes_of_its_seed(preset, tmp_path):
-    controller = CONTROLLERS[list_presets().index(preset) % len(CONTROLLERS)]
+    controller = CONTROLLERS[len(preset) % len(CONTROLLERS)]  # they take turns
     scenario = load_scenario(preset).with_changes(steps=40)
     for drive in drive_episodes(scenario, controller, (3, 9)):
         write_slamlog(to_slamlog(drive), tmp_path / "here.csv")
