@@ -11,7 +11,6 @@ import numpy as np
 import numpy_active_slam as twin
 import pytest
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils.env_checker import check_env
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.agents import (
@@ -57,11 +56,6 @@ def wander(env, steps, seed=0):
         yield step
         if step[2] or step[3]:
             return
-
-
-@pytest.mark.parametrize("level", LEVELS)
-def test_gymnasiums_checker_finds_nothing_to_warn_of(level):
-    check_env(gym.make(ID, scenario=level).unwrapped)
 
 
 @pytest.mark.parametrize("level", LEVELS)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import FlattenObservation, RecordEpisodeStatistics
 from presets import KINDS
 from worlds import WALLS
 
@@ -259,13 +258,6 @@ def test_a_deep_copy_goes_on_as_the_original_would():
         same(*(each.step(np.full((WORLDS, 2), 0.4)) for each in (vector, other)))
 
 
-def test_gymnasiums_episode_statistics_go_on_top():
-    vector = RecordEpisodeStatistics(native(2, mode=AutoresetMode.SAME_STEP, steps=3))
-    vector.reset(seed=0)
-    *_, infos = [vector.step(np.zeros((2, 2))) for _ in range(3)][-1]
-    assert infos["episode"]["l"].tolist() == [3, 3]
-
-
 # --- pictures ---
 
 
@@ -401,14 +393,6 @@ def test_flat_observations_are_gymnasiums(mode, changes):
             (rows, _), (observations, _) = (
                 each.reset(options=options) for each in (flat, nested)
             )
-
-
-def test_flat_observations_are_those_of_gymnasiums_own_wrapper():
-    flat, other = FlattenBatch(native()), FlattenObservation(native())
-    same(flat.reset(seed=0), other.reset(seed=0))
-    commands = np.full((WORLDS, 2), 0.2)
-    same(flat.step(commands), other.step(commands))
-    assert flat.observation_space == other.observation_space
 
 
 def test_only_one_level_of_arrays_can_be_flattened():

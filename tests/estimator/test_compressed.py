@@ -1,6 +1,5 @@
 """The compressed filter is the full filter: whatever it puts off, nothing is lost."""
 
-import io
 import pickle
 import sys
 from pathlib import Path
@@ -254,42 +253,6 @@ def test_a_landmark_removed_and_seen_again_is_a_new_one():
     report = slam.update([(0.1, 3.0), (0.5, 4.0)], [last, first])
     assert report.added_ids == (last, first)
     assert slam.landmark_ids[-2:] == (last, first)
-
-
-def through_pickle(state):
-    return pickle.loads(pickle.dumps(state))
-
-
-def through_npz(state):
-    file = io.BytesIO()
-    np.savez(file, **state)
-    file.seek(0)
-    return dict(np.load(file))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("base", "jumping"), [("ekf", True), ("invariant", False)])
-def test_a_run_stopped_at_any_step_continues_bit_for_bit(base, jumping):
-    drive = list(wander(300, 130, jumping=jumping))
-    slam = map_all(CompressedEkfSlam(*NOISE, base=base), 300)
-    saved = []
-    for odometry, readings, ids in drive:
-        slam.predict(odometry)
-        saved.append(slam.state_dict())
-        slam.update(readings, ids)
-    assert len({state["far_progress"][1] for state in saved}) > 1  # amid the work
-    assert len({len(state["far_pending_signs"]) for state in saved}) > 1
-    for step in range(0, 130, 13):
-        travel = (through_npz, through_pickle)[step % 2]
-        other = CompressedEkfSlam(*NOISE, base=base)
-        other.load_state_dict(travel(saved[step]))
-        other.update(*drive[step][1:])
-        run(other, drive[step + 1 :])
-        assert_same_bits(other.belief(), slam.belief())
-        found, expected = other.state_dict(), slam.state_dict()
-        assert found.keys() == expected.keys()
-        for key, value in found.items():
-            np.testing.assert_array_equal(value, expected[key], err_msg=key)
 
 
 def test_a_state_is_shared_with_nobody():

@@ -665,10 +665,7 @@ def test_a_wrong_option_of_the_filter_is_refused(log, options, message):
             ("loop", "--set", "sensor.max_rage=4"),
             "unknown key 'max_rage' in sensor; did you mean 'max_range'?",
         ),
-        (
-            ("loop", "--set", "sensor.std=[-1, 0.1]"),
-            "sensor.std must be 2 ",
-        ),
+        (("loop", "--set", "sensor.std=[-1, 0.1]"), "sensor.std must be 2 "),
         (("loop", "--set", "motion.std=[0.1, 0.1]"), "motion.std must be 3 "),
         (("loop", "--set", "sensor"), "--set must be KEY=VALUE, got 'sensor'"),
         (("loop", "--steps", "1"), "steps must be an integer >= 2, got 1"),

@@ -347,9 +347,7 @@ def test_walls_are_drawn_within_the_limits(figure_of):
 def test_filters_are_compared_on_the_same_area_with_landmarks_inside_3_sigma():
     honest = make_trace(count=4)
     overconfident = make_trace(
-        count=4,
-        estimator="certain",
-        final_covariance=1e-9 * honest.final_covariance,
+        count=4, estimator="certain", final_covariance=1e-9 * honest.final_covariance
     )
     figure = comparison_figure([honest, overconfident])
     left, right = figure.axes

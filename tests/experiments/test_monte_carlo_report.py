@@ -27,7 +27,6 @@ from slamgym.experiments.monte_carlo.report import (
     measures,
     monte_carlo_table,
 )
-from slamgym.experiments.monte_carlo.run_measures import VARIABLES
 from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
 from slamgym.experiments.monte_carlo.verdict import (
     KINDS,
@@ -66,13 +65,6 @@ def white_report(factor, runs, steps=20, outliers=0):
     dof = np.full((runs, steps), 2)
     nis = rng.chisquare(2, (runs, steps))
     return evaluate_consistency(nees, nis, dof, frame="invariant", rng=rng)
-
-
-def test_the_fixture_has_the_runners_schema():
-    dataset = typical()
-    assert set(dataset.data_vars) == set(VARIABLES)
-    for name, variable in VARIABLES.items():
-        assert dataset[name].dims == ("estimator", *variable.dims)
 
 
 @pytest.mark.parametrize("label", ["ekf", "invariant"])
@@ -191,7 +183,7 @@ def test_the_number_of_runs_that_a_verdict_names_suffices():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("runs", [2, 3, 5, 10, 20])
+@pytest.mark.parametrize("runs", [2, 5, 20])
 def test_few_runs_of_a_consistent_filter_are_called_wrong_in_5_percent(runs):
     """NEES that never changes over time is the hardest case: as skewed as can be."""
     repetitions = 1000

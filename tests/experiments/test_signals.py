@@ -23,6 +23,7 @@ from slamgym.sim_configs import load_scenario
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals are those of POSIX")
 
 JOB = "monte-carlo six_landmarks -e ekf --runs 90000 --block-size 8 --jobs 2 --out out"
+DATA_SET = "generate six_landmarks --episodes 90000 --shard 8 --out out"
 GOES_ON = "the finished runs are in out, and the same command continues"
 
 
@@ -82,14 +83,11 @@ def test_a_scheduler_ends_workers_of_dask(here):
 
 
 IMPORTS = 2.5  # [s] more than a forked command takes to load what it lacks
-IMPORTS_OF_WORKERS = 4.0  # [s] which load everything
 LONG = (  # those that the next test ends in a filter are not among them
-    "generate city --episodes 9 --shard 1 --jobs 2 --out out",
     "replay ../city.csv --out out",
     "smooth ../city.csv --out out",
     "fit-noise ../city.csv --out out",
     "noise-study city --runs 4 --out out",
-    "monte-carlo city --runs 4 --block-size 1 --jobs 2 --out out",
 )
 
 
@@ -148,15 +146,26 @@ def test_a_command_that_computes_ends_in_time(here, city_log, command, number):
 
     def computed():
         assert child.is_alive()
-        workers = of_child.children(recursive=True)
-        if "--jobs" in command:
-            of_workers = [worker.cpu_times().user for worker in workers]
-            return sum(seconds > IMPORTS_OF_WORKERS for seconds in of_workers) == 2
         return of_child.cpu_times().user > IMPORTS
 
     wait_until(computed)
     assert_ends_in_time(child, number, here, message_of(command))
     assert list(here.glob(".*")) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "made", "number"),
+    [
+        (f"{DATA_SET} --jobs 2", "shard_*.npz", signal.SIGTERM),
+        (JOB, "blocks/runs-*.npz", signal.SIGINT),
+    ],
+    ids=["generate", "monte-carlo"],
+)
+def test_a_job_of_workers_ends_in_time(here, command, made, number):
+    child = begin(here, *command.split())
+    wait_until(lambda: child.exitcode or len(list(here.glob(f"out/{made}"))) > 1)
+    assert_ends_in_time(child, number, here, message_of(command))
 
 
 @pytest.mark.slow
