@@ -728,7 +728,10 @@ def test_estimators_that_are_neither_names_nor_classes_are_refused():
         monte_carlo("six_landmarks", ["ekf", 3], 2)
 
 
-@pytest.mark.parametrize("world", ["six_landmarks", "hidden_identities"])
+@pytest.mark.parametrize(
+    "world",
+    ["six_landmarks", pytest.param("hidden_identities", marks=pytest.mark.slow)],
+)
 def test_runs_computed_a_few_at_once_are_those_computed_together(world, monkeypatch):
     scenario = load_scenario(world).with_changes(steps=12)
     together = monte_carlo(scenario, "ekf,robocentric", 5, 300)
