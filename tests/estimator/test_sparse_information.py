@@ -310,7 +310,7 @@ def test_what_waits_far_from_the_robot_is_within_the_tolerance():
         for tolerance in (0.0, 1e-3, 1e-6)
     )
     worst = {loose: 0.0, tight: 0.0}
-    for step, each in enumerate(wander(6000, 600, seed=1)):
+    for step, each in enumerate(wander(6000, 900, seed=1)):
         for slam in (exact, loose, tight):
             run(slam, [each])
         if step % 150 == 149:
