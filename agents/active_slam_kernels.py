@@ -81,12 +81,9 @@ class Rules(NamedTuple):
 class Scratch(NamedTuple):
     """Room for intermediate results."""
 
-    points: Array
-    """Shape (3, max(C, N))."""
-    variances: Array
-    """Of the landmarks, shape (N,) [m²]."""
-    matrix: Array
-    """Shape (2N, 2N)."""
+    points: Array  # (3, max(C, N))
+    variances: Array  # of the landmarks, shape (N,) [m²]
+    matrix: Array  # (2N, 2N)
 
 
 @jit
@@ -277,13 +274,11 @@ def write_nearest(points: Array, count: int, diagonal: float, goal: Array) -> No
 
 Pose = tuple[float, float, float, float]
 
-SECTORS = 8
-"""Number of directions around the robot, the first straight ahead."""
+SECTORS = 8  # number of directions around the robot, the first straight ahead
 
+# Distance over which near densities decay to 1 / e, in diagonals of the floor.
 NEAR_REACH = 0.1
-"""Distance over which near densities decay to 1 / e, in diagonals of the floor."""
-FAR_REACH = 4 * NEAR_REACH
-"""The same of far densities."""
+FAR_REACH = 4 * NEAR_REACH  # the same of far densities
 
 AHEAD, ASIDE, DISTANCE = range(3)  # rows of an array of points
 _TIE = 1e-9  # values no farther apart count as equal
@@ -295,33 +290,25 @@ _SIN = np.sin(2 * np.pi * np.arange(SECTORS) / SECTORS)
 class Floor(NamedTuple):
     """The plan of a floor and the sight of the robot on it."""
 
-    cells: Array
-    """x and y of the centres of the cells, shape (2, C) [m]."""
-    walls: Array
-    """Rows (x0, y0, x1, y1), shape (W, 4) [m]."""
+    cells: Array  # x and y of the centres of the cells, shape (2, C) [m]
+    walls: Array  # rows (x0, y0, x1, y1), shape (W, 4) [m]
     bounds: Rectangle
-    diagonal: float
-    """Of the bounds [m]."""
+    diagonal: float  # of the bounds [m]
     sight: View
 
 
 class Lobes(NamedTuple):
     """Weighted sums over points with the unit vectors (x, y) towards them."""
 
-    total: float
-    """Σ w"""
-    xx: float
-    """Σ w x²"""
-    xy: float
-    """Σ w x y"""
-    ahead: float
-    """Σ w x², of points ahead."""
+    total: float  # Σ w
+    xx: float  # Σ w x²
+    xy: float  # Σ w x y
+    ahead: float  # Σ w x², of points ahead
+    # Σ w (x + y)² / 2, of points ahead or to the left by the same angle or more.
     ahead_left: float
-    """Σ w (x + y)² / 2, of points ahead or to the left by the same angle or more."""
-    left: float
-    """Σ w y², of points to the left."""
+    left: float  # Σ w y², of points to the left
+    # Σ w (y - x)² / 2, of points to the left or behind by the same angle or more.
     left_behind: float
-    """Σ w (y - x)² / 2, of points to the left or behind by the same angle or more."""
 
 
 @jit

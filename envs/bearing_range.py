@@ -34,12 +34,10 @@ Limit = float | Array | None
 class AnonymousScan(NamedTuple):
     """Readings without identities, in random order, empty rows last."""
 
-    readings: Array
-    """(β, r), zeros in empty rows, shape (2, …, M) [rad, m]."""
-    mask: BoolArray
-    """Rows with a reading, shape (…, M)."""
+    readings: Array  # (β, r), zeros in empty rows, shape (2, …, M) [rad, m]
+    mask: BoolArray  # rows with a reading, shape (…, M)
+    # The true landmark of each row, -1 for clutter and empty rows, shape (…, M).
     landmark_ids: IntArray
-    """The true landmark of each row, -1 for clutter and empty rows, shape (…, M)."""
 
 
 class BearingRangeSensor:

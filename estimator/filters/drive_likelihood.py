@@ -22,9 +22,8 @@ from .batch import can_batch
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap, workspace_for
 
+# NIS beyond which a reading is rejected: a share e⁻¹⁵ of them if the noise is right.
 GATE = 30.0
-"""NIS beyond which a reading is rejected: a share e⁻¹⁵ of them if the noise is right.
-"""
 
 
 def drive_likelihood(

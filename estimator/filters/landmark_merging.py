@@ -16,26 +16,21 @@ from ...arrays import Array, ComplexArray, IntArray
 from ..models.rigid_motion import ErrorFrame, left_jacobian
 
 MOST_ITERATIONS = 50
-TURN_TOLERANCE = 1e-13
-"""Iterations of a turn end when it changes by less [rad]."""
+TURN_TOLERANCE = 1e-13  # iterations of a turn end when it changes by less [rad]
 
 
 class ConditionedMap(NamedTuple):
     """Mean and covariance of robot and map after conditioning."""
 
-    mean: Array
-    """Shape (3 + 2n,)."""
-    covariance: Array
-    """Shape (3 + 2n, 3 + 2n), of the additive error."""
+    mean: Array  # (3 + 2n,)
+    covariance: Array  # (3 + 2n, 3 + 2n), of the additive error
 
 
 class Separation(NamedTuple):
     """Offset of two landmarks and its covariance."""
 
-    offset: Array
-    """D = l_i − l_j, shape (2,) [m]."""
-    covariance: Array
-    """C, shape (2, 2) [m²]."""
+    offset: Array  # D = l_i − l_j, shape (2,) [m]
+    covariance: Array  # C, shape (2, 2) [m²]
 
     @property
     def squared(self) -> float:

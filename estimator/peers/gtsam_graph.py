@@ -37,11 +37,9 @@ from .peer_slam import (
 
 X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
 
-LEAST_VARIANCE = 1e-10
-"""Of motion noise [m², m², rad²]: GTSAM takes no certain motion."""
+LEAST_VARIANCE = 1e-10  # of motion noise [m², m², rad²]: GTSAM takes no certain motion
 PoseAndPlaces = tuple[Any, list[Array]]
-MOVE, READING, SOLVE = 0.0, 1.0, 2.0
-"""Kinds of the events of a drive."""
+MOVE, READING, SOLVE = 0.0, 1.0, 2.0  # kinds of the events of a drive
 
 
 class GtsamSlam(PeerSlam):

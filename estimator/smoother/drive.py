@@ -34,10 +34,8 @@ class Motion(NamedTuple):
 class Sightings(NamedTuple):
     """The readings of one pose."""
 
-    measurements: Array
-    """Rows (β, r), shape (m, 2) [rad, m]."""
-    ids: IntArray
-    """Landmark of each, shape (m,)."""
+    measurements: Array  # rows (β, r), shape (m, 2) [rad, m]
+    ids: IntArray  # landmark of each, shape (m,)
 
 
 class Drive:
@@ -278,29 +276,24 @@ def _sensor_rules(
 # ε_k = N_k w_k  noise of that motion in the frame of pose k − 1, w_k ~ N(0, I)
 # V_k            whitener: V_k N_k = I where N_k has full rank
 
+# Variance of a direction without noise, relative to that of the noisiest one.
 NEGLIGIBLE = 1e-12
-"""Variance of a direction without noise, relative to that of the noisiest one."""
 
 
 class DriveArrays(NamedTuple):
     """N poses, M readings of n landmarks; entry 0 of the motions is the prior."""
 
-    start: Array
-    """Prior mean of pose 0, shape (3,)."""
-    increments: Array
-    """Δ_k, shape (N, 3) [m, m, rad]; row 0 is not read."""
-    factors: Array
-    """N_k, shape (N, 3, 3); entry 0 is the deviation of the prior."""
-    whiteners: Array
-    """V_k, shape (N, 3, 3)."""
+    start: Array  # prior mean of pose 0, shape (3,)
+    increments: Array  # Δ_k, shape (N, 3) [m, m, rad]; row 0 is not read
+    factors: Array  # N_k, shape (N, 3, 3); entry 0 is the deviation of the prior
+    whiteners: Array  # V_k, shape (N, 3, 3)
+    # The readings of pose k are rows firsts[k] … firsts[k + 1], shape (N + 1,).
     firsts: IntArray
-    """The readings of pose k are rows firsts[k] … firsts[k + 1], shape (N + 1,)."""
-    readings: Array
-    """Rows (β, r), shape (M, 2) [rad, m]."""
+    readings: Array  # rows (β, r), shape (M, 2) [rad, m]
+    # First column of the landmark of each reading, 2 slot, shape (M,).
     columns: IntArray
-    """First column of the landmark of each reading, 2 slot, shape (M,)."""
+    # Columns of the landmarks that pose k or a later one reads, shape (N,).
     widths: IntArray
-    """Columns of the landmarks that pose k or a later one reads, shape (N,)."""
 
 
 def noise_factors(covariances: Array) -> tuple[Array, Array]:

@@ -62,10 +62,8 @@ class Noise(NamedTuple):
 class Estimate(NamedTuple):
     """Poses and landmarks."""
 
-    poses: Array
-    """Shape (N, 3), heading not wrapped."""
-    landmarks: Array
-    """Shape (2n,), in the order of the elimination."""
+    poses: Array  # (N, 3), heading not wrapped
+    landmarks: Array  # (2n,), in the order of the elimination
 
 
 class Solution(NamedTuple):
@@ -73,11 +71,10 @@ class Solution(NamedTuple):
 
     estimate: Estimate
     cost: float
-    first_cost: float
-    """Of the start."""
+    first_cost: float  # of the start
     iterations: int
+    # Whether the last step was damped, so that its system may be singular.
     is_damped: bool
-    """Whether the last step was damped, so that its system may be singular."""
 
 
 class Minimum(NamedTuple):
@@ -85,8 +82,7 @@ class Minimum(NamedTuple):
 
     solution: Solution
     elimination: Elimination
-    information: Array
-    """Of the landmarks, shape (2n, 2n)."""
+    information: Array  # of the landmarks, shape (2n, 2n)
 
 
 class _State:

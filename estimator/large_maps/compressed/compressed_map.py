@@ -335,23 +335,20 @@ class CompressedMap:
 # --------------------------------------------------------------------------------------
 # Choice of the local landmarks, and of their number.
 
+# Up to this many landmarks, the local map is the whole map.
+#
+# The end of a phase has a cost of its own. In smaller maps it exceeds two full updates.
 LARGEST_WHOLE_MAP = 350
-"""Up to this many landmarks, the local map is the whole map.
-
-The end of a phase has a cost of its own.  In smaller maps it exceeds two full updates.
-"""
+# The same in the invariant frame, where phases end at twice the cost.
 LARGEST_WHOLE_INVARIANT = 400
-"""The same in the invariant frame, where phases end at twice the cost."""
+# Smallest number of landmarks at which a local map may be too large.
 SMALLEST_LOCAL_MAP = 30
-"""Smallest number of landmarks at which a local map may be too large."""
-SHORT_PHASE = 4
-"""Steps after which a phase has paid for its end."""
+SHORT_PHASE = 4  # steps after which a phase has paid for its end
+# Limit of the extra landmarks, as a multiple of the landmarks of a scan.
+#
+# The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
+# costs a² n.
 LARGEST_RATIO, LANDMARKS_PER_RATIO = 2.5, 400
-"""Limit of the extra landmarks, as a multiple of the landmarks of a scan.
-
-The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
-costs a² n.
-"""
 
 
 def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
@@ -430,8 +427,7 @@ LOCAL: saved_states.Table = {
     **MAP_STATE,
     "covariance": (saved_states.SYMMETRIC, "3+2n", "3+2n"),
 }
-COUNTERS = 4
-"""Numbers before the free slots: virtual landmarks, extra ones, age, rest."""
+COUNTERS = 4  # numbers before the free slots: virtual landmarks, extra ones, age, rest
 
 
 def _check_slots(

@@ -300,13 +300,13 @@ class Downdate(NamedTuple):
     signs: Array  # s, shape (rank,), each 1 or -1
 
 
+# What a saved state holds about downdates.
 PENDING: saved_states.Table = {
     "pending_signs": (saved_states.NUMBERS, "r"),
     "pending_root": (saved_states.NUMBERS, "w", "r"),
     "pending_shapes": (saved_states.COUNTS, -1, 2),
     "progress": (saved_states.NUMBERS, 3),
 }
-"""What a saved state holds about downdates."""
 
 
 def _downdates(saved: Mapping[str, Any]) -> list[Downdate]:

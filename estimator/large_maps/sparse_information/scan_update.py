@@ -33,10 +33,8 @@ from .local_information import (
 class Sparsity(NamedTuple):
     """Limit of the links of the pose."""
 
-    bound: float
-    """Γ, the largest number of active landmarks, or infinity."""
-    prunes: bool
-    """Whether to cut weak links instead of relocating the pose."""
+    bound: float  # Γ, the largest number of active landmarks, or infinity
+    prunes: bool  # whether to cut weak links instead of relocating the pose
 
 
 class ScanResult(NamedTuple):
@@ -151,17 +149,12 @@ def _exceeds_bound(
 class Screened(NamedTuple):
     """n measurements of mapped landmarks; m are used."""
 
-    skipped: BoolArray
-    """Landmark expected below the minimum range, shape (n,)."""
-    gated: BoolArray
-    """Rejected by the gate, shape (n,)."""
-    near: BoolArray
-    """Robot within 10 σ of the landmark, shape (n,)."""
-    scan: LinearScan
-    """The m used measurements, linearised at the prior."""
+    skipped: BoolArray  # landmark expected below the minimum range, shape (n,)
+    gated: BoolArray  # rejected by the gate, shape (n,)
+    near: BoolArray  # robot within 10 σ of the landmark, shape (n,)
+    scan: LinearScan  # the m used measurements, linearised at the prior
     nis: float
-    factor: Array
-    """L, shape (2m, 2m), L Lᵀ = S."""
+    factor: Array  # L, shape (2m, 2m), L Lᵀ = S
 
 
 class ScanRules:

@@ -35,23 +35,18 @@ from .scan_update import State, marginalise, merge_landmarks
 class SparseBelief:
     """All state of the filter; one local map is in use at any time."""
 
-    slots: dict[int, int]
-    """Slot of each landmark, by identity."""
-    free: list[int]
-    """Slots of removed landmarks."""
+    slots: dict[int, int]  # slot of each landmark, by identity
+    free: list[int]  # slots of removed landmarks
     map_: SparseMap
     local: LocalInformation
     pose: ConditionalPose
-    origin: Array
-    """Position of the robot when the local map was chosen, shape (2,) [m]."""
-    count: float = FIRST_COUNT
-    """Number of landmarks to eliminate around the local map."""
-    enlarged: bool = False
-    """Whether the first number was too small."""
+    origin: Array  # position of the robot when the local map was chosen, shape (2,) [m]
+    count: float = FIRST_COUNT  # number of landmarks to eliminate around the local map
+    enlarged: bool = False  # whether the first number was too small
+    # What takes back the update under way: the last of these.
     saved: list[Undo] = field(default_factory=list, repr=False)
-    """What takes back the update under way: the last of these."""
+    # Factor of all landmarks except the local ones, if known.
     rest: RestFactor | None = field(default=None, repr=False)
-    """Factor of all landmarks except the local ones, if known."""
 
     @classmethod
     def empty(cls, pose: Array, std: Array) -> SparseBelief:
@@ -236,10 +231,8 @@ class SparseBelief:
 class Marginal(NamedTuple):
     """Gaussian of the pose and n landmarks."""
 
-    mean: Array
-    """Shape (3 + 2n,)."""
-    covariance: Array
-    """Shape (3 + 2n, 3 + 2n)."""
+    mean: Array  # (3 + 2n,)
+    covariance: Array  # (3 + 2n, 3 + 2n)
 
 
 def marginal(

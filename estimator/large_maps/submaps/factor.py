@@ -22,17 +22,15 @@ from ....arrays import Array, ComplexArray
 from ...models.bearing_range import wrap_angle
 from ...models.rigid_motion import ErrorFrame
 
+# Lower bound of a standard deviation, relative to the largest of the submap.
 SMALLEST_RATIO = 1e-5
-"""Lower bound of a standard deviation, relative to the largest of the submap."""
 
 
 class FactorError(NamedTuple):
     """Error of a submap against the world, and its Jacobian."""
 
-    error: Array
-    """e, shape (3 + 2n,)."""
-    jacobian: Array
-    """∂e/∂(F_k, F_{k+1}, landmarks), shape (3 + 2n, 6 + 2n)."""
+    error: Array  # e, shape (3 + 2n,)
+    jacobian: Array  # ∂e/∂(F_k, F_{k+1}, landmarks), shape (3 + 2n, 6 + 2n)
 
 
 def factor_error(

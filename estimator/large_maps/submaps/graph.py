@@ -401,12 +401,9 @@ class ActiveSubmap:
 class ClosingRule(NamedTuple):
     """Limits of a submap; infinite ones have no effect."""
 
-    size: int
-    """Number of landmarks."""
-    heading: float
-    """Standard deviation of the heading in the frame of the submap [rad]."""
-    extent: float
-    """Distance of the robot from the origin of the frame [m]."""
+    size: int  # number of landmarks
+    heading: float  # standard deviation of the heading in the frame of the submap [rad]
+    extent: float  # distance of the robot from the origin of the frame [m]
 
     @classmethod
     def checked(
