@@ -256,10 +256,7 @@ def _outward(
 
 @jit
 def _find_near(
-    moves: tuple[Array, Array, Array, Array],
-    walls: Array,
-    reach: float,
-    near: IntArray,
+    moves: tuple[Array, Array, Array, Array], walls: Array, reach: float, near: IntArray
 ) -> int:
     """List the moves (x, y, dx, dy) that come within reach of a wall; return how many.
 

@@ -249,9 +249,7 @@ def _kind_of_new(place: int, in_map: Mapping[int, int]) -> str:
     return "duplicate" if place in in_map.values() else "new_correct"
 
 
-def _owners(
-    scans: Iterator[tuple[ScanDecisions, list[int]]],
-) -> dict[int, int]:
+def _owners(scans: Iterator[tuple[ScanDecisions, list[int]]]) -> dict[int, int]:
     """Return whose reading confirmed each landmark."""
     owners: dict[int, int] = {}
     for made, truth in scans:

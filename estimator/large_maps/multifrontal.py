@@ -538,6 +538,20 @@ def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:
         raise ValueError("state['matrix_blocks'] must be a symmetric matrix")
 
 
+_ROWS = 128  # that are copied at a time
+
+
+def symmetric(covariance: Array) -> Array:
+    """Copy the lower half into the upper one, in place."""
+    n = len(covariance)
+    for first in range(0, n, _ROWS):
+        last = min(first + _ROWS, n)
+        own = covariance[first:last, first:last]
+        own[:] = np.tril(own) + np.tril(own, -1).T
+        covariance[first:last, last:] = covariance[last:, first:last].T
+    return covariance
+
+
 def pairs(places: Sequence[int] | IntArray) -> IntArray:
     """Return the two columns of each landmark, in turn: 2 p, 2 p + 1.
 

@@ -12,10 +12,7 @@ import numpy as np
 from stonesoup.base import Property
 from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
 from stonesoup.models.transition.nonlinear import GaussianTransitionModel
-from stonesoup.predictor.kalman import (
-    ExtendedKalmanPredictor,
-    UnscentedKalmanPredictor,
-)
+from stonesoup.predictor.kalman import ExtendedKalmanPredictor, UnscentedKalmanPredictor
 from stonesoup.types.angle import Bearing
 from stonesoup.types.array import CovarianceMatrix, StateVector, StateVectors
 from stonesoup.types.detection import Detection

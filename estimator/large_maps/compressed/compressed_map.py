@@ -21,8 +21,8 @@ from ...support.argument_checks import LOWEST_ID
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
-from ..multifrontal import pairs
-from .deferred_covariance import BLOCK, DeferredCovariance, subtract, symmetric
+from ..multifrontal import pairs, symmetric
+from .deferred_covariance import BLOCK, DeferredCovariance, subtract
 from .phase_update import (
     Handover,
     Phase,

@@ -28,13 +28,12 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
-from ..multifrontal import pairs
+from ..multifrontal import pairs, symmetric
 from .deferred_covariance import (
     BLOCK,
     DeferredCovariance,
     fill_extended,
     subtract,
-    symmetric,
     unpivot,
 )
 
@@ -56,11 +55,7 @@ def virtual_landmarks(coordinates: int, invariant: bool) -> int:
 
 
 def begin_phase(
-    slam: EkfSlam,
-    mean: Array,
-    rows: Array,
-    reference: Array,
-    ids: list[int],
+    slam: EkfSlam, mean: Array, rows: Array, reference: Array, ids: list[int]
 ) -> None:
     """Replace the map of a filter by the extension, followed by a local map.
 
