@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..filters.ekf import MotionNoise, checked_rules
-from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE, Rules
+from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE
 from ..kernels.scan_update import predict
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import pose_rotation
@@ -88,13 +88,23 @@ class Drive:
         min_range: float = 1e-3,
     ) -> None:
         self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest)
-        self.rules = _sensor_rules(
+        self.rules = rules = checked_rules(
             measurement_std,
-            range_std_per_metre,
-            bearing_std_metres,
-            range_noise_at,
-            min_range,
+            linearisation=AT_ESTIMATE,
+            frame=ADDITIVE,
+            landmark_init="full",
+            range_std_per_metre=range_std_per_metre,
+            bearing_std_metres=bearing_std_metres,
+            range_noise_at=range_noise_at,
+            gate_probability=None,
+            min_range=min_range,
         )
+        bearing_noise = rules.bearing_std or rules.bearing_std_metres
+        if not (bearing_noise and (rules.range_std or rules.range_std_per_metre)):
+            raise ValueError(
+                "measurement_std must be > 0 to smooth, got "
+                f"({rules.bearing_std:g}, {rules.range_std:g})"
+            )
         self.initial_pose = argument_checks.finite_vector(
             "initial_pose", initial_pose, 3
         )
@@ -231,39 +241,8 @@ class Drive:
         return Motion(tuple(steps), pose, covariance)
 
     def __repr__(self) -> str:
-        readings = sum(len(scan.ids) for scans in self._sightings for scan in scans)
-        landmarks = len(self.landmark_ids)
-        return (
-            f"Drive of {self.poses} poses, {readings} readings of {landmarks} landmarks"
-        )
-
-
-def _sensor_rules(
-    measurement_std: ArrayLike,
-    range_std_per_metre: float,
-    bearing_std_metres: float,
-    range_noise_at: str,
-    min_range: float,
-) -> Rules:
-    """Return the noise of the sensor as rules; refuse a sensor without noise."""
-    rules = checked_rules(
-        measurement_std,
-        linearisation=AT_ESTIMATE,
-        frame=ADDITIVE,
-        landmark_init="full",
-        range_std_per_metre=range_std_per_metre,
-        bearing_std_metres=bearing_std_metres,
-        range_noise_at=range_noise_at,
-        gate_probability=None,
-        min_range=min_range,
-    )
-    bearing_noise = rules.bearing_std or rules.bearing_std_metres
-    if not (bearing_noise and (rules.range_std or rules.range_std_per_metre)):
-        raise ValueError(
-            "measurement_std must be > 0 to smooth, got "
-            f"({rules.bearing_std:g}, {rules.range_std:g})"
-        )
-    return rules
+        readings = f"{self.readings} readings of {len(self.landmark_ids)} landmarks"
+        return f"Drive of {self.poses} poses, {readings}"
 
 
 # --------------------------------------------------------------------------------------
