@@ -7,6 +7,7 @@ limits the links of the pose.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,13 @@ from numpy.typing import ArrayLike
 from scipy.linalg import lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
-from ...filters.ekf import EkfSlam, MotionNoise, reading_variances
+from ...filters.ekf import (
+    EkfSlam,
+    FirstEstimatesEkfSlam,
+    MotionNoise,
+    ObservabilityConstrainedEkfSlam,
+    reading_variances,
+)
 from ...filters.gaussian_map import not_positive_definite
 from ...interface import UpdateReport
 from ...models.bearing_range import locate_landmark, predict_measurement, wrap_angle
@@ -168,7 +175,7 @@ class ScanRules:
         base: str,
         **settings: Any,
     ) -> None:
-        self.base = argument_checks.one_of("base", base, BASES)
+        self.base = argument_checks.one_of("base", base, tuple(BASES))
         unknown = set(settings) - {
             "range_std_per_metre",
             "range_noise_at",
@@ -179,7 +186,10 @@ class ScanRules:
         }
         if unknown:
             raise TypeError(f"SparseInformationSlam has no option {min(unknown)!r}")
-        self.rules = EkfSlam(motion_std, measurement_std, **settings).rules
+        noise = np.array(motion_std), np.array(measurement_std)
+        self.dense = partial(BASES[base], *noise, **settings)
+        """Makes the filter of the same belief in dense form."""
+        self.rules = self.dense().rules
         at_rest = settings.get("noise_at_rest", True)
         self.motion_noise = MotionNoise.checked(motion_std, at_rest)
         bearing_std = self.rules.bearing_std + self.rules.bearing_std_metres
@@ -275,11 +285,12 @@ def _factor(S: Array, ids: list[int]) -> Array:
 # of a landmark use the same l̄, the information of the whole map does not observe it
 # either.
 
-ESTIMATE, FIRST, CONSTRAINED = BASES = (
-    "ekf",
-    "first_estimates",
-    "observability_constrained",
-)
+ESTIMATE, FIRST, CONSTRAINED = "ekf", "first_estimates", "observability_constrained"
+BASES: dict[str, type[EkfSlam]] = {
+    ESTIMATE: EkfSlam,
+    FIRST: FirstEstimatesEkfSlam,
+    CONSTRAINED: ObservabilityConstrainedEkfSlam,
+}
 
 
 def linearise_scan(

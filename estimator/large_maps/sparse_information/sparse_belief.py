@@ -9,9 +9,11 @@ from math import inf
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
+from ...filters.ekf import EkfSlam
+from ...models.rigid_motion import as_covariance
 from ...support.undo import Undo, attributes, contents, undone_on_error
 from ..elimination import RestFactor
 from ..multifrontal import SchurComplement, pairs
@@ -58,6 +60,26 @@ class SparseBelief:
         nothing = np.empty(0, dtype=np.int64)
         local, start = begin_local_map(map_, start, nothing, FIRST_COUNT)
         return cls({}, [], map_, local, start, pose[:2].copy())
+
+    @classmethod
+    def of(cls, slam: EkfSlam) -> SparseBelief:
+        """Return the belief of a dense filter, with all landmarks in the local map."""
+        (mean, P, reference), n = slam.map.arrays, slam.map.size
+        slots = np.arange(len(slam.map.slots))
+        belief = cls.empty(mean[:3], np.zeros(3))
+        belief.add(list(slam.map.slots), slots.tolist())
+        inverse = cho_solve(cho_factor(P[3:n, 3:n], lower=True), np.eye(n - 3))
+        gain, rest = P[:3, 3:n] @ inverse, P[:3, :3].copy()
+        rest -= gain @ P[3:n, :3]
+        belief.local = replace(
+            belief.local.extended(slots, mean[3:n]),
+            first=reference[3:n].copy(),
+            information=(inverse + inverse.T) / 2,
+        )
+        belief.pose = ConditionalPose(
+            mean[:3].copy(), gain, as_covariance(rest), reference[:2].copy()
+        )
+        return belief
 
     def free_slots(self, count: int) -> IntArray:
         """Return slots for new landmarks."""
