@@ -24,14 +24,10 @@ D, A, _ = range(3)  # criteria of the map, in the order of `CRITERIA`
 class Episodes(NamedTuple):
     """The progress of the episodes of B worlds, which the pass changes in place."""
 
-    explored: BoolArray
-    """Cells seen so far, as believed, shape (B, C)."""
-    steps: IntArray
-    """Steps so far, shape (B,)."""
-    uncertainty: Array
-    """Of the map, see `information_reward.uncertainty`, shape (B,)."""
-    known: BoolArray
-    """Landmarks known to the required accuracy, shape (B, N)."""
+    explored: BoolArray  # cells seen so far, as believed, shape (B, C)
+    steps: IntArray  # steps so far, shape (B,)
+    uncertainty: Array  # of the map, see `information_reward.uncertainty`, shape (B,)
+    known: BoolArray  # landmarks known to the required accuracy, shape (B, N)
 
 
 class StepOutcome(NamedTuple):
@@ -46,17 +42,15 @@ class StepOutcome(NamedTuple):
 class Worlds(NamedTuple):
     """All that the pass reads and writes of B worlds."""
 
-    beliefs: tuple[Array, Array, IntArray]
-    """A `BatchStorage`."""
+    beliefs: tuple[Array, Array, IntArray]  # a `BatchStorage`
     actions: Array
     collisions: BoolArray
     episodes: Episodes
     outcome: StepOutcome
-    counts: tuple[IntArray, IntArray]
-    """Landmarks mapped and known, (B,)."""
+    counts: tuple[IntArray, IntArray]  # landmarks mapped and known, (B,)
     belief_features: FeatureArrays
+    # Goals, progress, uncertain, unexplored and walls, see `ActiveSlamTask`.
     features: tuple[Array, Array, Array, Array, Array]
-    """Goals, progress, uncertain, unexplored and walls, see `ActiveSlamTask`."""
 
 
 class Rules(NamedTuple):
@@ -68,14 +62,10 @@ class Rules(NamedTuple):
     crash_cost: float
     effort_cost: float
     step_cost: float
-    limits: tuple[float, float]
-    """Largest speed and turn rate [m/s, rad/s]."""
-    longest_step: float
-    """[m]"""
-    steps: int
-    """Of an episode."""
-    prior_std: tuple[float, float]
-    """Of an unmapped landmark [m]."""
+    limits: tuple[float, float]  # largest speed and turn rate [m/s, rad/s]
+    longest_step: float  # [m]
+    steps: int  # of an episode
+    prior_std: tuple[float, float]  # of an unmapped landmark [m]
 
 
 class Scratch(NamedTuple):

@@ -28,12 +28,9 @@ START_FLOOR = 1e-6
 class Readings(NamedTuple):
     """Readings of one scan, with their variances."""
 
-    measurements: Array
-    """Rows (β, r), shape (m, 2) [rad, m]."""
-    slots: IntArray
-    """Place of each landmark in the map, shape (m,)."""
-    variances: Array
-    """(σβ², σr²), shape (m, 2)."""
+    measurements: Array  # rows (β, r), shape (m, 2) [rad, m]
+    slots: IntArray  # place of each landmark in the map, shape (m,)
+    variances: Array  # (σβ², σr²), shape (m, 2)
 
 
 class Innovation(NamedTuple):

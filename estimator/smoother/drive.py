@@ -23,12 +23,11 @@ from ..support import argument_checks
 class Motion(NamedTuple):
     """The odometry between two poses."""
 
+    # (d, α, dt) of each reading [m, rad, -].
     steps: tuple[tuple[float, float, float], ...]
-    """(d, α, dt) of each reading [m, rad, -]."""
+    # Where they lead, in the frame of the first pose, shape (3,) [m, m, rad].
     increment: Array
-    """Where they lead, in the frame of the first pose, shape (3,) [m, m, rad]."""
-    covariance: Array
-    """Of the noise in that frame, shape (3, 3)."""
+    covariance: Array  # of the noise in that frame, shape (3, 3)
 
 
 class Sightings(NamedTuple):

@@ -44,12 +44,9 @@ FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
 class Noise(NamedTuple):
     """The noise of the sensor, and how much an outlier counts."""
 
-    rules: Rules
-    """Of a filter, which hold the noise."""
-    kind: float
-    """Of the robust kernel, one of `KINDS`."""
-    scale: float
-    """Of the robust kernel, in standard deviations."""
+    rules: Rules  # of a filter, which hold the noise
+    kind: float  # of the robust kernel, one of `KINDS`
+    scale: float  # of the robust kernel, in standard deviations
 
 
 class Estimate(NamedTuple):

@@ -222,7 +222,8 @@ class ScanRules:
         blocks = np.array(
             [S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(places))]
         ).reshape(-1, 2, 2)
-        refused = _squared_distances(scan.innovation, blocks) > self.rules.gate
+        solved = np.linalg.solve(blocks, scan.innovation[..., None])[..., 0]
+        refused = (scan.innovation * solved).sum(axis=1) > self.rules.gate
         gated, near = np.zeros_like(skipped), np.zeros_like(skipped)
         gated[kept], near[kept] = refused, _is_too_near(scan, blocks, expected[kept])
         used = np.repeat(~refused, 2)
@@ -244,12 +245,6 @@ def _innovation_covariance(
     H, N = marginalise_pose(pose, scan)
     spread = solve_triangular(local.solver()[0], H.T, lower=True, check_finite=False)
     return np.asarray(spread.T @ spread + N)
-
-
-def _squared_distances(innovation: Array, blocks: Array) -> Array:
-    """Return the NIS of each measurement alone, shape (n,)."""
-    solved = np.linalg.solve(blocks, innovation[..., None])[..., 0]
-    return np.asarray((innovation * solved).sum(axis=1))
 
 
 def _is_too_near(scan: LinearScan, blocks: Array, distance: Array) -> BoolArray:

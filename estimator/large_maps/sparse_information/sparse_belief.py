@@ -152,7 +152,8 @@ class SparseBelief:
 
     def enlarge_elimination(self) -> None:
         """Keep the local map, and eliminate more landmarks around it."""
-        self._change_local_map(self.local.slots, self._larger_count())
+        count = larger_elimination_count(self.count, len(self.slots))
+        self._change_local_map(self.local.slots, count)
         self.enlarged = True
 
     def remove(self, ids: Sequence[int], *, exact: bool) -> None:
@@ -229,9 +230,6 @@ class SparseBelief:
         return first_elimination_count(
             self.count, len(self.slots), enlarged=self.enlarged
         )
-
-    def _larger_count(self) -> float:
-        return larger_elimination_count(self.count, len(self.slots))
 
     def _change_local_map(self, slots: IntArray, count: float) -> None:
         """Write the local map back, and begin another one."""

@@ -485,17 +485,12 @@ def merged(submap: Submap, renamed: Mapping[int, int], frame: ErrorFrame) -> Sub
     for place, slot in enumerate(slots):
         kept = first.setdefault(slot, place)
         if kept != place:
-            mean, covariance = _coincided(mean, covariance, kept, place, frame)
+            corrected = coincide(mean, covariance, kept, place)
+            mean = retract(mean, corrected.mean - mean, frame)
+            covariance = corrected.covariance
             gone.append(place)
     return Submap(
         np.array(list(first), dtype=np.int64),
         without_landmarks(mean, gone),
         without_landmarks(covariance, gone),
     )
-
-
-def _coincided(
-    mean: Array, covariance: Array, kept: int, gone: int, frame: ErrorFrame
-) -> tuple[Array, Array]:
-    corrected = coincide(mean, covariance, kept, gone)
-    return retract(mean, corrected.mean - mean, frame), corrected.covariance

@@ -141,10 +141,8 @@ Complex = ComplexArray
 class Gaussian(NamedTuple):
     """Mean of a pose and n landmarks, and the covariance of its additive error."""
 
-    mean: Array
-    """(x, y, θ, l1x, l1y, …), shape (3 + 2n,)."""
-    covariance: Array
-    """Shape (3 + 2n, 3 + 2n)."""
+    mean: Array  # (x, y, θ, l1x, l1y, …), shape (3 + 2n,)
+    covariance: Array  # (3 + 2n, 3 + 2n)
 
 
 def times(factor: complex, rows: Array) -> Array:

@@ -346,7 +346,8 @@ def _fill_map(covariance: Array, world: Gaussian, lever: Array, V: Array) -> Non
         return
     d = lever - state_of(1j * points_of(world.mean), 0.0)
     u = P[2] + d * (P[2, 2] / 2)
-    scale = np.sqrt(np.linalg.norm(u) / max(np.linalg.norm(d), 1e-300))
+    sizes = float(np.linalg.norm(u)), float(np.linalg.norm(d))
+    scale = np.sqrt(sizes[0] / sizes[1]) if all(sizes) else 1.0
     both, gap = scale * d + u / scale, scale * d - u / scale
     lost = [gap / np.sqrt(2), *(V[:, :cut] + np.outer(V[:, 2], lever))]
     for sign, rows in ((1.0, [both / np.sqrt(2)]), (-1.0, lost)):
@@ -421,11 +422,6 @@ class ActiveSubmap:
         return self.filter.map.mean[:3]
 
     @property
-    def heading_variance(self) -> float:
-        """Variance of the heading in the frame of the submap [rad²]."""
-        return float(self.filter.map.covariance[2, 2])
-
-    @property
     def pose_covariance(self) -> Array:
         """Covariance of the additive pose error, shape (3, 3)."""
         return self.filter.map.covariance[:3, :3].copy()
@@ -491,7 +487,7 @@ class ClosingRule(NamedTuple):
         own_size = SIZE if readings <= SIZE else 2 * readings
         return (
             len(active) >= (self.size or own_size)
-            or active.heading_variance > self.heading**2
+            or active.pose_covariance[2, 2] > self.heading**2
             or hypot(x, y) > self.extent
         )
 
