@@ -87,7 +87,7 @@ class TextbookEkf:
         J, B = np.eye(len(self.x) + 2, len(self.x)), np.zeros((len(self.x) + 2, 2))
         J[-2:, :3] = (1, 0, -r * s), (0, 1, r * c)
         B[-2:] = (-r * s, c), (r * c, s)
-        self.x = np.append(self.x, self.x[:2] + (r * c, r * s))
+        self.x = np.append(self.x, self.x[:2] + np.array([r * c, r * s]))
         self.P = J @ self.P @ J.T + B @ self.Q @ B.T
         self.ids.append(landmark)
 
