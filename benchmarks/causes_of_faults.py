@@ -184,8 +184,6 @@ def with_noise(runs: Any, column: int, noise: Array) -> Any:
     return runs._replace(measurements=measurements)
 
 
-G, F = "G[:3, :3] = moved.jacobian_pose", "F @ self._R @ F.T * dt"
-ACROSS, HEADING = "across = Fp @ self._P[:3]", "expected.jacobian_pose[k]"
 FAULTS = (
     Fault("bearing mirrored in the filter", (MODEL,), input=mirrored),
     Fault("scan one step late", (MODEL,), input=late),
@@ -193,7 +191,7 @@ FAULTS = (
     Fault(
         "sign error in G",
         (COVARIANCE,),
-        textbook(G, f"{G} * [[1, 1, -1], [1, 1, -1], [1, 1, 1]]"),
+        textbook("G[:2, 2] = -d * s, d * c", "G[:2, 2] = d * s, -d * c"),
     ),
     Fault("bias .006 rad in the filter", (MODEL,), input=biased),
     Fault(
@@ -212,14 +210,15 @@ FAULTS = (
     Fault(
         "no wrap",
         (MODEL,),
-        textbook("innovation[:, 0] = wrap_angle(innovation[:, 0])", ""),
+        textbook("nu[::2] = wrap_angle(nu[::2])", ""),
     ),
     Fault(
         "covariance of the pose and the map not moved",
         (COVARIANCE,),
         textbook(
-            "self._P = G @ self._P @ G.T",
-            "self._P[:3, :3] = G[:3, :3] @ self._P[:3, :3] @ G[:3, :3].T",
+            "self.P = G @ self.P @ G.T + F @ self.R @ F.T * dt",
+            "A, B = G[:3, :3], F[:3]\n        "
+            "self.P[:3, :3] = A @ self.P[:3, :3] @ A.T + B @ self.R @ B.T * dt",
         ),
     ),
     Fault("ranges 2 % too long", (MODEL,), input=long),
@@ -228,18 +227,24 @@ FAULTS = (
         (COVARIANCE,),
         textbook("np.square(measurement_std)", "np.square(measurement_std) / 4"),
     ),
-    Fault("motion noise not rotated", (COVARIANCE,), textbook(F, "self._R * dt")),
+    Fault(
+        "motion noise not rotated",
+        (COVARIANCE,),
+        textbook("F[:2, :2] = (c, -s), (s, c)", ""),
+    ),
     Fault("odometry one step late", (MODEL,), input=late_odometry),
     Fault(
         "no heading in H",
         (COVARIANCE,),
-        textbook(HEADING, f"{HEADING} * [[1, 1, 0], [1, 1, 1]]"),
+        textbook("-dx / r**2, -1)", "-dx / r**2, 0)"),
     ),
     Fault("two identities swapped", (MODEL,), input=swapped),
     Fault(
         "new landmark without the noise of its range",
         (COVARIANCE,),
-        textbook(ACROSS, f"Fz = Fz * [1, 0]; {ACROSS}"),
+        textbook(
+            "B[-2:] = (-r * s, c), (r * c, s)", "B[-2:] = (-r * s, 0), (r * c, 0)"
+        ),
     ),
 )
 UNSURE = {"start": {"std": [0.3, 0.3, 0.001], "drawn": "truth"}}

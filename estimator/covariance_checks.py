@@ -59,7 +59,7 @@ class _Call(NamedTuple):
     """One call: its equation, and what the equation needs."""
 
     method: str
-    equation: Callable[[Array, Array, Array], _Gaussian]
+    equation: Callable[..., _Gaussian]
     """Of both Jacobians and the covariance of the noise."""
     jacobians: tuple[Array, Array]
     rows: tuple[str, ...]
@@ -238,7 +238,7 @@ def _correction(mean: Array, P: Array, readings: Array) -> _Call:
         for k, each in enumerate(Hl):
             H[2 * k : 2 * k + 2, 3 + 2 * k : 5 + 2 * k] = each
         S = H @ P @ H.T + np.kron(np.eye(len(Hl)), Q)
-        return np.linalg.solve(S, H @ P).T, S
+        return np.asarray(np.linalg.solve(S, H @ P).T), np.asarray(S)
 
     def corrected(P: Array, K: Array, S: Array) -> _Gaussian:
         nis = float(nu @ np.linalg.solve(S, nu))
