@@ -4,9 +4,9 @@
 
 Each of 23 faults, of a filter or of its readings, is tried in three worlds where the
 filter without the fault is consistent, and 20 studies have none. An answer is right if
-it is the one named in the table, or if the fault changes so little that the verdict is
-not "not consistent"; "cannot tell" is counted by itself. `--seed` gives other worlds
-than those with which the rules were developed.
+it names the kind of the fault, or if the fault changes so little that the verdict is
+"consistent" or "nearly consistent"; "cannot tell" is counted by itself. `--seed` gives
+other worlds than those with which the rules were developed.
 """
 
 from __future__ import annotations
@@ -287,7 +287,8 @@ def answer(world: Scenario, fault: Fault, runs: int, seed: int) -> dict[str, Any
 def rating(fault: Fault, entry: dict[str, Any]) -> str:
     """Rate an answer: "right", "undecided" or "wrong"."""
     cause = entry["diagnosis"]["cause"]
-    if cause in fault.right or entry["verdict"] != "not consistent":
+    is_accepted = entry["verdict"] in ("consistent", "nearly consistent")
+    if cause in fault.right or (is_accepted and cause in ("honest", CANNOT_TELL)):
         return "right"
     return "undecided" if cause == CANNOT_TELL else "wrong"
 
