@@ -161,7 +161,7 @@ def answers(
     for repetition in range(repetitions):
         first = seed + runs * repetition
         with monte_carlo(
-            scenario, world.estimator, runs, first, assumed=assumed
+            scenario, world.estimator, runs, first, assumed=assumed, small_noise=True
         ) as results:
             counts[cause_of(results)] += 1
             ratios.append(float(results.pose_nees_invariant[:, :, 1:].mean() / 3))

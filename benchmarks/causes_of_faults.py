@@ -279,7 +279,9 @@ def changed_runs(fault: Fault) -> Iterator[None]:
 def answer(world: Scenario, fault: Fault, runs: int, seed: int) -> dict[str, Any]:
     """Return the entry of the summary of one study."""
     with changed_runs(fault):
-        results = monte_carlo(world, {"filter": fault.estimator}, runs, seed)
+        results = monte_carlo(
+            world, {"filter": fault.estimator}, runs, seed, small_noise=True
+        )
     entry: dict[str, Any] = summarise_monte_carlo(results)["estimators"]["filter"]
     return entry
 

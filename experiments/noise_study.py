@@ -273,7 +273,6 @@ def noise_effects(
             assumed=assumed,
             jobs=jobs,
             backend=backend,
-            small_noise=False,
         )
         effects += [
             _effect(place, variation, scores_of(results, label, "invariant"))

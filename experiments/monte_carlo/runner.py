@@ -76,7 +76,7 @@ def monte_carlo(
     resolution: float = 0.0,
     command: str = "",
     progress: Progress | None = None,
-    small_noise: bool = True,
+    small_noise: bool = False,
 ) -> xr.Dataset:
     """Run estimators many times over a scenario, and measure every run.
 
@@ -119,7 +119,8 @@ def monte_carlo(
         Called with (runs done, runs) after every block.
     small_noise : bool
         Whether to repeat some runs of a filter that is not consistent with less noise,
-        which shows the cause; see :func:`~slamgym.evaluation.diagnose`.
+        which shows the cause; see :func:`~slamgym.evaluation.diagnose`. The command
+        does so. The results then have the variables `SMALL_NOISE` too.
 
     Returns
     -------
@@ -229,7 +230,6 @@ def _repeated(
                 assumed=with_less_noise(job.assumed, factor),
                 block_size=job.block_size,
                 first_run=asked.start,
-                small_noise=False,
                 **engine,
             )
             averages = averages_of(scores_of(small, choice.label, "invariant"))
