@@ -46,6 +46,9 @@ POLICIES = {
 }
 
 
+OTHERS = sorted(set(list_estimators()) - {"ekf", "submaps"})
+
+
 def make(name, managed):
     if name == "smoother":
         return SmoothingSlam(**NOISE)
@@ -133,7 +136,11 @@ def settled(name, policy):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "policy"),
-    [*((n, p) for n in list_estimators() for p in POLICIES), ("smoother", "none")],
+    [
+        *((n, p) for n in ("ekf", "submaps") for p in POLICIES),
+        *((n, p) for n in OTHERS for p in ("none", "tidy_hypotheses")),
+        ("smoother", "none"),
+    ],
 )
 def test_a_pickled_filter_continues_bit_for_bit(name, policy):
     slam, rest = settled(name, POLICIES[policy])

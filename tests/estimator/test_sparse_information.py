@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import forked
 import numpy as np
 import pytest
 from comparison import assert_same_bits
@@ -404,26 +403,6 @@ def test_removing_landmarks_changes_nothing_about_the_others():
     assert len(slam.belief().landmark_ids) == len(stays) + 2
 
 
-def continued(saved, steps):
-    slam = sparse(*NOISE, active_bound=12)
-    slam.load_state_dict(np.load(saved))
-    return run(slam, list(wander(1000, 400))[steps:]).belief()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("steps", [137, 301])
-def test_another_process_continues_with_the_same_bits(tmp_path, steps):
-    drive = list(wander(1000, 400))
-    slam = run(sparse(*NOISE, active_bound=12), drive[:steps])
-    slam.belief([])  # asking leaves no trace
-    np.savez(tmp_path / "saved.npz", **slam.state_dict())
-    run(slam, drive[steps:])
-    result = forked.result_of(continued, tmp_path / "saved.npz", steps)
-    belief = slam.belief()
-    assert len(belief.landmark_ids) > 1.3 * len(slam.local_ids)
-    assert_same_bits(result, belief)
-
-
 def test_a_saved_state_that_does_not_fit_is_refused_and_nothing_changes():
     slam = run(sparse(*NOISE, active_bound=12), wander(1000, 300))
     assert len(slam.landmark_ids) > len(slam.local_ids)
@@ -671,7 +650,7 @@ def test_readings_are_blind_to_a_turn_of_the_map_at_its_first_estimates(base, bo
 @pytest.mark.slow
 def test_in_the_loop_constrained_jacobians_make_relocating_honest():
     # Seven times overconfident as ekf, with four landmarks that may be linked.
-    world, runs = load_scenario("loop"), 3
+    world, runs = load_scenario("loop"), 2
     data, nees = simulate_runs(world, runs, 0), []
     for run_ in range(runs):
         slam = sparse(
