@@ -26,6 +26,7 @@ from ...evaluation.hypothesis_tests import (
 from ..runs.trace import finite, mean, quotient, root_mean_square
 from .run_measures import COUNTS, KNOWN_IDS_ATE, MAPS, MARGIN, PREFIX, SHARES
 from .verdict import (
+    FITTED,
     POINT_FREEDOM,
     POSE_FREEDOM,
     EstimatorScores,
@@ -142,7 +143,8 @@ def summarise_estimator(
     """
     found = _computed(scores, frame)
     claimed = found["heading_std_end"]["claimed"]
-    report = _report_of(scores, frame) if scores.good.sum() > 1 else None
+    decides = scores.good.sum() > 1 and not scores.is_fitted
+    report = _report_of(scores, frame) if decides else None
     return {
         **_verdict(scores, report, claimed, knowable),
         "good_runs": int(scores.good.sum()),
@@ -163,7 +165,9 @@ def _verdict(
     knowable: float,
 ) -> dict[str, Any]:
     """Write the verdict on an estimator, and the decisions behind it."""
-    verdict = judge(report, len(scores.failures), len(scores.good))
+    verdict = FITTED
+    if not scores.is_fitted:
+        verdict = judge(report, len(scores.failures), len(scores.good))
     return {
         "verdict": verdict.word,
         "reason": verdict.reason,
