@@ -23,7 +23,9 @@ from ..evaluation.nees import pose_nees
 
 FEWEST_DRIVES = 5
 """Drives from which on covariances are read in other conventions."""
-_MOST_DRIVES, _STEPS, _SHIFT = 200, 24, 3
+MOST_DRIVES = 200
+"""Drives that are read so."""
+_STEPS, _SHIFT = 24, 3
 _NEAR, _FAR, _ERRORS = 1.5, 2.5, 3.0
 """An honest square is within a factor _NEAR of 1 or _ERRORS standard errors, not beyond
 the factor _FAR."""
@@ -87,7 +89,7 @@ def mistake_in(
     """
     if np.array_equal(truth, poses, equal_nan=True):
         return "the poses are the true ones to the last digit, not estimates."
-    drives = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))[:_MOST_DRIVES]
+    drives = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))[:MOST_DRIVES]
     last = truth.shape[1] - 1
     reach = min(_SHIFT, (last - 1) // 2)
     steps = np.unique(np.linspace(1 + reach, last - reach, _STEPS).round().astype(int))
@@ -109,7 +111,7 @@ def mistake_in(
     found = None
     if len(drives) >= FEWEST_DRIVES:
         groups = claims, [r for own in others for r in own[:2]]
-        both = [r for own in others for r in own[2:]]
+        both = [r for own in others if _gain(exact, own[0], before) for r in own[2:]]
         for group in (*groups, both):
             found = found or _honest(exact, group, before)
     if found is not None:
@@ -162,17 +164,23 @@ def _honest(
     return max(honest, key=lambda pair: round(pair[1].likelihood, 6))
 
 
+def _gain(truth: Array, reading: Reading, before: _Fit) -> float:
+    """Return by how much the errors of poses fall [nats]; 0 if it is not far."""
+    sizes = [
+        np.log(np.maximum(fit.errors, 1e-9)).sum()
+        for fit in (before, _fit(truth, reading))
+    ]
+    gain = float(sizes[0] - sizes[1])
+    return gain if gain > np.log(_SMALLER) else 0.0
+
+
 def _nearer(truth: Array, readings: Sequence[Reading], before: _Fit) -> str:
     """Name the reading whose errors are far smaller, though not honest."""
-    fits = [(reading, _fit(truth, reading)) for reading in readings]
-
-    def size(fit: _Fit) -> float:
-        return float(np.log(np.maximum(fit.errors, 1e-9)).sum())
-
-    reading, fit = min(fits, key=lambda pair: size(pair[1]))
-    if size(fit) > size(before) - np.log(_SMALLER):
+    gains = [_gain(truth, reading, before) for reading in readings]
+    reading = readings[int(np.argmax(gains))]
+    if not max(gains) > 0:
         return ""
-    (place, turn), (was_place, was_turn) = fit.errors, before.errors
+    (place, turn), (was_place, was_turn) = _fit(truth, reading).errors, before.errors
     return (
         f"{reading.name}: read so, the median errors are {place:.2g} m and {turn:.2g} "
         f"rad instead of {was_place:.2g} m and {was_turn:.2g} rad."

@@ -25,7 +25,7 @@ from ..evaluation.nees import normalised_squared_error
 from ..evaluation.noise_findings import CHANNELS, MOMENTS
 from ..evaluation.trajectory_error import Alignment, align_positions, poses_at
 from ..sim_configs.scenario_files import scenario_text
-from .conventions import additive_covariances, mistake_in, swapped_drives
+from .conventions import MOST_DRIVES, additive_covariances, mistake_in, swapped_drives
 from .estimate_files import (
     Estimate,
     beliefs_of,
@@ -45,7 +45,7 @@ from .monte_carlo.run_measures import (
     measure_runs,
 )
 from .runs.simulated_runs import SimulatedRuns
-from .trajectories.manifest import MANIFEST, load_trajectories
+from .trajectories.manifest import MANIFEST, TrajectoryDataset, load_trajectories
 from .trajectories.trajectory import Trajectory, array_of
 
 if TYPE_CHECKING:
@@ -57,6 +57,9 @@ FRAMES = {"additive": "additive", "invariant": "invariant", "right": "invariant"
           "left": "left"}  # fmt: skip
 """The errors of covariances; the invariant error is the right-invariant one."""
 _BOUNDS = ("position_bound", "position_bound_raw", "heading_bound", "map_bound")
+_NO_BOUND = PosteriorBound(*(np.array(np.nan) for _ in _BOUNDS), ())
+"""For estimates without a map: what came later may be in their poses."""
+NO_FILE = "there is no file of estimates"
 _AT_ONCE = 100  # drives in memory
 _ON_TIME = 0.01  # of a step
 _SYMMETRIC = 1e-6  # relative difference of two entries
@@ -185,51 +188,61 @@ class _Part(NamedTuple):
 def _drives(place: Place | None, sources: dict[str, list[Path]]) -> _Task:
     """Match estimates with the drives of a data set, by their seeds."""
     if place is None:
-        (place, *more) = [p for paths in sources.values() for p in paths]
-        if more or not (Path(place) / MANIFEST).is_file():
+        (place, *more) = [path for paths in sources.values() for path in paths]
+        if more or not (place / MANIFEST).is_file():
             raise ValueError(
                 "drives must be the folder of slamgym generate that holds the truth, "
                 f"or truth must be given: {place} holds no truth"
             )
     folder, data = Path(place), load_trajectories(place)
-    job, seeds = data.manifest.job, range(0)
-    shards = [range(s.first_episode, s.first_episode + s.episodes)
-              for s in data.manifest.shards]  # fmt: skip
-    seeds = [job.seed + k for shard in shards for k in shard]
-    found = {
-        label: None if [p.resolve() for p in paths] == [folder.resolve()]
-        else read_estimates(paths)
-        for label, paths in sources.items()
-    }  # fmt: skip
-    for label, each in found.items():
-        if each is not None and not set(each) & set(seeds):
-            name = next(iter(each))
+    job = data.manifest.job
+    seeds = [
+        job.seed + shard.first_episode + k
+        for shard in data.manifest.shards
+        for k in range(shard.episodes)
+    ]
+    found: dict[str, dict[Any, Estimate] | None] = {}
+    for label, paths in sources.items():
+        is_own = [path.resolve() for path in paths] == [folder.resolve()]
+        found[label] = files = None if is_own else read_estimates(paths)
+        if files is not None and not set(files) & set(seeds):
             raise ValueError(
                 f"no estimates of {label} match a drive of {folder}: files must be "
-                f"named after the seeds {min(seeds)} to {max(seeds)}, such as "
-                f"seed_{min(seeds):08d}.csv, got {each[name].file}"
+                f"named after its seeds, such as seed_{seeds[0]:08d}.csv, got "
+                f"{next(iter(files.values())).file}"
             )
-
-    def chunks() -> Iterator[_Chunk]:
-        drives = iter(data)
-        while some := list(islice(drives, _AT_ONCE)):
-            runs = _runs_of(some)
-            known = [_known(each) for each in _alike(some, runs)]
-            bounds, noises = zip(*known, strict=True)
-            files = {
-                label: [
-                    beliefs_of(drive, str(folder)) if each is None
-                    else each.get(drive.seed, "there is no file of estimates")
-                    for drive in some
-                ]
-                for label, each in found.items()
-            }  # fmt: skip
-            parts = zip(*(bound[:4] for bound in bounds), strict=True)
-            bound = PosteriorBound(*map(np.concatenate, parts), ())
-            yield _Chunk(runs, files, bound, np.concatenate(noises), job.scenario.dt)
-
     text = scenario_text(job.scenario)
-    return _Task(job.scenario.name, text, job.seed, seeds, chunks())
+    return _Task(job.scenario.name, text, job.seed, seeds, _chunks(data, found))
+
+
+def _chunks(
+    data: TrajectoryDataset, found: Mapping[str, Mapping[Any, Estimate] | None]
+) -> Iterator[_Chunk]:
+    """Yield some drives at a time; None stands for the beliefs that are in the data."""
+    drives = iter(data)
+    while some := list(islice(drives, _AT_ONCE)):
+        files: dict[str, list[Estimate | str]] = {
+            label: [
+                beliefs_of(drive, str(data.folder))
+                if each is None
+                else each.get(drive.seed, NO_FILE)
+                for drive in some
+            ]
+            for label, each in found.items()
+        }
+        runs = _runs_of(some)
+        alike = list(_alike(some, runs))
+        noise = np.concatenate([noise_of_runs(s, s, same) for s, same in alike])
+        bound = _NO_BOUND
+        if any(_has_map(each) for listed in files.values() for each in listed):
+            bounds = [bound_runs(scenario, same)[:4] for scenario, same in alike]
+            joined = map(np.concatenate, zip(*bounds, strict=True))
+            bound = PosteriorBound(*joined, ())
+        yield _Chunk(runs, files, bound, noise, some[0].scenario.dt)
+
+
+def _has_map(estimate: Estimate | str) -> bool:
+    return isinstance(estimate, Estimate) and len(estimate.landmark_ids) > 0
 
 
 def _runs_of(drives: Sequence[Trajectory]) -> SimulatedRuns:
@@ -262,11 +275,6 @@ def _alike(
         parts = {n: a[rows] for n, a in runs._asdict().items()
                  if a is not None and n != "ids"}  # fmt: skip
         yield scenario, runs._replace(**parts)
-
-
-def _known(group: tuple[Any, SimulatedRuns]) -> tuple[PosteriorBound, Array]:
-    scenario, runs = group
-    return bound_runs(scenario, runs), noise_of_runs(scenario, scenario, runs)
 
 
 def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _Task:
@@ -307,7 +315,7 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
             poses = np.full((len(names), count, 3), np.nan)
             for row, name in enumerate(names):
                 if (label, name) not in inside:
-                    files.append("there is no file of estimates")
+                    files.append(NO_FILE)
                     continue
                 estimate, exact = inside[label, name]
                 few = np.linspace(0, len(exact) - 1, count).round().astype(int)
@@ -328,7 +336,6 @@ def _chunk_without_world(
     poses: Array, files: dict[str, list[Estimate | str]]
 ) -> _Chunk:
     count, steps, _ = poses.shape
-    nothing, no_map = np.full((count, steps), np.nan), np.full(count, np.nan)
     runs = SimulatedRuns(
         odometry=np.zeros((count, steps, 2)),
         measurements=np.zeros((count, steps, 0, 2)),
@@ -337,9 +344,8 @@ def _chunk_without_world(
         landmarks=np.zeros((count, 0, 2)),
         initial_poses=poses[:, 0],
     )
-    bound = PosteriorBound(nothing, nothing, nothing, no_map, ())
     noise = np.zeros((count, len(CHANNELS), len(MOMENTS)))
-    return _Chunk(runs, files, bound, noise)
+    return _Chunk(runs, files, _NO_BOUND, noise)
 
 
 def _within(estimate: Estimate, path: Array) -> tuple[Estimate, Array]:
@@ -452,18 +458,16 @@ def _invalid(
             found[run] = Failure(step, "an entry of the covariance is not finite")
         elif gap[run] > _SYMMETRIC * size[run]:
             differences = abs(matrices - np.swapaxes(matrices, -1, -2))
-            step, row, column = np.unravel_index(differences.argmax(), matrices.shape)
+            step, *entry = np.unravel_index(differences.argmax(), matrices.shape)
+            row, column = (int(k) for k in entry)
             found[run] = Failure(
                 int(step),
-                f"the covariance is not symmetric: its entry ({row}, {column}) is "
-                f"{matrices[step, row, column]:.3g}, and ({column}, {row}) is "
-                f"{matrices[step, column, row]:.3g}",
+                f"the covariance is not symmetric: its entries ({row}, {column}) and "
+                f"({column}, {row}) differ",
             )
         elif (variances[run] < 0).any():
             step = int((variances[run] < 0).any(axis=1).argmax())
-            found[run] = Failure(
-                step, f"a variance is negative: {variances[run, step].min():.3g}"
-            )
+            found[run] = Failure(step, "a variance is negative")
     return found
 
 
@@ -513,14 +517,22 @@ def _add_map(
 
 def _mistakes(parts: Sequence[_Part], task: _Task, frame: str) -> str:
     """Name the convention that an estimator breaks, if any."""
-    arrays = zip(*(part[1:] for part in parts), strict=True)
-    whole = _Part({}, *map(np.concatenate, arrays))
-    steps = np.unique(np.linspace(0, whole.truth.shape[1] - 1, 25).astype(int))
-    few = whole.truth[:, steps], whole.poses[:, steps], whole.covariances[:, steps]
-    additive = additive_covariances(*few[1:], frame)
-    return swapped_drives(*few[:2], additive, task.names) or mistake_in(
-        *whole[1:], frame
+    steps = np.unique(np.linspace(1, parts[0].truth.shape[1] - 1, 25).astype(int))
+    truth, poses, claims = (
+        np.concatenate([part[place][:, steps] for part in parts]) for place in (1, 2, 3)
     )
+    additive = additive_covariances(poses, claims, frame)
+    swapped = swapped_drives(truth, poses, additive, task.names)
+    return swapped or mistake_in(*map(np.concatenate, _first(parts)), frame)
+
+
+def _first(parts: Sequence[_Part]) -> Iterator[list[Array]]:
+    """Yield the arrays of enough parts to name a mistake."""
+    counts = np.cumsum([0, *(len(part.truth) for part in parts)])
+    few = [part for part, before in zip(parts, counts, strict=False)
+           if before < MOST_DRIVES]  # fmt: skip
+    for place in range(1, len(_Part._fields)):
+        yield [part[place] for part in few]
 
 
 def _dataset(

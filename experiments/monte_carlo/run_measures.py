@@ -168,8 +168,8 @@ def measure_runs(
             measured |= map_measures
         for name, value in measured.items():
             block[name][run] = value
-    block["position_bound"], block["heading_bound"] = bound.position, bound.heading
-    block["position_bound_raw"], block["map_bound"] = bound.raw_position, bound.map
+    block["position_bound"][:], block["heading_bound"][:] = bound[:2]
+    block["position_bound_raw"][:], block["map_bound"][:] = bound[2:4]
     block["noise_sums"] = noise
     block["readings"] = runs.visible.sum(axis=(1, 2))
     _write_failures(block, failures)
