@@ -152,7 +152,7 @@ def swapped_drives(
 def _honest(
     truth: Array, readings: Sequence[Reading], before: _Fit
 ) -> tuple[Reading, _Fit] | None:
-    """Return the likeliest reading that is honest; the first of equal ones."""
+    """Return the honest reading of the largest likelihood; the first of equal ones."""
     fits = [(reading, _fit(truth, reading)) for reading in readings]
     honest = [
         (reading, fit)

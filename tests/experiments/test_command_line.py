@@ -28,6 +28,7 @@ COMMANDS = (
     "smooth",
     "fit-noise",
     "generate",
+    "judge",
     "monte-carlo",
     "noise-study",
     "render",
