@@ -135,14 +135,15 @@ def swapped_drives(
     names : sequence
         Of the drives.
     """
-    own = pose_nees(truth, poses, covariances, frame="invariant").mean(axis=1) / 3
-    bad = np.flatnonzero(own > _LOST)
     swaps = []
-    for k in bad[:_MOST_LOST]:
-        of_others = pose_nees(truth[bad], poses[k], covariances[k], frame="invariant")
-        ratios = of_others.mean(axis=1) / 3
-        if len(ratios) > 1 and ratios.min() < min(own[k] / _LOST, _LOST):
-            swaps.append((names[k], names[bad[ratios.argmin()]]))
+    with np.errstate(invalid="ignore"):  # drives without estimates
+        own = pose_nees(truth, poses, covariances, frame="invariant").mean(axis=1) / 3
+        bad = np.flatnonzero(own > _LOST)
+        for k in bad[:_MOST_LOST]:
+            others = pose_nees(truth[bad], poses[k], covariances[k], frame="invariant")
+            ratios = others.mean(axis=1) / 3
+            if ratios.min() < min(own[k] / _LOST, _LOST):
+                swaps.append((names[k], names[bad[ratios.argmin()]]))
     if not swaps:
         return ""
     said = " and ".join(f"that of {a} fits the truth of {b}" for a, b in swaps[:2])

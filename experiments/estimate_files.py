@@ -182,7 +182,7 @@ def _of_arrays(
 def _of_npz(file: Path) -> Iterator[tuple[Any, Estimate]]:
     """Yield the drives of an npz: one, or those of its array seed."""
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        with file.open("rb") as stream, np.load(stream) as archive:
             known = [name for name in ("seed", *BELIEFS) if name in archive.files]
             arrays = {name: archive[name] for name in known}
     except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:

@@ -1,6 +1,7 @@
 """`judge`: estimates of any program have the verdict of a Monte Carlo."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,13 @@ import numpy as np
 import pytest
 from commands import slamgym
 
-from slamgym import judge, load_trajectories, make_estimator, monte_carlo
+from slamgym import (
+    judge,
+    load_scenario,
+    load_trajectories,
+    make_estimator,
+    monte_carlo,
+)
 from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments import (
@@ -83,8 +90,8 @@ def rows(poses, covariances, entries=9, landmarks=()):
     return "\n".join([*lines, ""])
 
 
-def filter_text(path):
-    """Read a drive as text and filter it: a program that knows slamgym's filter only."""
+def filter_text(path, estimator="invariant", *, one_by_one=False):
+    """Read a drive as text and filter it; return the lines of estimates."""
     log = read_slamlog(path)
     stds = {
         name: [float(part) for part in log.header[key].split(",")]
@@ -94,25 +101,31 @@ def filter_text(path):
             ("initial_pose_std", "start_sigma"),
         )
     }
-    slam = make_estimator("invariant", initial_pose=log.start, **stds)
+    slam = make_estimator(estimator, initial_pose=log.start, **stds)
     poses, covariances = [], []
     for event in log.events:
         if isinstance(event, Scan):
-            slam.update(event.measurements, event.landmark_ids.tolist())
+            pairs = zip(event.measurements, event.landmark_ids.tolist(), strict=True)
+            for reading, landmark in pairs if one_by_one else ():
+                slam.update([reading], [landmark])
+            if not one_by_one:
+                slam.update(event.measurements, event.landmark_ids.tolist())
         elif isinstance(event, OdometryRow):
             poses.append(slam.belief().pose)
             covariances.append(slam.belief().pose_covariance)
             slam.predict((event.d, event.alpha))
     belief = slam.belief()
-    triples = zip(
-        belief.landmark_ids, belief.landmarks, belief.landmark_covariances, strict=True
-    )
     landmarks = [
-        f"landmark,{i},{place[0]!r},{place[1]!r},{P[0, 0]!r},{P[0, 1]!r},{P[1, 1]!r}"
-        for i, place, P in triples
+        f"landmark,{i},{','.join(map(repr, [*place.tolist(), *P.ravel().tolist()]))}"
+        for i, place, P in zip(
+            belief.landmark_ids,
+            belief.landmarks,
+            belief.landmark_covariances,
+            strict=True,
+        )
     ]
     poses, covariances = [*poses, belief.pose], [*covariances, belief.pose_covariance]
-    return rows(poses, covariances, landmarks=landmarks).replace("np.float64", "")
+    return rows(poses, covariances, landmarks=landmarks)
 
 
 def entry_of(results, **options):
@@ -146,8 +159,7 @@ def test_a_filter_is_judged_through_files_as_in_a_monte_carlo(
         results = judge(written(poses, covariances), drives)
     elif way == "csv":
         for path in text_drives.glob("shard_*/seed_*.csv"):
-            text = filter_text(path).replace("(", "").replace(")", "")
-            (folder / path.name).write_text(text)
+            (folder / path.name).write_text(filter_text(path))
         results = judge(folder, text_drives)
     else:
         for seed, path, P in zip(seeds, poses, covariances, strict=True):
@@ -165,7 +177,7 @@ def test_a_filter_is_judged_through_files_as_in_a_monte_carlo(
             np.testing.assert_allclose(results[name], study[name], **tolerance)
     ours, theirs = entry_of(results), entry_of(study)
     assert (ours["verdict"], ours["reason"]) == (theirs["verdict"], theirs["reason"])
-    assert ours["diagnosis"]["cause"] == theirs["diagnosis"]["cause"] == "honest"
+    assert ours["diagnosis"]["cause"] == theirs["diagnosis"]["cause"]
     assert ours["nis"] is None
     assert (ours["efficiency"]["map"] is not None) == has_map
 
@@ -279,21 +291,17 @@ def test_a_broken_convention_is_named_in_one_sentence(
     said = found["diagnosis"]["sentence"]
     assert said.startswith(sentence)
     assert said.count(".\n") == 0
-    if wrong != "swapped":  # the NEES of the right convention, at some steps
+    if wrong not in ("swapped", "deviations"):  # the NEES that it had, at some steps
         right = float(study["pose_nees_invariant"].mean() / 3)
         stated = float(said.partition("NEES / 3 is ")[2].partition(",")[0])
         assert stated == pytest.approx(right, rel=0.2)
 
 
-def test_poses_relative_to_the_start_are_named(tmp_path, beliefs):
-    start = {"pose": [5.0, -3.0, 1.0], "std": [0.0, 0.0, 0.0]}
+def test_poses_relative_to_the_start_are_named(tmp_path):
+    start = {"pose": [5.0, -3.0, 1.0], "drawn": "estimate"}
+    world = load_scenario("six_landmarks").with_changes(start=start)
     drives = tmp_path / "drives"
-    generate_trajectories(
-        {"name": "elsewhere", "steps": 30, "start": start, "landmarks": [[8, 0]]},
-        drives,
-        episodes=8,
-        estimator="invariant",
-    )
+    generate_trajectories(world, drives, episodes=8, estimator="invariant")
     data = list(load_trajectories(drives))
     np.savez(
         tmp_path / "mine.npz",
@@ -456,10 +464,9 @@ REFUSED = {
 def test_a_malformed_csv_is_refused_with_its_line(text, drives, tmp_path):
     path = tmp_path / f"seed_{SEED}.csv"
     path.write_text(text)
-    with pytest.raises(ValueError, match=".") as refusal:
+    with pytest.raises(ValueError, match=re.escape(REFUSED[text])) as refusal:
         judge(path, drives)
     assert str(path) in str(refusal.value)
-    assert REFUSED[text] in str(refusal.value)
 
 
 def test_a_damaged_or_foreign_npz_is_refused(drives, tmp_path):
@@ -492,8 +499,8 @@ def test_what_matches_no_drive_is_refused(drives, beliefs, tmp_path):
         judge(path, drives, covariances="up")
     with pytest.raises(ValueError, match="does not exist"):
         judge(tmp_path / "nowhere", drives)
+    (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="got none in"):
-        (tmp_path / "empty").mkdir()
         judge(tmp_path / "empty", drives)
     shutil.copy(path, tmp_path / "seed_0007.csv")
     with pytest.raises(ValueError, match="are both of drive 7"):
@@ -611,8 +618,6 @@ def test_worlds_with_ranges_and_hidden_identities_are_judged(tmp_path):
         ("ranges", "six_landmarks", changes),
         ("hidden", "hidden_identities", {"steps": 40}),
     ):
-        from slamgym import load_scenario
-
         world = load_scenario(preset).with_changes(**more)
         job = {"episodes": 5, "estimator": "invariant"}
         generate_trajectories(world, tmp_path / name, **job)
@@ -687,11 +692,13 @@ def test_a_program_in_c_is_judged(text_drives, tmp_path):
     results = judge(estimates, text_drives)
     assert not results.failed.any()
     assert not json.loads(results.attrs["mistakes"])["estimates"]
-    ekf = monte_carlo("six_landmarks", "ekf", RUNS, SEED)
-    # One reading after the other is linearised elsewhere than a whole scan.
-    for name, tolerance in (("position_std", 0.1), ("landmark_rmse", 0.1)):
-        ours, theirs = float(results[name].mean()), float(ekf[name].mean())
-        assert ours == pytest.approx(theirs, rel=tolerance)
+    same = tmp_path / "same"
+    same.mkdir()
+    for path in files:
+        (same / path.name).write_text(filter_text(path, "ekf", one_by_one=True))
+    expected = judge(same, text_drives)
+    for name in ("pose_nees_invariant", "landmark_nees_additive", "landmark_rmse"):
+        np.testing.assert_allclose(results[name], expected[name], rtol=1e-6)
 
 
 @pytest.mark.slow
