@@ -45,7 +45,6 @@ def filtered(path: Path) -> list[str]:
     """Run iSAM2 over a drive; return the lines of its estimates."""
     header, events = read_drive(path)
     sensor = gtsam.noiseModel.Diagonal.Sigmas(np.array(header["measurement_std"]))
-    motion = np.square(header["motion_std"])
     start = gtsam.Pose2(*header["start"])
     prior = gtsam.noiseModel.Diagonal.Sigmas(np.array(header["start_sigma"]))
     settings = gtsam.ISAM2Params()
@@ -72,22 +71,17 @@ def filtered(path: Path) -> list[str]:
         if kind == "odometry":
             solve()
             distance, turn, _ = map(float, fields)
-            back = gtsam.Rot2(turn).matrix()
-            noise = np.diag(motion)
-            noise[:2, :2] = back.T @ noise[:2, :2] @ back  # in the frame after the turn
-            moved = gtsam.Pose2(distance, 0.0, turn)
-            model = gtsam.noiseModel.Gaussian.Covariance(noise)
+            moved, model = odometry_factor(distance, turn, header["motion_std"])
             graph.add(
                 gtsam.BetweenFactorPose2(POSE(step), POSE(step + 1), moved, model)
             )
             step, here = step + 1, here.compose(moved)
             guess.insert(POSE(step), here)
         else:
-            name = int(fields[0])
-            bearing, distance = float(fields[1]), float(fields[2])
-            seen = gtsam.Point2(distance * np.cos(bearing), distance * np.sin(bearing))
+            name, bearing, distance = int(fields[0]), float(fields[1]), float(fields[2])
             if name not in known:
                 known.add(name)
+                seen = distance * np.array([np.cos(bearing), np.sin(bearing)])
                 guess.insert(PLACE(name), here.transformFrom(seen))
             graph.add(
                 gtsam.BearingRangeFactor2D(
@@ -96,6 +90,17 @@ def filtered(path: Path) -> list[str]:
             )
     solve()
     return lines
+
+
+def odometry_factor(
+    distance: float, turn: float, std: list[float]
+) -> tuple[gtsam.Pose2, gtsam.noiseModel.Gaussian]:
+    """Return a motion, and its noise in the robot's frame after the turn."""
+    noise = np.diag(np.square(std))
+    back = gtsam.Rot2(turn).matrix()
+    noise[:2, :2] = back.T @ noise[:2, :2] @ back
+    moved = gtsam.Pose2(distance, 0.0, turn)
+    return moved, gtsam.noiseModel.Gaussian.Covariance(noise)
 
 
 def main() -> None:

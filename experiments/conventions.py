@@ -214,15 +214,13 @@ def _fit(truth: Array, reading: Reading) -> _Fit:
 
 def _whitened(errors: Array, covariances: Array) -> tuple[Array, Array]:
     """Return L⁻¹ e and log |P|, P = L Lᵀ; nan where P is no covariance."""
-    whole = np.isfinite(covariances).all(axis=(-2, -1)) & np.isfinite(errors).all(-1)
-    safe = np.where(whole[..., None, None], covariances, np.eye(3))
-    a, b, c = safe[..., 0, 0], safe[..., 1, 0], safe[..., 2, 0]
+    P = covariances
     with np.errstate(invalid="ignore", divide="ignore"):
-        l00 = np.sqrt(np.where(whole, a, np.nan))
-        l10, l20 = b / l00, c / l00
-        l11 = np.sqrt(safe[..., 1, 1] - l10**2)
-        l21 = (safe[..., 2, 1] - l20 * l10) / l11
-        l22 = np.sqrt(safe[..., 2, 2] - l20**2 - l21**2)
+        l00 = np.sqrt(P[..., 0, 0])
+        l10, l20 = P[..., 1, 0] / l00, P[..., 2, 0] / l00
+        l11 = np.sqrt(P[..., 1, 1] - l10**2)
+        l21 = (P[..., 2, 1] - l20 * l10) / l11
+        l22 = np.sqrt(P[..., 2, 2] - l20**2 - l21**2)
         w0 = errors[..., 0] / l00
         w1 = (errors[..., 1] - l10 * w0) / l11
         w2 = (errors[..., 2] - l20 * w0 - l21 * w1) / l22

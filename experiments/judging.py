@@ -57,7 +57,8 @@ FRAMES = {"additive": "additive", "invariant": "invariant", "right": "invariant"
           "left": "left"}  # fmt: skip
 """The errors of covariances; the invariant error is the right-invariant one."""
 _BOUNDS = ("position_bound", "position_bound_raw", "heading_bound", "map_bound")
-_NO_BOUND = PosteriorBound(*(np.array(np.nan) for _ in _BOUNDS), ())
+_UNKNOWN = np.array(np.nan)
+_NO_BOUND = PosteriorBound(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, ())
 """For estimates without a map: what came later may be in their poses."""
 NO_FILE = "there is no file of estimates"
 _AT_ONCE = 100  # drives in memory
@@ -175,10 +176,8 @@ class _Part(NamedTuple):
     """Measures of the drives of a chunk, and what names mistakes."""
 
     block: Block
-    truth: Array
-    poses: Array
-    covariances: Array
-    starts: Array
+    arrays: tuple[Array, Array, Array, Array]
+    """Truth, poses and covariances as in the files, and starts."""
 
 
 # --------------------------------------------------------------------------------------
@@ -236,8 +235,9 @@ def _chunks(
         bound = _NO_BOUND
         if any(_has_map(each) for listed in files.values() for each in listed):
             bounds = [bound_runs(scenario, same)[:4] for scenario, same in alike]
-            joined = map(np.concatenate, zip(*bounds, strict=True))
-            bound = PosteriorBound(*joined, ())
+            joined = zip(*bounds, strict=True)
+            position, heading, raw, of_map = (np.concatenate(each) for each in joined)
+            bound = PosteriorBound(position, heading, raw, of_map, ())
         yield _Chunk(runs, files, bound, noise, some[0].scenario.dt)
 
 
@@ -409,7 +409,7 @@ def _measured(
                 block["failed"][run], block["failed_at"][run] = True, steps - 1
                 block["message"] = block["message"].astype(object)
                 block["message"][run] = problem
-    return _Part(block, truth, poses, claims, chunk.runs.initial_poses)
+    return _Part(block, (truth, poses, claims, chunk.runs.initial_poses))
 
 
 def _unmatched(estimate: Estimate, steps: int, dt: float) -> str:
@@ -517,22 +517,19 @@ def _add_map(
 
 def _mistakes(parts: Sequence[_Part], task: _Task, frame: str) -> str:
     """Name the convention that an estimator breaks, if any."""
-    steps = np.unique(np.linspace(1, parts[0].truth.shape[1] - 1, 25).astype(int))
+    last = parts[0].arrays[0].shape[1] - 1
+    steps = np.unique(np.linspace(1, last, 25).astype(int))
     truth, poses, claims = (
-        np.concatenate([part[place][:, steps] for part in parts]) for place in (1, 2, 3)
+        np.concatenate([part.arrays[place][:, steps] for part in parts])
+        for place in range(3)
     )
     additive = additive_covariances(poses, claims, frame)
-    swapped = swapped_drives(truth, poses, additive, task.names)
-    return swapped or mistake_in(*map(np.concatenate, _first(parts)), frame)
-
-
-def _first(parts: Sequence[_Part]) -> Iterator[list[Array]]:
-    """Yield the arrays of enough parts to name a mistake."""
-    counts = np.cumsum([0, *(len(part.truth) for part in parts)])
-    few = [part for part, before in zip(parts, counts, strict=False)
-           if before < MOST_DRIVES]  # fmt: skip
-    for place in range(1, len(_Part._fields)):
-        yield [part[place] for part in few]
+    counts = np.cumsum([len(part.arrays[0]) for part in parts])
+    few = parts[: int(np.searchsorted(counts, MOST_DRIVES)) + 1]
+    first = [np.concatenate([part.arrays[place] for part in few]) for place in range(4)]
+    return swapped_drives(truth, poses, additive, task.names) or mistake_in(
+        first[0], first[1], first[2], first[3], frame
+    )
 
 
 def _dataset(

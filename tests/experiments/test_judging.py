@@ -148,9 +148,10 @@ SAME = (
 
 @pytest.mark.parametrize("way", ["data set", "npz", "csv", "tum"])
 def test_a_filter_is_judged_through_files_as_in_a_monte_carlo(
-    way, drives, text_drives, beliefs, written, study, tmp_path
+    way, drives, beliefs, written, study, request
 ):
     seeds, poses, covariances, _ = beliefs
+    tmp_path = request.getfixturevalue("tmp_path")
     folder = tmp_path / "estimates"
     folder.mkdir()
     if way == "data set":
@@ -158,6 +159,7 @@ def test_a_filter_is_judged_through_files_as_in_a_monte_carlo(
     elif way == "npz":
         results = judge(written(poses, covariances), drives)
     elif way == "csv":
+        text_drives = request.getfixturevalue("text_drives")
         for path in text_drives.glob("shard_*/seed_*.csv"):
             (folder / path.name).write_text(filter_text(path))
         results = judge(folder, text_drives)
