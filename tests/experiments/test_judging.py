@@ -683,7 +683,7 @@ def test_a_program_in_c_is_judged(text_drives, tmp_path):
     compiler = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
     if compiler is None:
         pytest.skip("there is no C compiler")
-    source = ROOT / "examples" / "14_judge_a_program_in_c.c"
+    source = ROOT / "examples" / "15_judge_a_program_in_c.c"
     program = tmp_path / "ekf_slam"
     strict = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror"]
     subprocess.run([compiler, *strict, source, "-o", program, "-lm"], check=True)
@@ -707,7 +707,7 @@ def test_a_program_in_c_is_judged(text_drives, tmp_path):
 def test_the_example_of_gtsam_names_the_frame(tmp_path):
     pytest.importorskip("gtsam")
     done = subprocess.run(
-        [sys.executable, ROOT / "examples" / "13_judge_gtsam.py", "--drives", "24"],
+        [sys.executable, ROOT / "examples" / "14_judge_gtsam.py", "--drives", "24"],
         cwd=tmp_path,
         capture_output=True,
         text=True,

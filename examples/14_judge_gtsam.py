@@ -3,7 +3,7 @@
 slamgym writes drives, the program reads odometry and readings from them, and writes a
 pose with covariance for every step. `judge` then compares both with the truth, as
 `monte_carlo` does for filters of slamgym. Nothing of slamgym is between the program and
-its files: the same works in any language, see 14_judge_a_program_in_c.c.
+its files: the same works in any language, see 15_judge_a_program_in_c.c.
 
 The program is iSAM2 on a graph of the poses and landmarks. GTSAM states the covariance
 of a pose in the robot's own frame. A program that passes it on as it is says
@@ -11,7 +11,7 @@ of a pose in the robot's own frame. A program that passes it on as it is says
 
 Run it (needs ``pip install 'slamgym[peers]'``)::
 
-    python examples/13_judge_gtsam.py
+    python examples/14_judge_gtsam.py
 """
 
 import argparse
@@ -107,7 +107,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--drives", type=int, default=50, help="number of drives")
     count = parser.parse_args().drives
-    folder = Path("results/13_judge_gtsam")
+    folder = Path("results/14_judge_gtsam")
     generate_trajectories(
         "six_landmarks",
         folder / "drives",
