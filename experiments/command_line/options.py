@@ -74,6 +74,13 @@ ScenarioName = Annotated[
 LogFile = Annotated[
     Path, typer.Argument(metavar="LOG", help="A log of any format that replay reads.")
 ]
+FilesOfEstimates = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="FILES",
+        help="Files of estimates, or folders of them; each folder is an estimator.",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)

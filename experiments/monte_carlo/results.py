@@ -203,15 +203,19 @@ def attributes(job: Job, runs: range, command: str) -> dict[str, Any]:
         "runs": len(runs),
         "block_size": job.block_size,
         "resolution": job.resolution,
-        "versions": json.dumps(_versions()),
-        "command": command,
-        "comment": _FROM_TRUTH,
+        **provenance(command),
     }
 
 
-def _versions() -> dict[str, str]:
+def provenance(command: str) -> dict[str, str]:
+    """Return the attributes that name the command and the versions of packages."""
     own = {"slamgym": __version__, "python": platform.python_version()}
-    return own | {package: version(package) for package in _PACKAGES}
+    versions = own | {package: version(package) for package in _PACKAGES}
+    return {
+        "versions": json.dumps(versions),
+        "command": command,
+        "comment": _FROM_TRUTH,
+    }
 
 
 def _fill(

@@ -26,6 +26,7 @@ from ...evaluation.hypothesis_tests import (
 from ..runs.trace import finite, mean, quotient, root_mean_square
 from .run_measures import COUNTS, KNOWN_IDS_ATE, MAPS, MARGIN, PREFIX, SHARES
 from .verdict import (
+    FITTED,
     POINT_FREEDOM,
     POSE_FREEDOM,
     EstimatorScores,
@@ -143,8 +144,11 @@ def summarise_estimator(
     """
     found = _computed(scores, frame)
     claimed = found["heading_std_end"]["claimed"]
-    report = report_of(scores, frame) if scores.good.sum() > 1 else None
-    verdict = judge(report, len(scores.failures), len(scores.good))
+    decides = scores.good.sum() > 1 and not scores.is_fitted
+    report = report_of(scores, frame) if decides else None
+    verdict = FITTED
+    if not scores.is_fitted:
+        verdict = judge(report, len(scores.failures), len(scores.good))
     return {
         **_verdict(scores, verdict, report, claimed, knowable),
         "good_runs": int(scores.good.sum()),

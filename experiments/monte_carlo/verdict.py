@@ -67,6 +67,14 @@ class Verdict(NamedTuple):
     """Continues after the word, without a full stop."""
 
 
+FITTED = Verdict(
+    NOT_SHOWN,
+    "each path is aligned with its truth, and an alignment fitted to the errors "
+    "makes them smaller: their NEES is not χ²",
+)
+"""In place of a verdict on estimates that are aligned."""
+
+
 def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
     """Reduce a report to a verdict.
 
@@ -348,6 +356,8 @@ def _group(group: Mapping[str, Any]) -> str:
 # --------------------------------------------------------------------------------------
 # The cause of an inconsistency, as an entry of the summary and as a sentence.
 
+CONVENTION = "convention"
+"""The cause for estimates in another convention than their files should have."""
 _MISTAKES = ("wrong", "duplicate", "ghost", "clutter_used")
 
 
@@ -360,10 +370,15 @@ def diagnosis_summary(
     -------
     dict or None
         ``cause``, one of :data:`slamgym.evaluation.CAUSES`, its ``p``, a ``sentence``,
-        and ``others``, further causes; see :func:`slamgym.evaluation.diagnose`. None
-        for results without noise, which an older version wrote.
+        and ``others``, further causes; see :func:`slamgym.evaluation.diagnose`. The
+        cause is "convention" for estimates that break one. None for results without
+        noise, and for estimates that are fitted to the truth.
     """
-    if "noise_sums" not in scores.results:
+    mistakes = json.loads(scores.results.attrs.get("mistakes", "{}"))
+    if mistake := mistakes.get(scores.label):
+        sentence = f"{CONVENTION}: {mistake}"
+        return {"cause": CONVENTION, "p": None, "sentence": sentence, "others": []}
+    if "noise_sums" not in scores.results or scores.is_fitted:
         return None
     found = diagnosis_of(scores, frame, verdict)
     return {
@@ -541,6 +556,11 @@ class EstimatorScores(NamedTuple):
         """Return NEES of the pose divided by 3, shape (M, K + 1 − first)."""
         nees = self.over_time(f"pose_nees_{frame}")[:, self.first - _FIRST :]
         return np.asarray(nees / POSE_FREEDOM)
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the estimates are aligned with the truth."""
+        return bool(self.results.attrs.get("alignment") == "fitted")
 
     @property
     def nis_per_degree(self) -> float | None:

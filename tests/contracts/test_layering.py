@@ -54,6 +54,8 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         monte_carlo
         noise_study noise_fitting
         trajectories
+        conventions estimate_files
+        judging
         command_line
     """,
     "experiments.monte_carlo": """

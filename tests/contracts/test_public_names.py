@@ -27,6 +27,7 @@ PROMISED = {
     *("consistency_of", "load_trajectories", "register_estimator"),
     *("make_estimator", "list_estimators", "check_estimator", "assert_consistent"),
     *("load_scenario", "monte_carlo", "replay", "read_log", "generate_trajectories"),
+    "judge",
 }
 MARKDOWN = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 SCRIPTS = [*ROOT.glob("examples/*.py"), *ROOT.glob("docs/tutorials/*.py")]

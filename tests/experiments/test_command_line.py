@@ -30,6 +30,7 @@ COMMANDS = (
     "smooth",
     "fit-noise",
     "generate",
+    "judge",
     "monte-carlo",
     "noise-study",
     "render",
