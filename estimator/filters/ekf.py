@@ -34,7 +34,6 @@ from .gaussian_map import (
     MAP_STATE,
     GaussianMap,
     ScanWorkspace,
-    covariances_for,
     not_positive_definite,
 )
 
@@ -164,7 +163,7 @@ class MapFilter:
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""
-        return self.map.copies * covariance_bytes(landmarks)
+        return covariance_bytes(landmarks)
 
 
 class EkfSlam(MapFilter):
@@ -351,7 +350,6 @@ class EkfSlam(MapFilter):
         self.rules = rules
         self.rule_values = np.array(rules)
         self._workspace = ScanWorkspace(rules)
-        self.map.copies = covariances_for(rules)
 
     def _refuse(self, status: int, readings: Array, ids: list[int]) -> NoReturn:
         """Raise the error of an update that failed."""
@@ -414,16 +412,12 @@ class InvariantEkfSlam(EkfSlam):
         motion_std: ArrayLike,
         measurement_std: ArrayLike,
         *,
-        iterations: int = 1,
-        sequential: bool = False,
+        iterations: int = 10,
         **settings: Any,
     ) -> None:
         super().__init__(motion_std, measurement_std, **settings)
-        rules = self.rules._replace(
-            iterations=argument_checks.whole("iterations", iterations, 1),
-            sequential=argument_checks.flag("sequential", sequential),
-        )
-        self._adopt(rules)
+        most = argument_checks.whole("iterations", iterations, 1)
+        self._adopt(self.rules._replace(iterations=most, adaptive=most > 1))
 
 
 class FirstEstimatesEkfSlam(EkfSlam):

@@ -43,7 +43,7 @@ class Room(NamedTuple):
     factor: Array
     readings: Array
     ledger: IntArray
-    workspace: tuple[Array, Array, Array]
+    workspace: tuple[Array, Array]
 
 
 class Imagined(NamedTuple):
@@ -104,7 +104,7 @@ def imagine_plans(
         np.zeros((capacity, capacity)),
         np.empty((landmarks, 2)),
         np.zeros((LEDGER_HEIGHT, landmarks), np.int64),
-        (workspace[0], workspace[1], workspace[2]),
+        (workspace[0], workspace[1]),
     )
     points, weights = density
     missed = np.empty(len(weights[0]))
