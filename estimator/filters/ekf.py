@@ -378,12 +378,11 @@ class InvariantEkfSlam(EkfSlam):
     motion_std, measurement_std
         As in :class:`EkfSlam`.
     iterations : int
-        Number of linearisations of a scan, with the same prior; more than one for
-        coarse sensors.  The heading column of H remains that of the prior, because the
-        exact Gauss-Newton column would make the heading observable.
-    sequential : bool
-        Process one landmark after the other instead of the whole scan at once, for
-        heading errors of half a radian and more.  The order of readings then matters.
+        Most linearisations of a scan, with the same prior.  A scan with readings far
+        from their predictions is linearised again until no landmark moves by more than
+        a tenth of its distance; where the heading turns by more than 0.1 rad, the
+        readings are taken one after the other, the farthest landmark first, each until
+        it no longer moves.  1 always linearises once, for study.
     **settings
         The other keywords of :class:`EkfSlam`.
 

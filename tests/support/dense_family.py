@@ -82,8 +82,8 @@ class DenseInvariant(DenseEkf):
         return np.concatenate([moved[0], [mean[2] + xi[2]], moved[1:].ravel()])
 
     def noise(self, distance):
-        std = np.sqrt(np.diag(self.Q)) + (0.0, self.range_std_per_metre * distance)
-        return np.diag(std**2)
+        growth = np.array([0.0, self.range_std_per_metre * distance])
+        return np.diag((np.sqrt(np.diag(self.Q)) + growth) ** 2)
 
     def seen(self, ids):
         """The landmarks relative to the robot's position."""
