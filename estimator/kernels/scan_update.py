@@ -3,6 +3,8 @@
 `update_belief` takes in one scan, and `predict` one odometry reading.
 """
 
+import math
+
 import numpy as np
 
 from ...arrays import LARGEST, Array, IntArray
@@ -41,6 +43,7 @@ from .kalman_gain import (
     SLOT,
     USED,
     VARIANCE,
+    WHITE,
     BeliefArrays,
     Rules,
     Workspace,
@@ -299,6 +302,9 @@ def is_too_near(mean: Array, covariance: Array, column: int) -> bool:
 FAR = 0.1  # a reading off its prediction, or a landmark moved, relative to its range
 TURNED = 0.1  # heading [rad]
 
+# Excess of νᵀ S⁻¹ ν at which an iterate is not believed: 99.9 % of χ²(2).
+IMPLAUSIBLE = 13.8
+
 
 @njit_inlined
 def correct(
@@ -427,13 +433,14 @@ def take_one_by_one(
     """Correct the mean by one reading after the other, the farthest landmark first.
 
     Each is linearised at the mean that those before it leave, and again until its
-    landmark no longer moves.  P is constant in invariant coordinates, so that all rows
-    of A come from the prior P, as in :func:`relinearise`.
+    landmark no longer moves; once only where the iterates do not settle, or end where
+    the reading is less plausible than at first.  P is constant in invariant
+    coordinates, so that all rows of A come from the prior P, as in `relinearise`.
 
     Far landmarks are first because their bearings fix the heading, and depend least on
     the position.
     """
-    mean, prior, at = belief.mean, rows[MEAN_BEFORE], rows[ITERATE]
+    mean, prior = belief.mean, rows[MEAN_BEFORE]
     system, again = rows[FIRST:], second_system(rows)
     columns, order = ledger[COLUMN], ledger[ORDER]
     sort_by_range(prior, columns, used, order)
@@ -442,24 +449,55 @@ def take_one_by_one(
     for k in range(used):
         row, read, c = 2 * k, 2 * order[k], columns[order[k]]
         copy_reading(system, read, again, row)
-        for i in range(2):
-            at[i], at[c + i] = mean[i], mean[c + i]
-        at[2] = mean[2]
         begin_correction(size, rows, again, 2 * used)
-        for _ in range(rules.iterations):
-            linearise_again(at, belief, rules, rows, row, c)
-            begin_correction(size, rows, again, 2 * used)
-            if not whiten(belief.covariance, size, rows, again, 0, row, c):
-                return int(read)
-            x, y = at[c] - at[0], at[c + 1] - at[1]
-            turned = turn_coefficients_jit(rows[CORRECTION, 2])
-            retract_point(at, mean, prior, rows[CORRECTION], turned, 0)
-            retract_point(at, mean, prior, rows[CORRECTION], turned, c)
-            at[2] = mean[2] + rows[CORRECTION, 2]
-            if not is_displaced(x, y, at[c] - at[0], at[c + 1] - at[1]):
-                break
+        once, last = iterate_reading(
+            belief, size, rules, rows, row, c, rules.iterations
+        )
+        if math.isnan(last):
+            return int(read)
+        if last > once + IMPLAUSIBLE:
+            iterate_reading(belief, size, rules, rows, row, c, 1)
         retract(mean, mean, rows, size)
     return -1
+
+
+@njit_internal
+def iterate_reading(
+    belief: BeliefArrays,
+    size: int,
+    rules: Rules,
+    rows: Array,
+    row: int,
+    c: int,
+    most: int,
+) -> tuple[float, float]:
+    """Linearise one reading at the mean, and again until its landmark is at rest.
+
+    Returns νᵀ S⁻¹ ν of the first linearisation and of the last: inf where the landmark
+    still moves after ``most``, nan where S is not positive definite.
+    """
+    mean, prior, at = belief.mean, rows[MEAN_BEFORE], rows[ITERATE]
+    again, delta = second_system(rows), rows[CORRECTION]
+    for i in range(2):
+        at[i], at[c + i] = mean[i], mean[c + i]
+    at[2], once = mean[2], np.inf
+    for j in range(size):
+        delta[j] = 0.0
+    for iteration in range(most):
+        linearise_again(at, belief, rules, rows, row, c)
+        begin_correction(size, rows, again, row + 2)
+        if not whiten(belief.covariance, size, rows, again, 0, row, c):
+            return once, np.nan
+        nis = again[row, WHITE] ** 2 + again[row + 1, WHITE] ** 2
+        once = nis if iteration == 0 else once
+        x, y = at[c] - at[0], at[c + 1] - at[1]
+        turned = turn_coefficients_jit(delta[2])
+        retract_point(at, mean, prior, delta, turned, 0)
+        retract_point(at, mean, prior, delta, turned, c)
+        at[2] = mean[2] + delta[2]
+        if not is_displaced(x, y, at[c] - at[0], at[c + 1] - at[1]):
+            return once, nis
+    return once, np.inf
 
 
 @njit_internal

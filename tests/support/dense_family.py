@@ -129,12 +129,18 @@ class DenseAdaptiveInvariant(DenseInvariant):
         return nis
 
     def correct_alone(self, readings, ids):
-        prior, total = self.mean.copy(), np.zeros(len(self.mean))
-        for _ in range(self.iterations):
-            before = self.seen(ids)
-            total, P, _ = self.gain(readings, ids, total)
-            self.mean = self.exponential(total, prior)
-            if not self.displaced(before, ids):
+        prior = self.mean.copy()
+        for most in (self.iterations, 1):
+            total, nis = np.zeros(len(prior)), []
+            self.mean = prior
+            for _ in range(most):
+                before = self.seen(ids)
+                total, P, one = self.gain(readings, ids, total)
+                nis.append(one)
+                self.mean = self.exponential(total, prior)
+                if settled := not self.displaced(before, ids):
+                    break
+            if settled and nis[-1] <= nis[0] + 13.8:
                 break
         self.P = P
 
