@@ -178,7 +178,7 @@ def _follow(
     first, motion = estimator.map, estimator.motion_values
     rules = estimator.rules._replace(gate=gate)
     motions, first_motions, readings, numbers, first_readings = events
-    rows, before, prior = workspace_for(rules, most, capacity)
+    rows, before = workspace_for(rules, most, capacity)
     likelihoods, nis, used, rejected, poses, covariances, innovations, outcomes = record
     follow_drive(
         (motions, first_motions, readings, numbers, first_readings),
@@ -187,7 +187,7 @@ def _follow(
         np.array(rules),
         (first.mean[:3].copy(), first.covariance[:3, :3].copy()),
         belief,
-        (rows, before, prior),
+        (rows, before),
         np.empty(landmarks, dtype=np.int64),
         (
             likelihoods[part],

@@ -154,10 +154,10 @@ def imagine_step(
     count = expect_readings(mean, size, settings, room.readings, room.ledger)
     if count == 0:
         return True
-    rows, before, prior = room.workspace
+    rows, before = room.workspace
     status, _, _ = update_belief(
         *(mean, covariance, reference, size, room.readings, count, room.ledger),
-        *(rows, before, prior, settings.rule_values),
+        *(rows, before, settings.rule_values),
     )
     return bool(status == DONE)
 
