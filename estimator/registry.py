@@ -343,7 +343,7 @@ def read_label(label: str) -> FilterLabel:
         table = tomllib.loads(f"options = {{ {options} }}")["options"]
     except (tomllib.TOMLDecodeError, RecursionError):
         raise ValueError(
-            f"options must be like [iterations=3,sequential=true], got '{label}'"
+            f"options must be like [iterations=3,min_range=0.5], got '{label}'"
         ) from None
     return FilterLabel(match["name"].strip(), table)
 
@@ -353,8 +353,8 @@ def split_labels(labels: str) -> list[str]:
 
     Examples
     --------
-    >>> split_labels("ekf, invariant[iterations=3,sequential=true]")
-    ['ekf', 'invariant[iterations=3,sequential=true]']
+    >>> split_labels("ekf, invariant[iterations=3,min_range=0.5]")
+    ['ekf', 'invariant[iterations=3,min_range=0.5]']
     """
     parts, depth = [""], 0
     for character in labels:

@@ -20,6 +20,7 @@ from ..kernels.kalman_gain import (
     ADDED,
     BLOCK,
     COLUMN,
+    FIRST,
     GATED,
     INNOVATION,
     JACOBIAN,
@@ -37,7 +38,6 @@ from ..kernels.kalman_gain import (
     Workspace,
     new_ledger,
     new_workspace,
-    prior_system,
 )
 from ..models.rigid_motion import ErrorFrame
 from ..support.memory_limit import aligned_zeros, landmarks_that_fit
@@ -58,12 +58,6 @@ class GaussianMap:
     map before a change or after it.  Kernels change the arrays in place, each in one
     call; the landmarks that a kernel adds follow from the places that it has written.
 
-    Parameters
-    ----------
-    copies : int
-        Number of covariances of this size that updates of the filter need, for the
-        check of the available memory.
-
     Examples
     --------
     >>> gaussian = GaussianMap()
@@ -78,8 +72,7 @@ class GaussianMap:
     arrays: BeliefArrays
     """Mean, covariance and linearisation points, as kernels take them."""
 
-    def __init__(self, copies: int = 1) -> None:
-        self.copies = copies
+    def __init__(self) -> None:
         self.reset(np.zeros(3), np.zeros((3, 3)))
 
     def reset(self, pose: Array, pose_covariance: Array) -> None:
@@ -209,7 +202,7 @@ class GaussianMap:
         self._refill(self.capacity, kept, {i: slot for slot, i in enumerate(left)})
 
     def _zeros(self, landmarks: int, more: int = 0) -> BeliefArrays:
-        fitting = landmarks_that_fit(landmarks, landmarks + more, self.copies)
+        fitting = landmarks_that_fit(landmarks, landmarks + more)
         return _zeros(self.capacity_for(fitting))
 
     def _become(self, arrays: BeliefArrays, slots: dict[int, int]) -> None:
@@ -351,8 +344,6 @@ class ScanWorkspace:
         room = 8 + 2 * readings
         self.arrays = workspace_for(self._rules, room, capacity)
         self.ledger = new_ledger(room)
-        height = len(self.arrays.rows)
-        self._first_row = prior_system(height, self._rules.iterations)
         self.readings, self.capacity = room, capacity
 
     def place(self, gaussian: GaussianMap, ids: Sequence[int]) -> int:
@@ -390,16 +381,15 @@ class ScanWorkspace:
     def _recalled(self) -> ScanReport | None:
         if not (self.readings and self.arrays.rows[MEAN_BEFORE, ABSORBED]):
             return None
-        ids, first = list(self._ids), self._first_row
+        ids = list(self._ids)
         used = int((self.ledger[OUTCOME, : len(ids)] == USED).sum())
-        white = self.arrays.rows[first : first + 2 * used, WHITE]
+        white = self.arrays.rows[FIRST : FIRST + 2 * used, WHITE]
         return self.report(float(white @ white), ids, used)
 
     def report(self, nis: float, ids: list[int], used: int) -> ScanReport:
         """Return the report of the last update, on copies of what it has left."""
-        ledger, first = self.ledger[:, : len(ids)], self._first_row
-        left = copy_scan(self.arrays.rows, ledger, used, first)
-        return ScanReport(nis, ids, left, sequential=self._rules.sequential)
+        left = copy_scan(self.arrays.rows, self.ledger[:, : len(ids)], used)
+        return ScanReport(nis, ids, left)
 
     def failed_reading(self, status: int, readings: int) -> int:
         """Return the reading whose innovation covariance could not be factored."""
@@ -409,19 +399,12 @@ class ScanWorkspace:
 
 def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
     """Allocate what updates by these rules need, with this many readings at most."""
-    repeated = rules.iterations > 1 or rules.sequential
     return new_workspace(
         readings,
         capacity,
         iterated=rules.iterations > 1,
-        spoilable=repeated or readings > BLOCK,
+        spoilable=readings > BLOCK,
     )
-
-
-def covariances_for(rules: Rules) -> int:
-    """Return how many arrays of the size of P an update needs: P, and copies of it."""
-    iterated = rules.iterations > 1
-    return 1 + iterated + (iterated or rules.sequential)
 
 
 def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:
@@ -443,30 +426,25 @@ class ScanRecord(NamedTuple):
         """Innovations ν, shape (m, 2)."""
         return self.rows[:, INNOVATION].reshape(-1, 2)
 
-    def joint_factor(self, *, sequential: bool) -> Array:
+    def joint_factor(self) -> Array:
         """Return L of S = L Lᵀ, shape (2m, 2m), lower triangular.
 
-        Off its diagonal blocks L = H Aᵀ, since Q is diagonal; or 0 where readings were
-        linearised one after the other.
+        Off its diagonal blocks L = H Aᵀ, since Q is diagonal.
         """
         rows, count = self.rows, len(self.rows)
         H = rows[:, JACOBIAN : JACOBIAN + 5]
-        factor = np.zeros((count, count))
-        if not sequential:
-            columns = np.repeat(self.ledger[COLUMN, : count // 2], 2)
-            every = np.arange(count)
-            pose = H[:, :3] @ rows[:, :3].T
-            x = H[every, 3, None] * rows[:, columns].T
-            y = H[every, 4, None] * rows[:, columns + 1].T
-            factor = np.tril(pose + x + y)
+        columns = np.repeat(self.ledger[COLUMN, : count // 2], 2)
+        every = np.arange(count)
+        pose = H[:, :3] @ rows[:, :3].T
+        x = H[every, 3, None] * rows[:, columns].T
+        y = H[every, 4, None] * rows[:, columns + 1].T
+        factor: Array = np.tril(pose + x + y)
         for k in range(0, count, 2):
             factor[k : k + 2, k : k + 2] = rows[k : k + 2, ROOT : ROOT + 2]
         return factor
 
 
-def copy_scan(
-    rows: Array, ledger: IntArray, used: int, first: int
-) -> tuple[Array, IntArray]:
+def copy_scan(rows: Array, ledger: IntArray, used: int) -> tuple[Array, IntArray]:
     """Copy the parts of a :class:`ScanRecord` out of the workspace.
 
     Where the map is much larger than the scan, the copy has only the columns of the
@@ -480,10 +458,8 @@ def copy_scan(
         One column for each reading of the scan.
     used : int
         Number of readings in use.
-    first : int
-        Row at which the system linearised at the prior begins.
     """
-    found, kept = rows[first : first + 2 * used], ledger.copy()
+    found, kept = rows[FIRST : FIRST + 2 * used], ledger.copy()
     if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
         return found.copy(), kept
     columns = ledger[COLUMN, :used]
@@ -504,25 +480,16 @@ class ScanReport(UpdateReport):
         Landmark of each reading.
     copies : tuple of ndarray
         The parts of a :class:`ScanRecord`.
-    sequential : bool
-        Whether readings were linearised one after the other.
     """
 
     _ids: list[int]
     _copies: tuple[Array, IntArray]
-    _sequential: bool
 
     def __init__(
-        self,
-        nis: float,
-        ids: list[int],
-        copies: tuple[Array, IntArray],
-        *,
-        sequential: bool,
+        self, nis: float, ids: list[int], copies: tuple[Array, IntArray]
     ) -> None:
         parts = self.__dict__
-        parts["nis"], parts["_ids"] = nis, ids
-        parts["_copies"], parts["_sequential"] = copies, sequential
+        parts["nis"], parts["_ids"], parts["_copies"] = nis, ids, copies
 
     @property
     def _record(self) -> ScanRecord:
@@ -566,7 +533,7 @@ class ScanReport(UpdateReport):
     @property
     def factor(self) -> Callable[[], Array]:
         """The function that returns L, shape (2m, 2m), L Lᵀ = S."""
-        return partial(self._record.joint_factor, sequential=self._sequential)
+        return self._record.joint_factor
 
     def _with_outcome(self, outcome: int) -> tuple[int, ...]:
         chosen = self._record.ledger[OUTCOME] == outcome

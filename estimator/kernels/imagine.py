@@ -39,7 +39,7 @@ class Room(NamedTuple):
     factor: Array
     readings: Array
     ledger: IntArray
-    workspace: tuple[Array, Array, Array]
+    workspace: tuple[Array, Array]
 
 
 class Imagined(NamedTuple):
@@ -100,7 +100,7 @@ def imagine_plans(
         np.zeros((capacity, capacity)),
         np.empty((landmarks, 2)),
         np.zeros((LEDGER_HEIGHT, landmarks), np.int64),
-        (workspace[0], workspace[1], workspace[2]),
+        (workspace[0], workspace[1]),
     )
     points, weights = density
     missed = np.empty(len(weights[0]))
@@ -150,10 +150,10 @@ def imagine_step(
     count = expect_readings(mean, size, settings, room.readings, room.ledger)
     if count == 0:
         return True
-    rows, before, prior = room.workspace
+    rows, before = room.workspace
     status, _, _ = update_belief(
         *(mean, covariance, reference, size, room.readings, count, room.ledger),
-        *(rows, before, prior, settings.rule_values),
+        *(rows, before, settings.rule_values),
     )
     return bool(status == DONE)
 
