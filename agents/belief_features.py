@@ -216,11 +216,11 @@ def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
 
 Rectangle = tuple[float, float, float, float]
 
+# Of B worlds, in the alphabetical order of their keys, see `belief_features`.
 FeatureArrays = tuple[Array, Array, Array, Array, BoolArray, Array, Array, Array]
-"""Of B worlds, in the alphabetical order of their keys, see `belief_features`."""
 
+# Standard deviations [m, rad] that `on_log_scale` maps to 0 and to 1.
 SMALLEST_STD, LARGEST_STD = 1e-3, 10.0
-"""Standard deviations [m, rad] that `on_log_scale` maps to 0 and to 1."""
 
 _SCALE = 1.0 / math.log(LARGEST_STD / SMALLEST_STD)
 
