@@ -11,6 +11,7 @@ import numpy as np
 import numpy_active_slam as twin
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from worlds import RANGED
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.agents import (
@@ -489,6 +490,48 @@ def test_many_worlds_are_the_single_ones(mode, level, settings):
         ended = terminated | truncated
     assert (level != "active_easy") or (True, False, False) in kinds
     assert len(kinds) >= 2
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_many_worlds_drawn_anew_are_the_single_ones(mode):
+    scenario = load_scenario("active_easy").with_changes(randomise=RANGED, steps=9)
+    many = ActiveSlamVectorEnv(3, scenario, autoreset_mode=mode)
+    singles = [ActiveSlamEnv(scenario) for _ in range(3)]
+    observations, _ = many.reset(seed=7)
+    seen = [env.reset(seed=7 + k)[0] for k, env in enumerate(singles)]
+    ended = np.zeros(3, dtype=bool)
+    rng, draws = np.random.default_rng(0), set()
+    for _ in range(40):
+        for k in range(3):
+            for key, value in seen[k].items():
+                np.testing.assert_array_equal(observations[key][k], value)
+        drawn = many.drawn_scenarios
+        assert [env.drawn_scenario for env in singles] == drawn
+        draws |= {each.motion.std for each in drawn}
+        actions = rng.uniform(-0.3, 0.8, (3, 2))
+        observations, _, terminated, truncated, _ = many.step(actions)
+        for k, env in enumerate(singles):
+            if mode == "NextStep" and ended[k]:
+                seen[k] = env.reset()[0]
+                continue
+            seen[k], _, over, late, _ = env.step(actions[k])
+            assert (over, late) == (terminated[k], truncated[k])
+            if mode == "SameStep" and (over or late):
+                seen[k] = env.reset()[0]
+        ended = terminated | truncated
+    assert len(draws) >= 9
+
+
+def test_filters_keep_the_nominal_noise():
+    env = ActiveSlamEnv(
+        "active_easy", randomise={"motion_std": [50.0, 50.0], "start_std": [9.0, 9.0]}
+    )
+    plain = ActiveSlamEnv("active_easy")
+    for each in (env, plain):
+        each.reset(seed=1)
+        each.step([1.0, 0.0])
+    uncertain = [each.knowledge.belief.pose_covariance for each in (env, plain)]
+    np.testing.assert_allclose(np.sqrt(uncertain[0][0, 0] / uncertain[1][0, 0]), 1, 0.5)
 
 
 def test_worlds_that_ended_must_be_begun_anew_by_hand_where_autoreset_is_off():

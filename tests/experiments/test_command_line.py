@@ -841,7 +841,7 @@ def test_a_run_fits_on_a_screen_whatever_the_map(
 ):
     monkeypatch.setenv("COLUMNS", "80")
     small = ("--set", "landmarks.count=80", "--set", "sensor.identities=false")
-    text = printed("run", "dense", *small, "--steps", 15, "-e", estimators)
+    text = printed("run", "dense", *small, "--steps", 30, "-e", estimators)
     lines = text.splitlines()
     assert len(lines) <= 40
     assert max(map(len, lines[:-1])) <= 80

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals are those of PO
 
 JOB = "monte-carlo six_landmarks -e ekf --runs 90000 --block-size 8 --jobs 2 --out out"
 DATA_SET = "generate six_landmarks --episodes 90000 --shard 8 --out out"
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 GOES_ON = "the finished runs are in out, and the same command continues"
 
 
@@ -67,21 +68,6 @@ def workers_among(processes):
     return [p for p, name in names.items() if "popen_loky" in name]
 
 
-@pytest.mark.slow
-def test_a_scheduler_ends_workers_of_dask(here):
-    pytest.importorskip("distributed")
-    child = begin(here, *f"{JOB} --backend dask".split())
-    wait_until(lambda: child.exitcode or blocks_in(here) > 1)
-    processes = psutil.Process(child.pid).children(recursive=True)
-    child.terminate()
-    message = message_at_the_end(child, here)
-    assert child.exitcode == 143
-    assert f"slamgym: interrupted; {GOES_ON}" in message
-    assert "Traceback" not in message
-    _, alive = psutil.wait_procs(processes, timeout=10)
-    assert alive == []
-
-
 IMPORTS = 2.5  # [s] more than a forked command takes to load what it lacks
 LONG = (  # those that the next test ends in a filter are not among them
     "replay ../city.csv --out out",
@@ -119,7 +105,7 @@ def assert_ends_in_time(child, number, here, message):
     lasted = seconds_until(lambda: not child.is_alive(), 30)
     said = message_at_the_end(child, here)
     assert lasted < 2
-    assert child.exitcode == {signal.SIGINT: 130, signal.SIGTERM: 143}[number]
+    assert child.exitcode == CODES[number]
     lines = [line for line in said.splitlines() if not line.startswith("note: ")]
     assert lines == [f"slamgym: interrupted; {message}"]
     _, alive = psutil.wait_procs(processes, timeout=10)
@@ -159,13 +145,23 @@ def test_a_command_that_computes_ends_in_time(here, city_log, command, number):
     [
         (f"{DATA_SET} --jobs 2", "shard_*.npz", signal.SIGTERM),
         (JOB, "blocks/runs-*.npz", signal.SIGINT),
+        (f"{JOB} --backend dask", "blocks/runs-*.npz", signal.SIGTERM),
     ],
-    ids=["generate", "monte-carlo"],
+    ids=["generate", "monte-carlo", "dask"],
 )
-def test_a_job_of_workers_ends_in_time(here, command, made, number):
+def test_workers_of_any_kind_end_with_their_job(here, command, made, number):
+    if "dask" in command:
+        pytest.importorskip("distributed")
     child = begin(here, *command.split())
     wait_until(lambda: child.exitcode or len(list(here.glob(f"out/{made}"))) > 1)
-    assert_ends_in_time(child, number, here, message_of(command))
+    processes = psutil.Process(child.pid).children(recursive=True)
+    os.kill(child.pid, number)
+    message = message_at_the_end(child, here)
+    assert child.exitcode == CODES[number]
+    assert f"slamgym: interrupted; {message_of(command)}" in message
+    assert "Traceback" not in message
+    _, alive = psutil.wait_procs(processes, timeout=10)
+    assert alive == []
 
 
 @pytest.mark.slow
