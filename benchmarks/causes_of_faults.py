@@ -139,9 +139,7 @@ def textbook(old: str, new: str) -> type:
     source, module = TEXTBOOK.read_text(encoding="utf-8"), ModuleType("textbook")
     assert source.count(old) == 1, old
     exec(compile(source.replace(old, new), str(TEXTBOOK), "exec"), module.__dict__)
-    return type(module.TextbookEkf)(
-        "TextbookEkf", (module.TextbookEkf,), {"__module__": __name__}
-    )
+    return type("TextbookEkf", (module.TextbookEkf,), {"__module__": __name__})
 
 
 class Fault(NamedTuple):
