@@ -3,6 +3,7 @@
 import csv
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -15,9 +16,9 @@ from ...suggestions import closest
 from .. import figures
 from .options import (
     Options,
+    declared,
     note_choices,
     note_noise,
-    option,
     refuse_broken,
     takes,
     with_options,
@@ -46,6 +47,26 @@ _ONLY_FOR = {
 """Parameters that have an effect on one kind of study alone."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class NoiseStudyOptions(Options):
+    """The options of ``slamgym noise-study``."""
+
+    estimator: str = declared(
+        "invariant",
+        "--estimator -e NAME",
+        "A filter, as for replay; with --runs, several with commas between.",
+    )
+    runs: int = declared(
+        1, "", "For a scenario: with more than one, each change is a Monte Carlo."
+    )
+    change: str = declared(
+        "all",
+        "both|world|filter|all",
+        "With --runs: whether noises change in world and filter, in the world alone, "
+        "or in what the filter assumes.",
+    )
+
+
 @command
 @takes(
     "estimator motion_std measurement_std initial_pose_std landmark_init "
@@ -62,26 +83,7 @@ def noise_study(
     ],
     *,
     context: typer.Context,
-    given: Options,
-    estimator: Annotated[
-        str,
-        option(
-            "--estimator -e NAME",
-            "A filter, as for replay; with --runs, several with commas between.",
-        ),
-    ] = "invariant",
-    runs: Annotated[
-        int,
-        option("", "For a scenario: with more than one, each change is a Monte Carlo."),
-    ] = 1,
-    change: Annotated[
-        str,
-        option(
-            "both|world|filter|all",
-            "With --runs: whether noises change in world and filter, in the world "
-            "alone, or in what the filter assumes.",
-        ),
-    ] = "all",
+    given: NoiseStudyOptions,
 ) -> None:
     """Every noise times 10 and divided by 10.
 
@@ -100,14 +102,14 @@ def noise_study(
     slamgym noise-study loop -e 'invariant[iterations=3]'
     slamgym noise-study six_landmarks --runs 100 -e ekf,invariant
     """
-    from ...estimator.registry import split_labels
     from ..noise_study import study_log, study_scenario
     from ..runs.filter_settings import settings_for, settings_for_scenario
 
-    is_scenario = _is_scenario(source)
-    kinds = (_SCENARIO, _ONE_RUN if runs == 1 else _MANY_RUNS)
-    _refuse_without_effect(context, *(kinds if is_scenario else (_LOG,)))
-    named, chosen = given.named_options(), given.filter_options()
+    many = given.runs != 1
+    is_scenario, estimator = _is_scenario(source), given.estimator
+    kinds = (_SCENARIO, _MANY_RUNS if many else _ONE_RUN) if is_scenario else (_LOG,)
+    _refuse_without_effect(context, *kinds)
+    chosen = given.filter_options()
     refuse_broken(estimator, chosen)
     reporter = given.reporter()
     if not is_scenario:
@@ -115,31 +117,20 @@ def noise_study(
         note_choices(log, reporter)
         stds = given.stds()
         settings = settings_for(log, estimator=estimator, options=chosen, **stds)
-        study = one_run_study(
-            log.name, estimator, settings, partial(study_log, log, settings)
-        )
+        run = partial(study_log, log, settings)
+        study = one_run_study(log.name, estimator, settings, run)
         write_study(study, given.out, reporter)
-        note_noise(log, settings, {*stds, *named}, reporter)
+        note_noise(log, settings, {*stds, *given.named_options()}, reporter)
         return
     world = given.scenario(source)
-    if runs == 1:
+    if many:
+        study = effects_study(world, given)
+    else:
         settings = settings_for_scenario(world, estimator=estimator, options=chosen)
         given.driver(world)  # refuses a wrong name
-        study = one_run_study(
-            world.name,
-            estimator,
-            settings,
-            partial(
-                study_scenario, world, given.record, estimator=estimator, options=chosen
-            ),
-        )
-    else:
-        texts = [f"{key}={value}" for key, value in named.items()]
-        texts += given.option_texts or []
-        labels = [with_options(label, texts) for label in split_labels(estimator)]
-        study = effects_study(
-            world, ",".join(labels), runs, given.seed, change, given.jobs
-        )
+        run = partial(study_scenario, world, given.record)
+        run = partial(run, estimator=estimator, options=chosen)
+        study = one_run_study(world.name, estimator, settings, run)
     write_study(study, given.out, reporter)
 
 
@@ -199,30 +190,27 @@ def one_run_study(
     return Study((name, estimator), about, run)
 
 
-def effects_study(
-    world: Scenario,
-    estimators: str,
-    runs: int,
-    seed: int,
-    change: str,
-    jobs: int | None,
-) -> Study:
+def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
     """Prepare the study of a scenario over many runs."""
     from ... import __version__
+    from ...estimator.registry import split_labels
     from ..noise_study import CHANGED, noise_effects, noise_effects_figure
     from .tables import effects_table
 
+    runs, seed, change = given.runs, given.seed, given.change
+    texts = [f"{key}={value}" for key, value in given.named_options().items()]
+    texts += given.option_texts or []
+    labels = [with_options(label, texts) for label in split_labels(given.estimator)]
     if change != "all" and change not in CHANGED:
         raise BadInputError(
             f"--change must be all, {', '.join(CHANGED)}, got '{change}'"
         )
     places = [place for place in CHANGED if change in ("all", place)]
+    study = partial(noise_effects, world, ",".join(labels), runs, seed, jobs=given.jobs)
 
     def run(reporter: Reporter) -> Results:
         with reporter.progress("running", unit="runs") as tick:
-            effects = noise_effects(
-                world, estimators, runs, seed, changed=places, jobs=jobs, progress=tick
-            )
+            effects = study(changed=places, progress=tick)
         shown = [effects_table(world.name, runs, effects)]
         return Results(effects, (), noise_effects_figure(effects), 150, shown)
 

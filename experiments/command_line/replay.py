@@ -1,6 +1,6 @@
 """``slamgym replay`` and ``slamgym smooth``: filter or smooth a log, compare, draw."""
 
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -8,12 +8,41 @@ from typing import Annotated
 import typer
 
 from .. import figures, runs
-from . import options
+from .options import (
+    LogFile,
+    Options,
+    assignments,
+    declared,
+    note_choices,
+    note_noise,
+    takes,
+)
 from .program import command
 
 
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions(Options):
+    """The options of ``slamgym replay``."""
+
+    hide_identities: bool = declared(
+        False,
+        "--hide-identities",
+        "Let the filter associate the readings of a log that identifies them, and "
+        "score it.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothOptions(Options):
+    """The options of ``slamgym smooth``."""
+
+    robust: str | None = declared(
+        None, "huber|cauchy", "Give outliers less weight.", "all weigh the same"
+    )
+
+
 @command
-@options.takes(
+@takes(
     "labels motion_std measurement_std initial_pose_std landmark_init gate_probability "
     "range_std_per_metre noise_at_rest option_texts hide_identities resolution robot "
     "truth noise_from_file out every_step rerun as_json"
@@ -28,15 +57,7 @@ def replay(
         ),
     ],
     *,
-    given: options.Options,
-    hide_identities: Annotated[
-        bool,
-        options.option(
-            "--hide-identities",
-            "Let the filter associate the readings of a log that identifies them, and "
-            "score it.",
-        ),
-    ] = False,
+    given: ReplayOptions,
 ) -> None:
     """Filter a log, compare with the truth, draw.
 
@@ -58,35 +79,25 @@ def replay(
 
     reporter = given.reporter()
     check_rerun(given.rerun)
-    drive = replace(given, hide_identities=hide_identities).read(log)
-    options.note_choices(drive, reporter)
+    drive = given.read(log)
+    note_choices(drive, reporter)
     stds = given.stds()
     filters = given.filters(partial(settings_for, drive, **stds))
     place = given.out or default_folder(drive.name, *filters)
     with output_folder(place) as folder:
         summary = filter_and_write(drive, filters, folder, given, reporter)
     chosen = {*stds, *given.named_options()}
-    options.note_noise(drive, next(iter(filters.values())), chosen, reporter)
+    note_noise(drive, next(iter(filters.values())), chosen, reporter)
     show_run(summary, place, reporter)
 
 
 @command
-@options.takes(
+@takes(
     "estimator motion_std measurement_std initial_pose_std robust gate_probability "
     "range_std_per_metre noise_at_rest option_texts robot truth noise_from_file out "
     "as_json"
 )
-def smooth(
-    log: options.LogFile,
-    *,
-    given: options.Options,
-    robust: Annotated[
-        str | None,
-        options.option(
-            "huber|cauchy", "Give outliers less weight.", "all weigh the same"
-        ),
-    ] = None,
-) -> None:
+def smooth(log: LogFile, *, given: SmoothOptions) -> None:
     """Smooth a log: estimate all poses and landmarks at once.
 
     Filter a log, then find the most likely poses and landmarks given all of its
@@ -106,13 +117,13 @@ def smooth(
     from .tables import heading, smoothing_figures, smoothing_table, written
 
     name, own = read_label(given.estimator)
-    chosen = given.named_options() | ({"robust": robust} if robust is not None else {})
-    chosen |= (
-        options.assignments("--option", given.option_texts) | own | {"follow": name}
-    )
+    chosen = given.named_options()
+    if given.robust is not None:
+        chosen["robust"] = given.robust
+    chosen |= assignments("--option", given.option_texts) | own | {"follow": name}
     reporter = given.reporter()
     drive = given.read(log)
-    options.note_choices(drive, reporter)
+    note_choices(drive, reporter)
     stated = given.stds()
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)
@@ -126,7 +137,7 @@ def smooth(
             smoothed = runs.smooth_log(drive, settings, progress=tick)
         figures.save_figure(figures.smoothed_figure(smoothed), folder / "map.png")
         summary = write_summary(folder, runs.summarise_smoothing(smoothed, settings))
-    options.note_noise(drive, settings, {*stds, *chosen}, reporter)
+    note_noise(drive, settings, {*stds, *chosen}, reporter)
     title = heading("", summary["log"], " smoothed, following ", given.estimator)
     files = written(str(place), summary["files"])
     is_compared = any(summary[key]["filter"] for key in ("ate", "landmark_rmse"))
