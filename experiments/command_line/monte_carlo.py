@@ -12,51 +12,47 @@ from typing import Any
 from rich.text import Text
 
 from ...sim_configs import load_scenario
-from .options import (
-    REPEATED,
-    Options,
-    ScenarioName,
-    changes,
-    declared,
-    refuse_broken,
-    takes,
-)
+from . import options
 from .program import FAILURE, BadInputError, command, interruptible
 
 
 @dataclass(frozen=True, kw_only=True)
-class MonteCarloOptions(Options):
+class MonteCarloOptions(options.Options):
     """The options of ``slamgym monte-carlo``."""
 
-    estimators: str = declared(
+    estimators: str = options.declared(
         "ekf,invariant",
         "--estimators -e NAMES",
         'Filters separated by commas, such as "ekf,invariant[iterations=3]", or '
         'your own "module:Class"; options in brackets.',
     )
-    runs: int = declared(
+    runs: int = options.declared(
         200,
         "",
         "Number of runs. Run i is the world of seed SEED + i; jobs whose seeds are "
         "closer than this share worlds.",
     )
-    assume: list[str] | None = declared(
+    assume: list[str] | None = options.declared(
         None,
         "KEY=VALUE",
         "A change of the scenario that only the filters assume, such as "
-        f"motion.std=[0.1,0.1,0.1]. {REPEATED}",
+        f"motion.std=[0.1,0.1,0.1]. {options.REPEATED}",
     )
-    block_size: int = declared(64, "N", "Number of runs computed and written together.")
-    first_run: int = declared(
+    block_size: int = options.declared(
+        64, "N", "Number of runs computed and written together."
+    )
+    first_run: int = options.declared(
         0, "N", "Omit the runs below N, a multiple of the block size."
     )
-    merge: list[Path] | None = declared(
-        None, "DIR", f"Add the results of another machine for this job. {REPEATED}"
+    merge: list[Path] | None = options.declared(
+        None,
+        "DIR",
+        f"Add the results of another machine for this job. {options.REPEATED}",
     )
-    fresh: bool = declared(
+    fresh: bool = options.declared(
         False, "--fresh", "Remove earlier results in the folder first."
     )
-    out: Path | None = declared(
+    out: Path | None = options.declared(
         None,
         "DIR",
         "The folder to write. An interrupted job there continues, and more runs are "
@@ -66,11 +62,11 @@ class MonteCarloOptions(Options):
 
 
 @command
-@takes(
+@options.takes(
     "estimators runs seed steps set_ assume resolution jobs backend scheduler "
     "block_size first_run merge fresh out as_json"
 )
-def monte_carlo(scenario: ScenarioName, *, given: MonteCarloOptions) -> int:
+def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> int:
     """Many runs: are the filters consistent?
 
     Run filters many times over a scenario, all on the same random numbers, and
@@ -95,9 +91,9 @@ def monte_carlo(scenario: ScenarioName, *, given: MonteCarloOptions) -> int:
     from .tables import written
 
     world = given.scenario(scenario)
-    assumed = changes("--assume", given.assume)
+    assumed = options.changes("--assume", given.assume)
     reporter = given.reporter()
-    refuse_broken(given.estimators)
+    options.refuse_broken(given.estimators)
     place = given.out or default_folder("monte-carlo", world.name)
     told = world.with_changes(**assumed) if assumed else world
     with reporter.note_if_compiling("the filters"):

@@ -14,16 +14,7 @@ from ...sim_configs import Scenario, list_presets
 from ...sim_configs.atomic_file import naming_file
 from ...suggestions import closest
 from .. import figures
-from .options import (
-    Options,
-    declared,
-    note_choices,
-    note_noise,
-    refuse_broken,
-    takes,
-    with_options,
-)
-from .program import BadInputError, command, way_to_set
+from . import options, program
 from .reporter import Reporter
 
 if TYPE_CHECKING:
@@ -48,18 +39,18 @@ _ONLY_FOR = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoiseStudyOptions(Options):
+class NoiseStudyOptions(options.Options):
     """The options of ``slamgym noise-study``."""
 
-    estimator: str = declared(
+    estimator: str = options.declared(
         "invariant",
         "--estimator -e NAME",
         "A filter, as for replay; with --runs, several with commas between.",
     )
-    runs: int = declared(
+    runs: int = options.declared(
         1, "", "For a scenario: with more than one, each change is a Monte Carlo."
     )
-    change: str = declared(
+    change: str = options.declared(
         "all",
         "both|world|filter|all",
         "With --runs: whether noises change in world and filter, in the world alone, "
@@ -67,8 +58,8 @@ class NoiseStudyOptions(Options):
     )
 
 
-@command
-@takes(
+@program.command
+@options.takes(
     "estimator motion_std measurement_std initial_pose_std landmark_init "
     "gate_probability range_std_per_metre noise_at_rest option_texts hide_identities "
     "robot truth noise_from_file seed steps controller set_ runs change jobs out "
@@ -110,17 +101,17 @@ def noise_study(
     kinds = (_SCENARIO, _MANY_RUNS if many else _ONE_RUN) if is_scenario else (_LOG,)
     _refuse_without_effect(context, *kinds)
     chosen = given.filter_options()
-    refuse_broken(estimator, chosen)
+    options.refuse_broken(estimator, chosen)
     reporter = given.reporter()
     if not is_scenario:
         log = given.read(Path(source))
-        note_choices(log, reporter)
+        options.note_choices(log, reporter)
         stds = given.stds()
         settings = settings_for(log, estimator=estimator, options=chosen, **stds)
         run = partial(study_log, log, settings)
         study = one_run_study(log.name, estimator, settings, run)
         write_study(study, given.out, reporter)
-        note_noise(log, settings, {*stds, *given.named_options()}, reporter)
+        options.note_noise(log, settings, {*stds, *given.named_options()}, reporter)
         return
     world = given.scenario(source)
     if many:
@@ -200,9 +191,11 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
     runs, seed, change = given.runs, given.seed, given.change
     texts = [f"{key}={value}" for key, value in given.named_options().items()]
     texts += given.option_texts or []
-    labels = [with_options(label, texts) for label in split_labels(given.estimator)]
+    labels = [
+        options.with_options(label, texts) for label in split_labels(given.estimator)
+    ]
     if change != "all" and change not in CHANGED:
-        raise BadInputError(
+        raise program.BadInputError(
             f"--change must be all, {', '.join(CHANGED)}, got '{change}'"
         )
     places = [place for place in CHANGED if change in ("all", place)]
@@ -261,7 +254,7 @@ def _is_scenario(source: str) -> bool:
         return True
     if Path(source).exists():
         return False
-    raise BadInputError(
+    raise program.BadInputError(
         f"no log and no scenario '{source}'{closest(source, list_presets())} "
         f"(there are {', '.join(list_presets())})"
     )
@@ -274,6 +267,7 @@ def _refuse_without_effect(context: typer.Context, *kinds: str) -> None:
             source = context.get_parameter_source(name)
             if source is not None and source.name == "COMMANDLINE":
                 option = f"--{name.strip('_').replace('_', '-')}"
-                raise BadInputError(
-                    f"{option} is for the noise study of {kind}{way_to_set(option)}"
+                hint = program.way_to_set(option)
+                raise program.BadInputError(
+                    f"{option} is for the noise study of {kind}{hint}"
                 )

@@ -8,23 +8,14 @@ from typing import Annotated
 import typer
 
 from .. import figures, runs
-from .options import (
-    LogFile,
-    Options,
-    assignments,
-    declared,
-    note_choices,
-    note_noise,
-    takes,
-)
-from .program import command
+from . import options, program
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayOptions(Options):
+class ReplayOptions(options.Options):
     """The options of ``slamgym replay``."""
 
-    hide_identities: bool = declared(
+    hide_identities: bool = options.declared(
         False,
         "--hide-identities",
         "Let the filter associate the readings of a log that identifies them, and "
@@ -33,16 +24,16 @@ class ReplayOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SmoothOptions(Options):
+class SmoothOptions(options.Options):
     """The options of ``slamgym smooth``."""
 
-    robust: str | None = declared(
+    robust: str | None = options.declared(
         None, "huber|cauchy", "Give outliers less weight.", "all weigh the same"
     )
 
 
-@command
-@takes(
+@program.command
+@options.takes(
     "labels motion_std measurement_std initial_pose_std landmark_init gate_probability "
     "range_std_per_metre noise_at_rest option_texts hide_identities resolution robot "
     "truth noise_from_file out every_step rerun as_json"
@@ -80,24 +71,24 @@ def replay(
     reporter = given.reporter()
     check_rerun(given.rerun)
     drive = given.read(log)
-    note_choices(drive, reporter)
+    options.note_choices(drive, reporter)
     stds = given.stds()
     filters = given.filters(partial(settings_for, drive, **stds))
     place = given.out or default_folder(drive.name, *filters)
     with output_folder(place) as folder:
         summary = filter_and_write(drive, filters, folder, given, reporter)
     chosen = {*stds, *given.named_options()}
-    note_noise(drive, next(iter(filters.values())), chosen, reporter)
+    options.note_noise(drive, next(iter(filters.values())), chosen, reporter)
     show_run(summary, place, reporter)
 
 
-@command
-@takes(
+@program.command
+@options.takes(
     "estimator motion_std measurement_std initial_pose_std robust gate_probability "
     "range_std_per_metre noise_at_rest option_texts robot truth noise_from_file out "
     "as_json"
 )
-def smooth(log: LogFile, *, given: SmoothOptions) -> None:
+def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
     """Smooth a log: estimate all poses and landmarks at once.
 
     Filter a log, then find the most likely poses and landmarks given all of its
@@ -120,10 +111,12 @@ def smooth(log: LogFile, *, given: SmoothOptions) -> None:
     chosen = given.named_options()
     if given.robust is not None:
         chosen["robust"] = given.robust
-    chosen |= assignments("--option", given.option_texts) | own | {"follow": name}
+    chosen |= (
+        options.assignments("--option", given.option_texts) | own | {"follow": name}
+    )
     reporter = given.reporter()
     drive = given.read(log)
-    note_choices(drive, reporter)
+    options.note_choices(drive, reporter)
     stated = given.stds()
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)
@@ -137,7 +130,7 @@ def smooth(log: LogFile, *, given: SmoothOptions) -> None:
             smoothed = runs.smooth_log(drive, settings, progress=tick)
         figures.save_figure(figures.smoothed_figure(smoothed), folder / "map.png")
         summary = write_summary(folder, runs.summarise_smoothing(smoothed, settings))
-    note_noise(drive, settings, {*stds, *chosen}, reporter)
+    options.note_noise(drive, settings, {*stds, *chosen}, reporter)
     title = heading("", summary["log"], " smoothed, following ", given.estimator)
     files = written(str(place), summary["files"])
     is_compared = any(summary[key]["filter"] for key in ("ate", "landmark_rmse"))

@@ -21,16 +21,8 @@ from ...estimator.interface import (
     SupportsTruth,
     UpdateReport,
 )
-from ...estimator.map_management.hypotheses import HypothesisSlam
-from ...estimator.map_management.managed_slam import ManagedSlam
-from ...estimator.map_management.map_editor import (
-    mapped_ids,
-    marginal_without_joining,
-    view_map,
-)
-from ..logs import ground_truth
-from ..logs.recording import Step, predictions, steps_of
-from ..logs.slamlog import Scan, SlamLog
+from ...estimator.map_management import hypotheses, managed_slam, map_editor
+from ..logs import ground_truth, recording, slamlog
 from .filter_settings import one_blas_thread, refuse_large_map
 from .trace import DecisionRecorder, MapEstimate, RunDecisions, RunTrace
 
@@ -58,7 +50,7 @@ class MapChanges(NamedTuple):
 class Replay:
     """An estimator's run over a log."""
 
-    log: SlamLog
+    log: slamlog.SlamLog
     """The log."""
     trace: RunTrace
     """The estimator's belief after every step."""
@@ -77,7 +69,7 @@ class Replay:
 
 
 def replay(
-    log: SlamLog,
+    log: slamlog.SlamLog,
     estimator: SlamEstimator,
     *,
     name: str | None = None,
@@ -135,7 +127,7 @@ def replay(
     ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1, ...
     """
     refuse_large_map(log, estimator)
-    steps = list(steps_of(log))
+    steps = list(recording.steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     show_truth = _truth_source(estimator, log, times)
     recorder = RunRecorder(estimator, len(steps), _history(estimator, keep_history))
@@ -146,9 +138,12 @@ def replay(
             with _naming_time(log, step):
                 show_truth(number)
                 for row in step.motions:
-                    for odometry, dt in predictions(row, log.motion):
+                    for odometry, dt in recording.predictions(row, log.motion):
                         estimator.predict(odometry, dt)
-                predicted, report = marginal_without_joining(estimator, ()), None
+                predicted, report = (
+                    map_editor.marginal_without_joining(estimator, ()),
+                    None,
+                )
                 if step.scan is not None:
                     report = estimator.update(step.scan.measurements, _ids(step.scan))
                     decisions.add(report, ground_truth.true_ids_of(step.scan))
@@ -185,13 +180,13 @@ def _name_of(estimator: SlamEstimator, given: str | None) -> str:
     """Return a given name, or that of the class; of a managed filter, the filter's."""
     if given:
         return given
-    if isinstance(estimator, ManagedSlam | HypothesisSlam):
+    if isinstance(estimator, managed_slam.ManagedSlam | hypotheses.HypothesisSlam):
         return type(estimator.filter).__name__
     return type(estimator).__name__
 
 
 def _truth_source(
-    estimator: SlamEstimator, log: SlamLog, times: Array
+    estimator: SlamEstimator, log: slamlog.SlamLog, times: Array
 ) -> Callable[[int], None]:
     """Return the function that passes the truth of a step to an observing estimator.
 
@@ -209,7 +204,7 @@ def _truth_source(
 
 
 @contextlib.contextmanager
-def _naming_time(log: SlamLog, step: Step) -> Iterator[None]:
+def _naming_time(log: slamlog.SlamLog, step: recording.Step) -> Iterator[None]:
     """Name the time of a step in the estimator's errors."""
     try:
         yield
@@ -219,7 +214,7 @@ def _naming_time(log: SlamLog, step: Step) -> Iterator[None]:
         raise kind(f"{log.name}, t = {step.t:g}: {error}") from error
 
 
-def _ids(scan: Scan) -> list[int] | None:
+def _ids(scan: slamlog.Scan) -> list[int] | None:
     return None if scan.landmark_ids is None else scan.landmark_ids.tolist()
 
 
@@ -266,13 +261,13 @@ class RunRecorder:
         self._predicted.put(step, predicted)
         updated = predicted
         if report is not None:
-            updated = marginal_without_joining(self._slam, ())
+            updated = map_editor.marginal_without_joining(self._slam, ())
             self._nis[step] = report.nis
             self._dof[step] = report.degrees_of_freedom
             self._count(report)
             seen = (*report.associated_ids, *report.added_ids)
             self.last_seen |= dict.fromkeys(seen, step)
-            self._keep_new(mapped_ids(self._slam))
+            self._keep_new(map_editor.mapped_ids(self._slam))
         self._updated.put(step, updated)
         if step == self._steps - 1:
             self.belief = self._slam.belief()
@@ -281,7 +276,7 @@ class RunRecorder:
             ):  # the joined map corrects the pose too
                 self._updated.put(step, self.belief)
         if step == self._steps - 1 or self._history.is_due(step, self._ids):
-            self._history.append(view_map(self._slam))
+            self._history.append(map_editor.view_map(self._slam))
         else:
             self._history.leave_out()
 
@@ -305,7 +300,7 @@ class RunRecorder:
         self,
         name: str,
         times: Array,
-        log: SlamLog,
+        log: slamlog.SlamLog,
         identities: Mapping[int, int] | None = None,
     ) -> RunTrace:
         """Return the trace of the run; identities are those of its own landmarks."""
@@ -345,7 +340,7 @@ class RunRecorder:
         if ids == self._ids:
             return
         new = [i for i in ids if i not in self._first]
-        belief = marginal_without_joining(self._slam, new)
+        belief = map_editor.marginal_without_joining(self._slam, new)
         if self._first_covariance is None:
             self._first_covariance = belief.covariance
         pairs = zip(belief.landmarks, belief.landmark_covariances, strict=True)

@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import slamlog
-from .course import read_course, read_freiburg
-from .graph import GRAPH_TAGS, read_isam
-from .utias import read_utias
+from . import course, graph, utias
 
 EXPECTED = (
     "a log: slamlog 1, a course data.txt, a Freiburg sensor.dat, "
@@ -20,8 +18,8 @@ EXPECTED = (
 )
 READERS = {
     "slamlog": slamlog.read_slamlog,
-    "course": read_course,
-    "freiburg": read_freiburg,
+    "course": course.read_course,
+    "freiburg": course.read_freiburg,
 }
 
 
@@ -80,9 +78,9 @@ def read_log(
     if kind != "isam":
         _refuse_options_of_graphs(truth, noise_from_file)
     if kind == "utias":
-        log = read_utias(source, robot=robot)
+        log = utias.read_utias(source, robot=robot)
     elif kind == "isam":
-        log = read_isam(path, truth=truth, noise_from_file=noise_from_file)
+        log = graph.read_isam(path, truth=truth, noise_from_file=noise_from_file)
     else:
         log = READERS[kind](path)
     if landmarks is None:
@@ -103,7 +101,7 @@ def _format_of(line: slamlog.LogLine) -> str:
         return "slamlog"
     if (tag, len(fields)) == ("ODOMETRY", 3) or tag == "SENSOR":
         return "freiburg"
-    if tag in GRAPH_TAGS:
+    if tag in graph.GRAPH_TAGS:
         return "isam"
     try:
         np.array([tag, *fields], dtype=np.float64)
