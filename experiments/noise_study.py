@@ -26,7 +26,7 @@ from matplotlib.lines import Line2D
 from ..estimator.registry import EstimatorFactory
 from ..evaluation.trajectory_error import ellipse_areas
 from ..sim_configs import Scenario, load_scenario
-from ..suggestions import closest
+from ..sim_configs.field_types import unknown_choice
 from .figures.style import GREY, INK, dress, new_figure, write_title
 from .logs.ground_truth import path_accuracy
 from .logs.slamlog import SlamLog
@@ -289,10 +289,7 @@ def _changes(
     """Yield (place of the change, variation, world, what the filters assume)."""
     for place in places:
         if place not in CHANGED:
-            hint = closest(place, CHANGED)
-            raise ValueError(
-                f"changed must be of {', '.join(CHANGED)}, got '{place}'{hint}"
-            )
+            raise ValueError(unknown_choice("changed", place, CHANGED))
         for variation in CHANGES:
             scaled = scaled_scenario(world, *variation)
             yield (

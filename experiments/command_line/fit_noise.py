@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from .. import figures, noise_fitting
-from .options import LogFile, Options, declared, note_choices, takes
+from .options import LogFile, Options, declared, takes
 from .program import command
 
 
@@ -46,10 +46,9 @@ def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
     from .tables import advice, heading, noise_comparison_table, noise_table, written
 
     reporter = given.reporter()
-    drive = given.read(log)
+    drive = given.read(log, reporter)
     if given.write:
         refuse_other_formats(log)
-    note_choices(drive, reporter)
     stated = given.stds()
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)

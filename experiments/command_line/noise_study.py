@@ -12,6 +12,7 @@ import typer
 
 from ...sim_configs import Scenario, list_presets
 from ...sim_configs.atomic_file import naming_file
+from ...sim_configs.field_types import unknown_choice
 from ...suggestions import closest
 from .. import figures
 from . import options, program
@@ -104,8 +105,7 @@ def noise_study(
     options.refuse_broken(estimator, chosen)
     reporter = given.reporter()
     if not is_scenario:
-        log = given.read(Path(source))
-        options.note_choices(log, reporter)
+        log = given.read(Path(source), reporter)
         stds = given.stds()
         settings = settings_for(log, estimator=estimator, options=chosen, **stds)
         run = partial(study_log, log, settings)
@@ -196,7 +196,7 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
     ]
     if change != "all" and change not in CHANGED:
         raise program.BadInputError(
-            f"--change must be all, {', '.join(CHANGED)}, got '{change}'"
+            unknown_choice("--change", change, ("all", *CHANGED))
         )
     places = [place for place in CHANGED if change in ("all", place)]
     study = partial(noise_effects, world, ",".join(labels), runs, seed, jobs=given.jobs)

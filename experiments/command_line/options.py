@@ -18,7 +18,7 @@ import numpy as np
 import typer
 
 from ...sim_configs import Scenario, list_presets, load_scenario
-from ...suggestions import closest
+from ...sim_configs.field_types import unknown_choice
 from .program import BadInputError, BrokenFilterError
 from .reporter import Reporter
 
@@ -249,10 +249,8 @@ class Options:
         from ...envs.controllers import CONTROLLERS, make_controller
 
         if self.controller not in CONTROLLERS:
-            hint, known = closest(self.controller, CONTROLLERS), ", ".join(CONTROLLERS)
-            raise BadInputError(
-                f"unknown controller '{self.controller}'{hint} (there are {known})"
-            )
+            message = unknown_choice("--controller", self.controller, CONTROLLERS)
+            raise BadInputError(message)
         random = np.random.default_rng([self.seed, 1])
         return make_controller(self.controller, scenario, random)
 
@@ -265,8 +263,10 @@ class Options:
         driver = self.driver(scenario)
         return record_episode(scenario, driver, self.seed, progress=progress)
 
-    def read(self, path: Path) -> "SlamLog":
+    def read(self, path: Path, reporter: Reporter) -> "SlamLog":
         """Read a log of any known format, with its truth if that is in another file.
+
+        Notes what the importer omitted, and where the noise is from.
 
         Raises
         ------
@@ -295,6 +295,10 @@ class Options:
             ) from error
         except MemoryError as error:
             raise BadInputError(f"the log {path} does not fit into memory") from error
+        if "left_out" in log.header:
+            reporter.note(f"left out of the log: {log.header['left_out']}")
+        if "noise" in log.header and "motion_std" in log.header:
+            reporter.note(f"noise {log.header['noise']}")
         return without_identities(log) if self.hide_identities else log
 
     def stds(self) -> dict[str, Any]:
@@ -493,14 +497,6 @@ def _refuse_log(name: str) -> None:
     )
 
 
-def note_choices(log: "SlamLog", reporter: Reporter) -> None:
-    """Note what the importer of a log omitted, and where its noise is from."""
-    if "left_out" in log.header:
-        reporter.note(f"left out of the log: {log.header['left_out']}")
-    if "noise" in log.header and "motion_std" in log.header:
-        reporter.note(f"noise {log.header['noise']}")
-
-
 def note_noise(
     log: "SlamLog",
     settings: "FilterSettings",
@@ -508,16 +504,11 @@ def note_noise(
     reporter: Reporter,
 ) -> None:
     """Note the noise of a log's filter, without what the user gave."""
-    options = {
-        "range_std_per_metre": settings.options.get("range_std_per_metre"),
-        "bearing_std_metres": settings.options.get("bearing_std_metres"),
-    }
-    values = {
-        "motion_std": settings.motion_std,
-        "measurement_std": settings.measurement_std,
-        "initial_pose_std": settings.initial_pose_std,
-        **{name: (std,) for name, std in options.items() if std},
-    }
+    names = ("motion_std", "measurement_std", "initial_pose_std")
+    values = {name: getattr(settings, name) for name in names}
+    for name in ("range_std_per_metre", "bearing_std_metres"):
+        if std := settings.options.get(name):
+            values[name] = (std,)
     found = [
         f"{name} {','.join(f'{std:.6g}' for std in stds)}"
         for name, stds in values.items()

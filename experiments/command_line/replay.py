@@ -70,8 +70,7 @@ def replay(
 
     reporter = given.reporter()
     check_rerun(given.rerun)
-    drive = given.read(log)
-    options.note_choices(drive, reporter)
+    drive = given.read(log, reporter)
     stds = given.stds()
     filters = given.filters(partial(settings_for, drive, **stds))
     place = given.out or default_folder(drive.name, *filters)
@@ -115,8 +114,7 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
         options.assignments("--option", given.option_texts) | own | {"follow": name}
     )
     reporter = given.reporter()
-    drive = given.read(log)
-    options.note_choices(drive, reporter)
+    drive = given.read(log, reporter)
     stated = given.stds()
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)

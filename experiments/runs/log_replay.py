@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import NamedTuple, overload
+from typing import Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 
@@ -380,9 +381,8 @@ class MapHistory(Sequence[MapEstimate]):
     """
 
     def __init__(self, most: int | None = None) -> None:
-        self._most = most
-        self._stride = 1
-        self._kept: dict[int, MapEstimate] = {}
+        most_steps = math.inf if most is None else most
+        self._kept = ThinnedSteps[MapEstimate](most_steps, math.inf, last=-1)
         self._first_map: int | None = None
         self._length = 0
 
@@ -395,12 +395,11 @@ class MapHistory(Sequence[MapEstimate]):
             belief.landmarks.copy(),
             belief.landmark_covariances,
         )
-        is_due = self.is_due(step, ids)
         if ids and self._first_map is None:
             self._first_map = step
-        if is_due:
-            self._kept[step] = self._latest
-            self._thin()
+            self._kept.always.add(step)
+        if self._kept.is_due(step):
+            self._kept.put(step, self._latest, size=0)
         self._length += 1
 
     def leave_out(self) -> None:
@@ -410,7 +409,7 @@ class MapHistory(Sequence[MapEstimate]):
     def is_due(self, step: int, ids: Sequence[int]) -> bool:
         """Whether the map of a step will be kept; ``ids`` are the landmarks in it."""
         is_first_map = self._first_map is None and len(ids) > 0
-        return is_first_map or self._is_due(step)
+        return is_first_map or self._kept.is_due(step)
 
     @overload
     def __getitem__(self, index: int) -> MapEstimate: ...
@@ -423,21 +422,67 @@ class MapHistory(Sequence[MapEstimate]):
         step = range(self._length)[index]
         if step == self._length - 1:
             return self._latest
-        kept = list(self._kept)
-        return self._kept[kept[bisect_right(kept, step) - 1]]
+        kept = list(self._kept.items)
+        return self._kept.items[kept[bisect_right(kept, step) - 1]]
 
     def __len__(self) -> int:
         """Return the number of steps, kept or not."""
         return self._length
 
-    def _is_due(self, step: int) -> bool:
-        return step % self._stride == 0 or step == self._first_map
 
-    def _thin(self) -> None:
-        """Drop every second map if there are too many."""
-        if self._most is None or len(self._kept) <= self._most + 1:
-            return
-        self._stride *= 2
-        self._kept = {
-            step: kept for step, kept in self._kept.items() if self._is_due(step)
-        }
+_Item = TypeVar("_Item")
+
+
+class ThinnedSteps(Generic[_Item]):
+    """Items by step; where they become too many, every second one is dropped.
+
+    Parameters
+    ----------
+    most_steps : int
+        Largest number of items, the last one not counted.
+    most_size : int
+        Largest sum of their sizes; at least two items are kept.
+    last : int
+        The last step, which is always kept.
+
+    Attributes
+    ----------
+    items : dict of int to item
+        The kept items, by their steps in ascending order.
+    stride : int
+        Steps between two items.
+    always : set of int
+        Steps whose items are kept, whatever the stride.
+
+    Examples
+    --------
+    >>> kept = ThinnedSteps(most_steps=3, most_size=100, last=8)
+    >>> for step in range(9):
+    ...     if kept.is_due(step):
+    ...         kept.put(step, f"map {step}", size=1)
+    >>> list(kept.items), kept.stride
+    ([0, 4, 8], 4)
+    """
+
+    def __init__(self, most_steps: float, most_size: float, last: int) -> None:
+        self._most_steps, self._most_size = most_steps, most_size
+        self._sizes: dict[int, int] = {}
+        self._total = 0
+        self.items: dict[int, _Item] = {}
+        self.stride, self.always = 1, {last}
+
+    def is_due(self, step: int) -> bool:
+        """Whether the item of a step will be kept."""
+        return step % self.stride == 0 or step in self.always
+
+    def put(self, step: int, item: _Item, size: int) -> None:
+        """Keep the item of a step that is due."""
+        self.items[step], self._sizes[step] = item, size
+        self._total += size
+        while len(self.items) > 2 and (
+            len(self.items) > self._most_steps + 1 or self._total > self._most_size
+        ):
+            self.stride *= 2
+            for old in [k for k in self.items if not self.is_due(k)]:
+                del self.items[old]
+                self._total -= self._sizes.pop(old)
