@@ -270,16 +270,13 @@ class RunRecorder:
             self.last_seen |= dict.fromkeys(seen, step)
             self._keep_new(map_editor.mapped_ids(self._slam))
         self._updated.put(step, updated)
-        if step == self._steps - 1:
+        is_last = step == self._steps - 1
+        if is_last:
             self.belief = self._slam.belief()
-            if isinstance(
-                self._slam, SupportsJoin
-            ):  # the joined map corrects the pose too
-                self._updated.put(step, self.belief)
-        if step == self._steps - 1 or self._history.is_due(step, self._ids):
-            self._history.append(map_editor.view_map(self._slam))
-        else:
-            self._history.leave_out()
+            if isinstance(self._slam, SupportsJoin):
+                self._updated.put(step, self.belief)  # the joined map corrects the pose
+        is_due = is_last or self._history.is_due(step, self._ids)
+        self._history.append(map_editor.view_map(self._slam) if is_due else None)
 
     def counts(self) -> ReadingCounts:
         """Count the readings."""
@@ -386,9 +383,12 @@ class MapHistory(Sequence[MapEstimate]):
         self._first_map: int | None = None
         self._length = 0
 
-    def append(self, belief: Belief | MapView) -> None:
-        """Append the belief after the next step."""
+    def append(self, belief: Belief | MapView | None) -> None:
+        """Append the belief after the next step; None if it is neither due nor last."""
         step = self._length
+        self._length += 1
+        if belief is None:
+            return
         ids = belief.ids if isinstance(belief, MapView) else belief.landmark_ids
         self._latest = MapEstimate(
             np.array(ids, dtype=np.int64),
@@ -400,11 +400,6 @@ class MapHistory(Sequence[MapEstimate]):
             self._kept.always.add(step)
         if self._kept.is_due(step):
             self._kept.put(step, self._latest, size=0)
-        self._length += 1
-
-    def leave_out(self) -> None:
-        """Skip the next step, which must be neither due nor the last."""
-        self._length += 1
 
     def is_due(self, step: int, ids: Sequence[int]) -> bool:
         """Whether the map of a step will be kept; ``ids`` are the landmarks in it."""

@@ -75,8 +75,10 @@ def read_log(
         kind = _format_of(slamlog.read_lines(path)[0])
     if robot is not None and kind != "utias":
         raise ValueError(f"robot must be None for a log in one file, got {robot}")
-    if kind != "isam":
-        _refuse_options_of_graphs(truth, noise_from_file)
+    if truth is not None and kind != "isam":
+        raise ValueError(f"truth must be None for a log that is no graph, got {truth}")
+    if noise_from_file and kind != "isam":
+        raise ValueError("noise_from_file needs a graph, iSAM or g2o text")
     if kind == "utias":
         log = utias.read_utias(source, robot=robot)
     elif kind == "isam":
@@ -108,12 +110,3 @@ def _format_of(line: slamlog.LogLine) -> str:
     except ValueError:
         raise line.error(EXPECTED, slamlog.shown(line.text)) from None
     return "course"
-
-
-def _refuse_options_of_graphs(
-    truth: str | PathLike[str] | None, noise_from_file: bool
-) -> None:
-    if truth is not None:
-        raise ValueError(f"truth must be None for a log that is no graph, got {truth}")
-    if noise_from_file:
-        raise ValueError("noise_from_file needs a graph, iSAM or g2o text")
