@@ -264,15 +264,9 @@ def noise_effects(
     world = load_scenario(scenario)
     jobs_to_do = [("nothing", REFERENCE, world, world), *_changes(world, changed)]
     effects: list[NoiseEffect] = []
-    for done, (place, variation, changed_world, assumed) in enumerate(jobs_to_do, 1):
+    for done, (place, variation, actual, assumed) in enumerate(jobs_to_do, 1):
         results = monte_carlo(
-            changed_world,
-            estimators,
-            runs,
-            seed,
-            assumed=assumed,
-            jobs=jobs,
-            backend=backend,
+            actual, estimators, runs, seed, assumed=assumed, jobs=jobs, backend=backend
         )
         effects += [
             _effect(place, variation, scores_of(results, label, "invariant"))

@@ -394,18 +394,15 @@ def map_limits(trace: RunTrace, walls: Walls = ()) -> Array:
     """
     truth = trace.true_landmarks
     points = [trace.poses[:, :2], trace.landmarks, wall_ends(walls)]
+    points += [] if truth is None else [truth]
+    poses = np.concatenate([trace.poses, trace.predicted_poses])
+    covariances = np.concatenate(
+        [trace.pose_covariances, trace.predicted_pose_covariances]
+    )
     return box_around(
-        np.concatenate(points if truth is None else [*points, truth]),
-        np.concatenate(
-            [trace.poses[:, :2], trace.predicted_poses[:, :2], trace.first_landmarks]
-        ),
-        np.concatenate(
-            [
-                trace.pose_covariances[:, :2, :2],
-                trace.predicted_pose_covariances[:, :2, :2],
-                trace.first_landmark_covariances,
-            ]
-        ),
+        np.concatenate(points),
+        np.concatenate([poses[:, :2], trace.first_landmarks]),
+        np.concatenate([covariances[:, :2, :2], trace.first_landmark_covariances]),
     )
 
 

@@ -390,11 +390,8 @@ class MapHistory(Sequence[MapEstimate]):
         if belief is None:
             return
         ids = belief.ids if isinstance(belief, MapView) else belief.landmark_ids
-        self._latest = MapEstimate(
-            np.array(ids, dtype=np.int64),
-            belief.landmarks.copy(),
-            belief.landmark_covariances,
-        )
+        means, covariances = belief.landmarks.copy(), belief.landmark_covariances
+        self._latest = MapEstimate(np.array(ids, dtype=np.int64), means, covariances)
         if ids and self._first_map is None:
             self._first_map = step
             self._kept.always.add(step)
