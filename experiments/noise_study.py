@@ -27,7 +27,7 @@ from ..estimator.registry import EstimatorFactory
 from ..evaluation.trajectory_error import ellipse_areas
 from ..sim_configs import Scenario, load_scenario
 from ..sim_configs.field_types import unknown_choice
-from .figures.style import GREY, INK, dress, new_figure, write_title
+from .figures.style import GREY, INK, dress, legend, new_figure, write_title
 from .logs.ground_truth import path_accuracy
 from .logs.slamlog import SlamLog
 from .runs.filter_settings import SIGMAS, FilterSettings, settings_for
@@ -395,13 +395,7 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
     ]
     for text, fill in (("σ × 10", INK), ("σ ÷ 10", "white")):
         keys.append(Line2D([], [], ls="", marker="o", color=INK, mfc=fill, label=text))
-    figure.legend(
-        handles=keys,
-        loc="outside upper left",
-        ncols=len(labels) + 2,
-        frameon=False,
-        fontsize=9.5,
-    )
+    legend(figure, keys, len(labels) + 2, place="outside upper left", size=9.5)
     return figure
 
 
@@ -418,12 +412,6 @@ def _draw(
         if math.isfinite(error):
             ends = effect.nees_per_degree + error * np.array([-1.0, 1.0])
             axes.plot(ends, [row, row], color=look.colour, lw=1.6, zorder=1.9)
-        axes.plot(
-            effect.nees_per_degree,
-            row,
-            look.marker,
-            color=look.colour,
-            ms=6.5,
-            mfc=look.colour if effect.factor >= 1 else "white",
-            mew=1.4,
-        )
+        (dot,) = axes.plot(effect.nees_per_degree, row, look.marker, color=look.colour)
+        fill = look.colour if effect.factor >= 1 else "white"
+        dot.set(markersize=6.5, markerfacecolor=fill, markeredgewidth=1.4)

@@ -70,7 +70,7 @@ def truth_figure(trace: RunTrace, walls: Walls = ()) -> Figure:
     style.write_title(
         area, "Estimate and ground truth", _summary(trace, poses, distances)
     )
-    style.legend_below(figure, keys, columns=len(keys))
+    style.legend(figure, keys, columns=len(keys))
     return figure
 
 
@@ -232,7 +232,7 @@ def comparison_figure(traces: Sequence[RunTrace], walls: Walls = ()) -> Figure:
         name = traces[k].estimator
         title = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
         style.write_title(axes, title, honesty(traces[k]))
-    style.legend_below(figure, keys, columns=len(keys))
+    style.legend(figure, keys, columns=len(keys))
     return figure
 
 
@@ -322,16 +322,8 @@ def _draw_nis(axes: Axes, trace: RunTrace) -> None:
     style.dress(axes)
     lower, upper = nis_band(trace.nis_dof)
     used = trace.nis_dof > 0
-    axes.fill_between(
-        trace.t,
-        lower,
-        upper,
-        step="mid",
-        color=style.TEAL,
-        alpha=0.18,
-        lw=0,
-        label="95% band",
-    )
+    band = axes.fill_between(trace.t, lower, upper, step="mid", color=style.TEAL, lw=0)
+    band.set(alpha=0.18, label="95% band")
     inside = used & (trace.nis >= lower) & (trace.nis <= upper)
     size = 4.0 if len(trace.t) <= 300 else 2.0
     for which, marker, colour, label in (
@@ -427,13 +419,9 @@ def correlations(covariance: Array) -> Array:
 def _draw_correlations(
     axes: Axes, covariance: Array, ids: NDArray[np.integer]
 ) -> AxesImage:
-    image = axes.imshow(
-        np.ma.masked_invalid(correlations(covariance)),
-        cmap="RdBu_r",  # blue to red through white: safe for colour-blind eyes
-        vmin=-1,
-        vmax=1,
-        interpolation="nearest",
-    )
+    known = np.ma.masked_invalid(correlations(covariance))
+    # Blue to red through white: safe for colour-blind eyes.
+    image = axes.imshow(known, cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
     axes.set_facecolor(_UNDEFINED)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0, labelsize=9, labelcolor=style.INK, pad=3)

@@ -166,7 +166,7 @@ def _map_parts(trace: RunTrace, walls: Walls) -> _MapParts:
     style.dress_map(axes, limits)
     picture = MapPicture(axes, trace)
     keys = picture.legend_keys() + draw_walls(axes, walls)
-    style.legend_below(figure, keys, columns=3)
+    style.legend(figure, keys, columns=3)
     titles = style.write_title(axes, *_title(trace, 0))
     figure.draw_without_rendering()  # equal axes need a second layout
     return _MapParts(figure, picture, titles, trace)
@@ -342,16 +342,10 @@ class MapPicture:
     def _add_truth(self, scale: float) -> Line2D:
         truth = self._trace.true_landmarks
         points = np.empty((0, 2)) if truth is None else truth
-        few = len(points) <= 60
-        (crosses,) = self._axes.plot(
-            *points.T,
-            "+",
-            color=style.INK,
-            ms=(9 if few else 5) * scale,
-            mew=(1.3 if few else 0.9) * scale,
-            zorder=5,
-            label="true landmark",
-        )
+        (crosses,) = self._axes.plot(*points.T, "+", color=style.INK, zorder=5)
+        crosses.set_label("true landmark")
+        size, width = (9.0, 1.3) if len(points) <= 60 else (5.0, 0.9)
+        crosses.set(markersize=size * scale, markeredgewidth=width * scale)
         return crosses
 
     def _add_artists(self, scale: float) -> _Artists:
@@ -500,7 +494,7 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
     style.write_title(
         axes, f"{smoothed.log.name}, smoothed", _subtitle(smoothed, accuracy)
     )
-    style.legend_below(figure, keys, columns=3)
+    style.legend(figure, keys, columns=3)
     return figure
 
 

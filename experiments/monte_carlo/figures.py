@@ -203,7 +203,7 @@ def _mark_grid(
     rejected = np.array(grid["rejected"])
     for chosen, face in ((rejected, look.colour), (~rejected, "white")):
         (dots,) = axes.plot(steps[chosen], ratios[chosen], look.marker, ms=4.5)
-        dots.set(color=look.colour, mfc=face, mew=1.2, zorder=3)
+        dots.set(color=look.colour, markerfacecolor=face, markeredgewidth=1.2, zorder=3)
 
 
 def _root_mean_square(values: Array) -> Array:
