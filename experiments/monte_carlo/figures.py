@@ -253,11 +253,8 @@ _ROW = 0.19  # height of a row of a legend [inch]
 def look_of(place: int) -> EstimatorLook:
     """Return the look of the estimator with an index in the results, from 0."""
     dashes = (place + place // len(_COLOURS)) % len(_DASHES)  # shifts per cycle
-    return EstimatorLook(
-        _COLOURS[place % len(_COLOURS)],
-        _DASHES[dashes],
-        _MARKERS[place % len(_MARKERS)],
-    )
+    colour, marker = _COLOURS[place % len(_COLOURS)], _MARKERS[place % len(_MARKERS)]
+    return EstimatorLook(colour, _DASHES[dashes], marker)
 
 
 def thinned(

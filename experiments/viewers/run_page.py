@@ -91,19 +91,16 @@ def _page(log: SlamLog, runs: Sequence[ViewedRun], walls: list[list[float]]) -> 
         "bands": {"nees": [q / 3 for q in chi_square_limits(3, (1 - _SHARE) / 2)]},
         "arrays": packed.table,
     }
-    return (
-        page_environment(_PARTS)
-        .get_template("page.html")
-        .render(
-            title=f"{log.name}: {', '.join(names)}",
-            notes=_notes(steps, runs),
-            several=len(runs) > 1,
-            style=Markup((_PARTS / "page.css").read_text("utf-8")),
-            script=Markup(script),
-            script_hash=_hash(f"\n{script}\n"),
-            facts=_inline_json(facts),
-            arrays=packed.text(),
-        )
+    template = page_environment(_PARTS).get_template("page.html")
+    return template.render(
+        title=f"{log.name}: {', '.join(names)}",
+        notes=_notes(steps, runs),
+        several=len(runs) > 1,
+        style=Markup((_PARTS / "page.css").read_text("utf-8")),
+        script=Markup(script),
+        script_hash=_hash(f"\n{script}\n"),
+        facts=_inline_json(facts),
+        arrays=packed.text(),
     )
 
 
