@@ -215,10 +215,9 @@ def error_lines(error: ValidationError) -> list[str]:
     list of str
         For example ``"sensor.std must be 2 numbers >= 0, got [-1, 0.1]"``.
     """
-    mistakes = [dict(details) for details in error.errors(include_url=False)]
     return [
-        _line(details)
-        for details in mistakes
+        _line(dict(details))
+        for details in error.errors(include_url=False)
         # a list with invalid items counts as too short, too
         if not (details["type"] == "too_short" and len(details["input"]) > 0)
     ]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from string import ascii_uppercase
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -127,7 +127,9 @@ def legend(
     keys: Sequence[Artist],
     columns: int,
     *,
-    place: str = "outside lower center",
+    place: Literal["outside lower center", "outside upper left"] = (
+        "outside lower center"
+    ),
     size: float = 9.0,
 ) -> None:
     """Put a legend of lines and ellipses outside the axes, by default below."""
