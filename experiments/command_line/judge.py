@@ -22,9 +22,9 @@ class JudgeOptions(options.Options):
         "The folder of slamgym generate that holds the truth.",
         "the estimates, if generate wrote them",
     )
-    truth: list[Path] | None = options.declared(
+    truths: list[Path] | None = options.declared(
         None,
-        "FILE",
+        "--truth FILE",
         "The true path of a drive from elsewhere: TUM, or a log with ground truth; "
         f"or a folder of such files. {options.REPEATED}",
         "that of the drives",
@@ -53,7 +53,7 @@ class JudgeOptions(options.Options):
 
 
 @command
-@options.takes("drives truth covariances frame align out as_json")
+@options.takes("drives truths covariances frame align out as_json")
 def judge(files: options.FilesOfEstimates, *, given: JudgeOptions) -> int:
     """Judge estimates of any program.
 
@@ -89,7 +89,7 @@ def judge(files: options.FilesOfEstimates, *, given: JudgeOptions) -> int:
         results = judging.judge(
             files,
             given.drives,
-            truth=given.truth,
+            truth=given.truths,
             covariances=given.covariances,
             align=_motion(given.align),
             command=shlex.join(["slamgym", *sys.argv[1:]]),
