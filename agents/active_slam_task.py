@@ -39,18 +39,14 @@ _SIZES = {  # of the entries besides the belief
 class RewardWeights:
     """Rewards, costs and accuracy of the task: keywords of the environments."""
 
-    criterion: str = "D"
-    """Criterion of the map's covariance, see `information_reward`."""
+    criterion: str = "D"  # criterion of the map's covariance, see `information_reward`
+    # A landmark is known when its worst standard deviation is at most this [m].
     accuracy: float = 0.25
-    """A landmark is known when its worst standard deviation is at most this [m]."""
+    # For knowing every landmark, multiplied by 1 + the share of steps left.
     success_reward: float = 5.0
-    """For knowing every landmark, multiplied by 1 + the share of steps left."""
-    crash_cost: float = 5.0
-    """For touching a wall, which ends the episode."""
-    effort_cost: float = 0.0
-    """For an `effort` of 1, per step."""
-    step_cost: float = 0.02
-    """Per step."""
+    crash_cost: float = 5.0  # for touching a wall, which ends the episode
+    effort_cost: float = 0.0  # for an `effort` of 1, per step
+    step_cost: float = 0.02  # per step
 
     def __post_init__(self) -> None:
         check_criterion(self.criterion)
@@ -261,8 +257,8 @@ def _no_outcome(count: int) -> StepOutcome:
     return StepOutcome(np.zeros(count), no[0], no[1], no[2])
 
 
+# Entries of `AssociationScores` that `info` reveals.
 SCORES = ("precision", "recall", "duplicate", "ghost")
-"""Entries of `AssociationScores` that `info` reveals."""
 
 
 class AssociationRecord:

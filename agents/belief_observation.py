@@ -19,12 +19,7 @@ from gymnasium.vector.utils import batch_space
 from ..arrays import AnyArray, Array, BoolArray
 from ..envs import LandmarkWorldEnv
 from ..envs.vector.landmark_world_vector import final_infos
-from ..estimator.filters.batch import (
-    BatchBeliefs,
-    BatchSlam,
-    BatchStorage,
-    can_batch,
-)
+from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage, can_batch
 from ..estimator.filters.ekf import EkfSlam
 from ..estimator.registry import find_estimator, make_batch, read_label
 from ..estimator.support import argument_checks
@@ -425,7 +420,7 @@ class SeparateFilters:
         if len(self._stored) == 1:
             one: BatchStorage = self._stored[0]
             return one
-        return BatchStorage(*map(np.concatenate, zip(*self._stored, strict=True)))
+        return BatchStorage.of(*map(np.concatenate, zip(*self._stored, strict=True)))
 
     def belief(self, run: int) -> BeliefOfMap | None:
         """Return the belief of one world; None before its first scan."""

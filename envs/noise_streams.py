@@ -16,15 +16,7 @@ import numpy as np
 from ..arrays import Array, IntArray, WordArray
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import Sensor
-from .streams import (
-    CLUTTER,
-    DROPOUT,
-    MEASUREMENT,
-    MOTION,
-    ORDER,
-    draw_normals,
-    draw_uniforms,
-)
+from . import streams
 
 Row = TypeVar("Row")
 
@@ -136,9 +128,9 @@ class WorldNoise:
         self._landmarks = count = scenario.landmarks.count
         hidden, rows = not sensor.identities, sensor.max_clutter
         self._widths = {  # of uniform numbers per step; one and two for each false row
-            DROPOUT: count if sensor.dropout else 0,
-            CLUTTER: 1 + 2 * rows if hidden and sensor.clutter else 0,
-            ORDER: count + rows if hidden else 0,
+            streams.DROPOUT: count if sensor.dropout else 0,
+            streams.CLUTTER: 1 + 2 * rows if hidden and sensor.clutter else 0,
+            streams.ORDER: count + rows if hidden else 0,
         }
         self._grows = sensor.range_std_per_metre > 0
         self._nearest = np.nextafter(sensor.min_range, -1.0)
@@ -158,7 +150,7 @@ class WorldNoise:
             Of each world, where worlds differ.
         """
         unit = np.empty((len(steps), 3))
-        draw_normals(keys, steps, MOTION, unit[None])
+        streams.draw_normals(keys, steps, streams.MOTION, unit[None])
         noise: Array = heavy_tails(unit, self._faults.motion_dof)
         return noise * (self._motion_std if std is None else std)
 
@@ -168,7 +160,7 @@ class WorldNoise:
         """Draw the sensor noise; see `motion`."""
         settings = settings or self._settings
         unit = np.empty((2, len(steps), self._landmarks))
-        draw_normals(keys, steps, MEASUREMENT, unit)
+        streams.draw_normals(keys, steps, streams.MEASUREMENT, unit)
         unit = heavy_tails(unit, self._faults.sensor_dof)
         dropout, clutter, order = (
             _uniform(keys, steps, stream, width)
@@ -235,7 +227,7 @@ def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array
     if not width:
         return None
     drawn = np.empty((len(steps), width))
-    draw_uniforms(keys, steps, stream, drawn)
+    streams.draw_uniforms(keys, steps, stream, drawn)
     return drawn
 
 

@@ -228,11 +228,8 @@ class WallContacts:
             shares[k] = self.free_share(x.item(k), y.item(k), dx.item(k), dy.item(k))
         return shares
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"radius": self._radius, "walls": self._walls}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        WallContacts.__init__(self, state["radius"], state["walls"])
+    def __reduce__(self) -> tuple[Any, ...]:
+        return WallContacts, (self._radius, self._walls)
 
 
 def _inflated(wall: Wall, radius: float, ground: pymunk.Body) -> list[pymunk.Shape]:
@@ -256,10 +253,7 @@ def _outward(
 
 @jit
 def _find_near(
-    moves: tuple[Array, Array, Array, Array],
-    walls: Array,
-    reach: float,
-    near: IntArray,
+    moves: tuple[Array, Array, Array, Array], walls: Array, reach: float, near: IntArray
 ) -> int:
     """List the moves (x, y, dx, dy) that come within reach of a wall; return how many.
 

@@ -314,10 +314,8 @@ _BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)"
 class FilterLabel(NamedTuple):
     """A filter and its options."""
 
-    name: str
-    """Registered name or "module:Class"."""
-    options: dict[str, Any]
-    """Arguments of its constructor other than the noise."""
+    name: str  # registered name or "module:Class"
+    options: dict[str, Any]  # arguments of its constructor other than the noise
 
 
 def read_label(label: str) -> FilterLabel:

@@ -240,8 +240,8 @@ class Band(NamedTuple):
 
 EQUIVALENCE_MARGIN = Band(0.8, 1.25)
 """Ratios of NEES to its expectation that count as consistent."""
+# Smallest number of runs with enough different resamples for a bootstrap.
 FEWEST_RESAMPLED = 5
-"""Smallest number of runs with enough different resamples for a bootstrap."""
 
 
 class EquivalenceTest(NamedTuple):

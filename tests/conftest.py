@@ -150,11 +150,17 @@ def browser():
 
 
 @pytest.fixture(scope="session")
-def sb3():
-    """Return Stable-Baselines3, which is slow to load, on one thread."""
-    library = pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
-    pytest.importorskip("torch").set_num_threads(1)
+def torch():
+    """Return PyTorch on one thread."""
+    library = pytest.importorskip("torch", reason="needs torch")
+    library.set_num_threads(1)
     return library
+
+
+@pytest.fixture(scope="session")
+def sb3(torch):
+    """Return Stable-Baselines3, which is slow to load."""
+    return pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
 
 
 REPORT = "slamgym.experiments.monte_carlo.report"

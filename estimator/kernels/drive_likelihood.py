@@ -1,7 +1,7 @@
 """Likelihood of a whole drive under several noises, compiled, in one call."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,17 +68,15 @@ class DriveRecord(NamedTuple):
 
 @jit
 def follow_drive(
-    events: tuple[Array, IntArray, Array, IntArray, IntArray],
+    events: tuple[Any, ...],
     noises: Array,
     noise_at_rest: bool,
     rule_values: Array,
     start: tuple[Array, Array],
     belief_arrays: tuple[Array, Array, Array],
-    workspace_arrays: tuple[Array, Array, Array],
+    workspace_arrays: tuple[Any, ...],
     slots: IntArray,
-    record_arrays: tuple[
-        Array, Array, IntArray, IntArray, Array, Array, Array, IntArray
-    ],
+    record_arrays: tuple[Any, ...],
 ) -> None:
     """Filter a drive once under each of B noises, and note how likely its readings are.
 

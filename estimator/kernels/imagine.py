@@ -23,15 +23,11 @@ class Settings(NamedTuple):
     """The sensor and the noise of all plans."""
 
     sight: View
-    min_range: float
-    """[m]"""
-    dropout: float
-    """Probability that a reading is lost."""
+    min_range: float  # [m]
+    dropout: float  # probability that a reading is lost
     motion_values: Array
-    no_noise: Array
-    """Zeros, for a robot at rest."""
-    rule_values: Array
-    """With the measurement noise of expected readings."""
+    no_noise: Array  # zeros, for a robot at rest
+    rule_values: Array  # with the measurement noise of expected readings
 
 
 class Room(NamedTuple):
@@ -239,12 +235,11 @@ _EDGE = 1e-12  # relative; a point on the edge of the view is in view
 class View(NamedTuple):
     """What limits the sight of the sensor."""
 
-    max_range: float
-    """[m]"""
+    max_range: float  # [m]
+    # Cosine of half the field of view, -inf where it sees all around.
     cos_half_view: float
-    """Cosine of half the field of view, -inf where it sees all around."""
+    # Walls that hide what is behind them, rows (x0, y0, x1, y1), (W, 4) [m].
     walls: Array
-    """Walls that hide what is behind them, rows (x0, y0, x1, y1), (W, 4) [m]."""
 
 
 def as_view(max_range: float, field_of_view: float, walls: Array) -> View:

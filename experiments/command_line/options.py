@@ -255,9 +255,7 @@ class Options:
         return make_controller(self.controller, scenario, random)
 
     def record(
-        self,
-        scenario: Scenario,
-        progress: Callable[[int, int], object] | None = None,
+        self, scenario: Scenario, progress: Callable[[int, int], object] | None = None
     ) -> "SlamLog":
         """Record one episode with the controller; see `record_episode`."""
         from ..logs.recording import record_episode

@@ -91,10 +91,10 @@ def test_every_registered_estimator_is_in_the_family():
     assert {name for name, *_ in FAMILY.values()} == set(list_estimators())
 
 
-@pytest.mark.parametrize("steps", [100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [60, pytest.param(400, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("case", FAMILY)
 def test_equals_its_slow_dense_twin(case, steps):
-    steps = min(steps, 200) if case == "unscented" else steps
+    steps = min(steps, 150) if case == "unscented" else steps
     twin = FAMILY[case][2](MOTION_STD, MEASUREMENT_STD, START_STD)
     fast = make(case, initial_pose_std=START_STD)
     rng, nis = np.random.default_rng(1), []
@@ -255,7 +255,7 @@ def test_nullity_of_the_observability_matrix_along_a_loop(case, nullity):
     assert found == nullity, values[:5]
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 3, 7])
+@pytest.mark.parametrize("iterations", [1, 3])
 @pytest.mark.parametrize("name", ["iterated", "invariant"])
 def test_a_scalar_linear_problem_keeps_its_answer_at_any_number_of_iterations(
     name, iterations
@@ -344,7 +344,7 @@ def solve_or_name(slam, scan):
 def test_a_scan_that_cannot_be_solved_is_refused_or_harmless(case):
     """Without sensor noise rounding decides; nothing absurd may come of either."""
     refused = 0
-    for seed in range(40):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         slam = make(case, motion_std=(0.1, 0.1, 0.1), measurement_std=(0, 0))
         scan = np.stack([rng.uniform(-3, 3, 9), rng.uniform(2, 9, 9)], axis=1)
@@ -361,7 +361,7 @@ def test_a_scan_that_cannot_be_solved_is_refused_or_harmless(case):
         else:
             assert np.isfinite(slam.belief().covariance).all()
             assert outcome.nis < 1e9
-    assert refused > 20
+    assert refused > 10
 
 
 @pytest.mark.parametrize("case", FAMILY)

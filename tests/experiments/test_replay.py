@@ -144,10 +144,7 @@ def ekf(**options):
 def test_a_midpoint_row_is_exactly_two_turn_last_steps():
     row = OdometryRow(0.5, 2.0, 0.6, 0.25)
     log = SlamLog("arc", motion="midpoint", events=(row,))
-    assert told_of(log) == [
-        ("predict", (0.0, 0.3), 0.0),
-        ("predict", (2.0, 0.3), 0.25),
-    ]
+    assert told_of(log) == [("predict", (0.0, 0.3), 0.0), ("predict", (2.0, 0.3), 0.25)]
 
 
 def test_a_midpoint_row_moves_along_the_chord_of_its_arc():
