@@ -122,8 +122,9 @@ class HypothesisSlam:
 
     Each hypothesis splits into the most likely joint assignments of a scan.  The costs
     of the scans are added.  Hypotheses beyond the number that the policy allows, and
-    those e^8 times less probable than the best one, are discarded (Reid 1979).  The
-    belief and the reports are those of the most probable hypothesis.
+    those e^20 times less probable than the best one, are discarded (Reid 1979), and so
+    are variants of the better ones whose poses overlap with theirs.  The belief and the
+    reports are those of the most probable hypothesis.
 
     Parameters
     ----------
