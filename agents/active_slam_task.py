@@ -19,6 +19,7 @@ from ..estimator.filters.batch import BatchStorage
 from ..estimator.interface import SupportsDecisions
 from ..estimator.map_management.policy import policy_of
 from ..evaluation.association_scores import score_association
+from ..restorable import Restorable
 from ..sim_configs import Scenario
 from .active_slam_kernels import Episodes, StepOutcome, advance
 from .belief_features import belief_space, empty_features
@@ -60,7 +61,7 @@ class RewardWeights:
                 raise ValueError(f"{name} must be a finite number >= 0, got {weight!r}")
 
 
-class ActiveSlamTask:
+class ActiveSlamTask(Restorable):
     """Computes observations, rewards and ends of the episodes of B worlds.
 
     Parameters
@@ -100,6 +101,8 @@ class ActiveSlamTask:
     mapped, known : ndarray, shape (B,)
         Numbers of landmarks in the present map, and of those known accurately.
     """
+
+    _changing = ("episodes", "outcome", "mapped", "known", "_rows")
 
     def __init__(
         self,
@@ -261,7 +264,7 @@ def _no_outcome(count: int) -> StepOutcome:
 SCORES = ("precision", "recall", "duplicate", "ghost")
 
 
-class AssociationRecord:
+class AssociationRecord(Restorable):
     """Collects the true landmarks of the readings of B worlds, and scores the filters.
 
     Parameters
@@ -270,13 +273,15 @@ class AssociationRecord:
         B, the number of worlds.
     """
 
+    _changing = ("_true_ids",)
+
     def __init__(self, worlds: int) -> None:
-        self._true_ids: list[list[IntArray]] = [[] for _ in range(worlds)]
+        self._true_ids: tuple[list[IntArray], ...] = tuple([] for _ in range(worlds))
 
     def begin(self, worlds: BoolArray) -> None:
         """Forget the readings of some worlds, (B,)."""
         for b in np.flatnonzero(worlds).tolist():
-            self._true_ids[b] = []
+            self._true_ids[b].clear()
 
     def add(self, worlds: BoolArray, true_ids: IntArray, mask: BoolArray) -> None:
         """Note one scan of some worlds, (B,): rows (B, M), and which are readings."""

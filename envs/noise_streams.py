@@ -14,6 +14,7 @@ from typing import Generic, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ..arrays import Array, IntArray, WordArray
+from ..restorable import Restorable
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import Sensor
 from . import streams
@@ -42,7 +43,7 @@ order : shape (…, N + C), or None with identities
 """
 
 
-class NoiseRows(Generic[Row]):
+class NoiseRows(Restorable, Generic[Row]):
     """An endless iterator over rows of noise, one per step, drawn in growing blocks.
 
     Parameters
@@ -58,6 +59,8 @@ class NoiseRows(Generic[Row]):
     >>> float(next(rows)), float(next(rows))
     (0.1, 0.2)
     """
+
+    _changing = ("_draw", "_next", "_block", "_to_come")
 
     def __init__(
         self, draw: Callable[[IntArray], Iterable[Row]], first: int = 0

@@ -32,12 +32,13 @@ import pymunk
 
 from ..arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ..jit import jit, njit_internal
+from ..restorable import Restorable, State
 from ..sim_configs import Scenario
 
 _NO_SLIP = (0.0, 0.0, 0.0)
 
 
-class UnicycleBody:
+class UnicycleBody(Restorable):
     """A round body that moves by one displacement and one turn per step.
 
     The engine's body is kinematic and has no shape. Only its velocity moves it, so one
@@ -78,6 +79,14 @@ class UnicycleBody:
         self.position = np.zeros((), dtype=np.complex128)
         self.inverse_heading = np.zeros((), dtype=np.complex128)
         self.place((0.0, 0.0, 0.0))
+
+    def state(self) -> State:
+        """Return the pose, for `restore`."""
+        return self._pose
+
+    def restore(self, state: State) -> None:
+        """Return to a pose."""
+        self.place(state)
 
     @property
     def pose(self) -> Array:
@@ -305,7 +314,7 @@ def _has_ends_apart(segment: Wall, other: Wall) -> bool:
     return first * last <= 0.0
 
 
-class UnicycleBodies:
+class UnicycleBodies(Restorable):
     """B round bodies, each in its own world.
 
     The results equal those of `UnicycleBody` to the bit: sums, products and queries of
@@ -343,6 +352,14 @@ class UnicycleBodies:
         self.position = np.zeros((count, 1), dtype=np.complex128)
         self.inverse_heading = np.zeros((count, 1), dtype=np.complex128)
         self._arrive(self._pose)
+
+    def state(self) -> State:
+        """Return the poses, for `restore`."""
+        return (self._pose,)  # which every move replaces
+
+    def restore(self, state: State) -> None:
+        """Return to poses."""
+        self._arrive(*state)
 
     def poses(self) -> Array:
         """(x, y, θ), shape (B, 3) [m, m, rad], a fresh array; θ is not wrapped."""

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtr, chdtrc, gammaincinv
-from scipy.stats import t as student
+from scipy.special import chdtr, chdtrc, gammaincinv, stdtr, stdtrit
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.support import argument_checks
@@ -283,9 +282,9 @@ def time_average_test(
     mean, error = _mean_and_error(ratios)
     skewness, runs = _skewness(ratios), len(ratios)
     score = _unskew((mean - 1) / error, skewness, runs) if error else np.inf
-    limit = student.ppf(1 - error_rate / 2, runs - 1)
+    limit = stdtrit(runs - 1, 1 - error_rate / 2)
     ends = 1 + error * _skew(np.array([-limit, limit]), skewness, runs)
-    p_value = float(2 * student.sf(abs(score), runs - 1))
+    p_value = float(2 * stdtr(runs - 1, -abs(score)))
     return HypothesisTest(mean, to_band(ends), p_value, error_rate)
 
 
@@ -345,7 +344,7 @@ def equivalence_test(
     """
     ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
     mean, error = _mean_and_error(ratios)
-    limit = student.ppf(1 - error_rate, len(ratios) - 1)
+    limit = stdtrit(len(ratios) - 1, 1 - error_rate)
     ends = _skew(np.array([limit, -limit]), _skewness(ratios), len(ratios))
     interval = to_band(mean - error * ends)
     low, high = EQUIVALENCE_MARGIN

@@ -22,6 +22,7 @@ from ...arrays import (
     IntArray,
     WordArray,
 )
+from ...restorable import Restorable
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import widest_scenario
 from ..bearing_range import BearingRangeSensor, hide_identities
@@ -36,7 +37,7 @@ Scan = tuple[Array, BoolArray, IntArray | None]
 _READINGS_AT_ONCE = 8192
 
 
-class WorldBatch:
+class WorldBatch(Restorable):
     """B independent worlds of one scenario.
 
     World i equals, to the bit, a `LandmarkWorldEnv` whose ``np_random`` is generator i.
@@ -84,6 +85,11 @@ class WorldBatch:
     array([[3. , 0. ],
            [1.5, 0.3]])
     """
+
+    _changing = (
+        *("measurements", "mask", "odometry", "poses", "collisions", "landmark_ids"),
+        *("_drawn", "_keys", "_steps", "_bodies", "_start_estimates", "_landmarks"),
+    )
 
     def __init__(
         self, scenario: Scenario, count: int, drawn: Sequence[Scenario] = ()
@@ -316,7 +322,7 @@ def _replaced(old: AnyArray, worlds: IndexArray, value: Any) -> AnyArray:
     return new
 
 
-class DrawnWorlds:
+class DrawnWorlds(Restorable):
     """The scenarios that B worlds drew for their episodes.
 
     Parameters
@@ -337,6 +343,8 @@ class DrawnWorlds:
     settings : SensorSettings
         Those of their sensors.
     """
+
+    _changing = ("scenarios", "motion_std", "settings")
 
     def __init__(
         self, scenario: Scenario, count: int, given: Sequence[Scenario] = ()

@@ -176,7 +176,7 @@ def comparison_table(columns: Mapping[str, Mapping[str, Any]]) -> Table:
     columns : mapping
         By the heading, ``ate``, ``landmark_rmse`` and ``nees`` as in a run's summary.
     """
-    from ..monte_carlo.report import headings_and_key
+    from ..figures.style import headings_and_key
 
     headings, key_of_headings = headings_and_key(list(columns))
     caption = Text(key_of_headings) if key_of_headings else None
@@ -302,7 +302,7 @@ def runs_table(runs: "Sequence[NoiseRun]") -> Table:
 
 def effects_table(name: str, runs: int, effects: "Sequence[NoiseEffect]") -> Table:
     """Lay out the study over many runs, a column for each estimator."""
-    from ..monte_carlo.report import headings_and_key
+    from ..figures.style import headings_and_key
 
     labels = list(dict.fromkeys(effect.estimator for effect in effects))
     headings, key = headings_and_key(labels)

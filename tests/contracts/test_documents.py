@@ -67,6 +67,9 @@ def reader(first_run, tmp_path, monkeypatch, own_registry):
     """Stand where a reader stands: in a folder with a first run and some drive.csv."""
     shutil.copytree(first_run, tmp_path / "results" / "first_run")
     shutil.copy(first_run / "log.csv", tmp_path / "drive.csv")
+    example = ROOT / "examples" / "05_your_own_estimator.py"
+    shutil.copy(example, tmp_path / "my_filters.py")
+    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
     noise = {"motion_std": (0.25, 0.1, 0.1), "measurement_std": (0.01, 0.08)}
     return {"__name__": "reader", "estimator": make_estimator("ekf", **noise)}

@@ -484,11 +484,11 @@ def test_a_filter_that_forgets_to_wrap_the_innovation_is_named(
     spec = importlib.util.spec_from_file_location("textbook", TEXTBOOK)
     textbook = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(textbook)
-    assert check_estimator(textbook.TextbookEkf) == ()
+    assert check_estimator(textbook.CarefulEkf) == ()
     monkeypatch.setattr(textbook, "wrap_angle", wrap)
     complaint = rf"bearings {bearings}.* wrap the innovation to .* NIS 4\.9e\+04"
     with pytest.raises(EstimatorContractError, match=complaint):
-        check_estimator(textbook.TextbookEkf)
+        check_estimator(textbook.CarefulEkf)
 
 
 def test_unknown_estimator_is_refused_with_a_suggestion():
