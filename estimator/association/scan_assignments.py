@@ -594,11 +594,11 @@ def best_assignments(
 
     Examples
     --------
-    >>> expected, variances = np.array([(0.0, 5.0), (0.3, 5.0)]), np.full((2, 2), 0.01)
+    >>> expected = np.array([(0.0, 5.0), (0.3, 5.0)])
     >>> problem = Problem(
     ...     innovations=innovations_of(expected + 0.2, expected),
     ...     joint=np.tile(0.04 * np.eye(2), (2, 2)),
-    ...     variances=variances,
+    ...     variances=np.full((2, 2, 2), 0.01),
     ...     feasible=np.ones((2, 2), dtype=bool),
     ...     missing=np.full(2, 9.0),
     ...     gate=25.0,

@@ -207,8 +207,9 @@ class Detections(NamedTuple):
     >>> detections = Detections.none()
     >>> for slot in (0, 0, 0, -1):
     ...     cost, detections = detections.after(view, np.array([slot]), longest=8.0)
-    >>> round(cost, 2)  # −2 ln(1 − 4 / 5)
-    3.22
+    >>> share = (3 + 2 * 4 / 5) / 5  # of the cell, with that of its ring
+    >>> bool(np.isclose(cost, -2 * np.log(HIDDEN + (1 - HIDDEN) * (1 - share))))
+    True
     """
 
     seen: Array
