@@ -69,7 +69,9 @@ class LoopCloser:
         std, least = _relative_std(view), self._rules.least
         is_lost = np.asarray(std > self._rules.lost_std)
         local = np.count_nonzero(std <= LOCAL_STD * self._rules.lost_std)
-        can_match = local >= least and np.count_nonzero(is_lost) >= 2 * least
+        elsewhere = len(view.mapped) - np.count_nonzero(~is_lost)
+        is_part = view.whole is not None  # landmarks near the robot may be left out
+        can_match = (local >= least or is_part) and elsewhere >= 2 * least
         return is_lost & (can_match or self._rules.always)
 
     def without_lost(self, view: MapView, within: float) -> MapView:
