@@ -25,22 +25,21 @@ _FIRST_BLOCK = 8  # steps; short, so that a reset is quick
 _GROWTH = 4  # of a block over the last one
 _LONGEST_BLOCK = 128  # steps
 
+# Random effects on the sensor in one step: (error, nearest, clutter, order).
+#
+# A plain tuple, because a named one costs 1 % of a step. N landmarks, C rows for
+# clutter. Worlds that are simulated together add axes at the dots.
+#
+# error : shape (2, …, N)
+#     (εβ, εr) [rad, m]; εr in units of σr(r) where that grows with the range.
+# nearest : shape (…, N)
+#     A landmark is read above this true range [m]. It is min_range or more, so that the
+#     noisy range is positive; inf where the reading drops out.
+# clutter : shape (2, …, C), or None with identities
+#     False readings (β, r), zeros where there is none [rad, m].
+# order : shape (…, N + C), or None with identities
+#     Uniform random numbers that sort the rows.
 SensorNoise = tuple[Array, Array, Array | None, Array | None]
-"""Random effects on the sensor in one step: (error, nearest, clutter, order).
-
-A plain tuple, because a named one costs 1 % of a step. N landmarks, C rows for clutter.
-Worlds that are simulated together add axes at the dots.
-
-error : shape (2, …, N)
-    (εβ, εr) [rad, m]; εr in units of σr(r) where that grows with the range.
-nearest : shape (…, N)
-    A landmark is read above this true range [m]. It is min_range or more, so that the
-    noisy range is positive; inf where the reading drops out.
-clutter : shape (2, …, C), or None with identities
-    False readings (β, r), zeros where there is none [rad, m].
-order : shape (…, N + C), or None with identities
-    Uniform random numbers that sort the rows.
-"""
 
 
 class NoiseRows(Restorable, Generic[Row]):

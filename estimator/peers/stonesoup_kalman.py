@@ -91,7 +91,7 @@ class _StoneSoupSlam(KalmanPeer):
 
     def _predicted(self, state: Moments, odometry: Array, variance: Array) -> Moments:
         noise = motion_covariance(state.mean, variance)
-        predictor = type(self)._predictor(_Motion(odometry=odometry, noise=noise))
+        predictor = self._predictor(_Motion(odometry=odometry, noise=noise))
         return _moments(predictor.predict(_gaussian(state)))
 
     def _corrected(
@@ -105,9 +105,7 @@ class _StoneSoupSlam(KalmanPeer):
             slots=readings.slots,
         )
         read = Detection(_typed(readings.measurements), measurement_model=model)
-        found = (
-            type(self)._updater(None).update(SingleHypothesis(_gaussian(state), read))
-        )
+        found = self._updater(None).update(SingleHypothesis(_gaussian(state), read))
         expected = found.hypothesis.measurement_prediction
         nu = _column(read.state_vector - expected.state_vector).reshape(-1, 2)
         return _moments(found), Innovation(nu, np.asarray(expected.covar, np.float64))
@@ -129,8 +127,9 @@ class StoneSoupUkfSlam(_StoneSoupSlam):
     heading.  Parameters are those of :class:`.peer_slam.PeerSlam`.
     """
 
-    _predictor = partial(UnscentedKalmanPredictor, alpha=SIGMA_ALPHA, beta=SIGMA_BETA)
-    _updater = partial(UnscentedKalmanUpdater, alpha=SIGMA_ALPHA, beta=SIGMA_BETA)
+    _options: ClassVar = {"alpha": SIGMA_ALPHA, "beta": SIGMA_BETA}
+    _predictor = staticmethod(partial(UnscentedKalmanPredictor, **_options))
+    _updater = staticmethod(partial(UnscentedKalmanUpdater, **_options))
 
 
 def _gaussian(state: Moments) -> Any:

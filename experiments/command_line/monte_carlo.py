@@ -93,6 +93,7 @@ def monte_carlo(
     from ..jobs import replace_own
     from ..monte_carlo.report import monte_carlo_table, write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
+    from ..monte_carlo.runner import SMALL_NOISE_SHARE
     from ..monte_carlo.verdict import diagnosis_lines
     from .output_folder import as_json_text, default_folder
     from .tables import written
@@ -130,6 +131,7 @@ def monte_carlo(
             resolution=given.resolution,
             command=shlex.join(["slamgym", *sys.argv[1:]]),
             progress=tick,
+            small_noise=True,
         ) as results,
     ):
         summary = monte_carlo.summarise_monte_carlo(results)
@@ -143,6 +145,9 @@ def monte_carlo(
         for label, entry in summary["estimators"].items()
         for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
     ]
+    if share := results.attrs.get(SMALL_NOISE_SHARE):
+        text = f"Runs with less noise, which show causes, took {share:.0%} of the time."
+        sentences.append(Text(text))
     reporter.show(monte_carlo_table(summary), "", *sentences, "")
     if summary["notes"]:
         reporter.show(*map(Text, summary["notes"]), "")

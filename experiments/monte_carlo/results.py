@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from importlib.metadata import version
@@ -38,7 +39,14 @@ from ..jobs import (
     set_aside,
 )
 from ..runs.filter_settings import EstimatorChoice
-from .run_measures import NOISE_SIZES, VARIABLES, Block, Variable, variables_of
+from .run_measures import (
+    NOISE_SIZES,
+    SMALL_NOISE,
+    VARIABLES,
+    Block,
+    Variable,
+    variables_of,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -109,6 +117,27 @@ def write_results(
     kept, full = "; its blocks stay, to continue from", RuntimeError  # of netCDF
     with naming(path, kept, full), replace_own(path) as partial:
         _write(partial, job, blocks, runs, command)
+
+
+def add_to_results(path: Path, added: Block) -> None:
+    """Add variables of shape (estimator, run) to a results file.
+
+    Parameters
+    ----------
+    path : Path
+        The file; after an error it stays as it was.
+    added : dict
+        Of `SMALL_NOISE`.
+    """
+    import netCDF4  # noqa: PLC0415
+
+    with naming(path, also=RuntimeError), replace_own(path) as partial:
+        shutil.copyfile(path, partial)
+        with netCDF4.Dataset(partial, "a") as file:
+            for name, values in added.items():
+                made = file.createVariable(name, "f8", _dims(SMALL_NOISE[name]))
+                made.long_name = SMALL_NOISE[name].meaning
+                made[:] = values
 
 
 def load_results(path: str | Path) -> xr.Dataset:
@@ -232,7 +261,7 @@ def _coordinates(job: Job, runs: range) -> dict[str, np.ndarray[Any, Any]]:
 # --------------------------------------------------------------------------------------
 # The folder of a Monte Carlo: it belongs to one job (``job.json``) and one writer.
 
-FORMAT = "slamgym monte carlo 3"
+FORMAT = "slamgym monte carlo 4"
 JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
 REPORT, SUMMARY = "report.html", "summary.json"
 

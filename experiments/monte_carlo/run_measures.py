@@ -121,6 +121,20 @@ HIDDEN_VARIABLES: dict[str, Variable] = {
 """Those of a world that hides identities; nan where unknown."""
 
 
+SMALL_NOISE: dict[str, Variable] = {
+    **{
+        f"small_noise_nees_{frame}": Variable(
+            RUN, "f8", "mean NEES of the pose, less noise"
+        )
+        for frame in ERROR_FRAMES
+    },
+    "small_noise_heading_nees": Variable(RUN, "f8", "mean NEES of the heading"),
+    "small_noise_factor": Variable(RUN, "f8", "of all noise, nan if not repeated"),
+}
+"""Of runs that were repeated with less noise to find the cause of an inconsistency; in
+the results, but in no block, if there are any."""
+
+
 def variables_of(scenario: Scenario) -> dict[str, Variable]:
     """Return the variables of the results in a world."""
     return VARIABLES if scenario.sensor.identities else HIDDEN_VARIABLES

@@ -32,6 +32,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         large_maps peers
         registry
         smoother
+        covariance_checks
         check_estimator
     """,
     "estimator.large_maps": """
@@ -59,8 +60,8 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         filtered_runs
         run_measures
         results
-        runner
         verdict
+        runner
         summary
         figures
         report
