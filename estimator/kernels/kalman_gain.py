@@ -417,6 +417,8 @@ class Rules(NamedTuple):
     noise_as_read: bool = False  # take noise at the range as read, not as expected
 
 
+RULES = len(Rules._fields)
+ITERATIONS, SEQUENTIAL = map(Rules._fields.index, ("iterations", "sequential"))
 FIRST_STD = Rules._fields.index("bearing_std")
 """Column of the first of the four standard deviations of a reading in the rules."""
 AFTER_STDS = Rules._fields.index("min_range")
@@ -432,8 +434,7 @@ CORRECTION = 0  # δ
 TRANSPORT = 1  # v of the transport T = I + v e_θᵀ
 PRIOR_MEAN = 2  # before this correction
 HEADING = 3  # P[:, θ]
-MEAN_BEFORE = 4  # before the scan; its last entry is the next one
-ABSORBED = -1  # 1 once the belief has taken in the scan
+MEAN_BEFORE = 4  # before the scan
 
 # The stacked system follows: two rows (bearing, range) for each reading in use.  Such a
 # row begins with its row of A and ends with META_WIDTH more columns, which are counted
@@ -522,3 +523,93 @@ class BeliefArrays(NamedTuple):
     mean: Array  # (capacity,)
     covariance: Array  # (capacity, capacity)
     reference: Array  # (capacity,) fixed points for Jacobians, where the rules use them
+
+
+# --------------------------------------------------------------------------------------
+# The memory of one filter: a single block, which Python passes as one argument.
+#
+# It begins with these integers.
+
+CAPACITY = 0  # length of the mean
+HEIGHT = 1  # of the rows of the workspace
+BEFORE, PRIOR = 2, 3  # heights of its copies of P
+LANDMARKS = 4  # number of landmarks in the map
+TABLED = 5  # how many of them are in the table
+STEPS = 6  # how many odometry readings and scans the belief has taken in
+SCANNED, IN_USE = 7, 8  # number of readings in the last scan, and of those in use
+STARTS = 12  # where each part begins, and the end
+NUMBERS = 24
+
+# Values in floating point; the rules come first.
+MOTION = len(Rules._fields)  # (σx², σy², σα²) per step
+MOVED = MOTION + 3  # the same for the last motion
+NIS = MOVED + 3  # of the last scan
+VALUES = 24
+
+
+class Parts(NamedTuple):
+    """The parts of a block, in their order; each begins on a cache line."""
+
+    numbers: IntArray  # (NUMBERS,)
+    values: Array  # (VALUES,)
+    mean: Array  # this and the next two as in BeliefArrays
+    covariance: Array
+    reference: Array
+    rows: Array  # this and the next two as in Workspace
+    before: Array
+    prior: Array
+    ids: IntArray  # (capacity,) identity of the landmark in each slot
+    table: IntArray  # slots + 1 by a hash of these identities; 0 is empty
+    scan_ids: IntArray  # (readings,) of the last scan
+    ledger: IntArray  # (LEDGER_HEIGHT, readings) of the last scan
+
+
+def new_block(capacity: int, readings: int, values: Array) -> Array:
+    """Allocate the memory of a filter with an empty map.
+
+    Parameters
+    ----------
+    capacity, readings : int
+        Least length of the mean, and of the list of readings in a scan.
+    values : ndarray
+        The rules, and the variances of the motion per step.
+    """
+    iterated = values[ITERATIONS] > 1
+    repeated = iterated or values[SEQUENTIAL] > 0
+    capacity, readings = (-(-size // 8) * 8 for size in (capacity, readings))
+    height = FIRST + (2 if iterated else 1) * (2 * readings + 2)
+    before = capacity if repeated else min(capacity, LARGE + 6)
+    prior, table = capacity * bool(iterated), 1 << capacity.bit_length()
+    sizes = [VALUES, capacity, capacity**2, capacity, height * (capacity + META_WIDTH)]
+    sizes += [before**2, prior**2, capacity, table, readings, LEDGER_HEIGHT * readings]
+    starts = NUMBERS + np.cumsum([0, *sizes])
+    block = aligned_zeros(int(starts[-1]))
+    numbers = block[:NUMBERS].view(np.int64)
+    numbers[: PRIOR + 1] = capacity, height, before, prior
+    numbers[STARTS:] = starts
+    block[NUMBERS : NUMBERS + len(values)] = values
+    return block
+
+
+def parts_of(block: Array) -> Parts:
+    """Return the parts of a block by name, without a copy."""
+    numbers = block[:NUMBERS].view(np.int64)
+    n, height, at = numbers[CAPACITY], numbers[HEIGHT], numbers[STARTS:]
+    before, prior = numbers[BEFORE], numbers[PRIOR]
+    return Parts(
+        numbers,
+        block[at[0] : at[1]],
+        block[at[1] : at[2]],
+        block[at[2] : at[3]].reshape((n, n)),
+        block[at[3] : at[4]],
+        block[at[4] : at[5]].reshape((height, n + META_WIDTH)),
+        block[at[5] : at[6]].reshape((before, before)),
+        block[at[6] : at[7]].reshape((prior, prior)),
+        block[at[7] : at[8]].view(np.int64),
+        block[at[8] : at[9]].view(np.int64),
+        block[at[9] : at[10]].view(np.int64),
+        block[at[10] : at[11]].view(np.int64).reshape((LEDGER_HEIGHT, -1)),
+    )
+
+
+parts_jit = njit_internal(parts_of)

@@ -1,6 +1,7 @@
 """Update of one belief by one scan, compiled: screen, correct, map new landmarks.
 
-`update_belief` takes in one scan, and `predict` one odometry reading.
+`update_map` takes in one scan, and `move_pose` one odometry reading: they change the
+memory of one filter.  `update_belief` and `predict` do so with the arrays of a belief.
 """
 
 import numpy as np
@@ -15,36 +16,46 @@ from ..models.bearing_range import (
 )
 from ..models.unicycle_motion import drive_jit
 from .kalman_gain import (
-    ABSORBED,
     ADDED,
     AT_ESTIMATE,
     AT_REFERENCE,
     AT_TRUTH,
     BLOCK,
+    CAPACITY,
     COLUMN,
     CORRECTION,
     FIRST,
     GATED,
+    IN_USE,
     INNOVATION,
     INVARIANT,
     JACOBIAN,
+    LANDMARKS,
     LARGE,
     MEAN_BEFORE,
+    MOTION,
+    MOVED,
     NEAR,
+    NIS,
     OUTCOME,
     PRIOR_MEAN,
     PROJECTED,
     READING,
+    SCANNED,
     SKIPPED,
     SLOT,
+    STEPS,
+    TABLED,
     USED,
     VARIANCE,
     BeliefArrays,
+    Parts,
     Rules,
     Workspace,
     absorb,
     compose,
     mirror,
+    parts_jit,
     prior_system_jit,
     squared_whitened,
     times,
@@ -52,7 +63,123 @@ from .kalman_gain import (
 )
 
 # Status of an update, where it is not the reading that failed.
-DONE, NOT_USABLE = -1, -2
+DONE, NOT_USABLE, REPEATED, NO_ROOM = -1, -2, -3, -4
+
+
+@jit
+def update_map(block: Array, readings: Array, ids: IntArray) -> int:
+    """Update the belief of a filter with one scan, in place.
+
+    Parameters
+    ----------
+    block : ndarray
+        The memory of the filter, see :class:`.kalman_gain.Parts`.  On return it also
+        holds the record of the scan.
+    readings : ndarray, shape (m, 2)
+        Rows (β, r) [rad, m].
+    ids : ndarray of int64, shape (m,)
+        The landmark of each reading.
+
+    Returns
+    -------
+    int
+        DONE; REPEATED, if a landmark has two readings; NO_ROOM, if the new landmarks
+        or the readings may not fit; or as of :func:`update_belief`.  Unless DONE, the
+        belief has not changed.
+    """
+    parts, count = parts_jit(block), len(ids)
+    numbers, slots = parts.numbers, parts.ledger[SLOT]
+    for k in range(count):
+        for j in range(k):
+            if ids[j] == ids[k]:
+                return REPEATED
+    mapped = numbers[LANDMARKS]
+    if count > len(parts.scan_ids):
+        return NO_ROOM
+    if mapped + find_slots(parts, ids) > (numbers[CAPACITY] - 4) // 2:
+        return NO_ROOM
+    status, used, nis = update_belief(
+        parts.mean,
+        parts.covariance,
+        parts.reference,
+        3 + 2 * mapped,
+        readings,
+        count,
+        parts.ledger,
+        parts.rows,
+        parts.before,
+        parts.prior,
+        parts.values,
+    )
+    if status == DONE:
+        for k in range(count):
+            parts.scan_ids[k] = ids[k]
+            if parts.ledger[OUTCOME, k] == ADDED:
+                parts.ids[slots[k]] = ids[k]
+                numbers[LANDMARKS] += 1
+        numbers[SCANNED], numbers[IN_USE], parts.values[NIS] = count, used, nis
+        numbers[STEPS] += 1
+    return int(status)
+
+
+@njit_internal
+def find_slots(parts: Parts, ids: IntArray) -> int:
+    """Write the slots of landmarks to the ledger, -1 for new ones; count these.
+
+    The table holds slots + 1 and is at most half full.  A search begins at the hash of
+    an identity and ends at its slot or at an empty entry.
+    """
+    numbers, table, mask, new = parts.numbers, parts.table, len(parts.table) - 1, 0
+    for slot in range(numbers[TABLED], numbers[LANDMARKS]):  # not in the table yet
+        at = hash_of(parts.ids[slot]) & mask
+        while table[at] > 0:
+            at = (at + 1) & mask
+        table[at] = slot + 1
+    numbers[TABLED] = numbers[LANDMARKS]
+    for k in range(len(ids)):
+        at = hash_of(ids[k]) & mask
+        while table[at] > 0 and parts.ids[table[at] - 1] != ids[k]:
+            at = (at + 1) & mask
+        parts.ledger[SLOT, k] = table[at] - 1
+        new += table[at] == 0
+    return new
+
+
+@njit_internal
+def hash_of(landmark_id: int) -> int:
+    """Mix the bits of an identity (Fibonacci hashing of both halves)."""
+    low, high = landmark_id & 0xFFFFFFFF, (landmark_id >> 32) & 0xFFFFFFFF
+    return (low * 0x278DDE6D + high * 0x1F123BB5) >> 20
+
+
+@jit
+def move_pose(block: Array, distance: float, turn: float, weight: float) -> None:
+    """Move the belief of a filter by one odometry reading, in place.
+
+    Parameters
+    ----------
+    block : ndarray
+        The memory of the filter.
+    distance, turn : float
+        (d, α) [m, rad].
+    weight : float
+        Factor of the variances of the motion noise.
+    """
+    parts = parts_jit(block)
+    values, size = parts.values, 3 + 2 * parts.numbers[LANDMARKS]
+    for i in range(3):
+        values[MOVED + i] = weight * values[MOTION + i]
+    predict(
+        parts.mean,
+        parts.covariance,
+        parts.reference,
+        size,
+        distance,
+        turn,
+        values[MOVED : MOVED + 3],
+        int(values[0]),
+    )
+    parts.numbers[STEPS] += 1
 
 
 @jit
@@ -70,9 +197,6 @@ def update_belief(
     rule_values: Array,
 ) -> tuple[int, int, float]:
     """Update one belief with one scan, in place.
-
-    From Python, call it with ``*belief`` and ``*workspace``, the arrays of these
-    NamedTuples one by one: numba takes microseconds to recognise a NamedTuple.
 
     Parameters
     ----------
@@ -113,7 +237,6 @@ def update_belief(
         return failed // 2, used, 0.0
     nis = squared_whitened(rows, rules.iterations, used)
     add_landmarks(belief, size, readings, count, rules, ledger)
-    rows[MEAN_BEFORE, ABSORBED] = 1.0
     return DONE, used, nis
 
 

@@ -84,7 +84,7 @@ class MapEditor:
         self._within = reach
         return self._view
 
-    def checkpoint(self) -> Undo:
+    def bookmark(self) -> Undo:
         """Return what takes back later views, but for those of the filter."""
         within = self._within
 

@@ -152,7 +152,7 @@ class MapPruner:
             self.merger.forget(ids)
         return ids
 
-    def checkpoint(self) -> Undo:
+    def bookmark(self) -> Undo:
         """Return what takes back later changes of what is remembered."""
         return contents(self, self._records, self.merger, self._closer)
 

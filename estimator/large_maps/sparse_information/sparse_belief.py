@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
+from ...interface import UpdateReport
 from ...support.undo import Undo, attributes, contents, undone_on_error
 from ..elimination import RestFactor
 from ..multifrontal import SchurComplement, pairs
@@ -48,6 +49,10 @@ class SparseBelief:
     """Number of landmarks to eliminate around the local map."""
     enlarged: bool = False
     """Whether the first number was too small."""
+    steps: int = 0
+    """Number of steps taken."""
+    report: UpdateReport = field(default_factory=UpdateReport, repr=False)
+    """Report of the last update."""
     saved: list[Undo] = field(default_factory=list, repr=False)
     """What takes back the update under way: the last of these."""
     rest: RestFactor | None = field(default=None, repr=False)

@@ -134,12 +134,13 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._scan_rules.motion_noise.over(distance, turn, dt)
-        self._belief.pose = move(
+        pose = move(
             self._belief.pose,
             np.array([distance, turn]),
             variance,
             from_mean=self._scan_rules.base == ESTIMATE,
         )
+        vars(self._belief).update(pose=pose, steps=self.steps + 1)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -161,7 +162,8 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
         if not ids:
-            return UpdateReport()
+            vars(self._belief).update(report=UpdateReport(), steps=self.steps + 1)
+            return self.report()
         with self._belief.undone_on_error():
             self._belief.choose_local_map(ids, exact=self._is_exact)
             result = self._process(readings, ids)
@@ -170,7 +172,9 @@ range_noise_at, gate_probability, noise_at_rest, min_range
                 result = self._process(readings, ids)
             self._belief.add(result.report.added_ids, result.added_slots)
             self._belief.pose, self._belief.local = result.pose, result.local
-        return result.report
+            self._belief.report = result.report
+            self._belief.steps += 1
+        return self.report()
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Remove landmarks by marginalisation; the belief about all else is unchanged.
@@ -289,10 +293,18 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         name, base = type(self).__name__, self._scan_rules.base
         self._belief = checked_state(state, name, base)
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
-        undo_belief = attributes(self._belief) if motion else self._belief.checkpoint()
-        return undo_all(undo_belief, attributes(self))
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls."""
+        return undo_all(attributes(self), self._belief.checkpoint())
+
+    @property
+    def steps(self) -> int:
+        """Number of steps taken; it changes at once with the belief."""
+        return self._belief.steps
+
+    def report(self) -> UpdateReport:
+        """Return the report of the last update once more."""
+        return self._belief.report
 
     @property
     def _is_exact(self) -> bool:
