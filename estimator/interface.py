@@ -359,7 +359,7 @@ def advance(
     step: Callable[[], Result],
     then: Callable[[Result], Answer],
     undo: Undo,
-    edits: Callable[[], Undo] | None = None,
+    undo_then: Callable[[], Undo],
 ) -> Answer:
     """Return ``then(step())``; an interrupt finds nothing done, or both.
 
@@ -378,29 +378,27 @@ def advance(
         What follows, from the result of the step.
     undo : callable
         Takes back all that ``step`` changes before the filter takes its step.
-    edits : callable, optional
-        Returns what takes back ``then``; by default ``undo`` and edits of the filter.
+    undo_then : callable
+        Returns what takes back ``then``, which is called after the step.
     """
     if not hasattr(estimator, "steps"):
-        with undone_on_error(undo_all(bookmark(estimator), undo)):
+        with undone_on_error(undo_all(bookmark(estimator), undo_then(), undo)):
             return then(step())
-    steps, undo_edits = estimator.steps, undo
-
-    def begin() -> None:
-        nonlocal undo_edits
-        after = edits() if edits else undo_all(bookmark(estimator), undo)
-        undo_edits = after
+    steps = estimator.steps
+    taken_back: Undo | None = None
 
     def settle() -> None:
-        if estimator.steps != steps and undo_edits is undo:
-            begin()  # nothing has followed yet
-        undo_edits()
-        if estimator.steps != steps:
-            then(estimator.report())
+        nonlocal taken_back
+        if estimator.steps == steps:
+            undo()
+            return
+        taken_back = taken_back or undo_then()
+        taken_back()
+        then(estimator.report())
 
     try:
         result = step()
-        begin()
+        taken_back = undo_then()
         return then(result)
     except BaseException:
         to_the_end(settle)

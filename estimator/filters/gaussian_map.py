@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import compress
 from typing import Any, NamedTuple
 from weakref import ref
 
 import numpy as np
 
-from ...arrays import Array, IntArray
+from ...arrays import Array, BoolArray, IntArray
 from ..interface import Belief, MapView, UpdateReport
 from ..kernels.kalman_gain import (
     ADDED,
@@ -436,6 +435,10 @@ class ScanRecord(NamedTuple):
         """Innovations ν, shape (m, 2)."""
         return self.rows[:, INNOVATION].reshape(-1, 2)
 
+    def ids_where(self, chosen: BoolArray) -> tuple[int, ...]:
+        """Return the landmarks of some readings."""
+        return tuple(self.scan_ids[chosen].tolist())
+
     def joint_factor(self) -> Array:
         """Return L of S = L Lᵀ, shape (2m, 2m), lower triangular.
 
@@ -528,9 +531,7 @@ class ScanReport(UpdateReport):
     @cached_property
     def near_ids(self) -> tuple[int, ...]:
         """Mapped landmarks within 10 σ of the robot."""
-        return tuple(
-            compress(self._record.scan_ids.tolist(), self._record.ledger[NEAR].tolist())
-        )
+        return self._record.ids_where(self._record.ledger[NEAR] > 0)
 
     @cached_property
     def innovation(self) -> Array:
@@ -538,5 +539,4 @@ class ScanReport(UpdateReport):
         return self._record.innovation
 
     def _with_outcome(self, outcome: int) -> tuple[int, ...]:
-        chosen = self._record.ledger[OUTCOME] == outcome
-        return tuple(compress(self._record.scan_ids.tolist(), chosen.tolist()))
+        return self._record.ids_where(self._record.ledger[OUTCOME] == outcome)

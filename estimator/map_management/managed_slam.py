@@ -230,7 +230,7 @@ class ManagedSlam:
         self, readings: Array, associate: Callable[[], ScanAssociation]
     ) -> UpdateReport:
         """Correct the belief with readings (m, 2) as associated, then prune the map."""
-        undo = self._undo_records()
+        undo = self._editor.bookmark()
         with undone_on_error(undo):
             plan = associate()
             missed = self._pruner.expected(readings) - plan.explained
@@ -238,10 +238,9 @@ class ManagedSlam:
         step = partial(self._recent.feed, scans, first, plan)
         follow = partial(self._follow, readings, plan, missed, scans, first)
         if first is None:
-            return advance(self._filter, step, follow, undo)
-        with undone_on_error(
-            self.bookmark()
-        ):  # steps since a saved state, in new arrays
+            return advance(self._filter, step, follow, undo, self.bookmark)
+        # The filter returns to a saved state, in new arrays, and repeats its steps.
+        with undone_on_error(undo_all(self.bookmark(), undo)):
             return follow(step())
 
     def _follow(
@@ -326,16 +325,13 @@ class ManagedSlam:
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
-        return undo_all(bookmark(self._filter), self._undo_records())
+        parts = self._pruner, self._recent, self._editor
+        undos = (part.bookmark() for part in parts)
+        return undo_all(*undos, bookmark(self._filter), attributes(self))
 
     def report(self) -> UpdateReport | None:
         """Return the report of the last update once more."""
         return self._report
-
-    def _undo_records(self) -> Undo:
-        """Return what takes back later changes of all but the filter."""
-        parts = self._pruner, self._recent, self._editor
-        return undo_all(attributes(self), *(part.bookmark() for part in parts))
 
     def copy_from(self, other: ManagedSlam) -> None:
         """Continue as another filter of the same settings, decisions included."""

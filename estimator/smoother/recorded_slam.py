@@ -101,7 +101,7 @@ class RecordedSlam:
             self._record("predict", motion, dt)
             self.steps += 1
 
-        advance(self._slam, step, record, attributes(self))
+        advance(self._slam, step, record, undo_all(), self.bookmark)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
@@ -109,7 +109,7 @@ class RecordedSlam:
         """Update the filter with one scan, and record the readings that it used."""
         step = partial(self._slam.update, measurements, landmark_ids)
         then = partial(self._record_scan, measurements, landmark_ids)
-        return advance(self._slam, step, then, attributes(self))
+        return advance(self._slam, step, then, undo_all(), self.bookmark)
 
     def _record_scan(
         self,
