@@ -183,7 +183,7 @@ class HypothesisSlam:
                     slam.predict(motion, dt)
             self.steps = steps
 
-        self._carry_out(finish, slams, undo_all())
+        self._carry_out(finish, slams)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -199,8 +199,13 @@ class HypothesisSlam:
             That of the most probable hypothesis.
         """
         readings = argument_checks.scan(measurements)
-        undo = self.bookmark()
-        with undone_on_error(undo):
+        undo, steps = self.bookmark(), self.steps
+
+        def undo_options() -> None:
+            if self.steps == steps:
+                undo()
+
+        with undone_on_error(undo_options):
             if landmark_ids is None:
                 options = self._options(readings)
             else:
@@ -209,9 +214,18 @@ class HypothesisSlam:
                     (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
                     for k, h in enumerate(self.hypotheses)
                 ]
-            costs = [cost for cost, _, _ in options]
             plans = [complete() for _, _, complete in options]
             slams = self._branches([k for _, k, _ in options])
+            return self._take(readings, [cost for cost, *_ in options], plans, slams)
+
+    def _take(
+        self,
+        readings: Array,
+        costs: Sequence[float],
+        plans: Sequence[ScanAssociation],
+        slams: Sequence[ManagedSlam],
+    ) -> UpdateReport:
+        """Update filters by their associations, and continue with the best of them."""
         begun, steps = [slam.steps for slam in slams], self.steps + 1
         taken: tuple[UpdateReport, list[Hypothesis]] | None = None
 
@@ -227,18 +241,18 @@ class HypothesisSlam:
             self.steps = steps
             return self._report
 
-        return self._carry_out(finish, slams, undo)
+        return self._carry_out(finish, slams)
 
     def _carry_out(
-        self, finish: Callable[[], Answer], slams: Sequence[ManagedSlam], undo: Undo
+        self, finish: Callable[[], Answer], slams: Sequence[ManagedSlam]
     ) -> Answer:
         """Return the result of a function that continues where it was interrupted."""
         begun = [slam.steps for slam in slams]
         try:
             return finish()
         except BaseException:
-            changed = begun != [slam.steps for slam in slams]
-            to_the_end(finish if changed else undo)
+            if begun != [slam.steps for slam in slams]:
+                to_the_end(finish)
             raise
 
     def remove(self, landmark_ids: LandmarkIds) -> None:

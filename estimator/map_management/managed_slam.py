@@ -230,18 +230,23 @@ class ManagedSlam:
         self, readings: Array, associate: Callable[[], ScanAssociation]
     ) -> UpdateReport:
         """Correct the belief with readings (m, 2) as associated, then prune the map."""
-        undo = self._editor.bookmark()
-        with undone_on_error(undo):
+        undo, steps = self._editor.bookmark(), self.steps
+
+        def undo_views() -> None:
+            if self.steps == steps:
+                undo()
+
+        with undone_on_error(undo_views):
             plan = associate()
             missed = self._pruner.expected(readings) - plan.explained
             scans, first = self._recent.with_scan(readings, plan)
-        step = partial(self._recent.feed, scans, first, plan)
-        follow = partial(self._follow, readings, plan, missed, scans, first)
-        if first is None:
-            return advance(self._filter, step, follow, undo, self.bookmark)
-        # The filter returns to a saved state, in new arrays, and repeats its steps.
-        with undone_on_error(undo_all(self.bookmark(), undo)):
-            return follow(step())
+            step = partial(self._recent.feed, scans, first, plan)
+            follow = partial(self._follow, readings, plan, missed, scans, first)
+            if first is None:
+                return advance(self._filter, step, follow, undo_all(), self.bookmark)
+            # The filter repeats its steps since a saved state, in new arrays.
+            with undone_on_error(self.bookmark()):
+                return follow(step())
 
     def _follow(
         self,
