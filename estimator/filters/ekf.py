@@ -243,8 +243,10 @@ class EkfSlam(MapFilter):
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
 
-    _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
-    """The kernel: screen, correct, add new landmarks."""
+    @property
+    def _update_map(self) -> UpdateKernel:
+        """The kernel: screen, correct, add new landmarks."""
+        return update_map
 
     def __init__(
         self,

@@ -348,7 +348,7 @@ class HypothesisSlam:
             try:
                 if slam.steps == steps:
                     slam.take(readings, partial(_the_plan, plan))
-                reports.append(slam.report())
+                reports.append(slam.report() or UpdateReport())
                 kept.append(Hypothesis(cost, slam))
             except (np.linalg.LinAlgError, MemoryError) as error:
                 errors.append(error)

@@ -136,7 +136,8 @@ def identity_array(
         raise ValueError(
             f"measurements has {count} rows but landmark_ids has {len(array)} entries"
         )
-    return array
+    checked: IntArray = array
+    return checked
 
 
 def _as_signed(array: AnyArray, given: LandmarkIds) -> AnyArray:

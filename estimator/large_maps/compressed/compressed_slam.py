@@ -312,7 +312,7 @@ class CompressedEkfSlam:
         """Return whether the local map holds these landmarks and is not too large."""
         local, mapped = self._map.local, len(self._map.slots)
         is_free = self._local_size is None
-        if not is_free and len(required) > self._local_size:
+        if self._local_size is not None and len(required) > self._local_size:
             return False
         if is_free and self._map.is_small and len(local) == mapped:
             return True
