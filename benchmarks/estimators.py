@@ -2,7 +2,7 @@
 
     python benchmarks/estimators.py     # with filterpy and Stone Soup if installed
     pip install "slamgym[benchmark]"    # installs them
-    python benchmarks/estimators.py --earlier FOLDER    # beside a checkout of another commit
+    python benchmarks/estimators.py --earlier FOLDER    # a checkout to compare with
 
 Every case takes the same step: predict, then all readings. "kernels" are the compiled
 functions alone; "public" are ``predict`` and ``update`` with all checks and the report.
@@ -91,7 +91,8 @@ def load_earlier(folder: Path) -> None:
     package = folder / "src" / "slamgym"
     search = {"submodule_search_locations": [str(package)]}
     found = spec_from_file_location(EARLIER, package / "__init__.py", **search)
-    assert found and found.loader
+    assert found is not None
+    assert found.loader is not None
     sys.modules[EARLIER] = module = module_from_spec(found)
     found.loader.exec_module(module)
     with warnings.catch_warnings():

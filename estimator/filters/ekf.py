@@ -164,7 +164,7 @@ class MapFilter:
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
-        return self.map.report()
+        return self.map.last_report()
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""
@@ -243,10 +243,8 @@ class EkfSlam(MapFilter):
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
 
-    @property
-    def _update_map(self) -> UpdateKernel:
-        """The kernel: screen, correct, add new landmarks."""
-        return update_map
+    _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
+    """The kernel: screen, correct, add new landmarks."""
 
     def __init__(
         self,
@@ -290,7 +288,9 @@ class EkfSlam(MapFilter):
             dt, and dt = 0 adds none.
         """
         distance, turn = argument_checks.pair("odometry", odometry)
-        weight = self._motion_noise.weight(distance, turn, dt)
+        noise, weight = self._motion_noise, 1.0
+        if not (dt == 1.0 and type(dt) is float and noise.at_rest):
+            weight = noise.weight(distance, turn, dt)
         move_pose(self.map.block, distance, turn, weight)
 
     def update(
@@ -586,8 +586,6 @@ class MotionNoise(NamedTuple):
         ValueError
             If dt is no number, negative, or too large.
         """
-        if type(dt) is float and dt == 1.0 and self.at_rest:
-            return 1.0
         dt = argument_checks.duration(dt)
         return dt if self.at_rest or distance or turn else 0.0
 

@@ -54,7 +54,7 @@ from .landmark_merging import coincide
 set_attribute = object.__setattr__  # of frozen dataclasses
 FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for
 
-UpdateKernel = Callable[[Array, Array, IntArray], int]
+UpdateKernel = Callable[..., int]
 """Takes block, readings and ids in; returns the status."""
 
 
@@ -261,10 +261,15 @@ class GaussianMap:
         return status
 
     def report(self) -> ScanReport:
-        """Return the report of the last scan."""
+        """Return the report of the scan that has just been taken in."""
         report = ScanReport(self.parts)
         self._last = ref(report)
         return report
+
+    def last_report(self) -> ScanReport:
+        """Return the report of the last scan once more."""
+        last = self._last()
+        return self.report() if last is None or last.is_detached else last
 
     def rename(self, names: Mapping[int, int]) -> None:
         """Give landmarks other identities."""
@@ -476,13 +481,14 @@ class ScanReport(UpdateReport):
 
     def detach(self) -> None:
         """Copy the results: the next update is about to overwrite them."""
-        known = self.__dict__
-        if "_parts" in known:
-            parts = known["_parts"]
-            known.setdefault("nis", float(parts.values[NIS]))
-            if "_record" not in known:
-                known["_record"] = ScanRecord.copied(parts)
-            del known["_parts"]
+        if not self.is_detached:
+            _ = self.nis, self._record
+            del self.__dict__["_parts"]
+
+    @property
+    def is_detached(self) -> bool:
+        """Whether the results are copies."""
+        return "_parts" not in self.__dict__
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the results."""

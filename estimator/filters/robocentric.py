@@ -17,7 +17,6 @@ from ..models.rigid_motion import as_covariance
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from .ekf import EkfSlam
-from .gaussian_map import UpdateKernel
 
 # The state that the kernels see, in the robot's frame at the last scan: the motion
 # since that scan in place of the pose; the world's origin (x, y), its heading and a
@@ -61,10 +60,7 @@ class RobocentricEkfSlam(EkfSlam):
        55(1), 2007.
     """
 
-    @property
-    def _update_map(self) -> UpdateKernel:
-        """The kernel."""
-        return update_and_move
+    _update_map = staticmethod(update_and_move)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""

@@ -229,10 +229,11 @@ def refuse_large_belief(landmarks: int, limit: int, instead: str) -> None:
 def pair(name: str, value: ArrayLike) -> tuple[float, float]:
     """Return ``value`` as two finite floats of a usable size, or refuse it."""
     given: Any = value
-    if isinstance(given, np.ndarray):
-        if type(given) is not np.ndarray or given.dtype is not _FLOAT64:
-            _refuse_masked_and_complex(name, given)
+    if type(given) is np.ndarray and given.dtype is _FLOAT64:
         given = given.tolist()  # in half the time that numpy's own numbers take
+    elif isinstance(given, np.ndarray):
+        _refuse_masked_and_complex(name, given)
+        given = given.tolist()
     try:
         first, second = given
         a, b = float(first), float(second)
