@@ -199,7 +199,8 @@ class HypothesisSlam:
             That of the most probable hypothesis.
         """
         readings = argument_checks.scan(measurements)
-        undo, steps = self.bookmark(), self.steps
+        views = (h.slam.bookmark_views() for h in self.hypotheses)
+        undo, steps = undo_all(*views, self._pool.bookmark()), self.steps
 
         def undo_options() -> None:
             if self.steps == steps:

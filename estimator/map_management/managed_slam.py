@@ -230,7 +230,7 @@ class ManagedSlam:
         self, readings: Array, associate: Callable[[], ScanAssociation]
     ) -> UpdateReport:
         """Correct the belief with readings (m, 2) as associated, then prune the map."""
-        undo, steps = self._editor.bookmark(), self.steps
+        undo, steps = self.bookmark_views(), self.steps
 
         def undo_views() -> None:
             if self.steps == steps:
@@ -333,6 +333,10 @@ class ManagedSlam:
         parts = self._pruner, self._recent, self._editor
         undos = (part.bookmark() for part in parts)
         return undo_all(*undos, bookmark(self._filter), attributes(self))
+
+    def bookmark_views(self) -> Undo:
+        """Return what takes back that associations have looked at the map."""
+        return self._editor.bookmark()
 
     def report(self) -> UpdateReport | None:
         """Return the report of the last update once more."""

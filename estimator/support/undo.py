@@ -1,7 +1,7 @@
 """Calls that change all of a state or nothing, also where an interrupt ends them."""
 
 from collections.abc import Callable
-from copy import copy
+from typing import Any
 
 import numpy as np
 
@@ -72,14 +72,11 @@ def contents(*objects: object) -> Undo:
     >>> count.numbers
     [1]
     """
-    before = [
-        (vars(each), {name: _kept(value) for name, value in vars(each).items()})
-        for each in objects
-    ]
+    before = [(vars(each), _kept(vars(each))) for each in objects]
 
     def undo() -> None:
         for values, old in before:
-            values.update({name: _kept(value) for name, value in old.items()})
+            values.update(_kept(old))
 
     return undo
 
@@ -87,5 +84,8 @@ def contents(*objects: object) -> Undo:
 _CHANGED_IN_PLACE = frozenset((np.ndarray, list, dict, set))
 
 
-def _kept(value: object) -> object:
-    return copy(value) if type(value) in _CHANGED_IN_PLACE else value
+def _kept(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: value.copy() if type(value) in _CHANGED_IN_PLACE else value
+        for name, value in values.items()
+    }
