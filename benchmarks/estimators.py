@@ -149,7 +149,9 @@ def single_cases(landmarks: int) -> dict[str, Callable[[], object]]:
 
 
 GAIN = ("ekf public, earlier", "ekf public")
-GOALS = {  # (slow, fast): at least, or (slow, fast): at most with a minus sign
+GOALS: dict[
+    int, dict[tuple[str, str], float]
+] = {  # (slow, fast): at least, or (slow, fast): at most with a minus sign
     6: {
         ("stacked dense numpy", "ekf kernels"): 20,
         ("stacked dense numpy", "ekf public"): 9,
