@@ -198,7 +198,9 @@ class GaussianMap:
         most = len(self.parts.scan_ids)
         if readings > most:
             most = 8 + 2 * readings
-        return new_block(self.capacity_for(fitting), most, self.parts.values)
+        capacity = self.capacity_for(fitting) // 8 * 8  # it is rounded up
+        capacity = max(capacity, self.capacity_for(landmarks))
+        return new_block(capacity, most, self.parts.values)
 
     def hold(
         self,

@@ -110,15 +110,15 @@ def identity_array(
 
     Parameters
     ----------
-    landmark_ids : sequence of int, optional
-        None is refused, unless there are no readings.
+    landmark_ids : sequence of int
     count : int
         Number of readings.
     estimator
-        What needs the ids, for the message.
+        The filter that needs the ids, which may be None where there are no readings;
+        None if ids are always needed.
     """
     array: Any = landmark_ids
-    if landmark_ids is None:
+    if landmark_ids is None and estimator is not None:
         if count:
             name = type(estimator).__name__
             raise ValueError(f"landmark_ids must be given: {name} does not associate")
