@@ -24,6 +24,7 @@ from ..envs.rendering import RENDER_MODES
 from ..envs.vector import LandmarkWorldVectorEnv
 from ..estimator.filters.batch import BatchBeliefs, BatchStorage
 from ..jit import jit
+from ..restorable import Restorable
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, AssociationRecord, split_settings
 from .belief_observation import (
@@ -148,6 +149,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
+    _changing = (*LandmarkWorldEnv._changing, "task", "_explorers")
 
     def __init__(
         self,
@@ -275,6 +277,8 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
     (3, 8)
     """
 
+    _changing = (*LandmarkWorldVectorEnv._changing, "task", "_explorers")
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -350,7 +354,7 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
 # What the single and the vector environment share.
 
 
-class Explorers:
+class Explorers(Restorable):
     """The filters of B worlds, and what `info` reveals about them.
 
     Parameters
@@ -360,6 +364,8 @@ class Explorers:
     task : ActiveSlamTask
         The task of these worlds.
     """
+
+    _changing = ("_filters", "_record")
 
     def __init__(self, filters: Filters, task: ActiveSlamTask) -> None:
         self._filters, self._task = filters, task

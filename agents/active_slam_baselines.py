@@ -134,8 +134,9 @@ class Revisit:
         belief = knowledge.belief
         if not len(belief.landmark_ids):
             return None
-        best = int(np.argmin(_landmark_variances(knowledge)))
-        return np.asarray(belief.landmarks[best])
+        columns = np.arange(3, len(belief.covariance)).reshape(-1, 2)
+        blocks = belief.covariance[columns[:, :, None], columns[:, None]]
+        return np.asarray(belief.landmarks[int(np.argmin(largest_variances(blocks)))])
 
 
 class Frontier:
@@ -224,14 +225,6 @@ def steer(pose: Array, goal: Array, robot: Robot, dt: float) -> Array:
     turn = min(max(error / dt, -robot.max_turn_rate), robot.max_turn_rate)
     speed = math.hypot(dx, dy) / dt if abs(error) < _ALIGNED else 0.0
     return np.array([min(speed, robot.max_speed), turn])
-
-
-def _landmark_variances(knowledge: AgentKnowledge) -> Array:
-    """Return the worst variance of each mapped landmark, (n,) [m²]."""
-    belief = knowledge.belief
-    first = 3 + 2 * np.arange(len(belief.landmark_ids))
-    rows = first[:, None] + (0, 1)
-    return largest_variances(belief.covariance[rows[:, :, None], rows[:, None]])
 
 
 def _nearest(knowledge: AgentKnowledge, points: Array) -> Array:

@@ -24,14 +24,10 @@ D, A, _ = range(3)  # criteria of the map, in the order of `CRITERIA`
 class Episodes(NamedTuple):
     """The progress of the episodes of B worlds, which the pass changes in place."""
 
-    explored: BoolArray
-    """Cells seen so far, as believed, shape (B, C)."""
-    steps: IntArray
-    """Steps so far, shape (B,)."""
-    uncertainty: Array
-    """Of the map, see `information_reward.uncertainty`, shape (B,)."""
-    known: BoolArray
-    """Landmarks known to the required accuracy, shape (B, N)."""
+    explored: BoolArray  # cells seen so far, as believed, shape (B, C)
+    steps: IntArray  # steps so far, shape (B,)
+    uncertainty: Array  # of the map, see `information_reward.uncertainty`, shape (B,)
+    known: BoolArray  # landmarks known to the required accuracy, shape (B, N)
 
 
 class StepOutcome(NamedTuple):
@@ -46,17 +42,15 @@ class StepOutcome(NamedTuple):
 class Worlds(NamedTuple):
     """All that the pass reads and writes of B worlds."""
 
-    beliefs: tuple[Array, Array, IntArray]
-    """A `BatchStorage`."""
+    beliefs: tuple[Array, Array, IntArray]  # a `BatchStorage`
     actions: Array
     collisions: BoolArray
     episodes: Episodes
     outcome: StepOutcome
-    counts: tuple[IntArray, IntArray]
-    """Landmarks mapped and known, (B,)."""
+    counts: tuple[IntArray, IntArray]  # landmarks mapped and known, (B,)
     belief_features: FeatureArrays
+    # Goals, progress, uncertain, unexplored and walls, see `ActiveSlamTask`.
     features: tuple[Array, Array, Array, Array, Array]
-    """Goals, progress, uncertain, unexplored and walls, see `ActiveSlamTask`."""
 
 
 class Rules(NamedTuple):
@@ -68,25 +62,18 @@ class Rules(NamedTuple):
     crash_cost: float
     effort_cost: float
     step_cost: float
-    limits: tuple[float, float]
-    """Largest speed and turn rate [m/s, rad/s]."""
-    longest_step: float
-    """[m]"""
-    steps: int
-    """Of an episode."""
-    prior_std: tuple[float, float]
-    """Of an unmapped landmark [m]."""
+    limits: tuple[float, float]  # largest speed and turn rate [m/s, rad/s]
+    longest_step: float  # [m]
+    steps: int  # of an episode
+    prior_std: tuple[float, float]  # of an unmapped landmark [m]
 
 
 class Scratch(NamedTuple):
     """Room for intermediate results."""
 
-    points: Array
-    """Shape (3, max(C, N))."""
-    variances: Array
-    """Of the landmarks, shape (N,) [m²]."""
-    matrix: Array
-    """Shape (2N, 2N)."""
+    points: Array  # (3, max(C, N))
+    variances: Array  # of the landmarks, shape (N,) [m²]
+    matrix: Array  # (2N, 2N)
 
 
 @jit
@@ -277,13 +264,11 @@ def write_nearest(points: Array, count: int, diagonal: float, goal: Array) -> No
 
 Pose = tuple[float, float, float, float]
 
-SECTORS = 8
-"""Number of directions around the robot, the first straight ahead."""
+SECTORS = 8  # number of directions around the robot, the first straight ahead
 
+# Distance over which near densities decay to 1 / e, in diagonals of the floor.
 NEAR_REACH = 0.1
-"""Distance over which near densities decay to 1 / e, in diagonals of the floor."""
-FAR_REACH = 4 * NEAR_REACH
-"""The same of far densities."""
+FAR_REACH = 4 * NEAR_REACH  # the same of far densities
 
 AHEAD, ASIDE, DISTANCE = range(3)  # rows of an array of points
 _TIE = 1e-9  # values no farther apart count as equal
@@ -295,33 +280,25 @@ _SIN = np.sin(2 * np.pi * np.arange(SECTORS) / SECTORS)
 class Floor(NamedTuple):
     """The plan of a floor and the sight of the robot on it."""
 
-    cells: Array
-    """x and y of the centres of the cells, shape (2, C) [m]."""
-    walls: Array
-    """Rows (x0, y0, x1, y1), shape (W, 4) [m]."""
+    cells: Array  # x and y of the centres of the cells, shape (2, C) [m]
+    walls: Array  # rows (x0, y0, x1, y1), shape (W, 4) [m]
     bounds: Rectangle
-    diagonal: float
-    """Of the bounds [m]."""
+    diagonal: float  # of the bounds [m]
     sight: View
 
 
 class Lobes(NamedTuple):
     """Weighted sums over points with the unit vectors (x, y) towards them."""
 
-    total: float
-    """Σ w"""
-    xx: float
-    """Σ w x²"""
-    xy: float
-    """Σ w x y"""
-    ahead: float
-    """Σ w x², of points ahead."""
+    total: float  # Σ w
+    xx: float  # Σ w x²
+    xy: float  # Σ w x y
+    ahead: float  # Σ w x², of points ahead
+    # Σ w (x + y)² / 2, of points ahead or to the left by the same angle or more.
     ahead_left: float
-    """Σ w (x + y)² / 2, of points ahead or to the left by the same angle or more."""
-    left: float
-    """Σ w y², of points to the left."""
+    left: float  # Σ w y², of points to the left
+    # Σ w (y - x)² / 2, of points to the left or behind by the same angle or more.
     left_behind: float
-    """Σ w (y - x)² / 2, of points to the left or behind by the same angle or more."""
 
 
 @jit

@@ -18,6 +18,7 @@ VALIDATION = 1_000_000
 HELD_OUT = 2_000_000
 """First seed of the maps for the final evaluation. No choice may depend on them."""
 
+# Columns of a table of scores, and the entries of `Episode` that they average.
 COLUMNS = {
     "return": "total",
     "success": "success",
@@ -27,7 +28,6 @@ COLUMNS = {
     "true RMSE [m]": "true_rmse",
     "crashed": "crashed",
 }
-"""Columns of a table of scores, and the entries of `Episode` that they average."""
 
 
 class Episode(NamedTuple):

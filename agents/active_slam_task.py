@@ -19,6 +19,7 @@ from ..estimator.filters.batch import BatchStorage
 from ..estimator.interface import SupportsDecisions
 from ..estimator.map_management.policy import policy_of
 from ..evaluation.association_scores import score_association
+from ..restorable import Restorable
 from ..sim_configs import Scenario
 from .active_slam_kernels import Episodes, StepOutcome, advance
 from .belief_features import belief_space, empty_features
@@ -39,18 +40,14 @@ _SIZES = {  # of the entries besides the belief
 class RewardWeights:
     """Rewards, costs and accuracy of the task: keywords of the environments."""
 
-    criterion: str = "D"
-    """Criterion of the map's covariance, see `information_reward`."""
+    criterion: str = "D"  # criterion of the map's covariance, see `information_reward`
+    # A landmark is known when its worst standard deviation is at most this [m].
     accuracy: float = 0.25
-    """A landmark is known when its worst standard deviation is at most this [m]."""
+    # For knowing every landmark, multiplied by 1 + the share of steps left.
     success_reward: float = 5.0
-    """For knowing every landmark, multiplied by 1 + the share of steps left."""
-    crash_cost: float = 5.0
-    """For touching a wall, which ends the episode."""
-    effort_cost: float = 0.0
-    """For an `effort` of 1, per step."""
-    step_cost: float = 0.02
-    """Per step."""
+    crash_cost: float = 5.0  # for touching a wall, which ends the episode
+    effort_cost: float = 0.0  # for an `effort` of 1, per step
+    step_cost: float = 0.02  # per step
 
     def __post_init__(self) -> None:
         check_criterion(self.criterion)
@@ -64,7 +61,7 @@ class RewardWeights:
                 raise ValueError(f"{name} must be a finite number >= 0, got {weight!r}")
 
 
-class ActiveSlamTask:
+class ActiveSlamTask(Restorable):
     """Computes observations, rewards and ends of the episodes of B worlds.
 
     Parameters
@@ -104,6 +101,8 @@ class ActiveSlamTask:
     mapped, known : ndarray, shape (B,)
         Numbers of landmarks in the present map, and of those known accurately.
     """
+
+    _changing = ("episodes", "outcome", "mapped", "known", "_rows")
 
     def __init__(
         self,
@@ -261,11 +260,11 @@ def _no_outcome(count: int) -> StepOutcome:
     return StepOutcome(np.zeros(count), no[0], no[1], no[2])
 
 
+# Entries of `AssociationScores` that `info` reveals.
 SCORES = ("precision", "recall", "duplicate", "ghost")
-"""Entries of `AssociationScores` that `info` reveals."""
 
 
-class AssociationRecord:
+class AssociationRecord(Restorable):
     """Collects the true landmarks of the readings of B worlds, and scores the filters.
 
     Parameters
@@ -274,13 +273,15 @@ class AssociationRecord:
         B, the number of worlds.
     """
 
+    _changing = ("_true_ids",)
+
     def __init__(self, worlds: int) -> None:
-        self._true_ids: list[list[IntArray]] = [[] for _ in range(worlds)]
+        self._true_ids: tuple[list[IntArray], ...] = tuple([] for _ in range(worlds))
 
     def begin(self, worlds: BoolArray) -> None:
         """Forget the readings of some worlds, (B,)."""
         for b in np.flatnonzero(worlds).tolist():
-            self._true_ids[b] = []
+            self._true_ids[b].clear()
 
     def add(self, worlds: BoolArray, true_ids: IntArray, mask: BoolArray) -> None:
         """Note one scan of some worlds, (B,): rows (B, M), and which are readings."""

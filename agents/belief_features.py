@@ -199,7 +199,7 @@ def belief_storage(belief: BeliefOfMap, size: int, *, by_id: bool) -> BatchStora
     means[0, 3:used] = np.ravel(belief.landmarks)
     covariances[0, :used, :used] = belief.covariance
     slots[0, rows] = np.arange(len(rows))
-    return BatchStorage(means, covariances, slots)
+    return BatchStorage.of(means, covariances, slots)
 
 
 def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
@@ -208,7 +208,7 @@ def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
     slots = np.full((1, size), -1, dtype=np.int64)
     for landmark, slot in gaussian.slots.items():
         slots[0, landmark] = slot
-    return BatchStorage(gaussian.mean[None], gaussian.covariance[None], slots)
+    return BatchStorage.of(gaussian.mean[None], gaussian.covariance[None], slots)
 
 
 # --------------------------------------------------------------------------------------
@@ -216,11 +216,11 @@ def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
 
 Rectangle = tuple[float, float, float, float]
 
+# Of B worlds, in the alphabetical order of their keys, see `belief_features`.
 FeatureArrays = tuple[Array, Array, Array, Array, BoolArray, Array, Array, Array]
-"""Of B worlds, in the alphabetical order of their keys, see `belief_features`."""
 
+# Standard deviations [m, rad] that `on_log_scale` maps to 0 and to 1.
 SMALLEST_STD, LARGEST_STD = 1e-3, 10.0
-"""Standard deviations [m, rad] that `on_log_scale` maps to 0 and to 1."""
 
 _SCALE = 1.0 / math.log(LARGEST_STD / SMALLEST_STD)
 

@@ -19,15 +19,12 @@ from gymnasium.vector.utils import batch_space
 from ..arrays import AnyArray, Array, BoolArray
 from ..envs import LandmarkWorldEnv
 from ..envs.vector.landmark_world_vector import final_infos
-from ..estimator.filters.batch import (
-    BatchBeliefs,
-    BatchSlam,
-    BatchStorage,
-    can_batch,
-)
+from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage, can_batch
 from ..estimator.filters.ekf import EkfSlam
+from ..estimator.interface import restore
 from ..estimator.registry import find_estimator, make_batch, read_label
 from ..estimator.support import argument_checks
+from ..restorable import Restorable, State
 from ..sim_configs import Scenario
 from .belief_features import (
     belief_features,
@@ -346,7 +343,7 @@ def _padded(rows: AnyArray, more: int) -> AnyArray:
     return np.pad(rows, padding)
 
 
-class SeparateFilters:
+class SeparateFilters(Restorable):
     """Filters side by side: any filter of one world, and all that associate.
 
     Batches neither associate nor run filters of other libraries.
@@ -378,6 +375,21 @@ class SeparateFilters:
         self._steps = [0] * len(filters)
         self._beliefs: list[BeliefOfMap | None] = [None] * len(filters)
         self._stored: list[Any] = [None] * len(filters)  # `BatchStorage`, B = 1
+
+    def state(self) -> State:
+        """Return the states of the filters, for `restore`."""
+        states = [slam.state_dict() for slam in self.filters]
+        return states, self._steps[:], self._beliefs[:], self._stored[:]
+
+    def restore(self, state: State) -> None:
+        """Return to states of these filters."""
+        states, *rest = state
+        for slam, own in zip(self.filters, states, strict=True):
+            restore(slam, own)
+        self._steps, self._beliefs, self._stored = (part[:] for part in rest)
+        for run, slam in enumerate(self.filters):
+            if self._live[run]:
+                self._stored[run] = live_storage(cast("EkfSlam", slam), self._rows)
 
     def reset(self, poses: Array, pose_std: Any, *, runs: BoolArray) -> None:
         """Start new runs in some worlds, at poses (B, 3) with deviations (3,)."""
@@ -425,7 +437,7 @@ class SeparateFilters:
         if len(self._stored) == 1:
             one: BatchStorage = self._stored[0]
             return one
-        return BatchStorage(*map(np.concatenate, zip(*self._stored, strict=True)))
+        return BatchStorage.of(*map(np.concatenate, zip(*self._stored, strict=True)))
 
     def belief(self, run: int) -> BeliefOfMap | None:
         """Return the belief of one world; None before its first scan."""

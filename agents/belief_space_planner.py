@@ -41,22 +41,15 @@ _TURNS = (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)  # of the largest turn rate
 class PlannerSettings(NamedTuple):
     """What a planner considers, and how it values plans."""
 
-    horizon: int
-    """Steps of a plan."""
-    straight: tuple[int, ...]
-    """Steps that a robot drives straight on after a turn."""
-    goals: int
-    """Unseen cells to drive to, at most; 0 leaves arcs alone."""
-    known_bonus: float
-    """For every landmark that becomes known."""
-    discount: float
-    """Of landmarks found a step later."""
-    overlooked: float
-    """Probability that a landmark in a cell in view is not seen."""
+    horizon: int  # steps of a plan
+    straight: tuple[int, ...]  # steps that a robot drives straight on after a turn
+    goals: int  # unseen cells to drive to, at most; 0 leaves arcs alone
+    known_bonus: float  # for every landmark that becomes known
+    discount: float  # of landmarks found a step later
+    overlooked: float  # probability that a landmark in a cell in view is not seen
+    # For the rest of the tour chosen before, so that the robot does not dither.
     persistence: float
-    """For the rest of the tour chosen before, so that the robot does not dither."""
-    attraction: float
-    """Per metre nearer to a goal that is left for later."""
+    attraction: float  # per metre nearer to a goal that is left for later
 
 
 MPC = PlannerSettings(
@@ -69,8 +62,8 @@ MPC = PlannerSettings(
     persistence=0.3,
     attraction=0.06,
 )
+# Looks ahead along motions that turn and then drive straight on.
 GREEDY = MPC._replace(horizon=20, straight=(2, 5, 10), goals=0)
-"""Looks ahead along motions that turn and then drive straight on."""
 
 
 class BeliefSpacePlanner:

@@ -13,13 +13,8 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, BoolArray
 from ..envs.rendering import BeliefLike
+from ..estimator import registry
 from ..estimator.map_management.policy import LandmarkPolicy, as_policy
-from ..estimator.registry import (
-    accepted_options,
-    find_estimator,
-    make_estimator,
-    read_label,
-)
 from ..sim_configs import Scenario
 
 
@@ -93,8 +88,10 @@ def choose_estimator(
     settings = dict(options or {})
     factory: Any
     if isinstance(estimator, str):
-        factory = partial(make_estimator, estimator)
-        known = noise_options(find_estimator(read_label(estimator).name), scenario)
+        factory = partial(registry.make_estimator, estimator)
+        known = noise_options(
+            registry.find_estimator(registry.read_label(estimator).name), scenario
+        )
         if not scenario.sensor.identities:
             settings["management"] = _bounded(settings.get("management", True), rows)
     elif isinstance(estimator, type) or not _has_a_method(estimator):
@@ -125,7 +122,7 @@ def noise_options(factory: Callable[..., Any], scenario: Scenario) -> dict[str, 
         "range_std_per_metre": scenario.sensor.range_std_per_metre,
         "noise_at_rest": scenario.motion.noise_at_rest,
     }
-    return accepted_options(factory, settings)
+    return registry.accepted_options(factory, settings)
 
 
 def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:

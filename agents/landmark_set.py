@@ -30,6 +30,7 @@ from .belief_features import (
     turned_jit,
 )
 
+# The columns of ``landmarks``.
 FEATURES = (
     "ahead",  # of ρ, squashed
     "aside",
@@ -47,10 +48,8 @@ FEATURES = (
     "aside_pose_aside",
     "aside_pose_heading",
 )
-"""The columns of ``landmarks``."""
 
-SCALE = 10.0
-"""s in ρ / (‖ρ‖ + s), which maps all distances into [0, 1) [m]."""
+SCALE = 10.0  # s in ρ / (‖ρ‖ + s), which maps all distances into [0, 1) [m]
 
 _ROWS = 32
 _KINDS, _PRECISIONS = ("flat", "set"), ("float64", "float32")
@@ -60,12 +59,11 @@ _KINDS, _PRECISIONS = ("flat", "set"), ("float64", "float32")
 class ObservationForm:
     """The form of the observation: keywords of the environments of active SLAM."""
 
+    # "flat": row i is landmark i. "set": rows in the order of their distance.
     observation: str = "flat"
-    """"flat": row i is landmark i. "set": rows in the order of their distance."""
+    # Rows of a set, 32 by default; the nearest landmarks have one.
     max_landmarks: int | None = None
-    """Rows of a set, 32 by default; the nearest landmarks have one."""
-    dtype: str = "float64"
-    """Of the numbers: "float64" or "float32"."""
+    dtype: str = "float64"  # of the numbers: "float64" or "float32"
 
     def __post_init__(self) -> None:
         if self.observation not in _KINDS:

@@ -323,20 +323,17 @@ class AgentKnowledge(NamedTuple):
 
     scenario: Scenario
     grid: CoverageGrid
+    # For predictions. A policy that changes its state must restore it.
     estimator: FollowingEstimator
-    """For predictions. A policy that changes its state must restore it."""
     belief: BeliefOfMap
-    explored: BoolArray
-    """Cells of the grid seen so far, as believed, shape (C,)."""
+    explored: BoolArray  # cells of the grid seen so far, as believed, shape (C,)
+    # Landmarks known to the required accuracy, shape (N,); with hidden identities in
+    # the order of the map.
     known: BoolArray
-    """Landmarks known to the required accuracy, shape (N,); with hidden identities in
-    the order of the map."""
-    accuracy: float
-    """Required standard deviation of a landmark [m]."""
+    accuracy: float  # required standard deviation of a landmark [m]
+    # Standard deviations of the coordinates of an unmapped landmark [m].
     prior_std: tuple[float, float]
-    """Standard deviations of the coordinates of an unmapped landmark [m]."""
-    step: int
-    """Steps so far."""
+    step: int  # steps so far
 
     @property
     def known_in_map(self) -> BoolArray:

@@ -42,8 +42,7 @@ FILTERS = (
     "first_estimates",
     "observability_constrained",
     "invariant",
-    "invariant[iterations=3]",
-    "invariant[sequential=true]",
+    "invariant[iterations=1]",
 )
 SLOW = ("unscented", "robocentric")
 

@@ -34,7 +34,7 @@ WORLDS = (
 FILTERS = (
     "ekf",
     "invariant",
-    "invariant[iterations=3]",
+    "invariant[iterations=1]",
     "first_estimates",
     "observability_constrained",
 )

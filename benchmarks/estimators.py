@@ -136,9 +136,6 @@ def single_cases(landmarks: int) -> dict[str, Callable[[], object]]:
         "iterated (3) kernels": kernel_step(
             prepared("iterated", readings, iterations=3), readings
         ),
-        "invariant (3) kernels": kernel_step(
-            prepared("invariant", readings, iterations=3), readings
-        ),
     }
     start = (belief.mean, belief.covariance, noise, data)
     if find_spec("filterpy"):

@@ -36,7 +36,7 @@ WORLDS = {"six_landmarks": 29, "loop": 260, "coarse_loop": 260}
 """Steps of the worlds: of the two loops somewhat more than the first lap."""
 LONGEST = {"gtsam_batch": 100}
 """Steps above which an estimator is left out: its time of a step grows with them."""
-OURS = ("ekf", "unscented", "invariant", "invariant[iterations=3]")
+OURS = ("ekf", "unscented", "invariant", "invariant[iterations=1]")
 VARIANTS = ("gtsam_isam2[relinearize_threshold=0.001]", "gtsam_fixed_lag[lag=50]")
 COLUMNS = (
     "estimator",

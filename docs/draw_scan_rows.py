@@ -22,7 +22,7 @@ COLOURS = {
     "linearise": "#a6cee3",
     "absorb": "#b2df8a",
     "retract, transport": "#cab2d6",
-    "correct, correct_or_restore": "#fb9a99",
+    "correct": "#fb9a99",
 }
 STATE = 14  # columns drawn for the state
 READINGS = 3
@@ -44,9 +44,9 @@ def state_rows() -> list[Part]:
     rows = (
         (layout.CORRECTION, "CORRECTION   δ", "absorb"),
         (layout.TRANSPORT, "TRANSPORT   v", "retract, transport"),
-        (layout.PRIOR_MEAN, "PRIOR_MEAN", "correct, correct_or_restore"),
+        (layout.ITERATE, "ITERATE", "correct"),
         (layout.HEADING, "HEADING   P[:, θ]", "retract, transport"),
-        (layout.MEAN_BEFORE, "MEAN_BEFORE", "correct, correct_or_restore"),
+        (layout.MEAN_BEFORE, "MEAN_BEFORE", "correct"),
     )
     return [Part(row, 0, 1, STATE, text, writer) for row, text, writer in rows]
 
@@ -82,6 +82,7 @@ def ledger_rows() -> list[Part]:
         (layout.OUTCOME, "OUTCOME", "screen"),
         (layout.NEAR, "NEAR", "screen"),
         (layout.COLUMN, "COLUMN", "screen"),
+        (layout.ORDER, "ORDER", "correct"),
     )
     return [Part(row, 0, 1, 5, text, writer) for row, text, writer in rows]
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
+from ..arrays import Array, BoolArray, ComplexArray, IntArray
 from ..sim_configs import Scenario
 from .noise_streams import SensorNoise, SensorSettings, largest_noise
 from .robot import wrap_bearings
@@ -34,12 +34,10 @@ Limit = float | Array | None
 class AnonymousScan(NamedTuple):
     """Readings without identities, in random order, empty rows last."""
 
-    readings: Array
-    """(β, r), zeros in empty rows, shape (2, …, M) [rad, m]."""
-    mask: BoolArray
-    """Rows with a reading, shape (…, M)."""
+    readings: Array  # (β, r), zeros in empty rows, shape (2, …, M) [rad, m]
+    mask: BoolArray  # rows with a reading, shape (…, M)
+    # The true landmark of each row, -1 for clutter and empty rows, shape (…, M).
     landmark_ids: IntArray
-    """The true landmark of each row, -1 for clutter and empty rows, shape (…, M)."""
 
 
 class BearingRangeSensor:
@@ -179,15 +177,11 @@ def hide_identities(
     rows[2] = -1.0
     np.copyto(rows[2, ..., :count], np.arange(count), where=mask)
     places = np.argsort(np.where(rows[1] > 0.0, order, _LAST), axis=-1)
-    packed = _take(rows, places)
-    return AnonymousScan(packed[:2], packed[1] > 0.0, packed[2].astype(np.int64))
-
-
-def _take(rows: Array, places: IndexArray) -> Array:
-    """Reorder the last axis of rows, (3, …, M), by places, (…, M)."""
     if places.ndim == 1:
-        return rows[:, places]  # 20 µs faster
-    return np.take_along_axis(rows, places[None], axis=-1)
+        packed = rows[:, places]  # 20 µs faster
+    else:
+        packed = np.take_along_axis(rows, places[None], axis=-1)
+    return AnonymousScan(packed[:2], packed[1] > 0.0, packed[2].astype(np.int64))
 
 
 _MOUNTED = 1e-6  # a landmark this near to the line of a wall is mounted on it [m]

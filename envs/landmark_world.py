@@ -14,6 +14,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, ComplexArray, ImageArray
+from ..restorable import Restorable, State
 from ..sim_configs import Scenario, load_scenario
 from .bearing_range import BearingRangeSensor, hide_identities
 from .noise_streams import NoiseRows, WorldNoise
@@ -28,7 +29,7 @@ Observation = dict[str, Any]
 _FPS = 30
 
 
-class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
+class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
     """A robot drives among point landmarks and measures its motion and the landmarks.
 
     ## Description
@@ -96,6 +97,11 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
     """  # noqa: E501 (tables)
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": _FPS}  # noqa: RUF012
+    _changing = (
+        *("_np_random", "_np_random_seed", "_drawn_scenario", "_sensor", "_starts"),
+        *("_noise", "_landmarks", "_body", "_start_estimate", "_motion_noise"),
+        *("_sensor_noise", "_steps_left", "_renderer"),
+    )
     _spec: EnvSpec | None = None
 
     def __init__(
@@ -192,6 +198,27 @@ class LandmarkWorldEnv(gymnasium.Env[Observation, AnyArray]):
         observation, info = self._observe(odometry, collision=share < 1.0)
         self._steps_left -= 1
         return observation, 0.0, False, self._steps_left <= 0, info
+
+    def state(self) -> State:
+        """Return all that later steps depend on, for `restore`.
+
+        It includes the generator, and with it the noise and episodes to come. A planner
+        that must not know them seeds its own world. Wrappers keep what is theirs, so
+        call it on ``env.unwrapped``.
+
+        Examples
+        --------
+        >>> env = LandmarkWorldEnv("corridor")
+        >>> observation, info = env.reset(seed=0)
+        >>> state = env.state()
+        >>> first = [env.step([1.0, 0.2])[0]["odometry"] for _ in range(5)]
+        >>> env.restore(state)
+        >>> second = [env.step([1.0, 0.2])[0]["odometry"] for _ in range(5)]
+        >>> np.array_equal(first, second)
+        True
+        """
+        self._refuse_before_reset()
+        return super().state()
 
     def render(self) -> ImageArray | None:
         """Return a frame in mode "rgb_array", else None."""

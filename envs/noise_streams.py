@@ -14,17 +14,10 @@ from typing import Generic, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ..arrays import Array, IntArray, WordArray
+from ..restorable import Restorable
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import Sensor
-from .streams import (
-    CLUTTER,
-    DROPOUT,
-    MEASUREMENT,
-    MOTION,
-    ORDER,
-    draw_normals,
-    draw_uniforms,
-)
+from . import streams
 
 Row = TypeVar("Row")
 
@@ -32,25 +25,24 @@ _FIRST_BLOCK = 8  # steps; short, so that a reset is quick
 _GROWTH = 4  # of a block over the last one
 _LONGEST_BLOCK = 128  # steps
 
+# Random effects on the sensor in one step: (error, nearest, clutter, order).
+#
+# A plain tuple, because a named one costs 1 % of a step. N landmarks, C rows for
+# clutter. Worlds that are simulated together add axes at the dots.
+#
+# error : shape (2, …, N)
+#     (εβ, εr) [rad, m]; εr in units of σr(r) where that grows with the range.
+# nearest : shape (…, N)
+#     A landmark is read above this true range [m]. It is min_range or more, so that the
+#     noisy range is positive; inf where the reading drops out.
+# clutter : shape (2, …, C), or None with identities
+#     False readings (β, r), zeros where there is none [rad, m].
+# order : shape (…, N + C), or None with identities
+#     Uniform random numbers that sort the rows.
 SensorNoise = tuple[Array, Array, Array | None, Array | None]
-"""Random effects on the sensor in one step: (error, nearest, clutter, order).
-
-A plain tuple, because a named one costs 1 % of a step. N landmarks, C rows for clutter.
-Worlds that are simulated together add axes at the dots.
-
-error : shape (2, …, N)
-    (εβ, εr) [rad, m]; εr in units of σr(r) where that grows with the range.
-nearest : shape (…, N)
-    A landmark is read above this true range [m]. It is min_range or more, so that the
-    noisy range is positive; inf where the reading drops out.
-clutter : shape (2, …, C), or None with identities
-    False readings (β, r), zeros where there is none [rad, m].
-order : shape (…, N + C), or None with identities
-    Uniform random numbers that sort the rows.
-"""
 
 
-class NoiseRows(Generic[Row]):
+class NoiseRows(Restorable, Generic[Row]):
     """An endless iterator over rows of noise, one per step, drawn in growing blocks.
 
     Parameters
@@ -66,6 +58,8 @@ class NoiseRows(Generic[Row]):
     >>> float(next(rows)), float(next(rows))
     (0.1, 0.2)
     """
+
+    _changing = ("_draw", "_next", "_block", "_to_come")
 
     def __init__(
         self, draw: Callable[[IntArray], Iterable[Row]], first: int = 0
@@ -136,9 +130,9 @@ class WorldNoise:
         self._landmarks = count = scenario.landmarks.count
         hidden, rows = not sensor.identities, sensor.max_clutter
         self._widths = {  # of uniform numbers per step; one and two for each false row
-            DROPOUT: count if sensor.dropout else 0,
-            CLUTTER: 1 + 2 * rows if hidden and sensor.clutter else 0,
-            ORDER: count + rows if hidden else 0,
+            streams.DROPOUT: count if sensor.dropout else 0,
+            streams.CLUTTER: 1 + 2 * rows if hidden and sensor.clutter else 0,
+            streams.ORDER: count + rows if hidden else 0,
         }
         self._grows = sensor.range_std_per_metre > 0
         self._nearest = np.nextafter(sensor.min_range, -1.0)
@@ -158,7 +152,7 @@ class WorldNoise:
             Of each world, where worlds differ.
         """
         unit = np.empty((len(steps), 3))
-        draw_normals(keys, steps, MOTION, unit[None])
+        streams.draw_normals(keys, steps, streams.MOTION, unit[None])
         noise: Array = heavy_tails(unit, self._faults.motion_dof)
         return noise * (self._motion_std if std is None else std)
 
@@ -168,7 +162,7 @@ class WorldNoise:
         """Draw the sensor noise; see `motion`."""
         settings = settings or self._settings
         unit = np.empty((2, len(steps), self._landmarks))
-        draw_normals(keys, steps, MEASUREMENT, unit)
+        streams.draw_normals(keys, steps, streams.MEASUREMENT, unit)
         unit = heavy_tails(unit, self._faults.sensor_dof)
         dropout, clutter, order = (
             _uniform(keys, steps, stream, width)
@@ -235,7 +229,7 @@ def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array
     if not width:
         return None
     drawn = np.empty((len(steps), width))
-    draw_uniforms(keys, steps, stream, drawn)
+    streams.draw_uniforms(keys, steps, stream, drawn)
     return drawn
 
 

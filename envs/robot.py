@@ -32,12 +32,13 @@ import pymunk
 
 from ..arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ..jit import jit, njit_internal
+from ..restorable import Restorable, State
 from ..sim_configs import Scenario
 
 _NO_SLIP = (0.0, 0.0, 0.0)
 
 
-class UnicycleBody:
+class UnicycleBody(Restorable):
     """A round body that moves by one displacement and one turn per step.
 
     The engine's body is kinematic and has no shape. Only its velocity moves it, so one
@@ -78,6 +79,14 @@ class UnicycleBody:
         self.position = np.zeros((), dtype=np.complex128)
         self.inverse_heading = np.zeros((), dtype=np.complex128)
         self.place((0.0, 0.0, 0.0))
+
+    def state(self) -> State:
+        """Return the pose, for `restore`."""
+        return self._pose
+
+    def restore(self, state: State) -> None:
+        """Return to a pose."""
+        self.place(state)
 
     @property
     def pose(self) -> Array:
@@ -228,11 +237,8 @@ class WallContacts:
             shares[k] = self.free_share(x.item(k), y.item(k), dx.item(k), dy.item(k))
         return shares
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"radius": self._radius, "walls": self._walls}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        WallContacts.__init__(self, state["radius"], state["walls"])
+    def __reduce__(self) -> tuple[Any, ...]:
+        return WallContacts, (self._radius, self._walls)
 
 
 def _inflated(wall: Wall, radius: float, ground: pymunk.Body) -> list[pymunk.Shape]:
@@ -256,10 +262,7 @@ def _outward(
 
 @jit
 def _find_near(
-    moves: tuple[Array, Array, Array, Array],
-    walls: Array,
-    reach: float,
-    near: IntArray,
+    moves: tuple[Array, Array, Array, Array], walls: Array, reach: float, near: IntArray
 ) -> int:
     """List the moves (x, y, dx, dy) that come within reach of a wall; return how many.
 
@@ -311,7 +314,7 @@ def _has_ends_apart(segment: Wall, other: Wall) -> bool:
     return first * last <= 0.0
 
 
-class UnicycleBodies:
+class UnicycleBodies(Restorable):
     """B round bodies, each in its own world.
 
     The results equal those of `UnicycleBody` to the bit: sums, products and queries of
@@ -349,6 +352,14 @@ class UnicycleBodies:
         self.position = np.zeros((count, 1), dtype=np.complex128)
         self.inverse_heading = np.zeros((count, 1), dtype=np.complex128)
         self._arrive(self._pose)
+
+    def state(self) -> State:
+        """Return the poses, for `restore`."""
+        return (self._pose,)  # which every move replaces
+
+    def restore(self, state: State) -> None:
+        """Return to poses."""
+        self._arrive(*state)
 
     def poses(self) -> Array:
         """(x, y, θ), shape (B, 3) [m, m, rad], a fresh array; θ is not wrapped."""

@@ -265,75 +265,64 @@ def make_normal(numbers: Array) -> None:
         signed[tail] = numbers[places[tail]]
         roots[tail] = sqrt(-log(0.5 - abs(signed[tail])))
     for place in range(len(numbers)):
-        numbers[place] = _centre(numbers[place])
+        q = numbers[place]
+        numbers[place] = _ratio(_CENTRE, 0.180625 - q * q, q)
     for tail in range(count):
-        root = roots[tail]
-        z = _tail(root - 1.6) if root <= 5.0 else _far_tail(root - 5.0)
-        numbers[places[tail]] = z if signed[tail] > 0.0 else -z
+        r, sign = roots[tail], 1.0 if signed[tail] > 0.0 else -1.0
+        near = r <= 5.0
+        z = _ratio(_TAIL, r - 1.6, sign) if near else _ratio(_FAR_TAIL, r - 5.0, sign)
+        numbers[places[tail]] = z
+
+
+def _columns(*rows: tuple[float, float]) -> tuple[tuple[float, ...], ...]:
+    return tuple(zip(*rows, strict=True))
+
+
+# The rational functions: coefficients of numerator and denominator, from r⁷ down to 1.
+_CENTRE = _columns(
+    (2.5090809287301226727e3, 5.2264952788528545610e3),
+    (3.3430575583588128105e4, 2.8729085735721942674e4),
+    (6.7265770927008700853e4, 3.9307895800092710610e4),
+    (4.5921953931549871457e4, 2.1213794301586595867e4),
+    (1.3731693765509461125e4, 5.3941960214247511077e3),
+    (1.9715909503065514427e3, 6.8718700749205790830e2),
+    (1.3314166789178437745e2, 4.2313330701600911252e1),
+    (3.3871328727963666080e0, 1.0),
+)
+_TAIL = _columns(
+    (7.74545014278341407640e-4, 1.05075007164441684324e-9),
+    (2.27238449892691845833e-2, 5.47593808499534494600e-4),
+    (2.41780725177450611770e-1, 1.51986665636164571966e-2),
+    (1.27045825245236838258e0, 1.48103976427480074590e-1),
+    (3.64784832476320460504e0, 6.89767334985100004550e-1),
+    (5.76949722146069140550e0, 1.67638483018380384940e0),
+    (4.63033784615654529590e0, 2.05319162663775882187e0),
+    (1.42343711074968357734e0, 1.0),
+)
+_FAR_TAIL = _columns(
+    (2.01033439929228813265e-7, 2.04426310338993978564e-15),
+    (2.71155556874348757815e-5, 1.42151175831644588870e-7),
+    (1.24266094738807843860e-3, 1.84631831751005468180e-5),
+    (2.65321895265761230930e-2, 7.86869131145613259100e-4),
+    (2.96560571828504891230e-1, 1.48753612908506148525e-2),
+    (1.78482653991729133580e0, 1.36929880922735805310e-1),
+    (5.46378491116411436990e0, 5.99832206555887937690e-1),
+    (6.65790464350110377720e0, 1.0),
+)
 
 
 @njit_internal
-def _centre(q: float) -> float:
-    r = 0.180625 - q * q
-    upper = 2.5090809287301226727e3
-    upper = upper * r + 3.3430575583588128105e4
-    upper = upper * r + 6.7265770927008700853e4
-    upper = upper * r + 4.5921953931549871457e4
-    upper = upper * r + 1.3731693765509461125e4
-    upper = upper * r + 1.9715909503065514427e3
-    upper = upper * r + 1.3314166789178437745e2
-    upper = upper * r + 3.3871328727963666080e0
-    lower = 5.2264952788528545610e3
-    lower = lower * r + 2.8729085735721942674e4
-    lower = lower * r + 3.9307895800092710610e4
-    lower = lower * r + 2.1213794301586595867e4
-    lower = lower * r + 5.3941960214247511077e3
-    lower = lower * r + 6.8718700749205790830e2
-    lower = lower * r + 4.2313330701600911252e1
-    lower = lower * r + 1.0
-    return upper * q / lower
+def _ratio(table: tuple[tuple[float, ...], ...], r: float, factor: float) -> float:
+    """Evaluate a rational function, times a factor."""
+    upper, lower = table
+    return _polynomial(upper, r) * factor / _polynomial(lower, r)
 
 
 @njit_internal
-def _tail(r: float) -> float:
-    upper = 7.74545014278341407640e-4
-    upper = upper * r + 2.27238449892691845833e-2
-    upper = upper * r + 2.41780725177450611770e-1
-    upper = upper * r + 1.27045825245236838258e0
-    upper = upper * r + 3.64784832476320460504e0
-    upper = upper * r + 5.76949722146069140550e0
-    upper = upper * r + 4.63033784615654529590e0
-    upper = upper * r + 1.42343711074968357734e0
-    lower = 1.05075007164441684324e-9
-    lower = lower * r + 5.47593808499534494600e-4
-    lower = lower * r + 1.51986665636164571966e-2
-    lower = lower * r + 1.48103976427480074590e-1
-    lower = lower * r + 6.89767334985100004550e-1
-    lower = lower * r + 1.67638483018380384940e0
-    lower = lower * r + 2.05319162663775882187e0
-    lower = lower * r + 1.0
-    return upper / lower
-
-
-@njit_internal
-def _far_tail(r: float) -> float:
-    upper = 2.01033439929228813265e-7
-    upper = upper * r + 2.71155556874348757815e-5
-    upper = upper * r + 1.24266094738807843860e-3
-    upper = upper * r + 2.65321895265761230930e-2
-    upper = upper * r + 2.96560571828504891230e-1
-    upper = upper * r + 1.78482653991729133580e0
-    upper = upper * r + 5.46378491116411436990e0
-    upper = upper * r + 6.65790464350110377720e0
-    lower = 2.04426310338993978564e-15
-    lower = lower * r + 1.42151175831644588870e-7
-    lower = lower * r + 1.84631831751005468180e-5
-    lower = lower * r + 7.86869131145613259100e-4
-    lower = lower * r + 1.48753612908506148525e-2
-    lower = lower * r + 1.36929880922735805310e-1
-    lower = lower * r + 5.99832206555887937690e-1
-    lower = lower * r + 1.0
-    return upper / lower
+def _polynomial(c: tuple[float, ...], r: float) -> float:
+    """Evaluate a polynomial of degree 7; a loop over c would not be vectorised."""
+    high = ((c[0] * r + c[1]) * r + c[2]) * r + c[3]
+    return (((high * r + c[4]) * r + c[5]) * r + c[6]) * r + c[7]
 
 
 # --------------------------------------------------------------------------------------

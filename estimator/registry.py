@@ -314,10 +314,8 @@ _BARE_WORD = re.compile(r"(=\s*)(?!true\b|false\b|inf\b|nan\b)([A-Za-z_][\w-]*)"
 class FilterLabel(NamedTuple):
     """A filter and its options."""
 
-    name: str
-    """Registered name or "module:Class"."""
-    options: dict[str, Any]
-    """Arguments of its constructor other than the noise."""
+    name: str  # registered name or "module:Class"
+    options: dict[str, Any]  # arguments of its constructor other than the noise
 
 
 def read_label(label: str) -> FilterLabel:
@@ -345,7 +343,7 @@ def read_label(label: str) -> FilterLabel:
         table = tomllib.loads(f"options = {{ {options} }}")["options"]
     except (tomllib.TOMLDecodeError, RecursionError):
         raise ValueError(
-            f"options must be like [iterations=3,sequential=true], got '{label}'"
+            f"options must be like [iterations=3,min_range=0.5], got '{label}'"
         ) from None
     return FilterLabel(match["name"].strip(), table)
 
@@ -355,8 +353,8 @@ def split_labels(labels: str) -> list[str]:
 
     Examples
     --------
-    >>> split_labels("ekf, invariant[iterations=3,sequential=true]")
-    ['ekf', 'invariant[iterations=3,sequential=true]']
+    >>> split_labels("ekf, invariant[iterations=3,min_range=0.5]")
+    ['ekf', 'invariant[iterations=3,min_range=0.5]']
     """
     parts, depth = [""], 0
     for character in labels:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .consistency_report import evaluate_consistency as evaluate_consistency
     from .diagnosis import CAUSES as CAUSES
     from .diagnosis import Diagnosis as Diagnosis
+    from .diagnosis import SmallNoise as SmallNoise
     from .diagnosis import diagnose as diagnose
     from .error_bound import Efficiency as Efficiency
     from .error_bound import PosteriorBound as PosteriorBound

@@ -33,8 +33,7 @@ from ..arrays import AnyArray, Array
 from ..estimator.interface import ScanDecisions
 from ..estimator.support.argument_checks import as_floats
 
-CLUTTER = -1
-"""The true landmark of a reading that has none."""
+CLUTTER = -1  # the true landmark of a reading that has none
 
 
 class AssociationScores(NamedTuple):
@@ -250,9 +249,7 @@ def _kind_of_new(place: int, in_map: Mapping[int, int]) -> str:
     return "duplicate" if place in in_map.values() else "new_correct"
 
 
-def _owners(
-    scans: Iterator[tuple[ScanDecisions, list[int]]],
-) -> dict[int, int]:
+def _owners(scans: Iterator[tuple[ScanDecisions, list[int]]]) -> dict[int, int]:
     """Return whose reading confirmed each landmark."""
     owners: dict[int, int] = {}
     for made, truth in scans:
@@ -304,8 +301,7 @@ def _share(part: int, whole: int) -> float:
 #    sub-pattern assignment metric, 20th International Conference on Information Fusion,
 #    2017.
 
-CUTOFF = 1.0
-"""An estimate farther than this from a true landmark is not of it [m]."""
+CUTOFF = 1.0  # an estimate farther than this from a true landmark is not of it [m]
 
 
 class Gospa(NamedTuple):

@@ -77,6 +77,11 @@ class ConsistencyReport:
     """Median of the runs' time averages."""
     share_above_3: float
     """Share of the runs whose time average is above 3."""
+    deciding_runs: int
+    """Fewest runs without which the mean of the others is inside the margin, 0 if it is
+    anyway."""
+    ratio_of_others: float
+    """Mean without these runs."""
     runs_needed: tuple[tuple[float, int], ...]
     """(factor, number of runs with which the final step finds it in 90 % of cases)."""
 
@@ -198,6 +203,7 @@ def evaluate_consistency(
     averages = scores.mean(axis=1)
     steps = np.linspace(0, scores.shape[1] - 1, _GRID + 1).round()[1:]
     grid = np.unique(steps.astype(np.int64))
+    deciding, others = _deciding_runs(averages / dof)
     has_nis, lags = bool(freedom.any()), min(_LAGS, scans.shape[1] - 1)
     return ConsistencyReport(
         frame=frame,
@@ -216,8 +222,19 @@ def evaluate_consistency(
         mean_ratio=float(averages.mean() / dof),
         median_ratio=float(np.median(averages) / dof),
         share_above_3=float(np.mean(averages > 3 * dof)),
+        deciding_runs=deciding,
+        ratio_of_others=others,
         runs_needed=_runs_needed(dof),
     )
+
+
+def _deciding_runs(ratios: Array) -> tuple[int, float]:
+    """Return how many of the largest ratios lift the mean, and that of the others."""
+    smallest = np.sort(ratios)
+    means = np.cumsum(smallest) / np.arange(1, len(smallest) + 1)
+    inside = np.flatnonzero(means <= EQUIVALENCE_MARGIN.high)
+    kept = int(inside[-1]) + 1 if len(inside) else len(means)
+    return len(means) - kept, float(means[kept - 1])
 
 
 def assert_consistent(report: ConsistencyReport) -> None:

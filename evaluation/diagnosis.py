@@ -1,21 +1,22 @@
 """Name the cause if a filter is not consistent, from many runs: `diagnose`.
 
-The tests answer two questions in this order.
+The tests answer three questions in this order.
 
 1. Do odometry and readings have the noise that the filter assumes?  With the truth,
    all noise values are known (:mod:`.noise_findings`).  A wrong standard deviation, a
-   bias and heavy tails are tested separately: a bias changes the mean, a wrong
-   deviation the variance, and heavy tails the kurtosis.
-2. If so, do the covariances agree with the errors (`errors_of`)?  If not, the cause is
-   in the filter: its association if identities are hidden, otherwise its linearisation.
-   Linearisation does not change the size of the innovations, and its errors accumulate.
-   If the innovations are wrong too, or the errors are as wrong in the first steps as
-   later, it is not the cause, and the answer is "cannot tell".
+   bias, heavy tails and a correlation in time are tested separately.
+2. If so, do the covariances agree with the errors (`errors_of`)?  If not, and if
+   identities are hidden, do wrong associations make the errors larger?
+3. Otherwise, what is left of the excess if all noise in the same worlds is a tenth of
+   what it was, and the filter knows this (`excess_of`)?  An excess that vanishes is of
+   the linearisation.  One that stays is of a wrong Jacobian or covariance: both
+   scale with the noise.  One that grows is of a wrong model, whose errors do not.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +28,7 @@ from ..estimator.support import argument_checks
 from .hypothesis_tests import time_average_test
 from .noise_findings import (
     CHANNELS,
+    CORRELATED,
     HEAVY_TAILS,
     MOMENTS,
     Finding,
@@ -35,6 +37,7 @@ from .noise_findings import (
 
 HONEST, CANNOT_TELL = "honest", "cannot tell"
 LINEARISATION, ASSOCIATION = "linearisation", "association"
+WRONG_COVARIANCE, WRONG_MODEL = "wrong covariance", "wrong model"
 CAUSES = (
     HONEST,
     *(
@@ -47,7 +50,10 @@ CAUSES = (
     "bearing bias",
     "range bias",
     HEAVY_TAILS,
+    CORRELATED,
     LINEARISATION,
+    WRONG_COVARIANCE,
+    WRONG_MODEL,
     ASSOCIATION,
     CANNOT_TELL,
 )
@@ -58,6 +64,10 @@ _ERROR_RATE = 0.05
 LARGEST_NIS = 1.15
 """NIS per degree from which on a filter does not use the noise that it is given."""
 FEWEST_RUNS = 20
+_WITHOUT_SMALL_NOISE = (
+    "The cause is the linearisation, a wrong model or a wrong covariance; the same "
+    "runs with a tenth of the noise would show it."
+)
 
 
 class Diagnosis(NamedTuple):
@@ -70,10 +80,24 @@ class Diagnosis(NamedTuple):
     sentence: str
     others: tuple[str, ...] = ()
     """Further causes that the noise shows, the one with the largest effect first."""
+    repeat: int = 0
+    """How many of the first runs to repeat with less noise (`SmallNoise`), 0 for none:
+    they name the cause, as far as it can be named."""
+
+
+class SmallNoise(NamedTuple):
+    """The same runs with less noise in the world, and in what the filter assumes."""
+
+    nees: ArrayLike
+    """Time average of the NEES of the pose in each run, (M,); nan where not run."""
+    heading_nees: ArrayLike
+    """That of the heading, (M,)."""
+    factor: float = 0.1
+    """Of all noises, and of the deviations of the first pose."""
 
 
 def diagnose(
-    noise: ArrayLike,
+    noise: ArrayLike | None,
     nees: ArrayLike,
     heading_nees: ArrayLike,
     *,
@@ -81,6 +105,8 @@ def diagnose(
     heading_knowledge: ArrayLike | None = None,
     mistakes: ArrayLike | None = None,
     known_nees: ArrayLike | None = None,
+    small_noise: SmallNoise | None = None,
+    rejected: bool = False,
 ) -> Diagnosis:
     """Name why a filter is not consistent.
 
@@ -88,8 +114,8 @@ def diagnose(
 
     Parameters
     ----------
-    noise : array_like, shape (M, 5, 7)
-        Of :func:`~slamgym.evaluation.noise_sums`, of M runs.
+    noise : array_like, shape (M, 5, 9), or None
+        Of :func:`~slamgym.evaluation.noise_sums`, of M runs; None if it is not known.
     nees, heading_nees : array_like, shape (M, K)
         NEES of the pose (3 degrees) in the filter's own error frame, and of the
         heading (1 degree), after each of K steps; nan at leading steps without one. A
@@ -97,7 +123,7 @@ def diagnose(
     nis_ratio : float, optional
         Sum of all NIS divided by their degrees of freedom.
     heading_knowledge : array_like, shape (M,), optional
-        Variance of the last heading that the filter claims, divided by the least
+        Variance of the last heading that the filter reports, divided by the least
         possible one (:func:`~slamgym.evaluation.posterior_bound`).
     mistakes : array_like, shape (M,), optional
         Number of readings that a run gave to a wrong landmark, where identities are
@@ -105,6 +131,11 @@ def diagnose(
     known_nees : array_like, shape (M, K), optional
         NEES of the pose of the same filter on the same readings with known identities.
         With it, the effect of wrong associations is found in single runs.
+    small_noise : SmallNoise, optional
+        Without it, linearisation, a wrong model and a wrong covariance look alike, and
+        the answer is "cannot tell".
+    rejected : bool
+        Whether another test has rejected the filter, so that it is not "honest".
 
     Returns
     -------
@@ -120,27 +151,70 @@ def diagnose(
     >>> rng = np.random.default_rng(0)
     >>> w = 1.3 * rng.standard_normal((40, 5, 50))  # noise as assumed, but for σα
     >>> w[:, [0, 1, 3, 4]] /= 1.3
-    >>> sums = np.stack([(w**k).sum(axis=2) for k in (0, 1, 2, 3, 4, 1, 0)], axis=2)
+    >>> sums = [(w**k).sum(axis=2) for k in (0, 1, 2, 3, 4, 1, 0, 0, 1)]
     >>> nees = rng.chisquare(3, (40, 20))
-    >>> diagnose(sums, nees, rng.chisquare(1, (40, 20))).cause
+    >>> diagnose(np.stack(sums, 2), nees, rng.chisquare(1, (40, 20))).cause
     'motion noise too small'
     """
-    sums, pose, heading = _checked(noise, nees, heading_nees)
+    pose, heading = _checked(nees, heading_nees)
+    sums = None if noise is None else _checked_sums(noise, len(pose))
     runs = len(pose)
     if runs < FEWEST_RUNS:
         return Diagnosis(
             CANNOT_TELL, 1.0, f"{runs} runs are too few; {FEWEST_RUNS} are needed."
         )
-    errors, guilty = errors_of(pose, heading), significant_findings(sums, NOISE_RATE)
+    errors = errors_of(pose, heading)
+    guilty = [] if sums is None else significant_findings(sums, NOISE_RATE)
     if guilty:
         return _of_the_noise(guilty, errors)
-    known = None if heading_knowledge is None else np.asarray(heading_knowledge, float)
-    blame = None
-    if mistakes is not None and np.any(mistakes):
-        paired = None if known_nees is None else _paired(known_nees, nees, pose)
-        blame = blame_association(pose, np.asarray(mistakes, float), paired)
-    early = wrong_from_the_start(pose)
-    return _of_the_filter(errors, nis_ratio or 0.0, known, blame, early)
+    before = "" if sums is None else "the noise is as assumed, but "
+    blame = _blamed(pose, nees, mistakes, known_nees)
+    knowledge = (
+        None if heading_knowledge is None else np.asarray(heading_knowledge, float)
+    )
+    spurious = None if knowledge is None else spurious_knowledge(knowledge)
+    p_value = smallest_adjusted(errors, spurious, blame)
+    if p_value >= FILTER_RATE and not rejected:
+        return _of_consistent_errors(before, p_value, nis_ratio or 0.0, blame)
+    if _is_of_the_association(blame, errors):
+        return _of_the_association(before, blame, errors)
+    if p_value >= FILTER_RATE and 1 / LEAST_RATIO < errors.ratio < LEAST_RATIO:
+        text = (
+            f"cannot tell: {before}a test rejects the filter, although {errors.text}."
+        )
+        return Diagnosis(CANNOT_TELL, p_value, text)
+    what = f"{before}{errors.text} ({p_text(p_value)})"
+    what += _also(knowledge, spurious, nis_ratio)
+    if small_noise is None:
+        cause, text = CANNOT_TELL, _WITHOUT_SMALL_NOISE
+    else:
+        cause, text = excess_of(pose, heading, small_noise, nis_ratio or 0.0)
+    repeat = runs_to_repeat(pose, heading) if cause == CANNOT_TELL else 0
+    return Diagnosis(cause, p_value, f"{cause}: {what}. {text}", repeat=repeat)
+
+
+def _blamed(
+    pose: Array, nees: ArrayLike, mistakes: ArrayLike | None, known: ArrayLike | None
+) -> Blame | None:
+    if mistakes is None or not np.any(mistakes):
+        return None
+    paired = None if known is None else _paired(known, nees, pose)
+    return blame_association(pose, np.asarray(mistakes, float), paired)
+
+
+def _also(
+    knowledge: Array | None, spurious: float | None, nis_ratio: float | None
+) -> str:
+    """Write what else is wrong with an overconfident filter."""
+    text = ""
+    if knowledge is not None and spurious is not None and spurious < _ERROR_RATE:
+        text += (
+            f"; the filter reports {100 * knowledge.mean():.2g} % of the smallest "
+            "heading variance that any filter can reach"
+        )
+    if nis_ratio is not None and nis_ratio > LARGEST_NIS:
+        text += f"; the squared innovations are {nis_ratio:.3g} times too large"
+    return text
 
 
 def _paired(known_nees: ArrayLike, nees: ArrayLike, pose: Array) -> Array:
@@ -153,28 +227,33 @@ def _paired(known_nees: ArrayLike, nees: ArrayLike, pose: Array) -> Array:
     return known[:, known.shape[1] - pose.shape[1] :]
 
 
-def _checked(
-    noise: ArrayLike, nees: ArrayLike, heading_nees: ArrayLike
-) -> tuple[Array, Array, Array]:
-    sums = argument_checks.as_floats("noise", noise)
+def _checked_sums(noise: ArrayLike, runs: int) -> Array:
+    sums, shape = (
+        argument_checks.as_floats("noise", noise),
+        (runs, len(CHANNELS), len(MOMENTS)),
+    )
+    if sums.shape != shape:
+        raise ValueError(f"noise must be shape {shape}, got {sums.shape}")
+    if not np.isfinite(sums).all():
+        raise ValueError("noise must be finite: leave out runs that failed")
+    return sums
+
+
+def _checked(nees: ArrayLike, heading_nees: ArrayLike) -> tuple[Array, Array]:
     pose = argument_checks.as_floats("nees", nees)
     heading = argument_checks.as_floats("heading_nees", heading_nees)
     if pose.ndim != 2 or not pose.shape[1]:
         raise ValueError(f"nees must be shape (runs, steps), got {pose.shape}")
-    for name, array, shape in (
-        ("noise", sums, (len(pose), len(CHANNELS), len(MOMENTS))),
-        ("heading_nees", heading, pose.shape),
-    ):
-        if array.shape != shape:
-            raise ValueError(f"{name} must be shape {shape}, got {array.shape}")
-    if not np.isfinite(sums).all():
-        raise ValueError("noise must be finite: leave out runs that failed")
+    if heading.shape != pose.shape:
+        raise ValueError(
+            f"heading_nees must be shape {pose.shape}, got {heading.shape}"
+        )
     known = np.isfinite(pose)
     first = int(known.all(axis=0).argmax())
     if not known[:, first:].all():
         raise ValueError("nees must be finite from its first step on: leave out runs "
                          "that failed")  # fmt: skip
-    return sums, pose[:, first:], heading[:, np.isfinite(heading).all(axis=0)]
+    return pose[:, first:], heading[:, np.isfinite(heading).all(axis=0)]
 
 
 def _of_the_noise(guilty: list[Finding], errors: Errors) -> Diagnosis:
@@ -188,70 +267,31 @@ def _of_the_noise(guilty: list[Finding], errors: Errors) -> Diagnosis:
     return Diagnosis(first.cause, first.p_value, sentence, tuple(others))
 
 
-def _of_the_filter(
-    errors: Errors,
-    nis_ratio: float,
-    knowledge: Array | None,
-    blame: Blame | None,
-    early: Early | None,
-) -> Diagnosis:
-    """Return the answer for a filter that assumes the right noise."""
-    spurious = None if knowledge is None else spurious_knowledge(knowledge)
-    p_value = smallest_adjusted(errors, spurious, blame)
-    if p_value >= FILTER_RATE:
-        return _of_consistent_errors(p_value, nis_ratio, blame)
-    what = f"the noise is what it assumes, but {errors.text}"
-    is_association = blame is not None and blame.p_value < _ERROR_RATE
-    only_by_comparison = is_association and errors.p_value >= FILTER_RATE
-    if errors.ratio < 1 and not only_by_comparison:
-        return Diagnosis(CANNOT_TELL, p_value, f"cannot tell: {what}.")
-    if blame is not None and (is_association or not blame.is_paired):
-        return _of_the_association(blame, errors)
-    if doubt := _doubt(errors, nis_ratio, early):
-        return Diagnosis(CANNOT_TELL, p_value, f"cannot tell: {what}{doubt}.")
-    claims = ""
-    if knowledge is not None and spurious is not None and spurious < _ERROR_RATE:
-        share = f"{knowledge.mean():.2g}"
-        claims = f"; it claims {share} of the least possible variance of its heading"
-    sentence = f"linearisation: {what} ({p_text(p_value)}){claims}."
-    return Diagnosis(LINEARISATION, p_value, sentence)
-
-
 def _of_consistent_errors(
-    p_value: float, nis_ratio: float, blame: Blame | None
+    before: str, p_value: float, nis_ratio: float, blame: Blame | None
 ) -> Diagnosis:
     """Return the answer for errors that no test rejects: honest, if the NIS agrees."""
+    agree = before.removesuffix(", but ") + ", and " if before else ""
+    agree += "the errors agree with the covariances"
     if blame is not None or nis_ratio <= LARGEST_NIS:
-        sentence = "honest: the noise is what it assumes, and its errors agree."
-        return Diagnosis(HONEST, p_value, sentence)
+        return Diagnosis(HONEST, p_value, f"honest: {agree}.")
     sentence = (
-        "cannot tell: the noise is what it assumes, and its errors agree, but "
-        f"{_innovations_text(nis_ratio)}."
+        f"cannot tell: {agree}, but the squared innovations are {nis_ratio:.3g} times "
+        "too large: the filter may not use the noise that it is given."
     )
     return Diagnosis(CANNOT_TELL, p_value, sentence)
 
 
-def _doubt(errors: Errors, nis_ratio: float, early: Early | None) -> str:
-    """State what linearisation does not explain; empty if there is nothing."""
-    if nis_ratio > np.sqrt(errors.ratio):
-        return f", and {_innovations_text(nis_ratio)}"
-    if early is None:
-        return ""
-    return (
-        f", and {early.ratio:.3g} times in the first {early.steps} steps, where errors "
-        "of linearisation are small: its covariance may be scaled, or it may not use "
-        "the noise that it is given"
-    )
+def _is_of_the_association(blame: Blame | None, errors: Errors) -> TypeGuard[Blame]:
+    """Whether wrong associations are the cause, or may be and cannot be excluded."""
+    if blame is None:
+        return False
+    if errors.ratio <= 1 and errors.p_value < FILTER_RATE:
+        return False
+    return blame.p_value < _ERROR_RATE or not blame.is_paired
 
 
-def _innovations_text(nis_ratio: float) -> str:
-    return (
-        f"squared innovations are {nis_ratio:.3g} times too large: it may not use the "
-        "noise that it is given"
-    )
-
-
-def _of_the_association(blame: Blame, errors: Errors) -> Diagnosis:
+def _of_the_association(before: str, blame: Blame, errors: Errors) -> Diagnosis:
     if blame.p_value < _ERROR_RATE:
         sentence = (
             f"association: {blame.share:.0%} of the runs give readings to wrong "
@@ -259,8 +299,8 @@ def _of_the_association(blame: Blame, errors: Errors) -> Diagnosis:
         )
         return Diagnosis(ASSOCIATION, blame.p_value, sentence)
     sentence = (
-        f"cannot tell: the noise is what it assumes, and {errors.text}, but runs with "
-        "more wrong associations err no more than others."
+        f"cannot tell: {before}{errors.text}, and runs with more wrong associations "
+        "err no more than others."
     )
     return Diagnosis(CANNOT_TELL, errors.p_value, sentence)
 
@@ -289,10 +329,11 @@ KNOWABLE = 0.9
 """Share of the least possible variance below which a claim is spurious."""
 LOST_LEVEL, LOST_RATE = 1e-4, 1e-3
 """Quantile of χ²(3) beyond which a run is lost, and its rate that is accepted."""
-EARLY_SHARE, FEWEST_EARLY = 0.1, 5
-"""Which share of all steps is early, and at least how many steps."""
-_EARLY_RATE = 0.01
-_GROWTH = 2.0  # by which linearisation errors grow after the early steps
+SHRINKS, GROWS = 0.5, 3.0
+"""Shares of the excess: with less noise, that of the linearisation falls below the
+first, and that of a wrong model exceeds the second."""
+SMALLEST_NOISE = 0.01
+_CLEARLY, _MOST = 2.0, 0.75
 _FEWEST_OF_A_KIND = 5
 _FEWEST_LOST = 2
 
@@ -305,20 +346,17 @@ class Errors(NamedTuple):
     """NEES per degree over runs and steps, of pose or heading: farthest from 1."""
     lost: int
     """Number of lost runs."""
+    of: str
+    """"pose" or "heading"."""
 
     @property
     def text(self) -> str:
         """The finding, for a sentence."""
         lost = f", and {self.lost} runs are lost" if self.lost > 1 else ""
-        return f"its squared errors are {self.ratio:.3g} times what it claims{lost}"
-
-
-class Early(NamedTuple):
-    """How far the covariances are from the errors in the early steps."""
-
-    steps: int
-    ratio: float
-    """NEES of the pose per degree."""
+        return (
+            f"the squared errors of the {self.of} are {self.ratio:.3g} times what the "
+            f"covariances state{lost}"
+        )
 
 
 class Blame(NamedTuple):
@@ -354,8 +392,10 @@ def errors_of(pose: Array, heading: Array) -> Errors:
     lost = int(lost_runs(pose).sum())
     p_values = [_beyond_margin(average) for average in averages]
     p_values.append(float(binom.sf(lost - 1, len(pose), LOST_RATE)))
-    ratio = max((float(a.mean()) for a in averages), key=lambda x: abs(np.log(x)))
-    return Errors(min(1.0, len(p_values) * min(p_values)), ratio, lost)
+    ratios = [float(average.mean()) for average in averages]
+    ratio = max(ratios, key=lambda x: abs(np.log(x)))
+    of = ("pose", "heading")[ratios.index(ratio)]
+    return Errors(min(1.0, len(p_values) * min(p_values)), ratio, lost, of)
 
 
 def lost_runs(pose: Array) -> BoolArray:
@@ -368,29 +408,122 @@ def lost_runs(pose: Array) -> BoolArray:
     return np.asarray(pose.mean(axis=1) > chi2.isf(LOST_LEVEL, POSE))
 
 
-def wrong_from_the_start(pose: Array) -> Early | None:
-    """Return the errors of the early steps, if they are as inconsistent as later ones.
+def runs_to_repeat(pose: Array, heading: Array) -> int:
+    """Return how many of the first runs show what is left of the excess.
 
-    Errors of linearisation accumulate.  If the NEES is significantly above 1 in the
-    first tenth of the steps, and its excess over 1 does not double after them, and not
-    after the first step, the covariance is too small for another reason.
+    They are a tenth of the runs, at least 10, where most runs err clearly; otherwise as
+    many as show half of the excess in 90 % of cases, or five lost runs.
 
     Parameters
     ----------
-    pose : ndarray, shape (M, K)
-        NEES of the pose, 3 degrees.
+    pose, heading : ndarray, shape (M, K), (M, L)
+        As for `errors_of`.
     """
-    steps = max(int(EARLY_SHARE * pose.shape[1]), FEWEST_EARLY)
-    if steps >= pose.shape[1]:
-        return None
-    averages = pose[:, :steps].mean(axis=1) / POSE
-    early, overall = float(averages.mean()), float(pose.mean()) / POSE
-    least = min(early, float(pose[:, 0].mean()) / POSE)
-    has_grown = overall - 1 >= _GROWTH * (least - 1)
-    if least <= 1 or has_grown:
-        return None
-    is_certain = time_average_test(averages, 1).p_value < _EARLY_RATE
-    return Early(steps, early) if is_certain else None
+    score, few = _averages(pose, heading), max(10, len(pose) // 10)
+    lost = np.flatnonzero(lost_runs(pose))
+    if np.median(score) > _CLEARLY:
+        needed = few
+    elif len(lost) > 1:
+        needed = int(lost[:5][-1]) + 1
+    else:
+        excess = max(abs(float(score.mean()) - 1), LEAST_RATIO - 1)
+        needed = math.ceil((3.5 * float(score.std()) / excess) ** 2)
+    return min(max(needed, few), len(pose))
+
+
+def excess_of(
+    pose: Array, heading: Array, small: SmallNoise, nis_ratio: float = 0.0
+) -> tuple[str, str]:
+    """Compare the errors of the same runs with much and with little noise.
+
+    With the average NEES per degree a of a run and b with less noise, the excess b − 1
+    is tested against the shares `SHRINKS` and `GROWS` of a − 1 (t-test over runs).  If
+    most runs err clearly, or if some are lost, the answer is what most of these runs
+    show, because a few of them make the average.
+
+    Parameters
+    ----------
+    pose, heading : ndarray, shape (M, K), (M, L)
+        As for `errors_of`.
+    small : SmallNoise
+        Of the same runs.
+    nis_ratio : float
+        Sum of all NIS divided by their degrees of freedom.  Linearisation hardly
+        changes the size of innovations.
+
+    Returns
+    -------
+    cause : str
+        `LINEARISATION`, `WRONG_COVARIANCE`, `WRONG_MODEL` or `CANNOT_TELL`.
+    sentence : str
+    """
+    errors, lost = errors_of(pose, heading), lost_runs(pose)
+    repeated = np.asarray(small.nees, float) / POSE
+    if errors.of == "heading":
+        repeated = np.asarray(small.heading_nees, float)
+    is_known = np.isfinite(repeated)
+    if is_known.sum() < _FEWEST_OF_A_KIND:
+        return CANNOT_TELL, "Too few runs succeed with less noise."
+    many, few = _averages(pose, heading)[is_known], repeated[is_known]
+    change = _change(many, few, lost[is_known], 1.0 if errors.ratio > 1 else -1.0)
+    ratio = float(few.mean())
+    remains = ratio > LEAST_RATIO and _beyond_margin(few) < _ERROR_RATE
+    share = "a tenth" if small.factor == 0.1 else f"{100 * small.factor:.0f} %"
+    found = f"With {share} of the noise, the squared errors are {ratio:.3g} times"
+    if change == "grows":
+        return WRONG_MODEL, (
+            f"{found}, and thus do not shrink with it: a model of the filter is wrong, "
+            "such as a bias, a sign, an offset or a delay."
+        )
+    if change == "stays" or (
+        change == "shrinks" and remains and small.factor <= SMALLEST_NOISE
+    ):
+        return WRONG_COVARIANCE, (
+            f"{found}, so the excess stays: a Jacobian or a covariance of the filter "
+            "is wrong."
+        )
+    if change != "shrinks" or remains:
+        return CANNOT_TELL, f"{found}, which does not show the cause."
+    if nis_ratio > np.sqrt(max(errors.ratio, 1.0)):
+        return CANNOT_TELL, (
+            f"{found}, but the innovations are too large for linearisation: is an "
+            "angle not wrapped?"
+        )
+    return LINEARISATION, f"{found}, so the excess vanishes with the noise."
+
+
+def _change(many: Array, few: Array, lost: BoolArray, sign: float) -> str:
+    """Return whether the excess "grows", "shrinks" or "stays", else ""."""
+    before, after = sign * (many - 1), sign * (few - 1)
+    chosen = np.ones(len(few), np.bool_)
+    if np.median(many) <= _CLEARLY and lost.sum() >= _FEWEST_LOST:
+        chosen = lost
+    if np.median(many[chosen]) > _CLEARLY:
+        share = after[chosen] / before[chosen]
+        shows = {
+            "grows": share > GROWS,
+            "shrinks": share < SHRINKS,
+            "stays": (share >= SHRINKS) & (share <= GROWS),
+        }
+        for change, runs in shows.items():
+            if runs.mean() > _MOST:
+                return change
+    if _is_positive(few - 1 - GROWS * abs(before.mean())):
+        return "grows"
+    if _is_positive(after - SHRINKS * before):
+        return "stays"
+    return "shrinks" if _is_positive(SHRINKS * before - after) else ""
+
+
+def _averages(pose: Array, heading: Array) -> Array:
+    """Return the average NEES per degree of each run, of pose or heading."""
+    of_heading = errors_of(pose, heading).of == "heading"
+    return np.asarray(heading.mean(axis=1) if of_heading else pose.mean(axis=1) / POSE)
+
+
+def _is_positive(values: Array) -> bool:
+    spread = values.std(ddof=1) / np.sqrt(len(values))
+    return bool(student.sf(values.mean() / max(spread, 1e-300), len(values) - 1) < 0.05)
 
 
 def spurious_knowledge(knowledge: Array) -> float:

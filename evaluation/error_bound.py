@@ -109,18 +109,11 @@ def posterior_bound(
     durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps)).copy()
     position, heading, raw = (np.empty((count, steps)) for _ in range(3))
     starts = _invariant_start(poses[:, :1], start)
+    runs = zip(poses, places, seen, durations, strict=True)
+    rows = zip(position, heading, raw, strict=True)
     covariances = tuple(
-        _of_one_run(
-            poses[b],
-            places[b],
-            seen[b],
-            durations[b],
-            motion,
-            noise,
-            starts[b],
-            (position[b], heading[b], raw[b]),
-        )
-        for b in range(count)
+        _of_one_run(run, (motion, noise), start, out)
+        for run, start, out in zip(runs, starts, rows, strict=True)
     )
     spread = np.array([_about_centre(covariance) for covariance in covariances])
     return PosteriorBound(position, heading, raw, spread, covariances)
@@ -183,12 +176,8 @@ def _invariant_start(first: Array, std: Array) -> Array:
 
 
 def _of_one_run(
-    poses: Array,
-    landmarks: Array,
-    visible: BoolArray,
-    dt: Array,
-    motion: Array,
-    noise: Array,
+    run: tuple[Array, Array, BoolArray, Array],
+    noise: tuple[Array, Array],
     start: Array,
     out: tuple[Array, Array, Array],
 ) -> Array:
@@ -197,6 +186,7 @@ def _of_one_run(
     Landmarks enter in the order in which they are read, so that those still unread
     cost nothing.
     """
+    poses, landmarks, visible, dt = run
     rows = np.flatnonzero(visible.any(axis=0))
     rows = rows[np.argsort(visible[:, rows].argmax(axis=0), kind="stable")]
     P = np.zeros((3 + 2 * len(rows), 3 + 2 * len(rows)))
@@ -208,8 +198,7 @@ def _of_one_run(
         visible[:, rows],
         np.argsort(rows),  # the order within a scan
         dt,
-        motion,
-        noise,
+        *noise,
         np.empty((2, 2 * most, len(P))),
         P,
         out,

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtr, chdtrc, gammaincinv
-from scipy.stats import t as student
+from scipy.special import chdtr, chdtrc, gammaincinv, stdtr, stdtrit
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.support import argument_checks
@@ -240,8 +239,8 @@ class Band(NamedTuple):
 
 EQUIVALENCE_MARGIN = Band(0.8, 1.25)
 """Ratios of NEES to its expectation that count as consistent."""
+# Smallest number of runs with enough different resamples for a bootstrap.
 FEWEST_RESAMPLED = 5
-"""Smallest number of runs with enough different resamples for a bootstrap."""
 
 
 class EquivalenceTest(NamedTuple):
@@ -283,9 +282,9 @@ def time_average_test(
     mean, error = _mean_and_error(ratios)
     skewness, runs = _skewness(ratios), len(ratios)
     score = _unskew((mean - 1) / error, skewness, runs) if error else np.inf
-    limit = student.ppf(1 - error_rate / 2, runs - 1)
+    limit = stdtrit(runs - 1, 1 - error_rate / 2)
     ends = 1 + error * _skew(np.array([-limit, limit]), skewness, runs)
-    p_value = float(2 * student.sf(abs(score), runs - 1))
+    p_value = float(2 * stdtr(runs - 1, -abs(score)))
     return HypothesisTest(mean, to_band(ends), p_value, error_rate)
 
 
@@ -345,7 +344,7 @@ def equivalence_test(
     """
     ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
     mean, error = _mean_and_error(ratios)
-    limit = student.ppf(1 - error_rate, len(ratios) - 1)
+    limit = stdtrit(len(ratios) - 1, 1 - error_rate)
     ends = _skew(np.array([limit, -limit]), _skewness(ratios), len(ratios))
     interval = to_band(mean - error * ends)
     low, high = EQUIVALENCE_MARGIN

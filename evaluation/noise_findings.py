@@ -41,8 +41,9 @@ _BIASES = {
     "bearing": "bearing bias",
     "range": "range bias",
 }
-HEAVY_TAILS = "heavy tails"
+HEAVY_TAILS, CORRELATED = "heavy tails", "correlated noise"
 _LEAST_VARIANCE = 0.05
+_LEAST_CORRELATION = 0.05
 _LEAST_BIAS = 0.1
 _LEAST_KURTOSIS = 0.5
 _FEWEST = 30  # numbers, for the distribution of the kurtosis
@@ -71,10 +72,12 @@ def noise_findings(sums: Array) -> list[Finding]:
         mean   b = Σ g w / Σ g²,  b √(Σ g²) / s ~ t(n − 1),
                matters if b² Σ g², averaged over runs, ≥ .1
         tails  kurtosis of n numbers [1]_,  matters if it is .5 above that of a normal
+        time   correlation ρ of m pairs of successive numbers, without their mean,
+               ρ √m ~ N(0, 1),  matters if |ρ| ≥ .05
 
     Parameters
     ----------
-    sums : ndarray, shape (B, 5, 7)
+    sums : ndarray, shape (B, 5, 9)
         Of :func:`noise_sums`.
 
     References
@@ -114,6 +117,23 @@ def _tests(channel: str, total: Array, runs: int) -> Iterator[Finding]:
         yield tails
     if tails is None or not (tails.matters and tails.p_value < 1e-4):
         yield _size(channel, count, variance)
+    if found["pairs"] >= _FEWEST and variance > 0:
+        yield _correlation(channel, found, mean, variance)
+
+
+def _correlation(
+    channel: str, found: dict[str, float], mean: float, variance: float
+) -> Finding:
+    pairs = found["pairs"]
+    rho = (found["lagged"] / pairs - mean**2) / variance
+    return Finding(
+        CORRELATED,
+        float(2 * ndtr(-abs(rho) * np.sqrt(pairs))),
+        abs(float(np.log((1 + min(rho, 0.99)) / (1 - min(rho, 0.99))))),
+        abs(rho) >= _LEAST_CORRELATION,
+        f"successive errors of {_SYMBOLS[channel]} have a correlation of {rho:.2g}, "
+        "where the filter assumes none",
+    )
 
 
 def _size(channel: str, count: float, variance: float) -> Finding:
@@ -193,10 +213,14 @@ def _kurtosis_score(kurtosis: float, n: float) -> float:
     return float((1 - 2 / (9 * a) - np.cbrt(cube)) / np.sqrt(2 / (9 * a)))
 
 
-MOMENTS = ("count", "first", "second", "third", "fourth", "slope", "leverage")
+MOMENTS = (
+    *("count", "first", "second", "third", "fourth"),
+    *("slope", "leverage", "pairs", "lagged"),
+)
 """Sums over w, the standardised noise of a channel in a run: 1, w, w², w³, w⁴, and
 g w, g², where a bias b adds b g: g = d/σx along, so that b is a scale, else 1/σ. That
-of d which has no noise counts, odometry or true distance."""
+of d which has no noise counts, odometry or true distance. The last two are the number
+of pairs of successive steps, of the same landmark, and the sum of w w' over them."""
 _ROUNDING = 1e-9
 _LEAST_STD = 1e-6  # in place of 0, where the world has noise
 
@@ -208,6 +232,8 @@ class _Noise(NamedTuple):
     std: Array | float
     lever: Array | float
     runs: IntArray
+    follows: BoolArray
+    """Whether a number, but the first, is of the step after that of the one before."""
 
 
 def noise_sums(
@@ -250,7 +276,7 @@ def noise_sums(
 
     Returns
     -------
-    ndarray, shape (B, 5, 7)
+    ndarray, shape (B, 5, 9)
         By run, `CHANNELS` and `MOMENTS`.  A channel has zeros if it has no noise and
         the filter assumes none.
 
@@ -304,8 +330,9 @@ def _motion_noise(
         wrap_angle(after[:, 2] - before[:, 2] - turned),
     )
     levers = driven if slips else ahead, 1.0, 1.0
+    follows = (np.diff(run) == 0) & (np.diff(step) == 1)
     return [
-        _Noise(error, sigma, lever, run)
+        _Noise(error, sigma, lever, run, follows)
         for error, sigma, lever in zip(errors, std.tolist(), levers, strict=True)
     ]
 
@@ -318,15 +345,16 @@ def _sensor_noise(
     std: Array,
     per_metre: float,
 ) -> list[_Noise]:
-    run, step, landmark = np.nonzero(visible)
+    run, landmark, step = np.nonzero(visible.transpose(0, 2, 1))
+    follows = (np.diff(run) == 0) & (np.diff(landmark) == 0) & (np.diff(step) == 1)
     dx, dy = (landmarks[run, landmark] - poses[run, step, :2]).T
     bearing, distance = readings[run, step, landmark].T
     expected = np.arctan2(dy, dx) - poses[run, step, 2], np.hypot(dx, dy)
     bearing_error = wrap_angle(bearing - expected[0])
     range_std = std[1] + per_metre * expected[1]
     return [
-        _Noise(bearing_error, float(std[0]), 1.0, run),
-        _Noise(distance - expected[1], range_std, 1.0, run),
+        _Noise(bearing_error, float(std[0]), 1.0, run, follows),
+        _Noise(distance - expected[1], range_std, 1.0, run, follows),
     ]
 
 
@@ -337,7 +365,11 @@ def _summed(noise: _Noise, count: int) -> Array:
         return np.zeros((count, len(MOMENTS)))
     std = np.where(std > 0, std, _LEAST_STD)
     w, g = noise.values / std, noise.lever / std
-    terms = (np.ones_like(w), w, w**2, w**3, w**4, g * w, g**2)
+    terms = [np.ones_like(w), w, w**2, w**3, w**4, g * w, g**2]
+    terms += [
+        np.append(of, 0.0) for of in (noise.follows, noise.follows * w[1:] * w[:-1])
+    ]
     return np.stack(
-        [np.bincount(noise.runs, term, minlength=count) for term in terms], axis=1
+        [np.bincount(noise.runs, term[: len(w)], minlength=count) for term in terms],
+        axis=1,
     )

@@ -4,6 +4,7 @@
 * :mod:`~slamgym.experiments.runs` filters a log or simulated runs, and summarises them.
 * :mod:`~slamgym.experiments.figures` draws a run: map, errors, covariance.
 * :mod:`~slamgym.experiments.monte_carlo` tests the consistency of filters in many runs.
+* :mod:`~slamgym.experiments.judging` judges the estimates of other programs.
 * :mod:`~slamgym.experiments.noise_study` scales each noise, in one run or in many.
 * :mod:`~slamgym.experiments.noise_fitting` fits the noise of logs.
 * :mod:`~slamgym.experiments.trajectories` generates data sets of trajectories.
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from . import trajectories as trajectories
     from . import viewers as viewers
     from .figures import *
+    from .judging import judge as judge
     from .logs import *
     from .monte_carlo import consistency_of as consistency_of
     from .monte_carlo import load_results as load_results

@@ -397,10 +397,7 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
     names = (str(REFERENCE), *SIGMAS)
     all_axes[0, 0].set_yticks(range(len(names)), names)
     all_axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
-    figure.supxlabel(
-        "mean pose NEES / 3 ± standard error; 1 is expected",
-        fontsize=10,
-    )
+    figure.supxlabel("mean pose NEES / 3 ± standard error; 1 is expected", fontsize=10)
     keys = [
         Line2D([], [], ls="", marker=look.marker, color=look.colour, label=plain(label))
         for label, look in looks.items()

@@ -93,9 +93,7 @@ class Faults(Part):
 
 _NO_FAULTS = Faults()
 _Steps = Annotated[
-    int,
-    Field(strict=True, ge=2),
-    expect("an integer >= 2"),
+    int, Field(strict=True, ge=2), expect("an integer >= 2")
 ]  # Gymnasium's checker refuses an episode that ends at its first step
 
 
@@ -173,8 +171,7 @@ class Sensor(Part):
         description="rows reserved for false measurements when identities are hidden",
     )
     identities: Flag = Field(
-        default=True,
-        description="whether readings carry landmark identities",
+        default=True, description="whether readings carry landmark identities"
     )
 
     def _broken_rules(self) -> Iterator[str]:
@@ -253,10 +250,7 @@ class Randomise(Part):
                 yield f"{name} must have low <= high, got {ends}"
 
     def changes(
-        self,
-        scenario: "Scenario",
-        shares: Mapping[str, float],
-        directions: Array,
+        self, scenario: "Scenario", shares: Mapping[str, float], directions: Array
     ) -> dict[str, Any]:
         """Compute the changes of a scenario for one point of the ranges.
 

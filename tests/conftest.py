@@ -1,6 +1,8 @@
 """What all tests share: one thread a process, bytecode files, the public logs."""
 
+import contextlib
 import gc
+import hashlib
 import os
 import sys
 from pathlib import Path
@@ -120,6 +122,33 @@ def fuzzer(request, record_property):
     record_property("inputs", fuzzer.inputs)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _one_worker_compiles(request, tmp_path_factory):
+    """Let workers wait for a kernel that one of them compiles, and load it then."""
+    if not hasattr(request.config, "workerinput") or "numba" not in sys.modules:
+        yield
+        return
+    from filelock import FileLock, Timeout
+    from numba.core.dispatcher import Dispatcher
+
+    from slamgym.jit import KernelCache
+
+    folder = tmp_path_factory.getbasetemp().parent / "kernels"
+    folder.mkdir(exist_ok=True)
+    compiled = Dispatcher.compile
+
+    def compiled_once(kernel, signature):
+        if isinstance(kernel._cache, KernelCache):
+            key = f"{kernel.py_func.__module__}.{kernel.__name__} {signature}"
+            name = hashlib.sha256(key.encode()).hexdigest()
+            with contextlib.suppress(Timeout), FileLock(folder / name, timeout=100):
+                return compiled(kernel, signature)
+        return compiled(kernel, signature)
+
+    with patch.object(Dispatcher, "compile", compiled_once):
+        yield
+
+
 @pytest.fixture
 def own_registry():
     """Forget at the end of a test the estimators that it registers."""
@@ -150,11 +179,17 @@ def browser():
 
 
 @pytest.fixture(scope="session")
-def sb3():
-    """Return Stable-Baselines3, which is slow to load, on one thread."""
-    library = pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
-    pytest.importorskip("torch").set_num_threads(1)
+def torch():
+    """Return PyTorch on one thread."""
+    library = pytest.importorskip("torch", reason="needs torch")
+    library.set_num_threads(1)
     return library
+
+
+@pytest.fixture(scope="session")
+def sb3(torch):
+    """Return Stable-Baselines3, which is slow to load."""
+    return pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
 
 
 REPORT = "slamgym.experiments.monte_carlo.report"

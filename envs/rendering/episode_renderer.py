@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...arrays import Array, BoolArray, ImageArray
+from ...restorable import Restorable, State
 from ...sim_configs import Scenario
 from .render_state import RENDER_MODES, BeliefLike, RenderMode, RenderState
 
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     from .renderer import WorldRenderer
 
 
-class EpisodeRenderer:
+class EpisodeRenderer(Restorable):
     """Records the path of an episode and renders its present state.
 
     The first frame loads matplotlib. The figure is kept for the following episodes
@@ -27,6 +28,8 @@ class EpisodeRenderer:
     fps : float
         Largest number of frames per second in the window [1/s].
     """
+
+    _changing = ("_landmarks", "_path", "_present", "_belief")
 
     def __init__(self, scenario: Scenario, mode: str, fps: float) -> None:
         if mode not in RENDER_MODES:
@@ -48,6 +51,13 @@ class EpisodeRenderer:
         self._path: list[list[float]] = []
         self._present: dict[str, Any] = {}
         self._belief: BeliefLike | None = None
+
+    def restore(self, state: State) -> None:
+        """Return to an earlier step, perhaps of another episode."""
+        shown = self._landmarks
+        super().restore(state)
+        if not np.array_equal(shown, self._landmarks):
+            self.close()
 
     def add(
         self,

@@ -79,7 +79,8 @@ class Scene:
         self._moving.path.set_data(*np.transpose(state.path))
         self._show_readings(state.pose, state.measurements, state.clutter)
         self._show_belief(state.belief)
-        self._show_clock(state)
+        clock = f"step {state.step}/{self._scenario.steps}   {state.time:.1f} s"
+        self._moving.clock.set_text(clock)
         return resized or renamed
 
     def _show_robot(self, pose: Array, collision: bool) -> None:
@@ -127,12 +128,6 @@ class Scene:
         moving.estimate.set_xy(arrow_at(belief.pose, self._arrow_length()))
         spread = np.asarray(belief.pose_covariance)[None, :2, :2]
         set_ellipses(moving.pose_ellipse, belief.pose[None, :2], spread)
-
-    def _show_clock(self, state: RenderState) -> None:
-        """Show step and time."""
-        self._moving.clock.set_text(
-            f"step {state.step}/{self._scenario.steps}   {state.time:.1f} s"
-        )
 
     def _show_limits(self) -> None:
         self._axes.set(xlim=self._limits.x, ylim=self._limits.y)

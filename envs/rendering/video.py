@@ -57,13 +57,9 @@ def write_video(
     """
     target = Path(path)
     check_video(target, fps)
-    if target.suffix.lower() == ".mp4":
-        ffmpeg = _import_ffmpeg()
-        with replace_when_written(target) as partial:
-            _write_mp4(ffmpeg, _checked(frames), partial, fps)
-    else:
-        with replace_when_written(target) as partial:
-            _write_gif(_checked(frames), partial, fps)
+    write = _write_mp4 if target.suffix.lower() == ".mp4" else _write_gif
+    with replace_when_written(target) as partial:
+        write(_checked(frames), partial, fps)
 
 
 def _checked(frames: Iterable[ImageArray]) -> Iterator[ImageArray]:
@@ -114,12 +110,10 @@ def _palette(frame: ImageArray) -> Image.Image:
     return palette
 
 
-def _write_mp4(
-    ffmpeg: ModuleType, frames: Iterator[ImageArray], path: Path, fps: float
-) -> None:
+def _write_mp4(frames: Iterator[ImageArray], path: Path, fps: float) -> None:
     first = next(frames)
     height, width = (size + size % 2 for size in first.shape[:2])
-    writer = ffmpeg.write_frames(
+    writer = _import_ffmpeg().write_frames(
         str(path), (width, height), fps=fps, macro_block_size=2
     )
     writer.send(None)

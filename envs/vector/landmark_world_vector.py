@@ -19,6 +19,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from ...arrays import AnyArray, Array, BoolArray, ImageArray
+from ...restorable import Restorable, State, copied, put_back
 from ...sim_configs import Scenario, load_scenario
 from ..landmark_world import LandmarkWorldEnv
 from ..rendering.episode_renderer import EpisodeRenderer
@@ -30,7 +31,7 @@ Observations = dict[str, Any]
 Infos = dict[str, Any]
 
 
-class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
+class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyArray]):
     """B landmark worlds of one scenario, simulated together in numpy.
 
     After ``reset(seed=s)`` world i equals, to the bit, a `LandmarkWorldEnv` after
@@ -65,6 +66,7 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
     ((3, 28, 2), (3, 3))
     """
 
+    _changing = ("_seeds", "_worlds", "_steps_left", "_ended")
     _renderers: Sequence[EpisodeRenderer] = ()  # for close after a failed constructor
 
     def __init__(
@@ -171,6 +173,33 @@ class LandmarkWorldVectorEnv(VectorEnv[Observations, AnyArray, AnyArray]):
             self._begin(ended)
         infos = {**final, **with_masks(self._infos(), None, self.num_envs)}
         return self._observations(), rewards, terminated, truncated, infos
+
+    def state(self) -> State:
+        """Return the state of all worlds, for `restore`; see `LandmarkWorldEnv.state`.
+
+        Examples
+        --------
+        >>> worlds = LandmarkWorldVectorEnv(2, "corridor")
+        >>> observations, infos = worlds.reset(seed=0)
+        >>> state = worlds.state()
+        >>> first = worlds.step([[1.0, 0.2], [0.5, 0.0]])[0]
+        >>> worlds.restore(state)
+        >>> second = worlds.step([[1.0, 0.2], [0.5, 0.0]])[0]
+        >>> all(np.array_equal(first[key], second[key]) for key in first)
+        True
+        """
+        self._begun_worlds()
+        own = *self._generators(), *self._renderers
+        return (*super().state(), copied(own))
+
+    def restore(self, state: State) -> None:
+        """Return to a state of these worlds, which stays usable for further calls."""
+        *rest, own = state
+        super().restore(tuple(rest))
+        for part, value in zip(
+            (*self._generators(), *self._renderers), own, strict=True
+        ):
+            put_back(part, value)
 
     def render(self) -> tuple[ImageArray, ...] | None:
         """Return a frame of each world in mode "rgb_array", else None."""

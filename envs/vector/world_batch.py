@@ -22,10 +22,10 @@ from ...arrays import (
     IntArray,
     WordArray,
 )
+from ...restorable import Restorable
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import widest_scenario
 from ..bearing_range import BearingRangeSensor, hide_identities
-from ..landmark_world import LandmarkWorldEnv, Observation
 from ..noise_streams import SensorSettings, WorldNoise
 from ..robot import UnicycleBodies, VectorOdometrySensor
 from ..spaces import clipped_actions, count_rows
@@ -37,7 +37,7 @@ Scan = tuple[Array, BoolArray, IntArray | None]
 _READINGS_AT_ONCE = 8192
 
 
-class WorldBatch:
+class WorldBatch(Restorable):
     """B independent worlds of one scenario.
 
     World i equals, to the bit, a `LandmarkWorldEnv` whose ``np_random`` is generator i.
@@ -49,6 +49,8 @@ class WorldBatch:
         With ranges, every world draws its settings anew for every episode.
     count : int
         B, the number of worlds.
+    drawn : sequence of Scenario, length B, optional
+        What each world has drawn from the ranges already, and keeps in every episode.
 
     Attributes
     ----------
@@ -84,12 +86,21 @@ class WorldBatch:
            [1.5, 0.3]])
     """
 
-    def __init__(self, scenario: Scenario, count: int) -> None:
+    _changing = (
+        *("measurements", "mask", "odometry", "poses", "collisions", "landmark_ids"),
+        *("_drawn", "_keys", "_steps", "_bodies", "_start_estimates", "_landmarks"),
+    )
+
+    def __init__(
+        self, scenario: Scenario, count: int, drawn: Sequence[Scenario] = ()
+    ) -> None:
         if count < 1:
             raise ValueError(f"count must be >= 1, got {count}")
         self.scenario = scenario
         self.count = count
-        self._drawn = DrawnWorlds(scenario, count) if scenario.randomise else None
+        self._drawn = None
+        if scenario.randomise is not None:
+            self._drawn = DrawnWorlds(scenario, count, drawn)
         self._starts, widest = EpisodeStarts(scenario), widest_scenario(scenario)
         self._noise = WorldNoise(widest)
         self._keys = np.zeros((count, 2), dtype=np.uint64)
@@ -311,7 +322,7 @@ def _replaced(old: AnyArray, worlds: IndexArray, value: Any) -> AnyArray:
     return new
 
 
-class DrawnWorlds:
+class DrawnWorlds(Restorable):
     """The scenarios that B worlds drew for their episodes.
 
     Parameters
@@ -320,6 +331,8 @@ class DrawnWorlds:
         With ranges.
     count : int
         B.
+    given : sequence of Scenario, length B, optional
+        What each world keeps, instead of drawing from the ranges.
 
     Attributes
     ----------
@@ -331,8 +344,12 @@ class DrawnWorlds:
         Those of their sensors.
     """
 
-    def __init__(self, scenario: Scenario, count: int) -> None:
-        self._family = scenario
+    _changing = ("scenarios", "motion_std", "settings")
+
+    def __init__(
+        self, scenario: Scenario, count: int, given: Sequence[Scenario] = ()
+    ) -> None:
+        self._family, self._given = scenario, given
         self.scenarios = [scenario] * count
         self.motion_std = np.zeros((count, 3))
         columns = {name: np.zeros((count, 1)) for name in SensorSettings._fields}
@@ -350,7 +367,10 @@ class DrawnWorlds:
         landmarks, poses, estimates : ndarray, shapes (b, N), (b, 3), (b, 3)
             See `EpisodeStarts`.
         """
-        drawn = drawn_scenarios(self._family, keys)
+        if self._given:
+            drawn = [self._given[world] for world in worlds.tolist()]
+        else:
+            drawn = drawn_scenarios(self._family, keys)
         for world, scenario in zip(worlds.tolist(), drawn, strict=True):
             self.scenarios[world] = scenario
             self.motion_std[world] = scenario.motion.std
@@ -370,71 +390,3 @@ def _starts(
         rows.append([part[0] for part in parts])
     landmarks, poses, estimates = map(np.array, zip(*rows, strict=True))
     return landmarks, poses, estimates
-
-
-class MixedWorlds:
-    """B single worlds of different scenarios, stepped one after the other.
-
-    All have equally many landmarks. Either all hide identities or none.
-
-    Parameters
-    ----------
-    scenarios : sequence of Scenario, length B
-        The scenario of each world.
-
-    Attributes
-    ----------
-    measurements, mask, odometry, poses, collisions, landmark_ids : ndarray
-        As in `WorldBatch`, new arrays after every step.
-
-    Examples
-    --------
-    >>> from slamgym.sim_configs import load_scenario
-    >>> scenario = load_scenario("six_landmarks")
-    >>> other = scenario.with_changes(start={"pose": [1.0, 0.0, 0.0]})
-    >>> worlds = MixedWorlds([scenario, other])
-    >>> worlds.reset([np.random.default_rng(seed) for seed in (0, 1)])
-    >>> worlds.start_estimates[:, 0]
-    array([0., 1.])
-    """
-
-    def __init__(self, scenarios: Sequence[Scenario]) -> None:
-        self._worlds = [LandmarkWorldEnv(scenario) for scenario in scenarios]
-
-    @property
-    def landmarks(self) -> Array:
-        """True positions, shape (B, N, 2) [m], a copy."""
-        return np.array([world.landmarks for world in self._worlds])
-
-    @property
-    def start_estimates(self) -> Array:
-        """Start poses for filters, shape (B, 3) [m, m, rad], a copy."""
-        return np.array([world.start_estimate for world in self._worlds])
-
-    def reset(self, generators: Sequence[np.random.Generator]) -> None:
-        """Start an episode in every world; see `WorldBatch.reset`."""
-        outputs = []
-        for world, generator in zip(self._worlds, generators, strict=True):
-            world.np_random = generator
-            outputs.append(world.reset())
-        self._stack(outputs)
-
-    def step(self, actions: Array) -> None:
-        """Drive and turn for one step; see `WorldBatch.step`."""
-        outputs = []
-        for world, action in zip(self._worlds, actions, strict=True):
-            observation, *_, info = world.step(action)
-            outputs.append((observation, info))
-        self._stack(outputs)
-
-    def _stack(self, outputs: list[tuple[Observation, dict[str, object]]]) -> None:
-        """Stack the observations and infos of the worlds."""
-        seen, infos = zip(*outputs, strict=True)
-        self.measurements = np.array([each["landmarks"] for each in seen])
-        self.mask = np.array([each["mask"] for each in seen])
-        self.odometry = np.array([each["odometry"] for each in seen])
-        self.poses = np.array([each["pose"] for each in infos])
-        self.collisions = np.array([each["collision"] for each in infos])
-        self.landmark_ids: IntArray | None = None
-        if "landmark_ids" in infos[0]:
-            self.landmark_ids = np.array([each["landmark_ids"] for each in infos])

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, Array, BoolArray, IntArray
+from ...restorable import Restorable, State
 from ..interface import Belief
 from ..kernels.batch import (
     NEVER,
@@ -32,7 +33,7 @@ from .ekf import FRAMES, EkfSlam
 from .gaussian_map import GaussianMap, workspace_for
 
 
-class BatchOfBeliefs:
+class BatchOfBeliefs(Restorable):
     """The beliefs of B runs about their poses and up to L landmarks.
 
     Parameters
@@ -103,6 +104,15 @@ class BatchOfBeliefs:
     def references(self) -> Array:
         """Linearisation points, stored like the means, for filters that fix them."""
         return BatchStorage.of(self._references, self._covariances, self._slots).means
+
+    def state(self) -> State:
+        """Return the state of all runs, for `restore`."""
+        return tuple(array.copy() for array in (*self._arrays(), self.failed_at))
+
+    def restore(self, state: State) -> None:
+        """Return to a state of these runs, without checks."""
+        for array, value in zip((*self._arrays(), self.failed_at), state, strict=True):
+            array[...] = value
 
     def load(
         self,

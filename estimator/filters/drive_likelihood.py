@@ -8,12 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, Array, IntArray
-from ..kernels.drive_likelihood import (
-    NOISE_WIDTH,
-    DriveEvents,
-    DriveRecord,
-    follow_drive,
-)
+from ..kernels import drive_likelihood as kernel
 from ..kernels.kalman_gain import SKIPPED
 from ..models.bearing_range import wrap_angle
 from ..support import argument_checks
@@ -22,20 +17,19 @@ from .batch import can_batch
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap, workspace_for
 
+# NIS beyond which a reading is rejected: a share e⁻¹⁵ of them if the noise is right.
 GATE = 30.0
-"""NIS beyond which a reading is rejected: a share e⁻¹⁵ of them if the noise is right.
-"""
 
 
 def drive_likelihood(
     estimator: EkfSlam,
-    events: DriveEvents,
+    events: kernel.DriveEvents,
     noises: ArrayLike,
     *,
     gate: float = GATE,
     keep_beliefs: bool = False,
     threads: int | None = None,
-) -> DriveRecord:
+) -> kernel.DriveRecord:
     """Filter a drive under several noises; return how likely its readings are [1]_.
 
     ::
@@ -97,9 +91,10 @@ def drive_likelihood(
             "kernels, which can compute innovations for many noises at once"
         )
     values = argument_checks.as_floats("noises", noises)
-    if values.ndim != 2 or values.shape[1] != NOISE_WIDTH:
+    if values.ndim != 2 or values.shape[1] != kernel.NOISE_WIDTH:
         raise ValueError(
-            f"noises must have shape (B, {NOISE_WIDTH}), got shape {values.shape}"
+            f"noises must have shape (B, {kernel.NOISE_WIDTH}), got "
+            f"shape {values.shape}"
         )
     check_events(events)
     record = _new_record(len(values), events, keep_beliefs)
@@ -109,7 +104,7 @@ def drive_likelihood(
     return record
 
 
-def check_events(events: DriveEvents) -> None:
+def check_events(events: kernel.DriveEvents) -> None:
     """Refuse events of a drive that the kernels cannot process.
 
     Raises
@@ -147,10 +142,12 @@ def _refuse_firsts(name: str, firsts: IntArray, rows: int) -> None:
         raise ValueError(f"{name} must rise from 0 to {rows}, got {firsts.tolist()}")
 
 
-def _new_record(count: int, events: DriveEvents, keep_beliefs: bool) -> DriveRecord:
+def _new_record(
+    count: int, events: kernel.DriveEvents, keep_beliefs: bool
+) -> kernel.DriveRecord:
     steps = len(events.first_motions) - 1
     kept, readings = (steps, len(events.readings)) if keep_beliefs else (0, 0)
-    return DriveRecord(
+    return kernel.DriveRecord(
         np.zeros((count, steps)),
         np.zeros((count, steps)),
         np.zeros((count, steps), dtype=np.int64),
@@ -164,10 +161,10 @@ def _new_record(count: int, events: DriveEvents, keep_beliefs: bool) -> DriveRec
 
 def _follow(
     estimator: EkfSlam,
-    events: DriveEvents,
+    events: kernel.DriveEvents,
     noises: Array,
     gate: float,
-    record: DriveRecord,
+    record: kernel.DriveRecord,
     part: slice,
 ) -> None:
     """Fill a part of a record, with room of its own."""
@@ -177,26 +174,14 @@ def _follow(
     belief = np.zeros(capacity), aligned_zeros(capacity, capacity), np.zeros(capacity)
     first, motion = estimator.map, estimator.motion_values
     rules = estimator.rules._replace(gate=gate)
-    motions, first_motions, readings, numbers, first_readings = events
-    rows, before, prior = workspace_for(rules, most, capacity)
-    likelihoods, nis, used, rejected, poses, covariances, innovations, outcomes = record
-    follow_drive(
-        (motions, first_motions, readings, numbers, first_readings),
+    kernel.follow_drive(
+        tuple(events),  # numba checks the type of a named one at every call
         noises[part],
         bool(motion[3] > 0),
         np.array(rules),
         (first.mean[:3].copy(), first.covariance[:3, :3].copy()),
         belief,
-        (rows, before, prior),
+        tuple(workspace_for(rules, most, capacity)),
         np.empty(landmarks, dtype=np.int64),
-        (
-            likelihoods[part],
-            nis[part],
-            used[part],
-            rejected[part],
-            poses[part],
-            covariances[part],
-            innovations[part],
-            outcomes[part],
-        ),
+        tuple(array[part] for array in record),
     )

@@ -168,7 +168,7 @@ class MapFilter:
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""
-        return self.map.copies * covariance_bytes(landmarks)
+        return covariance_bytes(landmarks)
 
 
 class EkfSlam(MapFilter):
@@ -372,12 +372,11 @@ class InvariantEkfSlam(EkfSlam):
     motion_std, measurement_std
         As in :class:`EkfSlam`.
     iterations : int
-        Number of linearisations of a scan, with the same prior; more than one for
-        coarse sensors.  The heading column of H remains that of the prior, because the
-        exact Gauss-Newton column would make the heading observable.
-    sequential : bool
-        Process one landmark after the other instead of the whole scan at once, for
-        heading errors of half a radian and more.  The order of readings then matters.
+        Most linearisations of a scan, with the same prior.  A scan with readings far
+        from their predictions is linearised again until no landmark moves by more than
+        a tenth of its distance; where the heading turns by more than 0.1 rad, the
+        readings are taken one after the other, the farthest landmark first, each until
+        it no longer moves.  1 always linearises once, for study.
     **settings
         The other keywords of :class:`EkfSlam`.
 
@@ -406,16 +405,12 @@ class InvariantEkfSlam(EkfSlam):
         motion_std: ArrayLike,
         measurement_std: ArrayLike,
         *,
-        iterations: int = 1,
-        sequential: bool = False,
+        iterations: int = 10,
         **settings: Any,
     ) -> None:
         super().__init__(motion_std, measurement_std, **settings)
-        rules = self.rules._replace(
-            iterations=argument_checks.whole("iterations", iterations, 1),
-            sequential=argument_checks.flag("sequential", sequential),
-        )
-        self._adopt(rules)
+        most = argument_checks.whole("iterations", iterations, 1)
+        self._adopt(self.rules._replace(iterations=most, adaptive=most > 1))
 
 
 class FirstEstimatesEkfSlam(EkfSlam):

@@ -18,20 +18,18 @@ from ..kernels.kalman_gain import (
     ADDED,
     BLOCK,
     COLUMN,
+    FIRST,
     GATED,
     IN_USE,
     INNOVATION,
-    ITERATIONS,
     JACOBIAN,
     LANDMARKS,
     META_WIDTH,
-    MOTION,
     NEAR,
     NIS,
     OUTCOME,
     ROOT,
     SCANNED,
-    SEQUENTIAL,
     SKIPPED,
     STEPS,
     USED,
@@ -42,7 +40,6 @@ from ..kernels.kalman_gain import (
     new_block,
     new_workspace,
     parts_of,
-    prior_system,
 )
 from ..kernels.scan_update import NO_ROOM
 from ..models.rigid_motion import ErrorFrame
@@ -167,13 +164,6 @@ class GaussianMap:
         """Number of landmarks that the arrays have room for."""
         return (self.capacity - 4) // 2
 
-    @property
-    def copies(self) -> int:
-        """Number of arrays of the size of P that an update needs: P, and copies."""
-        rules = Rules(*self.parts.values[:MOTION].tolist())
-        iterated = rules.iterations > 1
-        return 1 + iterated + (iterated or rules.sequential)
-
     @staticmethod
     def capacity_for(landmarks: int) -> int:
         """Return the length of a mean with room for this many landmarks.
@@ -194,7 +184,7 @@ class GaussianMap:
         readings : int
             Readings of a scan that must have room.
         """
-        fitting = landmarks_that_fit(landmarks, landmarks + more, self.copies)
+        fitting = landmarks_that_fit(landmarks, landmarks + more)
         most = len(self.parts.scan_ids)
         if readings > most:
             most = 8 + 2 * readings
@@ -391,12 +381,11 @@ def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
 
 def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
     """Allocate what updates by these rules need, with this many readings at most."""
-    repeated = rules.iterations > 1 or rules.sequential
     return new_workspace(
         readings,
         capacity,
         iterated=rules.iterations > 1,
-        spoilable=repeated or readings > BLOCK,
+        spoilable=readings > BLOCK,
     )
 
 
@@ -412,7 +401,6 @@ class ScanRecord(NamedTuple):
     """What an update has left of one scan, copied."""
 
     scan_ids: IntArray  # the landmark of each reading
-    is_sequential: bool
     rows: Array  # (2m, at least 3 + 2m + META_WIDTH), the stacked system
     ledger: IntArray  # (LEDGER_HEIGHT, readings), its columns counted in these rows
 
@@ -423,19 +411,16 @@ class ScanRecord(NamedTuple):
         Where the map is much larger than the scan, the copy has only the columns of
         the pose and of the landmarks read.
         """
-        rows, values = parts.rows, parts.values
         count, used = parts.numbers[SCANNED : IN_USE + 1].tolist()
-        own = parts.scan_ids[:count].copy(), bool(values[SEQUENTIAL])
-        ledger = parts.ledger[:, :count].copy()
-        first = prior_system(len(rows), values[ITERATIONS])
-        found = rows[first : first + 2 * used]
+        ids, ledger = parts.scan_ids[:count].copy(), parts.ledger[:, :count].copy()
+        found = parts.rows[FIRST : FIRST + 2 * used]
         if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
-            return cls(*own, found.copy(), ledger)
+            return cls(ids, found.copy(), ledger)
         columns = ledger[COLUMN, :used]
         landmarks = np.stack([columns, columns + 1], axis=1).ravel()
         chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-META_WIDTH, 0)])
         ledger[COLUMN, :used] = 3 + 2 * np.arange(used)
-        return cls(*own, found[:, chosen], ledger)
+        return cls(ids, found[:, chosen], ledger)
 
     @property
     def innovation(self) -> Array:
@@ -449,19 +434,16 @@ class ScanRecord(NamedTuple):
     def joint_factor(self) -> Array:
         """Return L of S = L Lᵀ, shape (2m, 2m), lower triangular.
 
-        Off its diagonal blocks L = H Aᵀ, since Q is diagonal; or 0 where readings were
-        linearised one after the other.
+        Off its diagonal blocks L = H Aᵀ, since Q is diagonal.
         """
         rows, count = self.rows, len(self.rows)
         H = rows[:, JACOBIAN : JACOBIAN + 5]
-        factor = np.zeros((count, count))
-        if not self.is_sequential:
-            columns = np.repeat(self.ledger[COLUMN, : count // 2], 2)
-            every = np.arange(count)
-            pose = H[:, :3] @ rows[:, :3].T
-            x = H[every, 3, None] * rows[:, columns].T
-            y = H[every, 4, None] * rows[:, columns + 1].T
-            factor = np.tril(pose + x + y)
+        columns = np.repeat(self.ledger[COLUMN, : count // 2], 2)
+        every = np.arange(count)
+        pose = H[:, :3] @ rows[:, :3].T
+        x = H[every, 3, None] * rows[:, columns].T
+        y = H[every, 4, None] * rows[:, columns + 1].T
+        factor: Array = np.tril(pose + x + y)
         for k in range(0, count, 2):
             factor[k : k + 2, k : k + 2] = rows[k : k + 2, ROOT : ROOT + 2]
         return factor

@@ -12,30 +12,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array, ComplexArray, IntArray
-from ..models.rigid_motion import ErrorFrame, left_jacobian
+from ...arrays import Array, IntArray
+from ..models.rigid_motion import ErrorFrame, left_jacobian, points_of, state_of
 
 MOST_ITERATIONS = 50
-TURN_TOLERANCE = 1e-13
-"""Iterations of a turn end when it changes by less [rad]."""
+TURN_TOLERANCE = 1e-13  # iterations of a turn end when it changes by less [rad]
 
 
 class ConditionedMap(NamedTuple):
     """Mean and covariance of robot and map after conditioning."""
 
-    mean: Array
-    """Shape (3 + 2n,)."""
-    covariance: Array
-    """Shape (3 + 2n, 3 + 2n), of the additive error."""
+    mean: Array  # (3 + 2n,)
+    covariance: Array  # (3 + 2n, 3 + 2n), of the additive error
 
 
 class Separation(NamedTuple):
     """Offset of two landmarks and its covariance."""
 
-    offset: Array
-    """D = l_i − l_j, shape (2,) [m]."""
-    covariance: Array
-    """C, shape (2, 2) [m²]."""
+    offset: Array  # D = l_i − l_j, shape (2,) [m]
+    covariance: Array  # C, shape (2, 2) [m²]
 
     @property
     def squared(self) -> float:
@@ -178,21 +173,10 @@ def _composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
         P ← T P Tᵀ,    T = I + v e_θᵀ,    v = J (q⁺ − q)
     """
     turn = shift[2]
-    points, moves = _points(mean), _points(shift)
+    points, moves = points_of(mean), points_of(shift)
     turned = np.exp(1j * turn) * points
     moved = turned + left_jacobian(turn) * (moves - 1j * turn * points)
-    way = _state(1j * (moved - points), 0.0)
+    way = state_of(1j * (moved - points), 0.0)
     cross = np.outer(way, covariance[2])
     P = covariance + (cross + cross.T) + covariance[2, 2] * np.outer(way, way)
-    return ConditionedMap(_state(moved, mean[2] + turn), P)
-
-
-def _points(state: Array) -> ComplexArray:
-    """Robot position and landmarks as complex numbers, shape (1 + n,)."""
-    plane = np.delete(state, 2).reshape(-1, 2)
-    return np.asarray(plane[:, 0] + 1j * plane[:, 1])
-
-
-def _state(points: ComplexArray, heading: float) -> Array:
-    flat = np.column_stack([points.real, points.imag]).ravel()
-    return np.insert(flat, 2, heading)
+    return ConditionedMap(state_of(moved, mean[2] + turn), P)

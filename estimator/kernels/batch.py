@@ -41,7 +41,7 @@ def drive_runs(
     failed_at: IntArray,
     motion_values: Array,
     rule_values: Array,
-    workspace_arrays: tuple[Array, Array, Array],
+    workspace_arrays: tuple[Array, Array],
 ) -> None:
     """Take each run through all its steps, in place.
 
@@ -184,7 +184,7 @@ def step_run(
     mean, covariance = runs.means[b], runs.covariances[b]
     reference, slots = runs.references[b], runs.slots[b]
     ledger, readings, ids, variance, workspace = room
-    rows, before, prior = workspace
+    rows, before = workspace
     odometry, measurements, visible = scan
     d, turn = odometry[0], odometry[1]
     m = gather(measurements, visible, slots, readings, ids, ledger)
@@ -205,7 +205,6 @@ def step_run(
         ledger,
         rows,
         before,
-        prior,
         rule_values,
     )
     if status != DONE:

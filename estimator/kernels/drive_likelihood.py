@@ -1,7 +1,7 @@
 """Likelihood of a whole drive under several noises, compiled, in one call."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from .kalman_gain import (
     BeliefArrays,
     Rules,
     Workspace,
-    prior_system_jit,
 )
 from .scan_update import (
     DONE,
@@ -68,17 +67,15 @@ class DriveRecord(NamedTuple):
 
 @jit
 def follow_drive(
-    events: tuple[Array, IntArray, Array, IntArray, IntArray],
+    events: tuple[Any, ...],
     noises: Array,
     noise_at_rest: bool,
     rule_values: Array,
     start: tuple[Array, Array],
     belief_arrays: tuple[Array, Array, Array],
-    workspace_arrays: tuple[Array, Array, Array],
+    workspace_arrays: tuple[Any, ...],
     slots: IntArray,
-    record_arrays: tuple[
-        Array, Array, IntArray, IntArray, Array, Array, Array, IntArray
-    ],
+    record_arrays: tuple[Any, ...],
 ) -> None:
     """Filter a drive once under each of B noises, and note how likely its readings are.
 
@@ -150,7 +147,6 @@ def follow_drive(
                 ledger,
                 workspace.rows,
                 workspace.before,
-                workspace.prior,
                 rule_values,
             )
             if status != DONE:
@@ -158,9 +154,7 @@ def follow_drive(
                     record.log_likelihoods[b, rest] = -math.inf
                 break
             record.nis[b, s], record.used[b, s] = nis, used
-            record.log_likelihoods[b, s] = log_density(
-                workspace.rows, used, nis, rules.iterations
-            )
+            record.log_likelihoods[b, s] = log_density(workspace.rows, used, nis)
             size = settle(drive, record, b, s, size, ledger, own, slots, rules.gate)
             keep(belief, record, b, s)
 
@@ -221,11 +215,10 @@ def begin(belief: BeliefArrays, slots: IntArray, start: tuple[Array, Array]) -> 
 
 
 @njit_internal
-def log_density(rows: Array, used: int, nis: float, iterations: int) -> float:
+def log_density(rows: Array, used: int, nis: float) -> float:
     """Return log N(ν; 0, S) of the readings of a scan that were used."""
-    first = prior_system_jit(len(rows), iterations)
     half_log_det = 0.0
-    for row in range(first, first + 2 * used, 2):
+    for row in range(FIRST, FIRST + 2 * used, 2):
         half_log_det += math.log(rows[row, ROOT] * rows[row + 1, ROOT + 1])
     return -0.5 * nis - half_log_det - used * LOG_TURN
 

@@ -23,15 +23,11 @@ class Settings(NamedTuple):
     """The sensor and the noise of all plans."""
 
     sight: View
-    min_range: float
-    """[m]"""
-    dropout: float
-    """Probability that a reading is lost."""
+    min_range: float  # [m]
+    dropout: float  # probability that a reading is lost
     motion_values: Array
-    no_noise: Array
-    """Zeros, for a robot at rest."""
-    rule_values: Array
-    """With the measurement noise of expected readings."""
+    no_noise: Array  # zeros, for a robot at rest
+    rule_values: Array  # with the measurement noise of expected readings
 
 
 class Room(NamedTuple):
@@ -43,7 +39,7 @@ class Room(NamedTuple):
     factor: Array
     readings: Array
     ledger: IntArray
-    workspace: tuple[Array, Array, Array]
+    workspace: tuple[Array, Array]
 
 
 class Imagined(NamedTuple):
@@ -104,7 +100,7 @@ def imagine_plans(
         np.zeros((capacity, capacity)),
         np.empty((landmarks, 2)),
         np.zeros((LEDGER_HEIGHT, landmarks), np.int64),
-        (workspace[0], workspace[1], workspace[2]),
+        (workspace[0], workspace[1]),
     )
     points, weights = density
     missed = np.empty(len(weights[0]))
@@ -154,10 +150,10 @@ def imagine_step(
     count = expect_readings(mean, size, settings, room.readings, room.ledger)
     if count == 0:
         return True
-    rows, before, prior = room.workspace
+    rows, before = room.workspace
     status, _, _ = update_belief(
         *(mean, covariance, reference, size, room.readings, count, room.ledger),
-        *(rows, before, prior, settings.rule_values),
+        *(rows, before, settings.rule_values),
     )
     return bool(status == DONE)
 
@@ -239,12 +235,11 @@ _EDGE = 1e-12  # relative; a point on the edge of the view is in view
 class View(NamedTuple):
     """What limits the sight of the sensor."""
 
-    max_range: float
-    """[m]"""
+    max_range: float  # [m]
+    # Cosine of half the field of view, -inf where it sees all around.
     cos_half_view: float
-    """Cosine of half the field of view, -inf where it sees all around."""
+    # Walls that hide what is behind them, rows (x0, y0, x1, y1), (W, 4) [m].
     walls: Array
-    """Walls that hide what is behind them, rows (x0, y0, x1, y1), (W, 4) [m]."""
 
 
 def as_view(max_range: float, field_of_view: float, walls: Array) -> View:

@@ -30,8 +30,7 @@ def absorb(
     size: int,
     rows: Array,
     columns: IntArray,
-    top: int,
-    bottom: int,
+    used: int,
     block: int,
 ) -> int:
     """Condition P on m simultaneous readings, and find the correction of the state.
@@ -51,14 +50,13 @@ def absorb(
     covariance, size
         P.
     rows
-        The workspace.  Read are, from row ``top`` to ``bottom`` of its system, JACOBIAN
-        (H), VARIANCE (the diagonal of Q) and INNOVATION (ν).  Written are A, ROOT (the
-        diagonal blocks of L), WHITE (w), and δ in the row CORRECTION.  Two rows below
-        ``bottom`` are overwritten.
+        The workspace.  Read are, from its first system, JACOBIAN (H), VARIANCE (the
+        diagonal of Q) and INNOVATION (ν).  Written are A, ROOT (the diagonal blocks of
+        L), WHITE (w), and δ in the row CORRECTION.  Two rows below are overwritten.
     columns
         For each reading in use, its landmark's first column in P.
-    top, bottom
-        Rows of the system, counted from FIRST.
+    used
+        Number of readings in use.
     block
         How many readings to absorb at a time.
 
@@ -69,24 +67,49 @@ def absorb(
         Or the first row at which S is not positive definite: P is then spoilt, unless
         that row lies in the first block.
     """
-    system, delta = rows[FIRST:], rows[CORRECTION]
-    for j in range(_whole(size)):
-        delta[j] = system[bottom, j] = system[bottom + 1, j] = 0.0
-    for first in range(top, bottom, 2 * block):
+    system, bottom = rows[FIRST:], 2 * used
+    begin_correction(size, rows, system, bottom)
+    for first in range(0, bottom, 2 * block):
         last = min(first + 2 * block, bottom)
-        if first > top:
+        if first > 0:
             _refresh_for(covariance, size, columns[first // 2 : last // 2])
         for row in range(first, last, 2):
-            c, below = columns[row // 2], row + 1
-            _correlate(covariance, size, system, row, c)
-            least = SINGULAR * _own_variance(system, row, c)
-            least_below = SINGULAR * _own_variance(system, below, c)
-            for before in range(first, row, 2):
-                _orthogonalise(size, system, row, before, c)
-            if not _normalise(size, system, delta, row, c, least, least_below):
+            c = columns[row // 2]
+            if not whiten(covariance, size, rows, system, first, row, c):
                 return row
         downdate(covariance, size, system, first, last)
     return -1
+
+
+@njit_internal
+def begin_correction(size: int, rows: Array, system: Array, bottom: int) -> None:
+    """Set δ to zero, and the two rows below the system, as :func:`downdate` asks."""
+    delta = rows[CORRECTION]
+    for j in range(_whole(size)):
+        delta[j] = system[bottom, j] = system[bottom + 1, j] = 0.0
+
+
+@njit_internal
+def whiten(
+    covariance: Array,
+    size: int,
+    rows: Array,
+    system: Array,
+    first: int,
+    row: int,
+    c: int,
+) -> bool:
+    """Fill A, L and w of the reading in ``row`` and the next, and add its share to δ.
+
+    The rows of A from ``first`` on are finished, and P does not contain them yet.
+    The function returns false where S is not positive definite; P stays as it is.
+    """
+    _correlate(covariance, size, system, row, c)
+    least = SINGULAR * _own_variance(system, row, c)
+    least_below = SINGULAR * _own_variance(system, row + 1, c)
+    for before in range(first, row, 2):
+        _orthogonalise(size, system, row, before, c)
+    return _normalise(size, system, rows[CORRECTION], row, c, least, least_below)
 
 
 @njit_internal
@@ -253,10 +276,10 @@ def mirror(covariance: Array, size: int) -> None:
 
 
 @njit_internal
-def squared_whitened(rows: Array, iterations: int, used: int) -> float:
+def squared_whitened(rows: Array, used: int) -> float:
     """Return the NIS νᵀ S⁻¹ ν of the readings in use, linearised at the prior."""
-    nis, first = 0.0, prior_system_jit(len(rows), iterations)
-    for row in range(first, first + 2 * used):
+    nis = 0.0
+    for row in range(FIRST, FIRST + 2 * used):
         nis += rows[row, WHITE] * rows[row, WHITE]
     return nis
 
@@ -266,38 +289,52 @@ def squared_whitened(rows: Array, iterations: int, used: int) -> float:
 
 
 @njit_internal
-def compose(mean: Array, rows: Array, size: int, frame: int) -> None:
-    """Compose the correction δ with the mean, by the error frame."""
+def compose(mean: Array, base: Array, rows: Array, size: int, frame: int) -> None:
+    """Compose the correction δ with the state ``base``, by the error frame."""
     if frame == INVARIANT:
-        retract(mean, rows, size)
+        retract(mean, base, rows, size)
         return
     for j in range(size):
-        mean[j] += rows[CORRECTION, j]
+        mean[j] = base[j] + rows[CORRECTION, j]
 
 
 @njit_internal
-def retract(mean: Array, rows: Array, size: int) -> None:
-    """Compose an invariant correction δ with the state, in place of adding it.
+def retract(mean: Array, base: Array, rows: Array, size: int) -> None:
+    """Compose an invariant correction δ with a state, in place of adding it.
 
     With t = δθ and every point q, the robot's position and each landmark::
 
-        q⁺ = R(t) q + V(t) (δq − t J q),    θ⁺ = θ + t
+        q⁺ = R(t) q + V(t) (δq − t J q⁻),    θ⁺ = θ + t
 
-    with R, V and J of :mod:`..models.rigid_motion`.  The row TRANSPORT becomes
-    v = J (q⁺ − q), 0 at θ, for :func:`transport`.
+    with R, V and J of :mod:`..models.rigid_motion`, and q⁻ of the prior mean, whose
+    coordinates δ has.  The row TRANSPORT becomes v = J (q⁺ − q⁻), 0 at θ, for
+    :func:`transport`.
     """
-    delta, v = rows[CORRECTION], rows[TRANSPORT]
-    t = delta[2]
-    cos, sin, even, odd = turn_coefficients_jit(t)
+    delta, prior, v = rows[CORRECTION], rows[MEAN_BEFORE], rows[TRANSPORT]
+    turned = turn_coefficients_jit(delta[2])
     for i in range(-1, size // 2 - 1):
         c = 3 + 2 * i if i >= 0 else 0  # the pose first, then the landmarks
-        x, y = mean[c], mean[c + 1]
-        ux, uy = delta[c] + t * y, delta[c + 1] - t * x
-        mean[c] = cos * x - sin * y + even * ux - odd * uy
-        mean[c + 1] = sin * x + cos * y + odd * ux + even * uy
-        v[c], v[c + 1] = y - mean[c + 1], mean[c] - x
-    mean[2] += t
+        retract_point(mean, base, prior, delta, turned, c)
+        v[c], v[c + 1] = prior[c + 1] - mean[c + 1], mean[c] - prior[c]
+    mean[2] = base[2] + delta[2]
     v[2] = 0.0
+
+
+@njit_internal
+def retract_point(
+    mean: Array,
+    base: Array,
+    prior: Array,
+    delta: Array,
+    turned: tuple[float, float, float, float],
+    c: int,
+) -> None:
+    """Retract the point in columns c and c + 1."""
+    cos, sin, even, odd = turned
+    x, y, t = base[c], base[c + 1], delta[2]
+    ux, uy = delta[c] + t * prior[c + 1], delta[c + 1] - t * prior[c]
+    mean[c] = cos * x - sin * y + even * ux - odd * uy
+    mean[c + 1] = sin * x + cos * y + odd * ux + even * uy
 
 
 @njit_internal
@@ -405,8 +442,8 @@ class Rules(NamedTuple):
 
     linearisation: int = AT_ESTIMATE
     frame: int = ADDITIVE
-    iterations: int = 1
-    sequential: bool = False  # one correction for each reading
+    iterations: int = 1  # most linearisations of a reading
+    adaptive: bool = False  # linearise again only where a reading asks for it
     correlated: bool = True  # a new landmark with the pose it was seen from
     bearing_std: float = 0.0  # [rad]
     range_std: float = 0.0  # [m]
@@ -417,8 +454,7 @@ class Rules(NamedTuple):
     noise_as_read: bool = False  # take noise at the range as read, not as expected
 
 
-RULES = len(Rules._fields)
-ITERATIONS, SEQUENTIAL = map(Rules._fields.index, ("iterations", "sequential"))
+ITERATIONS = Rules._fields.index("iterations")
 FIRST_STD = Rules._fields.index("bearing_std")
 """Column of the first of the four standard deviations of a reading in the rules."""
 AFTER_STDS = Rules._fields.index("min_range")
@@ -432,13 +468,14 @@ AFTER_STDS = Rules._fields.index("min_range")
 # The first rows are vectors over the whole state.
 CORRECTION = 0  # δ
 TRANSPORT = 1  # v of the transport T = I + v e_θᵀ
-PRIOR_MEAN = 2  # before this correction
+ITERATE = 2  # where the readings are linearised again
 HEADING = 3  # P[:, θ]
-MEAN_BEFORE = 4  # before the scan
+MEAN_BEFORE = 4  # the prior mean
 
 # The stacked system follows: two rows (bearing, range) for each reading in use.  Such a
 # row begins with its row of A and ends with META_WIDTH more columns, which are counted
-# from the end.
+# from the end.  Rules that iterate have a second system below it, for readings that are
+# linearised again.
 FIRST = 5
 READING = -1  # z
 VARIANCE = -2  # diagonal of Q
@@ -453,7 +490,8 @@ SLOT = 0  # of each reading: place of its landmark in the map, negative for a ne
 OUTCOME = 1  # of each reading: USED, ADDED, GATED or SKIPPED
 NEAR = 2  # of each reading: 1 where the robot is too near its landmark to linearise
 COLUMN = 3  # of each reading in use: its landmark's first column in the state
-LEDGER_HEIGHT = 4
+ORDER = 4  # the readings in use in the order in which they are taken one by one
+LEDGER_HEIGHT = 5
 
 # Outcomes of a reading.
 USED, ADDED, GATED, SKIPPED = 0, 1, 2, 3
@@ -464,7 +502,6 @@ class Workspace(NamedTuple):
 
     rows: Array  # (FIRST + 2m + 2, capacity + META_WIDTH), two systems to iterate
     before: Array  # (capacity, capacity) P to restore after a failure, or empty
-    prior: Array  # (capacity, capacity) P to iterate from, or empty
 
 
 def new_workspace(
@@ -477,16 +514,15 @@ def new_workspace(
     readings, capacity : int
         Most readings in one scan, and length of the mean.
     iterated : bool
-        Whether updates linearise more than once.
+        Whether updates may linearise more than once.
     spoilable : bool
         Whether an update can fail after it has changed P.
     """
     systems = (2 if iterated else 1) * (2 * readings + 2)
-    kept, iterable = capacity * spoilable, capacity * iterated
+    kept = capacity * spoilable
     return Workspace(
         aligned_zeros(FIRST + systems, (capacity + 7) // 8 * 8 + META_WIDTH),
         aligned_zeros(kept, kept),
-        aligned_zeros(iterable, iterable),
     )
 
 
@@ -495,21 +531,10 @@ def new_ledger(readings: int) -> IntArray:
     return np.zeros((LEDGER_HEIGHT, readings), dtype=np.int64)
 
 
-def prior_system(height: int, iterations: int) -> int:
-    """Return the row at which the system linearised at the prior begins.
-
-    Parameters
-    ----------
-    height : int
-        Number of rows of the workspace.
-    iterations : int
-        With more than one, :func:`.scan_update.save_prior_rows` copies that system
-        to the second half of the rows.
-    """
-    return FIRST if iterations == 1 else FIRST + (height - FIRST) // 2
-
-
-prior_system_jit = njit_internal(prior_system)
+@njit_internal
+def second_system(rows: Array) -> Array:
+    """Return the system of readings linearised again, where the rules iterate."""
+    return rows[FIRST + (len(rows) - FIRST) // 2 :]
 
 
 class BeliefArrays(NamedTuple):
@@ -532,12 +557,12 @@ class BeliefArrays(NamedTuple):
 
 CAPACITY = 0  # length of the mean
 HEIGHT = 1  # of the rows of the workspace
-BEFORE, PRIOR = 2, 3  # heights of its copies of P
-LANDMARKS = 4  # number of landmarks in the map
-TABLED = 5  # how many of them are in the table
-STEPS = 6  # how many odometry readings and scans the belief has taken in
-SCANNED, IN_USE = 7, 8  # number of readings in the last scan, and of those in use
-STARTS = 12  # where each part begins, and the end
+BEFORE = 2  # height of its copy of P
+LANDMARKS = 3  # number of landmarks in the map
+TABLED = 4  # how many of them are in the table
+STEPS = 5  # how many odometry readings and scans the belief has taken in
+SCANNED, IN_USE = 6, 7  # number of readings in the last scan, and of those in use
+STARTS = 13  # where each part begins, and the end
 NUMBERS = 24
 
 # Values in floating point; the rules come first.
@@ -555,9 +580,8 @@ class Parts(NamedTuple):
     mean: Array  # this and the next two as in BeliefArrays
     covariance: Array
     reference: Array
-    rows: Array  # this and the next two as in Workspace
+    rows: Array  # this and the next as in Workspace
     before: Array
-    prior: Array
     ids: IntArray  # (capacity,) identity of the landmark in each slot
     table: IntArray  # slots + 1 by a hash of these identities; 0 is empty
     scan_ids: IntArray  # (readings,) of the last scan
@@ -575,17 +599,15 @@ def new_block(capacity: int, readings: int, values: Array) -> Array:
         The rules, and the variances of the motion per step.
     """
     iterated = values[ITERATIONS] > 1
-    repeated = iterated or values[SEQUENTIAL] > 0
     capacity, readings = (-(-size // 8) * 8 for size in (capacity, readings))
     height = FIRST + (2 if iterated else 1) * (2 * readings + 2)
-    before = capacity if repeated else min(capacity, LARGE + 6)
-    prior, table = capacity * bool(iterated), 1 << capacity.bit_length()
+    before, table = min(capacity, LARGE + 6), 1 << capacity.bit_length()
     sizes = [VALUES, capacity, capacity**2, capacity, height * (capacity + META_WIDTH)]
-    sizes += [before**2, prior**2, capacity, table, readings, LEDGER_HEIGHT * readings]
+    sizes += [before**2, capacity, table, readings, LEDGER_HEIGHT * readings]
     starts = NUMBERS + np.cumsum([0, *sizes])
     block = aligned_zeros(int(starts[-1]))
     numbers = block[:NUMBERS].view(np.int64)
-    numbers[: PRIOR + 1] = capacity, height, before, prior
+    numbers[: BEFORE + 1] = capacity, height, before
     numbers[STARTS:] = starts
     block[NUMBERS : NUMBERS + len(values)] = values
     return block
@@ -594,8 +616,8 @@ def new_block(capacity: int, readings: int, values: Array) -> Array:
 def parts_of(block: Array) -> Parts:
     """Return the parts of a block by name, without a copy."""
     numbers = block[:NUMBERS].view(np.int64)
-    n, height, at = numbers[CAPACITY], numbers[HEIGHT], numbers[STARTS:]
-    before, prior = numbers[BEFORE], numbers[PRIOR]
+    n, height, before = numbers[CAPACITY], numbers[HEIGHT], numbers[BEFORE]
+    at = numbers[STARTS:]
     return Parts(
         numbers,
         block[at[0] : at[1]],
@@ -604,11 +626,10 @@ def parts_of(block: Array) -> Parts:
         block[at[3] : at[4]],
         block[at[4] : at[5]].reshape((height, n + META_WIDTH)),
         block[at[5] : at[6]].reshape((before, before)),
-        block[at[6] : at[7]].reshape((prior, prior)),
+        block[at[6] : at[7]].view(np.int64),
         block[at[7] : at[8]].view(np.int64),
         block[at[8] : at[9]].view(np.int64),
-        block[at[9] : at[10]].view(np.int64),
-        block[at[10] : at[11]].view(np.int64).reshape((LEDGER_HEIGHT, -1)),
+        block[at[9] : at[10]].view(np.int64).reshape((LEDGER_HEIGHT, -1)),
     )
 
 

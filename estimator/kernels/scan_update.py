@@ -4,6 +4,8 @@
 memory of one filter.  `update_belief` and `predict` do so with the arrays of a belief.
 """
 
+import math
+
 import numpy as np
 
 from ...arrays import LARGEST, Array, IntArray
@@ -14,6 +16,7 @@ from ..models.bearing_range import (
     reading_slopes_jit,
     wrap_angle_jit,
 )
+from ..models.rigid_motion import turn_coefficients_jit
 from ..models.unicycle_motion import drive_jit
 from .kalman_gain import (
     ADDED,
@@ -29,6 +32,7 @@ from .kalman_gain import (
     IN_USE,
     INNOVATION,
     INVARIANT,
+    ITERATE,
     JACOBIAN,
     LANDMARKS,
     LARGE,
@@ -37,8 +41,8 @@ from .kalman_gain import (
     MOVED,
     NEAR,
     NIS,
+    ORDER,
     OUTCOME,
-    PRIOR_MEAN,
     PROJECTED,
     READING,
     SCANNED,
@@ -48,18 +52,24 @@ from .kalman_gain import (
     TABLED,
     USED,
     VARIANCE,
+    WHITE,
     BeliefArrays,
     Parts,
     Rules,
     Workspace,
     absorb,
+    begin_correction,
     compose,
+    downdate,
     mirror,
     parts_jit,
-    prior_system_jit,
+    retract,
+    retract_point,
+    second_system,
     squared_whitened,
     times,
     transport,
+    whiten,
 )
 
 # Status of an update, where it is not the reading that failed.
@@ -108,7 +118,6 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
         parts.ledger,
         parts.rows,
         parts.before,
-        parts.prior,
         parts.values,
     )
     if status == DONE:
@@ -193,7 +202,6 @@ def update_belief(
     ledger: IntArray,
     rows: Array,
     before: Array,
-    prior: Array,
     rule_values: Array,
 ) -> tuple[int, int, float]:
     """Update one belief with one scan, in place.
@@ -210,7 +218,7 @@ def update_belief(
         A :func:`.kalman_gain.new_ledger` whose row SLOT holds the place of each
         reading's landmark in the map.  On return its other rows are filled, and SLOT
         holds the places of added landmarks, too.
-    rows, before, prior
+    rows, before
         A :class:`.kalman_gain.Workspace`, which then holds the record of the scan.
     rule_values
         The filter's rules, as :func:`as_rules` reads them.
@@ -226,50 +234,18 @@ def update_belief(
         νᵀ S⁻¹ ν over them.
     """
     belief = BeliefArrays(mean, covariance, reference)
-    workspace = Workspace(rows, before, prior)
+    workspace = Workspace(rows, before)
     rules = as_rules(rule_values)
     for k in range(count):
         if not (usable(readings[k, 0]) and usable(readings[k, 1])):
             return NOT_USABLE, 0, 0.0
     used = screen(belief, readings, count, rules, rows, ledger)
-    failed = correct_or_restore(belief, size, ledger, rules, workspace, used)
+    failed = correct(belief, size, ledger, rules, workspace, used)
     if failed >= 0:
         return failed // 2, used, 0.0
-    nis = squared_whitened(rows, rules.iterations, used)
+    nis = squared_whitened(rows, used)
     add_landmarks(belief, size, readings, count, rules, ledger)
     return DONE, used, nis
-
-
-@njit_inlined
-def correct_or_restore(
-    belief: BeliefArrays,
-    size: int,
-    ledger: IntArray,
-    rules: Rules,
-    workspace: Workspace,
-    used: int,
-) -> int:
-    """Correct the belief by the readings in use, or leave it as it was.
-
-    Returns -1, or the row whose innovation covariance is not positive definite.  What
-    such a row could spoil is copied first: where P changes before the last row is read.
-    """
-    rows, repeated = workspace.rows, rules.sequential or rules.iterations > 1
-    spoilable = repeated or used > block_of(size, used)
-    if spoilable:
-        copy_covariance(belief.covariance, workspace.before, size)
-        for j in range(size):
-            rows[MEAN_BEFORE, j] = belief.mean[j]
-    height = 2 if rules.sequential else max(2 * used, 1)
-    for top in range(0, 2 * used, height):
-        failed = correct(belief, size, ledger, rules, workspace, top, top + height)
-        if failed >= 0:
-            if spoilable:
-                copy_covariance(workspace.before, belief.covariance, size)
-                for j in range(size):
-                    belief.mean[j] = rows[MEAN_BEFORE, j]
-            return failed
-    return -1
 
 
 @njit_inlined
@@ -362,9 +338,7 @@ def screen(
         ledger[COLUMN, used] = column
         system[row, READING], system[row + 1, READING] = bearing, distance
         # The range as read makes σr small just where its error is negative.
-        at = distance if rules.noise_as_read else expected
-        system[row, VARIANCE] = bearing_variance(rules, at)
-        system[row + 1, VARIANCE] = range_variance(rules, at)
+        set_noise(system, row, rules, distance if rules.noise_as_read else expected)
         ledger[NEAR, k] = is_too_near(mean, belief.covariance, column)
         if rules.gate < np.inf:
             linearise(mean, belief.reference, rules.linearisation, system, row, column)
@@ -375,6 +349,13 @@ def screen(
                 continue
         used += 1
     return used
+
+
+@njit_internal
+def set_noise(system: Array, row: int, rules: Rules, distance: float) -> None:
+    """Fill the variances of the reading in ``row`` and the next, at that range [m]."""
+    system[row, VARIANCE] = bearing_variance(rules, distance)
+    system[row + 1, VARIANCE] = range_variance(rules, distance)
 
 
 @njit_internal
@@ -437,13 +418,14 @@ def is_too_near(mean: Array, covariance: Array, column: int) -> bool:
 
 
 # --------------------------------------------------------------------------------------
-# One correction: linearise, condition, compose; iterated.
+# One correction: linearise, condition, compose; again where a reading asks for it.
 
+# What asks for another linearisation, or for readings one by one.
+FAR = 0.1  # a reading off its prediction, or a landmark moved, relative to its range
+TURNED = 0.1  # heading [rad]
 
-@njit_internal
-def block_of(size: int, readings: int) -> int:
-    """Return how many readings to absorb at a time: few while P fits the caches."""
-    return BLOCK if size <= LARGE else max(readings, 1)
+# Excess of νᵀ S⁻¹ ν at which an iterate is not believed: 99.9 % of χ²(2).
+IMPLAUSIBLE = 13.8
 
 
 @njit_inlined
@@ -453,51 +435,41 @@ def correct(
     ledger: IntArray,
     rules: Rules,
     workspace: Workspace,
-    top: int,
-    bottom: int,
+    used: int,
 ) -> int:
-    """Condition the belief on the readings of some rows, at one linearisation.
+    """Condition the belief on the readings in use, or leave it as it was.
 
-    With more iterations the readings are linearised again at each iterate, always
-    against the same prior (Bell and Cathey, 1993).  In the invariant frame the heading
-    column of H keeps the prior's geometry: with the exact Gauss-Newton column the
-    filter would believe that it observes its heading.
-
-    Parameters
-    ----------
-    top, bottom
-        Rows of the system, counted from FIRST.
-
-    Returns
-    -------
-    int
-        -1, or the row at which the innovation covariance is not positive definite; the
-        covariance may then be spoilt.
+    Returns -1, or the row at which the innovation covariance is not positive definite.
+    What such a row could spoil is copied first: where P changes before the last row is
+    read.
     """
-    mean, covariance = belief.mean, belief.covariance
-    rows, columns = workspace.rows, ledger[COLUMN]
-    system, prior_mean = rows[FIRST:], rows[PRIOR_MEAN]
+    if used == 0:
+        return -1
+    mean, covariance, rows = belief.mean, belief.covariance, workspace.rows
+    system, prior, columns = rows[FIRST:], rows[MEAN_BEFORE], ledger[COLUMN]
     for j in range(size):
-        prior_mean[j] = mean[j]
-    if rules.iterations > 1:
-        copy_covariance(covariance, workspace.prior, size)
-    for iteration in range(rules.iterations):
-        if iteration > 0:
-            copy_covariance(workspace.prior, covariance, size)
-        for row in range(top, bottom, 2):
-            c = columns[row // 2]
-            linearise(mean, belief.reference, rules.linearisation, system, row, c)
-            if iteration > 0:
-                relate_to_prior(rows, row, c, rules.frame)
+        prior[j] = mean[j]
+    again = rules.iterations > 1 and not rules.adaptive
+    for k in range(used):
+        linearise(
+            mean, belief.reference, rules.linearisation, system, 2 * k, columns[k]
+        )
+        again |= rules.adaptive and is_far_off(mean, system, 2 * k, columns[k])
+    if again:
+        failed = relinearise(belief, size, ledger, rules, rows, used)
+    else:
+        block = block_of(size, used)
+        if used > block:
+            copy_covariance(covariance, workspace.before, size)
+        failed = absorb(covariance, size, rows, columns, used, block)
+        if failed < 0:
+            compose(mean, prior, rows, size, rules.frame)
+        elif used > block:
+            copy_covariance(workspace.before, covariance, size)
+    if failed >= 0:
         for j in range(size):
-            mean[j] = prior_mean[j]
-        block = block_of(size, (bottom - top) // 2)
-        failed = absorb(covariance, size, rows, columns, top, bottom, block)
-        if failed >= 0:
-            return failed
-        if iteration == 0 and rules.iterations > 1:
-            save_prior_rows(rows, top, bottom)
-        compose(mean, rows, size, rules.frame)
+            mean[j] = prior[j]
+        return failed
     if rules.frame == INVARIANT:
         transport(covariance, rows, size)
     mirror(covariance, size)
@@ -505,27 +477,9 @@ def correct(
 
 
 @njit_internal
-def relate_to_prior(rows: Array, row: int, c: int, frame: int) -> None:
-    """Turn ν at an iterate into z − h + H δ, the innovation seen from the prior."""
-    system, prior = rows[FIRST:], rows[PRIOR_MEAN]
-    dx, dy = prior[c] - prior[0], prior[c + 1] - prior[1]
-    for i in range(row, row + 2):
-        h = system[i, JACOBIAN : JACOBIAN + 5]
-        if frame == INVARIANT:
-            h[2] = h[3] * dy - h[4] * dx
-        system[i, INNOVATION] += times(system, i, c, rows[CORRECTION])
-
-
-@njit_internal
-def save_prior_rows(rows: Array, top: int, bottom: int) -> None:
-    """Copy rows of the system linearised at the prior to where the report reads them.
-
-    The next iterate overwrites the system itself.
-    """
-    system, saved = rows[FIRST:], rows[prior_system_jit(len(rows), 2) :]
-    for row in range(top, bottom):
-        for j in range(rows.shape[1]):
-            saved[row, j] = system[row, j]
+def block_of(size: int, readings: int) -> int:
+    """Return how many readings to absorb at a time: few while P fits the caches."""
+    return BLOCK if size <= LARGE else max(readings, 1)
 
 
 @njit_internal
@@ -534,6 +488,213 @@ def copy_covariance(source: Array, target: Array, size: int) -> None:
     for i in range(size):
         for j in range(size):
             target[i, j] = source[i, j]
+
+
+@njit_internal
+def relinearise(
+    belief: BeliefArrays,
+    size: int,
+    ledger: IntArray,
+    rules: Rules,
+    rows: Array,
+    used: int,
+) -> int:
+    """Linearise again at each iterate, with the same prior (Bell and Cathey, 1993).
+
+    Every iterate takes its rows of A from the prior P, and the last ones downdate it.
+    In the invariant frame the heading column of H keeps the prior's geometry: with the
+    exact Gauss-Newton column the filter would believe that it observes its heading.
+
+    Adaptive rules stop when no landmark moves any more.  Where the heading turns, the
+    joint iterates can diverge, and the readings are taken one by one.
+
+    Returns -1, or the row at which the innovation covariance is not positive definite;
+    P is then as before.
+    """
+    mean, columns = belief.mean, ledger[COLUMN]
+    now, again, at = rows[FIRST:], second_system(rows), rows[ITERATE]
+    for k in range(used):
+        copy_reading(now, 2 * k, again, 2 * k)
+    for iteration in range(rules.iterations):
+        for j in range(size):
+            at[j] = mean[j]
+        if iteration > 0:
+            now = again
+            for k in range(used):
+                linearise_again(at, belief, rules, rows, 2 * k, columns[k])
+        begin_correction(size, rows, now, 2 * used)
+        for k in range(used):
+            if not whiten(belief.covariance, size, rows, now, 0, 2 * k, columns[k]):
+                return 2 * k
+        compose(mean, rows[MEAN_BEFORE], rows, size, rules.frame)
+        if rules.adaptive:
+            if abs(rows[CORRECTION, 2]) > TURNED:
+                now = again
+                failed = take_one_by_one(belief, size, ledger, rules, rows, used)
+                if failed >= 0:
+                    return failed
+                break
+            settled = True
+            for k in range(used):
+                settled &= not has_moved(at, mean, columns[k])
+            if settled:
+                break
+    downdate(belief.covariance, size, now, 0, 2 * used)
+    return -1
+
+
+@njit_internal
+def take_one_by_one(
+    belief: BeliefArrays,
+    size: int,
+    ledger: IntArray,
+    rules: Rules,
+    rows: Array,
+    used: int,
+) -> int:
+    """Correct the mean by one reading after the other, the farthest landmark first.
+
+    Each is linearised at the mean that those before it leave, and again until its
+    landmark no longer moves; once only where the iterates do not settle, or end where
+    the reading is less plausible than at first.  P is constant in invariant
+    coordinates, so that all rows of A come from the prior P, as in `relinearise`.
+
+    Far landmarks are first because their bearings fix the heading, and depend least on
+    the position.
+    """
+    mean, prior = belief.mean, rows[MEAN_BEFORE]
+    system, again = rows[FIRST:], second_system(rows)
+    columns, order = ledger[COLUMN], ledger[ORDER]
+    sort_by_range(prior, columns, used, order)
+    for j in range(size):
+        mean[j] = prior[j]
+    for k in range(used):
+        row, read, c = 2 * k, 2 * order[k], columns[order[k]]
+        copy_reading(system, read, again, row)
+        begin_correction(size, rows, again, 2 * used)
+        once, last = iterate_reading(
+            belief, size, rules, rows, row, c, rules.iterations
+        )
+        if math.isnan(last):
+            return int(read)
+        if last > once + IMPLAUSIBLE:
+            iterate_reading(belief, size, rules, rows, row, c, 1)
+        retract(mean, mean, rows, size)
+    return -1
+
+
+@njit_internal
+def iterate_reading(
+    belief: BeliefArrays,
+    size: int,
+    rules: Rules,
+    rows: Array,
+    row: int,
+    c: int,
+    most: int,
+) -> tuple[float, float]:
+    """Linearise one reading at the mean, and again until its landmark is at rest.
+
+    Returns νᵀ S⁻¹ ν of the first linearisation and of the last: inf where the landmark
+    still moves after ``most``, nan where S is not positive definite.
+    """
+    mean, prior, at = belief.mean, rows[MEAN_BEFORE], rows[ITERATE]
+    again, delta = second_system(rows), rows[CORRECTION]
+    for i in range(2):
+        at[i], at[c + i] = mean[i], mean[c + i]
+    at[2], once = mean[2], np.inf
+    for j in range(size):
+        delta[j] = 0.0
+    for iteration in range(most):
+        linearise_again(at, belief, rules, rows, row, c)
+        begin_correction(size, rows, again, row + 2)
+        if not whiten(belief.covariance, size, rows, again, 0, row, c):
+            return once, np.nan
+        nis = again[row, WHITE] ** 2 + again[row + 1, WHITE] ** 2
+        once = nis if iteration == 0 else once
+        x, y = at[c] - at[0], at[c + 1] - at[1]
+        turned = turn_coefficients_jit(delta[2])
+        retract_point(at, mean, prior, delta, turned, 0)
+        retract_point(at, mean, prior, delta, turned, c)
+        at[2] = mean[2] + delta[2]
+        if not is_displaced(x, y, at[c] - at[0], at[c + 1] - at[1]):
+            return once, nis
+    return once, np.inf
+
+
+@njit_internal
+def sort_by_range(mean: Array, columns: IntArray, used: int, order: IntArray) -> None:
+    """Fill the order of the readings in use, that of the farthest landmark first."""
+    for k in range(used):
+        place = k
+        while place > 0 and squared_range(mean, columns[k]) > squared_range(
+            mean, columns[order[place - 1]]
+        ):
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = k
+
+
+@njit_internal
+def squared_range(mean: Array, c: int) -> float:
+    """Return the squared distance of the robot to a landmark [m²]."""
+    dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+    return float(dx * dx + dy * dy)
+
+
+@njit_internal
+def is_far_off(mean: Array, system: Array, row: int, c: int) -> bool:
+    """Whether a reading differs from its prediction by more than FAR of the range."""
+    bearing, distance = system[row, INNOVATION], system[row + 1, INNOVATION]
+    far = distance * distance > FAR * FAR * squared_range(mean, c)
+    return bool(far or abs(bearing) > FAR)
+
+
+@njit_internal
+def has_moved(before: Array, after: Array, c: int) -> bool:
+    """Whether a landmark moves relative to the robot between two states."""
+    return is_displaced(
+        before[c] - before[0],
+        before[c + 1] - before[1],
+        after[c] - after[0],
+        after[c + 1] - after[1],
+    )
+
+
+@njit_internal
+def is_displaced(x: float, y: float, new_x: float, new_y: float) -> bool:
+    """Whether a displacement from the robot changes by more than FAR of the range."""
+    dx, dy = new_x - x, new_y - y
+    return bool(dx * dx + dy * dy > FAR * FAR * (x * x + y * y))
+
+
+@njit_internal
+def copy_reading(source: Array, row: int, target: Array, to: int) -> None:
+    """Copy the reading in ``row`` and the next, and its variances, to another row."""
+    for i in range(2):
+        target[to + i, READING] = source[row + i, READING]
+        target[to + i, VARIANCE] = source[row + i, VARIANCE]
+
+
+@njit_internal
+def linearise_again(
+    at: Array, belief: BeliefArrays, rules: Rules, rows: Array, row: int, c: int
+) -> None:
+    """Linearise the reading in ``row`` of the second system at an iterate.
+
+    ν becomes z − h + H δ, the innovation seen from the state that δ corrects.
+    """
+    system, prior, delta = second_system(rows), rows[MEAN_BEFORE], rows[CORRECTION]
+    linearise(at, belief.reference, rules.linearisation, system, row, c)
+    if rules.adaptive and not rules.noise_as_read:
+        distance = np.sqrt(squared_range(at, c))
+        set_noise(system, row, rules, max(distance, rules.min_range))
+    dx, dy = prior[c] - prior[0], prior[c + 1] - prior[1]
+    for i in range(row, row + 2):
+        h = system[i, JACOBIAN : JACOBIAN + 5]
+        if rules.frame == INVARIANT:
+            h[2] = h[3] * dy - h[4] * dx
+        system[i, INNOVATION] += times(system, i, c, delta)
 
 
 # --------------------------------------------------------------------------------------

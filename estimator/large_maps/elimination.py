@@ -262,10 +262,8 @@ class RestFactor:
 # ancestor of the node of the other, or the same node.  Elimination in one branch
 # therefore does not affect any other branch.
 
-LEAF = 75
-"""Largest number of landmarks in a leaf."""
-EXTRA_LEVELS = 6
-"""Levels by which a branch may exceed the depth of a balanced tree."""
+LEAF = 75  # largest number of landmarks in a leaf
+EXTRA_LEVELS = 6  # levels by which a branch may exceed the depth of a balanced tree
 
 
 class LandmarkDissection:
@@ -459,8 +457,7 @@ def with_ancestors(nodes: IntArray) -> set[int]:
     return found
 
 
-Quadratic = tuple[Array, Array, float]
-"""(H, g, c) of the function c − 2 gᵀ x + xᵀ H x."""
+Quadratic = tuple[Array, Array, float]  # (H, g, c) of the function c − 2 gᵀ x + xᵀ H x
 
 
 class SubmapElimination:
@@ -556,14 +553,12 @@ class SubmapElimination:
 class Part(NamedTuple):
     """One submap, or two parts joined."""
 
+    # -1 if the part joins the two most recent parts that are not joined yet.
     submap: int
-    """-1 if the part joins the two most recent parts that are not joined yet."""
-    interior: IntArray
-    """Unknowns that no submap outside the part touches."""
-    border: IntArray
-    """All other unknowns of the part."""
+    interior: IntArray  # unknowns that no submap outside the part touches
+    border: IntArray  # all other unknowns of the part
+    # Positions in (interior, border) of the submap's or each half's unknowns.
     places: tuple[IntArray, ...]
-    """Positions in (interior, border) of the submap's or each half's unknowns."""
 
 
 def dissect(unknowns: Sequence[IntArray], positions: Array) -> list[Part]:

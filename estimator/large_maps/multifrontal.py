@@ -35,14 +35,10 @@ from ..support import saved_states
 class Node(NamedTuple):
     """One eliminated front."""
 
-    own: IntArray
-    """p, the unknowns that the node eliminates."""
-    rest: IntArray
-    """r, the unknowns that the front links with them."""
-    lower: Array
-    """L, shape (p, p)."""
-    response: Array
-    """X, shape (p, r)."""
+    own: IntArray  # p, the unknowns that the node eliminates
+    rest: IntArray  # r, the unknowns that the front links with them
+    lower: Array  # L, shape (p, p)
+    response: Array  # X, shape (p, r)
 
     @property
     def nbytes(self) -> int:
@@ -210,8 +206,8 @@ def _solve(lower: Array, right: Array, *, transposed: bool = False) -> Array:
 
 Solver = Callable[[Array], Array]
 
+# Up to this many landmarks, a dense Cholesky factor is faster than a sparse one.
 LARGEST_DENSE = 150
-"""Up to this many landmarks, a dense Cholesky factor is faster than a sparse one."""
 
 
 class Factor(Protocol):
@@ -240,14 +236,11 @@ class SchurComplement(NamedTuple):
     where B ⊂ L are the local landmarks linked with H.
     """
 
-    slots: IntArray
-    """H."""
-    border: IntArray
-    """Columns of B in L, shape (c,)."""
+    slots: IntArray  # H
+    border: IntArray  # columns of B in L, shape (c,)
+    # T, shape (2h, c); not computed, (0, c), if H is the whole rest of the map.
     response: Array
-    """T, shape (2h, c); not computed, (0, c), if H is the whole rest of the map."""
-    complement: Array
-    """C, shape (c, c), symmetric."""
+    complement: Array  # C, shape (c, c), symmetric
     factor: Factor
 
 
@@ -350,8 +343,7 @@ def add_update(top: Array, rest: Array, at: IntArray, update: Array) -> None:
                 rest[row - p, column - p] += update[i, j]
 
 
-_ARRAY_OBJECTS = 220
-"""Memory of two empty array objects [bytes]."""
+_ARRAY_OBJECTS = 220  # memory of two empty array objects [bytes]
 
 
 class InformationMatrix:
@@ -544,6 +536,20 @@ def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:
         blocks[order], blocks[mirrored].transpose(0, 2, 1), rtol=1e-9, atol=0
     ):
         raise ValueError("state['matrix_blocks'] must be a symmetric matrix")
+
+
+_ROWS = 128  # that are copied at a time
+
+
+def symmetric(covariance: Array) -> Array:
+    """Copy the lower half into the upper one, in place."""
+    n = len(covariance)
+    for first in range(0, n, _ROWS):
+        last = min(first + _ROWS, n)
+        own = covariance[first:last, first:last]
+        own[:] = np.tril(own) + np.tril(own, -1).T
+        covariance[first:last, last:] = covariance[last:, first:last].T
+    return covariance
 
 
 def pairs(places: Sequence[int] | IntArray) -> IntArray:

@@ -154,9 +154,9 @@ def invariant_error(true_state: Array, mean: Array) -> Array:
     True
     """
     turn = wrap_angle(np.asarray(true_state[..., 2] - mean[..., 2]))
-    true_points, points = _points(true_state), _points(mean)
+    true_points, points = points_of(true_state), points_of(mean)
     moved = true_points - np.exp(1j * turn)[..., None] * points
-    return _state(moved / left_jacobian(turn)[..., None], turn)
+    return state_of(moved / left_jacobian(turn)[..., None], turn)
 
 
 def invariant_covariance(mean: Array, covariance: Array) -> Array:
@@ -171,25 +171,22 @@ def invariant_covariance(mean: Array, covariance: Array) -> Array:
     -------
     ndarray, shape (..., 3 + 2n, 3 + 2n)
     """
-    lever = _state(1j * _points(mean), np.zeros(mean.shape[:-1]))[..., :, None]
+    lever = state_of(1j * points_of(mean), np.zeros(mean.shape[:-1]))[..., :, None]
     half = covariance - lever * covariance[..., 2:3, :]
     return np.asarray(half - np.swapaxes(lever, -1, -2) * half[..., :, 2:3])
 
 
-def _points(state: Array) -> ComplexArray:
+def points_of(state: Array) -> ComplexArray:
     """Robot position and landmarks as complex numbers, shape (..., 1 + n)."""
     x = np.concatenate([state[..., :1], state[..., 3::2]], axis=-1)
     y = np.concatenate([state[..., 1:2], state[..., 4::2]], axis=-1)
     return np.asarray(x + 1j * y)
 
 
-def _state(points: ComplexArray, heading: Array) -> Array:
-    pairs = np.stack([points.real, points.imag], axis=-1)
-    flat = pairs.reshape(*points.shape[:-1], -1)
-    return np.concatenate([flat[..., :2], heading[..., None], flat[..., 2:]], axis=-1)
-
-
-__all__ = ["as_covariance"]
+def state_of(points: ComplexArray, heading: Array | float) -> Array:
+    """Return the state of points, shape (..., 1 + n), and a heading, shape (...)."""
+    flat, turn = np.ascontiguousarray(points).view(np.float64), np.asarray(heading)
+    return np.concatenate([flat[..., :2], turn[..., None], flat[..., 2:]], axis=-1)
 
 
 def as_covariance(product: Array) -> Array:

@@ -31,56 +31,43 @@ class Peer(NamedTuple):
             )
 
 
-_GTSAM = f"{__package__}.gtsam_graph"
-_FILTERPY = f"{__package__}.filterpy_kalman"
-_STONESOUP = f"{__package__}.stonesoup_kalman"
-
+_MODULES = {
+    "gtsam": "gtsam_graph",
+    "filterpy": "filterpy_kalman",
+    "stonesoup": "stonesoup_kalman",
+}
+_ADAPTERS = {
+    "gtsam_isam2": ("GtsamIsam2Slam", "GTSAM's incremental smoother iSAM2."),
+    "gtsam_fixed_lag": (
+        "GtsamFixedLagSlam",
+        "GTSAM's incremental fixed-lag smoother; the landmarks stay in it.",
+    ),
+    "gtsam_batch": (
+        "GtsamBatchSlam",
+        "GTSAM's Levenberg-Marquardt over the whole drive after every scan.",
+    ),
+    "filterpy_ekf": (
+        "FilterpyEkfSlam",
+        "filterpy's extended Kalman filter over pose and map.",
+    ),
+    "filterpy_ukf": (
+        "FilterpyUkfSlam",
+        "filterpy's unscented Kalman filter over pose and map.",
+    ),
+    "stonesoup_ekf": (
+        "StoneSoupEkfSlam",
+        "Stone Soup's extended Kalman predictor and updater over pose and map.",
+    ),
+    "stonesoup_ukf": (
+        "StoneSoupUkfSlam",
+        "Stone Soup's unscented Kalman predictor and updater over pose and map.",
+    ),
+}
 PEERS = {
-    peer.name: peer
-    for peer in (
-        Peer(
-            "gtsam_isam2",
-            "gtsam",
-            f"{_GTSAM}:GtsamIsam2Slam",
-            "GTSAM's incremental smoother iSAM2.",
-        ),
-        Peer(
-            "gtsam_fixed_lag",
-            "gtsam",
-            f"{_GTSAM}:GtsamFixedLagSlam",
-            "GTSAM's incremental fixed-lag smoother; the landmarks stay in it.",
-        ),
-        Peer(
-            "gtsam_batch",
-            "gtsam",
-            f"{_GTSAM}:GtsamBatchSlam",
-            "GTSAM's Levenberg-Marquardt over the whole drive after every scan.",
-        ),
-        Peer(
-            "filterpy_ekf",
-            "filterpy",
-            f"{_FILTERPY}:FilterpyEkfSlam",
-            "filterpy's extended Kalman filter over pose and map.",
-        ),
-        Peer(
-            "filterpy_ukf",
-            "filterpy",
-            f"{_FILTERPY}:FilterpyUkfSlam",
-            "filterpy's unscented Kalman filter over pose and map.",
-        ),
-        Peer(
-            "stonesoup_ekf",
-            "stonesoup",
-            f"{_STONESOUP}:StoneSoupEkfSlam",
-            "Stone Soup's extended Kalman predictor and updater over pose and map.",
-        ),
-        Peer(
-            "stonesoup_ukf",
-            "stonesoup",
-            f"{_STONESOUP}:StoneSoupUkfSlam",
-            "Stone Soup's unscented Kalman predictor and updater over pose and map.",
-        ),
-    )
+    name: Peer(name, library, f"{__package__}.{module}:{adapter}", description)
+    for library, module in _MODULES.items()
+    for name, (adapter, description) in _ADAPTERS.items()
+    if name.startswith(library)
 }
 
 

@@ -37,11 +37,9 @@ from .peer_slam import (
 
 X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
 
-LEAST_VARIANCE = 1e-10
-"""Of motion noise [m², m², rad²]: GTSAM takes no certain motion."""
+LEAST_VARIANCE = 1e-10  # of motion noise [m², m², rad²]: GTSAM takes no certain motion
 PoseAndPlaces = tuple[Any, list[Array]]
-MOVE, READING, SOLVE = 0.0, 1.0, 2.0
-"""Kinds of the events of a drive."""
+MOVE, READING, SOLVE = 0.0, 1.0, 2.0  # kinds of the events of a drive
 
 
 class GtsamSlam(PeerSlam):
@@ -265,13 +263,14 @@ class GtsamIsam2Slam(GtsamSlam):
         self._solver.update(graph, guess)
 
     def _found(self, pose: int, landmarks: list[int]) -> PoseAndPlaces:
-        return _estimates(self._solver, pose, landmarks)
+        places = [self._solver.calculateEstimatePoint2(key) for key in landmarks]
+        return self._solver.calculateEstimatePose2(pose), places
 
     def _joint(self, keys: list[int]) -> tuple[Array, Any]:
         return _joint_marginal(self._solver, keys)
 
 
-class GtsamFixedLagSlam(GtsamSlam):
+class GtsamFixedLagSlam(GtsamIsam2Slam):
     """GTSAM's incremental fixed-lag smoother; the landmarks stay in it.
 
     Poses older than the lag are marginalised, as they are linearised then.
@@ -279,11 +278,9 @@ class GtsamFixedLagSlam(GtsamSlam):
     Parameters
     ----------
     motion_std, measurement_std, **settings
-        As in :class:`GtsamSlam`.
+        As in :class:`GtsamIsam2Slam`.
     lag : int
         Number of poses kept behind the last one.
-    relinearize_threshold, relinearize_skip
-        As in :class:`GtsamIsam2Slam`.
     """
 
     def __init__(
@@ -292,12 +289,9 @@ class GtsamFixedLagSlam(GtsamSlam):
         measurement_std: ArrayLike,
         *,
         lag: int = 10,
-        relinearize_threshold: float = 0.1,
-        relinearize_skip: int = 1,
         **settings: Any,
     ) -> None:
         self._lag = argument_checks.whole("lag", lag, 1)
-        self._parameters = _isam2_parameters(relinearize_threshold, relinearize_skip)
         super().__init__(motion_std, measurement_std, **settings)
 
     def _begin(self) -> None:
@@ -311,9 +305,6 @@ class GtsamFixedLagSlam(GtsamSlam):
         times = {X(k): float(k) for k in range(self._solved_k, self._k + 1)}
         times |= {L(slot): float(self._k) for slot in range(landmarks)}
         self._solver.update(graph, guess, times)
-
-    def _found(self, pose: int, landmarks: list[int]) -> PoseAndPlaces:
-        return _estimates(self._solver, pose, landmarks)
 
     def _joint(self, keys: list[int]) -> tuple[Array, Any]:
         return _joint_marginal(self._solver.getISAM2(), keys)
@@ -367,8 +358,3 @@ def _joint_marginal(isam: gtsam.ISAM2, keys: list[int]) -> tuple[Array, Any]:
     """Return the marginal about the linearisation point, from which iSAM2 steps."""
     covariance = isam.jointMarginalCovariance(keys).fullMatrix()
     return covariance, isam.getLinearizationPoint()
-
-
-def _estimates(solver: Any, pose: int, landmarks: list[int]) -> PoseAndPlaces:
-    places = [solver.calculateEstimatePoint2(key) for key in landmarks]
-    return solver.calculateEstimatePose2(pose), places

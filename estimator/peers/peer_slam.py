@@ -21,28 +21,23 @@ from ..models.unicycle_motion import predict_pose
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 
+# Least deviation of the first pose [m, rad]: the libraries take no certain one.
 START_FLOOR = 1e-6
-"""Least deviation of the first pose [m, rad]: the libraries take no certain one."""
 
 
 class Readings(NamedTuple):
     """Readings of one scan, with their variances."""
 
-    measurements: Array
-    """Rows (β, r), shape (m, 2) [rad, m]."""
-    slots: IntArray
-    """Place of each landmark in the map, shape (m,)."""
-    variances: Array
-    """(σβ², σr²), shape (m, 2)."""
+    measurements: Array  # rows (β, r), shape (m, 2) [rad, m]
+    slots: IntArray  # place of each landmark in the map, shape (m,)
+    variances: Array  # (σβ², σr²), shape (m, 2)
 
 
 class Innovation(NamedTuple):
     """Innovations of a scan at the prior."""
 
-    values: Array
-    """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
-    covariance: Array
-    """S, shape (2m, 2m), in the order β1, r1, β2, r2."""
+    values: Array  # ν, shape (m, 2), rows (bearing, range) [rad, m]
+    covariance: Array  # S, shape (2m, 2m), in the order β1, r1, β2, r2
 
 
 class PeerSlam(ABC):
@@ -193,18 +188,16 @@ def _report(innovation: Innovation | None) -> UpdateReport:
 #
 #     l = f(x, z),    P_l* = F_p P_p*,    P_ll = F_p P_pp F_pᵀ + F_z Q F_zᵀ
 
+# Spread of the points of both unscented filters, with κ = 3 − n: the defaults of Stone
+# Soup.
 SIGMA_ALPHA, SIGMA_BETA = 0.5, 2.0
-"""Spread of the points of both unscented filters, with κ = 3 − n: the defaults of Stone
-Soup."""
 
 
 class Moments(NamedTuple):
     """A Gaussian over pose and map."""
 
-    mean: Array
-    """Shape (3 + 2n,)."""
-    covariance: Array
-    """Shape (3 + 2n, 3 + 2n)."""
+    mean: Array  # (3 + 2n,)
+    covariance: Array  # (3 + 2n, 3 + 2n)
 
 
 STATE: saved_states.Table = {

@@ -6,16 +6,15 @@ the whole state, with their Jacobians, and bearings of its own type, which wrap.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 from stonesoup.base import Property
 from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
 from stonesoup.models.transition.nonlinear import GaussianTransitionModel
-from stonesoup.predictor.kalman import (
-    ExtendedKalmanPredictor,
-    UnscentedKalmanPredictor,
-)
+from stonesoup.predictor.kalman import ExtendedKalmanPredictor, UnscentedKalmanPredictor
 from stonesoup.types.angle import Bearing
 from stonesoup.types.array import CovarianceMatrix, StateVector, StateVectors
 from stonesoup.types.detection import Detection
@@ -87,13 +86,8 @@ class _Scan(NonLinearGaussianMeasurement):  # type: ignore[misc]
 class _StoneSoupSlam(KalmanPeer):
     """A predictor and an updater of Stone Soup over pose and map."""
 
-    @staticmethod
-    def _predictor(motion: _Motion) -> Any:
-        raise NotImplementedError
-
-    @staticmethod
-    def _updater() -> Any:
-        raise NotImplementedError
+    _predictor: ClassVar[Callable[..., Any]]
+    _updater: ClassVar[Callable[..., Any]]
 
     def _predicted(self, state: Moments, odometry: Array, variance: Array) -> Moments:
         noise = motion_covariance(state.mean, variance)
@@ -111,11 +105,10 @@ class _StoneSoupSlam(KalmanPeer):
             slots=readings.slots,
         )
         read = Detection(_typed(readings.measurements), measurement_model=model)
-        found = self._updater().update(SingleHypothesis(_gaussian(state), read))
+        found = self._updater(None).update(SingleHypothesis(_gaussian(state), read))
         expected = found.hypothesis.measurement_prediction
         nu = _column(read.state_vector - expected.state_vector).reshape(-1, 2)
-        covariance = np.asarray(expected.covar, dtype=np.float64)
-        return _moments(found), Innovation(nu, covariance)
+        return _moments(found), Innovation(nu, np.asarray(expected.covar, np.float64))
 
 
 class StoneSoupEkfSlam(_StoneSoupSlam):
@@ -124,13 +117,7 @@ class StoneSoupEkfSlam(_StoneSoupSlam):
     Jacobians are given.  Parameters are those of :class:`.peer_slam.PeerSlam`.
     """
 
-    @staticmethod
-    def _predictor(motion: _Motion) -> Any:
-        return ExtendedKalmanPredictor(motion)
-
-    @staticmethod
-    def _updater() -> Any:
-        return ExtendedKalmanUpdater(None)
+    _predictor, _updater = ExtendedKalmanPredictor, ExtendedKalmanUpdater
 
 
 class StoneSoupUkfSlam(_StoneSoupSlam):
@@ -140,13 +127,9 @@ class StoneSoupUkfSlam(_StoneSoupSlam):
     heading.  Parameters are those of :class:`.peer_slam.PeerSlam`.
     """
 
-    @staticmethod
-    def _predictor(motion: _Motion) -> Any:
-        return UnscentedKalmanPredictor(motion, alpha=SIGMA_ALPHA, beta=SIGMA_BETA)
-
-    @staticmethod
-    def _updater() -> Any:
-        return UnscentedKalmanUpdater(None, alpha=SIGMA_ALPHA, beta=SIGMA_BETA)
+    _options: ClassVar = {"alpha": SIGMA_ALPHA, "beta": SIGMA_BETA}
+    _predictor = staticmethod(partial(UnscentedKalmanPredictor, **_options))
+    _updater = staticmethod(partial(UnscentedKalmanUpdater, **_options))
 
 
 def _gaussian(state: Moments) -> Any:

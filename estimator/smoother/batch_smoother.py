@@ -183,16 +183,11 @@ def _landmarks_at(
 class _Marginals(NamedTuple):
     """What the covariances are made of."""
 
-    given_map: Array
-    """Π, shape (N, 3, 3)."""
-    transitions: Array
-    """Φ, shape (N, 3, 3)."""
-    sensitivity: Array
-    """Ψ, shape (N, 3, 2n)."""
-    factor: Array
-    """Lower Cholesky factor of S, shape (2n, 2n)."""
-    landmarks: Array
-    """P_l, shape (2n, 2n)."""
+    given_map: Array  # Π, shape (N, 3, 3)
+    transitions: Array  # Φ, shape (N, 3, 3)
+    sensitivity: Array  # Ψ, shape (N, 3, 2n)
+    factor: Array  # lower Cholesky factor of S, shape (2n, 2n)
+    landmarks: Array  # P_l, shape (2n, 2n)
 
 
 class SmoothedDrive:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..filters.ekf import MotionNoise, checked_rules
-from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE, Rules
+from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE
 from ..kernels.scan_update import predict
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import pose_rotation
@@ -23,21 +23,18 @@ from ..support import argument_checks
 class Motion(NamedTuple):
     """The odometry between two poses."""
 
+    # (d, α, dt) of each reading [m, rad, -].
     steps: tuple[tuple[float, float, float], ...]
-    """(d, α, dt) of each reading [m, rad, -]."""
+    # Where they lead, in the frame of the first pose, shape (3,) [m, m, rad].
     increment: Array
-    """Where they lead, in the frame of the first pose, shape (3,) [m, m, rad]."""
-    covariance: Array
-    """Of the noise in that frame, shape (3, 3)."""
+    covariance: Array  # of the noise in that frame, shape (3, 3)
 
 
 class Sightings(NamedTuple):
     """The readings of one pose."""
 
-    measurements: Array
-    """Rows (β, r), shape (m, 2) [rad, m]."""
-    ids: IntArray
-    """Landmark of each, shape (m,)."""
+    measurements: Array  # rows (β, r), shape (m, 2) [rad, m]
+    ids: IntArray  # landmark of each, shape (m,)
 
 
 class Drive:
@@ -90,13 +87,23 @@ class Drive:
         min_range: float = 1e-3,
     ) -> None:
         self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest)
-        self.rules = _sensor_rules(
+        self.rules = rules = checked_rules(
             measurement_std,
-            range_std_per_metre,
-            bearing_std_metres,
-            range_noise_at,
-            min_range,
+            linearisation=AT_ESTIMATE,
+            frame=ADDITIVE,
+            landmark_init="full",
+            range_std_per_metre=range_std_per_metre,
+            bearing_std_metres=bearing_std_metres,
+            range_noise_at=range_noise_at,
+            gate_probability=None,
+            min_range=min_range,
         )
+        bearing_noise = rules.bearing_std or rules.bearing_std_metres
+        if not (bearing_noise and (rules.range_std or rules.range_std_per_metre)):
+            raise ValueError(
+                "measurement_std must be > 0 to smooth, got "
+                f"({rules.bearing_std:g}, {rules.range_std:g})"
+            )
         self.initial_pose = argument_checks.finite_vector(
             "initial_pose", initial_pose, 3
         )
@@ -233,39 +240,8 @@ class Drive:
         return Motion(tuple(steps), pose, covariance)
 
     def __repr__(self) -> str:
-        readings = sum(len(scan.ids) for scans in self._sightings for scan in scans)
-        landmarks = len(self.landmark_ids)
-        return (
-            f"Drive of {self.poses} poses, {readings} readings of {landmarks} landmarks"
-        )
-
-
-def _sensor_rules(
-    measurement_std: ArrayLike,
-    range_std_per_metre: float,
-    bearing_std_metres: float,
-    range_noise_at: str,
-    min_range: float,
-) -> Rules:
-    """Return the noise of the sensor as rules; refuse a sensor without noise."""
-    rules = checked_rules(
-        measurement_std,
-        linearisation=AT_ESTIMATE,
-        frame=ADDITIVE,
-        landmark_init="full",
-        range_std_per_metre=range_std_per_metre,
-        bearing_std_metres=bearing_std_metres,
-        range_noise_at=range_noise_at,
-        gate_probability=None,
-        min_range=min_range,
-    )
-    bearing_noise = rules.bearing_std or rules.bearing_std_metres
-    if not (bearing_noise and (rules.range_std or rules.range_std_per_metre)):
-        raise ValueError(
-            "measurement_std must be > 0 to smooth, got "
-            f"({rules.bearing_std:g}, {rules.range_std:g})"
-        )
-    return rules
+        readings = f"{self.readings} readings of {len(self.landmark_ids)} landmarks"
+        return f"Drive of {self.poses} poses, {readings}"
 
 
 # --------------------------------------------------------------------------------------
@@ -278,29 +254,24 @@ def _sensor_rules(
 # ε_k = N_k w_k  noise of that motion in the frame of pose k − 1, w_k ~ N(0, I)
 # V_k            whitener: V_k N_k = I where N_k has full rank
 
+# Variance of a direction without noise, relative to that of the noisiest one.
 NEGLIGIBLE = 1e-12
-"""Variance of a direction without noise, relative to that of the noisiest one."""
 
 
 class DriveArrays(NamedTuple):
     """N poses, M readings of n landmarks; entry 0 of the motions is the prior."""
 
-    start: Array
-    """Prior mean of pose 0, shape (3,)."""
-    increments: Array
-    """Δ_k, shape (N, 3) [m, m, rad]; row 0 is not read."""
-    factors: Array
-    """N_k, shape (N, 3, 3); entry 0 is the deviation of the prior."""
-    whiteners: Array
-    """V_k, shape (N, 3, 3)."""
+    start: Array  # prior mean of pose 0, shape (3,)
+    increments: Array  # Δ_k, shape (N, 3) [m, m, rad]; row 0 is not read
+    factors: Array  # N_k, shape (N, 3, 3); entry 0 is the deviation of the prior
+    whiteners: Array  # V_k, shape (N, 3, 3)
+    # The readings of pose k are rows firsts[k] … firsts[k + 1], shape (N + 1,).
     firsts: IntArray
-    """The readings of pose k are rows firsts[k] … firsts[k + 1], shape (N + 1,)."""
-    readings: Array
-    """Rows (β, r), shape (M, 2) [rad, m]."""
+    readings: Array  # rows (β, r), shape (M, 2) [rad, m]
+    # First column of the landmark of each reading, 2 slot, shape (M,).
     columns: IntArray
-    """First column of the landmark of each reading, 2 slot, shape (M,)."""
+    # Columns of the landmarks that pose k or a later one reads, shape (N,).
     widths: IntArray
-    """Columns of the landmarks that pose k or a later one reads, shape (N,)."""
 
 
 def noise_factors(covariances: Array) -> tuple[Array, Array]:

@@ -55,6 +55,14 @@ class Elimination(NamedTuple):
     right: Array  # (2n,) η
 
 
+class System(NamedTuple):
+    """What is left of the poses from k on, of pose k and the landmarks: Λ, λ and B."""
+
+    curvature: Array  # (3, 3)
+    slope: Array  # (3,)
+    coupling: Array  # (3, 2n)
+
+
 def new_elimination(poses: int, landmarks: int) -> Elimination:
     """Allocate room; rows beyond the landmarks that a pose meets stay zero."""
     return Elimination(
@@ -93,6 +101,7 @@ def eliminate(
     """
     curvature, slope = np.zeros((3, 3)), np.zeros(3)
     coupling = np.zeros((3, len(landmarks)))
+    system = System(curvature, slope, coupling)
     noise, room = np.empty((3, 3)), np.empty((5, 3, 3))
     out.blocks[:] = 0.0
     out.right[:] = 0.0
@@ -100,17 +109,7 @@ def eliminate(
         width = drive.widths[k]
         before = curvature[0, 0], curvature[1, 1], curvature[2, 2]
         for j in range(drive.firsts[k], drive.firsts[k + 1]):
-            _absorb(
-                poses,
-                landmarks,
-                drive,
-                (k, j),
-                (stds[j, 0], stds[j, 1], robust[0], robust[1]),
-                curvature,
-                slope,
-                coupling,
-                out,
-            )
+            _absorb((k, j), poses, landmarks, drive, stds, robust, system, out)
         for i in range(3):
             curvature[i, i] += damping * (curvature[i, i] - before[i])
             out.slopes[k, i] = slope[i]
@@ -119,10 +118,10 @@ def eliminate(
         _noise_in_world(poses, drive, k, noise, out.shifts[k])
         _minimise(curvature, slope, noise, room, out.gains[k])
         _minimise_landmarks(coupling, width, k, room, out)
-        _shift(curvature, slope, coupling, width, k, out)
+        _shift(system, width, k, out)
         if k > 0:
             turned = poses[k - 1, 1] - poses[k, 1], poses[k, 0] - poses[k - 1, 0]
-            _change_pose(curvature, slope, coupling, width, turned)
+            _change_pose(system, width, turned)
     for i in range(len(out.blocks)):
         for axis in range(2):
             out.blocks[i, axis, axis] *= 1 + damping
@@ -130,25 +129,24 @@ def eliminate(
 
 @njit_internal
 def _absorb(
+    where: tuple[int, int],
     poses: Array,
     landmarks: Array,
     drive: DriveArrays,
-    where: tuple[int, int],
-    noise: tuple[float, float, float, float],
-    curvature: Array,
-    slope: Array,
-    coupling: Array,
+    stds: Array,
+    robust: tuple[float, float],
+    system: System,
     out: Elimination,
 ) -> None:
     """Add reading j of pose k: Hᵀ Q⁻¹ H and Hᵀ Q⁻¹ ν, weighted by a robust kernel."""
     k, j = where
-    bearing_std, range_std, kind, scale = noise
-    c = drive.columns[j]
+    curvature, slope, coupling = system
+    bearing_std, range_std, c = stds[j, 0], stds[j, 1], drive.columns[j]
     to_bearing, to_range = innovation(poses, landmarks, drive, k, j)
     dx, dy = landmarks[c] - poses[k, 0], landmarks[c + 1] - poses[k, 1]
     bx, by, rx, ry = reading_slopes_jit(dx, dy)
     squared = (to_bearing / bearing_std) ** 2 + (to_range / range_std) ** 2
-    weight = robust_weight(squared, kind, scale)
+    weight = robust_weight(squared, robust[0], robust[1])
     b, r = weight / bearing_std**2, weight / range_std**2
     xx, yy = b * bx * bx + r * rx * rx, b * by * by + r * ry * ry
     xy = b * bx * by + r * rx * ry
@@ -242,16 +240,9 @@ def _minimise_landmarks(
 
 
 @njit_internal
-def _shift(
-    curvature: Array,
-    slope: Array,
-    coupling: Array,
-    width: int,
-    k: int,
-    out: Elimination,
-) -> None:
+def _shift(system: System, width: int, k: int, out: Elimination) -> None:
     """Replace q by q + s: λ ← λ − Λ s, η ← η − Bᵀ s."""
-    s = out.shifts[k]
+    (curvature, slope, coupling), s = system, out.shifts[k]
     for i in range(3):
         for j in range(3):
             slope[i] -= curvature[i, j] * s[j]
@@ -262,15 +253,9 @@ def _shift(
 
 
 @njit_internal
-def _change_pose(
-    curvature: Array,
-    slope: Array,
-    coupling: Array,
-    width: int,
-    turned: tuple[float, float],
-) -> None:
+def _change_pose(system: System, width: int, turned: tuple[float, float]) -> None:
     """Write q = G δ: Λ ← Gᵀ Λ G, λ ← Gᵀ λ, B ← Gᵀ B, G = I + (turned, 0) e_θᵀ."""
-    tx, ty = turned
+    (curvature, slope, coupling), (tx, ty) = system, turned
     slope[2] += tx * slope[0] + ty * slope[1]
     for c in range(width):
         coupling[2, c] += tx * coupling[0, c] + ty * coupling[1, c]

@@ -24,21 +24,14 @@ from ..models.bearing_range import (
     wrap_angle_jit,
 )
 from ..support.memory_limit import refuse_beyond_memory
+from . import elimination
 from .drive import Drive, DriveArrays
-from .elimination import (
-    CAUCHY,
-    HUBER,
-    SQUARED,
-    Elimination,
-    eliminate,
-    new_elimination,
-    reading_stds,
-    robust_loss,
-    substitute,
-    total_cost,
-)
 
-KINDS = {None: SQUARED, "huber": HUBER, "cauchy": CAUCHY}
+KINDS = {
+    None: elimination.SQUARED,
+    "huber": elimination.HUBER,
+    "cauchy": elimination.CAUCHY,
+}
 SLACK = 1e-12  # of the cost, in rounding
 REWEIGHTED = 30  # iterations; from then on the noise is fixed
 SHRINKING = 0.5  # steps that shrink by this factor converge linearly
@@ -51,21 +44,16 @@ FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
 class Noise(NamedTuple):
     """The noise of the sensor, and how much an outlier counts."""
 
-    rules: Rules
-    """Of a filter, which hold the noise."""
-    kind: float
-    """Of the robust kernel, one of `KINDS`."""
-    scale: float
-    """Of the robust kernel, in standard deviations."""
+    rules: Rules  # of a filter, which hold the noise
+    kind: float  # of the robust kernel, one of `KINDS`
+    scale: float  # of the robust kernel, in standard deviations
 
 
 class Estimate(NamedTuple):
     """Poses and landmarks."""
 
-    poses: Array
-    """Shape (N, 3), heading not wrapped."""
-    landmarks: Array
-    """Shape (2n,), in the order of the elimination."""
+    poses: Array  # (N, 3), heading not wrapped
+    landmarks: Array  # (2n,), in the order of the elimination
 
 
 class Solution(NamedTuple):
@@ -73,20 +61,18 @@ class Solution(NamedTuple):
 
     estimate: Estimate
     cost: float
-    first_cost: float
-    """Of the start."""
+    first_cost: float  # of the start
     iterations: int
+    # Whether the last step was damped, so that its system may be singular.
     is_damped: bool
-    """Whether the last step was damped, so that its system may be singular."""
 
 
 class Minimum(NamedTuple):
     """A solution with the system linearised there."""
 
     solution: Solution
-    elimination: Elimination
-    information: Array
-    """Of the landmarks, shape (2n, 2n)."""
+    elimination: elimination.Elimination
+    information: Array  # of the landmarks, shape (2n, 2n)
 
 
 class _State:
@@ -127,7 +113,7 @@ class Optimiser:
             8 * (6 * poses * 2 * landmarks + 3 * (2 * landmarks) ** 2),
             "smooth a part of the drive, or a drive with fewer landmarks",
         )
-        self._room = new_elimination(poses, landmarks)
+        self._room = elimination.new_elimination(poses, landmarks)
         rules = noise.rules
         self._rule_values = np.array(rules)
         self._robust = noise.kind, noise.scale
@@ -198,16 +184,16 @@ class Optimiser:
 
     def reading_stds(self, estimate: Estimate) -> Array:
         """Return (σβ, σr) of each reading, shape (M, 2), at its expected range."""
-        return reading_stds(*estimate, self._drive, self._rule_values)
+        return elimination.reading_stds(*estimate, self._drive, self._rule_values)
 
     def cost(self, estimate: Estimate, stds: Array) -> float:
         """Return the cost, with the noise of every reading given."""
-        return total_cost(*estimate, self._drive, stds, *self._robust)
+        return elimination.total_cost(*estimate, self._drive, stds, *self._robust)
 
     def linearise(self, estimate: Estimate, stds: Array, damping: float = 0.0) -> Array:
         """Eliminate the poses; return the information of the landmarks, (2n, 2n)."""
         room, drive = self._room, self._drive
-        eliminate(*estimate, drive, stds, self._robust, damping, room)
+        elimination.eliminate(*estimate, drive, stds, self._robust, damping, room)
         rows = room.rows.reshape(-1, len(room.right))
         information = -(rows.T @ rows)
         n = len(room.blocks)
@@ -250,7 +236,9 @@ class Optimiser:
         information = self.linearise(estimate, stds, damping)
         factor = factorised(information)
         landmark_step = cho_solve(factor, self._room.right)
-        poses = substitute(estimate.poses, self._drive, landmark_step, self._room)
+        poses = elimination.substitute(
+            estimate.poses, self._drive, landmark_step, self._room
+        )
         return Estimate(poses, estimate.landmarks + landmark_step)
 
 
@@ -370,7 +358,7 @@ def _cost_at(
         to_bearing = wrap_angle_jit(z[0] - bearing)
         squared = to_bearing**2 / bearing_variance(rules, z[1])
         squared += (z[1] - distance) ** 2 / range_variance(rules, z[1])
-        total += robust_loss(squared, robust[0], robust[1])
+        total += elimination.robust_loss(squared, robust[0], robust[1])
     return total
 
 

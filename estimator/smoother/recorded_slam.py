@@ -32,8 +32,7 @@ class Event(NamedTuple):
     """One event of a drive, after all those before it."""
 
     before: Event | None
-    name: str
-    """Method of :class:`Drive` that takes it in."""
+    name: str  # method of :class:`Drive` that takes it in
     arguments: tuple[Any, ...]
 
 

@@ -91,30 +91,28 @@ def refuse_beyond_memory(
         )
 
 
-def landmarks_that_fit(least: int, wished: int, copies: int = 1) -> int:
+def landmarks_that_fit(least: int, wished: int) -> int:
     """Return the number of landmarks to allocate for, as far as memory allows.
 
     Parameters
     ----------
     least, wished : int
         Smallest and desired number of landmarks.
-    copies : int
-        Number of covariances of that size.
 
     Raises
     ------
     MemoryError
         If the smallest number does not fit.
     """
-    if copies * covariance_bytes(wished) < SMALL:
+    if covariance_bytes(wished) < SMALL:
         return wished
     refuse_beyond_memory(
         f"a covariance of {least} landmarks",
-        copies * covariance_bytes(least),
+        covariance_bytes(least),
         "'submaps' and 'sparse_information' take less",
     )
     free = available_memory()
-    most = wished if free == inf else int((sqrt(free / copies / 8) - 3) / 2)
+    most = wished if free == inf else int((sqrt(free / 8) - 3) / 2)
     return max(least, min(wished, most))
 
 

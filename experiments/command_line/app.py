@@ -8,7 +8,8 @@ it imports what is heavy when it runs, so that help answers at once.
 import inspect
 from typing import Any
 
-from . import run, replay, fit_noise, monte_carlo, generate, noise_study, render_video
+from . import run, replay, fit_noise, monte_carlo, generate, judge, noise_study
+from . import render_video
 from .options import Options, takes
 from .program import command, main
 from .reporter import Reporter
@@ -16,6 +17,7 @@ from .reporter import Reporter
 __all__ = [
     "fit_noise",
     "generate",
+    "judge",
     "main",
     "monte_carlo",
     "noise_study",

@@ -23,8 +23,7 @@ def generate(
     *,
     given: Options,
     episodes: Annotated[
-        int,
-        option("N", "Number of episodes; episode i has seed SEED + i.", min=1),
+        int, option("N", "Number of episodes; episode i has seed SEED + i.", min=1)
     ],
     format_: Annotated[
         str,

@@ -11,30 +11,22 @@ from typing import Annotated, Any
 from rich.text import Text
 
 from ...sim_configs import load_scenario
-from .options import (
-    REPEATED,
-    Options,
-    ScenarioName,
-    changes,
-    option,
-    refuse_broken,
-    takes,
-)
+from . import options
 from .program import FAILURE, BadInputError, command, interruptible
 
 
 @command
-@takes(
+@options.takes(
     "estimators runs seed steps set_ assume resolution jobs backend scheduler "
     "block_size first_run merge fresh out as_json"
 )
 def monte_carlo(
-    scenario: ScenarioName,
+    scenario: options.ScenarioName,
     *,
-    given: Options,
+    given: options.Options,
     estimators: Annotated[
         str,
-        option(
+        options.option(
             "--estimators -e NAMES",
             'Filters separated by commas, such as "ekf,invariant[iterations=3]", or '
             'your own "module:Class"; options in brackets.',
@@ -42,7 +34,7 @@ def monte_carlo(
     ] = "ekf,invariant",
     runs: Annotated[
         int,
-        option(
+        options.option(
             "",
             "Number of runs. Run i is the world of seed SEED + i; jobs whose seeds are "
             "closer than this share worlds.",
@@ -50,32 +42,31 @@ def monte_carlo(
     ] = 200,
     assume: Annotated[
         list[str] | None,
-        option(
+        options.option(
             "KEY=VALUE",
             "A change of the scenario that only the filters assume, such as "
-            f"motion.std=[0.1,0.1,0.1]. {REPEATED}",
+            f"motion.std=[0.1,0.1,0.1]. {options.REPEATED}",
         ),
     ] = None,
     block_size: Annotated[
-        int, option("N", "Number of runs computed and written together.")
+        int, options.option("N", "Number of runs computed and written together.")
     ] = 64,
     first_run: Annotated[
-        int,
-        option("N", "Omit the runs below N, a multiple of the block size."),
+        int, options.option("N", "Omit the runs below N, a multiple of the block size.")
     ] = 0,
     merge: Annotated[
         list[Path] | None,
-        option(
+        options.option(
             "DIR",
-            "Add the results of another machine for this job. " + REPEATED,
+            "Add the results of another machine for this job. " + options.REPEATED,
         ),
     ] = None,
     fresh: Annotated[
-        bool, option("--fresh", "Remove earlier results in the folder first.")
+        bool, options.option("--fresh", "Remove earlier results in the folder first.")
     ] = False,
     out: Annotated[
         Path | None,
-        option(
+        options.option(
             "DIR",
             "The folder to write. An interrupted job there continues, and more runs "
             "are added to existing ones.",
@@ -102,14 +93,15 @@ def monte_carlo(
     from ..jobs import replace_own
     from ..monte_carlo.report import monte_carlo_table, write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
+    from ..monte_carlo.runner import SMALL_NOISE_SHARE
     from ..monte_carlo.verdict import diagnosis_lines
     from .output_folder import as_json_text, default_folder
     from .tables import written
 
     world = given.scenario(scenario)
-    assumed = changes("--assume", assume)
+    assumed = options.changes("--assume", assume)
     reporter = given.reporter()
-    refuse_broken(estimators)
+    options.refuse_broken(estimators)
     place = out or default_folder("monte-carlo", world.name)
     told = world.with_changes(**assumed) if assumed else world
     with reporter.note_if_compiling("the filters"):
@@ -139,6 +131,7 @@ def monte_carlo(
             resolution=given.resolution,
             command=shlex.join(["slamgym", *sys.argv[1:]]),
             progress=tick,
+            small_noise=True,
         ) as results,
     ):
         summary = monte_carlo.summarise_monte_carlo(results)
@@ -152,6 +145,9 @@ def monte_carlo(
         for label, entry in summary["estimators"].items()
         for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
     ]
+    if share := results.attrs.get(SMALL_NOISE_SHARE):
+        text = f"Runs with less noise, which show causes, took {share:.0%} of the time."
+        sentences.append(Text(text))
     reporter.show(monte_carlo_table(summary), "", *sentences, "")
     if summary["notes"]:
         reporter.show(*map(Text, summary["notes"]), "")

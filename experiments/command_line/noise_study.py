@@ -130,11 +130,7 @@ def noise_study(
             estimator,
             settings,
             partial(
-                study_scenario,
-                world,
-                given.record,
-                estimator=estimator,
-                options=chosen,
+                study_scenario, world, given.record, estimator=estimator, options=chosen
             ),
         )
     else:

@@ -74,6 +74,13 @@ ScenarioName = Annotated[
 LogFile = Annotated[
     Path, typer.Argument(metavar="LOG", help="A log of any format that replay reads.")
 ]
+FilesOfEstimates = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="FILES",
+        help="Files of estimates, or folders of them; each folder is an estimator.",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,9 +262,7 @@ class Options:
         return make_controller(self.controller, scenario, random)
 
     def record(
-        self,
-        scenario: Scenario,
-        progress: Callable[[int, int], object] | None = None,
+        self, scenario: Scenario, progress: Callable[[int, int], object] | None = None
     ) -> "SlamLog":
         """Record one episode with the controller; see `record_episode`."""
         from ..logs.recording import record_episode

@@ -35,8 +35,7 @@ def render(
         ),
     ] = "invariant",
     fps: Annotated[
-        float | None,
-        option("N", "Frames (steps) per second.", "so that it lasts 12 s"),
+        float | None, option("N", "Frames (steps) per second.", "so that it lasts 12 s")
     ] = None,
 ) -> None:
     """Film an episode as .gif or .mp4.

@@ -8,20 +8,12 @@ from typing import Annotated
 import typer
 
 from .. import figures, runs
-from .options import (
-    LogFile,
-    Options,
-    assignments,
-    note_choices,
-    note_noise,
-    option,
-    takes,
-)
+from . import options
 from .program import command
 
 
 @command
-@takes(
+@options.takes(
     "labels motion_std measurement_std initial_pose_std landmark_init gate_probability "
     "range_std_per_metre noise_at_rest option_texts hide_identities resolution robot "
     "truth noise_from_file out every_step rerun as_json"
@@ -36,10 +28,10 @@ def replay(
         ),
     ],
     *,
-    given: Options,
+    given: options.Options,
     hide_identities: Annotated[
         bool,
-        option(
+        options.option(
             "--hide-identities",
             "Let the filter associate the readings of a log that identifies them, and "
             "score it.",
@@ -67,30 +59,32 @@ def replay(
     reporter = given.reporter()
     check_rerun(given.rerun)
     drive = replace(given, hide_identities=hide_identities).read(log)
-    note_choices(drive, reporter)
+    options.note_choices(drive, reporter)
     stds = given.stds()
     filters = given.filters(partial(settings_for, drive, **stds))
     place = given.out or default_folder(drive.name, *filters)
     with output_folder(place) as folder:
         summary = filter_and_write(drive, filters, folder, given, reporter)
     chosen = {*stds, *given.named_options()}
-    note_noise(drive, next(iter(filters.values())), chosen, reporter)
+    options.note_noise(drive, next(iter(filters.values())), chosen, reporter)
     show_run(summary, place, reporter)
 
 
 @command
-@takes(
+@options.takes(
     "estimator motion_std measurement_std initial_pose_std robust gate_probability "
     "range_std_per_metre noise_at_rest option_texts robot truth noise_from_file out "
     "as_json"
 )
 def smooth(
-    log: LogFile,
+    log: options.LogFile,
     *,
-    given: Options,
+    given: options.Options,
     robust: Annotated[
         str | None,
-        option("huber|cauchy", "Give outliers less weight.", "all weigh the same"),
+        options.option(
+            "huber|cauchy", "Give outliers less weight.", "all weigh the same"
+        ),
     ] = None,
 ) -> None:
     """Smooth a log: estimate all poses and landmarks at once.
@@ -113,10 +107,12 @@ def smooth(
 
     name, own = read_label(given.estimator)
     chosen = given.named_options() | ({"robust": robust} if robust is not None else {})
-    chosen |= assignments("--option", given.option_texts) | own | {"follow": name}
+    chosen |= (
+        options.assignments("--option", given.option_texts) | own | {"follow": name}
+    )
     reporter = given.reporter()
     drive = given.read(log)
-    note_choices(drive, reporter)
+    options.note_choices(drive, reporter)
     stated = given.stds()
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)
@@ -130,7 +126,7 @@ def smooth(
             smoothed = runs.smooth_log(drive, settings, progress=tick)
         figures.save_figure(figures.smoothed_figure(smoothed), folder / "map.png")
         summary = write_summary(folder, runs.summarise_smoothing(smoothed, settings))
-    note_noise(drive, settings, {*stds, *chosen}, reporter)
+    options.note_noise(drive, settings, {*stds, *chosen}, reporter)
     title = heading("", summary["log"], " smoothed, following ", given.estimator)
     files = written(str(place), summary["files"])
     is_compared = any(summary[key]["filter"] for key in ("ate", "landmark_rmse"))

@@ -24,6 +24,7 @@ _CHANGES = {name: name for name in ("confirmed", "removed", "merged")}
 _MOST_ROWS = 10  # landmarks; larger maps show the worst ones
 _WORST, _FEWER = 5, 3  # of them; fewer above the table of several filters
 _WIDTH = 80  # of a terminal
+_LARGE_NEES = 1.5  # per degree, with a suggested noise
 _TOO_MUCH, _TOO_LITTLE = 0.5, 2.0  # of NIS or NEES per degree, where 1 is expected
 
 
@@ -176,7 +177,7 @@ def comparison_table(columns: Mapping[str, Mapping[str, Any]]) -> Table:
     columns : mapping
         By the heading, ``ate``, ``landmark_rmse`` and ``nees`` as in a run's summary.
     """
-    from ..monte_carlo.report import headings_and_key
+    from ..figures.style import headings_and_key
 
     headings, key_of_headings = headings_and_key(list(columns))
     caption = Text(key_of_headings) if key_of_headings else None
@@ -302,7 +303,7 @@ def runs_table(runs: "Sequence[NoiseRun]") -> Table:
 
 def effects_table(name: str, runs: int, effects: "Sequence[NoiseEffect]") -> Table:
     """Lay out the study over many runs, a column for each estimator."""
-    from ..monte_carlo.report import headings_and_key
+    from ..figures.style import headings_and_key
 
     labels = list(dict.fromkeys(effect.estimator for effect in effects))
     headings, key = headings_and_key(labels)
@@ -394,12 +395,37 @@ def advice(summary: dict[str, Any]) -> Table:
         text = f"{', '.join(inflated)}: the errors of readings are correlated in time"
     rows = [("inflation", text)]
     if summary["calibration"] is not None:
-        factor, low, high = (
-            f"{summary['calibration'][key]:.3g}" for key in ("factor", "low", "high")
+        rows.append(("with the true path", _calibration(**summary["calibration"])))
+    nees = _at(summary["runs"]["suggested"], ("nees", "per_degree"))
+    if nees is not None and nees > _LARGE_NEES:
+        text = (
+            f"the pose NEES is {nees:.3g} per degree with the suggested noise, where 1 "
+            "is expected: the filter stays overconfident"
         )
-        text = f"× {factor} ({low} … {high}) of the most likely σβ and σr"
-        rows.append(("by the truth", f"{text} would make the pose NEES 1 per degree"))
+        rows.append(("remaining", text))
     return named_rows(rows)
+
+
+def _calibration(
+    factor: float | None, low: float, high: float | None, tried: Sequence[float]
+) -> str:
+    """Write a factor of the sensor's noise with its interval.
+
+    Examples
+    --------
+    >>> _calibration(1.14, 0.609, None, (0.25, 16))
+    'multiply σβ and σr by 1.14 (at least 0.61) for a pose NEES of 1 per degree'
+    """
+    if factor is None:
+        return f"no factor of σβ and σr up to {tried[1]:g} gives a pose NEES of 1"
+    if not factor:
+        return f"σβ and σr times {tried[0]:g} give a pose NEES below 1"
+    if high is not None:
+        within = f"{low:.2g} to {high:.2g}" if low else f"at most {high:.2g}"
+    else:
+        within = f"at least {low:.2g}" if low else "not known better"
+    text = f"multiply σβ and σr by {factor:.3g} ({within})"
+    return f"{text} for a pose NEES of 1 per degree"
 
 
 def _interval(row: dict[str, Any]) -> str:

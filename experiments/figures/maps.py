@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ...arrays import Array
-from ...envs.rendering import BlittedFigure
-from ...envs.rendering.scene import (
-    ELLIPSE_HANDLER,
-    EllipseKind,
-    arrow_at,
-    set_ellipses,
-    wall_lines,
-)
+from ...envs.rendering import BlittedFigure, scene
 from ...estimator.models.rigid_motion import rotation
 from ...evaluation.trajectory_error import PositionAccuracy, poses_at
 from ...sim_configs.atomic_file import replace_when_written
@@ -145,7 +138,7 @@ def noise_study_figure(runs: Sequence[tuple[str, RunTrace]]) -> Figure:
     beside.set_axis_off()
     beside.legend(
         handles=picture.legend_keys(),
-        handler_map=ELLIPSE_HANDLER,
+        handler_map=scene.ELLIPSE_HANDLER,
         loc="center left",
         frameon=False,
         fontsize=10,
@@ -262,11 +255,11 @@ def _label_outer_axes(grid: NDArray[np.object_], panels: int) -> None:
 # green, each with its 3σ ellipse. The kinds also differ by line style, for colour-blind
 # readers.
 
-PREDICTED = EllipseKind("predicted pose, 3σ", "#d216c6", (0, (4, 3)), width=1.2)
-UPDATED = EllipseKind("updated pose, 3σ", "#1d4ed8", fill=0.12, width=1.3)
-FIRST = EllipseKind("landmark at first, 3σ", "#dc1f26", (0, (5, 1.5, 1, 1.5)))
-LATER = EllipseKind("landmark later, 3σ", "#128a3a", fill=0.16, width=1.5)
-_FORMER = EllipseKind("landmark in between", LATER.colour, width=0.6, alpha=0.35)
+PREDICTED = scene.EllipseKind("predicted pose, 3σ", "#d216c6", (0, (4, 3)), width=1.2)
+UPDATED = scene.EllipseKind("updated pose, 3σ", "#1d4ed8", fill=0.12, width=1.3)
+FIRST = scene.EllipseKind("landmark at first, 3σ", "#dc1f26", (0, (5, 1.5, 1, 1.5)))
+LATER = scene.EllipseKind("landmark later, 3σ", "#128a3a", fill=0.16, width=1.5)
+_FORMER = scene.EllipseKind("landmark in between", LATER.colour, width=0.6, alpha=0.35)
 
 _MOST_POSES = 60  # ellipses along the path; longer runs show every second, third, …
 _MOST_FORMER = 300  # green ellipses of earlier steps; large maps show fewer steps
@@ -316,19 +309,19 @@ class MapPicture:
         artists, trace = self._artists, self._trace
         steps = np.append(np.arange(0, step, pose_stride(trace)), step)
         artists.path.set_data(*trace.poses[: step + 1, :2].T)
-        set_ellipses(
+        scene.set_ellipses(
             artists.predicted,
             trace.predicted_poses[steps, :2],
             trace.predicted_pose_covariances[steps, :2, :2],
         )
-        set_ellipses(
+        scene.set_ellipses(
             artists.updated,
             trace.poses[steps, :2],
             trace.pose_covariances[steps, :2, :2],
         )
         (left, right), (low, high) = self._axes.get_xlim(), self._axes.get_ylim()
         size = 0.018 * max(right - left, high - low)
-        artists.robot.set_xy(arrow_at(trace.poses[step], size))
+        artists.robot.set_xy(scene.arrow_at(trace.poses[step], size))
         self._show_landmarks(step)
 
     def legend_keys(self) -> list[Artist]:
@@ -341,17 +334,17 @@ class MapPicture:
     def _show_landmarks(self, step: int) -> None:
         artists, trace = self._artists, self._trace
         seen = self._first_steps <= step
-        set_ellipses(
+        scene.set_ellipses(
             artists.first,
             trace.first_landmarks[seen],
             trace.first_landmark_covariances[seen],
         )
         now = trace.map_at(step)
-        set_ellipses(artists.later, now.means, now.covariances)
+        scene.set_ellipses(artists.later, now.means, now.covariances)
         artists.estimates.set_data(*now.means.T)
         stride = -(-trace.last_step * len(self._first_steps) // _MOST_FORMER)
         former = [trace.map_at(k) for k in range(0, step, max(1, stride))]
-        set_ellipses(
+        scene.set_ellipses(
             artists.former,
             np.concatenate([np.empty((0, 2)), *(m.means for m in former)]),
             np.concatenate([np.empty((0, 2, 2)), *(m.covariances for m in former)]),
@@ -468,13 +461,13 @@ def draw_walls(axes: Axes, walls: Walls) -> list[Artist]:
     """Draw walls, and return the keys of a legend: none without walls."""
     if not len(walls):
         return []
-    lines = wall_lines(wall_ends(walls), 2.2, zorder=1.5)
+    lines = scene.wall_lines(wall_ends(walls), 2.2, zorder=1.5)
     axes.add_collection(lines, autolim=False)
     return [lines]
 
 
-_LANDMARK = EllipseKind("smoothed landmark, 3σ", TEAL, fill=0.15)
-_POSE = EllipseKind("smoothed pose, 3σ", style.BLUE, fill=0.12, width=0.9)
+_LANDMARK = scene.EllipseKind("smoothed landmark, 3σ", TEAL, fill=0.15)
+_POSE = scene.EllipseKind("smoothed pose, 3σ", style.BLUE, fill=0.12, width=0.9)
 
 
 def smoothed_figure(smoothed: SmoothedLog) -> Figure:

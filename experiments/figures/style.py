@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,15 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+def lay_out(figure: Figure, dpi: float) -> None:
+    """Lay a figure out for good: with its engine, each drawing would do so anew."""
+    figure.set_dpi(dpi)
+    if (layout := figure.get_layout_engine()) is not None:
+        for _ in range(2):  # equal axes need a second time
+            layout.execute(figure)
+        figure.set_layout_engine("none")
+
+
 def save_figure(figure: Figure, path: str | Path, dpi: float = 200) -> None:
     """Write a figure to a file, which appears complete or not at all.
 
@@ -59,7 +69,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 200) -> None:
             f"path must end in one of {', '.join(f'.{f}' for f in sorted(formats))}, "
             f"got {str(path)!r}"
         )
-    figure.draw_without_rendering()  # equal axes need a second layout
+    lay_out(figure, dpi)
     with replace_when_written(target) as partial:
         metadata = _METADATA.get(target.suffix.lower())
         with rc_context({"svg.hashsalt": "slamgym"}):  # makes its ids reproducible
@@ -127,6 +137,37 @@ def legend_below(figure: Figure, keys: Sequence[Artist], columns: int) -> None:
         frameon=False,
         fontsize=9,
     )
+
+
+_ROOM = 36  # characters for all columns of a terminal of 80
+_GAP = 2
+
+
+def headings_and_key(labels: Sequence[str]) -> tuple[list[str], str]:
+    r"""Return the headings of columns, and the key that explains short ones.
+
+    Labels that fit beside each other are headings themselves, and the key is empty.
+    Else the headings are letters, and the key has a line for each.
+
+    Examples
+    --------
+    >>> headings_and_key(["ekf", "invariant"])
+    (['ekf', 'invariant'], '')
+    >>> headings, key = headings_and_key(["ekf", "invariant[iterations=3]", "iterated"])
+    >>> print(headings, key, sep="\n")
+    ['A', 'B', 'C']
+    A  ekf
+    B  invariant[iterations=3]
+    C  iterated
+    """
+    fits = sum(len(label) + _GAP for label in labels) <= _ROOM
+    if fits or len(labels) > len(ascii_uppercase):
+        return list(labels), ""
+    letters = ascii_uppercase[: len(labels)]
+    lines = [
+        f"{letter}  {label}" for letter, label in zip(letters, labels, strict=True)
+    ]
+    return list(letters), "\n".join(lines)
 
 
 # --------------------------------------------------------------------------------------

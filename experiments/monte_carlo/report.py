@@ -7,10 +7,9 @@ column per estimator, and `inline_svg` draws figures in the page's fonts and col
 import html
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from html import escape
 from pathlib import Path
-from string import ascii_uppercase
 from typing import Any
 
 import xarray as xr
@@ -23,7 +22,18 @@ from rich.text import Text
 from ...evaluation.consistency_report import FEW_AVERAGES
 from ...evaluation.diagnosis import p_text
 from ...sim_configs.atomic_file import replace_when_written
-from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, PALE, TEAL, page_environment
+from ..figures.style import (
+    ALARM,
+    BLUE,
+    GREY,
+    INK,
+    ORANGE,
+    PALE,
+    TEAL,
+    headings_and_key,
+    lay_out,
+    page_environment,
+)
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
 from .runner import ASSUMED_FILE, python_call
 from .summary import NOTHING, measures, number, percent
@@ -223,37 +233,6 @@ def _bad_run(summary: dict[str, Any]) -> str:
     )
 
 
-_ROOM = 36  # characters for all columns of a terminal of 80
-_GAP = 2
-
-
-def headings_and_key(labels: Sequence[str]) -> tuple[list[str], str]:
-    r"""Return the headings of columns, and the key that explains short ones.
-
-    Labels that fit beside each other are headings themselves, and the key is empty.
-    Else the headings are letters, and the key has a line for each.
-
-    Examples
-    --------
-    >>> headings_and_key(["ekf", "invariant"])
-    (['ekf', 'invariant'], '')
-    >>> headings, key = headings_and_key(["ekf", "invariant[iterations=3]", "iterated"])
-    >>> print(headings, key, sep="\n")
-    ['A', 'B', 'C']
-    A  ekf
-    B  invariant[iterations=3]
-    C  iterated
-    """
-    fits = sum(len(label) + _GAP for label in labels) <= _ROOM
-    if fits or len(labels) > len(ascii_uppercase):
-        return list(labels), ""
-    letters = ascii_uppercase[: len(labels)]
-    lines = [
-        f"{letter}  {label}" for letter, label in zip(letters, labels, strict=True)
-    ]
-    return list(letters), "\n".join(lines)
-
-
 COLOUR_VARIABLES = {
     INK: "--ink",
     "#000000": "--ink",
@@ -286,7 +265,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
         Text for screen readers.
     """
     buffer = io.StringIO()
-    figure.draw_without_rendering()
+    lay_out(figure, 72)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()

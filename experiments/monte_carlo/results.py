@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from importlib.metadata import version
@@ -38,7 +39,14 @@ from ..jobs import (
     set_aside,
 )
 from ..runs.filter_settings import EstimatorChoice
-from .run_measures import NOISE_SIZES, VARIABLES, Block, Variable, variables_of
+from .run_measures import (
+    NOISE_SIZES,
+    SMALL_NOISE,
+    VARIABLES,
+    Block,
+    Variable,
+    variables_of,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -111,6 +119,27 @@ def write_results(
         _write(partial, job, blocks, runs, command)
 
 
+def add_to_results(path: Path, added: Block) -> None:
+    """Add variables of shape (estimator, run) to a results file.
+
+    Parameters
+    ----------
+    path : Path
+        The file; after an error it stays as it was.
+    added : dict
+        Of `SMALL_NOISE`.
+    """
+    import netCDF4  # noqa: PLC0415
+
+    with naming(path, also=RuntimeError), replace_own(path) as partial:
+        shutil.copyfile(path, partial)
+        with netCDF4.Dataset(partial, "a") as file:
+            for name, values in added.items():
+                made = file.createVariable(name, "f8", _dims(SMALL_NOISE[name]))
+                made.long_name = SMALL_NOISE[name].meaning
+                made[:] = values
+
+
 def load_results(path: str | Path) -> xr.Dataset:
     """Open the results of a Monte Carlo; arrays are read on demand.
 
@@ -174,15 +203,19 @@ def attributes(job: Job, runs: range, command: str) -> dict[str, Any]:
         "runs": len(runs),
         "block_size": job.block_size,
         "resolution": job.resolution,
-        "versions": json.dumps(_versions()),
-        "command": command,
-        "comment": _FROM_TRUTH,
+        **provenance(command),
     }
 
 
-def _versions() -> dict[str, str]:
+def provenance(command: str) -> dict[str, str]:
+    """Return the attributes that name the command and the versions of packages."""
     own = {"slamgym": __version__, "python": platform.python_version()}
-    return own | {package: version(package) for package in _PACKAGES}
+    versions = own | {package: version(package) for package in _PACKAGES}
+    return {
+        "versions": json.dumps(versions),
+        "command": command,
+        "comment": _FROM_TRUTH,
+    }
 
 
 def _fill(
@@ -232,7 +265,7 @@ def _coordinates(job: Job, runs: range) -> dict[str, np.ndarray[Any, Any]]:
 # --------------------------------------------------------------------------------------
 # The folder of a Monte Carlo: it belongs to one job (``job.json``) and one writer.
 
-FORMAT = "slamgym monte carlo 3"
+FORMAT = "slamgym monte carlo 4"
 JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
 REPORT, SUMMARY = "report.html", "summary.json"
 

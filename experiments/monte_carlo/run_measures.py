@@ -121,6 +121,20 @@ HIDDEN_VARIABLES: dict[str, Variable] = {
 """Those of a world that hides identities; nan where unknown."""
 
 
+SMALL_NOISE: dict[str, Variable] = {
+    **{
+        f"small_noise_nees_{frame}": Variable(
+            RUN, "f8", "mean NEES of the pose, less noise"
+        )
+        for frame in ERROR_FRAMES
+    },
+    "small_noise_heading_nees": Variable(RUN, "f8", "mean NEES of the heading"),
+    "small_noise_factor": Variable(RUN, "f8", "of all noise, nan if not repeated"),
+}
+"""Of runs that were repeated with less noise to find the cause of an inconsistency; in
+the results, but in no block, if there are any."""
+
+
 def variables_of(scenario: Scenario) -> dict[str, Variable]:
     """Return the variables of the results in a world."""
     return VARIABLES if scenario.sensor.identities else HIDDEN_VARIABLES
@@ -168,8 +182,8 @@ def measure_runs(
             measured |= map_measures
         for name, value in measured.items():
             block[name][run] = value
-    block["position_bound"], block["heading_bound"] = bound.position, bound.heading
-    block["position_bound_raw"], block["map_bound"] = bound.raw_position, bound.map
+    block["position_bound"][:], block["heading_bound"][:] = bound[:2]
+    block["position_bound_raw"][:], block["map_bound"][:] = bound[2:4]
     block["noise_sums"] = noise
     block["readings"] = runs.visible.sum(axis=(1, 2))
     _write_failures(block, failures)
@@ -273,21 +287,58 @@ def _measure_map(
         return measured
     for frame in ERROR_FRAMES:
         values = nees.landmark_nees(*states, frame=frame)
-        measured[f"landmark_nees_{frame}"] = _by_id(values, ids, len(true_landmarks))
-    _, centred = invariant_squares(invariant_error(*states[:2]))
-    accuracy = position_accuracy(belief.landmarks, true_landmarks[ids])
+        measured[f"landmark_nees_{frame}"] = by_id(values, ids, len(true_landmarks))
     return measured | {
         "relative_map_nees": float(nees.relative_map_nees(*states)),
-        "map_error_centred": float(np.sqrt(centred)),
-        "landmark_rmse": accuracy.raw_rmse,
-        "landmark_rmse_aligned": accuracy.aligned_rmse,
-        "landmark_area": float(ellipse_areas(belief.landmark_covariances).mean()),
-        "landmark_error": _by_id(accuracy.raw_errors, ids, len(true_landmarks)),
+        **measure_landmarks(true_pose, true_landmarks, belief.pose, *_map_of(belief)),
         "landmark_mahalanobis": np.sqrt(measured["landmark_nees_additive"]),
     }
 
 
-def _by_id(values: Array, ids: list[int], count: int) -> Array:
+def _map_of(belief: Belief) -> tuple[list[int], Array, Array]:
+    return list(belief.landmark_ids), belief.landmarks, belief.landmark_covariances
+
+
+def measure_landmarks(
+    true_pose: Array,
+    true_landmarks: Array,
+    pose: Array,
+    ids: list[int],
+    landmarks: Array,
+    covariances: Array,
+) -> dict[str, Value]:
+    """Measure what the final map is worth without its correlations.
+
+    Parameters
+    ----------
+    true_pose, pose : ndarray, shape (3,)
+        The final pose and its estimate [m, m, rad].
+    true_landmarks : ndarray, shape (L, 2)
+        All of them [m].
+    ids : list of int
+        Which of them are in the map, n > 0 different ones.
+    landmarks : ndarray, shape (n, 2)
+        Their estimated positions [m].
+    covariances : ndarray, shape (n, 2, 2)
+        Of these [m²].
+    """
+    truth = true_landmarks[ids]
+    states = (
+        np.append(true_pose, truth.ravel()),
+        np.append(pose, landmarks.ravel()),
+    )
+    _, centred = invariant_squares(invariant_error(*states))
+    accuracy = position_accuracy(landmarks, truth)
+    return {
+        "map_error_centred": float(np.sqrt(centred)),
+        "landmark_rmse": accuracy.raw_rmse,
+        "landmark_rmse_aligned": accuracy.aligned_rmse,
+        "landmark_area": float(ellipse_areas(covariances).mean()),
+        "landmark_error": by_id(accuracy.raw_errors, ids, len(true_landmarks)),
+    }
+
+
+def by_id(values: Array, ids: list[int], count: int) -> Array:
     """Return values for all landmarks, nan for those that are not in the map."""
     rows = np.full(count, np.nan)
     rows[ids] = values

@@ -13,14 +13,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...arrays import Array
 from ...envs.spaces import count_rows
 from ...estimator import registry
 from ...estimator.interface import SupportsTruth
 from ...estimator.support.memory_limit import usable_cores
+from ...evaluation.diagnosis import SMALLEST_NOISE
 from ...sim_configs import Scenario, load_scenario
 from ..jobs import Progress, blocks_of, complete, engage_workers
 from ..runs.filter_settings import (
@@ -35,18 +38,25 @@ from .filtered_runs import bound_runs, filter_runs, noise_of_runs
 from .results import (
     RESULTS,
     Job,
+    add_to_results,
     dataset_of,
     load_results,
     opened,
     write_results,
 )
-from .run_measures import Block, measure_runs, with_known_ids
+from .run_measures import SMALL_NOISE, Block, measure_runs, with_known_ids
+from .verdict import averages_of, runs_to_repeat, scores_of
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
 BLOCK_SIZE = 64
+LESS_NOISE = 0.1, SMALLEST_NOISE
+"""Factors of all noise; the second is used if the first decides nothing."""
+SMALL_NOISE_SHARE = "small_noise_share"
+"""Attribute of results, but of no file: share of the time for runs with less noise."""
+EACH_RUN = "estimator", "run"
 _MOST_BYTES, _BYTES_OF_READING = 2**28, 17
 
 
@@ -66,6 +76,7 @@ def monte_carlo(
     resolution: float = 0.0,
     command: str = "",
     progress: Progress | None = None,
+    small_noise: bool = False,
 ) -> xr.Dataset:
     """Run estimators many times over a scenario, and measure every run.
 
@@ -106,6 +117,10 @@ def monte_carlo(
         Command that reproduces the results, to be stored with them.
     progress : callable, optional
         Called with (runs done, runs) after every block.
+    small_noise : bool
+        Whether to repeat some runs of a filter that is not consistent with less noise,
+        which shows the cause; see :func:`~slamgym.evaluation.diagnose`. The command
+        does so. The results then have the variables `SMALL_NOISE` too.
 
     Returns
     -------
@@ -156,19 +171,96 @@ def monte_carlo(
         complete, work, workers=workers, runs=len(asked), progress=progress
     )
     with one_blas_thread():
+        begun = perf_counter()
+        factors = LESS_NOISE if small_noise else ()
+        repeat = partial(_repeated, job, asked, factors, jobs=jobs, backend=backend)
         if out is None:
             found: dict[range, list[Block]] = {}
             kept = "nothing is kept without a folder for the results"
             compute(blocks, found.__setitem__, kept=kept)
             parts = ((block, found.pop(block)) for block in blocks)
-            return dataset_of(job, parts, asked, command)
+            whole = dataset_of(job, parts, asked, command)
+            added, told = repeat(perf_counter() - begun, whole)
+            variables = {name: (EACH_RUN, values) for name, values in added.items()}
+            return whole.assign(variables).assign_attrs(told)
         out = Path(out)
         with opened(out, job.identity(), fresh=fresh) as folder:
             kept = f"the finished runs are in {out}, and the same command continues"
             compute(folder.missing(blocks), folder.add, kept=kept)
             results = out / RESULTS
             write_results(results, job, folder.read(blocks, job), asked, command)
-            return load_results(results)
+            with load_results(results) as whole:
+                added, told = repeat(perf_counter() - begun, whole)
+            if added:
+                add_to_results(results, added)
+            return load_results(results).assign_attrs(told)
+
+
+def _repeated(
+    job: Job,
+    asked: range,
+    factors: Sequence[float],
+    seconds: float,
+    results: xr.Dataset,
+    **engine: Any,
+) -> tuple[dict[str, Array], dict[str, float]]:
+    """Repeat runs with less noise where that shows why a filter is not consistent.
+
+    Returns
+    -------
+    dict
+        `SMALL_NOISE`, shape (estimators, runs); empty if nothing is repeated.
+    dict
+        `SMALL_NOISE_SHARE` of the time; the results took the given seconds.
+    """
+    begun = perf_counter()
+    shape = len(job.estimators), len(asked)
+    found: dict[str, Array] = {name: np.full(shape, np.nan) for name in SMALL_NOISE}
+    for row, choice in enumerate(job.estimators):
+        for factor in factors:
+            known = results.assign({k: (EACH_RUN, found[k]) for k in found})
+            count = runs_to_repeat(scores_of(known, choice.label, "invariant"))
+            if not count:
+                break
+            small = monte_carlo(
+                with_less_noise(job.scenario, factor),
+                {choice.label: (choice.name, choice.options)},
+                asked.start + count,
+                job.seed,
+                assumed=with_less_noise(job.assumed, factor),
+                block_size=job.block_size,
+                first_run=asked.start,
+                **engine,
+            )
+            averages = averages_of(scores_of(small, choice.label, "invariant"))
+            averages["small_noise_factor"] = np.full(count, factor)
+            for name, values in averages.items():
+                found[name][row, :count] = values
+    if np.isnan(found["small_noise_factor"]).all():
+        return {}, {}
+    took = perf_counter() - begun
+    return found, {SMALL_NOISE_SHARE: took / (seconds + took)}
+
+
+def with_less_noise(scenario: Scenario, factor: float) -> Scenario:
+    """Multiply all noises, and the deviations of the first pose, by a factor.
+
+    Examples
+    --------
+    >>> with_less_noise(load_scenario("six_landmarks"), 0.1).motion.std
+    (0.025, 0.01, 0.01)
+    """
+
+    def scaled(deviations: Sequence[float]) -> list[float]:
+        return [factor * std for std in deviations]
+
+    sensor = scenario.sensor
+    per_metre = factor * sensor.range_std_per_metre
+    return scenario.with_changes(
+        start={"std": scaled(scenario.start.std)},
+        motion={"std": scaled(scenario.motion.std)},
+        sensor={"std": scaled(sensor.std), "range_std_per_metre": per_metre},
+    )
 
 
 @dataclass(frozen=True)

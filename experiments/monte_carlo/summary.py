@@ -16,7 +16,7 @@ import xarray as xr
 from ...arrays import AnyArray, Array
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.association_scores import CUTOFF, Gospa
-from ...evaluation.consistency_report import ConsistencyReport, evaluate_consistency
+from ...evaluation.consistency_report import ConsistencyReport
 from ...evaluation.error_bound import Efficiency, efficiency
 from ...evaluation.hypothesis_tests import (
     EQUIVALENCE_MARGIN,
@@ -26,9 +26,11 @@ from ...evaluation.hypothesis_tests import (
 from ..runs.trace import finite, mean, quotient, root_mean_square
 from .run_measures import COUNTS, KNOWN_IDS_ATE, MAPS, MARGIN, PREFIX, SHARES
 from .verdict import (
+    FITTED,
     POINT_FREEDOM,
     POSE_FREEDOM,
     EstimatorScores,
+    Verdict,
     diagnosis_summary,
     estimators_of,
     failure_groups,
@@ -36,13 +38,13 @@ from .verdict import (
     in_degrees,
     judge,
     labels_of,
+    report_of,
     run_warnings,
     scores_of,
     start_heading_std,
     verdict_sentence,
 )
 
-_BOOTSTRAP_SEED = 0  # the same for each estimator, independent of the others
 _FRAMES: tuple[ErrorFrame, ...] = ("invariant", "additive")
 
 
@@ -142,15 +144,19 @@ def summarise_estimator(
     """
     found = _computed(scores, frame)
     claimed = found["heading_std_end"]["claimed"]
-    report = _report_of(scores, frame) if scores.good.sum() > 1 else None
+    decides = scores.good.sum() > 1 and not scores.is_fitted
+    report = report_of(scores, frame) if decides else None
+    verdict = FITTED
+    if not scores.is_fitted:
+        verdict = judge(report, len(scores.failures), len(scores.good))
     return {
-        **_verdict(scores, report, claimed, knowable),
+        **_verdict(scores, verdict, report, claimed, knowable),
         "good_runs": int(scores.good.sum()),
         "failed_runs": [failure._asdict() for failure in scores.failures],
         "failure_groups": failure_groups(scores.failures),
         **found,
         "efficiency": efficiency_summary(scores),
-        "diagnosis": diagnosis_summary(scores, frame),
+        "diagnosis": diagnosis_summary(scores, frame, verdict),
         "association": association_summary(scores),
         "unused_readings": _unused_readings(scores),
     }
@@ -158,12 +164,12 @@ def summarise_estimator(
 
 def _verdict(
     scores: EstimatorScores,
+    verdict: Verdict,
     report: ConsistencyReport | None,
     heading_std: float | None,
     knowable: float,
 ) -> dict[str, Any]:
     """Write the verdict on an estimator, and the decisions behind it."""
-    verdict = judge(report, len(scores.failures), len(scores.good))
     return {
         "verdict": verdict.word,
         "reason": verdict.reason,
@@ -205,20 +211,7 @@ def consistency_of(
     if estimator not in labels_of(results):
         known = ", ".join(labels_of(results))
         raise ValueError(f"estimator must be one of {known}, got '{estimator}'")
-    return _report_of(scores_of(results, estimator, frame), frame)
-
-
-def _report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
-    nees = scores.results[f"pose_nees_{frame}"].values[:, 1:].copy()
-    nees[~scores.good] = np.nan
-    return evaluate_consistency(
-        nees,
-        scores.results["nis"].values[:, 1:],
-        scores.results["nis_dof"].values[:, 1:],
-        dof=POSE_FREEDOM,
-        frame=frame,
-        rng=np.random.default_rng(_BOOTSTRAP_SEED),
-    )
+    return report_of(scores_of(results, estimator, frame), frame)
 
 
 def _unused_readings(scores: EstimatorScores) -> float | None:

@@ -18,12 +18,25 @@ import xarray as xr
 
 from ...arrays import Array, BoolArray, IntArray
 from ...estimator.models.rigid_motion import ErrorFrame
-from ...evaluation.consistency_report import FEW_AVERAGES, FEW_RUNS, ConsistencyReport
-from ...evaluation.diagnosis import CANNOT_TELL, HONEST, Diagnosis, diagnose, p_text
+from ...evaluation.consistency_report import (
+    FEW_AVERAGES,
+    FEW_RUNS,
+    ConsistencyReport,
+    evaluate_consistency,
+)
+from ...evaluation.diagnosis import (
+    CANNOT_TELL,
+    FEWEST_RUNS,
+    HONEST,
+    Diagnosis,
+    SmallNoise,
+    diagnose,
+    p_text,
+)
 from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
 from ..runs.summary import MOST_REJECTED, NIS_RANGE, nis_suspicion
 from ..runs.trace import finite, quotient
-from .run_measures import KNOWN_IDS_ATE, KNOWN_IDS_NEES, PREFIX
+from .run_measures import KNOWN_IDS_ATE, KNOWN_IDS_NEES, PREFIX, SMALL_NOISE
 
 CONSISTENT = "consistent"
 NEARLY = "nearly consistent"
@@ -37,7 +50,9 @@ _DECIDING = 3  # final step, time averages and grid share the error rate
 _MARGIN = f"[{EQUIVALENCE_MARGIN.low:g}, {EQUIVALENCE_MARGIN.high:g}]"
 _INSIDE = f"lies inside {_MARGIN}"
 _TOO_SURE = 0.9
-_NOT_REFUSED = "its errors agree with its covariances (5 %)"
+_FEW = 0.1  # share of the runs that may make an average
+_BOOTSTRAP_SEED = 0  # the same for each estimator, independent of the others
+_NOT_REFUSED = "the errors of the pose agree with the covariances (5 %)"
 
 
 class Verdict(NamedTuple):
@@ -50,6 +65,14 @@ class Verdict(NamedTuple):
     or some runs failed."""
     reason: str
     """Continues after the word, without a full stop."""
+
+
+FITTED = Verdict(
+    NOT_SHOWN,
+    "each path is aligned with its truth, and an alignment fitted to the errors "
+    "makes them smaller: their NEES is not χ²",
+)
+"""In place of a verdict on estimates that are aligned."""
 
 
 def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
@@ -175,7 +198,7 @@ def _refusal(report: ConsistencyReport) -> str:
     final, average, grid = report.final_step, report.time_average, report.family
     p_value = min(final.p_value, report.average_p_value)
     ratios = [final.statistic, average.statistic]
-    claims = "what its covariances claim"
+    claims = "what the covariances state"
     amounts = "{} times {} at the end, {} times over all steps"
     if p_value * _DECIDING < _ERROR_RATE:
         what = amounts.format(_number(ratios[0]), claims, _number(ratios[1]))
@@ -186,8 +209,8 @@ def _refusal(report: ConsistencyReport) -> str:
         what = f"{_number(ratios[0])} times {claims} at step {step}"
     else:
         return ""
-    cautious = ": it is too cautious" if max(ratios) < 1 else ""
-    return f"its squared errors are {what} ({p_text(p_value)}){cautious}"
+    cautious = ": the filter is too cautious" if max(ratios) < 1 else ""
+    return f"the squared errors of the pose are {what} ({p_text(p_value)}){cautious}"
 
 
 def _is_near_everywhere(report: ConsistencyReport) -> bool:
@@ -197,13 +220,14 @@ def _is_near_everywhere(report: ConsistencyReport) -> bool:
 
 
 def _outliers(report: ConsistencyReport) -> str:
-    """Point out that a few runs dominate the average."""
-    most = EQUIVALENCE_MARGIN.high
-    if not report.median_ratio <= most < report.mean_ratio:
+    """Point out that a few runs make the average."""
+    few, runs = report.deciding_runs, report.used_runs
+    if not 0 < few <= _FEW * runs:
         return ""
+    make, them = ("makes", "it") if few == 1 else ("make", "them")
     return (
-        f"; few runs make this average: the median is {report.median_ratio:.2f}, "
-        f"{report.share_above_3:.1%} of the runs are above 3"
+        f"; {few} of {runs} runs {make} this average: without {them}, it is "
+        f"{report.ratio_of_others:.2f}"
     )
 
 
@@ -332,11 +356,13 @@ def _group(group: Mapping[str, Any]) -> str:
 # --------------------------------------------------------------------------------------
 # The cause of an inconsistency, as an entry of the summary and as a sentence.
 
+CONVENTION = "convention"
+"""The cause for estimates in another convention than their files should have."""
 _MISTAKES = ("wrong", "duplicate", "ghost", "clutter_used")
 
 
 def diagnosis_summary(
-    scores: EstimatorScores, frame: ErrorFrame
+    scores: EstimatorScores, frame: ErrorFrame, verdict: Verdict
 ) -> dict[str, Any] | None:
     """Name the cause for which an estimator is not consistent.
 
@@ -344,12 +370,17 @@ def diagnosis_summary(
     -------
     dict or None
         ``cause``, one of :data:`slamgym.evaluation.CAUSES`, its ``p``, a ``sentence``,
-        and ``others``, further causes; see :func:`slamgym.evaluation.diagnose`. None
-        for results without noise, which an older version wrote.
+        and ``others``, further causes; see :func:`slamgym.evaluation.diagnose`. The
+        cause is "convention" for estimates that break one. None for results without
+        noise, and for estimates that are fitted to the truth.
     """
-    if "noise_sums" not in scores.results:
+    mistakes = json.loads(scores.results.attrs.get("mistakes", "{}"))
+    if mistake := mistakes.get(scores.label):
+        sentence = f"{CONVENTION}: {mistake}"
+        return {"cause": CONVENTION, "p": None, "sentence": sentence, "others": []}
+    if "noise_sums" not in scores.results or scores.is_fitted:
         return None
-    found = _diagnosed(scores, frame)
+    found = diagnosis_of(scores, frame, verdict)
     return {
         "cause": found.cause,
         "p": finite(found.p_value),
@@ -373,10 +404,12 @@ def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     return (f"{label}: cause: {found['sentence']}",)
 
 
-def _diagnosed(scores: EstimatorScores, frame: ErrorFrame) -> Diagnosis:
+def diagnosis_of(
+    scores: EstimatorScores, frame: ErrorFrame, verdict: Verdict
+) -> Diagnosis:
     """Diagnose the runs that succeeded; the noise of all runs counts.
 
-    If runs failed and the others are consistent, the answer is "cannot tell".
+    The answer is "honest" only if the verdict is "consistent".
     """
     nees = scores.over_time(f"pose_nees_{frame}")[:, scores.first - 1 :]
     heading = scores.over_time("heading_nees")[:, scores.first - 1 :]
@@ -388,15 +421,62 @@ def _diagnosed(scores: EstimatorScores, frame: ErrorFrame) -> Diagnosis:
         heading_knowledge=_heading_knowledge(scores),
         mistakes=_mistakes(scores),
         known_nees=_known_nees(scores, frame),
+        small_noise=_small_noise(scores, frame),
+        rejected=verdict.word == NOT_CONSISTENT,
     )
-    if found.cause != "honest" or not scores.failures:
+    if found.cause != HONEST or verdict.word == CONSISTENT:
         return found
     failed, runs = len(scores.failures), len(scores.good)
-    return Diagnosis(
-        CANNOT_TELL,
-        found.p_value,
-        f"cannot tell: {failed} of {runs} runs failed; the others are honest.",
-    )
+    why = "the errors agree with the covariances so far, and more runs are needed"
+    if failed:
+        why = f"{failed} of {runs} runs failed; the others are honest"
+    elif verdict.word == NEARLY:
+        why = "the errors differ too little from the covariances to show a cause"
+    return Diagnosis(CANNOT_TELL, found.p_value, f"cannot tell: {why}.")
+
+
+def _small_noise(scores: EstimatorScores, frame: ErrorFrame) -> SmallNoise | None:
+    """Return the errors of the runs that were repeated with less noise, if any."""
+    name = f"small_noise_nees_{frame}"
+    if name not in scores.results or np.isnan(scores.per_run(name)).all():
+        return None
+    factor = float(np.nanmin(scores.per_run("small_noise_factor")))
+    heading = scores.per_run("small_noise_heading_nees")
+    return SmallNoise(scores.per_run(name), heading, factor)
+
+
+def runs_to_repeat(scores: EstimatorScores) -> int:
+    """Return how many of all runs to repeat with less noise, 0 if that shows nothing.
+
+    See :class:`~slamgym.evaluation.diagnosis.Diagnosis`.
+    """
+    if scores.good.sum() < FEWEST_RUNS:
+        return 0
+    report = report_of(scores, "invariant")
+    verdict = judge(report, len(scores.failures), len(scores.good))
+    count = diagnosis_of(scores, "invariant", verdict).repeat
+    return int(np.flatnonzero(scores.good)[count - 1]) + 1 if count else 0
+
+
+def averages_of(scores: EstimatorScores) -> dict[str, Array]:
+    """Average NEES over the steps of each run, nan for runs that failed.
+
+    Returns
+    -------
+    dict
+        Those of `SMALL_NOISE`, shape (runs,).
+    """
+    found = {}
+    for name in SMALL_NOISE:
+        source = name.replace("small_noise_nees", "pose_nees")
+        source = source.removeprefix("small_noise_")
+        if source in scores.results:
+            values = scores.over_time(source)[:, scores.first - 1 :]
+            found[name] = np.full(len(scores.good), np.nan)
+            known = np.isfinite(values).all(axis=0)
+            if known.any():
+                found[name][scores.good] = values[:, known].mean(axis=1)
+    return found
 
 
 def _heading_knowledge(scores: EstimatorScores) -> Array | None:
@@ -478,6 +558,11 @@ class EstimatorScores(NamedTuple):
         return np.asarray(nees / POSE_FREEDOM)
 
     @property
+    def is_fitted(self) -> bool:
+        """Whether the estimates are aligned with the truth."""
+        return bool(self.results.attrs.get("alignment") == "fitted")
+
+    @property
     def nis_per_degree(self) -> float | None:
         """Sum of NIS by the sum of degrees of freedom; None without readings."""
         freedom = self.over_time("nis_dof")
@@ -516,6 +601,20 @@ def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorSc
         for row in np.flatnonzero(~good)
     ]
     return EstimatorScores(label, first, good, tuple(failures), results)
+
+
+def report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
+    """Decide about the runs of one estimator; at least 2 must have succeeded."""
+    nees = scores.results[f"pose_nees_{frame}"].values[:, 1:].copy()
+    nees[~scores.good] = np.nan
+    return evaluate_consistency(
+        nees,
+        scores.results["nis"].values[:, 1:],
+        scores.results["nis_dof"].values[:, 1:],
+        dof=POSE_FREEDOM,
+        frame=frame,
+        rng=np.random.default_rng(_BOOTSTRAP_SEED),
+    )
 
 
 def labels_of(dataset: xr.Dataset) -> tuple[str, ...]:

@@ -213,6 +213,7 @@ class Calibration(NamedTuple):
     """The factor of the sensor's noise at which the pose NEES is as expected."""
 
     factor: float
+    """0 or infinity if none of `FACTORS` is small or large enough; likewise below."""
     low: float
     """Of its 95 % interval."""
     high: float
@@ -240,8 +241,8 @@ def calibrate(
     Returns
     -------
     Calibration or None
-        Where the mean NEES of the pose is 1 per degree of freedom; the nearest factor
-        that was tried where there is none.  None where the true poses are unknown.
+        Where the mean NEES of the pose is 1 per degree of freedom.  None where the true
+        poses are unknown.
     """
     truth = true_poses_of(log, times)
     if truth is None or not np.isfinite(truth).all(axis=1).any():
@@ -306,10 +307,10 @@ def _crossing(factors: Array, ratios: Array) -> float:
     """Return the factor at which decreasing ratios first reach 1, from logarithms."""
     below = np.flatnonzero(ratios <= 0)
     if not len(below):
-        return float(np.exp(factors[-1]))
+        return np.inf
     k = int(below[0])
     if k == 0:
-        return float(np.exp(factors[0]))
+        return 0.0
     share = ratios[k - 1] / (ratios[k - 1] - ratios[k])
     return float(np.exp(factors[k - 1] + share * (factors[k] - factors[k - 1])))
 

@@ -47,6 +47,7 @@ BEARING, RANGE, PER_METRE, IN_METRES = 3, 4, 5, 6  # columns of the sensor's noi
 NEEDLESS = ((PER_METRE, RANGE), (IN_METRES, BEARING))
 """Entries of the sensor's noise, and those that can replace them."""
 EXACT = 1e-6  # [rad, m] below which readings have no noise
+WORTH = 3.0  # by which a part of σβ in metres must raise the log likelihood (p = .014)
 PLAIN = 0.15  # standard deviation of log σ below which it is certainly not zero
 
 
@@ -92,7 +93,8 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
     The search alternates between rejecting readings beyond the gate and fitting the
     noise to the others, until the rejected readings stay the same. Some entries of the
     sensor's noise can replace each other, such as the part of σr that grows with the
-    range. Such an entry is zero unless it makes the readings significantly more likely.
+    range, and the part of σβ that shrinks with it. Such an entry is zero unless it
+    makes the readings significantly more likely.
 
     Parameters
     ----------
@@ -108,8 +110,13 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
     """
     start = positive_start(before, _typical_range(likelihood))
     chosen = np.ones(len(ENTRIES), dtype=np.bool_)
-    chosen[IN_METRES] = start[IN_METRES] > 0  # fitted only if it is used
+    chosen[IN_METRES] = start[IN_METRES] > 0  # otherwise only if it is worth it
     smooth, found = _in_turns(likelihood, start, chosen)
+    if not chosen[IN_METRES]:
+        metres = _in_metres(smooth, found)
+        if metres.likelihood > found.likelihood + WORTH:
+            chosen[IN_METRES] = True
+            smooth, found = _in_turns(likelihood, metres.noise, chosen)
     found = _without_zeros(smooth, _without_needless(smooth, found))
     _refuse_diverged(found)
     _refuse_exact(found.noise, _typical_range(smooth))
@@ -144,6 +151,15 @@ def _in_turns(
         rejected = again
     smooth = likelihood.without(rejected)
     return smooth, _fit(smooth, found)
+
+
+def _in_metres(smooth: LogLikelihood, found: _Fit) -> _Fit:
+    """Fit again with half of σβ as a part in metres, as of a sensor of positions."""
+    noise, free = found.noise.copy(), found.free.copy()
+    noise[IN_METRES] = 0.5 * max(noise[BEARING], EXACT) * _typical_range(smooth)
+    noise[BEARING] *= 0.5
+    free[IN_METRES] = True
+    return _fit(smooth, found._replace(noise=noise, free=free))
 
 
 def _coarse_start(likelihood: LogLikelihood, start: Array, chosen: BoolArray) -> _Fit:

@@ -16,7 +16,7 @@ from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import Progress, replay
 from ..runs.summary import settings_table, summarise
 from ..runs.trace import finite
-from .fit import GATE_PROBABILITY, Fitted, NoiseFit, Whiteness
+from .fit import FACTORS, GATE_PROBABILITY, Fitted, NoiseFit, Whiteness
 
 STAGES = ("before", "fitted", "suggested")
 COMPARED = ("nis", "nees", "ate", "landmark_rmse", "readings")
@@ -36,7 +36,8 @@ def summarise_fit(fit: NoiseFit, *, progress: Progress | None = None) -> dict[st
         ``whiteness`` of ``bearing`` and ``range``, and as in a replay's summary
         ``nis``, ``nees``, ``ate``, ``landmark_rmse`` and ``readings``; ``inflation`` of
         ``bearing`` and ``range``; ``calibration``, the ``factor`` of the sensor's
-        noise that the truth asks for, ``low`` and ``high`` of its interval, or None;
+        noise that the truth asks for, and ``low`` and ``high`` of its interval, 0 below
+        and None above the factors ``tried``; or None;
         ``options``, the line to paste.
     """
     runs: dict[str, Any] = {}
@@ -60,7 +61,10 @@ def summarise_fit(fit: NoiseFit, *, progress: Progress | None = None) -> dict[st
         "inflation": {"bearing": bearing.inflation, "range": distance.inflation},
         "calibration": None
         if fit.calibration is None
-        else {key: finite(value) for key, value in fit.calibration._asdict().items()},
+        else {
+            **{key: finite(value) for key, value in fit.calibration._asdict().items()},
+            "tried": [float(FACTORS[0]), float(FACTORS[-1])],
+        },
         "options": options_line(fit.suggested),
     }
 

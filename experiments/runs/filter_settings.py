@@ -20,20 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from ...estimator import registry
-from ...estimator.interface import (
-    SlamEstimator,
-    SupportsBeliefLimit,
-    SupportsMemoryEstimate,
-)
-from ...estimator.registry import (
-    EstimatorFactory,
-    find_estimator,
-    list_estimators,
-    read_label,
-    register_estimator,
-    split_labels,
-)
+from ...estimator import interface, registry
 from ...estimator.support.argument_checks import refuse_large_belief
 from ...estimator.support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ...sim_configs import Scenario
@@ -71,10 +58,7 @@ NOISE_KEYS = (
 )
 """Keys of a log's header that :func:`settings_for` reads."""
 
-_ASSUMED_NOISE = {
-    "motion_std": (0.1, 0.1, 0.03),
-    "measurement_std": (0.026, 0.3),
-}
+_ASSUMED_NOISE = {"motion_std": (0.1, 0.1, 0.03), "measurement_std": (0.026, 0.3)}
 
 
 @dataclass(frozen=True)
@@ -99,7 +83,7 @@ class FilterSettings:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Further arguments of the estimator's constructor."""
 
-    def make(self, initial_pose: ArrayLike) -> SlamEstimator:
+    def make(self, initial_pose: ArrayLike) -> interface.SlamEstimator:
         """Make the estimator at an initial pose (3,) [m, m, rad].
 
         Raises
@@ -175,7 +159,7 @@ def settings_for(
     LogError
         If a value in the header is malformed.
     """
-    name, own = read_label(estimator)
+    name, own = registry.read_label(estimator)
     estimator = OFFLINE.get(name, name)
     factory = registry.find_estimator(estimator)
     header = _noise_header(log)
@@ -315,7 +299,7 @@ def _flag(name: str, key: str, text: str) -> bool:
 
 
 _PACKAGE = Path(registry.__file__).resolve().parents[1]
-OWN_NAMES = frozenset(list_estimators())
+OWN_NAMES = frozenset(registry.list_estimators())
 """Names that stay those of slamgym's own estimators."""
 
 
@@ -330,7 +314,7 @@ class EstimatorChoice(NamedTuple):
 
     def code(self) -> str:
         """Return a digest of the user's own source; empty for slamgym's estimators."""
-        estimator = find_estimator(self.name)
+        estimator = registry.find_estimator(self.name)
         try:
             source = inspect.getsourcefile(estimator)
         except TypeError:
@@ -363,7 +347,7 @@ def _code_of_methods(estimator: object) -> bytes:
 
 
 def estimator_choices(
-    estimators: str | Iterable[str | EstimatorFactory] | Mapping[str, Any],
+    estimators: str | Iterable[str | registry.EstimatorFactory] | Mapping[str, Any],
 ) -> tuple[EstimatorChoice, ...]:
     """Parse estimators from names, classes or labels.
 
@@ -404,14 +388,14 @@ options={'iterations': 3})
         if labels.count(choice.label) > 1:
             raise ValueError(f"estimators must differ, got '{choice.label}' twice")
     for choice in choices:
-        find_estimator(choice.name)
+        registry.find_estimator(choice.name)
     return tuple(choices)
 
 
 def _unlabelled(what: Any) -> list[EstimatorChoice]:
     """Read names separated by commas, or a class, whose name is then its label."""
     if isinstance(what, str):
-        return [_labelled(label, label) for label in split_labels(what)]
+        return [_labelled(label, label) for label in registry.split_labels(what)]
     label = getattr(what, "__name__", None)
     if not (callable(what) and label):
         raise ValueError(f"estimators must be names or classes, got {what!r}")
@@ -421,7 +405,7 @@ def _unlabelled(what: Any) -> list[EstimatorChoice]:
 def _labelled(label: str, what: Any) -> EstimatorChoice:
     options: Mapping[str, Any] = {}
     if isinstance(what, str):
-        what, options = read_label(what)
+        what, options = registry.read_label(what)
     elif isinstance(what, tuple) and len(what) == 2:
         what, options = what
     return EstimatorChoice(label, _name_of(label, what), options)
@@ -436,11 +420,11 @@ def _name_of(label: str, what: str | Callable[..., Any]) -> str:
     if module != "__main__" and name.isidentifier():
         return path
     name = label if label not in OWN_NAMES else f"{label} of yours"
-    register_estimator(name, what)
+    registry.register_estimator(name, what)
     return name
 
 
-def refuse_large_map(log: SlamLog, estimator: SlamEstimator) -> None:
+def refuse_large_map(log: SlamLog, estimator: interface.SlamEstimator) -> None:
     """Refuse a log with more landmarks than memory holds for this filter.
 
     The check counts the least memory of a run: the filter's map and the final belief of
@@ -462,7 +446,7 @@ def refuse_large_map(log: SlamLog, estimator: SlamEstimator) -> None:
 
 
 def refuse_large_maps(
-    runs: SimulatedRuns, estimator: SlamEstimator, *, at_once: bool
+    runs: SimulatedRuns, estimator: interface.SlamEstimator, *, at_once: bool
 ) -> None:
     """Refuse runs with more landmarks than memory holds for this filter.
 
@@ -490,17 +474,17 @@ def refuse_large_maps(
 
 def _refuse_maps(
     landmarks: Sequence[int],
-    estimator: SlamEstimator,
+    estimator: interface.SlamEstimator,
     what: str,
     way_out: str,
     *,
     at_once: bool = False,
 ) -> None:
     """Refuse runs with so many landmarks each, if belief or memory cannot hold them."""
-    if isinstance(estimator, SupportsBeliefLimit):
+    if isinstance(estimator, interface.SupportsBeliefLimit):
         most = estimator.belief_limit
         refuse_large_belief(max(landmarks), most, "take fewer steps")
-    if isinstance(estimator, SupportsMemoryEstimate):
+    if isinstance(estimator, interface.SupportsMemoryEstimate):
         maps = [estimator.memory_for(count) for count in landmarks]
         beliefs = sum(covariance_bytes(count) for count in landmarks)
         need = beliefs + (sum(maps) if at_once else max(maps))

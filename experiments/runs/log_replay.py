@@ -28,12 +28,7 @@ from ...estimator.map_management.map_editor import (
     marginal_without_joining,
     view_map,
 )
-from ..logs.ground_truth import (
-    hides_identities,
-    true_ids_of,
-    true_landmarks_of,
-    true_poses_of,
-)
+from ..logs import ground_truth
 from ..logs.recording import Step, predictions, steps_of
 from ..logs.slamlog import Scan, SlamLog
 from .filter_settings import one_blas_thread, refuse_large_map
@@ -156,11 +151,11 @@ def replay(
                 predicted, report = marginal_without_joining(estimator, ()), None
                 if step.scan is not None:
                     report = estimator.update(step.scan.measurements, _ids(step.scan))
-                    decisions.add(report, true_ids_of(step.scan))
+                    decisions.add(report, ground_truth.true_ids_of(step.scan))
                 recorder.add(predicted, report)
             watch(number, estimator, report)
             progress(number + 1, len(steps))
-    made = decisions.result() if hides_identities(log) else None
+    made = decisions.result() if ground_truth.hides_identities(log) else None
     identities = None if made is None else made.identities()
     trace = recorder.trace(_name_of(estimator, name), times, log, identities)
     return Replay(
@@ -202,9 +197,9 @@ def _truth_source(
 
     It does nothing for other estimators, or if the log lacks a part of the truth.
     """
-    if not isinstance(estimator, SupportsTruth) or hides_identities(log):
+    if not isinstance(estimator, SupportsTruth) or ground_truth.hides_identities(log):
         return _unwatched  # with hidden identities, the estimator's ids are its own
-    poses = true_poses_of(log, times)
+    poses = ground_truth.true_poses_of(log, times)
     landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
     if poses is None or not np.isfinite(poses).all():
         return _unwatched
@@ -328,7 +323,7 @@ class RunRecorder:
             predicted_pose_covariances=self._predicted.covariances,
             poses=self._updated.poses,
             pose_covariances=self._updated.covariances,
-            true_poses=true_poses_of(log, times),
+            true_poses=ground_truth.true_poses_of(log, times),
             nis=self._nis,
             nis_dof=self._dof,
             landmark_ids=np.array(belief.landmark_ids, dtype=np.int64),
@@ -338,7 +333,7 @@ class RunRecorder:
                 -1, 2, 2
             ),
             landmark_history=self._history,
-            true_landmarks=true_landmarks_of(
+            true_landmarks=ground_truth.true_landmarks_of(
                 log, belief.landmark_ids, belief.landmarks, identities
             ),
             first_covariance=first_covariance,

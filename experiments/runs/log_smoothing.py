@@ -15,16 +15,9 @@ from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
 from ..logs.recording import predictions, steps_of
 from ..logs.slamlog import SlamLog
+from . import summary
 from .filter_settings import FilterSettings, one_blas_thread
 from .log_replay import Progress, Replay, replay
-from .summary import (
-    accuracy_of,
-    map_accuracy,
-    nees_summary,
-    nees_table,
-    rmse_table,
-    settings_table,
-)
 from .trace import finite
 
 
@@ -109,7 +102,7 @@ def summarise_smoothing(
         "slamgym": __version__,
         "log": log.name,
         "follows": trace.estimator,
-        "settings": None if settings is None else settings_table(settings),
+        "settings": None if settings is None else summary.settings_table(settings),
         "steps": trace.last_step,
         "scans": smoothed.filtered.scans,
         "poses": len(drive.poses),
@@ -122,14 +115,16 @@ def summarise_smoothing(
         },
         "iterations": drive.iterations,
         "ate": {
-            "filter": rmse_table(path_accuracy(log, trace.t, trace.poses)),
-            "smoother": rmse_table(path_accuracy(log, trace.t, smoothed.poses)),
+            "filter": summary.rmse_table(path_accuracy(log, trace.t, trace.poses)),
+            "smoother": summary.rmse_table(path_accuracy(log, trace.t, smoothed.poses)),
         },
         "landmark_rmse": {
-            "filter": rmse_table(map_accuracy(trace)),
-            "smoother": rmse_table(accuracy_of(drive.landmarks, true_landmarks)),
+            "filter": summary.rmse_table(summary.map_accuracy(trace)),
+            "smoother": summary.rmse_table(
+                summary.accuracy_of(drive.landmarks, true_landmarks)
+            ),
         },
-        "nees": {"filter": nees_summary(trace), "smoother": _nees(smoothed)},
+        "nees": {"filter": summary.nees_summary(trace), "smoother": _nees(smoothed)},
     }
 
 
@@ -157,4 +152,4 @@ def _nees(smoothed: SmoothedLog) -> dict[str, Any] | None:
         drive.pose_covariances[known],
         frame="invariant",
     )
-    return nees_table(values, "invariant")
+    return summary.nees_table(values, "invariant")

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.utils import seeding
 
 from ...arrays import AnyArray, Array, BoolArray, IntArray
-from ...envs.vector import MixedWorlds, WorldBatch
+from ...envs.vector import WorldBatch
 from ...estimator.support.memory_limit import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
 from ...sim_configs.scenario_files import refuse_ranges
@@ -192,7 +192,7 @@ class _Readings:
 
 
 def empty_record(
-    worlds: WorldBatch | MixedWorlds, names: Sequence[str], times: int
+    worlds: WorldBatch, names: Sequence[str], times: int
 ) -> dict[str, AnyArray]:
     """Return arrays (B, times, …) to record arrays (B, …) of B worlds by their names.
 
@@ -206,9 +206,7 @@ def empty_record(
     }
 
 
-def take(
-    record: Mapping[str, AnyArray], place: int, worlds: WorldBatch | MixedWorlds
-) -> None:
+def take(record: Mapping[str, AnyArray], place: int, worlds: WorldBatch) -> None:
     """Record the present arrays of the worlds at an index of time."""
     for name, array in record.items():
         array[:, place] = getattr(worlds, name)

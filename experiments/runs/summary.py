@@ -26,10 +26,7 @@ _SHARE = 0.95  # probability of the interval of the NIS
 
 
 def summarise(
-    replay: Replay,
-    settings: FilterSettings | None = None,
-    *,
-    resolution: float = 0.0,
+    replay: Replay, settings: FilterSettings | None = None, *, resolution: float = 0.0
 ) -> dict[str, Any]:
     """Summarise a run.
 
@@ -253,10 +250,7 @@ def rmse_table(accuracy: PositionAccuracy | None) -> dict[str, float | None] | N
     """Return root mean squares ``{raw, aligned}`` [m]; None if the truth is unknown."""
     if accuracy is None:
         return None
-    return {
-        "raw": finite(accuracy.raw_rmse),
-        "aligned": finite(accuracy.aligned_rmse),
-    }
+    return {"raw": finite(accuracy.raw_rmse), "aligned": finite(accuracy.aligned_rmse)}
 
 
 def _finite_list(values: Array) -> list[float | None]:

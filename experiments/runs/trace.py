@@ -15,29 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from ...arrays import AnyArray, Array, IntArray
-from ...estimator.interface import (
-    ScanDecisions,
-    SlamEstimator,
-    SupportsDecisions,
-    UpdateReport,
-)
+from ...estimator import interface
 from ...estimator.map_management.policy import policy_of
 from ...estimator.models.rigid_motion import ErrorFrame
-from ...evaluation.association_scores import (
-    CUTOFF,
-    AssociationScores,
-    Gospa,
-    gospa,
-    known_places,
-    landmark_identities,
-    places_of,
-    score_association,
-)
-from ...evaluation.trajectory_error import (
-    Alignment,
-    align_positions,
-    landmark_covariances,
-)
+from ...evaluation import association_scores, trajectory_error
 
 Integers = NDArray[np.integer]
 
@@ -129,7 +110,7 @@ class RunTrace:
     @property
     def landmark_covariances(self) -> Array:
         """Final covariance of each landmark, shape (n, 2, 2) [m²]."""
-        return landmark_covariances(self.final_covariance)
+        return trajectory_error.landmark_covariances(self.final_covariance)
 
     def map_at(self, step: int) -> MapEstimate:
         """Return the map after a step."""
@@ -163,7 +144,7 @@ def _shapes(steps: int, n: int) -> dict[str, tuple[int, ...]]:
     }
 
 
-NAMES = (*AssociationScores._fields, "precision", "recall")
+NAMES = (*association_scores.AssociationScores._fields, "precision", "recall")
 
 
 class TrueLandmarks(NamedTuple):
@@ -178,7 +159,7 @@ class TrueLandmarks(NamedTuple):
 class RunDecisions(NamedTuple):
     """What a filter decided about the readings of a run, and what they are of."""
 
-    decisions: Sequence[ScanDecisions]
+    decisions: Sequence[interface.ScanDecisions]
     """One per scan."""
     true_ids: Sequence[IntArray]
     """The true landmark of each reading, -1 for clutter, one array per scan."""
@@ -187,17 +168,17 @@ class RunDecisions(NamedTuple):
 
     def identities(self) -> dict[int, int]:
         """Return the true landmark of each mapped one, -1 for clutter."""
-        return landmark_identities(self.decisions, self.true_ids)
+        return association_scores.landmark_identities(self.decisions, self.true_ids)
 
 
 class RunAssociation(NamedTuple):
     """The association of a run, compared with the truth."""
 
-    scores: AssociationScores | None
+    scores: association_scores.AssociationScores | None
     """None where the true landmark of some reading is unknown."""
-    raw: Gospa
+    raw: association_scores.Gospa
     """Error of the final map."""
-    aligned: Gospa
+    aligned: association_scores.Gospa
     """The same after the rigid motion that brings its landmarks closest to theirs."""
     resolution: float
     """True landmarks nearer to each other count as one [m]."""
@@ -215,7 +196,7 @@ class RunAssociation(NamedTuple):
             "gospa": {
                 "raw": self.raw._asdict(),
                 "aligned": self.aligned._asdict(),
-                "cutoff": CUTOFF,
+                "cutoff": association_scores.CUTOFF,
             },
         }
 
@@ -229,26 +210,26 @@ class DecisionRecorder:
         The estimator.
     """
 
-    def __init__(self, slam: SlamEstimator) -> None:
+    def __init__(self, slam: interface.SlamEstimator) -> None:
         self._slam = slam
-        self._reported: list[ScanDecisions] = []
+        self._reported: list[interface.ScanDecisions] = []
         self._true_ids: list[IntArray | None] = []
 
-    def add(self, report: UpdateReport, true_ids: IntArray | None) -> None:
+    def add(self, report: interface.UpdateReport, true_ids: IntArray | None) -> None:
         """Note an update with readings of true landmarks, shape (m,), if known."""
         self._true_ids.append(true_ids)
-        if not isinstance(self._slam, SupportsDecisions):
+        if not isinstance(self._slam, interface.SupportsDecisions):
             new = {*report.added_ids, *report.confirmed_ids}
             added = tuple(i for i in report.row_ids if i in new)
-            self._reported.append(ScanDecisions(report.row_ids, added))
+            self._reported.append(interface.ScanDecisions(report.row_ids, added))
 
     def result(self) -> RunDecisions | None:
         """Return the decisions as they stand now.
 
         None if the estimator reports none, or a true landmark is unknown.
         """
-        made: Sequence[ScanDecisions] = self._reported
-        if isinstance(self._slam, SupportsDecisions):
+        made: Sequence[interface.ScanDecisions] = self._reported
+        if isinstance(self._slam, interface.SupportsDecisions):
             made = self._slam.decisions
         true_ids = [ids for ids in self._true_ids if ids is not None]
         if [len(scan.row_ids) for scan in made] != [len(ids) for ids in true_ids]:
@@ -279,15 +260,17 @@ def compare_association(
     resolution : float
         True landmarks nearer to each other count as one place [m].
     """
-    places = places_of(truth.ids, truth.positions, resolution)
+    places = association_scores.places_of(truth.ids, truth.positions, resolution)
     place = np.array([places[i] for i in truth.ids.tolist()], dtype=np.int64)
     scores, is_known = None, np.ones(len(place), dtype=np.bool_)
     if run is not None:
-        scores = score_association(
+        scores = association_scores.score_association(
             run.decisions, run.true_ids, places=places, confirm=run.confirm
         )
         seen = [[places.get(i, i) for i in scan.tolist()] for scan in run.true_ids]
-        is_known = np.isin(place, list(known_places(seen, run.confirm)))
+        is_known = np.isin(
+            place, list(association_scores.known_places(seen, run.confirm))
+        )
         identities = run.identities()
     else:
         identities = mutual_nearest(truth, landmark_ids, landmarks)
@@ -295,8 +278,8 @@ def compare_association(
     moved = alignment(identities, truth, landmark_ids, landmarks)
     return RunAssociation(
         scores,
-        gospa(landmarks, there, places=of),
-        gospa(moved.apply(landmarks), there, places=of),
+        association_scores.gospa(landmarks, there, places=of),
+        association_scores.gospa(moved.apply(landmarks), there, places=of),
         resolution,
     )
 
@@ -321,15 +304,15 @@ def alignment(
     truth: TrueLandmarks,
     landmark_ids: Sequence[int],
     landmarks: Array,
-) -> Alignment:
+) -> trajectory_error.Alignment:
     """Return the motion that brings landmarks closest to those they are of."""
     positions = dict(zip(truth.ids.tolist(), truth.positions, strict=True))
     owners = [positions.get(identities.get(i, -1)) for i in landmark_ids]
     pairs = [(m, o) for m, o in zip(landmarks, owners, strict=True) if o is not None]
     if not pairs:
-        return Alignment(0.0, np.zeros(2))
+        return trajectory_error.Alignment(0.0, np.zeros(2))
     mapped, true = (np.array(side) for side in zip(*pairs, strict=True))
-    return align_positions(mapped, true)
+    return trajectory_error.align_positions(mapped, true)
 
 
 # --------------------------------------------------------------------------------------

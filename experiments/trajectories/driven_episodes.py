@@ -15,7 +15,7 @@ from gymnasium.utils import seeding
 from ...arrays import AnyArray
 from ...envs.controllers import make_vector_controller
 from ...envs.spaces import count_rows
-from ...envs.vector import MixedWorlds, WorldBatch
+from ...envs.vector import WorldBatch
 from ...estimator.interface import SlamEstimator, UpdateReport
 from ...estimator.map_management.policy import LandmarkPolicy
 from ...estimator.registry import find_estimator, read_label
@@ -43,7 +43,7 @@ def drive_episodes(
 
     Every episode depends on its own seed alone: world and controller are, bit for bit,
     those of ``slamgym run`` with this seed. If the scenario has ranges, the world is
-    drawn from them first, and worlds are stepped one by one, about six times slower.
+    drawn from them first.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def drive_episodes(
         raise ValueError(f"seeds must be one or more integers >= 0, got {seeds!r}")
     rngs = _random_generators(seeds, _SCENARIO_STREAM)
     scenarios = [drawn_scenario(scenario, rng) for rng in rngs]
-    worlds = _worlds(scenario, scenarios)
+    worlds = WorldBatch(scenario, len(scenarios), scenarios)
     worlds.reset([seeding.np_random(seed)[0] for seed in seeds])
     rngs = _random_generators(seeds, _CONTROLLER_STREAM)
     drivers = make_vector_controller(controller, scenarios, rngs)
@@ -112,14 +112,6 @@ def drive_episodes(
 
 def _random_generators(seeds: Sequence[int], stream: int) -> list[np.random.Generator]:
     return [np.random.default_rng([seed, stream]) for seed in seeds]
-
-
-def _worlds(
-    scenario: Scenario, scenarios: Sequence[Scenario]
-) -> WorldBatch | MixedWorlds:
-    if scenario.randomise is None:
-        return WorldBatch(scenario, len(scenarios))
-    return MixedWorlds(scenarios)
 
 
 def with_beliefs(trajectory: Trajectory, estimator: str) -> Trajectory:

@@ -24,15 +24,8 @@ from ...estimator.models.unicycle_motion import drive
 from ...sim_configs import Scenario
 from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import scenario_text
+from ..logs import slamlog
 from ..logs.recording import log_header
-from ..logs.slamlog import (
-    NO_LANDMARK,
-    OdometryRow,
-    Scan,
-    SlamLog,
-    read_slamlog,
-    write_slamlog,
-)
 from ..runs.filter_settings import settings_for_scenario
 from .trajectory import (
     ARRAYS,
@@ -346,16 +339,16 @@ def filtered_path(trajectory: Trajectory) -> tuple[Array, dict[int, Array]]:
 def _write_slamlog(trajectories: Sequence[Trajectory], path: Path) -> None:
     """Write a shard; see `TrajectoryFormat`."""
     for name, trajectory in write_metadata(trajectories, path):
-        write_slamlog(to_slamlog(trajectory), path / f"{name}.csv")
+        slamlog.write_slamlog(to_slamlog(trajectory), path / f"{name}.csv")
 
 
 def _read_slamlog(path: Path) -> Iterator[Trajectory]:
     """Yield the trajectories of a shard; see `TrajectoryFormat`."""
     for name, about in read_metadata(path):
-        yield _trajectory(read_slamlog(path / f"{name}.csv"), about)
+        yield _trajectory(slamlog.read_slamlog(path / f"{name}.csv"), about)
 
 
-def to_slamlog(trajectory: Trajectory) -> SlamLog:
+def to_slamlog(trajectory: Trajectory) -> slamlog.SlamLog:
     """Return the log of a trajectory, for replay.
 
     Time counts steps, as in `record_episode`,
@@ -370,21 +363,21 @@ def to_slamlog(trajectory: Trajectory) -> SlamLog:
     measurements = array_of(trajectory, "measurements")
     mask = array_of(trajectory, "mask")
     true_ids = trajectory.landmark_ids
-    events: list[OdometryRow | Scan] = []
+    events: list[slamlog.OdometryRow | slamlog.Scan] = []
     for step, seen in enumerate(mask):
         if step > 0:
             distance, turn = trajectory.odometry[step - 1].tolist()
-            events.append(OdometryRow(float(step), distance, turn, dt=1.0))
+            events.append(slamlog.OdometryRow(float(step), distance, turn, dt=1.0))
         if seen.any():
             readings = measurements[step][seen]
             if trajectory.scenario.sensor.identities:
-                scan = Scan(float(step), readings, np.flatnonzero(seen))
+                scan = slamlog.Scan(float(step), readings, np.flatnonzero(seen))
             else:
                 of = None if true_ids is None else true_ids[step][seen]
-                scan = Scan(float(step), readings, true_ids=of)
+                scan = slamlog.Scan(float(step), readings, true_ids=of)
             events.append(scan)
     times = np.arange(len(trajectory.poses), dtype=np.float64)
-    return SlamLog(
+    return slamlog.SlamLog(
         name=trajectory.scenario.name,
         header=log_header(trajectory.scenario, trajectory.seed),
         start=trajectory.start_estimate,
@@ -395,12 +388,12 @@ def to_slamlog(trajectory: Trajectory) -> SlamLog:
     )
 
 
-def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
-    moves = [event for event in log.events if isinstance(event, OdometryRow)]
+def _trajectory(log: slamlog.SlamLog, about: dict[str, Any]) -> Trajectory:
+    moves = [event for event in log.events if isinstance(event, slamlog.OdometryRow)]
     rows = count_rows(about["scenario"])
     measurements = np.zeros((len(moves) + 1, rows, 2))
     mask = np.zeros((len(moves) + 1, rows), dtype=np.bool_)
-    true_ids = np.full(mask.shape, NO_LANDMARK, dtype=np.int64)
+    true_ids = np.full(mask.shape, slamlog.NO_LANDMARK, dtype=np.int64)
     for scan in _scans(log):
         ids = scan.landmark_ids
         places = int(scan.t), np.arange(len(scan.measurements)) if ids is None else ids
@@ -421,8 +414,8 @@ def _trajectory(log: SlamLog, about: dict[str, Any]) -> Trajectory:
     )
 
 
-def _scans(log: SlamLog) -> Iterator[Scan]:
-    return (event for event in log.events if isinstance(event, Scan))
+def _scans(log: slamlog.SlamLog) -> Iterator[slamlog.Scan]:
+    return (event for event in log.events if isinstance(event, slamlog.Scan))
 
 
 FORMATS = {

@@ -305,10 +305,7 @@ class ShardWork:
             return made._replace(files=content)
 
     def _write(
-        self,
-        episodes: range,
-        folder: Path,
-        progress: Callable[[int], object] | None,
+        self, episodes: range, folder: Path, progress: Callable[[int], object] | None
     ) -> MadeShard:
         # The process that engages workers never loads the simulator.
         from .driven_episodes import drive_episodes, with_beliefs  # noqa: PLC0415

@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import numpy as np
 
@@ -88,6 +89,7 @@ BELIEFS = _NAMES[_NAMES.index("belief_poses") :]
 """The names of the arrays of what a filter believes during it."""
 
 
+@lru_cache(maxsize=8)
 def scenario_from_text(text: str) -> Scenario:
     """Parse a scenario from the TOML in a file of trajectories."""
     return load_scenario(tomllib.loads(text))

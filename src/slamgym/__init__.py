@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .estimator import register_estimator as register_estimator
     from .estimator import smooth as smooth
     from .evaluation import assert_consistent as assert_consistent
+    from .experiments.judging import judge as judge
     from .experiments.logs import read_log as read_log
     from .experiments.monte_carlo import consistency_of as consistency_of
     from .experiments.monte_carlo import monte_carlo as monte_carlo

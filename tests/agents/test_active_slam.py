@@ -11,7 +11,7 @@ import numpy as np
 import numpy_active_slam as twin
 import pytest
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils.env_checker import check_env
+from worlds import RANGED
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.agents import (
@@ -57,20 +57,6 @@ def wander(env, steps, seed=0):
         yield step
         if step[2] or step[3]:
             return
-
-
-@pytest.mark.parametrize("level", LEVELS)
-def test_gymnasiums_checker_finds_nothing_to_warn_of(level):
-    check_env(gym.make(ID, scenario=level).unwrapped)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("level", LEVELS)
-def test_the_checker_of_stable_baselines_finds_nothing_to_warn_of(level):
-    checker = pytest.importorskip(
-        "stable_baselines3.common.env_checker", reason="needs Stable-Baselines3"
-    )
-    checker.check_env(gym.make(ID, scenario=level).unwrapped)
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -506,6 +492,48 @@ def test_many_worlds_are_the_single_ones(mode, level, settings):
     assert len(kinds) >= 2
 
 
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_many_worlds_drawn_anew_are_the_single_ones(mode):
+    scenario = load_scenario("active_easy").with_changes(randomise=RANGED, steps=9)
+    many = ActiveSlamVectorEnv(3, scenario, autoreset_mode=mode)
+    singles = [ActiveSlamEnv(scenario) for _ in range(3)]
+    observations, _ = many.reset(seed=7)
+    seen = [env.reset(seed=7 + k)[0] for k, env in enumerate(singles)]
+    ended = np.zeros(3, dtype=bool)
+    rng, draws = np.random.default_rng(0), set()
+    for _ in range(40):
+        for k in range(3):
+            for key, value in seen[k].items():
+                np.testing.assert_array_equal(observations[key][k], value)
+        drawn = many.drawn_scenarios
+        assert [env.drawn_scenario for env in singles] == drawn
+        draws |= {each.motion.std for each in drawn}
+        actions = rng.uniform(-0.3, 0.8, (3, 2))
+        observations, _, terminated, truncated, _ = many.step(actions)
+        for k, env in enumerate(singles):
+            if mode == "NextStep" and ended[k]:
+                seen[k] = env.reset()[0]
+                continue
+            seen[k], _, over, late, _ = env.step(actions[k])
+            assert (over, late) == (terminated[k], truncated[k])
+            if mode == "SameStep" and (over or late):
+                seen[k] = env.reset()[0]
+        ended = terminated | truncated
+    assert len(draws) >= 9
+
+
+def test_filters_keep_the_nominal_noise():
+    env = ActiveSlamEnv(
+        "active_easy", randomise={"motion_std": [50.0, 50.0], "start_std": [9.0, 9.0]}
+    )
+    plain = ActiveSlamEnv("active_easy")
+    for each in (env, plain):
+        each.reset(seed=1)
+        each.step([1.0, 0.0])
+    uncertain = [each.knowledge.belief.pose_covariance for each in (env, plain)]
+    np.testing.assert_allclose(np.sqrt(uncertain[0][0, 0] / uncertain[1][0, 0]), 1, 0.5)
+
+
 def test_worlds_that_ended_must_be_begun_anew_by_hand_where_autoreset_is_off():
     vector = ActiveSlamVectorEnv(2, "active_easy", steps=2, autoreset_mode="Disabled")
     vector.reset(seed=0)
@@ -537,30 +565,6 @@ def test_the_seeds_of_many_worlds_are_told():
     vector = ActiveSlamVectorEnv(3, "active_easy")
     vector.reset(seed=5)
     assert vector.np_random_seed == (5, 6, 7)
-
-
-@pytest.mark.slow
-def test_stable_baselines_gets_images_of_many_worlds():
-    pytest.importorskip("stable_baselines3", reason="needs Stable-Baselines3")
-    from slamgym.envs.vector import to_stable_baselines
-
-    settings = {"render_mode": "rgb_array", "autoreset_mode": "SameStep"}
-    worlds = to_stable_baselines(ActiveSlamVectorEnv(2, "active_easy", **settings))
-    worlds.reset()
-    assert [image.shape for image in worlds.get_images()] == [(600, 600, 3)] * 2
-    worlds.close()
-
-
-@pytest.mark.slow
-def test_episodes_are_filmed(tmp_path):
-    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
-    env = gym.make(ID, scenario="active_easy", steps=3, render_mode="rgb_array")
-    env = gym.wrappers.RecordVideo(env, str(tmp_path / "videos"))
-    env.reset(seed=0)
-    for _ in range(3):
-        env.step([0.1, 0.1])
-    env.close()
-    assert list(tmp_path.glob("videos/*.mp4"))
 
 
 @pytest.mark.parametrize("name", [ID, "slamgym/LandmarkWorld-v0"])
@@ -863,34 +867,6 @@ def test_a_table_names_means_with_their_intervals():
 
 
 # who learns
-
-
-def test_a_loop_in_the_manner_of_cleanrl_runs():
-    from slamgym.envs.vector import FlattenBatch
-
-    vector = FlattenBatch(gym.make_vec(ID, 4, scenario="active_easy"))
-    size = int(np.prod(vector.single_observation_space.shape))
-    actor = np.zeros((size, int(np.prod(vector.single_action_space.shape))))
-    observation, _ = vector.reset(seed=1)
-    for _ in range(30):
-        observation, rewards, *_ = vector.step(observation @ actor)
-    assert observation.shape == (4, size)
-    assert np.isfinite(rewards).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
-def test_stable_baselines_learns_from_single_worlds(algorithm):
-    library = pytest.importorskip("stable_baselines3", reason="needs SB3")
-    pytest.importorskip("torch").set_num_threads(1)
-    env = gym.make(ID, scenario="active_easy")
-    options = {"n_steps": 32, "batch_size": 16} if algorithm == "PPO" else {}
-    if algorithm == "SAC":
-        options = {"learning_starts": 50, "buffer_size": 100}
-    model = getattr(library, algorithm)("MultiInputPolicy", env, seed=0, **options)
-    model.learn(64)
-    action, _ = model.predict(env.reset(seed=0)[0])
-    assert action in env.action_space
 
 
 @pytest.mark.slow

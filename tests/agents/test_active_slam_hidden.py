@@ -58,7 +58,7 @@ def test_baselines_act_on_managed_maps(name):
 def test_a_duplicate_is_compared_with_another_landmark():
     """Two landmarks of the map stand at the first of two true ones, 4 m apart."""
     means = np.array([[0, 0, 0, 1.0, 1.0, 1.0, 1.0]])
-    beliefs = BatchStorage(means, np.zeros((1, 7, 7)), np.array([[0, 1]]))
+    beliefs = BatchStorage.of(means, np.zeros((1, 7, 7)), np.array([[0, 1]]))
     truth = np.array([[1 + 1j, 5 + 1j]])
     np.testing.assert_allclose(matched_rmse(beliefs, truth), [8**0.5])
     alone = beliefs._replace(slots=np.array([[0, -1]]))

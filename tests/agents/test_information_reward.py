@@ -112,12 +112,7 @@ def test_measures_are_per_landmark(slam):
     assert uncertainty(rows, "E", 2.0)[0] == e_optimality(joint)
 
 
-@given(
-    st.floats(-3, 3),
-    st.floats(-3, 3),
-    st.floats(0.1, 3),
-    st.floats(0.1, 3),
-)
+@given(st.floats(-3, 3), st.floats(-3, 3), st.floats(0.1, 3), st.floats(0.1, 3))
 def test_effort_is_between_rest_and_both_limits(v, w, fastest, quickest):
     spent = effort([v, w], (fastest, quickest)).item()
     assert 0 <= spent <= 1

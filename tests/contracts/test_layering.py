@@ -32,6 +32,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         large_maps peers
         registry
         smoother
+        covariance_checks
         check_estimator
     """,
     "estimator.large_maps": """
@@ -53,14 +54,16 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         monte_carlo
         noise_study noise_fitting
         trajectories
+        conventions estimate_files
+        judging
         command_line
     """,
     "experiments.monte_carlo": """
         filtered_runs
         run_measures
         results
-        runner
         verdict
+        runner
         summary
         figures
         report

@@ -22,13 +22,6 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def torch():
-    library = pytest.importorskip("torch", reason="needs torch")
-    library.set_num_threads(1)
-    return library
-
-
-@pytest.fixture(scope="module")
 def ppo(torch):
     return runpy.run_path(str(ONE_FILE))
 

@@ -138,22 +138,10 @@ def test_attributes_and_methods_are_handed_out_world_by_world(sb3):
 
 
 @pytest.mark.slow
-def test_stable_baselines_own_checker_accepts_the_single_world(sb3):
-    from stable_baselines3.common.env_checker import check_env
-
-    env = gym.make(ID, disable_env_checker=True).unwrapped
-    with pytest.warns(UserWarning, match="recommend you to flatten"):
-        check_env(env)
-    check_env(gym.wrappers.FlattenObservation(env))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("flat", [False, True])
-def test_ppo_learns_on_it(flat, sb3):
-    worlds = native(8, steps=16)
-    worlds = to_stable_baselines(FlattenBatch(worlds) if flat else worlds)
-    policy = "MlpPolicy" if flat else "MultiInputPolicy"
+def test_ppo_learns_on_observations_of_several_parts(sb3):
+    worlds = to_stable_baselines(native(8, steps=16))
     monitored = sb3.common.vec_env.VecMonitor(worlds)
+    policy = "MultiInputPolicy"
     model = sb3.PPO(policy, monitored, n_steps=16, batch_size=64, n_epochs=1, seed=0)
     model.learn(256)
     assert model.num_timesteps == 256
@@ -229,13 +217,3 @@ def test_worlds_that_are_drawn_anew_per_episode_repeat_under_their_seed(sb3):
     assert ends > 4
     assert len(noises) == ends + 4
     np.testing.assert_array_equal(*drives)
-
-
-@pytest.mark.slow
-def test_ppo_takes_worlds_that_are_drawn_anew_per_episode(sb3):
-    scope = {"__name__": "reader"}
-    exec(compile(randomised()[0], "document", "exec"), scope)
-    worlds = to_stable_baselines(FlattenBatch(scope["worlds"]))
-    model = sb3.PPO("MlpPolicy", worlds, n_steps=16, batch_size=32, n_epochs=1, seed=0)
-    model.learn(128)
-    assert model.num_timesteps == 128

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from presets import PRESETS
+from scipy.spatial import KDTree
 
 from slamgym.envs.controllers import (
     CONTROLLERS,
@@ -39,7 +40,7 @@ def drive(controller, steps, *, dt, pose=ORIGIN, noise=None):
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(
     pose=st.tuples(*[st.floats(-1e3, 1e3)] * 3),
     step=st.integers(0, 10_000),
@@ -111,7 +112,7 @@ def test_the_planned_path_starts_at_the_start():
 @settings(max_examples=20, deadline=None)
 @given(
     points=st.lists(
-        st.tuples(st.floats(-10, 10), st.floats(-10, 10)), min_size=1, max_size=4
+        st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=1, max_size=4
     ),
     heading=st.floats(-20, 20),
     seed=st.integers(0, 1000),
@@ -119,7 +120,7 @@ def test_the_planned_path_starts_at_the_start():
 def test_waypoints_are_all_visited_in_order_despite_slip(points, heading, seed):
     dt, tolerance = 0.5, 0.2
     driver = Waypoints(points, ROBOT, dt=dt, tolerance=tolerance)
-    path = drive(driver, 1200, dt=dt, pose=(0.0, 0.0, heading), noise=rng(seed))
+    path = drive(driver, 600, dt=dt, pose=(0.0, 0.0, heading), noise=rng(seed))
     step = 0
     for point in points:
         gaps = np.linalg.norm(path[step:, :2] - point, axis=1)
@@ -181,7 +182,7 @@ def test_waypoints_keep_near_the_planned_path_of_a_preset(name):
     controller = make_controller("waypoints", scenario, rng())
     path = drive(controller, scenario.steps, dt=scenario.dt, pose=scenario.start.pose)
     plan = planned_path(scenario)[:, :2]
-    gaps = np.linalg.norm(path[:, None, :2] - plan, axis=2).min(axis=1)
+    gaps, _ = KDTree(plan).query(path[:, :2])
     assert gaps.max() <= np.linalg.norm(np.diff(plan, axis=0), axis=1).max()
 
 
@@ -211,12 +212,12 @@ def test_wandering_has_the_documented_means_and_spreads(dt):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dt", [0.1, 1.0])
+@pytest.mark.parametrize("dt", [0.5, 2.0])
 def test_wandering_forgets_within_the_correlation_time(dt):
     turns = wander(steps=int(8000 / dt), dt=dt, correlation_time=5.0)[:, 1]
-    lag = int(5.0 / dt)
+    lag = math.ceil(5.0 / dt)
     correlation = np.corrcoef(turns[:-lag], turns[lag:])[0, 1]
-    assert correlation == pytest.approx(math.exp(-1), abs=0.06)
+    assert correlation == pytest.approx(math.exp(-lag * dt / 5.0), abs=0.06)
 
 
 def test_wandering_goes_forwards_only():

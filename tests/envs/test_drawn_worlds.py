@@ -6,8 +6,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from worlds import RANGED
 
-from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.streams import drawn_scenarios, episode_keys
 from slamgym.envs.vector import LandmarkWorldVectorEnv
@@ -17,13 +17,6 @@ from slamgym.sim_configs import ScenarioError, load_scenario
 from slamgym.sim_configs.scenario import RANGES
 from slamgym.sim_configs.scenario_files import copied_draw
 
-RANGED = {
-    "motion_std": [0.5, 2.0],
-    "measurement_std": [0.25, 4.0],
-    "max_range": [2.0, 6.0],
-    "start_x": [-2.0, 2.0],
-    "start_heading": [-3.0, 3.0],
-}
 FAMILY = load_scenario("active_easy").with_changes(randomise=RANGED)
 
 
@@ -100,48 +93,6 @@ def test_without_ranges_the_scenario_is_its_own_draw():
     env = LandmarkWorldEnv("loop")
     env.reset(seed=0)
     assert env.drawn_scenario is env.scenario
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_vector_active_slam_equals_single_worlds_over_episodes(mode):
-    scenario = FAMILY.with_changes(steps=9)
-    many = ActiveSlamVectorEnv(3, scenario, autoreset_mode=mode)
-    singles = [ActiveSlamEnv(scenario) for _ in range(3)]
-    observations, _ = many.reset(seed=7)
-    seen = [env.reset(seed=7 + k)[0] for k, env in enumerate(singles)]
-    ended = np.zeros(3, dtype=bool)
-    rng, draws = np.random.default_rng(0), set()
-    for _ in range(40):
-        for k in range(3):
-            for key, value in seen[k].items():
-                np.testing.assert_array_equal(observations[key][k], value)
-        drawn = many.drawn_scenarios
-        assert [env.drawn_scenario for env in singles] == drawn
-        draws |= {each.motion.std for each in drawn}
-        actions = rng.uniform(-0.3, 0.8, (3, 2))
-        observations, _, terminated, truncated, _ = many.step(actions)
-        for k, env in enumerate(singles):
-            if mode == "NextStep" and ended[k]:
-                seen[k] = env.reset()[0]
-                continue
-            seen[k], _, over, late, _ = env.step(actions[k])
-            assert (over, late) == (terminated[k], truncated[k])
-            if mode == "SameStep" and (over or late):
-                seen[k] = env.reset()[0]
-        ended = terminated | truncated
-    assert len(draws) >= 9
-
-
-def test_filters_keep_the_nominal_noise():
-    env = ActiveSlamEnv(
-        "active_easy", randomise={"motion_std": [50.0, 50.0], "start_std": [9.0, 9.0]}
-    )
-    plain = ActiveSlamEnv("active_easy")
-    for each in (env, plain):
-        each.reset(seed=1)
-        each.step([1.0, 0.0])
-    uncertain = [each.knowledge.belief.pose_covariance for each in (env, plain)]
-    np.testing.assert_allclose(np.sqrt(uncertain[0][0, 0] / uncertain[1][0, 0]), 1, 0.5)
 
 
 @pytest.mark.parametrize("max_range", [None, [2.0, 6.0]])

@@ -417,7 +417,7 @@ def test_a_copied_environment_continues_alike(duplicate, render_mode):
     if render_mode:
         env.render()
     twin = duplicate(env)
-    for action in actions(300, seed=1):
+    for action in actions(60, seed=1):
         a, b = env.step(action), twin.step(action)
         assert_same([a[::4]], [b[::4]])
     if render_mode:

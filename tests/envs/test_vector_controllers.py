@@ -29,7 +29,7 @@ def one_by_one(singles, poses, step):
 @pytest.mark.parametrize("name", CONTROLLERS)
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_robot_drives_as_with_a_controller_of_its_own(preset, name):
-    scenario = load_scenario(preset).with_changes(steps=150)
+    scenario = load_scenario(preset).with_changes(steps=60)
     envs = [LandmarkWorldEnv(scenario) for _ in range(3)]
     poses = [env.reset(seed=seed)[1]["pose"] for seed, env in enumerate(envs)]
     singles = [make_controller(name, scenario, rng) for rng in generators(3)]

@@ -21,8 +21,7 @@ CASES = {
     "positions": ("ekf", {"bearing_std_metres": 0.1, "range_noise_at": "reading"}),
     "independent": ("ekf", {"landmark_init": "independent", "noise_at_rest": False}),
     "invariant": ("invariant", {}),
-    "invariant iterated": ("invariant", {"iterations": 3}),
-    "invariant sequential": ("invariant", {"sequential": True}),
+    "invariant once": ("invariant", {"iterations": 1}),
     "iterated": ("iterated", {}),
     "first_estimates": ("first_estimates", {}),
     "observability_constrained": ("observability_constrained", {}),
@@ -155,11 +154,6 @@ def test_arrays_of_a_wrong_shape_are_refused_by_name(data, index, message):
         batch.run(*arrays)
 
 
-def test_first_poses_of_a_wrong_shape_are_refused():
-    with pytest.raises(ValueError, match="initial_poses must be finite with shape"):
-        make_batch("ekf", runs=3, landmarks=1, initial_poses=np.zeros((2, 3)), **NOISE)
-
-
 def test_a_run_that_has_stopped_stays_so(data):
     odometry, measurements, visible = (array.copy() for array in data)
     odometry[1, 3] = np.nan
@@ -192,7 +186,9 @@ def test_a_scan_that_fails_leaves_the_belief_of_its_run(landmarks):
     np.testing.assert_array_equal(batch.belief(0).covariance, before.covariance)
 
 
-def test_settings_that_a_batch_would_ignore_are_refused():
+def test_settings_of_a_wrong_shape_and_those_that_a_batch_would_ignore_are_refused():
+    with pytest.raises(ValueError, match="initial_poses must be finite with shape"):
+        make_batch("ekf", runs=3, landmarks=1, initial_poses=np.zeros((2, 3)), **NOISE)
     with pytest.raises(ValueError, match="initial_pose must be given as initial_poses"):
         make_batch("ekf", runs=1, landmarks=1, initial_pose=(5, 5, 1), **NOISE)
     with pytest.raises(ValueError, match="threads must be a whole number >= 1"):

@@ -1,7 +1,7 @@
-import importlib.util
 import re
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -18,6 +18,19 @@ from slamgym.estimator import (
     register_estimator,
 )
 from slamgym.estimator.check_estimator import find_breaches
+from slamgym.estimator.covariance_checks import (
+    _ERRORS,
+    _IDS,
+    _LANDMARKS,
+    _MOTION_STD,
+    _SENSOR_STD,
+    _START,
+    _addition,
+    _correction,
+    _prediction,
+    _state,
+)
+from slamgym.estimator.models.bearing_range import predict_measurement
 
 TEXTBOOK = Path(__file__).parents[2] / "examples" / "05_your_own_estimator.py"
 NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
@@ -481,14 +494,183 @@ def test_a_belief_that_is_not_finite_is_a_finding():
 def test_a_filter_that_forgets_to_wrap_the_innovation_is_named(
     monkeypatch, wrap, bearings
 ):
-    spec = importlib.util.spec_from_file_location("textbook", TEXTBOOK)
-    textbook = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(textbook)
-    assert check_estimator(textbook.TextbookEkf) == ()
+    textbook = textbook_module()
+    assert check_estimator(textbook.CarefulEkf) == ()
     monkeypatch.setattr(textbook, "wrap_angle", wrap)
     complaint = rf"bearings {bearings}.* wrap the innovation to .* NIS 4\.9e\+04"
     with pytest.raises(EstimatorContractError, match=complaint):
-        check_estimator(textbook.TextbookEkf)
+        check_estimator(textbook.CarefulEkf)
+
+
+def textbook_module(old="", new=""):
+    """Import the example, with one text of it in place of another."""
+    source = TEXTBOOK.read_text(encoding="utf-8")
+    assert not old or source.count(old) == 1
+    module = ModuleType("textbook")
+    code = compile(source.replace(old, new) if old else source, TEXTBOOK, "exec")
+    exec(code, module.__dict__)
+    return module
+
+
+MISTAKES = {
+    "sign of -d sin in G": (
+        "G[:2, 2] = -d * s, d * c",
+        "G[:2, 2] = d * s, d * c",
+        r"predict\(\): ∂x'/∂θ has the wrong sign: covariance\[0, 1\], of x and y, must "
+        r"be 3\.15e-06, got 5\.24e-06",
+    ),
+    "sign of d cos in G": (
+        "G[:2, 2] = -d * s, d * c",
+        "G[:2, 2] = -d * s, -d * c",
+        r"predict\(\): ∂y'/∂θ has the wrong sign: covariance\[1, 2\]",
+    ),
+    "G is the identity": (
+        "G[:2, 2] = -d * s, d * c",
+        "",
+        r"predict\(\): ∂x'/∂θ and ∂y'/∂θ are missing: covariance\[1, 1\]",
+    ),
+    "sign of a sine in F": (
+        "F[:2, :2] = (c, -s), (s, c)",
+        "F[:2, :2] = (c, s), (s, c)",
+        r"predict\(\): ∂x'/∂εy has the wrong sign",
+    ),
+    "noise along the axes of the world": (
+        "F[:2, :2] = (c, -s), (s, c)",
+        "",
+        r"predict\(\): the motion noise is not rotated by the heading",
+    ),
+    "half dt": (
+        "F.T * dt",
+        "F.T * dt / 2",
+        r"predict\(\): the variance of the motion noise is multiplied by 0\.5: "
+        r"covariance\[\d, \d\]",
+    ),
+    "dt squared": ("F.T * dt", "F.T * dt**2", "motion noise is multiplied by dt²"),
+    "no dt": ("F.T * dt", "F.T", "motion noise is not multiplied by dt"),
+    "deviations for variances of the motion": (
+        "np.diag(np.square(motion_std))",
+        "np.diag(motion_std)",
+        "standard deviations of the motion noise are used as variances",
+    ),
+    "cross-covariance does not move": (
+        "self.P = G @ self.P @ G.T + F @ self.R @ F.T * dt",
+        "A, B = G[:3, :3], F[:3]\n"
+        "        self.P[:3, :3] = A @ self.P[:3, :3] @ A.T + B @ self.R @ B.T * dt",
+        r"predict\(\): the covariance of pose and landmarks is not multiplied by G: "
+        r"covariance\[\d, \d\], of .*l\d[xy], must be .*, got",
+    ),
+    "new landmark without cross-covariance": (
+        "self.ids.append(landmark)",
+        "self.ids.append(landmark); self.P[-2:, :-2] = 0; self.P[:-2, -2:] = 0",
+        "new landmarks: all covariances with the pose and other landmarks are missing",
+    ),
+    "new landmark without the pose's covariance": (
+        "J[-2:, :3] = (1, 0, -r * s), (0, 1, r * c)",
+        "",
+        "new landmarks: the uncertainty of the pose is left out",
+    ),
+    "new landmarks without each other's covariance": (
+        "self.ids.append(landmark)",
+        "self.ids.append(landmark); self.P[-2:, 3:-2] = 0; self.P[3:-2, -2:] = 0",
+        "the covariance of two new landmarks is missing",
+    ),
+    "sign in the Jacobian of a new landmark": (
+        "(1, 0, -r * s), (0, 1, r * c)",
+        "(1, 0, r * s), (0, 1, r * c)",
+        "new landmarks: ∂lx/∂θ has the wrong sign",
+    ),
+    "new landmark without the noise of the reading": (
+        " + B @ self.Q @ B.T",
+        "",
+        "new landmarks: the sensor noise is missing",
+    ),
+    "reading of a new landmark used again": (
+        "self._add(i, *scan[i])\n",
+        "self._add(i, *scan[i])\n        if new: self.update(*zip(*[(scan[i], i) for "
+        "i in new]))\n",
+        "new landmarks: every reading is used twice",
+    ),
+    "scan used twice": (
+        "S = H @ self.P @ H.T + np.kron(np.eye(len(known)), self.Q)\n",
+        "H, nu = np.vstack([H, H]), np.append(nu, nu)\n"
+        "        S = H @ self.P @ H.T + np.kron(np.eye(2 * len(known)), self.Q)\n",
+        r"update\(\): every reading is used twice: covariance\[\d, \d\]",
+    ),
+    "sign of the heading in H": (
+        "-dx / r**2, -1)",
+        "-dx / r**2, 1)",
+        r"update\(\): ∂β/∂θ has the wrong sign",
+    ),
+    "no heading in H": (
+        "-dx / r**2, -1)",
+        "-dx / r**2, 0)",
+        r"update\(\): ∂β/∂θ is missing",
+    ),
+    "sign in the landmark's Jacobian": (
+        "(dx / r, dy / r)",
+        "(dx / r, -dy / r)",
+        r"update\(\): ∂r/∂ly has the wrong sign",
+    ),
+    "deviations of the readings swapped": (
+        "np.diag(np.square(measurement_std))",
+        "np.diag(np.square(measurement_std)[::-1])",
+        "standard deviations of the sensor noise are in another order",
+    ),
+    "covariance not updated": (
+        "self.P - K @ S @ K.T",
+        "self.P",
+        r"update\(\): the covariance is not updated",
+    ),
+    "map not corrected": (
+        "K = np.linalg.solve(S, H @ self.P).T",
+        "K = np.linalg.solve(S, H @ self.P).T; K[3:] = 0",
+        r"update\(\): the gain of the landmarks is missing",
+    ),
+    "innovation against the readings": (
+        "self.x + K @ nu",
+        "self.x - K @ nu",
+        r"update\(\): the innovation has the wrong sign: mean\[\d\]",
+    ),
+    "NIS without the noise": (
+        "nu @ np.linalg.solve(S, nu)",
+        "nu @ np.linalg.solve(S / 2, nu)",
+        r"update\(\)\.nis must be νᵀ S⁻¹ ν",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_wrong_covariance_is_named_with_the_entry_and_its_value(mistake):
+    old, new, complaint = MISTAKES[mistake]
+    textbook = textbook_module(old, new)
+    findings = find_breaches(textbook.TextbookEkf, ("correct",))
+    assert any(re.search(complaint, each.message) for each in findings), findings
+
+
+def test_every_frequent_mistake_differs_from_the_equations():
+    slam = EkfSlam(motion_std=_MOTION_STD, measurement_std=_SENSOR_STD, **_START)
+    calls = [_prediction(*_state(slam.belief()), np.array([1.5, 0.7]), 3.0)]
+    slam.predict((1.5, 0.7), 2.0)
+    pose = slam.belief().pose
+    readings = predict_measurement(pose, _LANDMARKS).measurement
+    calls += [_addition(*_state(slam.belief()), readings)]
+    slam.update(readings, _IDS)
+    calls += [_prediction(*_state(slam.belief()), np.array([0.8, 0.4]), 0.5)]
+    slam.predict((0.8, 0.4), 0.5)
+    pose = slam.belief().pose
+    readings = predict_measurement(pose, _LANDMARKS).measurement + _ERRORS
+    calls += [_correction(*_state(slam.belief()), readings)]
+    seen = {}
+    for call in calls:
+        for text, guess in call.mistakes():
+            differs = text != "" and not call.right().agrees(guess)
+            seen[call.method, text] = seen.get((call.method, text), False) or differs
+    same = {text for (_, text), differs in seen.items() if text and not differs}
+    zeros = ("∂x'/∂y", "∂y'/∂x", "∂θ'/∂x", "∂θ'/∂y", "∂x'/∂εα", "∂y'/∂εα", "∂θ'/∂εx")
+    zeros += ("∂θ'/∂εy", "∂lx/∂y", "∂ly/∂x", "∂r/∂θ")
+    assert {text for text in same if not text.startswith(zeros)} == {
+        "∂θ'/∂εα has the wrong sign"
+    }
 
 
 def test_unknown_estimator_is_refused_with_a_suggestion():

@@ -1,11 +1,9 @@
 """The compressed filter is the full filter: whatever it puts off, nothing is lost."""
 
-import io
 import pickle
 import sys
 from pathlib import Path
 
-import forked
 import numpy as np
 import pytest
 from comparison import assert_same_bits
@@ -114,27 +112,18 @@ def test_it_keeps_the_contract(base):
 @pytest.mark.slow
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_it_equals_the_full_filter_while_300_landmarks_come_and_go(base):
-    slam, phases = follow_both(base, 300, 1000, mapped=True)
+    slam, phases = follow_both(base, 300, 400, mapped=True)
     assert 50 < len(slam.landmark_ids) < 280
-    assert phases > 20
+    assert phases > 8
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("base", "count", "steps"), [("ekf", 600, 500), ("invariant", 1000, 200)]
-)
-def test_it_equals_the_full_filter_while_many_landmarks_come_and_go(base, count, steps):
-    _, phases = follow_both(base, count, steps, mapped=True, every=100)
-    assert phases > 9
-
-
-@pytest.mark.slow
-def test_it_equals_the_full_filter_over_1000_steps_among_1000_landmarks():
+def test_it_equals_the_full_filter_over_400_steps_among_1000_landmarks():
     """With a twin in numpy and BLAS for the full filter, not its own kernels."""
     slam = map_all(CompressedEkfSlam(*NOISE), 1000)
     start = slam.belief()
     full = FullWithDsyrk(start.mean, start.covariance, *map(np.array, NOISE))
-    for odometry, readings, ids in wander(1000, 1000):
+    for odometry, readings, ids in wander(1000, 400):
         full.predict(odometry)
         full.update(readings, ids)
         slam.predict(odometry)
@@ -153,9 +142,9 @@ def test_every_base_stays_itself_where_readings_jump_about_the_map(base):
 
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_it_equals_the_full_filter_while_it_explores(base):
-    slam, phases = follow_both(base, 1000, 900, every=450)
-    assert len(slam.landmark_ids) > 100
-    assert phases > 5
+    slam, phases = follow_both(base, 1000, 500, every=250)
+    assert len(slam.landmark_ids) > 80
+    assert phases > 3
 
 
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
@@ -166,8 +155,8 @@ def test_it_equals_the_full_filter_at_a_local_size_of_the_users_choice(base):
 
 
 @pytest.mark.slow
-def test_over_8000_steps_it_stays_symmetric_and_positive_definite():
-    slam = run(CompressedEkfSlam(*NOISE), wander(120, 8000, seen=4))
+def test_over_4000_steps_it_stays_symmetric_and_positive_definite():
+    slam = run(CompressedEkfSlam(*NOISE), wander(120, 4000, seen=4))
     belief = slam.belief()
     assert len(belief.landmark_ids) > 100
     np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
@@ -222,8 +211,10 @@ def test_to_remove_landmarks_leaves_all_else_exactly_as_it_was(near):
     )
 
 
-@pytest.mark.parametrize("base", ["ekf", "invariant", "first_estimates"])
-@pytest.mark.parametrize("jumping", [False, True])
+@pytest.mark.parametrize(
+    ("base", "jumping"),
+    [("ekf", False), ("invariant", True), ("first_estimates", False)],
+)
 def test_a_merge_is_that_of_the_full_filter(base, jumping):
     count = 60
     slam, full = CompressedEkfSlam(*NOISE, base=base), BASES[base](*NOISE)
@@ -262,65 +253,6 @@ def test_a_landmark_removed_and_seen_again_is_a_new_one():
     report = slam.update([(0.1, 3.0), (0.5, 4.0)], [last, first])
     assert report.added_ids == (last, first)
     assert slam.landmark_ids[-2:] == (last, first)
-
-
-def through_pickle(state):
-    return pickle.loads(pickle.dumps(state))
-
-
-def through_npz(state):
-    file = io.BytesIO()
-    np.savez(file, **state)
-    file.seek(0)
-    return dict(np.load(file))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("base", ["ekf", "invariant"])
-@pytest.mark.parametrize("jumping", [False, True])
-def test_a_run_stopped_at_any_step_continues_bit_for_bit(base, jumping):
-    drive = list(wander(300, 130, jumping=jumping))
-    slam = map_all(CompressedEkfSlam(*NOISE, base=base), 300)
-    saved = []
-    for odometry, readings, ids in drive:
-        slam.predict(odometry)
-        saved.append(slam.state_dict())
-        slam.update(readings, ids)
-    assert len({state["far_progress"][1] for state in saved}) > 1  # amid the work
-    assert len({len(state["far_pending_signs"]) for state in saved}) > 1
-    for step in range(0, 130, 9):
-        travel = (through_npz, through_pickle)[step % 2]
-        other = CompressedEkfSlam(*NOISE, base=base)
-        other.load_state_dict(travel(saved[step]))
-        other.update(*drive[step][1:])
-        run(other, drive[step + 1 :])
-        assert_same_bits(other.belief(), slam.belief())
-        found, expected = other.state_dict(), slam.state_dict()
-        assert found.keys() == expected.keys()
-        for key, value in found.items():
-            np.testing.assert_array_equal(value, expected[key], err_msg=key)
-
-
-def saved_and_continued(saved, which):
-    slam = CompressedEkfSlam(*NOISE, base="invariant")
-    drive = list(wander(300, 60))
-    if which == "first":
-        run(map_all(slam, 300), drive[:25])
-        saved.write_bytes(pickle.dumps(slam.state_dict()))
-    else:
-        slam.load_state_dict(pickle.loads(saved.read_bytes()))
-    return run(slam, drive[25:]).belief()
-
-
-@pytest.mark.slow
-def test_a_saved_run_continues_bit_for_bit_in_another_process(tmp_path):
-    run(CompressedEkfSlam(*NOISE, base="invariant"), wander(300, 60))  # compiles
-    first, second = (
-        forked.result_of(saved_and_continued, tmp_path / "saved.pickle", which)
-        for which in ("first", "second")
-    )
-    assert len(first.mean) > 600
-    assert_same_bits(first, second)
 
 
 def test_a_state_is_shared_with_nobody():

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from dense_ekf import DenseEkf
 from dense_family import (
+    DenseAdaptiveInvariant,
     DenseConstrained,
     DenseFirstEstimates,
     DenseIdeal,
     DenseInvariant,
     DenseIterated,
     DenseRobocentric,
-    DenseSequentialInvariant,
     DenseUnscented,
 )
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 
-from slamgym.estimator import EkfSlam, list_estimators, make_estimator
+from slamgym.estimator import EkfSlam, list_estimators, make_batch, make_estimator
 from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.smoother.recorded_slam import RecordedSlam
 
@@ -26,20 +26,16 @@ TRUE_MAP = dict(enumerate(SIX))
 START_STD = (0.05, 0.05, 0.02)
 
 
-class DenseIteratedInvariant(DenseInvariant):
-    iterations = 3
+class DenseTwiceInvariant(DenseAdaptiveInvariant):
+    iterations = 2
 
 
 # name, options, dense twin
 FAMILY = {
     "ekf": ("ekf", {}, DenseEkf),
-    "invariant": ("invariant", {}, DenseInvariant),
-    "invariant iterated": ("invariant", {"iterations": 3}, DenseIteratedInvariant),
-    "invariant sequential": (
-        "invariant",
-        {"sequential": True},
-        DenseSequentialInvariant,
-    ),
+    "invariant": ("invariant", {}, DenseAdaptiveInvariant),
+    "invariant once": ("invariant", {"iterations": 1}, DenseInvariant),
+    "invariant twice": ("invariant", {"iterations": 2}, DenseTwiceInvariant),
     "first_estimates": ("first_estimates", {}, DenseFirstEstimates),
     "observability_constrained": ("observability_constrained", {}, DenseConstrained),
     "iterated": ("iterated", {"iterations": 3}, DenseIterated),
@@ -50,15 +46,15 @@ FAMILY = {
     "compressed invariant": (
         "compressed",
         {"base": "invariant"},
-        DenseInvariant,
+        DenseAdaptiveInvariant,
     ),
-    "submaps": ("submaps", {}, DenseInvariant),
+    "submaps": ("submaps", {}, DenseAdaptiveInvariant),
     "sparse_information": ("sparse_information", {"active_bound": None}, DenseEkf),
 }
 BLIND_TO_A_TURN = [
     "invariant",
-    "invariant iterated",
-    "invariant sequential",
+    "invariant once",
+    "invariant twice",
     "first_estimates",
     "observability_constrained",
     "robocentric",
@@ -91,10 +87,10 @@ def test_every_registered_estimator_is_in_the_family():
     assert {name for name, *_ in FAMILY.values()} == set(list_estimators())
 
 
-@pytest.mark.parametrize("steps", [100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [60, pytest.param(400, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("case", FAMILY)
 def test_equals_its_slow_dense_twin(case, steps):
-    steps = min(steps, 200) if case == "unscented" else steps
+    steps = min(steps, 150) if case == "unscented" else steps
     twin = FAMILY[case][2](MOTION_STD, MEASUREMENT_STD, START_STD)
     fast = make(case, initial_pose_std=START_STD)
     rng, nis = np.random.default_rng(1), []
@@ -119,7 +115,73 @@ def test_equals_its_slow_dense_twin(case, steps):
     np.testing.assert_allclose(belief.covariance, covariance, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("case", [c for c in FAMILY if c != "invariant sequential"])
+ROUGH = {"motion_std": (0.1, 0.05, 0.3), "measurement_std": (0.1, 0.05)}
+
+
+def rough_drive(seed, steps):
+    """A coarse sensor, and a heading that jumps by half a radian now and then."""
+    rng = np.random.default_rng(seed)
+    for step, (odometry, exact, _) in enumerate(drive(seed, steps)):
+        noise = rng.standard_normal((6, 2)) * (0.1, 0.15)
+        readings = exact + noise * np.column_stack([np.ones(6), exact[:, 1]])
+        readings[:, 0] += 0.5 * (step % 7 == 0)  # odometry tells nothing of this turn
+        seen = np.flatnonzero(readings[:, 1] > 1)
+        yield odometry, readings[seen], seen
+
+
+@pytest.mark.parametrize(
+    "case", ["invariant", "invariant twice", "compressed invariant"]
+)
+def test_relinearises_as_its_slow_dense_twin(case):
+    options = {**ROUGH, "range_std_per_metre": 0.1}
+    twin = FAMILY[case][2](*ROUGH.values(), START_STD)
+    twin.range_std_per_metre = 0.1
+    fast = make(case, **options, initial_pose_std=START_STD)
+    once = make("invariant", **options, initial_pose_std=START_STD, iterations=1)
+    for odometry, readings, ids in rough_drive(4, 80):
+        for each in (fast, once, twin):
+            each.predict(odometry)
+        report = fast.update(readings, ids)
+        assert report.nis == pytest.approx(twin.update(readings, ids.tolist()))
+        once.update(readings, ids)
+    belief, mean = fast.belief(), twin.mean.copy()
+    mean[2] = wrap_angle(mean[2])
+    np.testing.assert_allclose(belief.mean, mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(belief.covariance, twin.covariance, rtol=0, atol=1e-9)
+    assert np.abs(once.belief().mean - belief.mean).max() > 0.1
+
+
+def test_relinearises_alike_in_a_batch_and_alone():
+    slam, batch = (
+        make("invariant", **ROUGH),
+        make_batch("invariant", runs=1, landmarks=6, **ROUGH),
+    )
+    for odometry, readings, ids in rough_drive(5, 60):
+        slam.predict(odometry)
+        slam.update(readings, ids)
+        scan, visible = np.zeros((1, 6, 2)), np.zeros((1, 6), dtype=bool)
+        scan[0, ids], visible[0, ids] = readings, True
+        batch.step(odometry[None], scan, visible, np.ones(1))
+    alone, together = slam.belief(), batch.belief(0)
+    order = [together.landmark_ids.index(i) for i in alone.landmark_ids]
+    assert order == list(range(6))
+    np.testing.assert_array_equal(alone.mean, together.mean)
+    np.testing.assert_array_equal(alone.covariance, together.covariance)
+
+
+def test_scans_that_relinearise_do_not_depend_on_the_order_of_readings():
+    one, other = make("invariant", **ROUGH), make("invariant", **ROUGH)
+    rng = np.random.default_rng(0)
+    for step, (odometry, readings, ids) in enumerate(rough_drive(6, 40)):
+        order = rng.permutation(len(ids)) if step else np.arange(len(ids))
+        for each, rows in ((one, np.arange(len(ids))), (other, order)):
+            each.predict(odometry)
+            each.update(readings[rows], ids[rows])
+    landmarks = [each.belief(IDS).landmarks for each in (one, other)]
+    np.testing.assert_allclose(*landmarks, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("case", FAMILY)
 def test_the_order_of_readings_does_not_matter(case):
     one, other = make(case), make(case)
     rng = np.random.default_rng(0)
@@ -255,7 +317,7 @@ def test_nullity_of_the_observability_matrix_along_a_loop(case, nullity):
     assert found == nullity, values[:5]
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 3, 7])
+@pytest.mark.parametrize("iterations", [1, 3])
 @pytest.mark.parametrize("name", ["iterated", "invariant"])
 def test_a_scalar_linear_problem_keeps_its_answer_at_any_number_of_iterations(
     name, iterations
@@ -278,13 +340,13 @@ def test_a_scalar_linear_problem_keeps_its_answer_at_any_number_of_iterations(
     assert slam.belief().pose_covariance[0, 0] == pytest.approx(0.005, abs=1e-12)
 
 
-def test_invariant_filter_on_a_single_iteration_is_the_plain_one():
-    once, plain = make("invariant", iterations=1), make("invariant")
+def test_near_its_predictions_the_invariant_filter_linearises_once():
+    once, free = make("invariant", iterations=1), make("invariant")
     for odometry, readings, _ in drive(2, 30):
-        for each in (once, plain):
+        for each in (once, free):
             each.predict(odometry)
             each.update(readings, IDS)
-    np.testing.assert_array_equal(once.belief().mean, plain.belief().mean)
+    np.testing.assert_array_equal(once.belief().mean, free.belief().mean)
 
 
 @pytest.mark.parametrize("case", FAMILY)
@@ -344,7 +406,7 @@ def solve_or_name(slam, scan):
 def test_a_scan_that_cannot_be_solved_is_refused_or_harmless(case):
     """Without sensor noise rounding decides; nothing absurd may come of either."""
     refused = 0
-    for seed in range(40):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         slam = make(case, motion_std=(0.1, 0.1, 0.1), measurement_std=(0, 0))
         scan = np.stack([rng.uniform(-3, 3, 9), rng.uniform(2, 9, 9)], axis=1)
@@ -361,7 +423,7 @@ def test_a_scan_that_cannot_be_solved_is_refused_or_harmless(case):
         else:
             assert np.isfinite(slam.belief().covariance).all()
             assert outcome.nis < 1e9
-    assert refused > 20
+    assert refused > 10
 
 
 @pytest.mark.parametrize("case", FAMILY)
@@ -443,8 +505,8 @@ def test_beliefs_name_the_frame_of_their_error():
     frames = {case: make(case).belief().frame for case in FAMILY}
     assert {c for c, frame in frames.items() if frame == "invariant"} == {
         "invariant",
-        "invariant iterated",
-        "invariant sequential",
+        "invariant once",
+        "invariant twice",
         "compressed invariant",
         "submaps",
     }

@@ -46,12 +46,17 @@ POLICIES = {
 }
 
 
+OTHERS = sorted(set(list_estimators()) - {"ekf", "submaps"})
+
+
 def make(name, managed):
     if name == "smoother":
         return SmoothingSlam(**NOISE)
     options = {"submap_size": 6} if name == "submaps" else {}
     if name == "compressed":
         options = {"local_size": 4}
+    if name == "sparse_information":
+        options = {"active_bound": 4}  # fewer than are mapped: else it is dense
     return make_estimator(name, **NOISE, management=managed or None, **options)
 
 
@@ -131,7 +136,11 @@ def settled(name, policy):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "policy"),
-    [*((n, p) for n in list_estimators() for p in POLICIES), ("smoother", "none")],
+    [
+        *((n, p) for n in ("ekf", "submaps") for p in POLICIES),
+        *((n, p) for n in OTHERS for p in ("none", "tidy_hypotheses")),
+        ("smoother", "none"),
+    ],
 )
 def test_a_pickled_filter_continues_bit_for_bit(name, policy):
     slam, rest = settled(name, POLICIES[policy])
@@ -228,10 +237,7 @@ def test_a_state_saved_after_an_uncertain_start_is_accepted(name):
 
 
 def test_whole_numbers_beyond_those_of_floats_are_refused():
-    slam = make_estimator(
-        "sparse_information", motion_std=(0.1,) * 3, measurement_std=(0.1, 0.1)
-    )
-    slam.update([(0.0, 2.0), (1.0, 3.0)], [0, 1])
+    slam = driven("sparse_information", False)
     state = slam.state_dict()
     state["around_slots"] = np.array([2.0**63])
     with pytest.raises(ValueError, match="around_slots'] must be whole numbers <= 2⁵³"):

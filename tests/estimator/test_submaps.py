@@ -1,6 +1,5 @@
 """Submaps: independent pieces, joined into the map that all of the data make."""
 
-import forked
 import numpy as np
 import pytest
 from comparison import assert_same_bits
@@ -11,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import csc_array
 from town_drives import run
 
-from slamgym.estimator import EkfSlam, check_estimator
+from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
 from slamgym.estimator.large_maps.elimination import SubmapElimination, dissect
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.factor import (
@@ -24,6 +23,7 @@ from slamgym.estimator.large_maps.submaps.graph import fuse
 from slamgym.estimator.large_maps.submaps.store import CACHE_SIZE, MARKER
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
+from slamgym.estimator.models.rigid_motion import invariant_covariance
 from slamgym.estimator.models.unicycle_motion import predict_pose
 from slamgym.evaluation.nees import pose_nees
 from slamgym.experiments.runs.simulated_runs import simulate_runs
@@ -306,7 +306,7 @@ def test_the_landmarks_and_the_pose_are_where_the_covariance_says():
 @pytest.mark.slow
 def test_in_the_loop_it_is_honest_where_the_ekf_is_not():
     world, nees = load_scenario("loop"), {"ekf": [], "submaps": []}
-    data = simulate_runs(world, 3, 0)
+    data = simulate_runs(world, 2, 0)
     for run_, first in enumerate(data.initial_poses):
         start = {"initial_pose": first, "initial_pose_std": world.start.std}
         noise = world.motion.std, world.sensor.std
@@ -401,9 +401,10 @@ def test_elimination_solves_what_a_dense_solver_solves(count):
 # --- saved and continued --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("base", BASES)
-@pytest.mark.parametrize("joined", [False, True])
-@pytest.mark.parametrize("on_disk", [False, True])
+@pytest.mark.parametrize(
+    ("base", "joined", "on_disk"),
+    [("ekf", False, True), ("invariant", False, False), ("invariant", True, True)],
+)
 def test_a_saved_run_continues_bit_for_bit(tmp_path, base, joined, on_disk):
     options = {"base": base, "folder": tmp_path / "run" if on_disk else None}
     drive = list(laps(70))
@@ -421,19 +422,6 @@ def test_a_saved_run_continues_bit_for_bit(tmp_path, base, joined, on_disk):
     assert found.closed_count == expected.closed_count > 5
     assert_same_bits(expected.belief(), found.belief())
     assert_same_bits(expected.local_belief(), found.local_belief())
-
-
-def continued(folder, state):
-    slam = made(folder=folder)
-    slam.load_state_dict(state)
-    return run(slam, list(laps(70))[45:]).belief()
-
-
-def test_another_process_continues_from_the_folder(tmp_path):
-    folder, drive = str(tmp_path / "run"), list(laps(70))
-    slam = run(made(folder=folder), drive[:45])
-    found = forked.result_of(continued, folder, slam.state_dict())
-    assert_same_bits(run(made(), drive).belief(), found)
 
 
 def test_submaps_on_disk_are_those_in_memory_and_few_are_cache(tmp_path):
@@ -647,6 +635,54 @@ def test_a_world_without_noise_is_mapped_as_it_is():
     np.testing.assert_allclose(slam.belief().landmarks, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+@pytest.mark.parametrize(("shared", "heading_std"), [(0, 1), (3, 1), (3, 0)])
+def test_a_fusion_equals_a_dense_update_with_numeric_derivatives(
+    frame, shared, heading_std
+):
+    """The updated covariance is T (P - K S Kᵀ) Tᵀ; T takes errors to the map."""
+    rng = np.random.default_rng(1)
+    spread = [rng.normal(size=(size, size)) for size in (15, 13)]
+    spread[0][2] *= heading_std
+    P, L = (1e-3 * (root @ root.T) for root in spread)
+    mean, own = 5 * rng.normal(size=15), 3 * rng.normal(size=13)
+    start, turn = complex(*mean[:2]), np.exp(1j * mean[2])
+    seen = (own[3:].view(complex) * turn + start).view(float)
+    mean[3 : 3 + 2 * shared] = seen[: 2 * shared] + rng.normal(size=2 * shared)
+    common = np.arange(shared)
+
+    def moved(errors, mean, own):
+        return retract(mean, errors[:15], "invariant"), retract(own, errors[15:], frame)
+
+    def difference(errors, mean, own):
+        world, local = moved(errors, mean, own)
+        away = (world[3:].view(complex) - complex(*world[:2])) * np.exp(-1j * world[2])
+        return (away[:shared] - local[3:].view(complex)[:shared]).view(float)
+
+    def whole(errors, mean, own):
+        world, local = moved(errors, mean, own)
+        turn, start = np.exp(1j * world[2]), complex(*world[:2])
+        robot = complex(*local[:2]) * turn + start
+        fresh = local[3:].view(complex)[shared:] * turn + start
+        pose = [robot.real, robot.imag, world[2] + local[2]]
+        return np.concatenate([pose, world[3:], fresh.view(float)])
+
+    covariance = block_diag(invariant_covariance(mean, P), L)
+    if shared:
+        A = numeric_jacobian(lambda e: difference(e, mean, own), np.zeros(28))
+        gain = covariance @ A.T @ np.linalg.inv(A @ covariance @ A.T)
+        correction = -gain @ difference(np.zeros(28), mean, own)
+        covariance = covariance - gain @ A @ covariance
+        fused = fuse(Gaussian(mean, P), Gaussian(own, L), frame, (common, common))
+        mean, own = moved(correction, mean, own)
+    else:
+        fused = fuse(Gaussian(mean, P), Gaussian(own, L), frame, (common, common))
+    T = numeric_jacobian(lambda e: whole(e, mean, own), np.zeros(28))
+    np.testing.assert_allclose(fused.mean, whole(np.zeros(28), mean, own), atol=1e-6)
+    np.testing.assert_allclose(fused.covariance, T @ covariance @ T.T, atol=1e-7)
+    assert np.array_equal(fused.covariance, fused.covariance.T)
+
+
 def test_differences_that_cannot_be_solved_are_told():
     world, local = (Gaussian(np.r_[0.0, 0, 0, 1, 1], np.zeros((5, 5))) for _ in "ab")
     common = (np.array([0]), np.array([0]))
@@ -684,6 +720,21 @@ def test_a_scan_larger_than_a_submap_is_refused():
     with pytest.raises(ValueError, match=r"submap_size must be >= 8, .* got 7"):
         slam.update(np.ones((8, 2)), range(8))
     assert_same_bits(before, slam.belief())
+
+
+def test_the_default_size_takes_a_scan_of_any_size():
+    rng = np.random.default_rng(0)
+    slam = SubmapSlam(MOTION_STD, MEASUREMENT_STD)
+    ekf = InvariantEkfSlam(MOTION_STD, MEASUREMENT_STD)
+    readings = np.column_stack([np.linspace(-3, 3, 100), rng.uniform(2, 9, 100)])
+    for filter_ in (slam, ekf):
+        filter_.update(readings, range(100))
+        filter_.predict((0.0, 0.0))
+        filter_.update(readings[:60], range(60))
+        filter_.update(readings, range(100, 200))  # as many as end a submap
+    assert slam.closed_count == 1
+    expected = ekf.belief(slam.landmark_ids)
+    np.testing.assert_allclose(slam.belief().mean, expected.mean, atol=1e-6)
 
 
 def test_a_belief_beyond_the_limit_names_the_memory_it_would_take():

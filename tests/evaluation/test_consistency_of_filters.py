@@ -76,10 +76,10 @@ def test_with_the_frame_anchored_every_filter_is_consistent(name):
 
 
 @pytest.mark.slow
-def test_with_a_coarse_sensor_the_iterated_invariant_filter_stays_sound():
-    nees, _ = study("coarse_loop", "invariant", iterations=3)
+def test_with_a_coarse_sensor_the_invariant_filter_stays_sound():
+    nees, _ = study("coarse_loop", "invariant")
     per_run = nees.mean(axis=1)
-    assert np.median(per_run) <= 1.1
+    assert 0.9 < per_run.mean() < 1.25
     assert (per_run > 3).mean() <= 0.03
 
 
@@ -89,6 +89,6 @@ def test_an_unknown_first_heading_does_not_mislead_the_invariant_filter():
     assert std.mean() == pytest.approx(np.rad2deg(0.5), abs=0.1)
 
 
-def test_large_heading_jumps_need_one_landmark_after_the_other():
-    assert 1.0 <= study("slippery", "invariant", sequential=True)[0].mean() < 1.25
-    assert study("slippery", "invariant")[0].mean() > 3
+def test_large_heading_jumps_do_not_mislead_the_invariant_filter():
+    assert 0.9 < study("slippery", "invariant")[0].mean() < 1.15
+    assert study("slippery", "invariant", iterations=1)[0].mean() > 1.8

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slamgym.evaluation import CAUSES, diagnose
+from slamgym.evaluation import CAUSES, SmallNoise, diagnose
 from slamgym.evaluation.diagnosis import errors_of
 from slamgym.evaluation.hypothesis_tests import time_average_test
 from slamgym.evaluation.noise_findings import (
@@ -72,7 +72,15 @@ def test_sums_are_those_of_the_noise_that_made_the_drive(noise_in):
             powers = [(values**k).sum() for k in range(5)]
             assert channel[:5] == pytest.approx(powers, abs=1e-9)
         g = command[b, 1:, 0] / MOTION_STD[0]
-        assert sums[b, 0, 5:] == pytest.approx([(g * w[0]).sum(), (g * g).sum()])
+        assert sums[b, 0, 5:7] == pytest.approx([(g * w[0]).sum(), (g * g).sum()])
+        for channel, values in zip(sums[b], w[:3], strict=False):
+            lagged = (values[1:] * values[:-1]).sum()
+            assert channel[7:] == pytest.approx([len(values) - 1, lagged], abs=1e-9)
+        both = visible[b, 1:] & visible[b, :-1]
+        for k, std in enumerate((SENSOR_STD[0], SENSOR_STD[1] + PER_METRE * far[b])):
+            noise = sensor[b, ..., k] / std
+            lagged = (noise[1:] * noise[:-1])[both].sum()
+            assert sums[b, 3 + k, 7:] == pytest.approx([both.sum(), lagged])
 
 
 def test_steps_that_do_not_count_are_left_out_of_the_motion_alone():
@@ -96,7 +104,9 @@ def sums_of(w, lever=20.0):
     """Sums of standardised noise, shape (runs, 5, numbers), all of one lever."""
     powers = [(w**k).sum(axis=2) for k in range(5)]
     count = np.full(w.shape[:2], w.shape[2])
-    return np.stack([*powers, lever * powers[1], lever**2 * count], axis=2)
+    lagged = (w[:, :, 1:] * w[:, :, :-1]).sum(axis=2)
+    terms = [*powers, lever * powers[1], lever**2 * count, count - 1, lagged]
+    return np.stack(terms, axis=2)
 
 
 def honest(seed, runs=RUNS):
@@ -116,6 +126,14 @@ def with_noise(channel, change, seed=5):
     return honest(seed) | {"noise": sums_of(w)}
 
 
+def in_time(w, phi=0.4):
+    """Noise of the same size, correlated in time."""
+    out = w.copy()
+    for step in range(1, w.shape[-1]):
+        out[:, step] = phi * out[:, step - 1] + np.sqrt(1 - phi**2) * w[:, step]
+    return out
+
+
 @pytest.mark.parametrize(
     ("channel", "change", "cause"),
     [
@@ -130,6 +148,8 @@ def with_noise(channel, change, seed=5):
         ("turn", lambda _, w: w + 0.2, "odometry turn"),
         ("bearing", lambda _, w: w + 0.2, "bearing bias"),
         ("range", lambda _, w: w - 0.2, "range bias"),
+        ("turn", lambda _, w: in_time(w), "correlated noise"),
+        ("bearing", lambda _, w: in_time(w), "correlated noise"),
         ("turn", lambda rng, w: rng.standard_t(5, w.shape), "heavy tails"),
         ("range", lambda rng, w: rng.standard_t(5, w.shape) / 1.29, "heavy tails"),
     ],
@@ -165,27 +185,94 @@ def test_honest_runs_are_called_something_else_in_at_most_five_percent():
     assert causes.count("honest") >= 36  # of 40; fewer in .3 % of cases at 5 %
 
 
-def growing(scores, factor=1.8):
-    """The scores of a filter whose squared errors grow by twice the excess."""
-    growth = np.linspace(1, 2 * factor - 1, STEPS)
-    return scores | {"nees": growth * scores["nees"]}
+def wrong(seed, factor=1.8, **options):
+    """The scores of a filter whose squared errors are too large by a factor."""
+    scores = honest(seed, **options)
+    return scores | {"nees": factor * scores["nees"]}
 
 
-def test_errors_that_grow_without_a_fault_of_the_noise_are_linearisation():
-    wrong = growing(honest(11))
-    assert diagnose(**wrong).cause == "linearisation"
-    assert diagnose(**wrong, nis_ratio=1.02).cause == "linearisation"
+def less_noise(scores, excess, factor=0.1, runs=RUNS):
+    """The runs of a filter again, the excess of whose squared errors is another."""
+    average = scores["nees"].mean(axis=1)
+    ratio = average.mean() / 3
+    again = average * (1 + excess * (ratio - 1)) / ratio
+    again[runs:] = np.nan
+    heading = np.where(np.isnan(again), np.nan, scores["heading_nees"].mean(axis=1))
+    return SmallNoise(again, heading, factor)
 
 
-def test_errors_that_are_wrong_from_the_start_are_not_of_the_linearisation():
-    for factor in (1.3, 1.8, 4.0):
-        scores = honest(11, runs=100)
-        scaled = scores | {
-            key: factor * scores[key] for key in ("nees", "heading_nees")
-        }
-        found = diagnose(**scaled, nis_ratio=1.0)
-        assert found.cause == "cannot tell"
-        assert "in the first 5 steps" in found.sentence
+@pytest.mark.parametrize("factor", [1.3, 1.8, 40.0])
+@pytest.mark.parametrize(
+    ("excess", "cause", "text"),
+    [
+        (0.001, "linearisation", "vanishes with the noise"),
+        (1.0, "wrong covariance", "the excess stays"),
+        (100.0, "wrong model", "do not shrink with it"),
+    ],
+)
+def test_what_is_left_of_an_excess_with_less_noise_names_the_cause(
+    factor, excess, cause, text
+):
+    scores = wrong(11, factor, runs=120)
+    without = diagnose(**scores)
+    assert without.cause == "cannot tell"
+    assert "a tenth of the noise would show it" in without.sentence
+    count = without.repeat
+    assert count == 12 if factor == 40 else 12 <= count <= 120
+    found = diagnose(**scores, small_noise=less_noise(scores, excess, runs=count))
+    assert found.cause == cause
+    assert found.sentence.startswith(f"{cause}: the noise is as assumed, but the sq")
+    assert text in found.sentence
+    assert found.repeat == 0
+
+
+def test_an_excess_of_which_a_part_remains_is_repeated_with_still_less_noise():
+    scores = wrong(11, 4.0)
+    found = diagnose(**scores, small_noise=less_noise(scores, 0.2))
+    assert (found.cause, found.repeat > 0) == ("cannot tell", True)
+    last = diagnose(**scores, small_noise=less_noise(scores, 0.2, factor=0.01))
+    assert last.cause == "wrong covariance"
+    assert "With 1 % of the noise" in last.sentence
+
+
+def test_an_excess_with_very_large_innovations_is_not_of_the_linearisation():
+    scores = wrong(11, 40.0)
+    small = less_noise(scores, 0.001)
+    found = diagnose(**scores, small_noise=small, nis_ratio=6.0)
+    assert found.cause == "linearisation"
+    found = diagnose(**scores, small_noise=small, nis_ratio=7.0)
+    assert found.cause == "cannot tell"
+    assert found.sentence.endswith("is an angle not wrapped?")
+
+
+def test_a_cautious_filter_has_a_cause_too():
+    scores = wrong(13, 0.5)
+    assert diagnose(**scores).cause == "cannot tell"
+    for excess, cause in ((0.0, "linearisation"), (1.0, "wrong covariance")):
+        small = less_noise(scores, excess)
+        assert diagnose(**scores, small_noise=small).cause == cause
+
+
+def test_nothing_is_concluded_if_the_runs_fail_with_less_noise():
+    scores = wrong(11)
+    small = SmallNoise(np.full(RUNS, np.nan), np.full(RUNS, np.nan))
+    found = diagnose(**scores, small_noise=small)
+    assert found.cause == "cannot tell"
+    assert "Too few runs succeed with less noise" in found.sentence
+
+
+def test_a_filter_that_another_test_rejects_is_not_honest():
+    scores = honest(14)
+    found = diagnose(**scores, rejected=True)
+    assert found.cause == "cannot tell"
+    assert "a test rejects the filter, although" in found.sentence
+
+
+def test_without_the_noise_only_the_errors_are_judged():
+    scores = honest(14) | {"noise": None}
+    assert diagnose(**scores).sentence.startswith("honest: the errors agree")
+    found = diagnose(**wrong(11) | {"noise": None})
+    assert found.sentence.startswith("cannot tell: the squared errors of the pose are")
 
 
 def test_wrong_innovations_are_not_honest_even_if_the_errors_agree():
@@ -201,15 +288,8 @@ def test_spurious_knowledge_of_the_heading_makes_small_errors_suffice():
     nearly = scores | {"heading_nees": 1.15 * scores["heading_nees"]}
     assert diagnose(**nearly, heading_knowledge=np.ones(RUNS)).cause == "honest"
     knowing = diagnose(**nearly, heading_knowledge=np.full(RUNS, 0.6))
-    assert knowing.cause == "linearisation"
-    assert "0.6 of the least possible variance" in knowing.sentence
-
-
-def test_a_filter_that_ignores_the_noise_it_is_given_is_not_explained():
-    scores = honest(13)
-    assert diagnose(**growing(scores), nis_ratio=1.7).cause == "cannot tell"
-    cautious = scores | {"nees": 0.5 * scores["nees"]}
-    assert diagnose(**cautious).cause == "cannot tell"
+    assert knowing.cause == "cannot tell"
+    assert "reports 60 % of the smallest heading variance" in knowing.sentence
 
 
 @pytest.mark.parametrize(("factor", "margin"), [(0.5, 1 / 1.1), (2.0, 1.1)])
@@ -225,10 +305,12 @@ def test_runs_with_wrong_associations_that_err_more_point_to_the_association():
     nees = scores["nees"].copy()
     nees[:20] *= np.linspace(1, 7, STEPS)
     mistakes[:20] = 3
-    wrong = scores | {"nees": nees}
-    assert diagnose(**wrong, mistakes=mistakes).cause == "association"
-    assert diagnose(**wrong, mistakes=mistakes[::-1]).cause == "cannot tell"
-    assert diagnose(**wrong, mistakes=np.zeros(RUNS)).cause == "linearisation"
+    larger = scores | {"nees": nees}
+    assert diagnose(**larger, mistakes=mistakes).cause == "association"
+    other = diagnose(**larger, mistakes=mistakes[::-1])
+    assert (other.cause, other.repeat) == ("cannot tell", 0)
+    assert "err no more than others" in other.sentence
+    assert diagnose(**larger, mistakes=np.zeros(RUNS)).repeat > 0
 
 
 def test_errors_that_known_identities_remove_are_of_the_association():
@@ -246,18 +328,18 @@ def test_errors_that_known_identities_remove_are_of_the_association():
 
 def test_errors_that_known_identities_share_are_not_of_the_association():
     scores, rng = honest(18), np.random.default_rng(18)
-    nees = growing(scores)["nees"]
+    nees = np.linspace(1, 2.6, STEPS) * scores["nees"]
     nees[3] = 60.0
     known = nees * rng.uniform(0.8, 1.25, nees.shape)
-    wrong = scores | {"nees": nees, "mistakes": np.ones(RUNS), "known_nees": known}
-    assert diagnose(**wrong).cause == "linearisation"
+    both = scores | {"nees": nees, "mistakes": np.ones(RUNS), "known_nees": known}
+    assert diagnose(**both).repeat > 0
     growth = np.linspace(1, 800, STEPS)
-    both = {"nees": growth * nees, "known_nees": growth * known / 1.05}
-    assert diagnose(**wrong | both).cause == "linearisation"  # a tenth of them
+    more = {"nees": growth * nees, "known_nees": growth * known / 1.05}
+    assert diagnose(**both | more).repeat > 0  # a tenth of them
     nees[[5, 7]] = 60.0
-    assert diagnose(**wrong | {"nees": nees}).cause == "association"
+    assert diagnose(**both | {"nees": nees}).cause == "association"
     with pytest.raises(ValueError, match="known_nees must be shape"):
-        diagnose(**wrong | {"known_nees": known[:, 1:]})
+        diagnose(**both | {"known_nees": known[:, 1:]})
 
 
 def test_a_few_lost_runs_are_not_called_honest():
@@ -266,8 +348,14 @@ def test_a_few_lost_runs_are_not_called_honest():
     nees[[3, 30, 50]] = nees[[3, 30, 50]] * [[60.0], [400.0], [15.0]]
     mistakes[[3, 30, 50]] = 5
     lost = scores | {"nees": nees}
-    assert diagnose(**lost).cause == "linearisation"
     assert "and 3 runs are lost" in diagnose(**lost).sentence
+    count = diagnose(**lost).repeat
+    assert count == 51  # with all three
+    for left, cause in ((0.0, "linearisation"), (1.0, "wrong covariance")):
+        again = np.where(np.arange(RUNS) < count, nees.mean(axis=1), np.nan)
+        again[[3, 30, 50]] = 3 + left * (again[[3, 30, 50]] - 3)
+        small = SmallNoise(again, scores["heading_nees"].mean(axis=1))
+        assert diagnose(**lost, small_noise=small).cause == cause
     assert diagnose(**lost, mistakes=mistakes).cause == "association"
     assert diagnose(**lost, mistakes=6 - mistakes).cause == "cannot tell"
     nees[[3, 50]] = scores["nees"][[3, 50]]
@@ -303,8 +391,8 @@ def test_few_runs_decide_nothing():
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("noise", np.zeros((RUNS, 5, 6)), r"noise must be shape \(60, 5, 7\)"),
-        ("noise", np.full((RUNS, 5, 7), np.nan), "noise must be finite"),
+        ("noise", np.zeros((RUNS, 5, 6)), r"noise must be shape \(60, 5, 9\)"),
+        ("noise", np.full((RUNS, 5, 9), np.nan), "noise must be finite"),
         ("nees", np.ones(RUNS), r"nees must be shape \(runs, steps\)"),
         ("nees", np.full((RUNS, STEPS), np.nan), "nees must be finite"),
         ("heading_nees", np.ones((RUNS, 2)), "heading_nees must be shape"),

@@ -16,11 +16,13 @@ RUNS = 3
 
 def sums_of(channel, numbers, lever=4.0):
     """Sums of one channel's numbers, shape (runs, n), and of no other."""
-    sums = np.zeros((len(numbers), 5, 7))
+    sums = np.zeros((len(numbers), 5, 9))
     powers = [(numbers**k).sum(axis=1) for k in range(5)]
     leverage = np.full(len(numbers), lever**2 * numbers.shape[1])
+    pairs = np.full(len(numbers), numbers.shape[1] - 1)
+    lagged = (numbers[:, 1:] * numbers[:, :-1]).sum(axis=1)
     sums[:, CHANNELS.index(channel)] = np.stack(
-        [*powers, lever * powers[1], leverage], axis=1
+        [*powers, lever * powers[1], leverage, pairs, lagged], axis=1
     )
     return sums
 
@@ -44,6 +46,21 @@ def test_the_size_has_the_p_value_of_the_chi_square_test(scale, cause):
     assert found.p_value == pytest.approx(2 * min(tails), rel=1e-6, abs=0)
     assert found.impact == pytest.approx(abs(np.log(variance)))
     assert f"σβ is {np.sqrt(variance):.3g} times" in found.text
+
+
+def test_a_correlation_in_time_has_the_p_value_of_a_normal_score():
+    numbers = draw((RUNS, 400)) + 0.3
+    numbers[:, 1:] += 0.1 * numbers[:, :-1]
+    found = findings_of("turn", numbers)["correlated noise"]
+    pairs = numbers - numbers.mean()
+    rho = (pairs[:, 1:] * pairs[:, :-1]).mean() / numbers.var()
+    score = rho * np.sqrt(pairs[:, 1:].size)
+    assert np.log(found.p_value) == pytest.approx(
+        np.log(2 * stats.norm.sf(score)), rel=0.02
+    )
+    assert found.matters
+    assert "successive errors of σα have a correlation of 0.1" in found.text
+    assert not findings_of("turn", draw())["correlated noise"].matters
 
 
 def test_a_size_as_assumed_is_likely_and_does_not_matter():
@@ -123,7 +140,7 @@ def test_a_bias_of_the_sensor_is_that_of_its_readings():
         motion_std=(0.1, 0.1, 0.1),
         measurement_std=(0.05, 0.4),
     )
-    slope, leverage = sums[0, 3:, 5:].T
+    slope, leverage = sums[0, 3:, 5:7].T
     assert slope / leverage == pytest.approx([0.02, 0.3])
 
 

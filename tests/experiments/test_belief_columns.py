@@ -16,7 +16,6 @@ from slamgym.sim_configs import load_scenario
 
 KNOWN = load_scenario("corridor").with_changes(steps=12)
 HIDDEN = load_scenario("hidden_identities").with_changes(steps=12)
-HOLDING = ("npz", "parquet", "minari")
 
 
 def beliefs_by_hand(drive, slam, ids_of):
@@ -100,8 +99,11 @@ def test_the_filter_knows_the_noise_that_an_episode_drew():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scenario", [KNOWN, HIDDEN], ids=["known", "hidden"])
-@pytest.mark.parametrize("name", HOLDING)
+@pytest.mark.parametrize(
+    ("name", "scenario"),
+    [("npz", HIDDEN), ("parquet", KNOWN), ("minari", HIDDEN)],
+    ids=["npz-hidden", "parquet-known", "minari-hidden"],
+)
 def test_formats_return_every_bit_and_workers_write_equal_bytes(
     name, scenario, tmp_path
 ):

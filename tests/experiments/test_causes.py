@@ -1,9 +1,16 @@
 """Faults of worlds, found by a Monte Carlo whose filters do not know them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
+from slamgym.estimator import EkfSlam
+from slamgym.experiments.monte_carlo import (
+    load_results,
+    monte_carlo,
+    summarise_monte_carlo,
+)
 from slamgym.experiments.monte_carlo.filtered_runs import noise_of_runs
 from slamgym.experiments.monte_carlo.report import escaped as escape
 from slamgym.experiments.monte_carlo.report import html_report
@@ -16,7 +23,9 @@ WALLED = WORLD.with_changes(walls=[[4.0, -9.0, 4.0, 9.0]])
 
 
 def summary_of(world, estimators="invariant", assumed=None, runs=RUNS):
-    results = monte_carlo(world, estimators, runs, SEED, assumed=assumed)
+    results = monte_carlo(
+        world, estimators, runs, SEED, assumed=assumed, small_noise=True
+    )
     return summarise_monte_carlo(results)
 
 
@@ -55,6 +64,43 @@ def test_linearisation_is_the_fault_of_one_filter_and_not_of_the_other():
     assert causes(found) == {"ekf": "linearisation", "invariant": "honest"}
     page = html_report(monte_carlo("six_landmarks", "ekf,invariant", 20, SEED), found)
     assert escape(found["estimators"]["ekf"]["diagnosis"]["sentence"]) in page
+
+
+class Scaled(EkfSlam):
+    """Reports two thirds of its covariance."""
+
+    def belief(self, landmark_ids=None):
+        found = super().belief(landmark_ids)
+        return replace(found, covariance=found.covariance / 1.5)
+
+
+class Offset(EkfSlam):
+    """Believes its bearings to be a hundredth of a radian larger than they are."""
+
+    def update(self, measurements, landmark_ids=None):
+        rows = np.array(measurements, float).reshape(-1, 2)
+        return super().update(rows + np.array([0.01, 0.0]), landmark_ids)
+
+
+def test_errors_in_the_code_of_a_filter_are_not_called_linearisation(tmp_path):
+    wrong = {"scaled": Scaled, "offset": Offset}
+    results = monte_carlo(WORLD, wrong, 40, SEED, out=tmp_path, small_noise=True)
+    share = results.attrs["small_noise_share"]
+    assert 0 < share < 1
+    results.close()
+    with load_results(tmp_path) as stored:
+        found = summarise_monte_carlo(stored)
+        few = np.isfinite(stored.small_noise_factor).sum("run").values
+    assert causes(found) == {"scaled": "wrong covariance", "offset": "wrong model"}
+    assert (few >= 10).all()
+    without = summarise_monte_carlo(monte_carlo(WORLD, wrong, 40, SEED))
+    assert causes(without) == dict.fromkeys(wrong, "cannot tell")
+
+
+def test_only_a_consistent_filter_is_honest():
+    entry = summary_of(WORLD, runs=20)["estimators"]["invariant"]
+    is_honest = entry["diagnosis"]["cause"] == "honest"
+    assert is_honest == (entry["verdict"] == "consistent")
 
 
 def test_association_is_named_where_landmarks_are_confused_and_not_elsewhere():

@@ -70,11 +70,9 @@ def format_or_skip(name):
 # what is generated
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("preset", PRESETS)
-def test_an_episode_is_the_log_that_slamgym_run_makes_of_its_seed(
-    preset, controller, tmp_path
-):
+def test_an_episode_is_the_log_that_slamgym_run_makes_of_its_seed(preset, tmp_path):
+    controller = CONTROLLERS[len(preset) % len(CONTROLLERS)]  # they take turns
     scenario = load_scenario(preset).with_changes(steps=40)
     for drive in drive_episodes(scenario, controller, (3, 9)):
         write_slamlog(to_slamlog(drive), tmp_path / "here.csv")
@@ -183,7 +181,8 @@ def test_the_same_job_gives_the_same_bytes(name, tmp_path):
 def test_workers_make_the_bytes_of_one_process_in_every_format(tmp_path):
     for name in FORMATS:
         format_or_skip(name)
-        job = {"format": name, "controller": "random", "episodes_per_shard": 2}
+        job = {"format": name, "controller": "random", "episodes": 4}
+        job["episodes_per_shard"] = 2
         small(tmp_path / name / "one", **job)
         small(tmp_path / name / "two", **job, jobs=2, backend="loky")
         assert tree(tmp_path / name / "one") == tree(tmp_path / name / "two")
@@ -234,18 +233,16 @@ def test_a_data_set_with_a_gap_is_extended_with_the_bytes_of_one_call(tmp_path):
 # killed and damaged
 
 
-def whole_shards(out):
-    try:
-        return len(read_manifest(out).shards)
-    except ValueError:
-        return -1
+def last_listed(out):
+    manifest = out / "manifest.json"
+    return manifest.stat().st_mtime_ns if manifest.exists() else 0
 
 
 def run_until_killed(out, name, delay, kind=jobs_to_kill.episodes):
     """Kill the job with SIGKILL a while after some progress."""
-    before = whole_shards(out)
+    before = last_listed(out)
     job = forked.start(kind, out, name)
-    while job.is_alive() and whole_shards(out) == before:
+    while job.is_alive() and last_listed(out) == before:
         time.sleep(0.005)
     time.sleep(delay)
     job.kill()
@@ -256,7 +253,7 @@ def run_until_killed(out, name, delay, kind=jobs_to_kill.episodes):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kills", "latest"),
-    [("npz", 5, 0.06), ("slamlog", 3, 0.2)],  # [s]: about two shards
+    [("npz", 3, 0.06), ("slamlog", 2, 0.2)],  # [s]: about two shards
     ids=["npz", "slamlog"],
 )
 def test_a_job_killed_at_random_ends_with_the_bytes_of_one_that_was_not(
@@ -272,19 +269,14 @@ def test_a_job_killed_at_random_ends_with_the_bytes_of_one_that_was_not(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", ["loky", "dask"])
-def test_a_job_of_workers_killed_at_random_ends_with_the_bytes_of_one_process(
-    backend, tmp_path
-):
-    if backend == "dask":
-        pytest.importorskip("distributed", reason="needs dask.distributed")
+def test_a_job_of_workers_killed_at_random_ends_with_the_bytes_of_one_process(tmp_path):
     kind = jobs_to_kill.episodes_by_workers
     delays = [random.uniform(0.0, 0.3) for _ in range(KILLS)]
     ends = [
-        run_until_killed(tmp_path / "killed", backend, delay, kind) for delay in delays
+        run_until_killed(tmp_path / "killed", "loky", delay, kind) for delay in delays
     ]
     assert forked.KILLED in ends
-    kind(tmp_path / "killed", backend)
+    kind(tmp_path / "killed", "loky")
     kind(tmp_path / "whole", None, None)
     assert read_manifest(tmp_path / "whole").is_complete
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
@@ -435,7 +427,7 @@ def test_a_repair_that_gives_other_bits_is_refused(tmp_path, monkeypatch):
     assert tree(tmp_path / "out") == before
 
 
-@pytest.mark.parametrize("first", [1, 3, 4, 6])
+@pytest.mark.parametrize("first", [3, 4])
 @pytest.mark.parametrize("format", ["npz", "slamlog"])
 def test_more_episodes_end_with_the_bytes_of_one_call(first, format, tmp_path):
     small(tmp_path / "once", format=format)

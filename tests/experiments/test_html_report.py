@@ -85,6 +85,7 @@ def report(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_the_page_says_verdicts_numbers_and_how_to_do_it_again(report):
     outline = Outline(report.read_text(encoding="utf-8"))
     text = " ".join(outline.texts).replace("\xa0", " ")
@@ -118,6 +119,7 @@ def test_numbers_on_the_page_are_those_of_the_summary():
     assert [float(c) for c in cells] == pytest.approx(np.degrees(std).values, abs=0.05)
 
 
+@pytest.mark.slow
 def test_every_figure_has_a_name_and_its_ids_are_its_own(report):
     outline = Outline(report.read_text(encoding="utf-8"))
     figures = [found for tag, found in outline.elements if tag == "svg"]
@@ -129,6 +131,7 @@ def test_every_figure_has_a_name_and_its_ids_are_its_own(report):
     assert set(re.findall(r'(?:url\(#|href="#)([^)"]+)', page)) == set(ids)
 
 
+@pytest.mark.slow
 def test_colours_and_fonts_of_figures_come_from_the_page(report):
     page = report.read_text(encoding="utf-8")
     drawn = "".join(re.findall(r"<svg.*?</svg>", page, re.DOTALL))
@@ -140,6 +143,7 @@ def test_colours_and_fonts_of_figures_come_from_the_page(report):
     assert all(f"{name}:" in dark for name in used - {"--mono"})
 
 
+@pytest.mark.slow
 def test_the_page_asks_for_nothing_and_runs_nothing(report):
     page = report.read_text(encoding="utf-8")
     outline = Outline(page)
@@ -203,14 +207,13 @@ def call_on(page, folder):
 
 
 @pytest.mark.usefixtures("_no_figures_in_reports")
-@pytest.mark.parametrize("changes", [{}, {"steps": 5}, {"name": "my_own"}])
-@pytest.mark.parametrize("assumed", [False, True])
 @pytest.mark.parametrize(
-    "estimators",
+    ("changes", "assumed", "estimators"),
     [
-        "ekf,invariant",
-        "invariant[iterations=3]",
-        {"mine": ("ekf", {"gate_probability": 0.99})},
+        ({}, False, "ekf,invariant"),
+        ({"steps": 5}, True, "invariant[iterations=3]"),
+        ({"name": "my_own"}, False, {"mine": ("ekf", {"gate_probability": 0.99})}),
+        ({}, True, {"mine": ("ekf", {"gate_probability": 0.99})}),
     ],
 )
 def test_the_call_on_the_page_makes_the_same_results(

@@ -356,26 +356,6 @@ def test_more_runs_build_on_those_there_are(whole, tmp_path):
         xr.testing.assert_equal(fewer.load(), whole.isel(run=slice(0, 18)))
 
 
-@pytest.mark.slow
-def test_parts_of_two_machines_are_one_job(whole, tmp_path):
-    job = {"estimators": "ekf,invariant", "block_size": 8}
-    one, two, both = (tmp_path / name for name in ("one", "two", "both"))
-    monte_carlo("six_landmarks", runs=12, out=one, **job).close()
-    with monte_carlo("six_landmarks", runs=RUNS, first_run=8, out=two, **job) as part:
-        xr.testing.assert_equal(part.load(), whole.isel(run=slice(8, None)))
-    merge_blocks([str(one), two], str(both))
-    done = []
-    with monte_carlo(
-        "six_landmarks",
-        runs=RUNS,
-        out=both,
-        progress=lambda runs, of: done.append(runs),
-        **job,
-    ) as merged:
-        xr.testing.assert_equal(merged.load(), whole)
-    assert done == [RUNS]  # there was nothing left to do
-
-
 def test_only_parts_of_one_job_are_merged(tmp_path):
     monte_carlo("six_landmarks", "ekf", 1, out=tmp_path / "a").close()
     monte_carlo("loop", "ekf", 1, out=tmp_path / "b").close()
@@ -517,11 +497,11 @@ def test_a_disk_that_fills_under_the_results_says_so(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_job_killed_ten_times_ends_with_the_same_bits(whole, tmp_path):
+def test_a_job_killed_six_times_ends_with_the_same_bits(whole, tmp_path):
     rng = np.random.default_rng(0)
     blocks = tmp_path / "blocks"
     stood = []
-    for _ in range(10):
+    for _ in range(6):
         before = len(list(blocks.glob("runs-*.npz")))
         job = forked.start(jobs_to_kill.two_filters, tmp_path)
         while job.is_alive() and len(list(blocks.glob("runs-*.npz"))) == before:
@@ -530,7 +510,7 @@ def test_a_job_killed_ten_times_ends_with_the_same_bits(whole, tmp_path):
         job.kill()
         job.join()
         stood.append(len(list(blocks.glob("runs-*.npz"))))
-    assert len({count for count in stood if 0 < count < RUNS}) >= 5  # in the middle
+    assert len({count for count in stood if 0 < count < RUNS}) >= 3  # in the middle
     with monte_carlo(
         "six_landmarks", "ekf,invariant", RUNS, block_size=1, out=tmp_path
     ) as resumed:
@@ -748,7 +728,10 @@ def test_estimators_that_are_neither_names_nor_classes_are_refused():
         monte_carlo("six_landmarks", ["ekf", 3], 2)
 
 
-@pytest.mark.parametrize("world", ["six_landmarks", "hidden_identities"])
+@pytest.mark.parametrize(
+    "world",
+    ["six_landmarks", pytest.param("hidden_identities", marks=pytest.mark.slow)],
+)
 def test_runs_computed_a_few_at_once_are_those_computed_together(world, monkeypatch):
     scenario = load_scenario(world).with_changes(steps=12)
     together = monte_carlo(scenario, "ekf,robocentric", 5, 300)

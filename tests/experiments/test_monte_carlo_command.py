@@ -52,8 +52,7 @@ def test_results_summary_and_report_are_written_and_told(here):
         expected = monte_carlo("six_landmarks", "ekf,invariant", 40)
         xr.testing.assert_equal(results.load(), expected)
     summary = json.loads((here / "out" / "summary.json").read_text())
-    again = slamgym(*arguments, "--json")
-    assert json.loads(again.stdout)["estimators"] == summary["estimators"]
+    assert summary["estimators"]["ekf"]["verdict"] == "not consistent"
     page = (here / "out" / "report.html").read_text()
     assert "not consistent" in page
     assert "<svg" in page

@@ -148,6 +148,7 @@ def test_a_writer_that_fails_lets_the_next_one_in(tmp_path, whole):
         xr.testing.assert_equal(results.load(), whole)
 
 
+@pytest.mark.slow
 def test_a_child_forked_meanwhile_does_not_keep_the_folder(tmp_path):
     code = """
         import os, pathlib, signal, sys, time

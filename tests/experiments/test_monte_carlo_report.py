@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 import pytest
-from monte_carlo_dataset import FILTERS, typical, with_failures
+from monte_carlo_dataset import typical, with_failures
 from rich.console import Console
 from scipy.stats import chi2
 
@@ -27,7 +27,6 @@ from slamgym.experiments.monte_carlo.report import (
     measures,
     monte_carlo_table,
 )
-from slamgym.experiments.monte_carlo.run_measures import VARIABLES
 from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
 from slamgym.experiments.monte_carlo.verdict import (
     KINDS,
@@ -66,13 +65,6 @@ def white_report(factor, runs, steps=20, outliers=0):
     dof = np.full((runs, steps), 2)
     nis = rng.chisquare(2, (runs, steps))
     return evaluate_consistency(nees, nis, dof, frame="invariant", rng=rng)
-
-
-def test_the_fixture_has_the_runners_schema():
-    dataset = typical()
-    assert set(dataset.data_vars) == set(VARIABLES)
-    for name, variable in VARIABLES.items():
-        assert dataset[name].dims == ("estimator", *variable.dims)
 
 
 @pytest.mark.parametrize("label", ["ekf", "invariant"])
@@ -146,7 +138,7 @@ def test_grid_steps_are_numbered_as_the_results_number_them():
 def test_the_ekf_is_refused_and_the_invariant_filter_is_consistent():
     entries = summarise_monte_carlo(typical())["estimators"]
     assert entries["ekf"]["verdict"] == "not consistent"
-    assert entries["ekf"]["sentence"].startswith("ekf: not consistent: its squared err")
+    assert entries["ekf"]["sentence"].startswith("ekf: not consistent: the squared err")
     assert "(p < 1e-16)" in entries["ekf"]["sentence"]
     assert entries["invariant"]["verdict"] == "consistent"
     assert "lies inside [0.8, 1.25]" in entries["invariant"]["sentence"]
@@ -165,7 +157,7 @@ def test_a_heading_better_known_than_at_the_start_is_pointed_out():
     [
         (1.0, 400, "consistent", "lies inside [0.8, 1.25]"),
         (1.5, 400, "not consistent", "over all steps (p < 1e-16)"),
-        (0.6, 400, "not consistent", "it is too cautious"),
+        (0.6, 400, "not consistent", "the filter is too cautious"),
         (1.06, 2000, "nearly consistent", "certain but small"),
         (1.0, 3, "not shown", "more runs are needed"),
         (0.6, 4, "not shown", "no test rejects it (5 %), but the 90 % interval"),
@@ -191,7 +183,7 @@ def test_the_number_of_runs_that_a_verdict_names_suffices():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("runs", [2, 3, 5, 10, 20])
+@pytest.mark.parametrize("runs", [2, 5, 20])
 def test_few_runs_of_a_consistent_filter_are_called_wrong_in_5_percent(runs):
     """NEES that never changes over time is the hardest case: as skewed as can be."""
     repetitions = 1000
@@ -214,7 +206,7 @@ def test_few_runs_of_a_filter_that_is_far_off_are_found(runs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("runs", range(2, 7))
+@pytest.mark.parametrize("runs", [2, 4, 5])
 def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs, request):
     world = load_scenario("six_landmarks").with_changes(steps=12)
     for seed in (0, 5, 9):
@@ -239,8 +231,9 @@ def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs, request):
 def test_a_few_bad_runs_that_make_the_average_are_pointed_out():
     verdict = judge(white_report(1.0, 200, outliers=4), 0, 200)
     assert verdict.word == "not consistent"
-    assert "few runs make this average" in verdict.reason
-    assert "2.0% of the runs are above 3" in verdict.reason
+    assert (
+        "; 3 of 200 runs make this average: without them, it is 1.17" in verdict.reason
+    )
 
 
 def test_failed_runs_are_told_and_counted_nowhere_else():
@@ -277,18 +270,11 @@ def test_notes_group_failures_and_warn_of_few_runs():
     assert summarise_monte_carlo(typical())["notes"] == []
 
 
-@pytest.mark.slow
-def test_notes_tell_why_all_runs_failed():
-    failures = [(label, run, 3, "boom") for label in FILTERS for run in range(40)]
-    summary = summarise_monte_carlo(with_failures(typical(), failures))
-    for label in FILTERS:
-        said = f"{label}: 40 of 40 runs failed: 40 × boom (first: run 0, step 3)."
-        assert said in summary["notes"]
-
-
-def test_few_runs_are_noted_once_for_all_estimators():
+def test_few_runs_are_noted_once_for_all_estimators_and_warned_of_in_each():
     summary = summarise_monte_carlo(typical().isel(run=slice(8)))
     assert summary["notes"] == ["Only 8 runs: below 20 little can be shown."]
+    entry = summary["estimators"]["invariant"]
+    assert any("Only 8 runs" in line for line in entry["warnings"])
 
 
 def test_a_flagged_run_counts_as_failed_even_if_its_numbers_are_finite():
@@ -336,12 +322,6 @@ def test_a_diverged_run_breaks_nothing():
     table_text(summary)
     for figure in report_figures(dataset, summary).values():
         figure.draw_without_rendering()
-
-
-def test_few_runs_are_warned_of():
-    dataset = typical().isel(run=slice(8))
-    entry = summarise_monte_carlo(dataset)["estimators"]["invariant"]
-    assert any("Only 8 runs" in line for line in entry["warnings"])
 
 
 def test_a_start_known_for_certain_is_no_failure():

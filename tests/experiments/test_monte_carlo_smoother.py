@@ -78,6 +78,7 @@ def test_it_takes_a_robust_kernel_and_refuses_what_is_none():
         monte_carlo(WORLD, "smoother[robust=tukey]", 2)
 
 
+@pytest.mark.slow
 def test_worlds_that_hide_identities_are_smoothed_with_the_associations_decided():
     world = load_scenario("hidden_identities")
     world = world.model_copy(update={"steps": 60})

@@ -119,7 +119,6 @@ def test_runs_have_failed_where_the_report_says_so(monkeypatch):
     assert reference.nees_per_degree == pytest.approx(nees.mean())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("runs", [1, 2])
 def test_table_csv_and_summary_show_the_error_where_there_is_one(
     runs, tmp_path, capsys

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from presets import KINDS
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments.runs.simulated_runs import simulate_runs
-from slamgym.sim_configs import action_sequence, list_presets, load_scenario
+from slamgym.sim_configs import action_sequence, load_scenario
 
 SEED = 30
 WALLED = load_scenario("corridor").with_changes(
@@ -14,10 +15,6 @@ WALLED = load_scenario("corridor").with_changes(
 # Its 10,000 landmarks are scanned in blocks.  The drive passes twenty corners, and the
 # noise drawn ahead ends after every 8 steps.
 CITY = load_scenario("city").with_changes(steps=300)
-SCENARIOS = [
-    pytest.param(CITY, marks=pytest.mark.slow) if preset == "city" else preset
-    for preset in list_presets()
-]
 
 
 def one_by_one(scenario, runs, seed):
@@ -45,7 +42,9 @@ def one_by_one(scenario, runs, seed):
     return [np.array(column) for column in columns] + ([] if hides else [None]) + [None]
 
 
-@pytest.mark.parametrize("scenario", [*SCENARIOS, WALLED], ids=str)
+@pytest.mark.parametrize(
+    "scenario", [*KINDS, WALLED, pytest.param(CITY, marks=pytest.mark.slow)], ids=str
+)
 def test_runs_are_the_single_worlds_of_their_seeds_to_the_last_bit(scenario):
     fast, slow = simulate_runs(scenario, 3, SEED), one_by_one(scenario, 3, SEED)
     for name, array, other in zip(fast._fields, fast, slow, strict=True):

@@ -18,10 +18,7 @@ def changed(**changes):
         ({"dt": 1e308}, "dt must not exceed 1e[+]12, got 1e[+]308"),
         ({"dt": 5e-324}, "dt must be at least 1e-12, got 5e-324"),
         ({"robot": {"max_speed": 1e308}}, "robot.max_speed must not exceed 1e[+]12"),
-        (
-            {"robot": {"max_speed": 1e12}},
-            "max_speed must not exceed 1e[+]12 / dt",
-        ),
+        ({"robot": {"max_speed": 1e12}}, "max_speed must not exceed 1e[+]12 / dt"),
         ({"start": {"pose": (0.0, 1e160, 0.0)}}, "start.pose must not exceed 1e[+]12"),
         ({"start": {"std": (1e160, 0.0, 0.0)}}, "start.std must not exceed 1e[+]12"),
         ({"motion": {"std": (2e12, 0.0, 0.0)}}, "motion.std must not exceed 1e[+]12"),

@@ -6,7 +6,7 @@ matrices over the whole state, matrix exponentials, complex-step derivatives.
 
 import numpy as np
 from dense_ekf import DenseEkf
-from scipy.linalg import expm, sqrtm
+from scipy.linalg import block_diag, expm, sqrtm
 
 from slamgym.estimator.models.bearing_range import (
     locate_landmark,
@@ -29,7 +29,7 @@ def levers(mean):
 class DenseInvariant(DenseEkf):
     """In invariant coordinates throughout: P is the covariance of ξ, G = I."""
 
-    iterations = 1
+    range_std_per_metre = 0.0
 
     def to_invariant(self):
         """D = I − (J q) e_θᵀ at the mean."""
@@ -51,22 +51,22 @@ class DenseInvariant(DenseEkf):
         self.P = self.P + noise @ self.R @ noise.T * dt
 
     def correct(self, readings, ids):
-        prior, total = self.mean.copy(), np.zeros(len(self.mean))
-        Q = np.kron(np.eye(len(ids)), self.Q)
-        for i in range(self.iterations):
-            nu, H = self.linearise(readings, ids)
-            H = H.copy()
-            H[:, 2] = 0.0  # in ξ the heading moves no reading, at any iterate
-            nu = nu + H @ total
-            S = H @ self.P @ H.T + Q
-            K = np.linalg.solve(S, H @ self.P).T
-            if i == 0:
-                nis = float(nu @ np.linalg.solve(S, nu))
-            total = K @ nu
-            self.mean = self.exponential(total, prior)
-        self.P = (np.eye(len(self.mean)) - K @ H) @ self.P
-        self.P = (self.P + self.P.T) / 2
+        prior = self.mean.copy()
+        total, self.P, nis = self.gain(readings, ids, np.zeros(len(prior)))
+        self.mean = self.exponential(total, prior)
         return nis
+
+    def gain(self, readings, ids, total):
+        """ξ and P after readings linearised at the mean, Exp(total) from the prior."""
+        nu, H = self.linearise(readings, ids)
+        H = H.copy()
+        H[:, 2] = 0.0  # in ξ the heading moves no reading, at any iterate
+        nu = nu + H @ total
+        ranges = np.linalg.norm(self.seen(ids), axis=1)
+        S = H @ self.P @ H.T + block_diag(*map(self.noise, ranges))
+        K = np.linalg.solve(S, H @ self.P).T
+        P = (np.eye(len(self.mean)) - K @ H) @ self.P
+        return K @ nu, (P + P.T) / 2, float(nu @ np.linalg.solve(S, nu))
 
     @staticmethod
     def exponential(xi, mean):
@@ -81,17 +81,72 @@ class DenseInvariant(DenseEkf):
         moved = points @ group[:2, :2].T + group[:2, 2:].T
         return np.concatenate([moved[0], [mean[2] + xi[2]], moved[1:].ravel()])
 
+    def noise(self, distance):
+        growth = np.array([0.0, self.range_std_per_metre * distance])
+        return np.diag((np.sqrt(np.diag(self.Q)) + growth) ** 2)
+
+    def seen(self, ids):
+        """The landmarks relative to the robot's position."""
+        points = self.mean[3:].reshape(-1, 2)[[self.ids.index(i) for i in ids]]
+        return points - self.mean[:2]
+
     def add(self, reading, landmark_id):
-        self.P = self.covariance
+        self.P, Q = self.covariance, self.Q
+        self.Q = self.noise(reading[1])
         super().add(reading, landmark_id)
-        D = self.to_invariant()
+        self.Q, D = Q, self.to_invariant()
         self.P = D @ self.P @ D.T
 
 
-class DenseSequentialInvariant(DenseInvariant):
+class DenseAdaptiveInvariant(DenseInvariant):
+    """Linearised again where a reading is far off; one by one where the heading turns.
+
+    One by one, P becomes that of the corrected belief before the next reading.
+    """
+
+    iterations = 10
+
     def correct(self, readings, ids):
-        one = super().correct
-        return sum(one(z[None], [i]) for z, i in zip(readings, ids, strict=True))
+        prior, nothing = self.mean.copy(), np.zeros(len(self.mean))
+        total, P, nis = self.gain(readings, ids, nothing)
+        nu = self.linearise(readings, ids)[0].reshape(-1, 2)
+        ranges = np.linalg.norm(self.seen(ids), axis=1)
+        is_far = (np.abs(nu) > 0.1 * np.column_stack([ranges**0, ranges])).any()
+        for i in range(self.iterations):
+            before = self.seen(ids)
+            self.mean = self.exponential(total, prior)
+            if not is_far:
+                break
+            if abs(total[2]) > 0.1:
+                self.mean = prior
+                for k in np.argsort(-ranges, kind="stable"):
+                    self.correct_alone(readings[[k]], [ids[k]])
+                return nis
+            if not self.displaced(before, ids) or i == self.iterations - 1:
+                break
+            total, P, _ = self.gain(readings, ids, total)
+        self.P = P
+        return nis
+
+    def correct_alone(self, readings, ids):
+        prior = self.mean.copy()
+        for most in (self.iterations, 1):
+            total, nis = np.zeros(len(prior)), []
+            self.mean = prior
+            for _ in range(most):
+                before = self.seen(ids)
+                total, P, one = self.gain(readings, ids, total)
+                nis.append(one)
+                self.mean = self.exponential(total, prior)
+                if settled := not self.displaced(before, ids):
+                    break
+            if settled and nis[-1] <= nis[0] + 13.8:
+                break
+        self.P = P
+
+    def displaced(self, before, ids):
+        moved = np.linalg.norm(self.seen(ids) - before, axis=1)
+        return (moved > 0.1 * np.linalg.norm(before, axis=1)).any()
 
 
 class DenseIterated(DenseEkf):

@@ -1,5 +1,7 @@
 """What the server of `forked` loads before it forks: modules, and compiled kernels."""
 
+import jobs_to_kill  # noqa: F401
+
 import slamgym.experiments.trajectories.generate  # noqa: F401
 from slamgym.experiments.monte_carlo import monte_carlo
 

@@ -21,20 +21,9 @@ from ...support.argument_checks import LOWEST_ID
 from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
 from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
-from ..multifrontal import pairs
-from .deferred_covariance import BLOCK, DeferredCovariance, subtract, symmetric
-from .phase_update import (
-    Handover,
-    Phase,
-    begin_handover,
-    begin_phase,
-    blocks_in_a_step,
-    combine,
-    end_phase,
-    exchanged_rows,
-    roots,
-    virtual_landmarks,
-)
+from ..multifrontal import pairs, symmetric
+from . import phase_update
+from .deferred_covariance import BLOCK, DeferredCovariance, subtract
 
 
 class CompressedMap:
@@ -61,7 +50,9 @@ class CompressedMap:
         self.deferred = DeferredCovariance()
         self.local: dict[int, None] = {}  # the local landmarks, in their order
         self._virtual = 0
-        self._handover: Handover | None = None  # the last change of the local map
+        self._handover: phase_update.Handover | None = (
+            None  # the last change of the local map
+        )
         self._strip = np.zeros((0, 0))  # covariance of local and all other coordinates
         self._origin = self.filter.map.mean[:2].copy()  # start of the phase
 
@@ -112,7 +103,7 @@ class CompressedMap:
             cross = self._combine(now.gain[local], strip)
             covariance[np.ix_(inside, outside)] = cross
             covariance[np.ix_(outside, inside)] = cross.T
-            root, signs = roots(now.loss, self.is_invariant)
+            root, signs = phase_update.roots(now.loss, self.is_invariant)
             block = self.deferred.marginal(columns)
             subtract(block, self._combine(root, strip).T, signs)
             covariance[np.ix_(outside, outside)] = symmetric(block)
@@ -166,8 +157,8 @@ class CompressedMap:
         points = self._points.reshape(-1, 2)
         chosen = choose_local(ahead, required, self.slots, points, size)
         self._origin = now.mean[:2].copy()
-        rows, self.local = exchanged_rows(self.slots, self.local, chosen)
-        self._handover, covariance = begin_handover(
+        rows, self.local = phase_update.exchanged_rows(self.slots, self.local, chosen)
+        self._handover, covariance = phase_update.begin_handover(
             self.deferred,
             self._strip,
             now,
@@ -191,7 +182,7 @@ class CompressedMap:
             Whether the change of the local map must not take several steps.
         """
         width = self.deferred.width
-        share = blocks_in_a_step(width, hurried=hurried)
+        share = phase_update.blocks_in_a_step(width, hurried=hurried)
         if self._handover is not None:
             self._handover.advance(self.deferred, age * share)
         if hurried or (age - 1) * share * BLOCK >= width:
@@ -277,7 +268,7 @@ class CompressedMap:
         self.local = dict.fromkeys(local_ids[self._virtual :])
         self._points, self._references = saved["points"], saved["references"]
         self._strip, self._origin = saved["strip"], saved["origin"]
-        rows = virtual_landmarks(len(self._strip), self.is_invariant)
+        rows = phase_update.virtual_landmarks(len(self._strip), self.is_invariant)
         if self._virtual and rows != self._virtual:
             raise ValueError(
                 f"state['strip'] must fit {self._virtual} virtual landmarks and "
@@ -301,10 +292,12 @@ class CompressedMap:
         """Load the local map with these covariance rows (a, a - 3) into the filter."""
         columns = self._columns(list(self.local))
         whole = len(self.local) == len(self.slots)
-        self._virtual = 0 if whole else virtual_landmarks(len(rows), self.is_invariant)
+        self._virtual = (
+            0 if whole else phase_update.virtual_landmarks(len(rows), self.is_invariant)
+        )
         if whole:
             self._strip, self._handover = self._strip[:0], None
-        begin_phase(
+        phase_update.begin_phase(
             self.filter,
             self._points[columns],
             rows,
@@ -322,10 +315,10 @@ class CompressedMap:
             self._strip = np.pad(self._strip, ((0, 0), (0, more)))
 
     def _combine(self, coefficients: Array, strip: Array) -> Array:
-        return combine(coefficients, strip, self.is_invariant)
+        return phase_update.combine(coefficients, strip, self.is_invariant)
 
-    def _phase(self) -> Phase:
-        return end_phase(self.filter, self._virtual)
+    def _phase(self) -> phase_update.Phase:
+        return phase_update.end_phase(self.filter, self._virtual)
 
     def _columns(self, ids: Sequence[int]) -> IntArray:
         """Return the columns of landmarks in the map's arrays."""
@@ -335,23 +328,20 @@ class CompressedMap:
 # --------------------------------------------------------------------------------------
 # Choice of the local landmarks, and of their number.
 
+# Up to this many landmarks, the local map is the whole map.
+#
+# The end of a phase has a cost of its own. In smaller maps it exceeds two full updates.
 LARGEST_WHOLE_MAP = 350
-"""Up to this many landmarks, the local map is the whole map.
-
-The end of a phase has a cost of its own.  In smaller maps it exceeds two full updates.
-"""
+# The same in the invariant frame, where phases end at twice the cost.
 LARGEST_WHOLE_INVARIANT = 400
-"""The same in the invariant frame, where phases end at twice the cost."""
+# Smallest number of landmarks at which a local map may be too large.
 SMALLEST_LOCAL_MAP = 30
-"""Smallest number of landmarks at which a local map may be too large."""
-SHORT_PHASE = 4
-"""Steps after which a phase has paid for its end."""
+SHORT_PHASE = 4  # steps after which a phase has paid for its end
+# Limit of the extra landmarks, as a multiple of the landmarks of a scan.
+#
+# The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
+# costs a² n.
 LARGEST_RATIO, LANDMARKS_PER_RATIO = 2.5, 400
-"""Limit of the extra landmarks, as a multiple of the landmarks of a scan.
-
-The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
-costs a² n.
-"""
 
 
 def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
@@ -430,8 +420,7 @@ LOCAL: saved_states.Table = {
     **MAP_STATE,
     "covariance": (saved_states.SYMMETRIC, "3+2n", "3+2n"),
 }
-COUNTERS = 4
-"""Numbers before the free slots: virtual landmarks, extra ones, age, rest."""
+COUNTERS = 4  # numbers before the free slots: virtual landmarks, extra ones, age, rest
 
 
 def _check_slots(

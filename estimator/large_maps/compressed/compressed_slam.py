@@ -37,8 +37,7 @@ BASES: dict[str, type[EkfSlam]] = {
     "observability_constrained": ObservabilityConstrainedEkfSlam,
     "iterated": IteratedEkfSlam,
 }
-CHECKED_LANDMARKS = 200
-"""Landmarks of a saved state whose joint covariance is checked."""
+CHECKED_LANDMARKS = 200  # landmarks of a saved state whose joint covariance is checked
 
 
 class CompressedEkfSlam:

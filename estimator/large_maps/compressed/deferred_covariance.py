@@ -14,6 +14,7 @@ from ....jit import jit
 from ...support import saved_states
 from ...support.memory_limit import refuse_beyond_memory
 from ...support.undo import Undo, contents
+from ..multifrontal import symmetric
 
 # Rows of one block: 64 landmarks.
 BLOCK = 128
@@ -290,9 +291,6 @@ def _bounds(columns: IntArray, blocks: range) -> list[int]:
     return bounds
 
 
-_CHUNK = 128  # rows that are changed at a time
-
-
 class Downdate(NamedTuple):
     """A change not yet applied to the stored covariance: P ← P − W diag(s) Wᵀ."""
 
@@ -300,13 +298,13 @@ class Downdate(NamedTuple):
     signs: Array  # s, shape (rank,), each 1 or -1
 
 
+# What a saved state holds about downdates.
 PENDING: saved_states.Table = {
     "pending_signs": (saved_states.NUMBERS, "r"),
     "pending_root": (saved_states.NUMBERS, "w", "r"),
     "pending_shapes": (saved_states.COUNTS, -1, 2),
     "progress": (saved_states.NUMBERS, 3),
 }
-"""What a saved state holds about downdates."""
 
 
 def _downdates(saved: Mapping[str, Any]) -> list[Downdate]:
@@ -339,20 +337,9 @@ def rows_of(root: Array, columns: IntArray) -> Array:
 
 def subtract(covariance: Array, root: Array, signs: Array) -> None:
     """P ← P − W diag(s) Wᵀ in place, a few rows at a time, without a second matrix."""
-    for first in range(0, len(covariance), _CHUNK):
-        own = slice(first, first + _CHUNK)
+    for first in range(0, len(covariance), BLOCK):
+        own = slice(first, first + BLOCK)
         covariance[own] -= (root[own] * signs) @ root.T
-
-
-def symmetric(covariance: Array) -> Array:
-    """Copy the lower half into the upper one, in place."""
-    n = len(covariance)
-    for first in range(0, n, _CHUNK):
-        last = min(first + _CHUNK, n)
-        own = covariance[first:last, first:last]
-        own[:] = np.tril(own) + np.tril(own, -1).T
-        covariance[first:last, last:] = covariance[last:, first:last].T
-    return covariance
 
 
 # --------------------------------------------------------------------------------------

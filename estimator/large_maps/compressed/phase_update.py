@@ -29,13 +29,12 @@ import numpy as np
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
 from ...kernels.kalman_gain import parts_of
-from ..multifrontal import pairs
+from ..multifrontal import pairs, symmetric
 from .deferred_covariance import (
     BLOCK,
     DeferredCovariance,
     fill_extended,
     subtract,
-    symmetric,
     unpivot,
 )
 
@@ -57,11 +56,7 @@ def virtual_landmarks(coordinates: int, invariant: bool) -> int:
 
 
 def begin_phase(
-    slam: EkfSlam,
-    mean: Array,
-    rows: Array,
-    reference: Array,
-    ids: list[int],
+    slam: EkfSlam, mean: Array, rows: Array, reference: Array, ids: list[int]
 ) -> None:
     """Replace the map of a filter by the extension, followed by a local map.
 
@@ -176,8 +171,7 @@ def _by_eigenvalues(part: Array) -> tuple[Array, Array]:
 # new phase needs none of this before it ends: it begins with the covariance of its own
 # landmarks alone.  The exchange therefore proceeds block by block.
 
-SPREAD = 4
-"""Steps that a change of the local map takes in a large map."""
+SPREAD = 4  # steps that a change of the local map takes in a large map
 
 
 def blocks_in_a_step(width: int, *, hurried: bool) -> int:
@@ -195,16 +189,11 @@ def blocks_in_a_step(width: int, *, hurried: bool) -> int:
 class Exchanged(NamedTuple):
     """The rows of a change of the local map."""
 
-    own: IntArray
-    """Columns of the old local landmarks, shape (a - 3,)."""
-    kept: IntArray
-    """Rows of the pose and of landmarks that stay, in the old local map."""
-    leaving: IntArray
-    """Ascending columns of the landmarks that leave."""
-    places: IntArray
-    """Their rows in the old local map."""
-    entering: IntArray
-    """Ascending columns of the landmarks that enter."""
+    own: IntArray  # columns of the old local landmarks, shape (a - 3,)
+    kept: IntArray  # rows of the pose and of landmarks that stay, in the old local map
+    leaving: IntArray  # ascending columns of the landmarks that leave
+    places: IntArray  # their rows in the old local map
+    entering: IntArray  # ascending columns of the landmarks that enter
 
 
 def exchanged_rows(
@@ -242,22 +231,16 @@ class Handover:
     which this happens.
     """
 
-    coefficients: Array
-    """Φ above Uᵀ of the old phase, shape (a + r, e)."""
-    strip: Array
-    """S of the old phase, shape (s, width)."""
+    coefficients: Array  # Φ above Uᵀ of the old phase, shape (a + r, e)
+    strip: Array  # S of the old phase, shape (s, width)
+    # P_aa at the end of the old phase, without the columns of the pose.
     covariance: Array
-    """P_aa at the end of the old phase, without the columns of the pose."""
     rows: Exchanged
-    lost: Array
-    """W of the deferred downdate, shape (width, r), to be filled."""
-    next_strip: Array
-    """S of the new phase, shape (s', width), to be filled."""
+    lost: Array  # W of the deferred downdate, shape (width, r), to be filled
+    next_strip: Array  # S of the new phase, shape (s', width), to be filled
     invariant: bool
-    group: int
-    """Number of blocks that are exchanged at a time."""
-    done: int = 0
-    """Number of blocks that have been exchanged."""
+    group: int  # number of blocks that are exchanged at a time
+    done: int = 0  # number of blocks that have been exchanged
     _values: Array = field(init=False, repr=False)
     _order: IntArray = field(init=False, repr=False)
 

@@ -62,14 +62,10 @@ class SparseMap:
 class FixedLandmarks:
     """Landmarks O linked with the eliminated ones, held at their means."""
 
-    slots: IntArray
-    """O."""
-    response: Array
-    """W = Λ_OH T, shape (2o, c): their residual is b + W δ_B."""
-    residual: Array
-    """b when the local map was chosen, shape (2o,)."""
-    scale: Array
-    """Inverse Cholesky factors of their diagonal blocks, shape (o, 2, 2)."""
+    slots: IntArray  # O
+    response: Array  # W = Λ_OH T, shape (2o, c): their residual is b + W δ_B
+    residual: Array  # b when the local map was chosen, shape (2o,)
+    scale: Array  # inverse Cholesky factors of their diagonal blocks, shape (o, 2, 2)
 
     def residual_after(self, shift: Array) -> Array:
         """Return the residual after the border moved by δ_B, shape (2o,)."""
@@ -92,14 +88,10 @@ class LocalInformation:
     """
 
     slots: IntArray
-    points: Array
-    """Means, shape (2k,) [m]."""
-    first: Array
-    """First estimates, shape (2k,) [m]."""
-    information: Array
-    """Λ_LL, shape (2k, 2k)."""
-    start: Array
-    """Means of the border when L was chosen, shape (c,)."""
+    points: Array  # means, shape (2k,) [m]
+    first: Array  # first estimates, shape (2k,) [m]
+    information: Array  # Λ_LL, shape (2k, 2k)
+    start: Array  # means of the border when L was chosen, shape (c,)
     eliminated: SchurComplement
     fixed: FixedLandmarks
 
@@ -258,21 +250,18 @@ def link_count(map_: SparseMap, local: LocalInformation) -> int:
 # the information of the map alone.  Storing K, Ω and Λ separately allows a singular Ω,
 # for a pose that is known exactly or a robot that cannot slip sideways.
 
+# The pose is not taken from measurements with a larger heading uncertainty [rad].
 LARGEST_HEADING_STD = 0.3
-"""The pose is not taken from measurements with a larger heading uncertainty [rad]."""
 
 
 class ConditionalPose(NamedTuple):
     """p | m ~ N(μ_p + K (m − μ_m), Ω)."""
 
-    mean: Array
-    """μ_p, shape (3,)."""
-    gain: Array
-    """K, shape (3, 2k)."""
-    covariance: Array
-    """Ω, shape (3, 3)."""
+    mean: Array  # μ_p, shape (3,)
+    gain: Array  # K, shape (3, 2k)
+    covariance: Array  # Ω, shape (3, 3)
+    # x̄, the linearisation point of every base except "ekf", shape (2,) [m].
     reference: Array
-    """x̄, the linearisation point of every base except "ekf", shape (2,) [m]."""
 
     @property
     def is_linked(self) -> BoolArray:
@@ -283,16 +272,11 @@ class ConditionalPose(NamedTuple):
 class LinearScan(NamedTuple):
     """n linearised measurements: z = h + H_p δp + H_l δl + v, v ~ N(0, Q)."""
 
-    innovation: Array
-    """ν = z − h, shape (n, 2)."""
-    jacobian_pose: Array
-    """H_p, shape (n, 2, 3)."""
-    jacobian_landmark: Array
-    """H_l, shape (n, 2, 2)."""
-    variance: Array
-    """Diagonal of Q, shape (n, 2)."""
-    landmarks: IntArray
-    """Positions of the landmarks in the local map, shape (n,)."""
+    innovation: Array  # ν = z − h, shape (n, 2)
+    jacobian_pose: Array  # H_p, shape (n, 2, 3)
+    jacobian_landmark: Array  # H_l, shape (n, 2, 2)
+    variance: Array  # diagonal of Q, shape (n, 2)
+    landmarks: IntArray  # positions of the landmarks in the local map, shape (n,)
 
     def subset(self, chosen: BoolArray) -> LinearScan:
         """Return some of the measurements."""
@@ -317,10 +301,8 @@ class LinearScan(NamedTuple):
 class MapMeasurement(NamedTuple):
     """Information about the map alone: W (z − h) = Y δm + white noise."""
 
-    rows: Array
-    """Y, shape (·, 2k)."""
-    innovation: Array
-    """w = W ν."""
+    rows: Array  # Y, shape (·, 2k)
+    innovation: Array  # w = W ν
 
 
 def move(
@@ -435,23 +417,19 @@ def cut_links(
 # --------------------------------------------------------------------------------------
 # Choice of the local landmarks, and of how many to eliminate around them.
 
-SMALLEST_LOCAL_MAP = 50
-"""Smallest number of landmarks in a new local map."""
-FIRST_COUNT = 100
-"""Number of landmarks eliminated at first, if the tolerance allows it."""
+SMALLEST_LOCAL_MAP = 50  # smallest number of landmarks in a new local map
+FIRST_COUNT = 100  # number of landmarks eliminated at first, if the tolerance allows it
+# Growth factor of that number when it is too small. The second step takes all.
 GROWTH = 16
-"""Growth factor of that number when it is too small.  The second step takes all."""
+# Take all at once if the larger number exceeds a tenth of the map.
+#
+# The elimination of all reuses what is known, and is then as fast.
 SMALLEST_SHARE = 10
-"""Take all at once if the larger number exceeds a tenth of the map.
-
-The elimination of all reuses what is known, and is then as fast.
-"""
+# Size of the local map of a large map: 2 n^0.4.
+#
+# A change of the local map may eliminate the whole map, at a cost that grows with n; a
+# step costs the third power of the local size.
 SCALE, EXPONENT = 2, 0.4
-"""Size of the local map of a large map: 2 n^0.4.
-
-A change of the local map may eliminate the whole map, at a cost that grows with n; a
-step costs the third power of the local size.
-"""
 
 
 def local_map_size(mapped: int, readings: int, required: int) -> int:

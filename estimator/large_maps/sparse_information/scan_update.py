@@ -7,6 +7,7 @@ limits the links of the pose.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,13 @@ from numpy.typing import ArrayLike
 from scipy.linalg import lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
-from ...filters.ekf import EkfSlam, MotionNoise, reading_variances
+from ...filters.ekf import (
+    EkfSlam,
+    FirstEstimatesEkfSlam,
+    MotionNoise,
+    ObservabilityConstrainedEkfSlam,
+    reading_variances,
+)
 from ...filters.gaussian_map import not_positive_definite
 from ...interface import UpdateReport
 from ...models.bearing_range import locate_landmark, predict_measurement, wrap_angle
@@ -33,10 +40,8 @@ from .local_information import (
 class Sparsity(NamedTuple):
     """Limit of the links of the pose."""
 
-    bound: float
-    """Γ, the largest number of active landmarks, or infinity."""
-    prunes: bool
-    """Whether to cut weak links instead of relocating the pose."""
+    bound: float  # Γ, the largest number of active landmarks, or infinity
+    prunes: bool  # whether to cut weak links instead of relocating the pose
 
 
 class ScanResult(NamedTuple):
@@ -151,17 +156,12 @@ def _exceeds_bound(
 class Screened(NamedTuple):
     """n measurements of mapped landmarks; m are used."""
 
-    skipped: BoolArray
-    """Landmark expected below the minimum range, shape (n,)."""
-    gated: BoolArray
-    """Rejected by the gate, shape (n,)."""
-    near: BoolArray
-    """Robot within 10 σ of the landmark, shape (n,)."""
-    scan: LinearScan
-    """The m used measurements, linearised at the prior."""
+    skipped: BoolArray  # landmark expected below the minimum range, shape (n,)
+    gated: BoolArray  # rejected by the gate, shape (n,)
+    near: BoolArray  # robot within 10 σ of the landmark, shape (n,)
+    scan: LinearScan  # the m used measurements, linearised at the prior
     nis: float
-    factor: Array
-    """L, shape (2m, 2m), L Lᵀ = S."""
+    factor: Array  # L, shape (2m, 2m), L Lᵀ = S
 
 
 class ScanRules:
@@ -175,7 +175,7 @@ class ScanRules:
         base: str,
         **settings: Any,
     ) -> None:
-        self.base = argument_checks.one_of("base", base, BASES)
+        self.base = argument_checks.one_of("base", base, tuple(BASES))
         unknown = set(settings) - {
             "range_std_per_metre",
             "range_noise_at",
@@ -186,7 +186,10 @@ class ScanRules:
         }
         if unknown:
             raise TypeError(f"SparseInformationSlam has no option {min(unknown)!r}")
-        self.rules = EkfSlam(motion_std, measurement_std, **settings).rules
+        noise = np.array(motion_std), np.array(measurement_std)
+        self.dense = partial(BASES[base], *noise, **settings)
+        """Makes the filter of the same belief in dense form."""
+        self.rules = self.dense().rules
         at_rest = settings.get("noise_at_rest", True)
         self.motion_noise = MotionNoise.checked(motion_std, at_rest)
         bearing_std = self.rules.bearing_std + self.rules.bearing_std_metres
@@ -219,7 +222,8 @@ class ScanRules:
         blocks = np.array(
             [S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(places))]
         ).reshape(-1, 2, 2)
-        refused = _squared_distances(scan.innovation, blocks) > self.rules.gate
+        solved = np.linalg.solve(blocks, scan.innovation[..., None])[..., 0]
+        refused = (scan.innovation * solved).sum(axis=1) > self.rules.gate
         gated, near = np.zeros_like(skipped), np.zeros_like(skipped)
         gated[kept], near[kept] = refused, _is_too_near(scan, blocks, expected[kept])
         used = np.repeat(~refused, 2)
@@ -241,12 +245,6 @@ def _innovation_covariance(
     H, N = marginalise_pose(pose, scan)
     spread = solve_triangular(local.solver()[0], H.T, lower=True, check_finite=False)
     return np.asarray(spread.T @ spread + N)
-
-
-def _squared_distances(innovation: Array, blocks: Array) -> Array:
-    """Return the NIS of each measurement alone, shape (n,)."""
-    solved = np.linalg.solve(blocks, innovation[..., None])[..., 0]
-    return np.asarray((innovation * solved).sum(axis=1))
 
 
 def _is_too_near(scan: LinearScan, blocks: Array, distance: Array) -> BoolArray:
@@ -282,11 +280,12 @@ def _factor(S: Array, ids: list[int]) -> Array:
 # of a landmark use the same l̄, the information of the whole map does not observe it
 # either.
 
-ESTIMATE, FIRST, CONSTRAINED = BASES = (
-    "ekf",
-    "first_estimates",
-    "observability_constrained",
-)
+ESTIMATE, FIRST, CONSTRAINED = "ekf", "first_estimates", "observability_constrained"
+BASES: dict[str, type[EkfSlam]] = {
+    ESTIMATE: EkfSlam,
+    FIRST: FirstEstimatesEkfSlam,
+    CONSTRAINED: ObservabilityConstrainedEkfSlam,
+}
 
 
 def linearise_scan(

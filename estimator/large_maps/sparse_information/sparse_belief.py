@@ -9,10 +9,12 @@ from math import inf
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
+from ...filters.ekf import EkfSlam
 from ...interface import UpdateReport
+from ...models.rigid_motion import as_covariance
 from ...support.undo import Undo, attributes, contents, undone_on_error
 from ..elimination import RestFactor
 from ..multifrontal import SchurComplement, pairs
@@ -36,27 +38,20 @@ from .scan_update import State, marginalise, merge_landmarks
 class SparseBelief:
     """All state of the filter; one local map is in use at any time."""
 
-    slots: dict[int, int]
-    """Slot of each landmark, by identity."""
-    free: list[int]
-    """Slots of removed landmarks."""
+    slots: dict[int, int]  # slot of each landmark, by identity
+    free: list[int]  # slots of removed landmarks
     map_: SparseMap
     local: LocalInformation
     pose: ConditionalPose
-    origin: Array
-    """Position of the robot when the local map was chosen, shape (2,) [m]."""
-    count: float = FIRST_COUNT
-    """Number of landmarks to eliminate around the local map."""
-    enlarged: bool = False
-    """Whether the first number was too small."""
-    steps: int = 0
-    """Number of steps taken."""
-    report: UpdateReport = field(default_factory=UpdateReport, repr=False)
-    """Report of the last update."""
+    origin: Array  # position of the robot when the local map was chosen, shape (2,) [m]
+    count: float = FIRST_COUNT  # number of landmarks to eliminate around the local map
+    enlarged: bool = False  # whether the first number was too small
+    steps: int = 0  # number of steps taken
+    report: UpdateReport = field(default_factory=UpdateReport, repr=False)  # the last
+    # What takes back the update under way: the last of these.
     saved: list[Undo] = field(default_factory=list, repr=False)
-    """What takes back the update under way: the last of these."""
+    # Factor of all landmarks except the local ones, if known.
     rest: RestFactor | None = field(default=None, repr=False)
-    """Factor of all landmarks except the local ones, if known."""
 
     @classmethod
     def empty(cls, pose: Array, std: Array) -> SparseBelief:
@@ -68,6 +63,27 @@ class SparseBelief:
         nothing = np.empty(0, dtype=np.int64)
         local, start = begin_local_map(map_, start, nothing, FIRST_COUNT)
         return cls({}, [], map_, local, start, pose[:2].copy())
+
+    @classmethod
+    def of(cls, slam: EkfSlam) -> SparseBelief:
+        """Return the belief of a dense filter, with all landmarks in the local map."""
+        (mean, P, reference), n = slam.map.arrays, slam.map.size
+        slots = np.arange(len(slam.map.slots))
+        belief = cls.empty(mean[:3], np.zeros(3))
+        belief.add(list(slam.map.slots), slots.tolist())
+        inverse = cho_solve(cho_factor(P[3:n, 3:n], lower=True), np.eye(n - 3))
+        gain, rest = P[:3, 3:n] @ inverse, P[:3, :3].copy()
+        rest -= gain @ P[3:n, :3]
+        belief.local = replace(
+            belief.local.extended(slots, mean[3:n]),
+            first=reference[3:n].copy(),
+            information=(inverse + inverse.T) / 2,
+        )
+        belief.pose = ConditionalPose(
+            mean[:3].copy(), gain, as_covariance(rest), reference[:2].copy()
+        )
+        belief.steps = slam.steps
+        return belief
 
     def free_slots(self, count: int) -> IntArray:
         """Return slots for new landmarks."""
@@ -140,7 +156,8 @@ class SparseBelief:
 
     def enlarge_elimination(self) -> None:
         """Keep the local map, and eliminate more landmarks around it."""
-        self._change_local_map(self.local.slots, self._larger_count())
+        count = larger_elimination_count(self.count, len(self.slots))
+        self._change_local_map(self.local.slots, count)
         self.enlarged = True
 
     def remove(self, ids: Sequence[int], *, exact: bool) -> None:
@@ -218,9 +235,6 @@ class SparseBelief:
             self.count, len(self.slots), enlarged=self.enlarged
         )
 
-    def _larger_count(self) -> float:
-        return larger_elimination_count(self.count, len(self.slots))
-
     def _change_local_map(self, slots: IntArray, count: float) -> None:
         """Write the local map back, and begin another one."""
         self._save()
@@ -241,10 +255,8 @@ class SparseBelief:
 class Marginal(NamedTuple):
     """Gaussian of the pose and n landmarks."""
 
-    mean: Array
-    """Shape (3 + 2n,)."""
-    covariance: Array
-    """Shape (3 + 2n, 3 + 2n)."""
+    mean: Array  # (3 + 2n,)
+    covariance: Array  # (3 + 2n, 3 + 2n)
 
 
 def marginal(

@@ -6,7 +6,7 @@ its belief to a saved state and back.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import inf
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
+from ...filters.ekf import EkfSlam
 from ...interface import Belief, MapView, UpdateReport, describe_filter
 from ...models.bearing_range import wrap_angle
 from ...support import argument_checks, saved_states
@@ -23,6 +24,7 @@ from ...support.undo import Undo, attributes, undo_all
 from ..elimination import RestFactor
 from ..multifrontal import PLACES, ROWS, Factor, SchurComplement, SubsetFactor
 from .local_information import (
+    SMALLEST_LOCAL_MAP,
     ConditionalPose,
     FixedLandmarks,
     LocalInformation,
@@ -47,10 +49,12 @@ class SparseInformationSlam:
     loses odometry information, so its belief is less certain than that of the EKF, and
     never more certain.
 
-    Means and covariances near the robot follow from a small dense matrix, from which
-    the surrounding landmarks have been eliminated.  This matrix is valid until the
-    robot leaves its local map.  The elimination then repeats only the branches of the
-    map that the robot left or entered.
+    As long as the map holds no more landmarks than ``active_bound``, and at most 50,
+    no link is ever cut: the filter is then the EKF, and stores its dense covariance.
+    Later, means and covariances near the robot follow from a small dense matrix, from
+    which the surrounding landmarks have been eliminated.  This matrix is valid until
+    the robot leaves its local map.  The elimination then repeats only the branches of
+    the map that the robot left or entered.
 
     Parameters
     ----------
@@ -120,27 +124,31 @@ range_noise_at, gate_probability, noise_at_rest, min_range
             bound = argument_checks.whole("active_bound", active_bound, 2)
         kind = argument_checks.one_of("sparsify", sparsify, ("relocate", "prune"))
         self._sparsity = Sparsity(bound, kind == "prune")
+        self._largest_dense = min(bound, SMALLEST_LOCAL_MAP)
         self._tolerance = argument_checks.at_least("tolerance", tolerance, 0.0)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self.reset(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map, as `EkfSlam.reset`."""
-        first = argument_checks.finite_vector("pose", pose, 3)
-        std = argument_checks.standard_deviations("pose_std", pose_std, 3)
-        self._belief = SparseBelief.empty(first, std)
+        dense = self._scan_rules.dense()
+        dense.reset(pose, pose_std)
+        self._held: EkfSlam | SparseBelief = dense
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
+        if isinstance(self._held, EkfSlam):
+            self._held.predict(odometry, dt)
+            return
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._scan_rules.motion_noise.over(distance, turn, dt)
         pose = move(
-            self._belief.pose,
+            self._held.pose,
             np.array([distance, turn]),
             variance,
             from_mean=self._scan_rules.base == ESTIMATE,
         )
-        vars(self._belief).update(pose=pose, steps=self.steps + 1)
+        vars(self._held).update(pose=pose, steps=self.steps + 1)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -161,20 +169,43 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         readings = argument_checks.scan(measurements)
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
+        if isinstance(self._held, EkfSlam) and self._stays_dense(ids):
+            return self._held.update(readings, ids)
+        belief = self._belief
         if not ids:
-            vars(self._belief).update(report=UpdateReport(), steps=self.steps + 1)
-            return self.report()
-        with self._belief.undone_on_error():
-            self._belief.choose_local_map(ids, exact=self._is_exact)
-            result = self._process(readings, ids)
-            while result.largest_residual > self._tolerance:
-                self._belief.enlarge_elimination()
-                result = self._process(readings, ids)
-            self._belief.add(result.report.added_ids, result.added_slots)
-            self._belief.pose, self._belief.local = result.pose, result.local
-            self._belief.report = result.report
-            self._belief.steps += 1
-        return self.report()
+            vars(belief).update(report=UpdateReport(), steps=belief.steps + 1)
+        else:
+            with belief.undone_on_error():
+                belief.choose_local_map(ids, exact=self._is_exact)
+                result = self._process(belief, readings, ids)
+                while result.largest_residual > self._tolerance:
+                    belief.enlarge_elimination()
+                    result = self._process(belief, readings, ids)
+                belief.add(result.report.added_ids, result.added_slots)
+                belief.pose, belief.local = result.pose, result.local
+                belief.report = result.report
+                belief.steps += 1
+        self._held = belief
+        return belief.report
+
+    @property
+    def _belief(self) -> SparseBelief:
+        """The belief in information form."""
+        held = self._held
+        return SparseBelief.of(held) if isinstance(held, EkfSlam) else held
+
+    @property
+    def _slots(self) -> Mapping[int, int]:
+        """The place of each landmark, by identity."""
+        held = self._held
+        return held.map.slots if isinstance(held, EkfSlam) else held.slots
+
+    def _stays_dense(self, ids: Sequence[int]) -> bool:
+        """Return whether a scan needs no limit of links, nor more than a local map.
+
+        A dense filter is then the same, and many times faster.
+        """
+        return len(self._slots.keys() | set(ids)) <= self._largest_dense
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Remove landmarks by marginalisation; the belief about all else is unchanged.
@@ -191,9 +222,11 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             If one is not in the map; no landmark is then removed.
         """
-        ids = argument_checks.mapped_identities(landmark_ids, self._belief.slots)
-        if ids:
-            self._belief.remove(ids, exact=self._is_exact)
+        ids = argument_checks.mapped_identities(landmark_ids, self._slots)
+        if isinstance(self._held, EkfSlam):
+            self._held.remove(ids)
+        elif ids:
+            self._held.remove(ids, exact=self._is_exact)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being the same, and remove the second.
@@ -208,8 +241,10 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             If one is not in the map or both are the same; nothing is merged.
         """
-        argument_checks.two_landmarks(kept, gone, self._belief.slots)
-        self._belief.merge(kept, gone, exact=self._is_exact)
+        argument_checks.two_landmarks(kept, gone, self._slots)
+        belief = self._belief
+        belief.merge(kept, gone, exact=self._is_exact)
+        self._held = belief
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return a snapshot of the belief, for the whole map or a part of it.
@@ -227,11 +262,13 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         ValueError
             If one is not in the map, or more than ``belief_limit`` are asked for.
         """
-        ids = argument_checks.asked_identities(landmark_ids, self._belief.slots)
+        ids = argument_checks.asked_identities(landmark_ids, self._slots)
         argument_checks.refuse_large_belief(
             len(ids), self.belief_limit, "give landmark_ids"
         )
-        answer = self._belief.marginal(ids)
+        if isinstance(self._held, EkfSlam):
+            return self._held.belief(ids)
+        answer = self._held.marginal(ids)
         return Belief(answer.mean, answer.covariance, tuple(ids), "additive")
 
     def local_view(self, within: float) -> MapView:
@@ -250,7 +287,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The mapped landmarks, in the order of the belief."""
-        return tuple(self._belief.slots)
+        return tuple(self._slots)
 
     @property
     def local_ids(self) -> tuple[int, ...]:
@@ -271,13 +308,15 @@ range_noise_at, gate_probability, noise_at_rest, min_range
     @property
     def pose(self) -> Array:
         """(x, y, θ), shape (3,) [m, m, rad]; no covariance is computed."""
-        x, y, heading = self._belief.pose.mean
-        return np.array([x, y, wrap_angle(heading)])
+        held = self._held
+        x, y, heading = (held.map if isinstance(held, EkfSlam) else held.pose).mean[:3]
+        return np.array([x, y, wrap_angle(float(heading))])
 
     @property
     def link_count(self) -> int:
         """Number of nonzero 2 × 2 blocks of Λ, including the diagonal."""
-        return link_count(self._belief.map_, self._belief.local)
+        belief = self._belief
+        return link_count(belief.map_, belief.local)
 
     @property
     def nbytes(self) -> int:
@@ -286,33 +325,47 @@ range_noise_at, gate_probability, noise_at_rest, min_range
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state, as arrays."""
-        return as_arrays(self._belief, type(self).__name__, self._scan_rules.base)
+        name, base = type(self).__name__, self._scan_rules.base
+        if isinstance(self._held, EkfSlam):
+            names = {"estimator": np.array(name), "base": np.array(base)}
+            return names | with_prefix("dense", self._held.state_dict(), "_")
+        return as_arrays(self._held, name, base)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, as `EkfSlam.load_state_dict`."""
         name, base = type(self).__name__, self._scan_rules.base
-        self._belief = checked_state(state, name, base)
+        if isinstance(state, Mapping) and "dense_estimator" in state:
+            saved_states.refuse_other_state(state, (), estimator=name, base=base)
+            dense = self._scan_rules.dense()
+            dense.load_state_dict(without_prefix(state, "dense", "_"))
+            self._held = dense
+        else:
+            self._held = checked_state(state, name, base)
 
     def bookmark(self) -> Undo:
-        """Return what takes back later calls."""
-        return undo_all(attributes(self), self._belief.checkpoint())
+        """Return what takes back later calls, as far as no kernel has run."""
+        held = self._held
+        undo = held.bookmark() if isinstance(held, EkfSlam) else held.checkpoint()
+        return undo_all(attributes(self), undo)
 
     @property
     def steps(self) -> int:
         """Number of steps taken; it changes at once with the belief."""
-        return self._belief.steps
+        return self._held.steps
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
-        return self._belief.report
+        held = self._held
+        return held.report() if isinstance(held, EkfSlam) else held.report
 
     @property
     def _is_exact(self) -> bool:
         """Whether every correction must reach the whole map at once."""
         return not self._tolerance
 
-    def _process(self, readings: Array, ids: list[int]) -> ScanResult:
-        belief = self._belief
+    def _process(
+        self, belief: SparseBelief, readings: Array, ids: list[int]
+    ) -> ScanResult:
         return process_scan(
             (belief.local, belief.pose),
             self._scan_rules,

@@ -33,8 +33,7 @@ from .joining import (
 )
 from .store import LostSubmapError, Submap, SubmapStore
 
-ROUGHLY_CONVERGED = 0.1
-"""Decrement at which to stop while computing initial frames."""
+ROUGHLY_CONVERGED = 0.1  # decrement at which to stop while computing initial frames
 
 
 class ClosedSubmaps:
@@ -197,27 +196,22 @@ class ClosedSubmaps:
 # of the joined map around the robot is therefore copied into an invariant filter, which
 # then processes each step too.  The copy is replaced whenever a submap is closed.
 
-LARGEST_COUNT = 1000
-"""Largest number of landmarks of closed submaps in a neighbourhood."""
+LARGEST_COUNT = 1000  # largest number of landmarks of closed submaps in a neighbourhood
+# Ratio of the copied to the required distance, so that a copy lasts for a while.
 MARGIN = 2.0
-"""Ratio of the copied to the required distance, so that a copy lasts for a while."""
+# Number of scans whose ranges determine the required distance of the next copy.
 RECENT_SCANS = 10
-"""Number of scans whose ranges determine the required distance of the next copy."""
 
 
 class Region(NamedTuple):
     """The disc that a neighbourhood covers."""
 
-    centre: Array
-    """Position of the robot when the copy was made, shape (2,) [m]."""
-    reach: float
-    """Required distance from the robot [m]."""
-    slack: float
-    """Uncertainty of the distances [m]."""
-    is_all: bool = False
-    """Whether the copy holds all landmarks."""
+    centre: Array  # position of the robot when the copy was made, shape (2,) [m]
+    reach: float  # required distance from the robot [m]
+    slack: float  # uncertainty of the distances [m]
+    is_all: bool = False  # whether the copy holds all landmarks
+    # Distance of the last landmark, if their number was limited [m].
     farthest: float = np.inf
-    """Distance of the last landmark, if their number was limited [m]."""
 
     @property
     def radius(self) -> float:
@@ -503,17 +497,12 @@ def merged(submap: Submap, renamed: Mapping[int, int], frame: ErrorFrame) -> Sub
     for place, slot in enumerate(slots):
         kept = first.setdefault(slot, place)
         if kept != place:
-            mean, covariance = _coincided(mean, covariance, kept, place, frame)
+            corrected = coincide(mean, covariance, kept, place)
+            mean = retract(mean, corrected.mean - mean, frame)
+            covariance = corrected.covariance
             gone.append(place)
     return Submap(
         np.array(list(first), dtype=np.int64),
         without_landmarks(mean, gone),
         without_landmarks(covariance, gone),
     )
-
-
-def _coincided(
-    mean: Array, covariance: Array, kept: int, gone: int, frame: ErrorFrame
-) -> tuple[Array, Array]:
-    corrected = coincide(mean, covariance, kept, gone)
-    return retract(mean, corrected.mean - mean, frame), corrected.covariance

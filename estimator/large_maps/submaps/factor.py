@@ -20,19 +20,17 @@ from scipy.linalg import solve_triangular
 
 from ....arrays import Array, ComplexArray
 from ...models.bearing_range import wrap_angle
-from ...models.rigid_motion import ErrorFrame
+from ...models.rigid_motion import ErrorFrame, points_of, state_of
 
+# Lower bound of a standard deviation, relative to the largest of the submap.
 SMALLEST_RATIO = 1e-5
-"""Lower bound of a standard deviation, relative to the largest of the submap."""
 
 
 class FactorError(NamedTuple):
     """Error of a submap against the world, and its Jacobian."""
 
-    error: Array
-    """e, shape (3 + 2n,)."""
-    jacobian: Array
-    """∂e/∂(F_k, F_{k+1}, landmarks), shape (3 + 2n, 6 + 2n)."""
+    error: Array  # e, shape (3 + 2n,)
+    jacobian: Array  # ∂e/∂(F_k, F_{k+1}, landmarks), shape (3 + 2n, 6 + 2n)
 
 
 def factor_error(
@@ -143,23 +141,8 @@ Complex = ComplexArray
 class Gaussian(NamedTuple):
     """Mean of a pose and n landmarks, and the covariance of its additive error."""
 
-    mean: Array
-    """(x, y, θ, l1x, l1y, …), shape (3 + 2n,)."""
-    covariance: Array
-    """Shape (3 + 2n, 3 + 2n)."""
-
-
-def points_of(state: Array) -> Complex:
-    """Return the positions of the pose and the landmarks, shape (1 + n,)."""
-    return np.concatenate([state[:1], state[3::2]]) + 1j * np.concatenate(
-        [state[1:2], state[4::2]]
-    )
-
-
-def state_of(points: Complex, heading: float) -> Array:
-    """Return (x, y, θ, l1x, l1y, …), shape (3 + 2n,)."""
-    flat = np.ascontiguousarray(points).view(np.float64)
-    return np.concatenate([flat[:2], [heading], flat[2:]])
+    mean: Array  # (x, y, θ, l1x, l1y, …), shape (3 + 2n,)
+    covariance: Array  # (3 + 2n, 3 + 2n)
 
 
 def times(factor: complex, rows: Array) -> Array:
@@ -180,6 +163,8 @@ def with_uncertain_start(map_: Gaussian, start: Array, covariance: Array) -> Gau
     start, covariance : ndarray, shapes (3,) and (3, 3)
         Pose at the beginning of the run.
     """
+    if not covariance.any():
+        return map_
     lever = 1j * (points_of(map_.mean) - complex(*start[:2]))
     G = np.zeros((len(map_.mean), 3))
     rows = np.r_[0, 3 : len(G) : 2]

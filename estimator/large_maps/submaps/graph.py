@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg.blas import dsyrk
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import FRAMES, EkfSlam
@@ -21,13 +22,14 @@ from ...models.rigid_motion import (
     ErrorFrame,
     as_covariance,
     compose,
-    invariant_covariance,
+    points_of,
+    state_of,
 )
 from ...support import argument_checks
 from ...support.undo import Undo, attributes, undo_all
-from ..multifrontal import pairs
+from ..multifrontal import pairs, symmetric
 from .closed_submaps import ClosedSubmaps, Region
-from .factor import Gaussian, points_of, retract, state_of, times, with_uncertain_start
+from .factor import Gaussian, retract, times, with_uncertain_start
 from .store import LandmarkIndex, Submap, link_name
 
 NO_SLOTS: IntArray = np.empty(0, dtype=np.int64)
@@ -218,21 +220,31 @@ def fuse(
         The robot's pose in the world, the map's landmarks, then the landmarks that only
         the submap holds.
     """
-    mean, own = world.mean, local.mean
-    prior = block_diag(invariant_covariance(mean, world.covariance), local.covariance)
+    mean, own, cut = world.mean, local.mean, len(world.mean)
+    V = np.empty((0, cut + len(own)))
+    start = _in_invariant(world, np.arange(3))
     if len(common[0]):
         A, innovation = _difference(mean, own, frame, common)
-        AP = A @ prior
-        S = AP @ A.T
+        seen = np.concatenate([start, _in_invariant(world, 3 + pairs(common[0]))])
+        AP = np.hstack([A[:, : len(seen)] @ seen, A[:, len(seen) :] @ local.covariance])
+        used = np.r_[0:3, 3 + pairs(common[0]), cut : cut + len(own)]
+        S = AP[:, used] @ A.T
         lower = _root((S + S.T) / 2)
         V = solve_triangular(
             lower, np.column_stack([AP, innovation]), lower=True, check_finite=False
         )
-        step = V[:, :-1].T @ V[:, -1]
-        prior -= V[:, :-1].T @ V[:, :-1]
-        mean = retract(mean, step[: len(mean)], "invariant")
-        own = retract(own, step[len(mean) :], frame)
-    return _composed(mean, own, prior, frame, common[1])
+        V, step = V[:, :-1], V[:, :-1].T @ V[:, -1]
+        mean = retract(mean, step[:cut], "invariant")
+        own = retract(own, step[cut:], frame)
+    moved = Gaussian(own, block_diag(start, local.covariance))
+    return _composed(world, mean, moved, V, (frame, common[1]))
+
+
+def _in_invariant(world: Gaussian, rows: IntArray) -> Array:
+    """Return some rows of the covariance in the coordinates ξ."""
+    lever = state_of(1j * points_of(world.mean), 0.0)
+    half = world.covariance[rows] - np.outer(lever[rows], world.covariance[2])
+    return np.asarray(half - np.outer(half[:, 2], lever))
 
 
 def _root(S: Array) -> Array:
@@ -248,50 +260,102 @@ def _root(S: Array) -> Array:
 def _difference(
     mean: Array, own: Array, frame: ErrorFrame, common: tuple[IntArray, IntArray]
 ) -> tuple[Array, Array]:
-    """Return the Jacobian by (ξ, local error), and the innovation."""
-    count = len(common[0])
-    out = np.exp(-1j * mean[2])
-    inside = 3 + pairs(common[0])
-    beside = len(mean) + 3 + pairs(common[1])
-    A = np.zeros((2 * count, len(mean) + len(own)))
-    A[:, :2] = -np.tile(np.eye(2), (count, 1))
-    A[np.arange(2 * count), inside] = 1.0
+    """Return the Jacobian by (ξ of start and landmarks, local error), and ν."""
+    size = 2 * len(common[0])
+    rows, out = np.arange(size), np.exp(-1j * mean[2])
+    A = np.zeros((size, 3 + size + len(own)))
+    A[:, :2] = -np.tile(np.eye(2), (len(common[0]), 1))
+    A[rows, 3 + rows] = 1.0
     A = times(out, A)
-    A[np.arange(2 * count), beside] = -1.0
+    A[rows, size + 6 + pairs(common[1])] = -1.0
     c = points_of(own)[1 + common[1]]
     if frame == "invariant":
-        A[:, len(mean) + 2] = -(1j * c).view(np.float64)
+        A[:, size + 5] = -(1j * c).view(np.float64)
     points = points_of(mean)
     difference = out * (points[1 + common[0]] - points[0]) - c
     return A, -difference.view(np.float64)
 
 
 def _composed(
-    mean: Array, own: Array, covariance: Array, frame: ErrorFrame, known: IntArray
+    world: Gaussian,
+    mean: Array,
+    local: Gaussian,
+    V: Array,
+    of_local: tuple[ErrorFrame, IntArray],
 ) -> Gaussian:
-    """Return robot, map and new landmarks in the world, with additive error."""
+    """Return robot, map and new landmarks in the world, with additive error.
+
+    Parameters
+    ----------
+    world : Gaussian
+        Before the fusion.
+    mean : ndarray
+        Of the world, after it.
+    local : Gaussian
+        The submap's mean after it; the rows of the start and of the submap in the joint
+        covariance before it, in the coordinates ξ and ``frame``.
+    V : ndarray, shape (r, ·)
+        The joint covariance falls by Vᵀ V.
+    of_local : (frame, known)
+        Coordinates of the local error, and the submap's landmarks that the map holds.
+    """
+    (frame, known), own, cut = of_local, local.mean, len(mean)
     fresh = np.setdiff1d(np.arange((len(own) - 3) // 2), known)
     pose, by_start, by_pose = compose(mean[:3], own[:3])
     seen = np.exp(1j * mean[2]) * points_of(own)[1 + fresh]
-    landmarks = points_of(mean)[1:]
     points = np.concatenate(
-        [[complex(*pose[:2])], landmarks, complex(*mean[:2]) + seen]
+        [[complex(*pose[:2])], points_of(mean)[1:], complex(*mean[:2]) + seen]
     )
-    cut = len(mean)
-    T = np.zeros((cut + 2 * len(fresh), len(covariance)))
-    T[:3, :3], T[:3, cut : cut + 3] = by_start, by_pose
-    T[np.arange(3, cut), np.arange(3, cut)] = 1.0
-    T[cut:, :2] = np.tile(np.eye(2), (len(fresh), 1))
-    T[cut:, 2] = (1j * seen).view(np.float64)
+    # T takes the errors of start and submap to those of robot and new landmarks.
+    T = np.zeros((3 + 2 * len(fresh), 3 + len(own)))
+    T[:3, :3], T[:3, 3:6] = by_start, by_pose
+    T[3:, :2] = np.tile(np.eye(2), (len(fresh), 1))
+    T[3:, 2] = (1j * seen).view(np.float64)
     new = np.zeros((2 * len(fresh), len(own)))
     new[np.arange(2 * len(fresh)), 3 + pairs(fresh)] = 1.0
-    T[cut:, cut:] = times(np.exp(1j * mean[2]), new)
+    T[3:, 3:] = times(np.exp(1j * mean[2]), new)
     # From ξ to the additive error: e = ξ + (J q; 0 at θ) ξ_θ.
-    T[:, 2] += T[:, :cut] @ state_of(1j * points_of(mean), 0.0)
+    lever = state_of(1j * points_of(mean), 0.0)
+    T[:, 2] += T[:, :3] @ lever[:3]
     if frame == "invariant":
-        T[:, cut + 2] += T[:, cut:] @ state_of(1j * points_of(own), 0.0)
-    moved = as_covariance(T @ covariance @ T.T)
-    return Gaussian(state_of(points, float(pose[2])), moved)
+        T[:, 5] += T[:, 3:] @ state_of(1j * points_of(own), 0.0)
+    at = np.r_[0:3, cut : cut + len(own)]
+    rows = T @ (local.covariance - V[:, at].T @ V)
+    covariance = np.zeros((2 * len(points) + 1,) * 2)
+    _fill_map(covariance, world, lever, V)
+    few = np.r_[0:3, cut : len(covariance)]
+    covariance[few, 3:cut] = rows[:, 3:cut] + np.outer(rows[:, 2], lever[3:])
+    covariance[3:cut, few] = covariance[few, 3:cut].T
+    covariance[np.ix_(few, few)] = as_covariance(rows[:, at] @ T.T)
+    np.fill_diagonal(covariance, np.maximum(covariance.diagonal(), 0.0))
+    return Gaussian(state_of(points, float(pose[2])), covariance)
+
+
+def _fill_map(covariance: Array, world: Gaussian, lever: Array, V: Array) -> None:
+    """Write the covariance of the map's landmarks after the fusion.
+
+    ::
+
+        P + d uᵀ + u dᵀ − Wᵀ W,    u = P_θ + d P_θθ / 2,    W = V + V_θ (J q)ᵀ
+
+    The turn of the map about its origin adds d = J (q − q before) to the derivatives.
+    """
+    P, cut = world.covariance, len(lever)
+    covariance[3:cut, 3:cut] = P[3:, 3:]
+    if not len(V):
+        return
+    d = lever - state_of(1j * points_of(world.mean), 0.0)
+    u = P[2] + d * (P[2, 2] / 2)
+    sizes = float(np.linalg.norm(u)), float(np.linalg.norm(d))
+    scale = np.sqrt(sizes[0] / sizes[1]) if all(sizes) else 1.0
+    both, gap = scale * d + u / scale, scale * d - u / scale
+    lost = [gap / np.sqrt(2), *(V[:, :cut] + np.outer(V[:, 2], lever))]
+    for sign, rows in ((1.0, [both / np.sqrt(2)]), (-1.0, lost)):
+        root = np.zeros((len(rows), len(covariance)))
+        root[:, 3:cut] = np.array(rows)[:, 3:]
+        # The transposes are contiguous in Fortran order: nothing is copied.
+        dsyrk(sign, root.T, 1.0, covariance.T, overwrite_c=1)
+    symmetric(covariance)
 
 
 def part_of(
@@ -313,11 +377,14 @@ def part_of(
     sorter = np.argsort(order)
     places = sorter[np.searchsorted(order, wanted, sorter=sorter)]
     rows = np.concatenate([np.arange(3), 3 + pairs(places)])
-    covariance = map_.covariance[rows[:, None], rows]
+    covariance = map_.covariance
+    if not np.array_equal(rows, np.arange(len(covariance))):
+        covariance = covariance[rows[:, None], rows]
     return Belief(map_.mean[rows], covariance, ids, "invariant")
 
 
 ORIGIN = (0.0, 0.0, 0.0)
+SIZE = 50  # landmarks of a submap, where scans hold no more
 
 
 class ActiveSubmap:
@@ -353,11 +420,6 @@ class ActiveSubmap:
     def pose(self) -> Array:
         """(x, y, θ) of the robot, shape (3,); the heading is not wrapped."""
         return self.filter.map.mean[:3]
-
-    @property
-    def heading_variance(self) -> float:
-        """Variance of the heading in the frame of the submap [rad²]."""
-        return float(self.filter.map.covariance[2, 2])
 
     @property
     def pose_covariance(self) -> Array:
@@ -401,32 +463,31 @@ class ActiveSubmap:
 class ClosingRule(NamedTuple):
     """Limits of a submap; infinite ones have no effect."""
 
-    size: int
-    """Number of landmarks."""
-    heading: float
-    """Standard deviation of the heading in the frame of the submap [rad]."""
-    extent: float
-    """Distance of the robot from the origin of the frame [m]."""
+    size: int | None  # number of landmarks; None: see `closes`
+    heading: float  # standard deviation of the heading in the frame of the submap [rad]
+    extent: float  # distance of the robot from the origin of the frame [m]
 
     @classmethod
     def checked(
-        cls, size: int, heading: float | None, extent: float | None
+        cls, size: int | None, heading: float | None, extent: float | None
     ) -> ClosingRule:
         """Return the rule of the options of :class:`SubmapSlam`, which it checks."""
-        least = argument_checks.whole("submap_size", size, 1)
+        if size is not None:
+            argument_checks.whole("submap_size", size, 1)
         limits = (("heading_limit", heading), ("extent_limit", extent))
         heading_limit, extent_limit = (
             np.inf if value is None else argument_checks.above(name, value, 0.0)
             for name, value in limits
         )
-        return cls(least, heading_limit, extent_limit)
+        return cls(size, heading_limit, extent_limit)
 
-    def closes(self, active: ActiveSubmap) -> bool:
-        """Return whether the submap has reached a limit."""
+    def closes(self, active: ActiveSubmap, readings: int) -> bool:
+        """Return whether the submap has reached a limit with this scan."""
         x, y, _ = active.pose.tolist()
+        own_size = SIZE if readings <= SIZE else 2 * readings
         return (
-            len(active) >= self.size
-            or active.heading_variance > self.heading**2
+            len(active) >= (self.size or own_size)
+            or active.pose_covariance[2, 2] > self.heading**2
             or hypot(x, y) > self.extent
         )
 

@@ -32,8 +32,8 @@ from .factor import (
 )
 from .store import Submap
 
+# Decrement at which to stop: the step is then below 1e-4 standard deviations.
 CONVERGED = 1e-9
-"""Decrement at which to stop: the step is then below 1e-4 standard deviations."""
 
 
 class JoinedMap:
@@ -193,19 +193,16 @@ class JoinedMap:
 
 Refine = Callable[[int, int, Array], Array]
 
+# Up to this many submaps, composing their frames is accurate enough.
 LARGEST_COMPOSED = 4
-"""Up to this many submaps, composing their frames is accurate enough."""
 
 
 class SubmapSummary(NamedTuple):
     """The part of a closed submap that stays in memory."""
 
-    slots: IntArray
-    """Its landmarks, shape (n,)."""
-    mean: Array
-    """As in the submap, shape (3 + 2n,)."""
-    pose_covariance: Array
-    """Covariance of its last pose, shape (3, 3)."""
+    slots: IntArray  # its landmarks, shape (n,)
+    mean: Array  # as in the submap, shape (3 + 2n,)
+    pose_covariance: Array  # covariance of its last pose, shape (3, 3)
 
     @property
     def nbytes(self) -> int:
@@ -366,12 +363,9 @@ def align(start: Array, covariance: Array, seen: Array, landmarks: Array) -> Arr
 class PrivateLandmarks(NamedTuple):
     """n landmarks of a single submap, in the world."""
 
-    points: Array
-    """Shape (2n,) [m]."""
-    jacobian: Array
-    """By the unknowns of the submap, shape (2n, u)."""
-    covariance: Array
-    """Conditional covariance given these unknowns, shape (2n, 2n)."""
+    points: Array  # (2n,) [m]
+    jacobian: Array  # by the unknowns of the submap, shape (2n, u)
+    covariance: Array  # conditional covariance given these unknowns, shape (2n, 2n)
 
 
 def private_landmarks(
@@ -441,23 +435,19 @@ def private_landmarks(
 # Gauss-Newton iteration with step halving and Anderson acceleration.
 
 ITERATIONS, HALVINGS, MEMORY = 200, 8, 5
+# Iterations after which an extrapolated step only has to lower the cost.
+#
+# Where large errors remain at the solution, as after improbable readings, plain steps
+# approach it slowly, and their decrement rises and falls on the way.
 PATIENCE = 30
-"""Iterations after which an extrapolated step only has to lower the cost.
-
-Where large errors remain at the solution, as after improbable readings, plain steps
-approach it slowly, and their decrement rises and falls on the way.
-"""
 
 
 class Iterate(NamedTuple):
     """One iterate of Gauss-Newton."""
 
-    values: Array
-    """All unknowns, shape (N,)."""
-    cost: float
-    """Sum of the squared errors, in standard deviations."""
-    decrement: float
-    """Decrease of the cost by a full step in a linear problem."""
+    values: Array  # all unknowns, shape (N,)
+    cost: float  # sum of the squared errors, in standard deviations
+    decrement: float  # decrease of the cost by a full step in a linear problem
     step: Array
 
     @property

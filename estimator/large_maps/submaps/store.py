@@ -18,8 +18,7 @@ from ....arrays import Array, IntArray
 from ...support.argument_checks import LOWEST_ID, LandmarkIds, refuse_reserved
 from ...support.undo import Undo
 
-CACHE_SIZE = 8
-"""Number of submaps of a folder that are kept in memory."""
+CACHE_SIZE = 8  # number of submaps of a folder that are kept in memory
 MARKER = "submaps.txt"
 FORMAT = "slamgym submaps 1"
 SUFFIX, PART = ".npy", ".part"
@@ -32,12 +31,11 @@ class LostSubmapError(ValueError):
 class Submap(NamedTuple):
     """A closed submap in its own frame."""
 
-    slots: IntArray
-    """Slots of its landmarks in the whole map, shape (n,)."""
+    slots: IntArray  # slots of its landmarks in the whole map, shape (n,)
+    # Last pose, where the next submap begins, and landmarks, shape (3 + 2n,).
     mean: Array
-    """Last pose, where the next submap begins, and landmarks, shape (3 + 2n,)."""
+    # Covariance of the error in its filter's frame, shape (3 + 2n, 3 + 2n).
     covariance: Array
-    """Covariance of the error in its filter's frame, shape (3 + 2n, 3 + 2n)."""
 
 
 class MemoryStore:

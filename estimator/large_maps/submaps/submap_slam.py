@@ -127,8 +127,9 @@ class SubmapSlam(SubmapQueries):
         As in :class:`EkfSlam`.
     base : {"invariant", "ekf"}
         The filter of a submap.
-    submap_size : int
+    submap_size : int or None
         Number of landmarks that closes a submap; at least as many as a scan holds.
+        None: 50, or twice as many as the last scan holds if it holds more than 50.
     heading_limit : float or None
         Standard deviation of the heading in the submap's frame that closes it [rad].
         Linearisation is accurate only while it is small.
@@ -176,7 +177,7 @@ class SubmapSlam(SubmapQueries):
         initial_pose: ArrayLike = ORIGIN,
         initial_pose_std: ArrayLike = ORIGIN,
         base: str = "invariant",
-        submap_size: int = 50,
+        submap_size: int | None = None,
         heading_limit: float | None = None,
         extent_limit: float | None = None,
         folder: str | os.PathLike[str] | None = None,
@@ -252,7 +253,7 @@ class SubmapSlam(SubmapQueries):
             is then unchanged.  Every later scan tries again.
         """
         readings = argument_checks.scan(measurements)
-        if len(readings) > self._rule.size:
+        if self._rule.size is not None and len(readings) > self._rule.size:
             raise ValueError(
                 f"submap_size must be >= {len(readings)}, the "
                 f"landmarks of one scan, got {self._rule.size}"
@@ -281,7 +282,7 @@ class SubmapSlam(SubmapQueries):
         if new != report.added_ids:
             report = report.replace(added_ids=new)
         self._neighbourhood.update(readings, ids, report)
-        if len(readings) and self._rule.closes(self._active):
+        if len(readings) and self._rule.closes(self._active, len(readings)):
             with suppress(OSError):  # the next scan tries again, and raises
                 self._close()
         self._report = report

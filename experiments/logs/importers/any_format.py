@@ -9,15 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..slamlog import (
-    LogLine,
-    ReadFile,
-    SlamLog,
-    float_array,
-    read_lines,
-    read_slamlog,
-    shown,
-)
+from .. import slamlog
 from .course import read_course, read_freiburg
 from .graph import GRAPH_TAGS, read_isam
 from .utias import read_utias
@@ -27,7 +19,7 @@ EXPECTED = (
     "iSAM or g2o text, or a UTIAS MR.CLAM folder"
 )
 READERS = {
-    "slamlog": read_slamlog,
+    "slamlog": slamlog.read_slamlog,
     "course": read_course,
     "freiburg": read_freiburg,
 }
@@ -40,7 +32,7 @@ def read_log(
     robot: int | None = None,
     truth: str | PathLike[str] | None = None,
     noise_from_file: bool = False,
-) -> SlamLog:
+) -> slamlog.SlamLog:
     """Read a log of any known format, which is detected from the content.
 
     Parameters
@@ -81,8 +73,8 @@ def read_log(
     if source.is_dir():
         kind = "utias"
     else:
-        path = ReadFile(path)
-        kind = _format_of(read_lines(path)[0])
+        path = slamlog.ReadFile(path)
+        kind = _format_of(slamlog.read_lines(path)[0])
     if robot is not None and kind != "utias":
         raise ValueError(f"robot must be None for a log in one file, got {robot}")
     if kind != "isam":
@@ -95,7 +87,7 @@ def read_log(
         log = READERS[kind](path)
     if landmarks is None:
         return log
-    positions = float_array("landmarks", landmarks, columns=2)
+    positions = slamlog.float_array("landmarks", landmarks, columns=2)
     return replace(
         log,
         header={**log.header, "truth": "landmarks given by the caller"},
@@ -104,7 +96,7 @@ def read_log(
     )
 
 
-def _format_of(line: LogLine) -> str:
+def _format_of(line: slamlog.LogLine) -> str:
     """Detect the format from the first line of a file."""
     tag, *fields = line.text.split()
     if line.text.startswith("#") or "," in line.text:
@@ -116,7 +108,7 @@ def _format_of(line: LogLine) -> str:
     try:
         np.array([tag, *fields], dtype=np.float64)
     except ValueError:
-        raise line.error(EXPECTED, shown(line.text)) from None
+        raise line.error(EXPECTED, slamlog.shown(line.text)) from None
     return "course"
 
 

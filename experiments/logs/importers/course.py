@@ -179,9 +179,7 @@ def read_freiburg(path: str | PathLike[str]) -> SlamLog:
     )
 
 
-def read_world(
-    path: str | PathLike[str],
-) -> tuple[IntArray, Array]:
+def read_world(path: str | PathLike[str]) -> tuple[IntArray, Array]:
     """Read landmark ids (n,) and positions (n, 2) [m].
 
     Raises

@@ -18,17 +18,7 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ....evaluation.trajectory_error import poses_at
-from ..slamlog import (
-    EventRecorder,
-    LogError,
-    LogLine,
-    OdometryRow,
-    Reading,
-    Scan,
-    SlamLog,
-    read_lines,
-    wrap_bearing,
-)
+from .. import slamlog
 
 ODOMETRY_STEP = 0.1  # [s]
 LONGEST = 1e6  # [s]: 10 million rows
@@ -36,12 +26,12 @@ TRUTH_STEP = 0.2  # [s]
 LAST_ROBOT = 5
 TIME_DIGITS = 6  # float64 resolves stamps near 1.25e9 s to 2.4e-7 s
 ODOMETRY_NAME = re.compile(r"Robot(\d+)_Odometry\.dat")
-MERGED = LogLine("merged odometry", 0, "")
+MERGED = slamlog.LogLine("merged odometry", 0, "")
 
-TimedReadings = list[tuple[LogLine, Reading]]
+TimedReadings = list[tuple[slamlog.LogLine, slamlog.Reading]]
 
 
-def read_utias(folder: Path, *, robot: int | None = None) -> SlamLog:
+def read_utias(folder: Path, *, robot: int | None = None) -> slamlog.SlamLog:
     """Read the drive of one robot.
 
     Velocities are constant between their stamps and integrated onto a grid of 10 Hz,
@@ -83,7 +73,7 @@ def read_utias(folder: Path, *, robot: int | None = None) -> SlamLog:
     start = poses_at([0.0], truth)[0]
     is_known = bool(np.isfinite(start).all())
     ids, landmarks = _read_landmarks(folder)
-    return SlamLog(
+    return slamlog.SlamLog(
         name=f"{folder.resolve().name}_r{number}",
         header={
             "source": f"UTIAS MR.CLAM, robot {number}",
@@ -104,12 +94,16 @@ def _choose_robot(folder: Path, robot: int | None) -> int:
     matches = (ODOMETRY_NAME.fullmatch(file.name) for file in folder.iterdir())
     robots = sorted(int(match[1]) for match in matches if match)
     if not robots:
-        raise LogError(f"{folder}: expected Robot<k>_Odometry.dat, got no such file")
+        raise slamlog.LogError(
+            f"{folder}: expected Robot<k>_Odometry.dat, got no such file"
+        )
     if robot is None:
         return robots[0]
     if robot not in robots:
         numbers = ", ".join(map(str, robots))
-        raise LogError(f"{folder}: expected one of the robots {numbers}, got {robot}")
+        raise slamlog.LogError(
+            f"{folder}: expected one of the robots {numbers}, got {robot}"
+        )
     return robot
 
 
@@ -133,8 +127,8 @@ def _read_measurements(
         elif not 0 <= t <= end:
             outside += 1
         else:
-            angle = wrap_bearing(line.to_real(bearing))
-            reading = Reading(t, subject, angle, line.to_real(distance))
+            angle = slamlog.wrap_bearing(line.to_real(bearing))
+            reading = slamlog.Reading(t, subject, angle, line.to_real(distance))
             readings.append((line, reading))
     return readings, (
         f"{robots} readings of robots, {unknown} of unknown barcodes, "
@@ -172,7 +166,9 @@ def _read_truth(path: Path, epoch: float) -> Array:
     return truth
 
 
-def _merge(odometry: Array, readings: TimedReadings) -> tuple[OdometryRow | Scan, ...]:
+def _merge(
+    odometry: Array, readings: TimedReadings
+) -> tuple[slamlog.OdometryRow | slamlog.Scan, ...]:
     """Integrate the velocities between the times of grid and readings."""
     stamps, end = odometry[:, 0], odometry[-1, 0]
     moved = odometry[:-1, 1:] * np.diff(stamps)[:, None]
@@ -187,9 +183,9 @@ def _merge(odometry: Array, readings: TimedReadings) -> tuple[OdometryRow | Scan
     seen: dict[float, TimedReadings] = {}
     for line, reading in readings:
         seen.setdefault(reading.t, []).append((line, reading))
-    recorder = EventRecorder()
+    recorder = slamlog.EventRecorder()
     for (t, d, alpha), dt in zip(rows.tolist(), steps.tolist(), strict=True):
-        recorder.add_odometry(MERGED, OdometryRow(t, d, alpha, dt))
+        recorder.add_odometry(MERGED, slamlog.OdometryRow(t, d, alpha, dt))
         for line, reading in seen.get(t, []):
             recorder.add_reading(line, reading)
     return recorder.finish()
@@ -209,7 +205,7 @@ def _timed_table(path: Path, form: str) -> Array:
     return np.array([[line.to_real(x) for x in line.text.split()] for line in lines])
 
 
-def _timed_lines(path: Path, form: str) -> list[LogLine]:
+def _timed_lines(path: Path, form: str) -> list[slamlog.LogLine]:
     """Read lines whose first field is a time that does not decrease."""
     lines, before = _lines(path, form), -np.inf
     for line in lines:
@@ -220,13 +216,13 @@ def _timed_lines(path: Path, form: str) -> list[LogLine]:
     return lines
 
 
-def _lines(path: Path, form: str) -> list[LogLine]:
+def _lines(path: Path, form: str) -> list[slamlog.LogLine]:
     """Read the lines without comments; each has as many fields as the form."""
     if not path.is_file():
-        raise LogError(f"{path.parent}: expected {path.name}, got no such file")
-    lines = [line for line in read_lines(path) if not line.text.startswith("#")]
+        raise slamlog.LogError(f"{path.parent}: expected {path.name}, got no such file")
+    lines = [line for line in slamlog.read_lines(path) if not line.text.startswith("#")]
     for line in lines:
         line.check_count(line.text.split(), (len(form.split()),), form)
     if not lines:
-        raise LogError(f"{path}: expected rows {form}, got comments only")
+        raise slamlog.LogError(f"{path}: expected rows {form}, got comments only")
     return lines

@@ -1,0 +1,345 @@
+"""Whether `diagnose` names errors in the code of a filter: faults and answers.
+
+    python benchmarks/causes_of_faults.py
+
+Each of 23 faults, of a filter or of its readings, is tried in three worlds where the
+filter without the fault is consistent, and 20 studies have none. An answer is right if
+it names the kind of the fault, or if the fault changes so little that the verdict is
+"consistent" or "nearly consistent"; "cannot tell" is counted by itself. `--seed` gives
+other worlds than those with which the rules were developed.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+from unittest import mock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slamgym.estimator import EkfSlam, UpdateReport
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.experiments.monte_carlo import (
+    monte_carlo,
+    runner,
+    summarise_monte_carlo,
+)
+from slamgym.sim_configs import Scenario, load_scenario
+
+Array = NDArray[np.float64]
+TEXTBOOK = Path(__file__).parents[1] / "examples" / "05_your_own_estimator.py"
+MODEL, COVARIANCE, CANNOT_TELL = "wrong model", "wrong covariance", "cannot tell"
+
+
+def mirrored(runs: Any) -> Any:
+    """Return runs whose bearings have the wrong sign."""
+    return runs._replace(measurements=runs.measurements * [-1, 1])
+
+
+def late(runs: Any) -> Any:
+    """Return runs whose scans come one step late."""
+    visible = np.roll(runs.visible, 1, axis=1)
+    visible[:, 0] = False
+    return runs._replace(
+        measurements=np.roll(runs.measurements, 1, axis=1), visible=visible
+    )
+
+
+def behind(runs: Any) -> Any:
+    """Return runs whose sensor is .3 m behind the robot."""
+    bearings, ranges = np.moveaxis(runs.measurements, -1, 0)
+    x, y = ranges * np.cos(bearings) + 0.3, ranges * np.sin(bearings)
+    return runs._replace(
+        measurements=np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=-1)
+    )
+
+
+def biased(runs: Any) -> Any:
+    """Return runs whose bearings are .006 rad too large."""
+    return runs._replace(measurements=runs.measurements + np.array([0.006, 0]))
+
+
+def long(runs: Any) -> Any:
+    """Return runs whose ranges are 2 % too long."""
+    return runs._replace(measurements=runs.measurements * [1, 1.02])
+
+
+def clipped(runs: Any) -> Any:
+    """Return runs whose ranges above 4 m are 4 m."""
+    return runs._replace(measurements=np.minimum(runs.measurements, [np.inf, 4.0]))
+
+
+def swapped(runs: Any) -> Any:
+    """Return runs whose landmarks 0 and 1 have each other's identity from scan 10."""
+    measurements, visible = runs.measurements.copy(), runs.visible.copy()
+    for array in (measurements, visible):
+        array[:, 10:, :2] = array[:, 10:, 1::-1]
+    return runs._replace(measurements=measurements, visible=visible)
+
+
+def scaled(runs: Any) -> Any:
+    """Return runs whose odometry reads distances 3 % too long."""
+    return runs._replace(odometry=runs.odometry * [1.03, 1])
+
+
+def late_odometry(runs: Any) -> Any:
+    """Return runs whose odometry comes one step late."""
+    odometry = np.roll(runs.odometry, 1, axis=1)
+    odometry[:, 0] = 0.0
+    return runs._replace(odometry=odometry)
+
+
+class TurnsFirst(EkfSlam):
+    """Turns before it drives."""
+
+    def predict(self, odometry: Any, dt: float = 1.0) -> None:
+        """Turn, then drive."""
+        distance, turn = odometry
+        super().predict((0.0, turn), 0.0)
+        super().predict((distance, 0.0), dt)
+
+
+class UsesTwice(EkfSlam):
+    """Every scan is used twice."""
+
+    def update(self, measurements: Any, landmark_ids: Any = None) -> UpdateReport:
+        """Take in the scan twice."""
+        super().update(measurements, landmark_ids)
+        return super().update(measurements, landmark_ids)
+
+
+class HalfDt(EkfSlam):
+    """Motion noise counts half."""
+
+    def predict(self, odometry: Any, dt: float = 1.0) -> None:
+        """Move with half of the noise."""
+        super().predict(odometry, dt / 2)
+
+
+class CertainStart(EkfSlam):
+    """The deviations of the first pose are a fifth of what they should be."""
+
+    def __init__(self, **settings: Any) -> None:
+        std = np.array(settings.pop("initial_pose_std", (0.0, 0.0, 0.0))) / 5
+        super().__init__(initial_pose_std=std, **settings)
+
+    def predict(self, odometry: Any, dt: float = 1.0) -> None:
+        """Move as usual, but not in a batch, which has a start of its own."""
+        super().predict(odometry, dt)
+
+
+def textbook(old: str, new: str) -> type:
+    """Return the filter of the example, with a text of it in place of another."""
+    source, module = TEXTBOOK.read_text(encoding="utf-8"), ModuleType("textbook")
+    assert source.count(old) == 1, old
+    exec(compile(source.replace(old, new), str(TEXTBOOK), "exec"), module.__dict__)
+    return type(module.TextbookEkf)(
+        "TextbookEkf", (module.TextbookEkf,), {"__module__": __name__}
+    )
+
+
+class Fault(NamedTuple):
+    """A fault and the answers that are right."""
+
+    name: str
+    right: tuple[str, ...]
+    estimator: Any = "ekf"
+    input: Callable[[Any], Any] = lambda runs: runs
+    """Change of what the filter reads, by which the world is as before."""
+    world: Callable[[Scenario, Any], Any] = lambda _, runs: runs
+    """Change of the readings of the world."""
+
+
+def correlated(world: Scenario, runs: Any) -> Any:
+    """Return runs whose bearing noise is AR(1) with φ = .9."""
+    phi, noise = 0.9, np.random.default_rng(5).standard_normal(runs.visible.shape)
+    for step in range(1, noise.shape[1]):
+        fresh = np.sqrt(1 - phi**2) * noise[:, step]
+        noise[:, step] = phi * noise[:, step - 1] + fresh
+    return with_noise(runs, 0, world.sensor.std[0] * noise)
+
+
+def with_outliers(world: Scenario, runs: Any) -> Any:
+    """Return runs where 2 % of the ranges err by ten deviations."""
+    rng = np.random.default_rng(6)
+    size = np.where(rng.random(runs.visible.shape) < 0.02, 10.0, 1.0)
+    noise = size * rng.standard_normal(runs.visible.shape)
+    return with_noise(runs, 1, world.sensor.std[1] * noise)
+
+
+def with_noise(runs: Any, column: int, noise: Array) -> Any:
+    """Replace the noise of all bearings (0) or ranges (1)."""
+    measurements = runs.measurements.copy()
+    for run, poses in enumerate(runs.true_poses):
+        for step, pose in enumerate(poses):
+            exact = predict_measurement(pose, runs.landmarks_of_rows[run]).measurement
+            measurements[run, step, :, column] = exact[:, column]
+    measurements[..., column] += noise
+    return runs._replace(measurements=measurements)
+
+
+FAULTS = (
+    Fault("bearing mirrored in the filter", (MODEL,), input=mirrored),
+    Fault("scan one step late", (MODEL,), input=late),
+    Fault("sensor .3 m off", (MODEL,), input=behind),
+    Fault(
+        "sign error in G",
+        (COVARIANCE,),
+        textbook("G[:2, 2] = -d * s, d * c", "G[:2, 2] = d * s, -d * c"),
+    ),
+    Fault("bias .006 rad in the filter", (MODEL,), input=biased),
+    Fault(
+        "new landmarks independent",
+        (COVARIANCE,),
+        ("ekf", {"landmark_init": "independent"}),
+    ),
+    Fault("bearing error AR(1), φ = .9", ("correlated noise",), world=correlated),
+    Fault("half dt", (COVARIANCE,), HalfDt),
+    Fault("scaled odometry in the filter", (MODEL,), input=scaled),
+    Fault("2 % outliers", ("heavy tails",), world=with_outliers),
+    Fault("first deviations / 5", (COVARIANCE,), CertainStart),
+    Fault("clipped range", (MODEL,), input=clipped),
+    Fault("turns first", (MODEL,), TurnsFirst),
+    Fault("scan used twice", (COVARIANCE,), UsesTwice),
+    Fault(
+        "no wrap",
+        (MODEL,),
+        textbook("nu[::2] = wrap_angle(nu[::2])", ""),
+    ),
+    Fault(
+        "covariance of the pose and the map not moved",
+        (COVARIANCE,),
+        textbook(
+            "self.P = G @ self.P @ G.T + F @ self.R @ F.T * dt",
+            "A, B = G[:3, :3], F[:3]\n        "
+            "self.P[:3, :3] = A @ self.P[:3, :3] @ A.T + B @ self.R @ B.T * dt",
+        ),
+    ),
+    Fault("ranges 2 % too long", (MODEL,), input=long),
+    Fault(
+        "deviations of bearing and range halved",
+        (COVARIANCE,),
+        textbook("np.square(measurement_std)", "np.square(measurement_std) / 4"),
+    ),
+    Fault(
+        "motion noise not rotated",
+        (COVARIANCE,),
+        textbook("F[:2, :2] = (c, -s), (s, c)", ""),
+    ),
+    Fault("odometry one step late", (MODEL,), input=late_odometry),
+    Fault(
+        "no heading in H",
+        (COVARIANCE,),
+        textbook("-dx / r**2, -1)", "-dx / r**2, 0)"),
+    ),
+    Fault("two identities swapped", (MODEL,), input=swapped),
+    Fault(
+        "new landmark without the noise of its range",
+        (COVARIANCE,),
+        textbook(
+            "B[-2:] = (-r * s, c), (r * c, s)", "B[-2:] = (-r * s, 0), (r * c, 0)"
+        ),
+    ),
+)
+UNSURE = {"start": {"std": [0.3, 0.3, 0.001], "drawn": "truth"}}
+WORLDS = {
+    "anchored": load_scenario("anchored"),
+    "loop, noise × .3": runner.with_less_noise(
+        load_scenario("loop").with_changes(steps=250), 0.3
+    ),
+    "dropout": load_scenario("dropout").with_changes(steps=130, **UNSURE),
+}
+HONEST_WORLDS = (*WORLDS.values(), load_scenario("corridor").with_changes(steps=100))
+
+
+@contextmanager
+def changed_runs(fault: Fault) -> Iterator[None]:
+    """Change the world of a Monte Carlo, and what its filter reads."""
+    simulate, use = runner.simulate_runs, runner.filter_runs
+
+    def simulated(world: Scenario, *arguments: Any, **options: Any) -> Any:
+        return fault.world(world, simulate(world, *arguments, **options))
+
+    def filtered(settings: Any, runs: Any, **options: Any) -> Any:
+        return use(settings, fault.input(runs), **options)
+
+    with (
+        mock.patch.object(runner, "simulate_runs", simulated),
+        mock.patch.object(runner, "filter_runs", filtered),
+    ):
+        yield
+
+
+def answer(world: Scenario, fault: Fault, runs: int, seed: int) -> dict[str, Any]:
+    """Return the entry of the summary of one study."""
+    with changed_runs(fault):
+        results = monte_carlo(
+            world, {"filter": fault.estimator}, runs, seed, small_noise=True
+        )
+    entry: dict[str, Any] = summarise_monte_carlo(results)["estimators"]["filter"]
+    return entry
+
+
+def rating(fault: Fault, entry: dict[str, Any]) -> str:
+    """Rate an answer: "right", "undecided" or "wrong"."""
+    cause = entry["diagnosis"]["cause"]
+    is_accepted = entry["verdict"] in ("consistent", "nearly consistent")
+    if cause in fault.right or (is_accepted and cause in ("honest", CANNOT_TELL)):
+        return "right"
+    return "undecided" if cause == CANNOT_TELL else "wrong"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=7_000_000)
+    parser.add_argument("--faults", nargs="+", help="only names that contain one")
+    parser.add_argument("--no-honest", action="store_true")
+    parser.add_argument("--sentences", action="store_true")
+    given = parser.parse_args(arguments)
+    ratings: Counter[str] = Counter()
+    linear = 0
+    print("| fault | world | NEES / 3 | verdict | answer | rating |")
+    print("|---|---|---|---|---|---|")
+    for fault in FAULTS:
+        if given.faults and not any(name in fault.name for name in given.faults):
+            continue
+        for name, world in WORLDS.items():
+            entry = answer(world, fault, given.runs, given.seed)
+            rated, cause = rating(fault, entry), entry["diagnosis"]["cause"]
+            ratings[rated] += 1
+            linear += cause == "linearisation"
+            ratio = entry["pose_nees"]["invariant"]["mean"]
+            nees = "–" if ratio is None else f"{ratio:.3g}"
+            row = fault.name, name, nees, entry["verdict"], cause, rated
+            print(f"| {' | '.join(row)} |", flush=True)
+            if given.sentences:
+                print("   ", entry["diagnosis"]["sentence"])
+    total = ratings.total()
+    shares = ", ".join(f"{word} {n} of {total}" for word, n in ratings.most_common())
+    print(f"\n{shares}; called linearisation: {linear}")
+    if not given.no_honest:
+        alarms = honest_alarms(given.runs, given.seed + 1_000_000)
+        print(f"false alarms in {len(alarms)} honest studies: {sum(alarms)}")
+
+
+def honest_alarms(runs: int, seed: int) -> list[bool]:
+    """Return for 20 studies of consistent filters whether they name a cause."""
+    found = []
+    for repetition in range(5):
+        for number, world in enumerate(HONEST_WORLDS):
+            first = seed + runs * (repetition * len(HONEST_WORLDS) + number)
+            entry = answer(world, Fault("", (), "invariant"), runs, first)
+            cause = entry["diagnosis"]["cause"]
+            found.append(cause not in ("honest", CANNOT_TELL))
+    return found
+
+
+if __name__ == "__main__":
+    main()

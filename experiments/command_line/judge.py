@@ -1,0 +1,133 @@
+"""``slamgym judge``: whether the estimates of any program agree with their errors."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+from rich.text import Text
+
+from .options import FilesOfEstimates, Options, option, takes
+from .program import FAILURE, BadInputError, command
+
+
+@command
+@takes("drives truth covariances frame align out as_json")
+def judge(
+    files: FilesOfEstimates,
+    *,
+    given: Options,
+    drives: Annotated[
+        Path | None,
+        option(
+            "DIR",
+            "The folder of slamgym generate that holds the truth.",
+            "the estimates, if generate wrote them",
+        ),
+    ] = None,
+    truth: Annotated[
+        list[Path] | None,
+        option(
+            "FILE",
+            "The true path of a drive from elsewhere: TUM, or a log with ground truth; "
+            "or a folder of such files. May be repeated.",
+            "that of the drives",
+        ),
+    ] = None,
+    covariances: Annotated[
+        str,
+        option(
+            "additive|invariant|right|left",
+            "The error whose covariances the files hold.",
+        ),
+    ] = "additive",
+    frame: Annotated[
+        str,
+        option("invariant|additive", "The error whose NEES decides."),
+    ] = "invariant",
+    align: Annotated[
+        str | None,
+        option(
+            "fit|X,Y,THETA",
+            "Move all estimates by this motion; fit brings each path closest to its "
+            "truth, and leaves no verdict.",
+            "none",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        option(
+            "DIR",
+            "The folder to write: new, empty, or with earlier output of slamgym.",
+            "results/judge-<scenario>",
+        ),
+    ] = None,
+) -> int:
+    """Judge estimates of any program.
+
+    Decide with known error rates whether the covariances of estimates agree with
+    their errors, as monte-carlo does for filters of slamgym. Each file holds the poses
+    of one drive, with covariances, as csv, TUM or npz. If a file breaks a convention,
+    such as radians or the order of entries, it is named. Writes results.nc,
+    summary.json and report.html.
+
+    Examples
+    --------
+    slamgym generate loop --episodes 100 --format slamlog --out drives
+    slamgym judge estimates --drives drives
+    slamgym judge mine yours --drives drives --covariances left
+    slamgym judge path.tum --truth truth.tum --align fit
+    """
+    from ...estimator.models.rigid_motion import ERROR_FRAMES
+    from .. import judging
+    from ..monte_carlo import summarise_monte_carlo
+    from ..monte_carlo.report import monte_carlo_table, write_html_report
+    from ..monte_carlo.results import REPORT, RESULTS
+    from ..monte_carlo.verdict import diagnosis_lines
+    from .output_folder import default_folder, output_folder, write_summary
+    from .tables import written
+
+    if frame not in ERROR_FRAMES:
+        raise BadInputError(
+            f"--frame must be one of {', '.join(ERROR_FRAMES)}, got {frame!r}"
+        )
+    error: Any = frame
+    reporter = given.reporter()
+    with reporter.warnings():
+        results = judging.judge(
+            files,
+            drives,
+            truth=truth,
+            covariances=covariances,
+            align=_motion(align),
+            command=shlex.join(["slamgym", *sys.argv[1:]]),
+        )
+        summary = summarise_monte_carlo(results, frame=error)
+    place = out or default_folder("judge", summary["scenario"])
+    with output_folder(place) as folder:
+        results.to_netcdf(folder / RESULTS)
+        write_html_report(results, summary, folder / REPORT)
+        summary = write_summary(folder, summary)
+    sentences = [
+        Text(sentence)
+        for label, entry in summary["estimators"].items()
+        for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
+    ]
+    reporter.show(monte_carlo_table(summary), "", *sentences, "")
+    if summary["notes"]:
+        reporter.show(*map(Text, summary["notes"]), "")
+    reporter.show(written(str(place), summary["files"]))
+    reporter.finish({**summary, "out": str(place)})
+    went_well = any(entry["good_runs"] for entry in summary["estimators"].values())
+    return 0 if went_well else FAILURE
+
+
+def _motion(text: str | None) -> str | list[float] | None:
+    """Parse "fit" or three numbers."""
+    if text is None or text == "fit":
+        return text
+    try:
+        x, y, turn = (float(part) for part in text.split(","))
+    except ValueError:
+        raise BadInputError(f"--align must be fit or X,Y,THETA, got {text!r}") from None
+    return [x, y, turn]

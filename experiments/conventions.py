@@ -1,0 +1,351 @@
+"""Name the convention that estimates break: `mistake_in`.
+
+A program that writes degrees, another order, or the covariance of another error is
+wrong in a way that its NEES shows but does not name. `mistake_in` reads the estimates
+in every other convention, and names the one that makes their errors honest, or far
+smaller. An honest filter has nothing to name, nor has one that is wrong in any reading.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import permutations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..arrays import Array
+from ..estimator.models.bearing_range import wrap_angle
+from ..estimator.models.rigid_motion import (
+    additive_error,
+    invariant_covariance,
+    invariant_error,
+)
+from ..evaluation.nees import pose_nees
+
+FEWEST_DRIVES = 5
+"""Drives from which on covariances are read in other conventions."""
+MOST_DRIVES = 200
+"""Drives that are read so."""
+_STEPS, _SHIFT = 24, 3
+_NEAR, _FAR, _ERRORS = 1.5, 2.5, 3.0
+"""An honest square is within a factor _NEAR of 1 or _ERRORS standard errors, not beyond
+the factor _FAR."""
+_GAIN = 1.0  # of log-likelihood of a pose [nats]
+_LOST, _MOST_LOST = 10.0, 50
+"""NEES / 3 of a drive that another truth may fit, and how many of them are compared."""
+_SMALLER = 4.0  # by which errors fall in the right convention
+_TURN = np.diag([1.0, 1.0, np.pi / 180])  # of headings in degrees
+
+
+class Reading(NamedTuple):
+    """Poses (B, K, 3) and covariances (B, K, 3, 3) as read in some convention."""
+
+    name: str
+    """What the file has; empty as it was declared."""
+    poses: Array
+    covariances: Array
+    """Of the additive error."""
+
+
+class _Fit(NamedTuple):
+    """How well a reading agrees with the truth."""
+
+    nees: float
+    """Divided by 3; nan for what is no covariance."""
+    is_honest: bool
+    likelihood: float
+    """Mean logarithm of the density of a pose, without constants."""
+    errors: tuple[float, float]
+    """Root of the median squared error of position [m] and heading [rad]."""
+
+
+def mistake_in(
+    truth: Array,
+    poses: Array,
+    covariances: Array,
+    starts: Array,
+    frame: str = "additive",
+) -> str:
+    """Return the convention that poses of B drives break as a sentence; empty if none.
+
+    Parameters
+    ----------
+    truth, poses : ndarray, shape (B, T, 3)
+        True and estimated (x, y, θ) [m, m, rad], as in the file.
+    covariances : ndarray, shape (B, T, 3, 3)
+        Of the estimates, as in the file.
+    starts : ndarray, shape (B, 3)
+        Poses at which the drives start according to their files.
+    frame : {"additive", "invariant", "left"}
+        The error whose covariance the file is declared to hold.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> truth = rng.uniform(-9, 9, (20, 50, 3))
+    >>> poses = truth + rng.normal(0, 0.1, truth.shape)
+    >>> claims = np.broadcast_to(np.eye(3) * 0.1, (20, 50, 3, 3))
+    >>> print(mistake_in(truth, poses, claims, truth[:, 0]))
+    standard deviations in place of variances: read so, NEES / 3 is 1.0..., not ...
+    """
+    if np.array_equal(truth, poses, equal_nan=True):
+        return "the poses are the true ones to the last digit, not estimates."
+    drives = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))[:MOST_DRIVES]
+    last = truth.shape[1] - 1
+    reach = min(_SHIFT, (last - 1) // 2)
+    steps = np.unique(np.linspace(1 + reach, last - reach, _STEPS).round().astype(int))
+    if not len(drives) or last < 1:
+        return ""
+
+    def at(shift: int) -> tuple[Array, Array]:
+        taken = np.ix_(drives, steps + shift)
+        return poses[taken], covariances[taken]
+
+    exact = truth[np.ix_(drives, steps)]
+    shifts = [shift for shift in range(-reach, reach + 1) if shift]
+    by_pose = list(_pose_readings(*at(0), starts[drives], {k: at(k) for k in shifts}))
+    read = [list(_readings(*each, frame)) for each in by_pose]
+    (declared, *claims), others = read[0], read[1:]
+    before = _fit(exact, declared)
+    if before.is_honest:
+        return ""
+    found = None
+    if len(drives) >= FEWEST_DRIVES:
+        groups = claims, [r for own in others for r in own[:2]]
+        both = [r for own in others if _gain(exact, own[0], before) for r in own[2:]]
+        for group in (*groups, both):
+            found = found or _honest(exact, group, before)
+    if found is not None:
+        reading, fit = found
+        was = f"{before.nees:.3g}" if np.isfinite(before.nees) else "undefined"
+        return f"{reading.name}: read so, NEES / 3 is {fit.nees:.2f}, not {was}."
+    return _nearer(exact, [own[0] for own in others], before)
+
+
+def swapped_drives(
+    truth: Array, poses: Array, covariances: Array, names: Sequence[object]
+) -> str:
+    """Return a sentence if estimates are honest with the truth of other drives.
+
+    Parameters
+    ----------
+    truth, poses : ndarray, shape (B, K, 3)
+        Poses of B drives, nan where there are none.
+    covariances : ndarray, shape (B, K, 3, 3)
+        Of the additive error.
+    names : sequence
+        Of the drives.
+    """
+    swaps = []
+    with np.errstate(invalid="ignore"):  # drives without estimates
+        own = pose_nees(truth, poses, covariances, frame="invariant").mean(axis=1) / 3
+        bad = np.flatnonzero(own > _LOST)
+        for k in bad[:_MOST_LOST]:
+            others = pose_nees(truth[bad], poses[k], covariances[k], frame="invariant")
+            ratios = others.mean(axis=1) / 3
+            if ratios.min() < min(own[k] / _LOST, _LOST):
+                swaps.append((names[k], names[bad[ratios.argmin()]]))
+    if not swaps:
+        return ""
+    said = " and ".join(f"that of {a} fits the truth of {b}" for a, b in swaps[:2])
+    return f"estimates or truths of {len(swaps)} drives are swapped: {said}."
+
+
+def _honest(
+    truth: Array, readings: Sequence[Reading], before: _Fit
+) -> tuple[Reading, _Fit] | None:
+    """Return the honest reading of the largest likelihood; the first of equal ones."""
+    fits = [(reading, _fit(truth, reading)) for reading in readings]
+    honest = [
+        (reading, fit)
+        for reading, fit in fits
+        if fit.is_honest and not fit.likelihood < before.likelihood + _GAIN
+    ]
+    if not honest:
+        return None
+    return max(honest, key=lambda pair: round(pair[1].likelihood, 6))
+
+
+def _gain(truth: Array, reading: Reading, before: _Fit) -> float:
+    """Return by how much the errors of poses fall [nats]; 0 if it is not far."""
+    sizes = [
+        np.log(np.maximum(fit.errors, 1e-9)).sum()
+        for fit in (before, _fit(truth, reading))
+    ]
+    gain = float(sizes[0] - sizes[1])
+    return gain if gain > np.log(_SMALLER) else 0.0
+
+
+def _nearer(truth: Array, readings: Sequence[Reading], before: _Fit) -> str:
+    """Name the reading whose errors are far smaller, though not honest."""
+    gains = [_gain(truth, reading, before) for reading in readings]
+    reading = readings[int(np.argmax(gains))]
+    if not max(gains) > 0:
+        return ""
+    (place, turn), (was_place, was_turn) = _fit(truth, reading).errors, before.errors
+    return (
+        f"{reading.name}: read so, the median errors are {place:.2g} m and {turn:.2g} "
+        f"rad instead of {was_place:.2g} m and {was_turn:.2g} rad."
+    )
+
+
+def _fit(truth: Array, reading: Reading) -> _Fit:
+    """Compare a reading with the truth, by the invariant error of the pose."""
+    covariances = invariant_covariance(reading.poses, reading.covariances)
+    errors = invariant_error(truth, reading.poses)
+    order = [2, 0, 1]  # the heading first: no frame changes it
+    plain = additive_error(truth, reading.poses)
+    middle = (
+        float(np.sqrt(np.nanmedian((plain[..., :2] ** 2).sum(axis=-1)))),
+        float(np.sqrt(np.nanmedian(plain[..., 2] ** 2))),
+    )
+    white, log_det = _whitened(
+        errors[..., order], covariances[..., order, :][..., order]
+    )
+    squares = (white**2).mean(axis=1)  # (B, 3): one number per run, and component
+    mean = squares.mean(axis=0)
+    if not np.isfinite(mean).all() or not mean.all():
+        return _Fit(np.nan, False, -np.inf, middle)
+    likelihood = -0.5 * float(((white**2).sum(axis=-1) + log_det).mean())
+    spread = squares.std(axis=0) / np.sqrt(len(squares)) / mean
+    limit = np.minimum(np.log(_NEAR) + _ERRORS * spread, np.log(_FAR))
+    is_honest = bool((np.abs(np.log(mean)) <= limit).all())
+    return _Fit(float(mean.mean()), is_honest, likelihood, middle)
+
+
+def _whitened(errors: Array, covariances: Array) -> tuple[Array, Array]:
+    """Return L⁻¹ e and log |P|, P = L Lᵀ; nan where P is no covariance."""
+    P = covariances
+    with np.errstate(invalid="ignore", divide="ignore"):
+        l00 = np.sqrt(P[..., 0, 0])
+        l10, l20 = P[..., 1, 0] / l00, P[..., 2, 0] / l00
+        l11 = np.sqrt(P[..., 1, 1] - l10**2)
+        l21 = (P[..., 2, 1] - l20 * l10) / l11
+        l22 = np.sqrt(P[..., 2, 2] - l20**2 - l21**2)
+        w0 = errors[..., 0] / l00
+        w1 = (errors[..., 1] - l10 * w0) / l11
+        w2 = (errors[..., 2] - l20 * w0 - l21 * w1) / l22
+        log_det = 2 * np.log(l00 * l11 * l22)
+    return np.stack([w0, w1, w2], axis=-1), log_det
+
+
+# --------------------------------------------------------------------------------------
+# The conventions: of the poses, and of the covariances beside them.
+
+_ORDERS = {
+    f"the order ({', '.join(name)}) instead of (x, y, θ)": np.eye(3)[
+        [name.index(entry) for entry in "xyθ"]
+    ]
+    for name in permutations("xyθ")
+    if name != tuple("xyθ")
+}
+FRAMES = {
+    "additive": "the additive error",
+    "left": "the left-invariant error (the robot's frame)",
+    "invariant": "the right-invariant error (the world's frame)",
+}
+_LINEAR = {
+    "headings in degrees instead of radians": _TURN,
+    "headings that grow clockwise": np.diag([1.0, 1.0, -1.0]),
+    "positions in millimetres": np.diag([1e-3, 1e-3, 1.0]),
+    "positions in centimetres": np.diag([1e-2, 1e-2, 1.0]),
+    **_ORDERS,
+}
+
+
+_Read = tuple[str, Array, Array, Array]
+"""Name, poses, covariances as in the file, and the Jacobian of the poses by its own."""
+
+
+def _pose_readings(
+    poses: Array, covariances: Array, starts: Array, shifted: Mapping[int, Any]
+) -> Iterator[_Read]:
+    """Yield the poses in all conventions, as declared first."""
+    yield "", poses, covariances, np.eye(3)
+    flipped = np.diag([1.0, 1.0, -1.0])
+    for name, matrix in _LINEAR.items():
+        yield name, poses @ matrix.T, covariances, matrix
+    compass = poses @ flipped + [0, 0, np.pi / 2]
+    yield "headings clockwise from the y axis", compass, covariances, flipped
+    turn = _rotations(-poses[..., 2])
+    back = -(turn @ poses[..., None])[..., 0]
+    by = -turn
+    by[..., 0, 2], by[..., 1, 2] = back[..., 1], -back[..., 0]
+    name = "poses of the world as the robot sees it (inverse)"
+    yield name, back, covariances, by
+    start = starts[:, None, :]
+    turn = _rotations(start[..., 2])
+    moved = start + (turn @ poses[..., None])[..., 0]
+    yield "poses in the frame of the start", moved, covariances, turn
+    for shift, (others, theirs) in shifted.items():
+        late, count = "late" if shift > 0 else "early", abs(shift)
+        name = f"time stamps that are {count} step{'s' * (count > 1)} too {late}"
+        yield name, others, theirs, np.eye(3)
+
+
+def additive_covariances(poses: Array, covariances: Array, frame: str) -> Array:
+    """Return covariances of the additive error for those of another error.
+
+    To first order, with the rotation R of θ̂ and J = [0 −1; 1 0]::
+
+        left        e = diag(R, 1) ξ
+        invariant   e = ξ + (J p̂, 0) ξ_θ
+
+    Parameters
+    ----------
+    poses : ndarray, shape (..., 3)
+        Estimates (x̂, ŷ, θ̂) [m, m, rad].
+    covariances : ndarray, shape (..., 3, 3)
+        Of the error in the frame.
+    frame : {"additive", "invariant", "left"}
+        The error of the covariances.
+    """
+    if frame == "additive":
+        return covariances
+    jacobian = _rotations(poses[..., 2] * (frame == "left"))
+    if frame == "invariant":
+        jacobian[..., 0, 2], jacobian[..., 1, 2] = -poses[..., 1], poses[..., 0]
+    return np.asarray(jacobian @ covariances @ np.swapaxes(jacobian, -1, -2))
+
+
+def _rotations(angles: Array) -> Array:
+    """Return R of each angle for poses, shape (..., 3, 3)."""
+    cos, sin, zero = np.cos(angles), np.sin(angles), np.zeros_like(angles)
+    rows = cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1
+    return np.stack(rows, axis=-1).reshape(*angles.shape, 3, 3)
+
+
+def _readings(
+    name: str, poses: Array, claims: Array, jacobian: Array, frame: str
+) -> Iterator[Reading]:
+    """Yield poses with their covariances in all conventions.
+
+    As declared first, and where the convention of the poses is another, then those that
+    follow it.
+    """
+    poses = np.concatenate([poses[..., :2], wrap_angle(poses[..., 2:])], axis=-1)
+
+    def read(what: str, matrices: Array, kind: str = frame) -> Reading:
+        whole = f"{name}; {what}" if name and what else name or what
+        return Reading(whole, poses, additive_covariances(poses, matrices, kind))
+
+    yield read("", claims)
+    if name:
+        following = jacobian @ claims @ np.swapaxes(jacobian, -1, -2)
+        yield read("", following)
+    for kind, title in FRAMES.items():
+        if kind != frame:
+            yield read(f"covariances of {title}", claims, kind)
+    turned = "covariances with headings in degrees"
+    yield read(turned, _TURN @ claims @ _TURN)
+    for order, matrix in _ORDERS.items():
+        yield read(f"covariances with {order}", matrix @ claims @ matrix.T)
+    xx, xy, xt, yy, yt, tt = np.moveaxis(claims[..., *np.triu_indices(3)], -1, 0)
+    lower = np.stack([xx, xy, yy, xy, xt, yt, yy, yt, tt], axis=-1)
+    by_rows = lower.reshape(claims.shape)
+    yield read("the lower triangle of the covariance, row by row", by_rows)
+    std = "standard deviations in place of variances"
+    yield read(std, np.sign(claims) * claims**2)
+    yield read("a root of the covariance", claims @ np.swapaxes(claims, -1, -2))
+    known = np.isfinite(claims).all(axis=(-2, -1)) & (np.linalg.det(claims) > 0)
+    information = np.linalg.inv(np.where(known[..., None, None], claims, np.eye(3)))
+    yield read("information matrices in place of covariances", information)

@@ -1,0 +1,281 @@
+"""Read the estimates of any program: csv, TUM with covariances, or npz.
+
+A file holds one drive and is named after its seed, as ``seed_00000007.csv``; an npz may
+hold many. docs/judge.md defines the columns.
+"""
+
+import re
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..arrays import AnyArray, Array, IntArray
+from .logs.importers import read_log
+from .logs.slamlog import LogError, LogLine, read_lines
+from .trajectories.manifest import MANIFEST, load_trajectories
+from .trajectories.trajectory import BELIEFS, Trajectory, array_of
+
+
+class Estimate(NamedTuple):
+    """The estimates of one drive, as in their file."""
+
+    file: str
+    poses: Array
+    """Shape (T, 3) [m, m, rad]."""
+    covariances: Array
+    """Shape (T, 3, 3)."""
+    times: Array | None = None
+    """Shape (T,); None if pose k is that of step k."""
+    in_seconds: bool = False
+    """Whether the times are in seconds, not steps."""
+    landmark_ids: IntArray = np.zeros(0, np.int64)
+    landmarks: Array = np.zeros((0, 2))
+    """Of the final map, shape (n, 2) [m]."""
+    landmark_covariances: Array = np.zeros((0, 2, 2))
+
+
+def true_path(path: Path) -> Array:
+    """Read rows (t, x, y, θ) of TUM, or of a log with ground truth."""
+    line = read_lines(path)[0]
+    if len(line.text.split()) < 8:
+        return read_log(path).ground_truth
+    rows = [_tum_row(line)[:8] for line in _content(path)]
+    return np.array([(t, x, y, _heading(*q)) for t, x, y, _, *q in rows])
+
+
+_CSV = (
+    "pose,t,x,y,θ and 6 or 9 entries of its covariance, or "
+    "landmark,id,x,y and 3 or 4 entries of its covariance"
+)
+_TUM = "t x y z qx qy qz qw and 6, 9, 21 or 36 entries of a covariance"
+_ENDINGS = (".csv", ".tum", ".txt", ".npz")
+_POSE_SIZES, _TUM_SIZES = (6, 9), (6, 9, 21, 36)
+
+
+def read_estimates(paths: Sequence[Path]) -> dict[Any, Estimate]:
+    """Read the files of an estimator; a folder stands for the files in it.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files, folders of files, or data sets with the beliefs of a filter.
+
+    Returns
+    -------
+    dict
+        By the seed in the name of a file, as in ``seed_00000007.csv`` or inside an npz;
+        by the name without its ending if there is none.
+
+    Raises
+    ------
+    ValueError
+        If a file is malformed, or two are of one drive.
+    """
+    found: dict[Any, Estimate] = {}
+    for path in paths:
+        for name, estimate in _each_estimate(path):
+            if name in found:
+                raise ValueError(
+                    f"{found[name].file} and {estimate.file} are both of drive {name}"
+                )
+            found[name] = estimate
+    if not found:
+        raise ValueError(
+            f"estimates must be files ending in {', '.join(_ENDINGS)}, got none in "
+            f"{', '.join(map(str, paths))}"
+        )
+    return found
+
+
+def _each_estimate(path: Path) -> Iterator[tuple[Any, Estimate]]:
+    if (path / MANIFEST).is_file():
+        for drive in load_trajectories(path):
+            yield drive.seed, beliefs_of(drive, str(path))
+        return
+    for file in files_in([path]):
+        if file.suffix == ".npz":
+            yield from _of_npz(file)
+        else:
+            read = _of_csv if file.suffix == ".csv" else _of_tum
+            yield name_of(file), read(file)
+
+
+def paths_by_label(estimates: Any) -> dict[str, list[Path]]:
+    """Return paths by the labels of estimators."""
+    if isinstance(estimates, Mapping):
+        named = {
+            str(label): [Path(each)] if isinstance(each, str | PathLike)
+            else [Path(one) for one in each]
+            for label, each in estimates.items()
+        }  # fmt: skip
+    else:
+        one = isinstance(estimates, str | PathLike)
+        named = {}
+        for path in [Path(estimates)] if one else map(Path, estimates):
+            folder = path if path.is_dir() else path.parent
+            label = folder.resolve().name or "estimates"
+            named.setdefault(label, []).append(path)
+    if not named or not all(named.values()):
+        raise ValueError("estimates must be at least one file or folder, got none")
+    for path in (path for paths in named.values() for path in paths):
+        if not path.exists():
+            raise ValueError(f"{path} does not exist")
+    return named
+
+
+def files_in(paths: Sequence[Path]) -> list[Path]:
+    """List files, and those with a known ending in folders."""
+    return [
+        file
+        for path in paths
+        for file in (
+            sorted(f for f in path.iterdir() if f.suffix in _ENDINGS and f.is_file())
+            if path.is_dir()
+            else [path]
+        )
+    ]
+
+
+def name_of(path: Path) -> Any:
+    """Return the seed in the name of a file, or the name."""
+    found = re.search(r"seed_?(\d{1,18})", path.stem)
+    return int(found[1]) if found else path.stem
+
+
+def beliefs_of(drive: Trajectory, file: str) -> Estimate:
+    """Return the beliefs that are in a data set beside the truth."""
+    if drive.belief_poses is None:
+        raise ValueError(
+            f"{file} must hold the beliefs of a filter to be judged: it was generated "
+            "without --estimator; give the files of estimates, and it as the drives"
+        )
+    beliefs = {name: array_of(drive, name) for name in BELIEFS}
+    return _of_arrays(file, beliefs, drive.scenario.sensor.identities)
+
+
+def _of_arrays(
+    file: str, arrays: Mapping[str, AnyArray], is_named: bool = True
+) -> Estimate:
+    """Return the estimates in arrays of one drive, with the names of a data set."""
+    poses, claims = (np.asarray(arrays[name], np.float64) for name in BELIEFS[:2])
+    if poses.ndim != 2 or claims.shape != (*poses.shape, 3) or poses.shape[1] != 3:
+        raise ValueError(
+            f"{file}: {BELIEFS[0]} must be (T, 3) and {BELIEFS[1]} (T, 3, 3) for each "
+            f"drive, got {poses.shape} and {claims.shape}"
+        )
+    estimate = Estimate(file, poses, claims)
+    if not is_named or not set(BELIEFS) <= set(arrays):
+        return estimate
+    places, their, ids = (np.asarray(arrays[name])[-1] for name in BELIEFS[2:])
+    there = ids >= 0
+    return estimate._replace(
+        landmark_ids=ids[there].astype(np.int64),
+        landmarks=places[there].astype(np.float64),
+        landmark_covariances=their[there].astype(np.float64),
+    )
+
+
+def _of_npz(file: Path) -> Iterator[tuple[Any, Estimate]]:
+    """Yield the drives of an npz: one, or those of its array seed."""
+    try:
+        with file.open("rb") as stream, np.load(stream) as archive:
+            known = [name for name in ("seed", *BELIEFS) if name in archive.files]
+            arrays = {name: archive[name] for name in known}
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{file} is truncated, or no npz: {error}") from None
+    lacking = [name for name in BELIEFS[:2] if name not in arrays]
+    if lacking:
+        raise ValueError(
+            f"{file} must hold {' and '.join(BELIEFS[:2])}: no {lacking[0]}"
+        )
+    if "seed" not in arrays:
+        yield name_of(file), _of_arrays(str(file), arrays)
+        return
+    seeds = np.atleast_1d(arrays.pop("seed"))
+    if any(array.shape[:1] != seeds.shape for array in arrays.values()):
+        raise ValueError(f"{file}: every array must have a row for each seed")
+    for row, seed in enumerate(seeds.tolist()):
+        each = {name: array[row] for name, array in arrays.items()}
+        yield seed, _of_arrays(str(file), each)
+
+
+def _content(path: Path) -> list[LogLine]:
+    return [line for line in read_lines(path) if not line.text.startswith("#")]
+
+
+def _of_csv(path: Path) -> Estimate:
+    poses: list[list[float]] = []
+    places: dict[int, list[float]] = {}
+    for line in _content(path):
+        kind, *fields = (field.strip() for field in line.text.split(","))
+        if kind == "pose":
+            line.check_count(fields, (10, 13), _CSV)
+            poses.append([line.to_real(field) for field in fields])
+        elif kind == "landmark":
+            line.check_count(fields, (6, 7), _CSV)
+            name = line.to_id(fields[0])
+            if name in places:
+                raise line.error("each landmark once", f"{name} again")
+            places[name] = [line.to_real(field) for field in fields[1:]]
+        else:
+            raise line.error(_CSV, repr(kind))
+    table = _even(path, poses, _CSV)
+    of_map = _even(path, list(places.values()), _CSV) if places else np.zeros((0, 5))
+    return Estimate(
+        str(path),
+        table[:, 1:4],
+        _square(table[:, 4:], 3),
+        times=table[:, 0],
+        landmark_ids=np.array(list(places), np.int64),
+        landmarks=of_map[:, :2],
+        landmark_covariances=_square(of_map[:, 2:], 2),
+    )
+
+
+def _tum_row(line: LogLine) -> list[float]:
+    fields = line.text.split()
+    line.check_count(fields, (8, *(8 + size for size in _TUM_SIZES)), _TUM)
+    return [line.to_real(field) for field in fields]
+
+
+def _of_tum(path: Path) -> Estimate:
+    rows = []
+    for line in _content(path):
+        rows.append(_tum_row(line))
+        if len(rows[-1]) == 8:
+            raise line.error(_TUM, "no covariance")
+    table = _even(path, rows, _TUM)
+    headings = [_heading(*q) for q in table[:, 4:8].tolist()]
+    entries = table[:, 8:]
+    if entries.shape[1] in (21, 36):  # of x, y, z, roll, pitch, yaw
+        entries = _square(entries, 6)[:, [0, 1, 5]][:, :, [0, 1, 5]].reshape(-1, 9)
+    poses = np.column_stack([table[:, 1:3], headings])
+    return Estimate(str(path), poses, _square(entries, 3), table[:, 0], in_seconds=True)
+
+
+def _heading(qx: float, qy: float, qz: float, qw: float) -> float:
+    """Return the yaw of a unit quaternion, whatever its length."""
+    return float(
+        np.arctan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
+    )
+
+
+def _even(path: Path, rows: list[list[float]], form: str) -> Array:
+    if not rows or len({len(row) for row in rows}) > 1:
+        got = "lines of several lengths" if rows else "no pose"
+        raise LogError(f"{path}: expected lines {form}, all alike, got {got}")
+    return np.array(rows)
+
+
+def _square(entries: Array, size: int) -> Array:
+    """Return matrices (T, n, n) of all entries by rows, or of the upper triangle."""
+    if entries.shape[1] == size**2:
+        return entries.reshape(-1, size, size)
+    matrices = np.zeros((len(entries), size, size))
+    rows, columns = np.triu_indices(size)
+    matrices[:, rows, columns] = matrices[:, columns, rows] = entries
+    return matrices

@@ -1,0 +1,560 @@
+"""Judge the estimates of any program as a Monte Carlo judges filters: `judge`.
+
+The drives hold the truth, and files the estimates: one a drive, or all drives in one.
+`judge` matches both and measures every drive as a run, so that the verdict, the causes
+and the report are those of a Monte Carlo. `read_estimates` reads the files.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby, islice
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ..arrays import AnyArray, Array
+from ..estimator.filters.batch import BatchTrace
+from ..estimator.models.rigid_motion import pose_rotation
+from ..estimator.support import argument_checks
+from ..evaluation.error_bound import PosteriorBound
+from ..evaluation.nees import normalised_squared_error
+from ..evaluation.noise_findings import CHANNELS, MOMENTS
+from ..evaluation.trajectory_error import Alignment, align_positions, poses_at
+from ..sim_configs.scenario_files import scenario_text
+from .conventions import MOST_DRIVES, additive_covariances, mistake_in, swapped_drives
+from .estimate_files import (
+    Estimate,
+    beliefs_of,
+    files_in,
+    name_of,
+    paths_by_label,
+    read_estimates,
+    true_path,
+)
+from .monte_carlo.filtered_runs import Failure, FilteredRuns, bound_runs, noise_of_runs
+from .monte_carlo.results import provenance
+from .monte_carlo.run_measures import (
+    VARIABLES,
+    Block,
+    by_id,
+    measure_landmarks,
+    measure_runs,
+)
+from .runs.simulated_runs import SimulatedRuns
+from .trajectories.manifest import MANIFEST, TrajectoryDataset, load_trajectories
+from .trajectories.trajectory import Trajectory, array_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Place: TypeAlias = str | PathLike[str]
+
+FRAMES = {"additive": "additive", "invariant": "invariant", "right": "invariant",
+          "left": "left"}  # fmt: skip
+"""The errors of covariances; the invariant error is the right-invariant one."""
+_BOUNDS = ("position_bound", "position_bound_raw", "heading_bound", "map_bound")
+_UNKNOWN = np.array(np.nan)
+_NO_BOUND = PosteriorBound(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, ())
+"""For estimates without a map: what came later may be in their poses."""
+NO_FILE = "there is no file of estimates"
+_AT_ONCE = 100  # drives in memory
+_ON_TIME = 0.01  # of a step
+_SYMMETRIC = 1e-6  # relative difference of two entries
+
+
+def judge(
+    estimates: Place | Sequence[Place] | Mapping[str, Place | Sequence[Place]],
+    drives: Place | None = None,
+    *,
+    truth: Place | Sequence[Place] | None = None,
+    covariances: str = "additive",
+    align: str | Sequence[float] | None = None,
+    command: str = "",
+) -> xr.Dataset:
+    """Measure estimates that any program made, as :func:`monte_carlo` does its own.
+
+    Parameters
+    ----------
+    estimates : path, sequence of paths, or mapping from labels to them
+        Files of estimates, or folders of them. A folder is an estimator, named after
+        it; files that are given by themselves are of one.
+    drives : path, optional
+        The folder of :func:`generate_trajectories` that holds the truth; by default the
+        estimates, if they are such a folder with the beliefs of a filter.
+    truth : path or sequence of paths, optional
+        True paths of drives from elsewhere, instead of ``drives``.
+    covariances : {"additive", "invariant", "right", "left"}
+        The error whose covariances the files hold; "right" is "invariant".
+    align : "fit" or (x, y, θ), optional
+        A motion [m, m, rad] of all estimates, covariances included, into the frame of
+        the truth. "fit" finds the one that brings each path closest to the truth; NEES
+        then is not χ², and there is no verdict.
+    command : str
+        Command that reproduces the results.
+
+    Returns
+    -------
+    xarray.Dataset
+        As of ``monte_carlo``, without NIS and the NEES of whole states. Run i is the
+        drive with the i-th smallest seed or name. A drive without usable estimates is a
+        failed run. The attribute ``mistakes`` names conventions that files break.
+
+    Raises
+    ------
+    ValueError
+        If a file is malformed, or matches no drive.
+    OSError
+        If a file cannot be read.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> from slamgym import generate_trajectories
+    >>> folder = mkdtemp()
+    >>> job = {"episodes": 3, "estimator": "invariant", "controller": "open_loop"}
+    >>> _ = generate_trajectories("six_landmarks", folder, **job)
+    >>> float(judge(folder).pose_nees_invariant.mean() / 3) < 2
+    True
+    """
+    argument_checks.one_of("covariances", covariances, tuple(FRAMES))
+    frame = FRAMES[covariances]
+    if align not in (None, "fit"):
+        align = argument_checks.finite_vector("align", align, 3).tolist()
+    if truth is not None and drives is not None:
+        raise ValueError("truth must be None where drives are given")
+    sources = paths_by_label(estimates)
+    task = _drives(drives, sources) if truth is None else _paths(truth, sources)
+    parts: dict[str, list[_Part]] = {label: [] for label in sources}
+    for chunk in task.chunks:
+        for label, files in chunk.estimates.items():
+            parts[label].append(_measured(chunk, files, frame, align))
+    mistakes = {label: _mistakes(each, task, frame) for label, each in parts.items()}
+    about = {
+        "title": f"Estimates of {len(task.names)} drives of {task.title}",
+        "scenario_name": task.title,
+        "scenario": task.scenario,
+        "estimators": json.dumps({k: {"name": k, "options": {}} for k in sources}),
+        "seed": task.seed,
+        "mistakes": json.dumps(mistakes),
+        "alignment": "fitted" if align == "fit" else "given" if align else "",
+        **provenance(command or f"judge({estimates!r}, {drives!r}, truth={truth!r})"),
+    }
+    return _dataset(
+        {k: [part.block for part in each] for k, each in parts.items()}, task, about
+    )
+
+
+class _Chunk(NamedTuple):
+    """Some drives with all estimates of them, and what a filter could know."""
+
+    runs: SimulatedRuns
+    estimates: dict[str, list[Estimate | str]]
+    """By label; the reason where there is none."""
+    bound: PosteriorBound
+    noise: Array
+    dt: float = 1.0
+    """Seconds of a step."""
+
+
+class _Task(NamedTuple):
+    """What is judged."""
+
+    title: str
+    scenario: str
+    """As TOML; empty for drives from elsewhere."""
+    seed: int
+    names: list[Any]
+    """Seeds, or names of files."""
+    chunks: Iterator[_Chunk]
+
+
+class _Part(NamedTuple):
+    """Measures of the drives of a chunk, and what names mistakes."""
+
+    block: Block
+    arrays: tuple[Array, Array, Array, Array]
+    """Truth, poses and covariances as in the files, and starts."""
+
+
+# --------------------------------------------------------------------------------------
+# The drives: of a data set with known worlds, or true paths from elsewhere.
+
+
+def _drives(place: Place | None, sources: dict[str, list[Path]]) -> _Task:
+    """Match estimates with the drives of a data set, by their seeds."""
+    if place is None:
+        (place, *more) = [path for paths in sources.values() for path in paths]
+        if more or not (place / MANIFEST).is_file():
+            raise ValueError(
+                "drives must be the folder of slamgym generate that holds the truth, "
+                f"or truth must be given: {place} holds no truth"
+            )
+    folder, data = Path(place), load_trajectories(place)
+    job = data.manifest.job
+    seeds = [
+        job.seed + shard.first_episode + k
+        for shard in data.manifest.shards
+        for k in range(shard.episodes)
+    ]
+    found: dict[str, dict[Any, Estimate] | None] = {}
+    for label, paths in sources.items():
+        is_own = [path.resolve() for path in paths] == [folder.resolve()]
+        found[label] = files = None if is_own else read_estimates(paths)
+        if files is not None and not set(files) & set(seeds):
+            raise ValueError(
+                f"no estimates of {label} match a drive of {folder}: files must be "
+                f"named after its seeds, such as seed_{seeds[0]:08d}.csv, got "
+                f"{next(iter(files.values())).file}"
+            )
+    text = scenario_text(job.scenario)
+    return _Task(job.scenario.name, text, job.seed, seeds, _chunks(data, found))
+
+
+def _chunks(
+    data: TrajectoryDataset, found: Mapping[str, Mapping[Any, Estimate] | None]
+) -> Iterator[_Chunk]:
+    """Yield some drives at a time; None stands for the beliefs that are in the data."""
+    drives = iter(data)
+    while some := list(islice(drives, _AT_ONCE)):
+        files: dict[str, list[Estimate | str]] = {
+            label: [
+                beliefs_of(drive, str(data.folder))
+                if each is None
+                else each.get(drive.seed, NO_FILE)
+                for drive in some
+            ]
+            for label, each in found.items()
+        }
+        runs = _runs_of(some)
+        alike = list(_alike(some, runs))
+        noise = np.concatenate([noise_of_runs(s, s, same) for s, same in alike])
+        bound = _NO_BOUND
+        if any(_has_map(each) for listed in files.values() for each in listed):
+            bounds = [bound_runs(scenario, same)[:4] for scenario, same in alike]
+            joined = zip(*bounds, strict=True)
+            position, heading, raw, of_map = (np.concatenate(each) for each in joined)
+            bound = PosteriorBound(position, heading, raw, of_map, ())
+        yield _Chunk(runs, files, bound, noise, some[0].scenario.dt)
+
+
+def _has_map(estimate: Estimate | str) -> bool:
+    return isinstance(estimate, Estimate) and len(estimate.landmark_ids) > 0
+
+
+def _runs_of(drives: Sequence[Trajectory]) -> SimulatedRuns:
+    """Return drives as runs; the first scan precedes any motion."""
+
+    def stacked(name: str) -> AnyArray:
+        return np.stack([array_of(each, name) for each in drives])
+
+    hidden = drives[0].landmark_ids is not None
+    still = np.zeros((len(drives), 1, 2))
+    return SimulatedRuns(
+        odometry=np.concatenate([still, stacked("odometry")], axis=1),
+        measurements=stacked("measurements"),
+        visible=stacked("mask"),
+        true_poses=stacked("poses"),
+        landmarks=stacked("landmarks"),
+        initial_poses=stacked("start_estimate"),
+        true_ids=stacked("landmark_ids") if hidden else None,
+    ).identified()
+
+
+def _alike(
+    drives: Sequence[Trajectory], runs: SimulatedRuns
+) -> Iterator[tuple[Any, SimulatedRuns]]:
+    """Yield neighbouring runs of one scenario together."""
+    begin = 0
+    for scenario, same in groupby(drives, key=lambda drive: drive.scenario):
+        rows = slice(begin, begin + len(list(same)))
+        begin = rows.stop
+        parts = {n: a[rows] for n, a in runs._asdict().items()
+                 if a is not None and n != "ids"}  # fmt: skip
+        yield scenario, runs._replace(**parts)
+
+
+def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _Task:
+    """Match estimates with true paths, by the names of their files.
+
+    The truth is interpolated at the times of the estimates. All drives are judged at
+    the same number of poses, evenly spread over those that lie within the truth.
+    """
+    (places,) = paths_by_label(truth).values()
+    true = {name_of(path): true_path(path) for path in files_in(places)}
+    if not true:
+        raise ValueError(f"truth must be at least one file, got none in {places[0]}")
+    found = {label: read_estimates(paths) for label, paths in sources.items()}
+    if len(true) == 1:
+        (name,) = true
+        found = {
+            label: {name: next(iter(each.values()))} if len(each) == 1 else each
+            for label, each in found.items()
+        }
+    names = sorted(true)
+    inside = {
+        (label, name): _within(each[name], true[name])
+        for label, each in found.items()
+        for name in names
+        if name in each
+    }
+    count = min((len(poses.poses) for poses, _ in inside.values()), default=0)
+    if count < 2:
+        raise ValueError(
+            "estimates and truth must share their names and at least two times, got "
+            f"truth named {names[0]}, and estimates named "
+            f"{next((n for each in found.values() for n in each), 'nothing')}"
+        )
+
+    def chunks() -> Iterator[_Chunk]:
+        for label in found:
+            files: list[Estimate | str] = []
+            poses = np.full((len(names), count, 3), np.nan)
+            for row, name in enumerate(names):
+                if (label, name) not in inside:
+                    files.append(NO_FILE)
+                    continue
+                estimate, exact = inside[label, name]
+                few = np.linspace(0, len(exact) - 1, count).round().astype(int)
+                poses[row] = exact[few]
+                files.append(
+                    estimate._replace(
+                        poses=estimate.poses[few],
+                        covariances=estimate.covariances[few],
+                        times=None,
+                    )
+                )
+            yield _chunk_without_world(poses, {label: files})
+
+    return _Task(Path(places[0]).stem, "", 0, names, chunks())
+
+
+def _chunk_without_world(
+    poses: Array, files: dict[str, list[Estimate | str]]
+) -> _Chunk:
+    count, steps, _ = poses.shape
+    runs = SimulatedRuns(
+        odometry=np.zeros((count, steps, 2)),
+        measurements=np.zeros((count, steps, 0, 2)),
+        visible=np.zeros((count, steps, 0), np.bool_),
+        true_poses=poses,
+        landmarks=np.zeros((count, 0, 2)),
+        initial_poses=poses[:, 0],
+    )
+    noise = np.zeros((count, len(CHANNELS), len(MOMENTS)))
+    return _Chunk(runs, files, _NO_BOUND, noise)
+
+
+def _within(estimate: Estimate, path: Array) -> tuple[Estimate, Array]:
+    """Return the estimates at times of a true path (n, 4), and the truth there."""
+    if estimate.times is None:
+        if len(estimate.poses) != len(path):
+            raise ValueError(
+                f"{estimate.file} has no times and must have as many poses as its "
+                f"truth, {len(path)}, got {len(estimate.poses)}"
+            )
+        return estimate, path[:, 1:]
+    exact = poses_at(estimate.times, path)
+    inside = np.isfinite(exact).all(axis=1)
+    kept = estimate._replace(
+        poses=estimate.poses[inside],
+        covariances=estimate.covariances[inside],
+        times=estimate.times[inside],
+    )
+    return kept, exact[inside]
+
+
+# --------------------------------------------------------------------------------------
+# The measures.
+
+
+def _measured(
+    chunk: _Chunk,
+    files: Sequence[Estimate | str],
+    frame: str,
+    align: Any,
+) -> _Part:
+    """Measure the estimates of one estimator on the drives of a chunk."""
+    truth = chunk.runs.true_poses
+    count, steps, _ = truth.shape
+    poses, claims = (
+        np.full((count, steps, 3), np.nan),
+        np.full((count, steps, 3, 3), np.nan),
+    )
+    failures: dict[int, Failure] = {}
+    for run, each in enumerate(files):
+        reason = each if isinstance(each, str) else _unmatched(each, steps, chunk.dt)
+        if reason or isinstance(each, str):
+            failures[run] = Failure(-1, reason)
+        else:
+            poses[run], claims[run] = each.poses, each.covariances
+    additive = additive_covariances(poses, claims, frame)
+    moved = poses
+    if align is not None:
+        moved, additive = _aligned(poses, additive, truth, align)
+    failures |= _invalid(claims, additive, failures)
+    trace = BatchTrace(
+        moved, additive, np.zeros((count, steps)), np.zeros((count, steps), np.int64)
+    )
+    filtered = FilteredRuns(trace, [None] * count, failures)
+    block = measure_runs(chunk.runs, filtered, chunk.bound, chunk.noise)
+    block["readings"][:] = 0  # which of them corrected anything is not known
+    for run, each in enumerate(files):
+        if isinstance(each, Estimate) and run not in failures:
+            problem = _add_map(block, run, chunk.runs, each, moved[run, -1])
+            if problem:
+                block["failed"][run], block["failed_at"][run] = True, steps - 1
+                block["message"] = block["message"].astype(object)
+                block["message"][run] = problem
+    return _Part(block, (truth, poses, claims, chunk.runs.initial_poses))
+
+
+def _unmatched(estimate: Estimate, steps: int, dt: float) -> str:
+    """Return why the poses of a file are not those of a drive; empty if they are."""
+    count = len(estimate.poses)
+    if estimate.times is None:
+        return "" if count == steps else f"it has {count} poses, the drive {steps}"
+    times = estimate.times / (dt if estimate.in_seconds else 1.0)
+    due = np.arange(steps)
+    if count == steps and np.allclose(times, due, rtol=0, atol=_ON_TIME):
+        return ""
+    unit, first, last = "steps", times[0], times[-1]
+    if estimate.in_seconds:
+        unit, first, last = "seconds", estimate.times[0], estimate.times[-1]
+    if count == steps and np.allclose(times - times[0], due, rtol=0, atol=_ON_TIME):
+        return (
+            f"its time stamps are shifted by {times[0]:.3g} steps: they begin at "
+            f"{first:.6g} {unit}, the drive at 0"
+        )
+    if count == steps and np.allclose(times, due * dt, rtol=0, atol=_ON_TIME * dt):
+        return f"its time stamps are seconds, not steps of {dt:g} s"
+    if count != steps:
+        end = (steps - 1) * (dt if estimate.in_seconds else 1)
+        return (
+            f"it has {count} poses, from {first:.6g} to {last:.6g} {unit}, the drive "
+            f"has {steps}, from 0 to {end:g}"
+        )
+    row = int((abs(times - due) > _ON_TIME).argmax())
+    return f"pose {row} is of step {times[row]:.6g}: every step must have one pose"
+
+
+def _invalid(
+    claims: Array, additive: Array, failures: Mapping[int, Failure]
+) -> dict[int, Failure]:
+    """Find runs with something else than covariances."""
+    found = {}
+    gap = abs(claims - np.swapaxes(claims, -1, -2)).max(axis=(1, 2, 3))
+    size = abs(claims).max(axis=(1, 2, 3))
+    variances = np.einsum("rsii->rsi", additive)
+    for run in range(len(claims)):
+        if run in failures:
+            continue
+        matrices = claims[run]
+        if not np.isfinite(size[run]):
+            step = int((~np.isfinite(matrices)).any(axis=(1, 2)).argmax())
+            found[run] = Failure(step, "an entry of the covariance is not finite")
+        elif gap[run] > _SYMMETRIC * size[run]:
+            differences = abs(matrices - np.swapaxes(matrices, -1, -2))
+            step, *entry = np.unravel_index(differences.argmax(), matrices.shape)
+            row, column = (int(k) for k in entry)
+            found[run] = Failure(
+                int(step),
+                f"the covariance is not symmetric: its entries ({row}, {column}) and "
+                f"({column}, {row}) differ",
+            )
+        elif (variances[run] < 0).any():
+            step = int((variances[run] < 0).any(axis=1).argmax())
+            found[run] = Failure(step, "a variance is negative")
+    return found
+
+
+def _aligned(
+    poses: Array, covariances: Array, truth: Array, align: Any
+) -> tuple[Array, Array]:
+    """Move estimates X̂ to T X̂ with their covariances.
+
+    The covariance of the additive error becomes diag(R, 1) P diag(R, 1)ᵀ; to first
+    order, that of the left-invariant error stays, and that of the right-invariant error
+    becomes Ad_T P Ad_Tᵀ.
+    """
+    poses, covariances = poses.copy(), covariances.copy()
+    for run in range(len(poses)):
+        motion = Alignment(0.0, np.zeros(2))
+        if align != "fit":
+            motion = Alignment(align[2], np.array(align[:2]))
+        elif np.isfinite(poses[run]).all():
+            motion = align_positions(poses[run, :, :2], truth[run, :, :2])
+        poses[run, :, :2] = motion.apply(poses[run, :, :2])
+        poses[run, :, 2] += motion.angle
+        turn = pose_rotation(motion.angle)
+        covariances[run] = turn @ covariances[run] @ turn.T
+    return poses, covariances
+
+
+def _add_map(
+    block: Block, run: int, runs: SimulatedRuns, estimate: Estimate, pose: Array
+) -> str:
+    """Measure the final map of a run into its block; return why it is none."""
+    ids, count = estimate.landmark_ids.tolist(), runs.landmarks.shape[1]
+    if not ids or not count:
+        return ""
+    if max(ids) >= count:
+        return f"its map has landmark {max(ids)}, the world has {count} from 0 on"
+    truth, claims = runs.landmarks[run], estimate.landmark_covariances
+    measured = measure_landmarks(
+        runs.true_poses[run, -1], truth, pose, ids, estimate.landmarks, claims
+    )
+    squares = normalised_squared_error(truth[ids] - estimate.landmarks, claims)
+    measured["landmark_nees_additive"] = by_id(squares, ids, count)
+    measured["landmark_mahalanobis"] = np.sqrt(measured["landmark_nees_additive"])
+    for name, value in measured.items():
+        block[name][run] = value
+    return ""
+
+
+def _mistakes(parts: Sequence[_Part], task: _Task, frame: str) -> str:
+    """Name the convention that an estimator breaks, if any."""
+    last = parts[0].arrays[0].shape[1] - 1
+    steps = np.unique(np.linspace(1, last, 25).astype(int))
+    truth, poses, claims = (
+        np.concatenate([part.arrays[place][:, steps] for part in parts])
+        for place in range(3)
+    )
+    additive = additive_covariances(poses, claims, frame)
+    counts = np.cumsum([len(part.arrays[0]) for part in parts])
+    few = parts[: int(np.searchsorted(counts, MOST_DRIVES)) + 1]
+    first = [np.concatenate([part.arrays[place] for part in few]) for place in range(4)]
+    return swapped_drives(truth, poses, additive, task.names) or mistake_in(
+        first[0], first[1], first[2], first[3], frame
+    )
+
+
+def _dataset(
+    blocks: Mapping[str, Sequence[Block]], task: _Task, about: dict[str, Any]
+) -> xr.Dataset:
+    import xarray as xr  # noqa: PLC0415
+
+    of_world = {"noise_sums", *_BOUNDS} if not task.scenario else set()
+    named = all(isinstance(name, int) for name in task.names)
+    arrays = {
+        name: (
+            ("estimator", *variable.dims),
+            np.stack(
+                [np.concatenate([b[name] for b in each]) for each in blocks.values()]
+            ).astype(object if variable.kind == "U" else variable.kind),
+            {"long_name": variable.meaning},
+        )
+        for name, variable in VARIABLES.items()
+        if name not in of_world
+    }
+    runs = [n - task.seed for n in task.names] if named else range(len(task.names))
+    coordinates = {
+        "estimator": np.array(list(blocks)),
+        "run": np.array(list(runs)),
+        "noise": np.array(CHANNELS),
+        "moment": np.array(MOMENTS),
+    }
+    return xr.Dataset(arrays, coordinates, about)

@@ -1,0 +1,94 @@
+"""Worlds return to earlier states, to the bit, whatever they have done since."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import data_equivalence
+
+from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.envs.vector import LandmarkWorldVectorEnv
+from slamgym.sim_configs import list_presets
+
+PRESETS = [name for name in list_presets() if name != "city"]
+FLOORS = ["active_easy", "active_rooms", "active_hidden"]
+
+
+def drive(env, actions):
+    """Step, beginning anew where a single world ends; return all that came out."""
+    outputs = []
+    for action in actions:
+        outputs.append(env.step(action))
+        if isinstance(env, gymnasium.Env) and (outputs[-1][2] or outputs[-1][3]):
+            outputs.append(env.reset())
+    return outputs
+
+
+def same(one, other):
+    return data_equivalence(one, other, exact=True)
+
+
+def check(env, seed, *, before=7, after=50):
+    rng = np.random.default_rng(seed)
+    low, high = env.action_space.low, env.action_space.high
+    actions = rng.uniform(low, high, (before + 2 * after, *low.shape)).astype("f4")
+    env.reset(seed=seed)
+    drive(env, actions[:before])
+    state = env.state()
+    first = drive(env, actions[before : before + after])
+    drive(env, actions[before + after :])
+    env.reset(seed=seed + 1)  # a new generator and, in some scenarios, a new world
+    for _ in range(2):  # the state itself stays as it was
+        env.restore(state)
+        again = drive(env, actions[before : before + after])
+        assert same(first, again)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PRESETS)
+def test_worlds_continue_from_a_state_to_the_bit(name):
+    check(LandmarkWorldEnv(name), 3)
+    for mode in ("NextStep", "SameStep"):
+        check(LandmarkWorldVectorEnv(3, name, autoreset_mode=mode), 5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FLOORS)
+def test_worlds_with_filters_continue_from_a_state_to_the_bit(name):
+    after = 15 if name == "active_hidden" else 50
+    check(ActiveSlamEnv(name), 3, after=after)
+    check(ActiveSlamVectorEnv(3, name), 5, after=after)
+
+
+def test_worlds_that_draw_their_settings_return_to_them():
+    ranges = {"motion_std": [0.5, 2.0], "measurement_std": [0.5, 2.0]}
+    check(LandmarkWorldEnv("loop", randomise=ranges), 8)
+    check(LandmarkWorldVectorEnv(3, "loop", randomise=ranges), 8)
+
+
+def test_filters_of_any_kind_return_with_their_world():
+    for estimator in ("ekf", "robocentric", "compressed", "unscented"):
+        check(ActiveSlamEnv("active_easy", estimator=estimator), 2, after=20)
+
+
+def test_frames_return_with_their_world():
+    env = ActiveSlamEnv("active_easy", render_mode="rgb_array")
+    env.reset(seed=1)
+    drive(env, [[0.5, 0.2]] * 3)
+    state, frame = env.state(), env.render()
+    drive(env, [[0.5, -0.2]] * 3)
+    env.reset(seed=9)
+    env.restore(state)
+    assert np.array_equal(env.render(), frame)
+    worlds = LandmarkWorldVectorEnv(2, "corridor", render_mode="rgb_array")
+    worlds.reset(seed=1)
+    state, frames = worlds.state(), worlds.render()
+    drive(worlds, [[[0.5, 0.2]] * 2] * 3)
+    worlds.restore(state)
+    assert all(map(np.array_equal, worlds.render(), frames))
+
+
+def test_there_is_no_state_before_the_first_episode():
+    for env in (LandmarkWorldEnv(), LandmarkWorldVectorEnv(2), ActiveSlamEnv()):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.state()

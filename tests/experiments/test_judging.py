@@ -1,0 +1,721 @@
+"""`judge`: estimates of any program have the verdict of a Monte Carlo."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import slamgym
+
+from slamgym import (
+    judge,
+    load_scenario,
+    load_trajectories,
+    make_estimator,
+    monte_carlo,
+)
+from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
+from slamgym.evaluation.nees import normalised_squared_error
+from slamgym.experiments import (
+    generate_trajectories,
+    read_slamlog,
+    summarise_monte_carlo,
+)
+from slamgym.experiments.conventions import additive_covariances
+from slamgym.experiments.logs.slamlog import OdometryRow, Scan
+
+ROOT = Path(__file__).parents[2]
+RUNS, SEED = 24, 300
+DEGREES = np.diag([1.0, 1.0, 180 / np.pi])
+ORDER = np.eye(3)[[2, 0, 1]]  # (θ, x, y)
+EXACT = {"rtol": 1e-12, "atol": 0}
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    """Return a data set that also holds what a consistent filter believes."""
+    folder = tmp_path_factory.mktemp("judge") / "drives"
+    generate_trajectories(
+        "six_landmarks",
+        folder,
+        episodes=RUNS,
+        seed=SEED,
+        controller="open_loop",
+        estimator="invariant",
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def text_drives(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("judge") / "text"
+    job = {"episodes": RUNS, "seed": SEED, "controller": "open_loop"}
+    generate_trajectories("six_landmarks", folder, format="slamlog", **job)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def beliefs(drives):
+    """Return seeds, poses (B, T, 3), covariances (B, T, 3, 3) and true poses."""
+    data = list(load_trajectories(drives))
+    names = ("seed", "belief_poses", "belief_pose_covariances", "poses")
+    return tuple(np.array([getattr(d, name) for d in data]) for name in names)
+
+
+@pytest.fixture
+def written(tmp_path, beliefs):
+    """Return a function that writes estimates as npz, and gives their folder."""
+
+    def write(poses, covariances):
+        folder = tmp_path / "mine"
+        folder.mkdir(exist_ok=True)
+        arrays = {"belief_poses": poses, "belief_pose_covariances": covariances}
+        np.savez(folder / "all.npz", seed=beliefs[0], **arrays)
+        return folder
+
+    return write
+
+
+def rows(poses, covariances, entries=9, landmarks=()):
+    """Return the lines of a csv."""
+    upper = np.triu_indices(3) if entries == 6 else np.indices((3, 3)).reshape(2, -1)
+    lines = ["# x, y, θ", *landmarks]
+    for step, (pose, P) in enumerate(zip(poses, covariances, strict=True)):
+        numbers = [*pose.tolist(), *P[tuple(upper)].tolist()]
+        lines.append(f"pose,{step},{','.join(map(repr, numbers))}")
+    return "\n".join([*lines, ""])
+
+
+def filter_text(path, estimator="invariant", *, one_by_one=False):
+    """Read a drive as text and filter it; return the lines of estimates."""
+    log = read_slamlog(path)
+    stds = {
+        name: [float(part) for part in log.header[key].split(",")]
+        for name, key in (
+            ("motion_std", "motion_std"),
+            ("measurement_std", "measurement_std"),
+            ("initial_pose_std", "start_sigma"),
+        )
+    }
+    slam = make_estimator(estimator, initial_pose=log.start, **stds)
+    poses, covariances = [], []
+    for event in log.events:
+        if isinstance(event, Scan):
+            pairs = zip(event.measurements, event.landmark_ids.tolist(), strict=True)
+            for reading, landmark in pairs if one_by_one else ():
+                slam.update([reading], [landmark])
+            if not one_by_one:
+                slam.update(event.measurements, event.landmark_ids.tolist())
+        elif isinstance(event, OdometryRow):
+            poses.append(slam.belief().pose)
+            covariances.append(slam.belief().pose_covariance)
+            slam.predict((event.d, event.alpha))
+    belief = slam.belief()
+    landmarks = [
+        f"landmark,{i},{','.join(map(repr, [*place.tolist(), *P.ravel().tolist()]))}"
+        for i, place, P in zip(
+            belief.landmark_ids,
+            belief.landmarks,
+            belief.landmark_covariances,
+            strict=True,
+        )
+    ]
+    poses, covariances = [*poses, belief.pose], [*covariances, belief.pose_covariance]
+    return rows(poses, covariances, landmarks=landmarks)
+
+
+def entry_of(results, **options):
+    (entry,) = summarise_monte_carlo(results, **options)["estimators"].values()
+    return entry
+
+
+@pytest.fixture(scope="module")
+def study():
+    return monte_carlo("six_landmarks", "invariant", RUNS, SEED)
+
+
+SAME = (
+    *("pose_nees_invariant", "pose_nees_additive", "position_nees_invariant"),
+    *("heading_nees", "position_error", "heading_std", "ate_aligned", "pose_area"),
+    *("landmark_rmse", "landmark_rmse_aligned", "landmark_nees_additive"),
+    *("landmark_error", "map_error_centred", "map_bound", "noise_sums"),
+)
+
+
+@pytest.mark.parametrize("way", ["data set", "npz", "csv", "tum"])
+def test_a_filter_is_judged_through_files_as_in_a_monte_carlo(
+    way, drives, beliefs, written, study, request
+):
+    seeds, poses, covariances, _ = beliefs
+    tmp_path = request.getfixturevalue("tmp_path")
+    folder = tmp_path / "estimates"
+    folder.mkdir()
+    if way == "data set":
+        results = judge(drives)
+    elif way == "npz":
+        results = judge(written(poses, covariances), drives)
+    elif way == "csv":
+        text_drives = request.getfixturevalue("text_drives")
+        for path in text_drives.glob("shard_*/seed_*.csv"):
+            (folder / path.name).write_text(filter_text(path))
+        results = judge(folder, text_drives)
+    else:
+        for seed, path, P in zip(seeds, poses, covariances, strict=True):
+            lines = [
+                (3.0 * k, x, y, 0, 0, 0, np.sin(t / 2), np.cos(t / 2), *P[k].ravel())
+                for k, (x, y, t) in enumerate(path.tolist())
+            ]
+            np.savetxt(folder / f"seed_{seed}.tum", lines, fmt="%.17g")
+        results = judge(folder, drives)
+    has_map = way in ("data set", "csv")
+    for name in SAME:
+        of_map = name.startswith(("landmark", "map"))
+        if has_map or not of_map:
+            tolerance = {"rtol": 1e-9, "atol": 1e-12} if way == "tum" else EXACT
+            np.testing.assert_allclose(results[name], study[name], **tolerance)
+    ours, theirs = entry_of(results), entry_of(study)
+    assert (ours["verdict"], ours["reason"]) == (theirs["verdict"], theirs["reason"])
+    assert ours["diagnosis"]["cause"] == theirs["diagnosis"]["cause"]
+    assert ours["nis"] is None
+    assert (ours["efficiency"]["map"] is not None) == has_map
+
+
+def to_left(poses, covariances):
+    cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    turn = np.zeros((*poses.shape, 3))
+    turn[..., 0, 0], turn[..., 0, 1] = cos, sin
+    turn[..., 1, 0], turn[..., 1, 1], turn[..., 2, 2] = -sin, cos, 1
+    return turn @ covariances @ turn.mT
+
+
+def late(array):
+    return np.concatenate([array[:, :1], array[:, :-1]], axis=1)
+
+
+def lower_as_upper(P):
+    rows, columns = np.tril_indices(3)
+    wrong = np.zeros_like(P)
+    first, second = np.triu_indices(3)
+    wrong[..., first, second] = wrong[..., second, first] = P[..., rows, columns]
+    return wrong
+
+
+def std_of(P):
+    return np.sqrt(np.einsum("...ii->...i", P))[..., None] * np.eye(3)
+
+
+def swapped(array):
+    return array[[1, 0, *range(2, len(array))]]
+
+
+def relative(poses):
+    """Poses as seen from (5, -3, 1), a start that they are then relative to."""
+    cos, sin = np.cos(1.0), np.sin(1.0)
+    x, y = poses[..., 0] - 5, poses[..., 1] + 3
+    return np.stack([cos * x + sin * y, cos * y - sin * x, poses[..., 2] - 1], axis=-1)
+
+
+WRONG = {
+    "degrees": (
+        lambda x, P: (x @ DEGREES, P),
+        "convention: headings in degrees instead of radians: ",
+    ),
+    "degrees everywhere": (
+        lambda x, P: (x @ DEGREES, DEGREES @ P @ DEGREES),
+        "convention: headings in degrees instead of radians: ",
+    ),
+    "degrees in the covariance": (
+        lambda x, P: (x, DEGREES @ P @ DEGREES),
+        "convention: covariances with headings in degrees: ",
+    ),
+    "order": (
+        lambda x, P: (x @ ORDER.T, ORDER @ P @ ORDER.T),
+        "convention: the order (θ, x, y) instead of (x, y, θ): ",
+    ),
+    "order in the covariance": (
+        lambda x, P: (x, ORDER @ P @ ORDER.T),
+        "convention: covariances with the order (θ, x, y) instead of (x, y, θ): ",
+    ),
+    "triangle": (
+        lambda x, P: (x, lower_as_upper(P)),
+        "convention: the lower triangle of the covariance, row by row: ",
+    ),
+    "left error": (
+        lambda x, P: (x, to_left(x, P)),
+        "convention: covariances of the left-invariant error (the robot's frame): ",
+    ),
+    "right error": (
+        lambda x, P: (x, invariant_covariance(x, P)),
+        "convention: covariances of the right-invariant error (the world's frame): ",
+    ),
+    "time": (
+        lambda x, P: (late(x), late(P)),
+        "convention: time stamps that are 1 step too late: ",
+    ),
+    "deviations": (
+        lambda x, P: (x, std_of(P)),
+        "convention: standard deviations in place of variances: ",
+    ),
+    "information": (
+        lambda x, P: (x, np.linalg.inv(P)),
+        "convention: information matrices in place of covariances: ",
+    ),
+    "root": (
+        lambda x, P: (x, np.linalg.cholesky(P)),
+        "convention: a root of the covariance: ",
+    ),
+    "clockwise": (
+        lambda x, P: (x * [1, 1, -1], P),
+        "convention: headings that grow clockwise: ",
+    ),
+    "millimetres": (
+        lambda x, P: (x * [1e3, 1e3, 1], P),
+        "convention: positions in millimetres: ",
+    ),
+    "swapped": (
+        lambda x, P: (swapped(x), swapped(P)),
+        f"convention: estimates or truths of 2 drives are swapped: that of {SEED} fits "
+        f"the truth of {SEED + 1} and that of {SEED + 1} fits the truth of {SEED}.",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_broken_convention_is_named_in_one_sentence(
+    wrong, drives, beliefs, written, study
+):
+    change, sentence = WRONG[wrong]
+    found = entry_of(judge(written(*change(*beliefs[1:3])), drives))
+    said = found["diagnosis"]["sentence"]
+    assert said.startswith(sentence)
+    assert said.count(".\n") == 0
+    if wrong not in ("swapped", "deviations"):  # the NEES that it had, at some steps
+        right = float(study["pose_nees_invariant"].mean() / 3)
+        stated = float(said.partition("NEES / 3 is ")[2].partition(",")[0])
+        assert stated == pytest.approx(right, rel=0.2)
+
+
+def test_poses_relative_to_the_start_are_named(tmp_path):
+    start = {"pose": [5.0, -3.0, 1.0], "drawn": "estimate"}
+    world = load_scenario("six_landmarks").with_changes(start=start)
+    drives = tmp_path / "drives"
+    generate_trajectories(world, drives, episodes=8, estimator="invariant")
+    data = list(load_trajectories(drives))
+    np.savez(
+        tmp_path / "mine.npz",
+        seed=[each.seed for each in data],
+        belief_poses=relative(np.stack([each.belief_poses for each in data])),
+        belief_pose_covariances=np.stack([d.belief_pose_covariances for d in data]),
+    )
+    found = entry_of(judge(tmp_path / "mine.npz", drives))["diagnosis"]
+    assert found["sentence"].startswith("convention: poses in the frame of the start: ")
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "invariant"])
+@pytest.mark.parametrize("preset", ["six_landmarks", "coarse_loop"])
+def test_no_convention_is_blamed_for_what_a_filter_does(preset, estimator, tmp_path):
+    job = {"episodes": RUNS, "seed": 7000, "estimator": estimator}
+    generate_trajectories(preset, tmp_path / "drives", **job)
+    results = judge(tmp_path / "drives")
+    assert json.loads(results.attrs["mistakes"]) == {"drives": ""}
+
+
+def test_the_truth_is_not_an_estimate(drives, beliefs, written):
+    found = entry_of(judge(written(beliefs[3], beliefs[2]), drives))
+    assert "the poses are the true ones" in found["diagnosis"]["sentence"]
+
+
+FRAMES = {
+    "left": to_left,
+    "right": invariant_covariance,
+    "invariant": invariant_covariance,
+    "additive": lambda _, P: P,
+}
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_covariances_of_a_named_error_give_the_same_nees(
+    frame, drives, beliefs, written, study
+):
+    poses, claims = beliefs[1], FRAMES[frame](*beliefs[1:3])
+    results = judge(written(poses, claims), drives, covariances=frame)
+    for name in ("pose_nees_invariant", "pose_nees_additive", "heading_nees"):
+        np.testing.assert_allclose(results[name], study[name], rtol=1e-6)
+    assert not json.loads(results.attrs["mistakes"])["mine"]
+
+
+def test_left_and_right_error_have_the_same_nees():
+    rng = np.random.default_rng(0)
+    truth, poses, half = rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), np.eye(3)
+    half = half + 0.3 * rng.normal(size=(3, 3, 3))
+    P = half @ half.mT
+    back = -np.stack([poses[:, 0], poses[:, 1]], -1)  # X̂⁻¹ X as a pose
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    d = truth[:, :2] + back
+    moved = np.stack([cos * d[:, 0] + sin * d[:, 1], cos * d[:, 1] - sin * d[:, 0],
+                      truth[:, 2] - poses[:, 2]], -1)  # fmt: skip
+    left = invariant_error(moved, np.zeros((3, 3)))  # Log(X̂⁻¹ X)
+    right = invariant_error(truth, poses)
+    np.testing.assert_allclose(
+        normalised_squared_error(left, to_left(poses, P)),
+        normalised_squared_error(right, invariant_covariance(poses, P)),
+    )
+
+
+@pytest.mark.parametrize("frame", ["left", "invariant"])
+def test_additive_covariances_are_those_of_a_numeric_jacobian(frame):
+    pose, eps = np.array([2.0, -1.0, 0.7]), 1e-6
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+
+    def moved(xi):
+        """Apply a small motion to the estimate, in the robot's or the world's frame."""
+        small = np.array([[1, -xi[2], xi[0]], [xi[2], 1, xi[1]], [0, 0, 1]])
+        own = np.array([[cos, -sin, pose[0]], [sin, cos, pose[1]], [0, 0, 1]])
+        result = own @ small if frame == "left" else small @ own
+        heading = np.arctan2(result[1, 0], result[0, 0])
+        return np.array([result[0, 2], result[1, 2], heading])
+
+    steps = eps * np.eye(3)
+    J = np.column_stack([(moved(s) - moved(-s)) / (2 * eps) for s in steps])
+    P = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.5]])
+    found = additive_covariances(pose, P, frame)
+    np.testing.assert_allclose(found, J @ P @ J.T, rtol=1e-6)
+
+
+BROKEN = {
+    "missing": (
+        lambda lines: None,
+        "there is no file of estimates",
+    ),
+    "short": (
+        lambda lines: lines[:-1],
+        "it has 29 poses, from 0 to 28 steps, the drive has 30, from 0 to 29",
+    ),
+    "late from the start": (
+        lambda lines: [
+            ",".join(["pose", str(k + 1), *line.split(",")[2:]])
+            for k, line in enumerate(lines)
+        ],
+        "its time stamps are shifted by 1 steps: they begin at 1 steps, the drive at 0",
+    ),
+    "seconds": (
+        lambda lines: [
+            ",".join(["pose", str(3 * k), *line.split(",")[2:]])
+            for k, line in enumerate(lines)
+        ],
+        "its time stamps are seconds, not steps of 3 s",
+    ),
+    "a step twice": (
+        lambda lines: [*lines[:-1], lines[-2]],
+        "pose 29 is of step 28: every step must have one pose",
+    ),
+    "not symmetric": (
+        lambda lines: [
+            ",".join([*(f := line.split(","))[:6], "0.5", *f[7:]]) for line in lines
+        ],
+        "the covariance is not symmetric: its entries (0, 1) and (1, 0) differ",
+    ),
+    "negative": (
+        lambda lines: [
+            ",".join([*(f := line.split(","))[:5], "-1", *f[6:]]) for line in lines
+        ],
+        "a variance is negative",
+    ),
+    "unknown landmark": (
+        lambda lines: [*lines, "landmark,6,0,0,1,0,1"],
+        "its map has landmark 6, the world has 6 from 0 on",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_drive_without_usable_estimates_is_a_failed_run(
+    what, drives, beliefs, tmp_path
+):
+    change, message = BROKEN[what]
+    for k, (seed, x, P) in enumerate(zip(*beliefs[:3], strict=True)):
+        lines = rows(x, P).splitlines()[1:]
+        lines = change(lines) if k == 3 else lines
+        if lines is not None:
+            (tmp_path / f"seed_{seed:08d}.csv").write_text("\n".join(lines))
+    results = judge({"mine": tmp_path}, drives)
+    found = entry_of(results)
+    assert [failure["run"] for failure in found["failed_runs"]] == [3]
+    assert found["failed_runs"][0]["message"] == message
+    assert found["verdict"] == "not shown"
+    assert found["reason"].startswith(f"1 of {RUNS} runs failed; of the others, ")
+
+
+REFUSED = {
+    "pose,0,1,2": "expected pose,t,x,y,θ and 6 or 9 entries of its covariance",
+    "pose,0,1,2,east,1,0,0,1,0,1": "line 1: expected a finite number, got 'east'",
+    "pose,0,1,2,nan,1,0,0,1,0,1": "line 1: expected a finite number, got 'nan'",
+    "place,0": "got 'place'",
+    "landmark,0,0,0,1,0,1": "got no pose",
+    "": "got an empty file",
+    "pose,0,1,2,0,1,0,0,1,0,1\npose,1,1,2,0,1,0,0,0,1,0,0,0,1": "lines of several",
+    "landmark,0,0,0,1,0,1\nlandmark,0,0,0,1,0,1": "each landmark once, got 0 again",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_a_malformed_csv_is_refused_with_its_line(text, drives, tmp_path):
+    path = tmp_path / f"seed_{SEED}.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=re.escape(REFUSED[text])) as refusal:
+        judge(path, drives)
+    assert str(path) in str(refusal.value)
+
+
+def test_a_damaged_or_foreign_npz_is_refused(drives, tmp_path):
+    path = tmp_path / "mine.npz"
+    path.write_bytes(b"PK\x03\x04 from a bad disk")
+    with pytest.raises(ValueError, match=r"mine\.npz is truncated, or no npz"):
+        judge(path, drives)
+    np.savez(path, belief_poses=np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="no belief_pose_covariances"):
+        judge(path, drives)
+    np.savez(path, belief_poses=[[0.0]], belief_pose_covariances=np.zeros((1, 3, 3)))
+    with pytest.raises(ValueError, match=r"belief_poses must be \(T, 3\)"):
+        judge(path, drives)
+    arrays = {"belief_poses": np.zeros((2, 3)), "belief_pose_covariances": np.eye(3)}
+    np.savez(path, seed=[1, 2, 3], **arrays)
+    with pytest.raises(ValueError, match="a row for each seed"):
+        judge(path, drives)
+
+
+def test_what_matches_no_drive_is_refused(drives, beliefs, tmp_path):
+    path = tmp_path / "seed_7.csv"
+    path.write_text(rows(beliefs[1][0], beliefs[2][0]))
+    with pytest.raises(ValueError, match=f"such as seed_{SEED:08d}.csv, got .*seed_7"):
+        judge(path, drives)
+    with pytest.raises(ValueError, match=r"holds no truth"):
+        judge(path)
+    with pytest.raises(ValueError, match="truth must be None where drives are given"):
+        judge(path, drives, truth=path)
+    with pytest.raises(ValueError, match="covariances must be 'additive' or"):
+        judge(path, drives, covariances="up")
+    with pytest.raises(ValueError, match="does not exist"):
+        judge(tmp_path / "nowhere", drives)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="got none in"):
+        judge(tmp_path / "empty", drives)
+    shutil.copy(path, tmp_path / "seed_0007.csv")
+    with pytest.raises(ValueError, match="are both of drive 7"):
+        judge(tmp_path, drives)
+
+
+def test_a_data_set_without_beliefs_is_refused(text_drives):
+    with pytest.raises(ValueError, match="generated without --estimator"):
+        judge(text_drives)
+
+
+# --------------------------------------------------------------------------------------
+# Truth from elsewhere.
+
+
+@pytest.fixture
+def elsewhere(tmp_path, beliefs):
+    """Return folders of true paths and of estimates as TUM."""
+    for name in ("truth", "mine"):
+        (tmp_path / name).mkdir()
+    for seed, x, P, truth in zip(*beliefs, strict=True):
+        for name, poses, claims in (("truth", truth, None), ("mine", x, P)):
+            half = poses[:, 2] / 2
+            zero = np.zeros(len(poses))
+            columns = [np.arange(len(poses)) * 0.1, *poses[:, :2].T, zero, zero, zero]
+            columns += [np.sin(half), np.cos(half)]
+            if claims is not None:
+                columns += [*claims.reshape(-1, 9).T]
+            path = tmp_path / name / f"drive_{seed}.tum"
+            np.savetxt(path, np.column_stack(columns), fmt="%.17g")
+    return tmp_path / "mine", tmp_path / "truth"
+
+
+def test_true_paths_from_elsewhere_give_the_same_nees(elsewhere, study):
+    mine, truth = elsewhere
+    results = judge(mine, truth=truth)
+    for name in ("pose_nees_invariant", "pose_nees_additive", "position_error"):
+        np.testing.assert_allclose(results[name], study[name], rtol=1e-6, atol=1e-9)
+    found = entry_of(results)
+    assert found["verdict"] == entry_of(study)["verdict"]
+    assert found["diagnosis"] is None
+    assert found["efficiency"] is None
+
+
+def test_one_estimate_and_one_truth_need_no_common_name(elsewhere, tmp_path):
+    mine, truth = elsewhere
+    path = tmp_path / "path.tum"
+    shutil.copy(mine / f"drive_{SEED}.tum", path)
+    results = judge(path, truth=truth / f"drive_{SEED}.tum")
+    assert results.sizes["run"] == 1
+    assert entry_of(results)["verdict"] == "not shown"
+    with pytest.raises(ValueError, match="must share their names"):
+        judge(path, truth=truth)
+
+
+def test_an_estimate_is_judged_at_its_own_times(elsewhere):
+    mine, truth = elsewhere
+    before = judge(mine, truth=truth)
+    for path in sorted(mine.iterdir())[:3]:
+        lines = path.read_text().splitlines()
+        path.write_text("\n".join([*lines[:10:2], *lines[10:]]))
+    results = judge(mine, truth=truth)
+    assert results.sizes["step"] == before.sizes["step"] - 5
+    np.testing.assert_allclose(
+        results.pose_nees_invariant[:, 3:, -1], before.pose_nees_invariant[:, 3:, -1]
+    )
+
+
+def test_an_alignment_transforms_the_covariance_with_the_error(
+    beliefs, drives, written, study
+):
+    """T X̂ for each error: additive R P Rᵀ, left P, right Ad P Adᵀ."""
+    _, poses, P, _ = beliefs
+    x, y, turn = 3.0, -2.0, 0.8
+    cos, sin = np.cos(turn), np.sin(turn)
+    moved = poses.copy()  # T⁻¹ X̂, so that T brings it back
+    moved[..., 0] = cos * (poses[..., 0] - x) + sin * (poses[..., 1] - y)
+    moved[..., 1] = cos * (poses[..., 1] - y) - sin * (poses[..., 0] - x)
+    moved[..., 2] -= turn
+    inverse = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    adjoint = np.array([[cos, -sin, y], [sin, cos, -x], [0, 0, 1]])
+    back = np.linalg.inv(adjoint)
+    claims = {
+        "additive": inverse @ P @ inverse.T,
+        "left": to_left(poses, P),
+        "right": back @ invariant_covariance(poses, P) @ back.T,
+    }
+    for frame, claim in claims.items():
+        folder = written(moved, claim)
+        results = judge(folder, drives, covariances=frame, align=(x, y, turn))
+        for name in ("pose_nees_invariant", "pose_nees_additive"):
+            np.testing.assert_allclose(results[name], study[name], rtol=1e-6)
+        assert entry_of(results)["verdict"] == entry_of(study)["verdict"]
+
+
+def test_a_fitted_alignment_leaves_no_verdict(drives):
+    found = entry_of(judge(drives, align="fit"))
+    assert found["verdict"] == "not shown"
+    assert "an alignment fitted to the errors" in found["reason"]
+    assert found["accepted"] is None
+    assert found["decisions"] is None
+    assert found["diagnosis"] is None
+    assert found["ate"]["raw"] == pytest.approx(found["ate"]["aligned"])
+    with pytest.raises(ValueError, match="align must be"):
+        judge(drives, align="best")
+
+
+# --------------------------------------------------------------------------------------
+# Worlds with ranges and hidden identities, several estimators, the command.
+
+
+def test_worlds_with_ranges_and_hidden_identities_are_judged(tmp_path):
+    changes = {"sensor": {"dropout": 0.1}, "randomise": {"motion_std": [0.5, 2.0]}}
+    for name, preset, more in (
+        ("ranges", "six_landmarks", changes),
+        ("hidden", "hidden_identities", {"steps": 40}),
+    ):
+        world = load_scenario(preset).with_changes(**more)
+        job = {"episodes": 5, "estimator": "invariant"}
+        generate_trajectories(world, tmp_path / name, **job)
+        found = entry_of(judge(tmp_path / name))
+        assert found["good_runs"] == 5
+        assert 0.2 < found["pose_nees"]["invariant"]["mean"] < 3
+        assert (found["landmark_rmse"]["raw"] is None) == (name == "hidden")
+
+
+def test_the_command_judges_two_estimators(drives, beliefs, written, tmp_path):
+    mine = written(*beliefs[1:3])
+    yours = tmp_path / "yours"
+    yours.mkdir()
+    for seed, x, P in zip(*beliefs[:3], strict=True):
+        (yours / f"seed_{seed}.csv").write_text(rows(x, P / 9, entries=6))
+    out = tmp_path / "out"
+    done = slamgym("judge", mine, yours, "--drives", drives, "--out", out)
+    assert done.exit_code == 0, done.stderr
+    assert "yours: not consistent: its squared errors are" in " ".join(
+        done.stdout.split()
+    )
+    summary = json.loads((out / "summary.json").read_text())
+    assert [e["verdict"] for e in summary["estimators"].values()][1] == "not consistent"
+    assert {"report.html", "results.nc", "summary.json"} == set(summary["files"])
+    assert "yours" in (out / "report.html").read_text()
+    again = slamgym("judge", drives, "--json", "--out", out)
+    printed = json.loads(again.stdout)
+    assert list(printed["estimators"]) == ["drives"]
+    assert printed["out"] == str(out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--frame", "up"], "--frame must be one of additive, invariant, got 'up'"),
+        (["--align", "1,2"], "--align must be fit or X,Y,THETA, got '1,2'"),
+        (["--covariances", "up"], "must be 'additive' or 'invariant' or 'right' or"),
+        (["--drives", "nowhere"], "nowhere must be a data set with a manifest.json"),
+    ],
+)
+def test_a_wrong_option_is_refused_in_one_line(arguments, message, drives, tmp_path):
+    done = slamgym("judge", drives, *arguments, "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_usable_estimate_is_a_failure(drives, beliefs, tmp_path):
+    path = tmp_path / f"seed_{SEED}.csv"
+    path.write_text(rows(beliefs[1][0][:9], beliefs[2][0][:9]))
+    done = slamgym("judge", path, "--drives", drives, "--out", tmp_path / "out")
+    assert done.exit_code == 1
+    assert f"{RUNS} of {RUNS} runs failed" in done.stdout
+
+
+# --------------------------------------------------------------------------------------
+# The examples.
+
+
+def test_a_program_in_c_is_judged(text_drives, tmp_path):
+    compiler = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
+    if compiler is None:
+        pytest.skip("there is no C compiler")
+    source = ROOT / "examples" / "15_judge_a_program_in_c.c"
+    program = tmp_path / "ekf_slam"
+    strict = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run([compiler, *strict, source, "-o", program, "-lm"], check=True)
+    estimates = tmp_path / "estimates"
+    estimates.mkdir()
+    files = sorted(text_drives.glob("shard_*/seed_*.csv"))
+    subprocess.run([program, estimates, *files], check=True)
+    results = judge(estimates, text_drives)
+    assert not results.failed.any()
+    assert not json.loads(results.attrs["mistakes"])["estimates"]
+    same = tmp_path / "same"
+    same.mkdir()
+    for path in files:
+        (same / path.name).write_text(filter_text(path, "ekf", one_by_one=True))
+    expected = judge(same, text_drives)
+    for name in ("pose_nees_invariant", "landmark_nees_additive", "landmark_rmse"):
+        np.testing.assert_allclose(results[name], expected[name], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_example_of_gtsam_names_the_frame(tmp_path):
+    pytest.importorskip("gtsam")
+    done = subprocess.run(
+        [sys.executable, ROOT / "examples" / "14_judge_gtsam.py", "--drives", "24"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    left, honest, additive, cause = done.stdout.splitlines()
+    assert left.startswith("covariances='left': isam2: ")
+    assert "not consistent" not in left
+    assert honest.startswith("honest: ")
+    assert additive.startswith("covariances='additive': isam2: not consistent: ")
+    assert cause.startswith("convention: covariances of the left-invariant error")
