@@ -21,7 +21,7 @@ from ..envs import LandmarkWorldEnv
 from ..envs.vector.landmark_world_vector import final_infos
 from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage, can_batch
 from ..estimator.filters.ekf import EkfSlam
-from ..estimator.interface import restore
+from ..estimator.interface import SlamEstimator, restore
 from ..estimator.registry import find_estimator, make_batch, read_label
 from ..estimator.support import argument_checks
 from ..restorable import Restorable, State
@@ -378,7 +378,7 @@ class SeparateFilters(Restorable):
 
     def state(self) -> State:
         """Return the states of the filters, for `restore`."""
-        states = [slam.state_dict() for slam in self.filters]
+        states = [cast("SlamEstimator", slam).state_dict() for slam in self.filters]
         return states, self._steps[:], self._beliefs[:], self._stored[:]
 
     def restore(self, state: State) -> None:

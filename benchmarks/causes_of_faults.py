@@ -139,9 +139,7 @@ def textbook(old: str, new: str) -> type:
     source, module = TEXTBOOK.read_text(encoding="utf-8"), ModuleType("textbook")
     assert source.count(old) == 1, old
     exec(compile(source.replace(old, new), str(TEXTBOOK), "exec"), module.__dict__)
-    return type(module.TextbookEkf)(
-        "TextbookEkf", (module.TextbookEkf,), {"__module__": __name__}
-    )
+    return type("TextbookEkf", (module.TextbookEkf,), {"__module__": __name__})
 
 
 class Fault(NamedTuple):
@@ -261,7 +259,8 @@ HONEST_WORLDS = (*WORLDS.values(), load_scenario("corridor").with_changes(steps=
 @contextmanager
 def changed_runs(fault: Fault) -> Iterator[None]:
     """Change the world of a Monte Carlo, and what its filter reads."""
-    simulate, use = runner.simulate_runs, runner.filter_runs
+    simulate: Any = vars(runner)["simulate_runs"]
+    use: Any = vars(runner)["filter_runs"]
 
     def simulated(world: Scenario, *arguments: Any, **options: Any) -> Any:
         return fault.world(world, simulate(world, *arguments, **options))

@@ -25,8 +25,8 @@ from slamgym.evaluation.trajectory_error import position_accuracy
 from slamgym.sim_configs import Scenario, load_scenario
 
 METHODS: dict[str, dict[str, Any]] = {
-    "nearest": {"association": "nearest"},
-    "joint": {"association": "joint", "backdate": True},
+    "nearest": {"association": "nearest", "constellations": False},
+    "joint": {"association": "joint", "constellations": False},
     "nearest, constellations": {"association": "nearest", "constellations": True},
     "joint, constellations": {
         "association": "joint",

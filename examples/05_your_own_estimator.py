@@ -93,7 +93,7 @@ class TextbookEkf:
 
     def belief(self) -> Belief:
         """Return a snapshot: a Belief copies its arguments."""
-        return Belief(self.x, self.P, self.ids)
+        return Belief(self.x, self.P, tuple(self.ids))
 
 
 class CarefulEkf(TextbookEkf):

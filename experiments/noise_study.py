@@ -26,8 +26,8 @@ from matplotlib.lines import Line2D
 from ..estimator.registry import EstimatorFactory
 from ..evaluation.trajectory_error import ellipse_areas
 from ..sim_configs import Scenario, load_scenario
-from ..suggestions import closest
-from .figures.style import GREY, INK, dress, new_figure, write_title
+from ..sim_configs.field_types import unknown_choice
+from .figures.style import GREY, INK, dress, legend, new_figure, write_title
 from .logs.ground_truth import path_accuracy
 from .logs.slamlog import SlamLog
 from .runs.filter_settings import SIGMAS, FilterSettings, settings_for
@@ -264,15 +264,9 @@ def noise_effects(
     world = load_scenario(scenario)
     jobs_to_do = [("nothing", REFERENCE, world, world), *_changes(world, changed)]
     effects: list[NoiseEffect] = []
-    for done, (place, variation, changed_world, assumed) in enumerate(jobs_to_do, 1):
+    for done, (place, variation, actual, assumed) in enumerate(jobs_to_do, 1):
         results = monte_carlo(
-            changed_world,
-            estimators,
-            runs,
-            seed,
-            assumed=assumed,
-            jobs=jobs,
-            backend=backend,
+            actual, estimators, runs, seed, assumed=assumed, jobs=jobs, backend=backend
         )
         effects += [
             _effect(place, variation, scores_of(results, label, "invariant"))
@@ -289,10 +283,7 @@ def _changes(
     """Yield (place of the change, variation, world, what the filters assume)."""
     for place in places:
         if place not in CHANGED:
-            hint = closest(place, CHANGED)
-            raise ValueError(
-                f"changed must be of {', '.join(CHANGED)}, got '{place}'{hint}"
-            )
+            raise ValueError(unknown_choice("changed", place, CHANGED))
         for variation in CHANGES:
             scaled = scaled_scenario(world, *variation)
             yield (
@@ -404,13 +395,7 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
     ]
     for text, fill in (("σ × 10", INK), ("σ ÷ 10", "white")):
         keys.append(Line2D([], [], ls="", marker="o", color=INK, mfc=fill, label=text))
-    figure.legend(
-        handles=keys,
-        loc="outside upper left",
-        ncols=len(labels) + 2,
-        frameon=False,
-        fontsize=9.5,
-    )
+    legend(figure, keys, len(labels) + 2, place="outside upper left", size=9.5)
     return figure
 
 
@@ -427,12 +412,6 @@ def _draw(
         if math.isfinite(error):
             ends = effect.nees_per_degree + error * np.array([-1.0, 1.0])
             axes.plot(ends, [row, row], color=look.colour, lw=1.6, zorder=1.9)
-        axes.plot(
-            effect.nees_per_degree,
-            row,
-            look.marker,
-            color=look.colour,
-            ms=6.5,
-            mfc=look.colour if effect.factor >= 1 else "white",
-            mew=1.4,
-        )
+        (dot,) = axes.plot(effect.nees_per_degree, row, look.marker, color=look.colour)
+        fill = look.colour if effect.factor >= 1 else "white"
+        dot.set(markersize=6.5, markerfacecolor=fill, markeredgewidth=1.4)

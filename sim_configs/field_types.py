@@ -57,6 +57,16 @@ class Part(BaseModel):
         return ()
 
 
+def setting(default: Any, description: str) -> Any:
+    """Declare a field of a scenario by its default and its description."""
+    extra = _leave_out_default if default == math.inf else None
+    return Field(default=default, description=description, json_schema_extra=extra)
+
+
+def _leave_out_default(schema: dict[str, Any]) -> None:
+    del schema["default"]  # JSON has no inf
+
+
 def broken_rule(message: str) -> PydanticCustomError:
     """Make the error of a rule between fields; `message` starts with a field's name."""
     return PydanticCustomError("rule", "{message}", {"message": message})
@@ -105,17 +115,17 @@ def _out_of_bounds(rule: str, bound: float, value: object) -> PydanticCustomErro
 # One of them to a type: older versions of pydantic keep the last one alone.
 BOUNDED, DIVISIBLE = AfterValidator(_within_bounds), AfterValidator(_divisible)
 
-_Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0)]
-_Integer = Annotated[int, Field(strict=True)]
+Integer = Annotated[int, Field(strict=True)]
 
 Text = Annotated[StrictStr, expect("a string")]
 Name = Annotated[StrictStr, Field(min_length=1), expect("a string that is not empty")]
 Flag = Annotated[StrictBool, expect("true or false")]
 
-Positive = Annotated[_Number, Field(gt=0), expect("a finite number > 0"), DIVISIBLE]
+Positive = Annotated[Number, Field(gt=0), expect("a finite number > 0"), DIVISIBLE]
 NotNegative = Annotated[_NotNegative, expect("a finite number >= 0"), BOUNDED]
-Finite = Annotated[_Number, expect("a finite number"), BOUNDED]
+Finite = Annotated[Number, expect("a finite number"), BOUNDED]
 PositiveOrInfinite = Annotated[
     float,
     Field(strict=True, allow_inf_nan=True, gt=0),
@@ -123,14 +133,14 @@ PositiveOrInfinite = Annotated[
     DIVISIBLE,
 ]
 Probability = Annotated[_NotNegative, Field(le=1), expect("a number from 0 to 1")]
-Count = Annotated[_Integer, Field(ge=1), expect("an integer >= 1"), BOUNDED]
-CountOrZero = Annotated[_Integer, Field(ge=0), expect("an integer >= 0"), BOUNDED]
+Count = Annotated[Integer, Field(ge=1), expect("an integer >= 1"), BOUNDED]
+CountOrZero = Annotated[Integer, Field(ge=0), expect("an integer >= 0"), BOUNDED]
 
-Seed = Annotated[_Integer, Field(ge=0), expect("an integer >= 0")]
+Seed = Annotated[Integer, Field(ge=0), expect("an integer >= 0")]
 
-_Two = tuple[_Number, _Number]
-_Three = tuple[_Number, _Number, _Number]
-_Four = tuple[_Number, _Number, _Number, _Number]
+_Two = tuple[Number, Number]
+_Three = tuple[Number, Number, Number]
+_Four = tuple[Number, Number, Number, Number]
 _ThreeStds = tuple[_NotNegative, _NotNegative, _NotNegative]
 _TwoStds = tuple[_NotNegative, _NotNegative]
 
@@ -151,7 +161,7 @@ MeasurementStd = Annotated[
 ]
 Ends = Annotated[_Two, expect("2 finite numbers, low and high"), BOUNDED]
 Command = Annotated[
-    tuple[_Number, _Number, Annotated[_Integer, Field(ge=1)]],
+    tuple[Number, Number, Annotated[Integer, Field(ge=1)]],
     expect("(d [m], α [rad], times): 2 finite numbers and an integer >= 1"),
     BOUNDED,
 ]
@@ -205,13 +215,12 @@ def error_lines(error: ValidationError) -> list[str]:
     list of str
         For example ``"sensor.std must be 2 numbers >= 0, got [-1, 0.1]"``.
     """
-    mistakes = error.errors(include_url=False)
-    return [_line(dict(details)) for details in mistakes if not _is_echo(dict(details))]
-
-
-def _is_echo(details: dict[str, Any]) -> bool:
-    """Report whether a list counts as too short only because its items are invalid."""
-    return details["type"] == "too_short" and len(details["input"]) > 0
+    return [
+        _line(dict(details))
+        for details in error.errors(include_url=False)
+        # a list with invalid items counts as too short, too
+        if not (details["type"] == "too_short" and len(details["input"]) > 0)
+    ]
 
 
 def _line(details: dict[str, Any]) -> str:

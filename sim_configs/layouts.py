@@ -16,6 +16,7 @@ from .field_types import (
     Positive,
     ScenarioError,
     Seed,
+    setting,
 )
 
 TRIES_PER_LANDMARK = 2000
@@ -53,9 +54,7 @@ class GridLayout(_Layout):
     rows: Count = Field(description="number of rows, along y")
     columns: Count = Field(description="number of columns, along x")
     spacing: Positive = Field(description="distance between neighbours [m]")
-    origin: Point = Field(
-        default=(0.0, 0.0), description="lower left landmark (x, y) [m]"
-    )
+    origin: Point = setting((0.0, 0.0), "lower left landmark (x, y) [m]")
 
     @property
     def count(self) -> int:
@@ -74,9 +73,7 @@ class RingLayout(_Layout):
     layout: Literal["ring"] = "ring"
     count: Count = Field(description="number of landmarks")
     radius: Positive = Field(description="radius of the circle [m]")
-    centre: Point = Field(
-        default=(0.0, 0.0), description="centre of the circle (x, y) [m]"
-    )
+    centre: Point = setting((0.0, 0.0), "centre of the circle (x, y) [m]")
 
     def place(self, rng: np.random.Generator) -> Array:
         """Return the positions, counter-clockwise."""
@@ -95,8 +92,8 @@ class CorridorLayout(_Layout):
     count: Count = Field(description="number of landmarks")
     length: Positive = Field(description="length of the corridor [m]")
     width: Positive = Field(description="distance between the two sides [m]")
-    origin: Point = Field(
-        default=(0.0, 0.0), description="start of the corridor's centre line (x, y) [m]"
+    origin: Point = setting(
+        (0.0, 0.0), "start of the corridor's centre line (x, y) [m]"
     )
 
     def place(self, rng: np.random.Generator) -> Array:
@@ -122,9 +119,7 @@ class StreetsLayout(_Layout):
         description="distance between the fronts across a street [m]"
     )
     per_front: Count = Field(description="landmarks on each of a block's four fronts")
-    origin: Point = Field(
-        default=(0.0, 0.0), description="lower left crossing (x, y) [m]"
-    )
+    origin: Point = setting((0.0, 0.0), "lower left crossing (x, y) [m]")
 
     @property
     def count(self) -> int:
@@ -156,12 +151,9 @@ class RandomLayout(_Layout):
     layout: Literal["random"] = "random"
     count: Count = Field(description="number of landmarks")
     bounds: Bounds = Field(description="rectangle (xmin, ymin, xmax, ymax) [m]")
-    min_distance: NotNegative = Field(
-        default=0.0, description="least distance between two landmarks [m]"
-    )
-    seed: Seed | None = Field(
-        default=None,
-        description="seed of the layout; without it every episode draws a new one",
+    min_distance: NotNegative = setting(0.0, "least distance between two landmarks [m]")
+    seed: Seed | None = setting(
+        None, "seed of the layout; without it every episode draws a new one"
     )
 
     def _broken_rules(self) -> Iterator[str]:

@@ -23,10 +23,12 @@ from .field_types import (
     Ends,
     Finite,
     Flag,
+    Integer,
     MeasurementStd,
     MotionStd,
     Name,
     NotNegative,
+    Number,
     Part,
     Pose,
     PoseStd,
@@ -39,6 +41,7 @@ from .field_types import (
     Wall,
     error_lines,
     expect,
+    setting,
 )
 from .layouts import LandmarkLayout, place_landmarks
 
@@ -50,10 +53,6 @@ _Degrees = Annotated[
 ]
 
 
-def _leave_out_default(schema: dict[str, Any]) -> None:
-    del schema["default"]  # JSON has no inf
-
-
 class Faults(Part):
     """Deviations of the world from its other tables; no filter knows of them.
 
@@ -63,38 +62,28 @@ class Faults(Part):
     """
 
     odometry_scale: Annotated[
-        float,
-        Field(strict=True, allow_inf_nan=False, gt=-1),
-        expect("a finite number > -1"),
-        BOUNDED,
-    ] = Field(
-        default=0.0, description="s: odometry reads (1 + s) d for a distance d [1]"
+        Number, Field(gt=-1), expect("a finite number > -1"), BOUNDED
+    ] = setting(0.0, "s: odometry reads (1 + s) d for a distance d [1]")
+    odometry_turn: Finite = setting(
+        0.0, "added to every turn of the odometry [rad per step]"
     )
-    odometry_turn: Finite = Field(
-        default=0.0, description="added to every turn of the odometry [rad per step]"
-    )
-    bearing_bias: Finite = Field(
-        default=0.0, description="added to every bearing [rad]"
-    )
-    range_bias: Finite = Field(default=0.0, description="added to every range [m]")
-    motion_dof: _Degrees = Field(
-        default=math.inf,
-        description="degrees of freedom of the motion noise, Student's t with scale "
+    bearing_bias: Finite = setting(0.0, "added to every bearing [rad]")
+    range_bias: Finite = setting(0.0, "added to every range [m]")
+    motion_dof: _Degrees = setting(
+        math.inf,
+        "degrees of freedom of the motion noise, Student's t with scale "
         "motion.std; inf (the default) for normal noise",
-        json_schema_extra=_leave_out_default,
     )
-    sensor_dof: _Degrees = Field(
-        default=math.inf,
-        description="degrees of freedom of the sensor noise, Student's t with scale "
+    sensor_dof: _Degrees = setting(
+        math.inf,
+        "degrees of freedom of the sensor noise, Student's t with scale "
         "sensor.std; inf (the default) for normal noise",
-        json_schema_extra=_leave_out_default,
     )
 
 
 _NO_FAULTS = Faults()
-_Steps = Annotated[
-    int, Field(strict=True, ge=2), expect("an integer >= 2")
-]  # Gymnasium's checker refuses an episode that ends at its first step
+# Gymnasium's checker refuses an episode that ends at its first step.
+_Steps = Annotated[Integer, Field(ge=2), expect("an integer >= 2")]
 
 
 class Motion(Part):
@@ -109,9 +98,9 @@ class Motion(Part):
     )
     noise_in: Annotated[
         Literal["motion", "odometry"], expect("'motion' or 'odometry'")
-    ] = Field(default="motion", description="what the noise disturbs")
-    noise_at_rest: Flag = Field(
-        default=True, description="whether a step with the command (0, 0) has noise too"
+    ] = setting("motion", "what the noise disturbs")
+    noise_at_rest: Flag = setting(
+        True, "whether a step with the command (0, 0) has noise too"
     )
 
     def _broken_rules(self) -> Iterator[str]:
@@ -128,14 +117,11 @@ Factors = Annotated[
 
 
 _Angle = Annotated[
-    float,
-    Field(strict=True, allow_inf_nan=False, gt=0, le=2 * math.pi),
-    DIVISIBLE,
-    expect("a number in (0, 2π] [rad]"),
+    Number, Field(gt=0, le=2 * math.pi), DIVISIBLE, expect("a number in (0, 2π] [rad]")
 ]
 _RangeGrowth = Annotated[
-    float,
-    Field(strict=True, allow_inf_nan=False, ge=0, le=LARGEST_RANGE_GROWTH),
+    Number,
+    Field(ge=0, le=LARGEST_RANGE_GROWTH),
     expect(f"a number from 0 to {LARGEST_RANGE_GROWTH:g}"),
 ]
 
@@ -144,35 +130,23 @@ class Sensor(Part):
     """The bearing-range sensor: its noise, its field of view and its failures."""
 
     std: MeasurementStd = Field(description="(σβ, σr) of one reading [rad, m]")
-    range_std_per_metre: _RangeGrowth = Field(
-        default=0.0, description="k in σr(r) = σr + k r [m/m]"
+    range_std_per_metre: _RangeGrowth = setting(0.0, "k in σr(r) = σr + k r [m/m]")
+    min_range: NotNegative = setting(0.05, "nearest visible landmark [m]")
+    max_range: PositiveOrInfinite = setting(
+        math.inf, "farthest visible landmark [m]; inf (the default) for all"
     )
-    min_range: NotNegative = Field(
-        default=0.05, description="nearest visible landmark [m]"
+    field_of_view: _Angle = setting(
+        2 * math.pi, "full angle of view, centred on the heading [rad]"
     )
-    max_range: PositiveOrInfinite = Field(
-        default=math.inf,
-        description="farthest visible landmark [m]; inf (the default) for all",
-        json_schema_extra=_leave_out_default,
+    occlusion: Flag = setting(False, "whether walls hide landmarks")
+    dropout: Probability = setting(0.0, "probability of losing a reading")
+    clutter: NotNegative = setting(
+        0.0, "mean number of false measurements per step (Poisson)"
     )
-    field_of_view: _Angle = Field(
-        default=2 * math.pi,
-        description="full angle of view, centred on the heading [rad]",
+    max_clutter: CountOrZero = setting(
+        0, "rows reserved for false measurements when identities are hidden"
     )
-    occlusion: Flag = Field(default=False, description="whether walls hide landmarks")
-    dropout: Probability = Field(
-        default=0.0, description="probability of losing a reading"
-    )
-    clutter: NotNegative = Field(
-        default=0.0, description="mean number of false measurements per step (Poisson)"
-    )
-    max_clutter: CountOrZero = Field(
-        default=0,
-        description="rows reserved for false measurements when identities are hidden",
-    )
-    identities: Flag = Field(
-        default=True, description="whether readings carry landmark identities"
-    )
+    identities: Flag = setting(True, "whether readings carry landmark identities")
 
     def _broken_rules(self) -> Iterator[str]:
         if self.min_range >= self.max_range:
@@ -200,16 +174,12 @@ class Start(Part):
     pose is drawn around it.
     """
 
-    pose: Pose = Field(default=(0.0, 0.0, 0.0), description="(x, y, θ) [m, m, rad]")
-    std: PoseStd = Field(
-        default=(0.0, 0.0, 0.0),
-        description="standard deviations (σx, σy, σθ) [m, m, rad]",
+    pose: Pose = setting((0.0, 0.0, 0.0), "(x, y, θ) [m, m, rad]")
+    std: PoseStd = setting(
+        (0.0, 0.0, 0.0), "standard deviations (σx, σy, σθ) [m, m, rad]"
     )
     drawn: Annotated[Literal["truth", "estimate"], expect("'truth' or 'estimate'")] = (
-        Field(
-            default="truth",
-            description="which of the two starts is drawn around `pose`",
-        )
+        setting("truth", "which of the two starts is drawn around `pose`")
     )
 
 
@@ -220,28 +190,23 @@ class Randomise(Part):
     one episode.
     """
 
-    motion_std: Factors | None = Field(default=None, description="factor on motion.std")
-    measurement_std: Factors | None = Field(
-        default=None, description="factor on sensor.std and sensor.range_std_per_metre"
+    motion_std: Factors | None = setting(None, "factor on motion.std")
+    measurement_std: Factors | None = setting(
+        None, "factor on sensor.std and sensor.range_std_per_metre"
     )
-    start_std: Factors | None = Field(default=None, description="factor on start.std")
-    dropout: Ends | None = Field(default=None, description="sensor.dropout")
-    clutter: Ends | None = Field(default=None, description="sensor.clutter")
-    max_range: Ends | None = Field(default=None, description="sensor.max_range [m]")
-    field_of_view: Ends | None = Field(
-        default=None, description="sensor.field_of_view [rad]"
+    start_std: Factors | None = setting(None, "factor on start.std")
+    dropout: Ends | None = setting(None, "sensor.dropout")
+    clutter: Ends | None = setting(None, "sensor.clutter")
+    max_range: Ends | None = setting(None, "sensor.max_range [m]")
+    field_of_view: Ends | None = setting(None, "sensor.field_of_view [rad]")
+    start_x: Ends | None = setting(None, "x of start.pose [m]")
+    start_y: Ends | None = setting(None, "y of start.pose [m]")
+    start_heading: Ends | None = setting(None, "θ of start.pose [rad]")
+    map_scale: Factors | None = setting(
+        None, "factor that scales the map about its mean"
     )
-    start_x: Ends | None = Field(default=None, description="x of start.pose [m]")
-    start_y: Ends | None = Field(default=None, description="y of start.pose [m]")
-    start_heading: Ends | None = Field(
-        default=None, description="θ of start.pose [rad]"
-    )
-    map_scale: Factors | None = Field(
-        default=None, description="factor that scales the map about its mean"
-    )
-    landmark_shift: NotNegative = Field(
-        default=0.0,
-        description="largest shift of each landmark along x and along y [m]",
+    landmark_shift: NotNegative = setting(
+        0.0, "largest shift of each landmark along x and along y [m]"
     )
 
     def _broken_rules(self) -> Iterator[str]:
@@ -291,9 +256,9 @@ class Randomise(Part):
 class Robot(Part):
     """The body of the robot and the limits of its actions."""
 
-    radius: Positive = Field(default=0.2, description="radius of the round body [m]")
-    max_speed: Positive = Field(default=1.0, description="limit of |v| [m/s]")
-    max_turn_rate: Positive = Field(default=1.0, description="limit of |ω| [rad/s]")
+    radius: Positive = setting(0.2, "radius of the round body [m]")
+    max_speed: Positive = setting(1.0, "limit of |v| [m/s]")
+    max_turn_rate: Positive = setting(1.0, "limit of |ω| [rad/s]")
 
 
 class Scenario(Part):
@@ -311,29 +276,25 @@ class Scenario(Part):
     """
 
     name: Name = Field(description="short name, for titles and files")
-    description: Text = Field(default="", description="purpose of the scenario")
-    dt: Positive = Field(default=0.2, description="duration of one step [s]")
-    steps: _Steps = Field(default=500, description="steps of an episode")
-    start: Start = Field(default=Start(), description="start pose of the robot")
-    robot: Robot = Field(default=Robot(), description="body and limits of the robot")
+    description: Text = setting("", "purpose of the scenario")
+    dt: Positive = setting(0.2, "duration of one step [s]")
+    steps: _Steps = setting(500, "steps of an episode")
+    start: Start = setting(Start(), "start pose of the robot")
+    robot: Robot = setting(Robot(), "body and limits of the robot")
     motion: Motion = Field(description="noise of the motion")
     sensor: Sensor = Field(description="bearing-range sensor")
     landmarks: LandmarkLayout = Field(description="positions of the landmarks")
-    walls: tuple[Wall, ...] = Field(
-        default=(), description="(x0, y0, x1, y1) of each [m]"
-    )
-    controls: ControlSequence = Field(
-        default=CircleSequence(radius=4.0, speed=0.5),
-        description="open-loop commands of the robot; repeated when short; by default "
+    walls: tuple[Wall, ...] = setting((), "(x0, y0, x1, y1) of each [m]")
+    controls: ControlSequence = setting(
+        CircleSequence(radius=4.0, speed=0.5),
+        "open-loop commands of the robot; repeated when short; by default "
         "a circle of 4 m at 0.5 m/s",
     )
-    randomise: Randomise | None = Field(
-        default=None, description="ranges from which every episode draws its own world"
+    randomise: Randomise | None = setting(
+        None, "ranges from which every episode draws its own world"
     )
 
-    faults: Faults | None = Field(
-        default=None, description="faults of the world that no filter knows"
-    )
+    faults: Faults | None = setting(None, "faults of the world that no filter knows")
 
     @property
     def present_faults(self) -> Faults:

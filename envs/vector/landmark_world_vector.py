@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import logger
@@ -66,7 +66,12 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
     ((3, 28, 2), (3, 3))
     """
 
-    _changing = ("_seeds", "_worlds", "_steps_left", "_ended")
+    _changing: ClassVar[tuple[str, ...]] = (
+        "_seeds",
+        "_worlds",
+        "_steps_left",
+        "_ended",
+    )
     _renderers: Sequence[EpisodeRenderer] = ()  # for close after a failed constructor
 
     def __init__(

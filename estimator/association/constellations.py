@@ -63,12 +63,16 @@ class Constellations:
     associated with single readings [m]."""
     search_nodes: int = 20_000
     """Limit of the search; beyond it no constellation is recognised."""
+    always: bool = False
+    """Whether single readings are not associated with uncertain landmarks either while
+    the map holds too few landmarks, around the robot or elsewhere, to recognise one."""
 
     def __post_init__(self) -> None:
         argument_checks.whole("constellations.least", self.least, 3)
         argument_checks.whole("constellations.margin", self.margin, 1)
         argument_checks.above("constellations.lost_std", self.lost_std, 0.0)
         argument_checks.whole("constellations.search_nodes", self.search_nodes, 1)
+        argument_checks.flag("constellations.always", self.always)
 
 
 def match_constellations(

@@ -30,6 +30,8 @@ from ..support import argument_checks
 BRANCH_SPREAD = 16.0
 """Assignments of a scan e^8 times less likely than the best one are not considered."""
 
+TINY = float(np.finfo(np.float64).tiny)
+
 SAME = 1.0
 """Beliefs with the same landmarks are one if no coordinate changes by more σ."""
 
@@ -90,7 +92,7 @@ def assign_scan(
     problem = Problem(
         innovations=innovations_of(readings, expected),
         joint=joint,
-        variances=_variances(readings, noise),
+        variances=_likely_variances(readings, expected, joint, noise),
         feasible=fit.squared[:, explained] <= policy.pair_gate,
         missing=np.zeros(count) if pairs_first else missing_costs(density, count),
         gate=policy.pair_gate,
@@ -135,9 +137,27 @@ def assign_nearest(policy: AssociationPolicy, fit: Distances) -> IntArray:
     )
 
 
-def _variances(readings: Array, noise: Noise) -> Array:
-    """Return (σβ², σr²) of each reading, shape (m, 2); above 0, for their logarithm."""
-    return np.maximum(noise.variances(readings[:, 1]), np.finfo(np.float64).tiny)
+def _likely_variances(
+    readings: Array, expected: Array, joint: Array, noise: Noise
+) -> Array:
+    """Return (σβ², σr²) of each pair, shape (m, J, 2); above 0, for their logarithm."""
+    variances = np.empty((len(readings), len(expected), 2))
+    spread = np.diagonal(joint)[1::2]
+    _fill_variances(readings[:, 1], expected[:, 1], spread, noise, variances)
+    return variances
+
+
+@jit
+def _fill_variances(
+    ranges: Array, expected: Array, spread: Array, noise: Noise, variances: Array
+) -> None:
+    for i in range(len(ranges)):
+        for j in range(len(expected)):
+            found = likely_variances_jit(noise, ranges[i], expected[j], spread[j])
+            variances[i, j, 0], variances[i, j, 1] = (
+                max(found[0], TINY),
+                max(found[1], TINY),
+            )
 
 
 def _limits(policy: AssociationPolicy, rows: int) -> Array:
@@ -283,6 +303,37 @@ class Noise(NamedTuple):
         return np.asarray(std**2)
 
 
+@jit
+def likely_variances_jit(
+    noise: Noise, measured: float, expected: float, spread: float
+) -> tuple[float, float]:
+    """Return (σβ², σr²) at the most likely range, given the reading and the map.
+
+    The noise depends on the true range.  At the measured one, a reading that is short
+    by chance looks too accurate, and at the expected one, the error of the map counts.
+    Between them is ::
+
+        r̂ = h + C / (C + σr²(h)) (z − h)
+
+    Parameters
+    ----------
+    noise : Noise
+    measured, expected : float
+        z and h [m].
+    spread : float
+        C, the variance of h [m²].
+    """
+    std = noise.range_std + noise.range_std_per_metre * expected
+    total = spread + std * std
+    if total > 0:
+        expected += spread / total * (measured - expected)
+    across = noise.bearing_std
+    if noise.bearing_std_metres > 0:
+        across += noise.bearing_std_metres / expected
+    std = noise.range_std + noise.range_std_per_metre * expected
+    return across * across, std * std
+
+
 # What a reading is of, where it is not a slot of the map.
 NEW, AMBIGUOUS = -1, -2
 
@@ -342,8 +393,7 @@ def innovation_distances(
     shape = (len(readings), landmarks)
     fit = Distances(np.full(shape, np.inf), np.full(shape, np.inf))
     if fit.squared.size:
-        variances = noise.variances(readings[:, 1])
-        _compare(mean, covariance, readings, variances, largest, fit)
+        _compare(mean, covariance, readings, noise, largest, fit)
     return fit
 
 
@@ -352,7 +402,7 @@ def _compare(
     mean: Array,
     covariance: Array,
     readings: Array,
-    variances: Array,
+    noise: Noise,
     largest: float,
     fit: Distances,
 ) -> None:
@@ -369,7 +419,9 @@ def _compare(
         is_complete = False
         for k in range(len(readings)):
             nu_r = readings[k, 1] - distance
-            if nu_r * nu_r > largest * (xx + yy + variances[k, 1]):
+            farther = max(distance, readings[k, 1])
+            most = noise.range_std + noise.range_std_per_metre * farther
+            if nu_r * nu_r > largest * (xx + yy + most * most):
                 continue
             if not is_complete:  # what the readings share, for few landmarks only
                 is_complete = True
@@ -384,8 +436,8 @@ def _compare(
                 s_bb += P[2, 2] - 2 * (ax * gx + ay * gy)
                 bearing = np.arctan2(dy, dx) - heading
             nu_b = wrap_angle_jit(readings[k, 0] - bearing)
-            rr = s_rr + variances[k, 1]
-            bb = s_bb + variances[k, 0]
+            q = likely_variances_jit(noise, readings[k, 1], distance, s_rr)
+            rr, bb = s_rr + q[1], s_bb + q[0]
             determinant = rr * bb - s_br * s_br
             if not determinant > 0:
                 continue
@@ -542,11 +594,11 @@ def best_assignments(
 
     Examples
     --------
-    >>> expected, variances = np.array([(0.0, 5.0), (0.3, 5.0)]), np.full((2, 2), 0.01)
+    >>> expected = np.array([(0.0, 5.0), (0.3, 5.0)])
     >>> problem = Problem(
     ...     innovations=innovations_of(expected + 0.2, expected),
     ...     joint=np.tile(0.04 * np.eye(2), (2, 2)),
-    ...     variances=variances,
+    ...     variances=np.full((2, 2, 2), 0.01),
     ...     feasible=np.ones((2, 2), dtype=bool),
     ...     missing=np.full(2, 9.0),
     ...     gate=25.0,

@@ -18,7 +18,11 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit
 from ..interface import MapView
-from ..models.bearing_range import reading_slopes_jit, wrap_angle_jit
+from ..models.bearing_range import (
+    expected_reading_jit,
+    reading_slopes_jit,
+    wrap_angle_jit,
+)
 from ..support import saved_states
 from .scan_assignments import (
     AMBIGUOUS,
@@ -71,7 +75,10 @@ class ScanAssociation:
     @property
     def candidates(self) -> Candidates:
         """The candidates after the scan."""
-        unexplained = self.row_ids.count(None)
+        first = [label < 0 or label >> LABEL_BITS == self.scan for label in self.labels]
+        unexplained = sum(
+            i is None and fresh for i, fresh in zip(self.row_ids, first, strict=True)
+        )
         density = self._density.after(unexplained, self._longest, len(self.confirmed))
         return Candidates(
             self._tentative,
@@ -179,9 +186,16 @@ class ScanAssociation:
 #     cost = −2 Σ ln(1 − P_D(β, r))
 #
 # P_D is the share of expected landmarks that the scans so far have shown, in cells of
-# bearing and range up to the longest reading, each with one sighting in two tries to
-# begin with.  A landmark counts as expected with the least P_D within two σ of where it
-# should be seen; one that may be out of view costs nothing.
+# bearing and range up to the longest reading; a cell counts the share of its sector or
+# its ring, the lower one, as one more try or two.  A landmark that is shown costs
+# −2 ln P_D: a map that explains little does not become likely by expecting little.
+#
+# A landmark that is in view for sure counts with the least P_D within two σ of where it
+# should be seen, and scan after scan.  One that may be out of view counts with its mean
+# P_D, and only where that exceeds those before: what keeps it out of view once does so
+# for long.  For the same reason something may hide a landmark until it is seen again::
+#
+#     P(missed so often) = ε + (1 − ε) Π (1 − P_D)
 
 
 class Detections(NamedTuple):
@@ -193,19 +207,23 @@ class Detections(NamedTuple):
     >>> detections = Detections.none()
     >>> for slot in (0, 0, 0, -1):
     ...     cost, detections = detections.after(view, np.array([slot]), longest=8.0)
-    >>> round(cost, 2)  # −2 ln(1 − 4 / 5)
-    3.22
+    >>> share = (3 + 2 * 4 / 5) / 5  # of the cell, with that of its ring
+    >>> bool(np.isclose(cost, -2 * np.log(HIDDEN + (1 - HIDDEN) * (1 - share))))
+    True
     """
 
     seen: Array
     """Shape (SECTORS, RINGS)."""
     expected: Array
     """Shape (SECTORS, RINGS)."""
+    missed: Mapping[int, float]
+    """For landmarks that may have been in view since they were last seen, the
+    probability of missing them so often if nothing hides them."""
 
     @classmethod
     def none(cls) -> Detections:
         """Return the state before the first scan."""
-        return cls(np.zeros((SECTORS, RINGS)), np.zeros((SECTORS, RINGS)))
+        return cls(np.zeros((SECTORS, RINGS)), np.zeros((SECTORS, RINGS)), {})
 
     def after(
         self, view: MapView, slots: IntArray, longest: float
@@ -223,9 +241,12 @@ class Detections(NamedTuple):
         """
         is_seen = np.zeros(len(view.ids), dtype=np.bool_)
         is_seen[slots[slots >= 0]] = True
-        after = Detections(self.seen.copy(), self.expected.copy())
-        cost = _count(view.mean, view.covariance, is_seen, longest, self, after)
-        return cost, after
+        missed = np.array([self.missed.get(i, 1.0) for i in view.ids])
+        counts = self.seen.copy(), self.expected.copy()
+        cost = _count(view.mean, view.covariance, is_seen, longest, counts, missed)
+        every = {**self.missed, **dict(zip(view.ids, missed.tolist(), strict=True))}
+        some = {i: left for i, left in every.items() if left < 1}
+        return cost, Detections(*counts, some)
 
 
 class UnexplainedDensity(NamedTuple):
@@ -250,7 +271,12 @@ class UnexplainedDensity(NamedTuple):
     @property
     def value(self) -> float:
         """Readings per scan and [rad m]."""
-        return self.readings / (self.scans * 2 * np.pi * self.longest)
+        return self.per_scan / (2 * np.pi * self.longest)
+
+    @property
+    def per_scan(self) -> float:
+        """Readings per scan; at least half a reading within the memory."""
+        return max(self.readings, 0.5) / self.scans
 
     @property
     def landmark_share(self) -> float:
@@ -295,6 +321,7 @@ class Candidates:
             "waiting": waiting,
             "detected": self.detections.seen,
             "expected": self.detections.expected,
+            "missed": list(self.detections.missed.items()),
         }
         return saved_states.write(found, CANDIDATES)
 
@@ -320,13 +347,16 @@ class Candidates:
                 "state['tentative.detected'] must be >= 0, and at most "
                 "state['tentative.expected']"
             )
+        missed = {int(i): left for i, left in saved["missed"].tolist()}
+        if not all(0 <= left <= 1 for left in missed.values()):
+            raise ValueError("state['tentative.missed'] must be probabilities")
         return cls(
             TentativeLandmarks(*(saved[key] for key in TENTATIVE)),
             waiting,
             int(saved["next_id"]),
             int(saved["scan"]),
             UnexplainedDensity(*density.tolist()),
-            Detections(seen, expected),
+            Detections(seen, expected, missed),
         )
 
 
@@ -345,8 +375,15 @@ CANDIDATES: saved_states.Table = {
     "density": (saved_states.NUMBERS, 4),
     "detected": (saved_states.NUMBERS, SECTORS, RINGS),
     "expected": (saved_states.NUMBERS, SECTORS, RINGS),
+    "missed": (saved_states.NUMBERS, -1, 2),
 }
 """What a saved state holds about the landmarks that are not in the map yet."""
+
+NODES = np.array([3 / 4, 1 / 8, 1 / 8])
+"""Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance."""
+
+HIDDEN = 0.003
+"""Probability that something hides a landmark until it is seen again."""
 
 SUREST = 0.95
 """Largest P_D: something may stand before a landmark."""
@@ -361,47 +398,62 @@ def _count(
     P: Array,
     is_seen: BoolArray,
     longest: float,
-    before: Detections,
-    after: Detections,
+    counts: tuple[Array, Array],
+    missed: Array,
 ) -> float:
-    seen, expected = before.seen, before.expected
-    cost = 0.0
+    seen, expected = counts
     sectors, rings = seen.shape
-    wide, deep = 2 * np.pi / sectors, longest / rings
+    ring = (seen.sum(axis=0) + 1) / (expected.sum(axis=0) + 2)
+    sector = (seen.sum(axis=1) + 1) / (expected.sum(axis=1) + 2)
+    usual = np.minimum(sector.reshape(-1, 1), ring.reshape(1, -1))
+    shares = np.minimum((seen + 2 * usual) / (expected + 2), SUREST)
+    cost = 0.0
     for j in range(len(is_seen)):
-        c = 3 + 2 * j
-        dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
-        distance = np.hypot(dx, dy)
-        if not 0 < distance < longest:
-            continue
-        slopes = reading_slopes_jit(dx, dy)
-        xx = P[0, 0] + P[c, c] - 2 * P[0, c]
-        yy = P[1, 1] + P[c + 1, c + 1] - 2 * P[1, c + 1]
-        xy = P[0, 1] + P[c, c + 1] - P[0, c + 1] - P[1, c]
-        gx, gy = P[2, c] - P[2, 0], P[2, c + 1] - P[2, 1]
-        x, y = slopes[2], slopes[3]
-        aside = 2 * np.sqrt(max(x * x * xx + 2 * x * y * xy + y * y * yy, 0.0))
-        if not distance + aside < longest:
-            continue
-        x, y = slopes[0], slopes[1]
-        turn = x * x * xx + 2 * x * y * xy + y * y * yy + P[2, 2]
-        turn = 2 * np.sqrt(max(turn - 2 * (x * gx + y * gy), 0.0))
-        if not turn <= WIDEST:
-            continue
-        bearing = wrap_angle_jit(np.arctan2(dy, dx) - mean[2]) + np.pi
-        first, last = int((bearing - turn) // wide), int((bearing + turn) // wide)
-        near, far = max(distance - aside, 0.0) // deep, (distance + aside) // deep
-        least = SUREST
-        for a in range(first, last + 1):
-            for b in range(int(near), min(int(far), rings - 1) + 1):
-                tries, hits = expected[a % sectors, b], seen[a % sectors, b]
-                least = min(least, (hits + 1) / (tries + 2))
-        if not is_seen[j]:
-            cost -= 2 * np.log(1 - least)
-        a, b = int(bearing // wide) % sectors, min(int(distance // deep), rings - 1)
-        after.expected[a, b] += 1
-        after.seen[a, b] += is_seen[j]
+        bearing, distance, turn, aside = _place_in_scan(mean, P, j)
+        cell = (
+            int(bearing // (2 * np.pi / sectors)) % sectors,
+            min(int(distance // (longest / rings)), rings - 1),
+        )
+        is_sure = distance + aside < longest and turn <= WIDEST
+        if is_sure:
+            seen[cell] += is_seen[j]
+            expected[cell] += 1
+        if is_seen[j]:
+            cost -= 2 * np.log(shares[cell])
+            missed[j] = 1.0
+        elif distance - aside < longest:
+            least, likely = SUREST, 0.0
+            for a in range(-1, 2):
+                side = int((bearing + a * turn) // (2 * np.pi / sectors)) % sectors
+                for b in range(-1, 2):
+                    far = int(abs(distance + b * aside) // (longest / rings))
+                    share = shares[side, far] if far < rings else 0.0
+                    least = min(least, share)
+                    likely += NODES[a] * NODES[b] * share
+            left = missed[j] * (1 - least) if is_sure else min(missed[j], 1 - likely)
+            odds = HIDDEN + (1 - HIDDEN) * left
+            cost -= 2 * np.log(odds / (HIDDEN + (1 - HIDDEN) * missed[j]))
+            missed[j] = left
     return cost
+
+
+@jit
+def _place_in_scan(mean: Array, P: Array, j: int) -> tuple[float, float, float, float]:
+    """Return bearing + π and range of landmark j, and two σ of both."""
+    c = 3 + 2 * j
+    dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+    bearing, distance = expected_reading_jit(dx, dy, mean[2])
+    slopes = reading_slopes_jit(dx, dy)
+    xx = P[0, 0] + P[c, c] - 2 * P[0, c]
+    yy = P[1, 1] + P[c + 1, c + 1] - 2 * P[1, c + 1]
+    xy = P[0, 1] + P[c, c + 1] - P[0, c + 1] - P[1, c]
+    gx, gy = P[2, c] - P[2, 0], P[2, c + 1] - P[2, 1]
+    x, y = slopes[2], slopes[3]
+    aside = x * x * xx + 2 * x * y * xy + y * y * yy
+    x, y = slopes[0], slopes[1]
+    turn = x * x * xx + 2 * x * y * xy + y * y * yy + P[2, 2] - 2 * (x * gx + y * gy)
+    std = np.sqrt(max(turn, 0.0)), np.sqrt(max(aside, 0.0))
+    return wrap_angle_jit(bearing) + np.pi, distance, 2 * std[0], 2 * std[1]
 
 
 Option = tuple[float, Callable[[], ScanAssociation]]
@@ -447,6 +499,8 @@ def associate(
         if policy.association == "hypotheses":
             longest = candidates.density.longest
             missed, detections = detections.after(view, slots, longest)
+            if policy.density is None:  # the Poisson probability of no other reading
+                missed += 2 * candidates.density.per_scan
         options.append((cost + missed, partial(complete, slots, detections)))
     return sorted(options, key=lambda option: option[0])
 

@@ -132,8 +132,7 @@ def search_assignments(
     int
         Number of nodes visited.
     """
-    variances, missing, gate, limits, pairs_first = (
-        problem.variances,
+    missing, gate, limits, pairs_first = (
         problem.missing,
         problem.gate,
         problem.limits,
@@ -143,6 +142,7 @@ def search_assignments(
     order = _decision_order(problem.feasible, problem.innovations)
     names, counts = _needed(problem.feasible, order)
     innovations = problem.innovations[:, names]
+    variances = problem.variances[:, names]
     listed, options = _candidates(problem.feasible[:, names])
     shifts = np.zeros((rows + 1, landmarks, 2))
     joints = np.empty((rows + 1, 2 * landmarks, 2 * landmarks))
@@ -152,7 +152,7 @@ def search_assignments(
                 for k in range(2):
                     value = problem.joint[2 * names[a] + i, 2 * names[b] + k]
                     joints[0, 2 * a + i, 2 * b + k] = value
-    least_base = np.log(variances[:, 0] * variances[:, 1])
+    least_base = np.log(variances[:, :, 0] * variances[:, :, 1])
     if pairs_first:
         least_base[:] = -PAIR_BONUS
     level = np.zeros(rows + 1, np.int64)
@@ -224,7 +224,7 @@ def search_assignments(
             bound, here = cost[depth + 1], level[depth + 1]
             for k in range(depth + 1, rows):  # a lower bound on the open readings
                 i = order[k]
-                base, least = least_base[i], missing[i]
+                least = missing[i]
                 for a in listed[i, : options[i]]:
                     if not taken[a]:
                         x, _ = fit(
@@ -235,7 +235,7 @@ def search_assignments(
                             a,
                             float(rows - depth - 1),
                         )
-                        least = min(least, base + x)
+                        least = min(least, least_base[i, a] + x)
                 bound += least
             if not bound < min(costs[-1], costs[0] + spread, ceiling):
                 if j != UNPAIRED:
@@ -255,6 +255,9 @@ def search_assignments(
 
 UNPAIRED = -1
 
+SURE = 9.0
+"""A landmark is sure to be where the map has it up to this det S / det Q."""
+
 PAIR_BONUS = 1e6
 """Cost that a pair saves where the number of pairs counts before all else."""
 
@@ -267,7 +270,7 @@ class Problem(NamedTuple):
     joint: Array
     """C = H P Hᵀ of all expected readings, shape (2J, 2J)."""
     variances: Array
-    """Diagonal of Q for each reading, shape (m, 2)."""
+    """Diagonal of Q for each pair, shape (m, J, 2)."""
     feasible: BoolArray
     """Pairs to consider, shape (m, J)."""
     missing: Array
@@ -325,9 +328,9 @@ def fit(
     innovation: Array, variance: Array, shift: Array, C: Array, j: int, inflation: float
 ) -> tuple[float, float]:
     """Return νᵀ S⁻¹ ν and det S of a reading at landmark j, with C times inflation."""
-    s00 = inflation * C[2 * j, 2 * j] + variance[0]
+    s00 = inflation * C[2 * j, 2 * j] + variance[j, 0]
     s10 = inflation * C[2 * j + 1, 2 * j]
-    s11 = inflation * C[2 * j + 1, 2 * j + 1] + variance[1]
+    s11 = inflation * C[2 * j + 1, 2 * j + 1] + variance[j, 1]
     n0, n1 = innovation[j, 0] - shift[j, 0], innovation[j, 1] - shift[j, 1]
     determinant = s00 * s11 - s10 * s10
     squared = n0 * n0 * s11 - 2 * n0 * n1 * s10 + n1 * n1 * s00
@@ -352,9 +355,9 @@ def condition(
         h ← h + K (z − h),  C ← C − K C
     """
     C, shift, after, moved = joints[here], shifts[here], joints[to], shifts[to]
-    s00 = C[2 * j, 2 * j] + variance[0]
+    s00 = C[2 * j, 2 * j] + variance[j, 0]
     s10 = C[2 * j + 1, 2 * j]
-    s11 = C[2 * j + 1, 2 * j + 1] + variance[1]
+    s11 = C[2 * j + 1, 2 * j + 1] + variance[j, 1]
     n0, n1 = innovation[j, 0] - shift[j, 0], innovation[j, 1] - shift[j, 1]
     determinant = s00 * s11 - s10 * s10
     cross = np.empty((2, 2 * count))
@@ -400,7 +403,9 @@ def condition_on_all(
 def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
     """Find the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
 
-    A scan shows a landmark once: a reading beside one that is taken is of another.
+    A scan shows a landmark once: a reading beside one that is taken is of another.  A
+    landmark whose place in the scan is uncertain says little about a reading beside it,
+    which may well be of another one: only landmarks with det S ≤ `SURE` det Q count.
 
     Parameters
     ----------
@@ -424,10 +429,12 @@ def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
                 for j in range(landmarks):
                     if taken[j]:
                         continue
-                    x, _ = fit(
+                    x, determinant = fit(
                         innovations[i], variances[i], shifts[here], joints[here], j, 1.0
                     )
-                    distances[s, i] = min(distances[s, i], x)
+                    q = variances[i, j]
+                    if determinant <= SURE * q[0] * q[1]:
+                        distances[s, i] = min(distances[s, i], x)
 
 
 @jit
@@ -464,15 +471,17 @@ def largest_change(problem: Problem, marks: IntArray, fewer: IntArray) -> float:
         j = marks[i]
         if fewer[i] == j:
             continue
-        z, q, C = problem.innovations[i], problem.variances[i], joints[here]
-        x, determinant = fit(z, q, shifts[here], C, j, 1.0)
+        z, C = problem.innovations[i], joints[here]
+        x, determinant = fit(z, problem.variances[i], shifts[here], C, j, 1.0)
+        q = problem.variances[i, j]
         s00, s11 = C[2 * j, 2 * j] + q[0], C[2 * j + 1, 2 * j + 1] + q[1]
         half = (s11 * q[0] + s00 * q[1]) / (2 * determinant)
         root = np.sqrt(max(half * half - q[0] * q[1] / determinant, 0.0))
         left = half - root  # 1 − λ
         shift = (shift + np.sqrt(x * (1 - left))) / np.sqrt(left)
         variance /= left
-        condition(z, q, j, landmarks, shifts, joints, here, 1 - here)
+        variances = problem.variances[i]
+        condition(z, variances, j, landmarks, shifts, joints, here, 1 - here)
         here = 1 - here
     return float(np.sqrt(shift * shift + variance - 1))
 

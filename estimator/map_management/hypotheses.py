@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
+from ...arrays import Array, BoolArray
 from ..association.scan_assignments import SAME
 from ..association.scan_association import ScanAssociation
 from ..interface import (
@@ -21,6 +21,7 @@ from ..interface import (
     SlamEstimator,
     UpdateReport,
 )
+from ..models.bearing_range import wrap_angle
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
@@ -38,8 +39,20 @@ from .policy import LandmarkPolicy, as_policy
 Option = tuple[float, int, Callable[[], ScanAssociation]]
 """Cost, the hypothesis that it continues, and what completes the association."""
 
-SPREAD = 16.0
-"""Hypotheses e^8 times less probable than the best one are discarded."""
+SPREAD = 40.0
+"""Hypotheses e^20 times less probable than the best one are discarded."""
+
+TRIED = 4
+"""Associations tried in a scan, for each hypothesis kept."""
+
+PER_BASIN = 3
+"""Most hypotheses whose poses overlap."""
+
+NIL = 1e-12
+"""Least variance of a pose that counts [m², rad²]."""
+
+OVERLAP = 0.5
+"""Two poses overlap up to this Bhattacharyya distance in every coordinate."""
 
 
 def manage(
@@ -65,16 +78,42 @@ class Hypothesis:
     slam: ManagedSlam
 
 
-def distinct(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
     """Return the hypotheses that differ from all that are more probable.
 
-    The effect of readings that were left out fades with time.
+    The effect of readings that were left out fades with time.  Of hypotheses with
+    overlapping poses, which are variants of one decision, the most probable are
+    returned only, so that they leave room for another decision.
     """
-    chosen: list[Hypothesis] = []
-    for hypothesis in hypotheses:
-        if not any(h.slam.resembles(hypothesis.slam, SAME) for h in chosen):
-            chosen.append(hypothesis)
-    return chosen
+    chosen: list[int] = []
+    near = _overlaps([h.slam.map_view() for h in hypotheses])
+    for k, hypothesis in enumerate(hypotheses):
+        if (
+            len(chosen) < most
+            and near[k, chosen].sum() < PER_BASIN
+            and not any(
+                hypotheses[n].slam.resembles(hypothesis.slam, SAME) for n in chosen
+            )
+        ):
+            chosen.append(k)
+    return [hypotheses[k] for k in chosen]
+
+
+def _overlaps(views: Sequence[MapView]) -> BoolArray:
+    """Return which of n poses overlap, shape (n, n).
+
+    The Bhattacharyya distance of two Gaussians is, in one coordinate, ::
+
+        (μ₂ − μ₁)² / 4 (σ₁² + σ₂²) + ½ ln ((σ₁² + σ₂²) / 2 σ₁σ₂)
+    """
+    poses = np.array([view.mean[:3] for view in views])
+    variance = np.array([np.diagonal(view.covariance)[:3] for view in views]) + NIL
+    both = variance[:, None] + variance[None]
+    gap = poses[:, None] - poses[None]
+    gap[..., 2] = wrap_angle(gap[..., 2])
+    apart = gap**2 / (4 * both)
+    apart += np.log(both**2 / (4 * variance[:, None] * variance[None])) / 4
+    return np.asarray((apart <= OVERLAP).all(axis=2))
 
 
 def _the_plan(plan: ScanAssociation) -> ScanAssociation:
@@ -86,8 +125,9 @@ class HypothesisSlam:
 
     Each hypothesis splits into the most likely joint assignments of a scan.  The costs
     of the scans are added.  Hypotheses beyond the number that the policy allows, and
-    those e^8 times less probable than the best one, are discarded (Reid 1979).  The
-    belief and the reports are those of the most probable hypothesis.
+    those e^20 times less probable than the best one, are discarded (Reid 1979), and so
+    are variants of the better ones whose poses overlap with theirs.  The belief and the
+    reports are those of the most probable hypothesis.
 
     Parameters
     ----------
@@ -318,7 +358,7 @@ class HypothesisSlam:
     def _options(self, readings: Array) -> list[Option]:
         """Return cost, hypothesis and association of the best, the cheapest first."""
         options: list[Option] = []
-        most, ceiling = self._policy.hypotheses, np.inf
+        most, ceiling = TRIED * self._policy.hypotheses, np.inf
         for k, h in enumerate(self.hypotheses):
             found = h.slam.alternatives(readings, ceiling - h.cost)
             options += [(h.cost + cost, k, plan) for cost, plan in found]
@@ -355,7 +395,7 @@ class HypothesisSlam:
                 errors.append(error)
         if not kept:
             raise errors[0]
-        return reports[0], distinct(kept)
+        return reports[0], distinct(kept, self._policy.hypotheses)
 
     def _keep(
         self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()

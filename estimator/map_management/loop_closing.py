@@ -4,13 +4,14 @@ A landmark is lost if its position relative to the robot, with the error ::
 
     e_l − e_p − J (l − p) e_θ,
 
-is less certain than the policy allows.  Readings are not associated with lost
-landmarks, so that around a robot that has lost its map a new one begins.  A landmark
-that enters the map where a lost one may be is *doubtful*: it may be a second copy.
-Once a constellation around the robot is recognised among the lost landmarks, both are
-merged by one measurement.  Where the loop has been closed otherwise, the older landmark
-is no longer lost, and a doubtful one is merged with it if their offset is accurate and
-passes the gate.
+is less certain than the policy allows, while the map holds enough landmarks, around
+the robot and elsewhere, to recognise a constellation.  Readings are not associated with
+lost landmarks, so that around a robot that has lost its map a new one begins.  A
+landmark that enters the map where a lost one may be is *doubtful*: it may be a second
+copy.  Once a constellation around the robot is recognised among the lost landmarks,
+both are merged by one measurement.  Where the loop has been closed otherwise, the older
+landmark is no longer lost, and a doubtful one is merged with it if their offset is
+accurate and passes the gate.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ OFFSET_GATE = 25.0
 """Largest χ² of the offset of two landmarks that may be the same; 2 degrees."""
 SAME_GATE = 9.21
 """Largest χ² of the offset of two landmarks that are the same; 2 degrees, 99 %."""
+LOCAL_STD = 0.5
+"""Landmarks around the robot are those more certain than this times lost ones."""
 ACCURATE = 0.25
 """An offset is accurate if its σ is less than this times that of lost landmarks."""
 NEAR_STDS = 10.0
@@ -56,10 +59,20 @@ class LoopCloser:
         """Mapped landmarks that may be older, lost ones."""
 
     def lost(self, view: MapView) -> BoolArray:
-        """Return which landmarks of a view are lost, shape (n,)."""
+        """Return which landmarks of a view are lost, shape (n,).
+
+        Unless the rules say always, none is as long as no constellation can be
+        recognised, with few landmarks around the robot or in the map.
+        """
         if self._rules is None or not view.ids:
             return np.zeros(len(view.ids), dtype=np.bool_)
-        return _relative_std(view) > self._rules.lost_std
+        std, least = _relative_std(view), self._rules.least
+        is_lost = np.asarray(std > self._rules.lost_std)
+        local = np.count_nonzero(std <= LOCAL_STD * self._rules.lost_std)
+        elsewhere = len(view.mapped) - np.count_nonzero(~is_lost)
+        is_part = view.whole is not None  # landmarks near the robot may be left out
+        can_match = (local >= least or is_part) and elsewhere >= 2 * least
+        return is_lost & (can_match or self._rules.always)
 
     def without_lost(self, view: MapView, within: float) -> MapView:
         """Return a view of the landmarks within a distance [m] that are not lost.

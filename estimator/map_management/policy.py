@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from math import inf, pi, sqrt
 from typing import Any, TypeVar
 
@@ -52,7 +52,7 @@ class LandmarkPolicy(AssociationPolicy):
     """Smallest distance of two landmarks [m]; landmarks estimated closer are merged."""
     merge_gate: float = 9.21
     """Largest Dᵀ C⁻¹ D, of the offset D, at which two landmarks may be one."""
-    constellations: Constellations | None = None
+    constellations: Constellations | None = field(default_factory=Constellations)
     """How landmarks around the robot are recognised as older ones after long drift;
     None: never."""
     capacity: int | None = None

@@ -70,26 +70,24 @@ def estimators(*, given: Options) -> None:
     from ...estimator.peers.catalogue import list_peers
     from ...estimator.registry import find_estimator, list_estimators
 
-    rows = [
-        _entry(name, "slamgym", inspect.getdoc(find_estimator(name)), installed=True)
+    each = [
+        (name, "slamgym", True, inspect.getdoc(find_estimator(name)) or "")
         for name in list_estimators()
     ]
-    rows += [
-        _entry(peer.name, peer.library, peer.description, installed=peer.installed)
+    each += [
+        (peer.name, peer.library, peer.installed, peer.description)
         for peer in list_peers()
     ]
+    rows = [
+        {
+            "name": name,
+            "library": library,
+            "installed": installed,
+            "description": description.partition("\n")[0],
+        }
+        for name, library, installed, description in each
+    ]
     _show("estimators", rows, given.reporter())
-
-
-def _entry(
-    name: str, library: str, description: str | None, *, installed: bool
-) -> dict[str, Any]:
-    return {
-        "name": name,
-        "library": library,
-        "installed": installed,
-        "description": (description or "").partition("\n")[0],
-    }
 
 
 def _show(what: str, rows: list[dict[str, Any]], reporter: Reporter) -> None:

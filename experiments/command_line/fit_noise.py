@@ -1,10 +1,21 @@
 """``slamgym fit-noise``: the noise of a log, by maximum likelihood."""
 
-from typing import Annotated
+from dataclasses import dataclass
 
 from .. import figures, noise_fitting
-from .options import LogFile, Options, note_choices, option, takes
+from .options import LogFile, Options, declared, takes
 from .program import command
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitNoiseOptions(Options):
+    """The options of ``slamgym fit-noise``."""
+
+    write: bool = declared(
+        False,
+        "--write",
+        "Put the suggested noise into the header of LOG, a slamlog 1.",
+    )
 
 
 @command
@@ -13,17 +24,7 @@ from .program import command
     "range_std_per_metre noise_at_rest hide_identities robot truth noise_from_file "
     "write out as_json"
 )
-def fit_noise(
-    log: LogFile,
-    *,
-    given: Options,
-    write: Annotated[
-        bool,
-        option(
-            "--write", "Put the suggested noise into the header of LOG, a slamlog 1."
-        ),
-    ] = False,
-) -> None:
+def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
     """Fit the noise of a log by maximum likelihood.
 
     Estimate the noise that makes the readings of a log most likely, from the
@@ -45,10 +46,9 @@ def fit_noise(
     from .tables import advice, heading, noise_comparison_table, noise_table, written
 
     reporter = given.reporter()
-    drive = given.read(log)
-    if write:
+    drive = given.read(log, reporter)
+    if given.write:
         refuse_other_formats(log)
-    note_choices(drive, reporter)
     stated = given.stds()
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)
@@ -67,13 +67,13 @@ def fit_noise(
         innovations = noise_fitting.noise_fit_figure(fit)
         figures.save_figure(innovations, folder / "innovations.png")
         summary = write_summary(folder, summary)
-    if write:
+    if given.write:
         write_noise(log, fit.suggested.settings)
     title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])
     compared = noise_comparison_table(summary)
     reporter.show(title, noise_table(summary), "", compared, "", advice(summary), "")
     reporter.show_verbatim(summary["options"])
     reporter.show("", written(str(place), summary["files"]))
-    if write:
+    if given.write:
         reporter.show(f"Wrote the suggested noise into the header of {log}")
-    reporter.finish({**summary, "out": str(place), "written": write})
+    reporter.finish({**summary, "out": str(place), "written": given.write})

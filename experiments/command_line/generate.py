@@ -1,74 +1,67 @@
 """``slamgym generate``: write many drives through a scenario as a data set."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from .. import trajectories
 from .monte_carlo import connected
-from .options import Options, ScenarioName, option, refuse_broken, takes
+from .options import REQUIRED, Options, ScenarioName, declared, refuse_broken, takes
 from .program import command, interruptible
 
 if TYPE_CHECKING:
     from ..trajectories.manifest import Manifest
 
 
+@dataclass(frozen=True, kw_only=True)
+class GenerateOptions(Options):
+    """The options of ``slamgym generate``."""
+
+    episodes: int = declared(
+        REQUIRED, "N", "Number of episodes; episode i has seed SEED + i.", min=1
+    )
+    format_: str = declared(
+        "npz",
+        "--format NAME",
+        "npz, parquet and minari hold everything; slamlog, g2o and tum hold what their "
+        "formats express.",
+    )
+    shard: int | None = declared(
+        None,
+        "N",
+        "Episodes in each file or folder of the data set.",
+        "100, fewer if they are large",
+        min=1,
+    )
+    smallest_std: float | None = declared(
+        None,
+        "--smallest-std S",
+        "Smallest standard deviation in files of g2o [m, rad].",
+        "0.001",
+    )
+    believer: str | None = declared(
+        None,
+        "--estimator -e NAME",
+        "A filter whose beliefs after every scan are written beside the truth (npz, "
+        "parquet and minari).",
+        "none",
+    )
+    out: Path | None = declared(
+        None,
+        "DIR",
+        "The folder to write: new, empty, or begun by the same command, which then "
+        "continues, perhaps with more episodes.",
+        "results/<name>-<controller>-<format>",
+    )
+
+
 @command
 @takes(
-    "episodes controller seed format_ shard smallest_std estimator jobs backend "
+    "episodes controller seed format_ shard smallest_std believer jobs backend "
     "scheduler steps set_ out as_json",
     controller="waypoints",
 )
-def generate(
-    scenario: ScenarioName,
-    *,
-    given: Options,
-    episodes: Annotated[
-        int, option("N", "Number of episodes; episode i has seed SEED + i.", min=1)
-    ],
-    format_: Annotated[
-        str,
-        option(
-            "--format NAME",
-            "npz, parquet and minari hold everything; slamlog, g2o and tum hold what "
-            "their formats express.",
-        ),
-    ] = "npz",
-    shard: Annotated[
-        int | None,
-        option(
-            "N",
-            "Episodes in each file or folder of the data set.",
-            "100, fewer if they are large",
-            min=1,
-        ),
-    ] = None,
-    smallest_std: Annotated[
-        float | None,
-        option(
-            "--smallest-std S",
-            "Smallest standard deviation in files of g2o [m, rad].",
-            "0.001",
-        ),
-    ] = None,
-    estimator: Annotated[
-        str | None,
-        option(
-            "--estimator -e NAME",
-            "A filter whose beliefs after every scan are written beside the truth "
-            "(npz, parquet and minari).",
-            "none",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        option(
-            "DIR",
-            "The folder to write: new, empty, or begun by the same command, which then "
-            "continues, perhaps with more episodes.",
-            "results/<name>-<controller>-<format>",
-        ),
-    ] = None,
-) -> None:
+def generate(scenario: ScenarioName, *, given: GenerateOptions) -> None:
     """Write a data set of trajectories.
 
     Drive many episodes of a scenario and write them as a data set: the actions, the
@@ -87,9 +80,9 @@ def generate(
     from .output_folder import default_folder
 
     world = given.scenario(scenario)
-    if estimator is not None:
-        refuse_broken(estimator)
-    place = out or default_folder(world.name, given.controller, format_)
+    if given.believer is not None:
+        refuse_broken(given.believer)
+    place = given.out or default_folder(world.name, given.controller, given.format_)
     reporter = given.reporter()
     stopped = f"interrupted; whole shards stay in {place}, the same command continues"
     with (
@@ -101,13 +94,13 @@ def generate(
         manifest = trajectories.generate_trajectories(
             world,
             place,
-            episodes=episodes,
+            episodes=given.episodes,
             controller=given.controller,
             seed=given.seed,
-            format=format_,
-            episodes_per_shard=shard,
-            smallest_std=smallest_std,
-            estimator=estimator,
+            format=given.format_,
+            episodes_per_shard=given.shard,
+            smallest_std=given.smallest_std,
+            estimator=given.believer,
             jobs=given.jobs,
             backend=given.backend,
             progress=tick,

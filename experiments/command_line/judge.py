@@ -2,67 +2,59 @@
 
 import shlex
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from rich.text import Text
 
-from .options import FilesOfEstimates, Options, option, takes
+from . import options
 from .program import FAILURE, BadInputError, command
 
 
+@dataclass(frozen=True, kw_only=True)
+class JudgeOptions(options.Options):
+    """The options of ``slamgym judge``."""
+
+    drives: Path | None = options.declared(
+        None,
+        "DIR",
+        "The folder of slamgym generate that holds the truth.",
+        "the estimates, if generate wrote them",
+    )
+    truths: list[Path] | None = options.declared(
+        None,
+        "--truth FILE",
+        "The true path of a drive from elsewhere: TUM, or a log with ground truth; "
+        f"or a folder of such files. {options.REPEATED}",
+        "that of the drives",
+    )
+    covariances: str = options.declared(
+        "additive",
+        "additive|invariant|right|left",
+        "The error whose covariances the files hold.",
+    )
+    frame: str = options.declared(
+        "invariant", "invariant|additive", "The error whose NEES decides."
+    )
+    align: str | None = options.declared(
+        None,
+        "fit|X,Y,THETA",
+        "Move all estimates by this motion; fit brings each path closest to its "
+        "truth, and leaves no verdict.",
+        "none",
+    )
+    out: Path | None = options.declared(
+        None,
+        "DIR",
+        "The folder to write: new, empty, or with earlier output of slamgym.",
+        "results/judge-<scenario>",
+    )
+
+
 @command
-@takes("drives truth covariances frame align out as_json")
-def judge(
-    files: FilesOfEstimates,
-    *,
-    given: Options,
-    drives: Annotated[
-        Path | None,
-        option(
-            "DIR",
-            "The folder of slamgym generate that holds the truth.",
-            "the estimates, if generate wrote them",
-        ),
-    ] = None,
-    truth: Annotated[
-        list[Path] | None,
-        option(
-            "FILE",
-            "The true path of a drive from elsewhere: TUM, or a log with ground truth; "
-            "or a folder of such files. May be repeated.",
-            "that of the drives",
-        ),
-    ] = None,
-    covariances: Annotated[
-        str,
-        option(
-            "additive|invariant|right|left",
-            "The error whose covariances the files hold.",
-        ),
-    ] = "additive",
-    frame: Annotated[
-        str,
-        option("invariant|additive", "The error whose NEES decides."),
-    ] = "invariant",
-    align: Annotated[
-        str | None,
-        option(
-            "fit|X,Y,THETA",
-            "Move all estimates by this motion; fit brings each path closest to its "
-            "truth, and leaves no verdict.",
-            "none",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        option(
-            "DIR",
-            "The folder to write: new, empty, or with earlier output of slamgym.",
-            "results/judge-<scenario>",
-        ),
-    ] = None,
-) -> int:
+@options.takes("drives truths covariances frame align out as_json")
+def judge(files: options.FilesOfEstimates, *, given: JudgeOptions) -> int:
     """Judge estimates of any program.
 
     Decide with known error rates whether the covariances of estimates agree with
@@ -87,23 +79,23 @@ def judge(
     from .output_folder import default_folder, output_folder, write_summary
     from .tables import written
 
-    if frame not in ERROR_FRAMES:
+    if given.frame not in ERROR_FRAMES:
         raise BadInputError(
-            f"--frame must be one of {', '.join(ERROR_FRAMES)}, got {frame!r}"
+            f"--frame must be one of {', '.join(ERROR_FRAMES)}, got {given.frame!r}"
         )
-    error: Any = frame
+    error: Any = given.frame
     reporter = given.reporter()
     with reporter.warnings():
         results = judging.judge(
             files,
-            drives,
-            truth=truth,
-            covariances=covariances,
-            align=_motion(align),
+            given.drives,
+            truth=given.truths,
+            covariances=given.covariances,
+            align=_motion(given.align),
             command=shlex.join(["slamgym", *sys.argv[1:]]),
         )
         summary = summarise_monte_carlo(results, frame=error)
-    place = out or default_folder("judge", summary["scenario"])
+    place = given.out or default_folder("judge", summary["scenario"])
     with output_folder(place) as folder:
         results.to_netcdf(folder / RESULTS)
         write_html_report(results, summary, folder / REPORT)

@@ -5,8 +5,9 @@ import shlex
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from rich.text import Text
 
@@ -15,65 +16,57 @@ from . import options
 from .program import FAILURE, BadInputError, command, interruptible
 
 
+@dataclass(frozen=True, kw_only=True)
+class MonteCarloOptions(options.Options):
+    """The options of ``slamgym monte-carlo``."""
+
+    estimators: str = options.declared(
+        "ekf,invariant",
+        "--estimators -e NAMES",
+        'Filters separated by commas, such as "ekf,invariant[iterations=3]", or '
+        'your own "module:Class"; options in brackets.',
+    )
+    runs: int = options.declared(
+        200,
+        "",
+        "Number of runs. Run i is the world of seed SEED + i; jobs whose seeds are "
+        "closer than this share worlds.",
+    )
+    assume: list[str] | None = options.declared(
+        None,
+        "KEY=VALUE",
+        "A change of the scenario that only the filters assume, such as "
+        f"motion.std=[0.1,0.1,0.1]. {options.REPEATED}",
+    )
+    block_size: int = options.declared(
+        64, "N", "Number of runs computed and written together."
+    )
+    first_run: int = options.declared(
+        0, "N", "Omit the runs below N, a multiple of the block size."
+    )
+    merge: list[Path] | None = options.declared(
+        None,
+        "DIR",
+        f"Add the results of another machine for this job. {options.REPEATED}",
+    )
+    fresh: bool = options.declared(
+        False, "--fresh", "Remove earlier results in the folder first."
+    )
+    out: Path | None = options.declared(
+        None,
+        "DIR",
+        "The folder to write. An interrupted job there continues, and more runs are "
+        "added to existing ones.",
+        "results/monte-carlo-<scenario>",
+    )
+
+
 @command
 @options.takes(
     "estimators runs seed steps set_ assume resolution jobs backend scheduler "
     "block_size first_run merge fresh out as_json"
 )
-def monte_carlo(
-    scenario: options.ScenarioName,
-    *,
-    given: options.Options,
-    estimators: Annotated[
-        str,
-        options.option(
-            "--estimators -e NAMES",
-            'Filters separated by commas, such as "ekf,invariant[iterations=3]", or '
-            'your own "module:Class"; options in brackets.',
-        ),
-    ] = "ekf,invariant",
-    runs: Annotated[
-        int,
-        options.option(
-            "",
-            "Number of runs. Run i is the world of seed SEED + i; jobs whose seeds are "
-            "closer than this share worlds.",
-        ),
-    ] = 200,
-    assume: Annotated[
-        list[str] | None,
-        options.option(
-            "KEY=VALUE",
-            "A change of the scenario that only the filters assume, such as "
-            f"motion.std=[0.1,0.1,0.1]. {options.REPEATED}",
-        ),
-    ] = None,
-    block_size: Annotated[
-        int, options.option("N", "Number of runs computed and written together.")
-    ] = 64,
-    first_run: Annotated[
-        int, options.option("N", "Omit the runs below N, a multiple of the block size.")
-    ] = 0,
-    merge: Annotated[
-        list[Path] | None,
-        options.option(
-            "DIR",
-            "Add the results of another machine for this job. " + options.REPEATED,
-        ),
-    ] = None,
-    fresh: Annotated[
-        bool, options.option("--fresh", "Remove earlier results in the folder first.")
-    ] = False,
-    out: Annotated[
-        Path | None,
-        options.option(
-            "DIR",
-            "The folder to write. An interrupted job there continues, and more runs "
-            "are added to existing ones.",
-            "results/monte-carlo-<scenario>",
-        ),
-    ] = None,
-) -> int:
+def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> int:
     """Many runs: are the filters consistent?
 
     Run filters many times over a scenario, all on the same random numbers, and
@@ -99,15 +92,15 @@ def monte_carlo(
     from .tables import written
 
     world = given.scenario(scenario)
-    assumed = options.changes("--assume", assume)
+    assumed = options.changes("--assume", given.assume)
     reporter = given.reporter()
-    options.refuse_broken(estimators)
-    place = out or default_folder("monte-carlo", world.name)
+    options.refuse_broken(given.estimators)
+    place = given.out or default_folder("monte-carlo", world.name)
     told = world.with_changes(**assumed) if assumed else world
     with reporter.note_if_compiling("the filters"):
-        _compile(estimators, identities=world.sensor.identities)
-    if merge:
-        monte_carlo.merge_blocks(merge, place)
+        _compile(given.estimators, identities=world.sensor.identities)
+    if given.merge:
+        monte_carlo.merge_blocks(given.merge, place)
     with (
         connected(given.backend, given.scheduler, given.jobs),
         reporter.warnings(),
@@ -118,16 +111,16 @@ def monte_carlo(
         ),
         monte_carlo.monte_carlo(
             world,
-            estimators,
-            runs,
+            given.estimators,
+            given.runs,
             given.seed,
             assumed=told,
             out=place,
             jobs=given.jobs,
             backend=given.backend,
-            block_size=block_size,
-            first_run=first_run,
-            fresh=fresh,
+            block_size=given.block_size,
+            first_run=given.first_run,
+            fresh=given.fresh,
             resolution=given.resolution,
             command=shlex.join(["slamgym", *sys.argv[1:]]),
             progress=tick,

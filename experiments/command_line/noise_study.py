@@ -3,6 +3,7 @@
 import csv
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -11,18 +12,10 @@ import typer
 
 from ...sim_configs import Scenario, list_presets
 from ...sim_configs.atomic_file import naming_file
+from ...sim_configs.field_types import unknown_choice
 from ...suggestions import closest
 from .. import figures
-from .options import (
-    Options,
-    note_choices,
-    note_noise,
-    option,
-    refuse_broken,
-    takes,
-    with_options,
-)
-from .program import BadInputError, command, way_to_set
+from . import options, program
 from .reporter import Reporter
 
 if TYPE_CHECKING:
@@ -46,8 +39,28 @@ _ONLY_FOR = {
 """Parameters that have an effect on one kind of study alone."""
 
 
-@command
-@takes(
+@dataclass(frozen=True, kw_only=True)
+class NoiseStudyOptions(options.Options):
+    """The options of ``slamgym noise-study``."""
+
+    estimator: str = options.declared(
+        "invariant",
+        "--estimator -e NAME",
+        "A filter, as for replay; with --runs, several with commas between.",
+    )
+    runs: int = options.declared(
+        1, "", "For a scenario: with more than one, each change is a Monte Carlo."
+    )
+    change: str = options.declared(
+        "all",
+        "both|world|filter|all",
+        "With --runs: whether noises change in world and filter, in the world alone, "
+        "or in what the filter assumes.",
+    )
+
+
+@program.command
+@options.takes(
     "estimator motion_std measurement_std initial_pose_std landmark_init "
     "gate_probability range_std_per_metre noise_at_rest option_texts hide_identities "
     "robot truth noise_from_file seed steps controller set_ runs change jobs out "
@@ -62,26 +75,7 @@ def noise_study(
     ],
     *,
     context: typer.Context,
-    given: Options,
-    estimator: Annotated[
-        str,
-        option(
-            "--estimator -e NAME",
-            "A filter, as for replay; with --runs, several with commas between.",
-        ),
-    ] = "invariant",
-    runs: Annotated[
-        int,
-        option("", "For a scenario: with more than one, each change is a Monte Carlo."),
-    ] = 1,
-    change: Annotated[
-        str,
-        option(
-            "both|world|filter|all",
-            "With --runs: whether noises change in world and filter, in the world "
-            "alone, or in what the filter assumes.",
-        ),
-    ] = "all",
+    given: NoiseStudyOptions,
 ) -> None:
     """Every noise times 10 and divided by 10.
 
@@ -100,46 +94,34 @@ def noise_study(
     slamgym noise-study loop -e 'invariant[iterations=3]'
     slamgym noise-study six_landmarks --runs 100 -e ekf,invariant
     """
-    from ...estimator.registry import split_labels
     from ..noise_study import study_log, study_scenario
     from ..runs.filter_settings import settings_for, settings_for_scenario
 
-    is_scenario = _is_scenario(source)
-    kinds = (_SCENARIO, _ONE_RUN if runs == 1 else _MANY_RUNS)
-    _refuse_without_effect(context, *(kinds if is_scenario else (_LOG,)))
-    named, chosen = given.named_options(), given.filter_options()
-    refuse_broken(estimator, chosen)
+    many = given.runs != 1
+    is_scenario, estimator = _is_scenario(source), given.estimator
+    kinds = (_SCENARIO, _MANY_RUNS if many else _ONE_RUN) if is_scenario else (_LOG,)
+    _refuse_without_effect(context, *kinds)
+    chosen = given.filter_options()
+    options.refuse_broken(estimator, chosen)
     reporter = given.reporter()
     if not is_scenario:
-        log = given.read(Path(source))
-        note_choices(log, reporter)
+        log = given.read(Path(source), reporter)
         stds = given.stds()
         settings = settings_for(log, estimator=estimator, options=chosen, **stds)
-        study = one_run_study(
-            log.name, estimator, settings, partial(study_log, log, settings)
-        )
+        run = partial(study_log, log, settings)
+        study = one_run_study(log.name, estimator, settings, run)
         write_study(study, given.out, reporter)
-        note_noise(log, settings, {*stds, *named}, reporter)
+        options.note_noise(log, settings, {*stds, *given.named_options()}, reporter)
         return
     world = given.scenario(source)
-    if runs == 1:
+    if many:
+        study = effects_study(world, given)
+    else:
         settings = settings_for_scenario(world, estimator=estimator, options=chosen)
         given.driver(world)  # refuses a wrong name
-        study = one_run_study(
-            world.name,
-            estimator,
-            settings,
-            partial(
-                study_scenario, world, given.record, estimator=estimator, options=chosen
-            ),
-        )
-    else:
-        texts = [f"{key}={value}" for key, value in named.items()]
-        texts += given.option_texts or []
-        labels = [with_options(label, texts) for label in split_labels(estimator)]
-        study = effects_study(
-            world, ",".join(labels), runs, given.seed, change, given.jobs
-        )
+        run = partial(study_scenario, world, given.record)
+        run = partial(run, estimator=estimator, options=chosen)
+        study = one_run_study(world.name, estimator, settings, run)
     write_study(study, given.out, reporter)
 
 
@@ -199,30 +181,29 @@ def one_run_study(
     return Study((name, estimator), about, run)
 
 
-def effects_study(
-    world: Scenario,
-    estimators: str,
-    runs: int,
-    seed: int,
-    change: str,
-    jobs: int | None,
-) -> Study:
+def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
     """Prepare the study of a scenario over many runs."""
     from ... import __version__
+    from ...estimator.registry import split_labels
     from ..noise_study import CHANGED, noise_effects, noise_effects_figure
     from .tables import effects_table
 
+    runs, seed, change = given.runs, given.seed, given.change
+    texts = [f"{key}={value}" for key, value in given.named_options().items()]
+    texts += given.option_texts or []
+    labels = [
+        options.with_options(label, texts) for label in split_labels(given.estimator)
+    ]
     if change != "all" and change not in CHANGED:
-        raise BadInputError(
-            f"--change must be all, {', '.join(CHANGED)}, got '{change}'"
+        raise program.BadInputError(
+            unknown_choice("--change", change, ("all", *CHANGED))
         )
     places = [place for place in CHANGED if change in ("all", place)]
+    study = partial(noise_effects, world, ",".join(labels), runs, seed, jobs=given.jobs)
 
     def run(reporter: Reporter) -> Results:
         with reporter.progress("running", unit="runs") as tick:
-            effects = noise_effects(
-                world, estimators, runs, seed, changed=places, jobs=jobs, progress=tick
-            )
+            effects = study(changed=places, progress=tick)
         shown = [effects_table(world.name, runs, effects)]
         return Results(effects, (), noise_effects_figure(effects), 150, shown)
 
@@ -273,7 +254,7 @@ def _is_scenario(source: str) -> bool:
         return True
     if Path(source).exists():
         return False
-    raise BadInputError(
+    raise program.BadInputError(
         f"no log and no scenario '{source}'{closest(source, list_presets())} "
         f"(there are {', '.join(list_presets())})"
     )
@@ -286,6 +267,7 @@ def _refuse_without_effect(context: typer.Context, *kinds: str) -> None:
             source = context.get_parameter_source(name)
             if source is not None and source.name == "COMMANDLINE":
                 option = f"--{name.strip('_').replace('_', '-')}"
-                raise BadInputError(
-                    f"{option} is for the noise study of {kind}{way_to_set(option)}"
+                hint = program.way_to_set(option)
+                raise program.BadInputError(
+                    f"{option} is for the noise study of {kind}{hint}"
                 )

@@ -4,14 +4,12 @@ Each annotated type is one option with its help. The functions below them parse 
 and choose scenarios, logs and filters by the names that the user gives.
 """
 
-# ruff: noqa: RUF009 (what `_shared` returns is a field)
-
 import inspect
 import json
 import math
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -20,7 +18,7 @@ import numpy as np
 import typer
 
 from ...sim_configs import Scenario, list_presets, load_scenario
-from ...suggestions import closest
+from ...sim_configs.field_types import unknown_choice
 from .program import BadInputError, BrokenFilterError
 from .reporter import Reporter
 
@@ -32,21 +30,29 @@ if TYPE_CHECKING:
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 REPEATED = "May be repeated."
+REQUIRED = MISSING
 
 
-def option(
-    form: str, text: str, default: str | bool = True, *, min: int | None = None
+def declared(
+    default: object,
+    form: str,
+    text: str,
+    shown: str | bool = True,
+    *,
+    min: int | None = None,
 ) -> Any:
-    """Describe an option of a command.
+    """Declare an option of a command as a field of :class:`Options` or a subclass.
 
     Parameters
     ----------
+    default : object
+        Its value by default; `REQUIRED` if it must be given.
     form : str
         Its names, then the placeholder of its value, as in "--jobs -j N". Without a
-        name, the option is named after the parameter.
+        name, the option is named after the field.
     text : str
         The help.
-    default : str or bool
+    shown : str or bool
         What the help shows as the default; True for the default itself.
     min : int, optional
         The least value.
@@ -55,14 +61,10 @@ def option(
     names = [word for word in words if word.startswith("-")]
     value = [word for word in words if word not in names]
     metavar = value[0] if value else None
-    return typer.Option(
-        *names, metavar=metavar, help=text, show_default=default, min=min
+    option = typer.Option(
+        *names, metavar=metavar, help=text, show_default=shown, min=min
     )
-
-
-def _shared(default: object, *described: Any, **limits: Any) -> Any:
-    """Declare an option of several commands by its default and as in `option`."""
-    return field(default=default, metadata={"option": option(*described, **limits)})
+    return field(default=default, metadata={"option": option})
 
 
 ScenarioName = Annotated[
@@ -87,143 +89,143 @@ FilesOfEstimates = Annotated[
 class Options:
     """The options that commands share, as the user gave them; the others' defaults.
 
-    A command takes some of them, see :func:`takes`.
+    A command takes some of them, see :func:`takes`. Its own ones are in a subclass.
     """
 
-    estimator: str = _shared(
+    estimator: str = declared(
         "invariant",
         "--estimator -e NAME",
         'A filter (see: slamgym estimators), or your own "module:Class", with or '
         'without options, as in "invariant[iterations=3]".',
     )
-    labels: str = _shared(
+    labels: str = declared(
         "invariant",
         "--estimator -e NAMES",
         'Filters separated by commas, such as "ekf,invariant[iterations=3]", or your '
         'own "module:Class". run.html and comparison.png show all of them; the other '
         "files and numbers are those of the first.",
     )
-    option_texts: list[str] | None = _shared(
+    option_texts: list[str] | None = declared(
         None,
         "--option KEY=VALUE",
         "An option of all filters, such as gate_probability=0.999; options in brackets "
         f"take precedence. {REPEATED}",
     )
-    motion_std: str | None = _shared(
+    motion_std: str | None = declared(
         None,
         "A,B,C",
         "σx,σy,σα of the motion noise in the robot's frame [m, m, rad], per unit of "
         "the log's time: a step or a second.",
         "from the log",
     )
-    measurement_std: str | None = _shared(
+    measurement_std: str | None = declared(
         None, "A,B", "σβ,σr of bearing and range [rad, m].", "from the log"
     )
-    initial_pose_std: str | None = _shared(
+    initial_pose_std: str | None = declared(
         None,
         "A,B,C",
         "σx,σy,σθ of the first pose [m, m, rad].",
         "from the log, else 0,0,0",
     )
-    landmark_init: str | None = _shared(
+    landmark_init: str | None = declared(
         None,
         "full|independent",
         "How a landmark enters the map: full correlates it with the pose; "
         "independent, as in the homework, does not.",
         "full",
     )
-    gate_probability: float | None = _shared(
+    gate_probability: float | None = declared(
         None,
         "P",
         "Reject readings outside this probability region of their innovation.",
         "none rejected",
     )
-    range_std_per_metre: float | None = _shared(
+    range_std_per_metre: float | None = declared(
         None,
         "K",
         "Part of σr that grows with the range: σr + K r.",
         "from the log, else 0",
     )
-    noise_at_rest: bool | None = _shared(
+    noise_at_rest: bool | None = declared(
         None,
         "--noise-at-rest/--no-noise-at-rest",
         "Whether there is motion noise while the odometry reports no motion.",
         "from the log, else not",
     )
-    hide_identities: bool = _shared(
+    hide_identities: bool = declared(
         False,
         "--hide-identities",
         "Let the filter associate the readings of a log that identifies them.",
     )
-    robot: int | None = _shared(
+    robot: int | None = declared(
         None, "K", "Which robot of a UTIAS folder.", "the lowest number"
     )
-    truth: Path | None = _shared(
+    truth: Path | None = declared(
         None,
         "FILE",
         "A graph file with the true poses of an iSAM or g2o text, by their ids.",
         "none",
     )
-    noise_from_file: bool = _shared(
+    noise_from_file: bool = declared(
         False,
         "--noise-from-file",
         "Take the noise from the information matrices of an iSAM or g2o text.",
     )
-    seed: int = _shared(0, "", "Seed of all random numbers.", min=0)
-    steps: int | None = _shared(None, "", "Steps to drive.", "those of the scenario")
-    controller: str = _shared(
+    seed: int = declared(0, "", "Seed of all random numbers.", min=0)
+    steps: int | None = declared(None, "", "Steps to drive.", "those of the scenario")
+    controller: str = declared(
         "open_loop",
         "NAME",
         "open_loop applies the scenario's controls, waypoints steers along their "
         "nominal path, random drives at random.",
     )
-    set_: list[str] | None = _shared(
+    set_: list[str] | None = declared(
         None,
         "--set KEY=VALUE",
         f"A change of the scenario, such as sensor.max_range=4. {REPEATED}",
     )
-    resolution: float = _shared(
+    resolution: float = declared(
         0.0,
         "R",
         "In scores of association, true landmarks nearer to each other than R count as "
         "one [m].",
         "each counts",
     )
-    jobs: int | None = _shared(
+    jobs: int | None = declared(
         None,
         "--jobs -j N",
         "Worker processes, -1 for one on each core.",
         "this process alone",
     )
-    backend: str | None = _shared(
+    backend: str | None = declared(
         None,
         "loky|dask|ray",
         "Where the workers run: loky, on this machine; dask or ray, on a cluster.",
     )
-    scheduler: str | None = _shared(
+    scheduler: str | None = declared(
         None, "ADDRESS", "The Dask or Ray cluster.", "a cluster of this machine"
     )
-    out: Path | None = _shared(
+    out: Path | None = declared(
         None,
         "DIR",
         "The folder to write: new, empty, or with earlier output of slamgym, which is "
         "replaced unless you changed it.",
         "results/<name>-<estimator>",
     )
-    every_step: bool | None = _shared(
+    every_step: bool | None = declared(
         None,
         "--every-step/--no-every-step",
         "Draw the map after every step, into map_steps/.",
         "if there are 60 steps or fewer",
     )
-    rerun: Path | None = _shared(
+    rerun: Path | None = declared(
         None,
         "FILE",
         "Also write the content of run.html as a recording for the viewer rerun (.rrd; "
         "needs slamgym[viewer]).",
         "none",
     )
-    as_json: bool = _shared(False, "--json", "Print one JSON object and nothing else.")
+    as_json: bool = declared(False, "--json", "Print one JSON object and nothing else.")
 
     def reporter(self) -> Reporter:
         """Return what prints the progress and the results."""
@@ -254,10 +256,8 @@ class Options:
         from ...envs.controllers import CONTROLLERS, make_controller
 
         if self.controller not in CONTROLLERS:
-            hint, known = closest(self.controller, CONTROLLERS), ", ".join(CONTROLLERS)
-            raise BadInputError(
-                f"unknown controller '{self.controller}'{hint} (there are {known})"
-            )
+            message = unknown_choice("--controller", self.controller, CONTROLLERS)
+            raise BadInputError(message)
         random = np.random.default_rng([self.seed, 1])
         return make_controller(self.controller, scenario, random)
 
@@ -270,8 +270,10 @@ class Options:
         driver = self.driver(scenario)
         return record_episode(scenario, driver, self.seed, progress=progress)
 
-    def read(self, path: Path) -> "SlamLog":
+    def read(self, path: Path, reporter: Reporter) -> "SlamLog":
         """Read a log of any known format, with its truth if that is in another file.
+
+        Notes what the importer omitted, and where the noise is from.
 
         Raises
         ------
@@ -300,6 +302,10 @@ class Options:
             ) from error
         except MemoryError as error:
             raise BadInputError(f"the log {path} does not fit into memory") from error
+        if "left_out" in log.header:
+            reporter.note(f"left out of the log: {log.header['left_out']}")
+        if "noise" in log.header and "motion_std" in log.header:
+            reporter.note(f"noise {log.header['noise']}")
         return without_identities(log) if self.hide_identities else log
 
     def stds(self) -> dict[str, Any]:
@@ -375,51 +381,49 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
         }
 
 
-_SHARED = {
-    each.name: inspect.Parameter(
-        each.name,
-        inspect.Parameter.KEYWORD_ONLY,
-        default=each.default,
-        annotation=Annotated[each.type, each.metadata["option"]],
-    )
-    for each in fields(Options)
-}
-
-
 def takes(names: str, **defaults: Any) -> Callable[[_Function], Callable[..., Any]]:
-    """Give a command some of :class:`Options`, as its argument ``given``.
+    """Give a command options, as its argument ``given`` of :class:`Options`.
 
     Parameters
     ----------
     names : str
-        The options in the order of the help, with white space between; those that the
-        command declares itself stand among them.
+        The fields of the class of ``given`` that the command takes, in the order of the
+        help, with white space between.
     defaults
-        Where they differ from those of :class:`Options`.
+        Where they differ from those of the class.
     """
-    order = names.split()
 
     def expand(function: _Function) -> Callable[..., Any]:
-        own = dict(inspect.signature(function).parameters)
-        del own["given"]
-        taken = [name for name in order if name not in own]
+        parameters = dict(inspect.signature(function).parameters)
+        kind = parameters.pop("given").annotation
+        declared = {each.name: each for each in fields(kind)}
+        taken = names.split()
 
         @wraps(function)
         def run(*arguments: Any, **values: Any) -> Any:
-            shared = {name: values.pop(name) for name in taken if name in values}
-            return function(*arguments, given=Options(**defaults | shared), **values)
+            options = {name: values.pop(name) for name in taken if name in values}
+            return function(*arguments, given=kind(**defaults | options), **values)
 
-        first = [own[name] for name in own if name not in order]
-        every = _SHARED | own
-        parameters = first + [
-            every[name].replace(default=defaults.get(name, every[name].default))
-            for name in order
+        every = [
+            *parameters.values(),
+            *(_parameter(declared[name], defaults) for name in taken),
         ]
-        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {each.name: each.annotation for each in parameters}
+        run.__signature__ = inspect.Signature(every)  # type: ignore[attr-defined]
+        run.__annotations__ = {each.name: each.annotation for each in every}
         return run
 
     return expand
+
+
+def _parameter(option: Field[Any], defaults: Mapping[str, Any]) -> inspect.Parameter:
+    """Return the parameter that typer reads an option from."""
+    default = defaults.get(option.name, option.default)
+    return inspect.Parameter(
+        option.name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if default is REQUIRED else default,
+        annotation=Annotated[option.type, option.metadata["option"]],
+    )
 
 
 # --------------------------------------------------------------------------------------
@@ -500,14 +504,6 @@ def _refuse_log(name: str) -> None:
     )
 
 
-def note_choices(log: "SlamLog", reporter: Reporter) -> None:
-    """Note what the importer of a log omitted, and where its noise is from."""
-    if "left_out" in log.header:
-        reporter.note(f"left out of the log: {log.header['left_out']}")
-    if "noise" in log.header and "motion_std" in log.header:
-        reporter.note(f"noise {log.header['noise']}")
-
-
 def note_noise(
     log: "SlamLog",
     settings: "FilterSettings",
@@ -515,16 +511,11 @@ def note_noise(
     reporter: Reporter,
 ) -> None:
     """Note the noise of a log's filter, without what the user gave."""
-    options = {
-        "range_std_per_metre": settings.options.get("range_std_per_metre"),
-        "bearing_std_metres": settings.options.get("bearing_std_metres"),
-    }
-    values = {
-        "motion_std": settings.motion_std,
-        "measurement_std": settings.measurement_std,
-        "initial_pose_std": settings.initial_pose_std,
-        **{name: (std,) for name, std in options.items() if std},
-    }
+    names = ("motion_std", "measurement_std", "initial_pose_std")
+    values = {name: getattr(settings, name) for name in names}
+    for name in ("range_std_per_metre", "bearing_std_metres"):
+        if std := settings.options.get(name):
+            values[name] = (std,)
     found = [
         f"{name} {','.join(f'{std:.6g}' for std in stds)}"
         for name, stds in values.items()

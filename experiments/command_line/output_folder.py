@@ -123,7 +123,7 @@ def _publish(folder: Path) -> None:
     old, new = own_files(folder), own_files(staging)
     present = set()
     for name in files_below(folder):
-        if _is_staged(folder, name):
+        if name.startswith(f"{STAGING}/") and not staging.is_symlink():
             continue
         if own_entry(folder, name, old | new) is None:
             raise BadInputError(_in_the_way(folder, name, old | new))
@@ -137,10 +137,6 @@ def _publish(folder: Path) -> None:
             _remove(folder, name)
         (staging / MANIFEST).replace(folder / MANIFEST)
     shutil.rmtree(staging, ignore_errors=True)
-
-
-def _is_staged(folder: Path, name: str) -> bool:
-    return name.startswith(f"{STAGING}/") and not (folder / STAGING).is_symlink()
 
 
 def _in_the_way(folder: Path, name: str, own: set[OwnFile]) -> str:

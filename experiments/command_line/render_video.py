@@ -1,11 +1,12 @@
 """``slamgym render``: film an episode."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from ...sim_configs import Scenario
-from .options import Options, ScenarioName, option, refuse_broken, takes
+from .options import REQUIRED, Options, ScenarioName, declared, refuse_broken, takes
 from .program import command
 from .reporter import Tick
 
@@ -19,25 +20,25 @@ _DURATION = 12.0  # [s] of a film by default
 _SLOWEST, _FASTEST = 4.0, 30.0  # [frames/s]
 
 
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions(Options):
+    """The options of ``slamgym render``."""
+
+    out: Path = declared(REQUIRED, "FILE", "The .gif or .mp4 file to write.")
+    estimator: str = declared(
+        "invariant",
+        "--estimator -e NAME",
+        'The filter whose belief is drawn, or "none".',
+        "invariant",
+    )
+    fps: float | None = declared(
+        None, "N", "Frames (steps) per second.", "so that it lasts 12 s"
+    )
+
+
 @command
 @takes("out estimator option_texts seed steps controller set_ fps as_json")
-def render(
-    scenario: ScenarioName,
-    *,
-    given: Options,
-    out: Annotated[Path, option("FILE", "The .gif or .mp4 file to write.")],
-    estimator: Annotated[
-        str,
-        option(
-            "--estimator -e NAME",
-            'The filter whose belief is drawn, or "none".',
-            "invariant",
-        ),
-    ] = "invariant",
-    fps: Annotated[
-        float | None, option("N", "Frames (steps) per second.", "so that it lasts 12 s")
-    ] = None,
-) -> None:
+def render(scenario: ScenarioName, *, given: RenderOptions) -> None:
     """Film an episode as .gif or .mp4.
 
     Film a drive through a scenario: the robot, its readings, the walls, and the
@@ -54,20 +55,23 @@ def render(
 
     world = given.scenario(scenario)
     chosen, settings = given.filter_options(), None
-    if estimator != "none":
-        refuse_broken(estimator, chosen)
-        settings = settings_for_scenario(world, estimator=estimator, options=chosen)
+    if given.estimator != "none":
+        refuse_broken(given.estimator, chosen)
+        settings = settings_for_scenario(
+            world, estimator=given.estimator, options=chosen
+        )
     reporter = given.reporter()
     driver = given.driver(world)
-    speed = fps or min(max(world.steps / _DURATION, _SLOWEST), _FASTEST)
-    check_video(out, speed)
+    speed = given.fps or min(max(world.steps / _DURATION, _SLOWEST), _FASTEST)
+    check_video(given.out, speed)
     if settings is not None:
         warm_up(settings, reporter)
     with reporter.progress("filming") as tick:
-        write_video(_frames(world, settings, driver, given.seed, tick), out, fps=speed)
-    frames = world.steps + 1
-    reporter.show(f"Wrote {out}: {frames} frames, {speed:.3g} per second")
-    reporter.finish({"out": str(out), "frames": frames, "fps": speed})
+        frames = _frames(world, settings, driver, given.seed, tick)
+        write_video(frames, given.out, fps=speed)
+    count = world.steps + 1
+    reporter.show(f"Wrote {given.out}: {count} frames, {speed:.3g} per second")
+    reporter.finish({"out": str(given.out), "frames": count, "fps": speed})
 
 
 def _frames(

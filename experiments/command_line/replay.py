@@ -1,6 +1,6 @@
 """``slamgym replay`` and ``slamgym smooth``: filter or smooth a log, compare, draw."""
 
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -8,11 +8,31 @@ from typing import Annotated
 import typer
 
 from .. import figures, runs
-from . import options
-from .program import command
+from . import options, program
 
 
-@command
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions(options.Options):
+    """The options of ``slamgym replay``."""
+
+    hide_identities: bool = options.declared(
+        False,
+        "--hide-identities",
+        "Let the filter associate the readings of a log that identifies them, and "
+        "score it.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothOptions(options.Options):
+    """The options of ``slamgym smooth``."""
+
+    robust: str | None = options.declared(
+        None, "huber|cauchy", "Give outliers less weight.", "all weigh the same"
+    )
+
+
+@program.command
 @options.takes(
     "labels motion_std measurement_std initial_pose_std landmark_init gate_probability "
     "range_std_per_metre noise_at_rest option_texts hide_identities resolution robot "
@@ -28,15 +48,7 @@ def replay(
         ),
     ],
     *,
-    given: options.Options,
-    hide_identities: Annotated[
-        bool,
-        options.option(
-            "--hide-identities",
-            "Let the filter associate the readings of a log that identifies them, and "
-            "score it.",
-        ),
-    ] = False,
+    given: ReplayOptions,
 ) -> None:
     """Filter a log, compare with the truth, draw.
 
@@ -58,8 +70,7 @@ def replay(
 
     reporter = given.reporter()
     check_rerun(given.rerun)
-    drive = replace(given, hide_identities=hide_identities).read(log)
-    options.note_choices(drive, reporter)
+    drive = given.read(log, reporter)
     stds = given.stds()
     filters = given.filters(partial(settings_for, drive, **stds))
     place = given.out or default_folder(drive.name, *filters)
@@ -70,23 +81,13 @@ def replay(
     show_run(summary, place, reporter)
 
 
-@command
+@program.command
 @options.takes(
     "estimator motion_std measurement_std initial_pose_std robust gate_probability "
     "range_std_per_metre noise_at_rest option_texts robot truth noise_from_file out "
     "as_json"
 )
-def smooth(
-    log: options.LogFile,
-    *,
-    given: options.Options,
-    robust: Annotated[
-        str | None,
-        options.option(
-            "huber|cauchy", "Give outliers less weight.", "all weigh the same"
-        ),
-    ] = None,
-) -> None:
+def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
     """Smooth a log: estimate all poses and landmarks at once.
 
     Filter a log, then find the most likely poses and landmarks given all of its
@@ -106,13 +107,14 @@ def smooth(
     from .tables import heading, smoothing_figures, smoothing_table, written
 
     name, own = read_label(given.estimator)
-    chosen = given.named_options() | ({"robust": robust} if robust is not None else {})
+    chosen = given.named_options()
+    if given.robust is not None:
+        chosen["robust"] = given.robust
     chosen |= (
         options.assignments("--option", given.option_texts) | own | {"follow": name}
     )
     reporter = given.reporter()
-    drive = given.read(log)
-    options.note_choices(drive, reporter)
+    drive = given.read(log, reporter)
     stated = given.stds()
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)

@@ -17,18 +17,9 @@ from ..runs.summary import summarise
 from ..runs.trace import RunTrace
 from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
 from ..viewers.rerun_recording import import_rerun
-from .options import Options
+from . import options, program, tables
 from .output_folder import write_summary
-from .program import BadInputError
 from .reporter import Reporter
-from .tables import (
-    association_table,
-    comparison_table,
-    heading,
-    key_figures,
-    landmark_table,
-    written,
-)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,9 +41,9 @@ def check_rerun(path: Path | None) -> None:
     if path is None:
         return
     if path.suffix != ".rrd":
-        raise BadInputError(f"--rerun must end in .rrd, got {path}")
+        raise program.BadInputError(f"--rerun must end in .rrd, got {path}")
     if not path.absolute().parent.is_dir():
-        raise BadInputError(f"--rerun: the folder of {path} does not exist")
+        raise program.BadInputError(f"--rerun: the folder of {path} does not exist")
     import_rerun()
 
 
@@ -60,7 +51,7 @@ def filter_and_write(
     log: SlamLog,
     filters: Mapping[str, FilterSettings],
     folder: Path,
-    given: Options,
+    given: options.Options,
     reporter: Reporter,
     walls: Sequence[Sequence[float]] = (),
 ) -> dict[str, Any]:
@@ -168,17 +159,21 @@ def write_figures(
 
 def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
     """Print a run's landmarks, key figures and files."""
-    title = heading("", summary["log"], " filtered by ", summary["estimator"])
-    reporter.show(title, landmark_table(summary), "", key_figures(summary), "")
+    title = tables.heading("", summary["log"], " filtered by ", summary["estimator"])
+    reporter.show(
+        title, tables.landmark_table(summary), "", tables.key_figures(summary), ""
+    )
     if summary["others"]:
         runs = (summary, *summary["others"])
-        reporter.show(comparison_table({run["estimator"]: run for run in runs}), "")
+        reporter.show(
+            tables.comparison_table({run["estimator"]: run for run in runs}), ""
+        )
     if summary["association"] is not None:
-        reporter.show(association_table(summary["association"]), "")
+        reporter.show(tables.association_table(summary["association"]), "")
     if summary["warnings"]:
         warnings = (Text(f"Warning: {text}", "yellow") for text in summary["warnings"])
         reporter.show(*warnings, "")
-    reporter.show(written(str(place), summary["files"]))
+    reporter.show(tables.written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
 
 

@@ -25,20 +25,8 @@ from ...evaluation.trajectory_error import LandmarkDistances, landmark_distances
 from ..runs.trace import RunTrace
 from . import style
 from .maps import Walls, box_around, draw_walls, shared_limits, wall_ends
-from .style import (
-    ALARM,
-    BLUE,
-    GREY,
-    INK,
-    TEAL,
-    deviations,
-    dress,
-    dress_map,
-    new_figure,
-    write_title,
-)
 
-_LANDMARK = EllipseKind("estimated landmark, 3σ", TEAL, fill=0.15)
+_LANDMARK = EllipseKind("estimated landmark, 3σ", style.TEAL, fill=0.15)
 _MOST_ERRORS = 80  # error lines along the path
 _FEW = 40  # landmarks; larger maps have smaller marks
 _NAME_HEIGHT = 0.16  # [inches] of the name of a landmark beside its bar
@@ -77,10 +65,12 @@ def truth_figure(trace: RunTrace, walls: Walls = ()) -> Figure:
         area, *beside = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
         names = [f"l{i}" for i in trace.landmark_ids[landmarks]]
         _draw_distances(beside[0], beside[1], distances, names, room=tall)
-    dress_map(area, limits)
+    style.dress_map(area, limits)
     keys = draw_against_truth(area, trace) + draw_walls(area, walls)
-    write_title(area, "Estimate and ground truth", _summary(trace, poses, distances))
-    style.legend_below(figure, keys, columns=len(keys))
+    style.write_title(
+        area, "Estimate and ground truth", _summary(trace, poses, distances)
+    )
+    style.legend(figure, keys, columns=len(keys))
     return figure
 
 
@@ -106,14 +96,14 @@ def draw_against_truth(axes: Axes, trace: RunTrace) -> list[Artist]:
     """Draw estimates, truth and the lines between them; return the legend's keys."""
     poses, landmarks = _known(trace.true_poses), _known(trace.true_landmarks)
     _LANDMARK.draw(axes, trace.landmarks, trace.landmark_covariances)
-    axes.plot(*trace.landmarks.T, ".", color=TEAL, ms=4)
+    axes.plot(*trace.landmarks.T, ".", color=style.TEAL, ms=4)
     (path,) = axes.plot(
         *trace.poses[:, :2].T, color=style.BLUE, lw=1.6, label="estimated path"
     )
     keys: list[Artist] = [path, _LANDMARK.legend_key()]
     if poses.any() and trace.true_poses is not None:
         truth = np.where(poses[:, None], trace.true_poses[:, :2], np.nan)
-        (line,) = axes.plot(*truth.T, "--", color=INK, lw=1.3, label="true path")
+        (line,) = axes.plot(*truth.T, "--", color=style.INK, lw=1.3, label="true path")
         steps = np.flatnonzero(poses)[:: -(-len(poses) // _MOST_ERRORS)]
         _join(axes, trace.poses[steps, :2], truth[steps], width=0.8)
         keys.insert(1, line)
@@ -122,17 +112,17 @@ def draw_against_truth(axes: Axes, trace: RunTrace) -> list[Artist]:
         few = len(truth) <= _FEW
         size = 9 if few else 5
         (crosses,) = axes.plot(
-            *truth.T, "+", color=INK, ms=size, mew=size / 7, label="true landmark"
+            *truth.T, "+", color=style.INK, ms=size, mew=size / 7, label="true landmark"
         )
         _join(axes, trace.landmarks[landmarks], truth, width=1.6)
         keys.append(crosses)
-    return [*keys, Line2D([], [], color=ALARM, lw=1.4, label="error")]
+    return [*keys, Line2D([], [], color=style.ALARM, lw=1.4, label="error")]
 
 
 def _join(axes: Axes, estimates: Array, truth: Array, *, width: float) -> None:
     lines = LineCollection(
         list(np.stack([estimates, truth], axis=1)),
-        colors=ALARM,
+        colors=style.ALARM,
         linewidths=width,
         zorder=3,
         label="error",
@@ -153,7 +143,7 @@ def distances_from_truth(trace: RunTrace) -> LandmarkDistances | None:
 
 def _draw_distances(
     metres: Axes,
-    deviations: Axes,
+    sigmas: Axes,
     distances: LandmarkDistances,
     names: list[str],
     *,
@@ -164,26 +154,26 @@ def _draw_distances(
     As many are named as fit into the height of the axes, `room` [inches].
     """
     _draw_bars(metres, distances.euclidean)
-    _draw_bars(deviations, distances.mahalanobis)
+    _draw_bars(sigmas, distances.mahalanobis)
     stride = max(1, math.ceil(len(names) * _NAME_HEIGHT / room))
     metres.set_yticks(range(0, len(names), stride), names[::stride])
-    deviations.set_yticks([])
+    sigmas.set_yticks([])
     metres.set_xlabel("distance [m]")
-    deviations.set_xlabel("distance [σ]")
+    sigmas.set_xlabel("distance [σ]")
     bound = float(np.sqrt(chdtri(2, 0.05)))
-    deviations.set_xlim(0, max(deviations.get_xlim()[1], 1.15 * bound))
-    deviations.axvline(bound, color=GREY, lw=1.2, ls="--")
+    sigmas.set_xlim(0, max(sigmas.get_xlim()[1], 1.15 * bound))
+    sigmas.axvline(bound, color=style.GREY, lw=1.2, ls="--")
     inside = np.mean(distances.mahalanobis <= bound)
-    write_title(metres, "Euclidean", "from truth, by landmark")
-    write_title(deviations, "Mahalanobis", f"{inside:.0%} in the 95% bound")
+    style.write_title(metres, "Euclidean", "from truth, by landmark")
+    style.write_title(sigmas, "Mahalanobis", f"{inside:.0%} in the 95% bound")
 
 
 def _draw_bars(axes: Axes, values: Array) -> None:
     rows, few = np.arange(len(values)), len(values) <= _FEW
-    dress(axes)
+    style.dress(axes)
     axes.grid(visible=False, axis="y")
-    axes.hlines(rows, 0, values, color=ALARM, lw=1.6 if few else 0.8)
-    axes.plot(values, rows, "o", color=ALARM, ms=4.5 if few else 2.5)
+    axes.hlines(rows, 0, values, color=style.ALARM, lw=1.6 if few else 0.8)
+    axes.plot(values, rows, "o", color=style.ALARM, ms=4.5 if few else 2.5)
     axes.set_xlim(0, 1.1 * max(float(values.max()), 1e-9))
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
@@ -237,12 +227,12 @@ def comparison_figure(traces: Sequence[RunTrace], walls: Walls = ()) -> Figure:
             axes.set_axis_off()
             continue
         ylabel = "y [m]" if k % _COLUMNS == 0 else ""
-        dress_map(axes, limits, labels=("x [m]", ylabel))
+        style.dress_map(axes, limits, labels=("x [m]", ylabel))
         keys = draw_against_truth(axes, traces[k]) + draw_walls(axes, walls)
         name = traces[k].estimator
         title = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
         style.write_title(axes, title, honesty(traces[k]))
-    style.legend_below(figure, keys, columns=len(keys))
+    style.legend(figure, keys, columns=len(keys))
     return figure
 
 
@@ -274,18 +264,18 @@ def errors_figure(trace: RunTrace) -> Figure:
     truth = trace.true_poses
     known = truth is not None and bool(np.isfinite(truth).any())
     rows = len(_ROWS) + 1 if known else 1
-    figure = new_figure(8.4, 1.0 + 1.9 * rows)
+    figure = style.new_figure(8.4, 1.0 + 1.9 * rows)
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     if truth is not None and known:
         errors = -additive_error(truth, trace.poses)
-        std = deviations(trace.pose_covariances)
+        std = style.deviations(trace.pose_covariances)
         for k, (label, name) in enumerate(_ROWS):
             _draw_error(axes[k], trace.t, errors[:, k], std[:, k])
             axes[k].set_ylabel(label)
             inside = np.abs(errors[:, k]) <= 3 * std[:, k]
             share = np.mean(inside[np.isfinite(errors[:, k])])
             title = f"{name}: {share:.0%} of the errors within ±3σ"
-            write_title(axes[k], title, size=10)
+            style.write_title(axes[k], title, size=10)
         _legend_above(axes[0], columns=2)
     _draw_nis(axes[-1], trace)
     axes[-1].set_xlabel(f"time [{trace.time_unit}]")
@@ -316,35 +306,29 @@ def nis_band(
 
 
 def _draw_error(axes: Axes, t: Array, error: Array, std: Array) -> None:
-    dress(axes)
-    axes.fill_between(t, -3 * std, 3 * std, color=BLUE, alpha=0.15, lw=0, label="±3σ")
+    style.dress(axes)
+    axes.fill_between(
+        t, -3 * std, 3 * std, color=style.BLUE, alpha=0.15, lw=0, label="±3σ"
+    )
     for sign in (-1, 1):
-        axes.plot(t, sign * 3 * std, color=BLUE, lw=0.8, alpha=0.6)
-    axes.axhline(0, color=GREY, lw=0.6)
-    axes.plot(t, error, color=INK, lw=1.2, label="error")
+        axes.plot(t, sign * 3 * std, color=style.BLUE, lw=0.8, alpha=0.6)
+    axes.axhline(0, color=style.GREY, lw=0.6)
+    axes.plot(t, error, color=style.INK, lw=1.2, label="error")
     axes.margins(x=0.01)
 
 
 def _draw_nis(axes: Axes, trace: RunTrace) -> None:
     """Draw the NIS of the steps with a correction; outliers have another marker."""
-    dress(axes)
+    style.dress(axes)
     lower, upper = nis_band(trace.nis_dof)
     used = trace.nis_dof > 0
-    axes.fill_between(
-        trace.t,
-        lower,
-        upper,
-        step="mid",
-        color=TEAL,
-        alpha=0.18,
-        lw=0,
-        label="95% band",
-    )
+    band = axes.fill_between(trace.t, lower, upper, step="mid", color=style.TEAL, lw=0)
+    band.set(alpha=0.18, label="95% band")
     inside = used & (trace.nis >= lower) & (trace.nis <= upper)
     size = 4.0 if len(trace.t) <= 300 else 2.0
     for which, marker, colour, label in (
-        (inside, "o", INK, "inside"),
-        (used & ~inside, "D", ALARM, "outside"),
+        (inside, "o", style.INK, "inside"),
+        (used & ~inside, "D", style.ALARM, "outside"),
     ):
         axes.plot(
             trace.t[which], trace.nis[which], marker, color=colour, ms=size, label=label
@@ -352,10 +336,10 @@ def _draw_nis(axes: Axes, trace: RunTrace) -> None:
     axes.set_ylabel("NIS")
     axes.margins(x=0.01)
     if not used.any():
-        write_title(axes, "NIS: no step corrected anything", size=10)
+        style.write_title(axes, "NIS: no step corrected anything", size=10)
         return
     share = np.mean(inside[used])
-    write_title(axes, f"NIS: {share:.0%} of the steps in the 95% band", size=10)
+    style.write_title(axes, f"NIS: {share:.0%} of the steps in the 95% band", size=10)
     if trace.nis[used].max() > _LOG_FROM * np.nanmax(upper):
         axes.set_yscale("log")
         axes.set_ylim(bottom=max(0.3 * float(np.nanmin(lower)), 1e-3))
@@ -390,25 +374,19 @@ def covariance_figure(trace: RunTrace) -> Figure:
     trace : RunTrace
         The run.
     """
-    sizes = [len(ids) for ids, *_ in trace.landmark_history]
-    first_step = next((step for step, size in enumerate(sizes) if size), 0)
-    figure = new_figure(12.4, 5.6)
+    counts = [len(ids) for ids, *_ in trace.landmark_history]
+    first_step = next((step for step, count in enumerate(counts) if count), 0)
+    figure = style.new_figure(12.4, 5.6)
     before, after = figure.subplots(1, 2)
     _draw_correlations(before, trace.first_covariance, trace.map_at(first_step).ids)
+    size = _size_of_correlations(trace.first_covariance, first_step)
+    style.write_title(before, "Before: the first map", size)
     image = _draw_correlations(after, trace.final_covariance, trace.landmark_ids)
-    write_title(
-        before,
-        "Before: the first map",
-        _size_of_correlations(trace.first_covariance, first_step),
-    )
-    write_title(
-        after,
-        "After: the final map",
-        _size_of_correlations(trace.final_covariance, trace.last_step),
-    )
+    size = _size_of_correlations(trace.final_covariance, trace.last_step)
+    style.write_title(after, "After: the final map", size)
     bar = figure.colorbar(image, ax=[before, after], shrink=0.85, aspect=28, pad=0.015)
-    bar.set_label("correlation", fontsize=10, color=INK)
-    bar.ax.tick_params(labelsize=9, color=GREY)
+    bar.set_label("correlation", fontsize=10, color=style.INK)
+    bar.ax.tick_params(labelsize=9, color=style.GREY)
     bar.outline.set_visible(False)
     figure.draw_without_rendering()  # the layout needs a second pass
     return figure
@@ -433,7 +411,7 @@ def correlations(covariance: Array) -> Array:
     array([[1. , 0.5],
            [0.5, 1. ]])
     """
-    std = deviations(covariance)
+    std = style.deviations(covariance)
     std = np.where(std > 0, std, np.nan)
     return np.asarray(np.clip(covariance / std[:, None] / std, -1.0, 1.0))
 
@@ -441,16 +419,12 @@ def correlations(covariance: Array) -> Array:
 def _draw_correlations(
     axes: Axes, covariance: Array, ids: NDArray[np.integer]
 ) -> AxesImage:
-    image = axes.imshow(
-        np.ma.masked_invalid(correlations(covariance)),
-        cmap="RdBu_r",  # blue to red through white: safe for colour-blind eyes
-        vmin=-1,
-        vmax=1,
-        interpolation="nearest",
-    )
+    known = np.ma.masked_invalid(correlations(covariance))
+    # Blue to red through white: safe for colour-blind eyes.
+    image = axes.imshow(known, cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
     axes.set_facecolor(_UNDEFINED)
     axes.spines[:].set_visible(False)
-    axes.tick_params(length=0, labelsize=9, labelcolor=INK, pad=3)
+    axes.tick_params(length=0, labelsize=9, labelcolor=style.INK, pad=3)
     rows, labels = row_labels(ids)
     axes.set_yticks(rows, labels)
     axes.set_xticks(rows, labels, rotation=90)
@@ -458,7 +432,7 @@ def _draw_correlations(
     for line in (axes.axhline, axes.axvline):  # between pose and landmarks
         line(2.5, color="white", lw=1.5 if few else 0.6)
     if few:
-        _write_deviations(axes, deviations(covariance))
+        _write_deviations(axes, style.deviations(covariance))
     return image
 
 
@@ -495,7 +469,7 @@ def _write_deviations(axes: Axes, std: Array) -> None:
             textcoords="offset points",
             va="center",
             fontsize=8,
-            color=GREY,
+            color=style.GREY,
         )
 
 

@@ -26,17 +26,6 @@ from ..logs.ground_truth import path_accuracy
 from ..runs.log_smoothing import SmoothedLog
 from ..runs.trace import RunTrace
 from . import style
-from .style import (
-    GREY,
-    INK,
-    ORANGE,
-    TEAL,
-    deviations,
-    dress_map,
-    legend_below,
-    new_figure,
-    write_title,
-)
 
 
 def map_figure(trace: RunTrace, step: int | None = None, walls: Walls = ()) -> Figure:
@@ -131,7 +120,7 @@ def noise_study_figure(runs: Sequence[tuple[str, RunTrace]]) -> Figure:
     limits = shared_limits([map_limits(trace) for _, trace in runs])
     rows = 1 + len(runs) // 2
     width, height = limits[1] - limits[0]
-    figure = new_figure(7.6, (3.15 * height / width + 0.55) * rows + 0.4)
+    figure = style.new_figure(7.6, (3.15 * height / width + 0.55) * rows + 0.4)
     grid = figure.subplots(rows, 2, squeeze=False)
     reference, beside, *others = grid.flat
     picture = _draw_panel(reference, *runs[0], limits)
@@ -172,13 +161,13 @@ class _MapParts(NamedTuple):
 def _map_parts(trace: RunTrace, walls: Walls) -> _MapParts:
     limits = map_limits(trace, walls)
     width, height = limits[1] - limits[0]
-    figure = new_figure(7.2, 6.4 * height / width + 1.5)
+    figure = style.new_figure(7.2, 6.4 * height / width + 1.5)
     axes = figure.add_subplot()
-    dress_map(axes, limits)
+    style.dress_map(axes, limits)
     picture = MapPicture(axes, trace)
     keys = picture.legend_keys() + draw_walls(axes, walls)
-    legend_below(figure, keys, columns=3)
-    titles = write_title(axes, *_title(trace, 0))
+    style.legend(figure, keys, columns=3)
+    titles = style.write_title(axes, *_title(trace, 0))
     figure.draw_without_rendering()  # equal axes need a second layout
     return _MapParts(figure, picture, titles, trace)
 
@@ -215,10 +204,10 @@ def _outcome(trace: RunTrace) -> str:
 
 
 def _draw_panel(axes: Axes, title: str, trace: RunTrace, limits: Array) -> MapPicture:
-    dress_map(axes, limits, size=9, labels=("", ""))
+    style.dress_map(axes, limits, size=9, labels=("", ""))
     picture = MapPicture(axes, trace, scale=0.75)
     picture.show(trace.last_step)
-    write_title(axes, title, _outcome(trace), size=10)
+    style.write_title(axes, title, _outcome(trace), size=10)
     return picture
 
 
@@ -353,16 +342,10 @@ class MapPicture:
     def _add_truth(self, scale: float) -> Line2D:
         truth = self._trace.true_landmarks
         points = np.empty((0, 2)) if truth is None else truth
-        few = len(points) <= 60
-        (crosses,) = self._axes.plot(
-            *points.T,
-            "+",
-            color=INK,
-            ms=(9 if few else 5) * scale,
-            mew=(1.3 if few else 0.9) * scale,
-            zorder=5,
-            label="true landmark",
-        )
+        (crosses,) = self._axes.plot(*points.T, "+", color=style.INK, zorder=5)
+        crosses.set_label("true landmark")
+        size, width = (9.0, 1.3) if len(points) <= 60 else (5.0, 0.9)
+        crosses.set(markersize=size * scale, markeredgewidth=width * scale)
         return crosses
 
     def _add_artists(self, scale: float) -> _Artists:
@@ -372,7 +355,9 @@ class MapPicture:
             later=LATER.add_to(axes, scale),
             first=FIRST.add_to(axes, scale),
             estimates=Line2D([], [], ls="", marker=".", ms=3 * scale, c=LATER.colour),
-            path=Line2D([], [], color=GREY, lw=1.1 * scale, label="estimated path"),
+            path=Line2D(
+                [], [], color=style.GREY, lw=1.1 * scale, label="estimated path"
+            ),
             updated=UPDATED.add_to(axes, scale),
             predicted=PREDICTED.add_to(axes, scale),
             robot=Polygon(
@@ -403,18 +388,15 @@ def map_limits(trace: RunTrace, walls: Walls = ()) -> Array:
     """
     truth = trace.true_landmarks
     points = [trace.poses[:, :2], trace.landmarks, wall_ends(walls)]
+    points += [] if truth is None else [truth]
+    poses = np.concatenate([trace.poses, trace.predicted_poses])
+    covariances = np.concatenate(
+        [trace.pose_covariances, trace.predicted_pose_covariances]
+    )
     return box_around(
-        np.concatenate(points if truth is None else [*points, truth]),
-        np.concatenate(
-            [trace.poses[:, :2], trace.predicted_poses[:, :2], trace.first_landmarks]
-        ),
-        np.concatenate(
-            [
-                trace.pose_covariances[:, :2, :2],
-                trace.predicted_pose_covariances[:, :2, :2],
-                trace.first_landmark_covariances,
-            ]
-        ),
+        np.concatenate(points),
+        np.concatenate([poses[:, :2], trace.first_landmarks]),
+        np.concatenate([covariances[:, :2, :2], trace.first_landmark_covariances]),
     )
 
 
@@ -438,7 +420,7 @@ def box_around(points: Array, means: Array, covariances: Array) -> Array:
     """
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     span = max(float((high - low).max()), 1e-3)
-    reach = 3 * deviations(covariances)
+    reach = 3 * style.deviations(covariances)
     lowest = (means - reach).min(axis=0, initial=np.inf)
     highest = (means + reach).max(axis=0, initial=-np.inf)
     low = np.maximum(np.minimum(low, lowest), low - span / 3)
@@ -466,7 +448,7 @@ def draw_walls(axes: Axes, walls: Walls) -> list[Artist]:
     return [lines]
 
 
-_LANDMARK = scene.EllipseKind("smoothed landmark, 3σ", TEAL, fill=0.15)
+_LANDMARK = scene.EllipseKind("smoothed landmark, 3σ", style.TEAL, fill=0.15)
 _POSE = scene.EllipseKind("smoothed pose, 3σ", style.BLUE, fill=0.12, width=0.9)
 
 
@@ -487,9 +469,12 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
     width, height = limits[1] - limits[0]
     figure = style.new_figure(7.2, 6.2 * height / width + 1.6)
     axes = figure.add_subplot()
-    dress_map(axes, limits)
+    style.dress_map(axes, limits)
     (filtered,) = axes.plot(
-        *trace.poses[:, :2].T, color=ORANGE, lw=1.0, label=f"filter: {trace.estimator}"
+        *trace.poses[:, :2].T,
+        color=style.ORANGE,
+        lw=1.0,
+        label=f"filter: {trace.estimator}",
     )
     (path,) = axes.plot(
         *smoothed.poses[:, :2].T, color=style.BLUE, lw=1.4, label="smoother"
@@ -497,15 +482,19 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
     chosen = np.arange(0, len(drive.poses), -(-len(drive.poses) // _MOST_POSES))
     _POSE.draw(axes, drive.poses[chosen, :2], drive.pose_covariances[chosen, :2, :2])
     _LANDMARK.draw(axes, drive.landmarks, drive.landmark_covariances)
-    axes.plot(*drive.landmarks.T, ".", color=TEAL, ms=3)
+    axes.plot(*drive.landmarks.T, ".", color=style.TEAL, ms=3)
     keys: list[Artist] = [path, filtered, _POSE.legend_key(), _LANDMARK.legend_key()]
     accuracy = path_accuracy(smoothed.log, trace.t, smoothed.poses)
     truth = _truth_beside(smoothed, accuracy)
     if truth is not None:
-        (line,) = axes.plot(*truth.T, "--", color=INK, lw=0.9, label="ground truth")
+        (line,) = axes.plot(
+            *truth.T, "--", color=style.INK, lw=0.9, label="ground truth"
+        )
         keys.insert(0, line)
-    write_title(axes, f"{smoothed.log.name}, smoothed", _subtitle(smoothed, accuracy))
-    style.legend_below(figure, keys, columns=3)
+    style.write_title(
+        axes, f"{smoothed.log.name}, smoothed", _subtitle(smoothed, accuracy)
+    )
+    style.legend(figure, keys, columns=3)
     return figure
 
 

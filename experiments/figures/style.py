@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from string import ascii_uppercase
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -110,14 +110,9 @@ def write_title(
         title, loc="left", fontsize=size, fontweight="bold", color=INK, pad=lift
     )
     below = axes.annotate(
-        subtitle,
-        (0, 1),
-        (0, 6),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        fontsize=small,
-        color=GREY,
+        subtitle, (0, 1), (0, 6), xycoords="axes fraction", textcoords="offset points"
     )
+    below.set(fontsize=small, color=GREY)
     return above, below
 
 
@@ -127,15 +122,24 @@ def deviations(covariances: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
-def legend_below(figure: Figure, keys: Sequence[Artist], columns: int) -> None:
-    """Put a legend of lines and ellipses below the axes."""
+def legend(
+    figure: Figure,
+    keys: Sequence[Artist],
+    columns: int,
+    *,
+    place: Literal["outside lower center", "outside upper left"] = (
+        "outside lower center"
+    ),
+    size: float = 9.0,
+) -> None:
+    """Put a legend of lines and ellipses outside the axes, by default below."""
     figure.legend(
         handles=list(keys),
         handler_map=ELLIPSE_HANDLER,
-        loc="outside lower center",
+        loc=place,
         ncols=columns,
         frameon=False,
-        fontsize=9,
+        fontsize=size,
     )
 
 

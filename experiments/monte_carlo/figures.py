@@ -148,13 +148,10 @@ def heading_figure(shown: Shown, knowable: float) -> Figure:
             *thinned(scores.steps, claimed),
             **(look.line("claimed deviation") | {"ls": "-", "lw": 2.0}),
         )
-        axes.axhline(
-            np.degrees(knowable),
-            color=GREY,
-            lw=1.2,
-            ls=(0, (1.4, 1.6)),
-            label="at the start",
+        known = axes.axhline(
+            np.degrees(knowable), ls=(0, (1.4, 1.6)), color=GREY, lw=1.2
         )
+        known.set_label("at the start")
         dress(axes)
         axes.margins(x=0.01)
         axes.set_ylim(bottom=0)
@@ -205,16 +202,8 @@ def _mark_grid(
     steps, ratios = np.array(grid["steps"]), np.array(grid["statistic"], dtype=float)
     rejected = np.array(grid["rejected"])
     for chosen, face in ((rejected, look.colour), (~rejected, "white")):
-        axes.plot(
-            steps[chosen],
-            ratios[chosen],
-            look.marker,
-            ms=4.5,
-            color=look.colour,
-            mfc=face,
-            mew=1.2,
-            zorder=3,
-        )
+        (dots,) = axes.plot(steps[chosen], ratios[chosen], look.marker, ms=4.5)
+        dots.set(color=look.colour, markerfacecolor=face, markeredgewidth=1.2, zorder=3)
 
 
 def _root_mean_square(values: Array) -> Array:
@@ -264,11 +253,8 @@ _ROW = 0.19  # height of a row of a legend [inch]
 def look_of(place: int) -> EstimatorLook:
     """Return the look of the estimator with an index in the results, from 0."""
     dashes = (place + place // len(_COLOURS)) % len(_DASHES)  # shifts per cycle
-    return EstimatorLook(
-        _COLOURS[place % len(_COLOURS)],
-        _DASHES[dashes],
-        _MARKERS[place % len(_MARKERS)],
-    )
+    colour, marker = _COLOURS[place % len(_COLOURS)], _MARKERS[place % len(_MARKERS)]
+    return EstimatorLook(colour, _DASHES[dashes], marker)
 
 
 def thinned(

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ... import __version__
+from ...arrays import Array
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...sim_configs import Scenario
 from ...sim_configs.atomic_file import replace_when_written
@@ -119,7 +120,7 @@ def write_results(
         _write(partial, job, blocks, runs, command)
 
 
-def add_to_results(path: Path, added: Block) -> None:
+def add_to_results(path: Path, added: Mapping[str, Array]) -> None:
     """Add variables of shape (estimator, run) to a results file.
 
     Parameters

@@ -165,6 +165,8 @@ def settings_for(
     header = _noise_header(log)
     if measurement_std is not None:
         header.pop("bearing_std_metres", None)
+    identified = _flag(log.name, "identities", header.get("identities", "true"))
+    managed = {} if identified and not hides_identities(log) else {"management": True}
     return FilterSettings(
         estimator=estimator,
         motion_std=_std(log.name, header, "motion_std", motion_std),
@@ -174,7 +176,7 @@ def settings_for(
         ),
         options={
             **_header_options(log.name, header, factory),
-            **_needed_options(log, header),
+            **managed,
             **(options or {}),
             **own,
         },
@@ -277,12 +279,6 @@ def _header_options(
             "not have: give it another --measurement-std"
         )
     return accepted
-
-
-def _needed_options(log: SlamLog, header: Mapping[str, str]) -> dict[str, Any]:
-    """Turn management on if the log does not identify all readings."""
-    identified = _flag(log.name, "identities", header.get("identities", "true"))
-    return {} if identified and not hides_identities(log) else {"management": True}
 
 
 def _number(name: str, key: str, text: str) -> float:

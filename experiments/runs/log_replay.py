@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import NamedTuple, overload
+from typing import Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 
@@ -21,16 +22,8 @@ from ...estimator.interface import (
     SupportsTruth,
     UpdateReport,
 )
-from ...estimator.map_management.hypotheses import HypothesisSlam
-from ...estimator.map_management.managed_slam import ManagedSlam
-from ...estimator.map_management.map_editor import (
-    mapped_ids,
-    marginal_without_joining,
-    view_map,
-)
-from ..logs import ground_truth
-from ..logs.recording import Step, predictions, steps_of
-from ..logs.slamlog import Scan, SlamLog
+from ...estimator.map_management import hypotheses, managed_slam, map_editor
+from ..logs import ground_truth, recording, slamlog
 from .filter_settings import one_blas_thread, refuse_large_map
 from .trace import DecisionRecorder, MapEstimate, RunDecisions, RunTrace
 
@@ -58,7 +51,7 @@ class MapChanges(NamedTuple):
 class Replay:
     """An estimator's run over a log."""
 
-    log: SlamLog
+    log: slamlog.SlamLog
     """The log."""
     trace: RunTrace
     """The estimator's belief after every step."""
@@ -77,7 +70,7 @@ class Replay:
 
 
 def replay(
-    log: SlamLog,
+    log: slamlog.SlamLog,
     estimator: SlamEstimator,
     *,
     name: str | None = None,
@@ -135,7 +128,7 @@ def replay(
     ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1, ...
     """
     refuse_large_map(log, estimator)
-    steps = list(steps_of(log))
+    steps = list(recording.steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     show_truth = _truth_source(estimator, log, times)
     recorder = RunRecorder(estimator, len(steps), _history(estimator, keep_history))
@@ -146,9 +139,12 @@ def replay(
             with _naming_time(log, step):
                 show_truth(number)
                 for row in step.motions:
-                    for odometry, dt in predictions(row, log.motion):
+                    for odometry, dt in recording.predictions(row, log.motion):
                         estimator.predict(odometry, dt)
-                predicted, report = marginal_without_joining(estimator, ()), None
+                predicted, report = (
+                    map_editor.marginal_without_joining(estimator, ()),
+                    None,
+                )
                 if step.scan is not None:
                     report = estimator.update(step.scan.measurements, _ids(step.scan))
                     decisions.add(report, ground_truth.true_ids_of(step.scan))
@@ -185,13 +181,13 @@ def _name_of(estimator: SlamEstimator, given: str | None) -> str:
     """Return a given name, or that of the class; of a managed filter, the filter's."""
     if given:
         return given
-    if isinstance(estimator, ManagedSlam | HypothesisSlam):
+    if isinstance(estimator, managed_slam.ManagedSlam | hypotheses.HypothesisSlam):
         return type(estimator.filter).__name__
     return type(estimator).__name__
 
 
 def _truth_source(
-    estimator: SlamEstimator, log: SlamLog, times: Array
+    estimator: SlamEstimator, log: slamlog.SlamLog, times: Array
 ) -> Callable[[int], None]:
     """Return the function that passes the truth of a step to an observing estimator.
 
@@ -209,7 +205,7 @@ def _truth_source(
 
 
 @contextlib.contextmanager
-def _naming_time(log: SlamLog, step: Step) -> Iterator[None]:
+def _naming_time(log: slamlog.SlamLog, step: recording.Step) -> Iterator[None]:
     """Name the time of a step in the estimator's errors."""
     try:
         yield
@@ -219,7 +215,7 @@ def _naming_time(log: SlamLog, step: Step) -> Iterator[None]:
         raise kind(f"{log.name}, t = {step.t:g}: {error}") from error
 
 
-def _ids(scan: Scan) -> list[int] | None:
+def _ids(scan: slamlog.Scan) -> list[int] | None:
     return None if scan.landmark_ids is None else scan.landmark_ids.tolist()
 
 
@@ -266,24 +262,21 @@ class RunRecorder:
         self._predicted.put(step, predicted)
         updated = predicted
         if report is not None:
-            updated = marginal_without_joining(self._slam, ())
+            updated = map_editor.marginal_without_joining(self._slam, ())
             self._nis[step] = report.nis
             self._dof[step] = report.degrees_of_freedom
             self._count(report)
             seen = (*report.associated_ids, *report.added_ids)
             self.last_seen |= dict.fromkeys(seen, step)
-            self._keep_new(mapped_ids(self._slam))
+            self._keep_new(map_editor.mapped_ids(self._slam))
         self._updated.put(step, updated)
-        if step == self._steps - 1:
+        is_last = step == self._steps - 1
+        if is_last:
             self.belief = self._slam.belief()
-            if isinstance(
-                self._slam, SupportsJoin
-            ):  # the joined map corrects the pose too
-                self._updated.put(step, self.belief)
-        if step == self._steps - 1 or self._history.is_due(step, self._ids):
-            self._history.append(view_map(self._slam))
-        else:
-            self._history.leave_out()
+            if isinstance(self._slam, SupportsJoin):
+                self._updated.put(step, self.belief)  # the joined map corrects the pose
+        is_due = is_last or self._history.is_due(step, self._ids)
+        self._history.append(map_editor.view_map(self._slam) if is_due else None)
 
     def counts(self) -> ReadingCounts:
         """Count the readings."""
@@ -305,7 +298,7 @@ class RunRecorder:
         self,
         name: str,
         times: Array,
-        log: SlamLog,
+        log: slamlog.SlamLog,
         identities: Mapping[int, int] | None = None,
     ) -> RunTrace:
         """Return the trace of the run; identities are those of its own landmarks."""
@@ -345,7 +338,7 @@ class RunRecorder:
         if ids == self._ids:
             return
         new = [i for i in ids if i not in self._first]
-        belief = marginal_without_joining(self._slam, new)
+        belief = map_editor.marginal_without_joining(self._slam, new)
         if self._first_covariance is None:
             self._first_covariance = belief.covariance
         pairs = zip(belief.landmarks, belief.landmark_covariances, strict=True)
@@ -385,37 +378,30 @@ class MapHistory(Sequence[MapEstimate]):
     """
 
     def __init__(self, most: int | None = None) -> None:
-        self._most = most
-        self._stride = 1
-        self._kept: dict[int, MapEstimate] = {}
+        most_steps = math.inf if most is None else most
+        self._kept = ThinnedSteps[MapEstimate](most_steps, math.inf, last=-1)
         self._first_map: int | None = None
         self._length = 0
 
-    def append(self, belief: Belief | MapView) -> None:
-        """Append the belief after the next step."""
+    def append(self, belief: Belief | MapView | None) -> None:
+        """Append the belief after the next step; None if it is neither due nor last."""
         step = self._length
+        self._length += 1
+        if belief is None:
+            return
         ids = belief.ids if isinstance(belief, MapView) else belief.landmark_ids
-        self._latest = MapEstimate(
-            np.array(ids, dtype=np.int64),
-            belief.landmarks.copy(),
-            belief.landmark_covariances,
-        )
-        is_due = self.is_due(step, ids)
+        means, covariances = belief.landmarks.copy(), belief.landmark_covariances
+        self._latest = MapEstimate(np.array(ids, dtype=np.int64), means, covariances)
         if ids and self._first_map is None:
             self._first_map = step
-        if is_due:
-            self._kept[step] = self._latest
-            self._thin()
-        self._length += 1
-
-    def leave_out(self) -> None:
-        """Skip the next step, which must be neither due nor the last."""
-        self._length += 1
+            self._kept.always.add(step)
+        if self._kept.is_due(step):
+            self._kept.put(step, self._latest, size=0)
 
     def is_due(self, step: int, ids: Sequence[int]) -> bool:
         """Whether the map of a step will be kept; ``ids`` are the landmarks in it."""
         is_first_map = self._first_map is None and len(ids) > 0
-        return is_first_map or self._is_due(step)
+        return is_first_map or self._kept.is_due(step)
 
     @overload
     def __getitem__(self, index: int) -> MapEstimate: ...
@@ -428,21 +414,67 @@ class MapHistory(Sequence[MapEstimate]):
         step = range(self._length)[index]
         if step == self._length - 1:
             return self._latest
-        kept = list(self._kept)
-        return self._kept[kept[bisect_right(kept, step) - 1]]
+        kept = list(self._kept.items)
+        return self._kept.items[kept[bisect_right(kept, step) - 1]]
 
     def __len__(self) -> int:
         """Return the number of steps, kept or not."""
         return self._length
 
-    def _is_due(self, step: int) -> bool:
-        return step % self._stride == 0 or step == self._first_map
 
-    def _thin(self) -> None:
-        """Drop every second map if there are too many."""
-        if self._most is None or len(self._kept) <= self._most + 1:
-            return
-        self._stride *= 2
-        self._kept = {
-            step: kept for step, kept in self._kept.items() if self._is_due(step)
-        }
+_Item = TypeVar("_Item")
+
+
+class ThinnedSteps(Generic[_Item]):
+    """Items by step; where they become too many, every second one is dropped.
+
+    Parameters
+    ----------
+    most_steps : int
+        Largest number of items, the last one not counted.
+    most_size : int
+        Largest sum of their sizes; at least two items are kept.
+    last : int
+        The last step, which is always kept.
+
+    Attributes
+    ----------
+    items : dict of int to item
+        The kept items, by their steps in ascending order.
+    stride : int
+        Steps between two items.
+    always : set of int
+        Steps whose items are kept, whatever the stride.
+
+    Examples
+    --------
+    >>> kept = ThinnedSteps(most_steps=3, most_size=100, last=8)
+    >>> for step in range(9):
+    ...     if kept.is_due(step):
+    ...         kept.put(step, f"map {step}", size=1)
+    >>> list(kept.items), kept.stride
+    ([0, 4, 8], 4)
+    """
+
+    def __init__(self, most_steps: float, most_size: float, last: int) -> None:
+        self._most_steps, self._most_size = most_steps, most_size
+        self._sizes: dict[int, int] = {}
+        self._total = 0
+        self.items: dict[int, _Item] = {}
+        self.stride, self.always = 1, {last}
+
+    def is_due(self, step: int) -> bool:
+        """Whether the item of a step will be kept."""
+        return step % self.stride == 0 or step in self.always
+
+    def put(self, step: int, item: _Item, size: int) -> None:
+        """Keep the item of a step that is due."""
+        self.items[step], self._sizes[step] = item, size
+        self._total += size
+        while len(self.items) > 2 and (
+            len(self.items) > self._most_steps + 1 or self._total > self._most_size
+        ):
+            self.stride *= 2
+            for old in [k for k in self.items if not self.is_due(k)]:
+                del self.items[old]
+                self._total -= self._sizes.pop(old)

@@ -146,10 +146,6 @@ def _nees(smoothed: SmoothedLog) -> dict[str, Any] | None:
     drive, known = smoothed.drive, np.isfinite(truth).all(axis=1)
     if not known.any():
         return None
-    values = nees.pose_nees(
-        truth[known],
-        drive.poses[known],
-        drive.pose_covariances[known],
-        frame="invariant",
-    )
+    poses, covariances = drive.poses[known], drive.pose_covariances[known]
+    values = nees.pose_nees(truth[known], poses, covariances, frame="invariant")
     return summary.nees_table(values, "invariant")

@@ -95,12 +95,20 @@ class RunTrace:
                 f"landmark_history must have {steps} entries, "
                 f"got {len(self.landmark_history)}"
             )
-        for name, shape in _shapes(steps, n).items():
-            value = getattr(self, name)
-            if value is not None and np.shape(value) != shape:
-                raise ValueError(
-                    f"{name} must have shape {shape}, got {np.shape(value)}"
-                )
+        for shape, names in (
+            ((steps,), "t nis nis_dof"),
+            ((steps, 3), "predicted_poses poses true_poses"),
+            ((steps, 3, 3), "predicted_pose_covariances pose_covariances"),
+            ((n, 2), "landmarks first_landmarks true_landmarks"),
+            ((n, 2, 2), "first_landmark_covariances"),
+            ((3 + 2 * n, 3 + 2 * n), "final_covariance"),
+        ):
+            for name in names.split():
+                value = getattr(self, name)
+                if value is not None and np.shape(value) != shape:
+                    raise ValueError(
+                        f"{name} must have shape {shape}, got {np.shape(value)}"
+                    )
 
     @property
     def last_step(self) -> int:
@@ -123,25 +131,6 @@ class RunTrace:
             ids = self.map_at(step).ids.tolist()
             first.update({i: step for i in ids if i in first})
         return np.array(list(first.values()), dtype=np.int64)
-
-
-def _shapes(steps: int, n: int) -> dict[str, tuple[int, ...]]:
-    size = 3 + 2 * n
-    return {
-        "t": (steps,),
-        "predicted_poses": (steps, 3),
-        "predicted_pose_covariances": (steps, 3, 3),
-        "poses": (steps, 3),
-        "pose_covariances": (steps, 3, 3),
-        "true_poses": (steps, 3),
-        "nis": (steps,),
-        "nis_dof": (steps,),
-        "landmarks": (n, 2),
-        "first_landmarks": (n, 2),
-        "first_landmark_covariances": (n, 2, 2),
-        "true_landmarks": (n, 2),
-        "final_covariance": (size, size),
-    }
 
 
 NAMES = (*association_scores.AssociationScores._fields, "precision", "recall")

@@ -117,27 +117,17 @@ def generate_trajectories(
     world = load_scenario(scenario)
     episodes, seed = integer("episodes", episodes, 1), integer("seed", seed, 0)
     integer("the seed of the last episode", seed + episodes - 1, 0)
-    if episodes_per_shard is None:
-        episodes_per_shard = default_episodes_per_shard(
-            world, beliefs=estimator is not None
-        )
-    episodes_per_shard = integer("episodes_per_shard", episodes_per_shard, 1)
+    size = episodes_per_shard
+    if size is None:
+        size = default_episodes_per_shard(world, beliefs=estimator is not None)
+    size = integer("episodes_per_shard", size, 1)
     if controller not in CONTROLLERS:
         raise ValueError(unknown_choice("controller", controller, CONTROLLERS))
     layout = trajectory_format(format)
     layout.check(world)
     smallest = checked_smallest_std(format, layout, smallest_std)
     check_estimator(world, format, layout, estimator)
-    job = Job(
-        world,
-        controller,
-        seed,
-        episodes,
-        episodes_per_shard,
-        format,
-        smallest,
-        estimator,
-    )
+    job = Job(world, controller, seed, episodes, size, format, smallest, estimator)
     versions = versions_of(job)
     serial = jobs is None and backend is None
     workers = None if serial else engage_workers(jobs, backend)

@@ -17,8 +17,8 @@ from typing import Any, Literal
 
 from ...sim_configs import Scenario
 from ...sim_configs.atomic_file import replace_when_written
+from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import scenario_text
-from ...suggestions import closest
 from ..jobs import blocks_of, sha256_of
 from ..runs.filter_settings import integer
 from .formats import trajectory_format
@@ -304,8 +304,7 @@ def load_trajectories(
         If episodes are missing, with their number and the way to generate them.
     """
     if damaged not in _DAMAGED:
-        hint = closest(str(damaged), _DAMAGED)
-        raise ValueError(f"damaged must be 'raise' or 'skip', got {damaged!r}{hint}")
+        raise ValueError(unknown_choice("damaged", damaged, _DAMAGED))
     dataset = TrajectoryDataset(Path(path), damaged)
     if not dataset.manifest.is_complete:
         warnings.warn(_unfinished(dataset), stacklevel=2)

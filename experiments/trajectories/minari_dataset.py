@@ -61,12 +61,8 @@ def write(trajectories: Sequence[Trajectory], path: Path) -> None:
 def read(path: Path) -> Iterator[Trajectory]:
     """Yield the trajectories of a shard; see `TrajectoryFormat`."""
     data = minari.MinariDataset(path / "data")
-    storage = data.storage
-    for episode, about in zip(
-        data.iterate_episodes(),
-        storage.get_episode_metadata(range(len(data))),
-        strict=True,
-    ):
+    abouts = data.storage.get_episode_metadata(range(len(data)))
+    for episode, about in zip(data.iterate_episodes(), abouts, strict=True):
         yield _trajectory(episode, about)
 
 

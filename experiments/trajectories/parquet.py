@@ -48,13 +48,8 @@ def read(path: Path) -> Iterator[Trajectory]:
 
 
 def _write_table(table: Any, path: Path, rows_per_group: int) -> None:
-    pq.write_table(
-        table,
-        path,
-        row_group_size=rows_per_group,
-        compression="zstd",
-        use_dictionary=False,
-    )
+    coding = {"compression": "zstd", "use_dictionary": False}
+    pq.write_table(table, path, row_group_size=rows_per_group, **coding)
 
 
 def _episode_table(trajectories: Sequence[Trajectory]) -> Any:

@@ -161,15 +161,11 @@ class _Writer:
         ends = pose[:2] + readings[:, 1:] * directions
         lines = [_raised(np.stack([pose[:2], end])) for end in ends]
         colours = [self._colour if code in _GOOD else _ALARM for code in frame.outcomes]
-        self._log(
-            f"world/{self._name}/readings",
-            self._rerun.LineStrips3D(
-                lines,
-                colors=colours or None,
-                labels=[run_frames.OUTCOMES[code] for code in frame.outcomes] or None,
-                show_labels=False,
-            ),
+        labels = [run_frames.OUTCOMES[code] for code in frame.outcomes]
+        strips = self._rerun.LineStrips3D(
+            lines, colors=colours or None, labels=labels or None, show_labels=False
         )
+        self._log(f"world/{self._name}/readings", strips)
 
     def _log_correlations(self, step: int) -> None:
         found = self._run.frames.correlations.get(step)

@@ -12,7 +12,7 @@ import json
 import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -28,6 +28,7 @@ from ..figures.style import deviations, page_environment
 from ..logs.ground_truth import true_ids_of
 from ..logs.recording import steps_of
 from ..logs.slamlog import Scan, SlamLog
+from ..runs.log_replay import ThinnedSteps
 from ..runs.summary import pose_nees
 from ..runs.trace import RunTrace
 
@@ -90,19 +91,16 @@ def _page(log: SlamLog, runs: Sequence[ViewedRun], walls: list[list[float]]) -> 
         "bands": {"nees": [q / 3 for q in chi_square_limits(3, (1 - _SHARE) / 2)]},
         "arrays": packed.table,
     }
-    return (
-        page_environment(_PARTS)
-        .get_template("page.html")
-        .render(
-            title=f"{log.name}: {', '.join(names)}",
-            notes=_notes(steps, runs),
-            several=len(runs) > 1,
-            style=Markup((_PARTS / "page.css").read_text("utf-8")),
-            script=Markup(script),
-            script_hash=_hash(f"\n{script}\n"),
-            facts=_inline_json(facts),
-            arrays=packed.text(),
-        )
+    template = page_environment(_PARTS).get_template("page.html")
+    return template.render(
+        title=f"{log.name}: {', '.join(names)}",
+        notes=_notes(steps, runs),
+        several=len(runs) > 1,
+        style=Markup((_PARTS / "page.css").read_text("utf-8")),
+        script=Markup(script),
+        script_hash=_hash(f"\n{script}\n"),
+        facts=_inline_json(facts),
+        arrays=packed.text(),
     )
 
 
@@ -550,52 +548,3 @@ def map_at(run: ViewedRun, step: int) -> MapFrame:
     return frame._replace(
         ids=ids.astype(np.int64), means=means, covariances=covariances
     )
-
-
-_Item = TypeVar("_Item")
-
-
-class ThinnedSteps(Generic[_Item]):
-    """Items by step; where they become too many, every second one is dropped.
-
-    Parameters
-    ----------
-    most_steps : int
-        Largest number of items, the last one not counted.
-    most_size : int
-        Largest sum of their sizes; at least two items are kept.
-    last : int
-        The last step, which is always kept.
-
-    Examples
-    --------
-    >>> kept = ThinnedSteps(most_steps=3, most_size=100, last=8)
-    >>> for step in range(9):
-    ...     if kept.is_due(step):
-    ...         kept.put(step, f"map {step}", size=1)
-    >>> list(kept.items), kept.stride
-    ([0, 4, 8], 4)
-    """
-
-    def __init__(self, most_steps: int, most_size: int, last: int) -> None:
-        self._most_steps, self._most_size, self._last = most_steps, most_size, last
-        self._sizes: dict[int, int] = {}
-        self.items: dict[int, _Item] = {}
-        """The kept items, by their steps in ascending order."""
-        self.stride = 1
-        """Steps between two items."""
-
-    def is_due(self, step: int) -> bool:
-        """Whether the item of a step will be kept."""
-        return step % self.stride == 0 or step == self._last
-
-    def put(self, step: int, item: _Item, size: int) -> None:
-        """Keep the item of a step that is due."""
-        self.items[step], self._sizes[step] = item, size
-        while len(self.items) > 2 and (
-            len(self.items) > self._most_steps + 1
-            or sum(self._sizes.values()) > self._most_size
-        ):
-            self.stride *= 2
-            for old in [k for k in self.items if not self.is_due(k)]:
-                del self.items[old], self._sizes[old]

@@ -200,20 +200,11 @@ class KernelCache:
 
     def __init__(self, kernel: Any) -> None:
         self._kernel = kernel
-        self.enabled = True
 
     @property
     def cache_path(self) -> str:
         """The folder, for numba's statistics."""
         return str(cache_folder())
-
-    def enable(self) -> None:
-        """Use the folder."""
-        self.enabled = True
-
-    def disable(self) -> None:
-        """Neither read nor write the folder."""
-        self.enabled = False
 
     def flush(self) -> None:
         """Do nothing: no file can be out of date."""
@@ -235,7 +226,7 @@ class KernelCache:
         return found
 
     def _loaded(self, signature: Any, target_context: Any) -> Any:
-        if not self.enabled or self._fingerprint is None:
+        if self._fingerprint is None:
             return None
         target_context.refresh()
         name = self._file_name(signature, target_context.codegen())
@@ -250,7 +241,7 @@ class KernelCache:
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Keep the compiled code for the types of a call."""
-        if not self.enabled or self._fingerprint is None:
+        if self._fingerprint is None:
             return
         if result.library.has_dynamic_globals or result.lifted:
             return  # it holds addresses in the memory of this process

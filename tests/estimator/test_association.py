@@ -61,7 +61,9 @@ def dense_distance(mean, P, slot, reading, noise):
     H = np.zeros((2, len(mean)))
     H[:, :3] = expected.jacobian_pose[0]
     H[:, 3 + 2 * slot : 5 + 2 * slot] = expected.jacobian_landmark[0]
-    S = H @ P @ H.T + sensor_noise(noise, reading[1])
+    C, h = H @ P @ H.T, expected.measurement[0, 1]
+    share = C[1, 1] / (C[1, 1] + sensor_noise(noise, h)[1, 1])
+    S = C + sensor_noise(noise, h + share * (reading[1] - h))
     nu = reading - expected.measurement[0]
     nu[0] = wrap_angle(nu[0])
     return nu @ np.linalg.solve(S, nu), np.linalg.slogdet(S).logabsdet

@@ -8,7 +8,14 @@ from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.association import scan_assignments
 from slamgym.estimator.interface import MapView
-from slamgym.estimator.map_management.hypotheses import FilterPool, HypothesisSlam
+from slamgym.estimator.map_management.hypotheses import (
+    OVERLAP,
+    PER_BASIN,
+    FilterPool,
+    Hypothesis,
+    HypothesisSlam,
+    distinct,
+)
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.estimator.map_management.map_editor import is_near
 from slamgym.estimator.models.bearing_range import predict_measurement
@@ -487,3 +494,52 @@ def test_a_loop_is_not_closed_for_good_by_one_reading_of_clutter():
     stds = [np.sqrt(h.slam.map_view().covariance[0, 0]) for h in slam.hypotheses]
     assert len(stds) == 2
     assert max(stds) > 2 * min(stds)
+
+
+def standing(x, std):
+    """Return a filter without landmarks at a place on the x axis."""
+    slam = ManagedSlam(EkfSlam, (0.1, 0.1, 0.1), (0.1, 0.1))
+    slam.reset((x, 0.0, 0.0), (std, 0.1, 0.1))
+    return slam
+
+
+def bhattacharyya(x, std, other, other_std):
+    """Return −ln ∫ √(p q) of two Gaussians, summed over a fine grid."""
+    at = np.linspace(-20.0, 20.0, 40_001)
+    p, q = (
+        np.exp(-(((at - mean) / s) ** 2) / 2) / (s * np.sqrt(2 * np.pi))
+        for mean, s in ((x, std), (other, other_std))
+    )
+    return -np.log(np.sqrt(p * q).sum() * (at[1] - at[0]))
+
+
+@pytest.mark.parametrize(
+    ("gap", "ratio"), [(1.9, 1.0), (2.1, 1.0), (0.0, 5.1), (0.0, 5.7), (-1.5, 2.0)]
+)
+def test_variants_of_one_pose_leave_room_for_another(gap, ratio):
+    std, count = 0.2, PER_BASIN + 1
+    first = [Hypothesis(k, standing(1e-3 * k, std)) for k in range(PER_BASIN)]
+    for k, hypothesis in enumerate(first):  # they differ by what is not confirmed
+        hypothesis.slam.update([(1.0 * row, 3.0) for row in range(k + 1)])
+    other = Hypothesis(9.0, standing(gap * std, ratio * std))
+    is_variant = bhattacharyya(0.0, std, gap * std, ratio * std) <= OVERLAP
+    kept = distinct([*first, other], most=10)
+    assert len(kept) == count - is_variant
+    assert (other in kept) is not is_variant
+    assert distinct([*first, other], most=2) == first[:2]
+
+
+def test_readings_that_a_hypothesis_does_not_explain_cost_their_poisson_probability():
+    noise = (0.01, 0.01, 0.01), (0.02, 0.1)
+    free, told = (
+        ManagedSlam(EkfSlam, *noise, management={"association": "hypotheses", **more})
+        for more in ({}, {"density": 0.1})
+    )
+    for scan in ([(0.3, 4.0), (2.0, 3.0)], [(-2.0, 5.0)], [(1.0, 2.0)]):
+        density, none = free.candidates.density, np.empty((0, 2))
+        expected = 2 * density.readings / density.scans
+        assert free.alternatives(none)[0][0] == pytest.approx(expected)
+        assert told.alternatives(none)[0][0] == 0
+        free.update(scan)
+        told.update(scan)
+    assert expected > 0.5

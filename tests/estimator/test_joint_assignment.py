@@ -12,6 +12,7 @@ from slamgym.estimator.association.scan_assignments import (
     predicted_readings,
 )
 from slamgym.estimator.kernels.assignment_search import (
+    SURE,
     UNPAIRED,
     Problem,
     largest_change,
@@ -34,7 +35,7 @@ def random_problem(rng, *, pairs_first=False):
     return Problem(
         innovations_of(readings, expected),
         joint,
-        rng.uniform(0.1, 0.5, (rows, 2)) ** 2,
+        rng.uniform(0.1, 0.5, (rows, landmarks, 2)) ** 2,
         rng.random((rows, landmarks)) < 0.8,
         np.zeros(rows) if pairs_first else MISSING + rng.uniform(-1, 1, rows),
         np.inf,
@@ -46,7 +47,7 @@ def random_problem(rng, *, pairs_first=False):
 def squared_and_logdet(problem, rows, marks):
     """Return νᵀ S⁻¹ ν and ln det S of some pairs, the dense way."""
     at = np.array([(2 * j, 2 * j + 1) for j in marks], dtype=int).ravel()
-    S = problem.joint[np.ix_(at, at)] + np.diag(problem.variances[rows].ravel())
+    S = problem.joint[np.ix_(at, at)] + np.diag(problem.variances[rows, marks].ravel())
     nu = problem.innovations[rows, marks].ravel()
     return nu @ np.linalg.solve(S, nu), np.linalg.slogdet(S)[1]
 
@@ -148,7 +149,7 @@ def test_the_limit_of_nodes_returns_the_best_so_far_and_says_so():
     problem = Problem(
         innovations_of(expected + rng.normal(scale=0.2, size=(rows, 2)), expected),
         0.2 * np.eye(2 * landmarks),
-        np.full((rows, 2), 0.04),
+        np.full((rows, landmarks, 2), 0.04),
         np.ones((rows, landmarks), dtype=bool),
         np.full(rows, 2.0),
         25.0,
@@ -194,19 +195,21 @@ def conditional_distance(problem, rows, marks, row, mark):
         C[at][:, 2 * mark : 2 * mark + 2],
     )
     nu = problem.innovations[row, mark]
-    S = own + np.diag(problem.variances[row])
+    Q = np.diag(problem.variances[row, mark])
+    S = own + Q
     if len(rows):
-        whole = C[np.ix_(at, at)] + np.diag(problem.variances[rows].ravel())
+        whole = C[np.ix_(at, at)] + np.diag(problem.variances[rows, marks].ravel())
         gain = np.linalg.solve(whole, cross).T
         nu = nu - gain @ problem.innovations[rows, marks].ravel()
         S = S - gain @ cross
-    return float(nu @ np.linalg.solve(S, nu))
+    is_sure = np.linalg.det(S) <= SURE * np.linalg.det(Q)
+    return float(nu @ np.linalg.solve(S, nu)) if is_sure else np.inf
 
 
 def posterior(P, H, problem, rows, marks):
     """Return the shift of the mean and the covariance after some pairs, dense."""
     at = np.array([(2 * j, 2 * j + 1) for j in marks], dtype=int).ravel()
-    S = problem.joint[np.ix_(at, at)] + np.diag(problem.variances[rows].ravel())
+    S = problem.joint[np.ix_(at, at)] + np.diag(problem.variances[rows, marks].ravel())
     gain = P @ H[at].T @ np.linalg.inv(S)
     return gain @ problem.innovations[rows, marks].ravel(), P - gain @ H[at] @ P
 
@@ -218,7 +221,7 @@ def linear_problem(rng, rows=4, landmarks=4):
     problem = Problem(
         rng.normal(scale=0.5, size=(rows, landmarks, 2)),
         H @ P @ H.T,
-        rng.uniform(0.1, 0.5, (rows, 2)) ** 2,
+        rng.uniform(0.1, 0.5, (rows, landmarks, 2)) ** 2,
         np.ones((rows, landmarks), dtype=bool),
         np.zeros(rows),
         np.inf,
@@ -249,7 +252,7 @@ def test_the_bound_on_the_change_by_some_pairs_holds_and_is_not_far_off():
 
 def test_the_bound_on_the_change_by_one_pair_is_that_of_its_equation():
     _, _, problem = linear_problem(np.random.default_rng(3), rows=1, landmarks=1)
-    nu, Q = problem.innovations[0, 0], np.diag(problem.variances[0])
+    nu, Q = problem.innovations[0, 0], np.diag(problem.variances[0, 0])
     S = problem.joint + Q
     left = np.linalg.eigvals(np.linalg.solve(S, Q)).real.min()  # 1 − λ
     shift = np.sqrt((1 - left) * (nu @ np.linalg.solve(S, nu)) / left)

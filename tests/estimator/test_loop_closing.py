@@ -6,9 +6,12 @@ import pytest
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import LandmarkPolicy, make_estimator
 from slamgym.estimator.association.constellations import Constellations
+from slamgym.estimator.interface import MapView
+from slamgym.estimator.map_management.loop_closing import LoopCloser
 from slamgym.estimator.map_management.policy import as_policy
 from slamgym.sim_configs import action_sequence, load_scenario
 
+EIGHT = {"least": 8, "always": True}
 POLICY = {"association": "joint", "backdate": True, "constellations": True}
 OPTIONS = {
     "invariant": {},
@@ -92,7 +95,7 @@ def lost_and_seen_again(scans=3, given=None, name="invariant", **changes):
         name,
         motion_std=(0.01, 0.01, 0.005),
         measurement_std=(0.01, 0.03),
-        management={"constellations": True, "confirm": (2, 3)} | changes,
+        management={"constellations": {"always": True}, "confirm": (2, 3)} | changes,
         **OPTIONS[name],
     )
     for _ in range(3):
@@ -147,8 +150,8 @@ def test_a_saved_large_map_continues_bit_for_bit_through_the_merge(name):
 
 
 def test_doubtful_landmarks_are_part_of_the_saved_state():
-    slam, _, where = lost_and_seen_again(constellations={"least": 8})
-    copy, _, _ = lost_and_seen_again(scans=0, constellations={"least": 8})
+    slam, _, where = lost_and_seen_again(constellations=EIGHT)
+    copy, _, _ = lost_and_seen_again(scans=0, constellations=EIGHT)
     copy.load_state_dict(slam.state_dict())
     two = readings_of(PLACE[:2], where)
     merged = [one.update(two, [0, 1]).merged_ids for one in (slam, copy)]
@@ -156,14 +159,18 @@ def test_doubtful_landmarks_are_part_of_the_saved_state():
 
 
 def test_readings_of_lost_landmarks_are_not_associated_with_them():
-    slam, merged, _ = lost_and_seen_again(constellations={"least": 8})
+    slam, merged, _ = lost_and_seen_again(constellations=EIGHT)
     assert merged == []
     assert len(slam.landmark_ids) == 14
 
 
 def test_lost_landmarks_are_not_missing():
     view = {"max_range": 20.0}
-    changes = {"view": view, "remove_after": 2, "constellations": {"least": 8}}
+    changes = {
+        "view": view,
+        "remove_after": 2,
+        "constellations": EIGHT,
+    }
     slam, _, _ = lost_and_seen_again(scans=4, **changes)
     assert len(slam.landmark_ids) == 14
 
@@ -175,8 +182,7 @@ def test_landmarks_that_come_with_an_identity_are_not_merged():
 
 
 def test_a_doubtful_landmark_is_merged_once_the_older_one_is_found_again():
-    few = {"least": 8}
-    slam, merged, where = lost_and_seen_again(constellations=few)
+    slam, merged, where = lost_and_seen_again(constellations=EIGHT)
     assert merged == []
     report = slam.update(readings_of(PLACE[:2], where), [0, 1])  # identities are given
     assert set(report.merged_ids) == {(i, i + 7) for i in range(7)}
@@ -204,3 +210,15 @@ def test_constellations_are_given_by_their_fields_true_or_none():
         as_policy({"constellations": {"leest": 8}})
     with pytest.raises(ValueError, match="constellations must be"):
         LandmarkPolicy(constellations=6)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("local", [2, 8])
+def test_landmarks_are_lost_only_where_a_constellation_can_be_recognised(local):
+    count = 14 + local
+    mean = np.append(np.zeros(3), np.arange(2.0 * count))
+    variance = np.repeat([9.0] * 14 + [0.01] * local, 2)
+    view = MapView(mean, np.diag(np.append(np.zeros(3), variance)), tuple(range(count)))
+    always = LoopCloser(Constellations(always=True)).lost(view)
+    assert always.tolist() == [True] * 14 + [False] * local
+    found = LoopCloser(Constellations()).lost(view)
+    assert found.tolist() == (always.tolist() if local >= 6 else [False] * count)

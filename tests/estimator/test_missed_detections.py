@@ -1,5 +1,7 @@
 """Costs of landmarks that a scan misses, and of readings that fit tentative ones."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from slamgym.estimator.association.scan_assignments import (
     predicted_readings,
 )
 from slamgym.estimator.association.scan_association import (
+    HIDDEN,
     RINGS,
     SECTORS,
     SUREST,
@@ -27,30 +30,44 @@ def random_view(rng, landmarks=8):
 
 
 def plain_count(view, slots, detections):
-    """Return cost and counts from the dense expected readings, cell by cell."""
+    """Return cost and counts from the dense expected readings, node by node."""
     expected, joint = predicted_readings(
         view.mean, view.covariance, np.arange(len(view.ids))
     )
-    cost, after = 0.0, Detections(detections.seen.copy(), detections.expected.copy())
+    seen, tries = detections.seen, detections.expected
+    ring = (seen.sum(axis=0) + 1) / (tries.sum(axis=0) + 2)
+    sector = (seen.sum(axis=1) + 1) / (tries.sum(axis=1) + 2)
+    shares = (seen + 2 * np.minimum(sector[:, None], ring)) / (tries + 2)
+    shares = np.minimum(shares, SUREST)
+    size = np.array([2 * np.pi / SECTORS, LONGEST / RINGS])
+    cost, missed = 0.0, {}
+    after = Detections(seen.copy(), tries.copy(), missed)
     for j, (bearing, distance) in enumerate(expected):
-        turn, aside = 2 * np.sqrt(np.diagonal(joint)[2 * j : 2 * j + 2])
-        if distance + aside >= LONGEST or turn > WIDEST:
-            continue
+        std = np.sqrt(np.diagonal(joint)[2 * j : 2 * j + 2])
         middle = np.array([bearing + np.pi, distance])
-        size = np.array([2 * np.pi / SECTORS, LONGEST / RINGS])
-        margin = np.array([turn, aside])
-        low, high = (middle - margin) // size, (middle + margin) // size
-        shares = [
-            (detections.seen[a % SECTORS, b] + 1)
-            / (detections.expected[a % SECTORS, b] + 2)
-            for a in np.arange(low[0], high[0] + 1).astype(int)
-            for b in np.arange(max(low[1], 0), high[1] + 1).astype(int)
-        ]
-        if j not in slots:
-            cost -= 2 * np.log(1 - min(*shares, SUREST))
         a, b = (middle // size).astype(int)
-        after.expected[a % SECTORS, b] += 1
-        after.seen[a % SECTORS, b] += j in slots
+        if j in slots:
+            cost -= 2 * np.log(shares[a % SECTORS, min(b, RINGS - 1)])
+        is_sure = distance + 2 * std[1] < LONGEST and 2 * std[0] <= WIDEST
+        if is_sure:
+            after.expected[a % SECTORS, b] += 1
+            after.seen[a % SECTORS, b] += j in slots
+        if j in slots or distance - 2 * std[1] >= LONGEST:
+            continue
+        found = []
+        for across, along in product((-2, 0, 2), repeat=2):
+            node = middle + std * (across, along)
+            cell = int(node[0] // size[0]) % SECTORS, int(abs(node[1]) // size[1])
+            weight = np.prod([1 / 8 if step else 3 / 4 for step in (across, along)])
+            found.append((weight, shares[cell] if cell[1] < RINGS else 0.0))
+        before = detections.missed.get(j, 1.0)
+        left = before * (1 - min(share for _, share in found))
+        if not is_sure:
+            left = min(before, 1 - sum(weight * share for weight, share in found))
+        cost -= 2 * np.log(
+            (HIDDEN + (1 - HIDDEN) * left) / (HIDDEN + (1 - HIDDEN) * before)
+        )
+        missed[j] = left
     return cost, after
 
 
@@ -60,26 +77,48 @@ def test_missed_landmarks_cost_what_the_dense_equations_say():
     for _ in range(100):
         view, slots = random_view(rng), rng.permutation(8)[:4]
         counts = rng.integers(0, 30, (2, SECTORS, RINGS)).astype(float)
-        before = Detections(counts.min(axis=0), counts.max(axis=0))
+        earlier = {j: rng.uniform() for j in range(0, 8, 2)}
+        before = Detections(counts.min(axis=0), counts.max(axis=0), earlier)
         cost, after = before.after(view, slots, LONGEST)
         expected_cost, expected = plain_count(view, slots, before)
         assert cost == pytest.approx(expected_cost, rel=1e-9)
         np.testing.assert_array_equal(after.seen, expected.seen)
         np.testing.assert_array_equal(after.expected, expected.expected)
+        for j in set(range(8)) - set(slots.tolist()):
+            left = expected.missed.get(j, before.missed.get(j, 1.0))
+            assert after.missed.get(j, 1.0) == pytest.approx(left, rel=1e-9)
+        assert set(after.missed).isdisjoint(slots.tolist())
         total += cost
     assert total > 100  # many were expected
 
 
-@pytest.mark.parametrize(
-    ("place", "std"),
-    [((5.9, 0.0), 0.2), ((7.0, 0.0), 0.01), ((3.0, 0.0), 2.0)],
-    ids=["at the edge of the range", "beyond the range", "somewhere"],
-)
-def test_a_landmark_that_may_be_out_of_view_costs_nothing(place, std):
+def cost_of_misses(place, std, scans):
+    """Return what each of some scans costs that do not show a landmark."""
     mean, covariance = np.append(np.zeros(3), place), np.diag([0, 0, 0, std, std]) ** 2
-    view = MapView(mean, covariance, (0,))
-    cost, _ = Detections.none().after(view, np.array([-1]), LONGEST)
-    assert cost == 0
+    view, detections, costs = MapView(mean, covariance, (0,)), Detections.none(), []
+    for _ in range(scans):
+        cost, detections = detections.after(view, np.array([-1]), LONGEST)
+        costs.append(cost)
+    return costs
+
+
+def test_a_landmark_that_is_out_of_view_costs_nothing():
+    assert cost_of_misses((7.0, 0.0), 0.01, scans=3) == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("place", "std"), [((5.9, 0.0), 0.2), ((3.0, 0.0), 2.0)], ids=["edge", "somewhere"]
+)
+def test_a_landmark_that_may_be_out_of_view_costs_once(place, std):
+    first, *others = cost_of_misses(place, std, scans=9)
+    assert 0 < first < -2 * np.log(0.5)
+    assert others == [0] * 8
+
+
+def test_something_may_hide_a_landmark_for_long():
+    costs = cost_of_misses((3.0, 0.0), 0.01, scans=200)
+    assert -2 * np.log(1 - (1 - HIDDEN) * 0.5) == pytest.approx(costs[0])
+    assert sum(costs) < -2 * np.log(HIDDEN) + 1e-9
 
 
 def test_a_reading_of_a_tentative_landmark_is_no_clutter():

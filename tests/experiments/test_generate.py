@@ -544,7 +544,7 @@ def test_a_folder_without_a_right_manifest_is_named(tmp_path):
         (tmp_path / "manifest.json").write_text(text)
         with pytest.raises(ValueError, match=r"manifest\.json must be a manifest of"):
             load_trajectories(tmp_path)
-    with pytest.raises(ValueError, match="damaged must be 'raise' or 'skip'"):
+    with pytest.raises(ValueError, match="damaged must be one of raise, skip"):
         load_trajectories(tmp_path, damaged="skp")
 
 

@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import slamlog
-from .course import read_course, read_freiburg
-from .graph import GRAPH_TAGS, read_isam
-from .utias import read_utias
+from . import course, graph, utias
 
 EXPECTED = (
     "a log: slamlog 1, a course data.txt, a Freiburg sensor.dat, "
@@ -20,8 +18,8 @@ EXPECTED = (
 )
 READERS = {
     "slamlog": slamlog.read_slamlog,
-    "course": read_course,
-    "freiburg": read_freiburg,
+    "course": course.read_course,
+    "freiburg": course.read_freiburg,
 }
 
 
@@ -77,12 +75,14 @@ def read_log(
         kind = _format_of(slamlog.read_lines(path)[0])
     if robot is not None and kind != "utias":
         raise ValueError(f"robot must be None for a log in one file, got {robot}")
-    if kind != "isam":
-        _refuse_options_of_graphs(truth, noise_from_file)
+    if truth is not None and kind != "isam":
+        raise ValueError(f"truth must be None for a log that is no graph, got {truth}")
+    if noise_from_file and kind != "isam":
+        raise ValueError("noise_from_file needs a graph, iSAM or g2o text")
     if kind == "utias":
-        log = read_utias(source, robot=robot)
+        log = utias.read_utias(source, robot=robot)
     elif kind == "isam":
-        log = read_isam(path, truth=truth, noise_from_file=noise_from_file)
+        log = graph.read_isam(path, truth=truth, noise_from_file=noise_from_file)
     else:
         log = READERS[kind](path)
     if landmarks is None:
@@ -103,19 +103,10 @@ def _format_of(line: slamlog.LogLine) -> str:
         return "slamlog"
     if (tag, len(fields)) == ("ODOMETRY", 3) or tag == "SENSOR":
         return "freiburg"
-    if tag in GRAPH_TAGS:
+    if tag in graph.GRAPH_TAGS:
         return "isam"
     try:
         np.array([tag, *fields], dtype=np.float64)
     except ValueError:
         raise line.error(EXPECTED, slamlog.shown(line.text)) from None
     return "course"
-
-
-def _refuse_options_of_graphs(
-    truth: str | PathLike[str] | None, noise_from_file: bool
-) -> None:
-    if truth is not None:
-        raise ValueError(f"truth must be None for a log that is no graph, got {truth}")
-    if noise_from_file:
-        raise ValueError("noise_from_file needs a graph, iSAM or g2o text")

@@ -167,12 +167,10 @@ def read_freiburg(path: str | PathLike[str]) -> SlamLog:
             )
     world = world_beside(path)
     ids, landmarks = read_world(world) if world else (np.arange(0), np.empty((0, 2)))
+    truth = world.name if world else "none"
     return SlamLog(
         name=Path(path).stem,
-        header={
-            "source": "Freiburg robot mapping course",
-            "truth": world.name if world else "none",
-        },
+        header={"source": "Freiburg robot mapping course", "truth": truth},
         landmark_ids=ids,
         landmarks=landmarks,
         events=recorder.finish(),

@@ -112,7 +112,8 @@ def chain_of(graph: Graph) -> tuple[list[LogLine], dict[int, int], int]:
     steps, closures = {pose: 0}, 0
     for line in graph.edges:
         start, end = id_at(line, 1), id_at(line, 2)
-        if _is_closure(line, start, end, steps):
+        is_edge = line.text.split()[0] in EDGE_TAGS
+        if is_edge and start != end and {start, end} <= steps.keys():
             closures += 1
             continue
         if start != pose:
@@ -132,12 +133,6 @@ def unread_landmarks(graph: Graph) -> list[int]:
         id_at(line, 1) for line in graph.vertices if line.text.split()[0] == "VERTEX_XY"
     }
     return sorted(named - read)
-
-
-def _is_closure(line: LogLine, start: int, end: int, steps: dict[int, int]) -> bool:
-    """Whether a line is an edge between two poses that were visited before."""
-    is_edge = line.text.split()[0] in EDGE_TAGS
-    return is_edge and start != end and {start, end} <= steps.keys()
 
 
 def id_at(line: LogLine, place: int) -> int:
@@ -309,7 +304,15 @@ def with_truth(
     if not poses:
         poses = _composed(graph)
         places = _seen_places(graph, poses)
-    _check_poses(path, poses, steps)
+    if len(poses) != len(steps):
+        raise LogError(
+            f"{path}: expected the true poses of the {len(steps)} poses of the log, "
+            f"got {len(poses)}"
+        )
+    if missing := steps.keys() - poses.keys():
+        raise LogError(
+            f"{path}: expected the poses of the log, found no pose {min(missing)}"
+        )
     table = np.array([(step, *poses[i]) for i, step in steps.items()])
     return replace(
         log,
@@ -333,21 +336,6 @@ def _values(graph: Graph) -> tuple[dict[int, Point], dict[int, Point]]:
             raise line.error("each vertex once", f"{tag} {fields[0]} again")
         known[id_at(line, 1)] = tuple(reals_at(line, 2))
     return poses, places
-
-
-def _check_poses(
-    path: str | PathLike[str], poses: Mapping[int, Point], steps: Mapping[int, int]
-) -> None:
-    if len(poses) != len(steps):
-        raise LogError(
-            f"{path}: expected the true poses of the {len(steps)} poses of the log, "
-            f"got {len(poses)}"
-        )
-    missing = steps.keys() - poses.keys()
-    if missing:
-        raise LogError(
-            f"{path}: expected the poses of the log, found no pose {min(missing)}"
-        )
 
 
 def _composed(graph: Graph) -> dict[int, Point]:
