@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..interface import Belief, MapView, UpdateReport, describe_filter
+from ..kernels.filter_memory import REPEATED, move_pose, update_map
 from ..kernels.kalman_gain import (
     ADDITIVE,
     AT_ESTIMATE,
@@ -26,7 +27,7 @@ from ..kernels.kalman_gain import (
     USED,
     Rules,
 )
-from ..kernels.scan_update import DONE, NOT_USABLE, REPEATED, move_pose, update_map
+from ..kernels.scan_update import DONE, NOT_USABLE
 from ..models.rigid_motion import ErrorFrame
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs

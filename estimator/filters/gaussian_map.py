@@ -14,34 +14,36 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ..interface import Belief, MapView, UpdateReport
+from ..kernels.filter_memory import (
+    IN_USE,
+    LANDMARKS,
+    NIS,
+    NO_ROOM,
+    SCANNED,
+    STEPS,
+    Parts,
+    new_block,
+    parts_of,
+)
 from ..kernels.kalman_gain import (
     ADDED,
     BLOCK,
     COLUMN,
     FIRST,
     GATED,
-    IN_USE,
     INNOVATION,
     JACOBIAN,
-    LANDMARKS,
     META_WIDTH,
     NEAR,
-    NIS,
     OUTCOME,
     ROOT,
-    SCANNED,
     SKIPPED,
-    STEPS,
     USED,
     BeliefArrays,
-    Parts,
     Rules,
     Workspace,
-    new_block,
     new_workspace,
-    parts_of,
 )
-from ..kernels.scan_update import NO_ROOM
 from ..models.rigid_motion import ErrorFrame
 from ..support.memory_limit import aligned_zeros, landmarks_that_fit
 from ..support.saved_states import COVARIANCE, IDS, NUMBERS, Table

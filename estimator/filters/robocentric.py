@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..interface import Belief, MapView, UpdateReport
-from ..kernels.kalman_gain import LANDMARKS, parts_jit
-from ..kernels.scan_update import DONE, update_map
+from ..kernels.filter_memory import LANDMARKS, parts_jit, update_map
+from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds

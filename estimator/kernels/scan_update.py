@@ -1,8 +1,4 @@
-"""Update of one belief by one scan, compiled: screen, correct, map new landmarks.
-
-`update_map` takes in one scan, and `move_pose` one odometry reading: they change the
-memory of one filter.  `update_belief` and `predict` do so with the arrays of a belief.
-"""
+"""Update of one belief by one scan, compiled: screen, correct, map new landmarks."""
 
 import math
 
@@ -17,44 +13,33 @@ from ..models.bearing_range import (
     wrap_angle_jit,
 )
 from ..models.rigid_motion import turn_coefficients_jit
-from ..models.unicycle_motion import drive_jit
 from .kalman_gain import (
     ADDED,
     AT_ESTIMATE,
     AT_REFERENCE,
     AT_TRUTH,
     BLOCK,
-    CAPACITY,
     COLUMN,
     CORRECTION,
     FIRST,
     GATED,
-    IN_USE,
     INNOVATION,
     INVARIANT,
     ITERATE,
     JACOBIAN,
-    LANDMARKS,
     LARGE,
     MEAN_BEFORE,
-    MOTION,
-    MOVED,
     NEAR,
-    NIS,
     ORDER,
     OUTCOME,
     PROJECTED,
     READING,
-    SCANNED,
     SKIPPED,
     SLOT,
-    STEPS,
-    TABLED,
     USED,
     VARIANCE,
     WHITE,
     BeliefArrays,
-    Parts,
     Rules,
     Workspace,
     absorb,
@@ -62,7 +47,6 @@ from .kalman_gain import (
     compose,
     downdate,
     mirror,
-    parts_jit,
     retract,
     retract_point,
     second_system,
@@ -73,122 +57,7 @@ from .kalman_gain import (
 )
 
 # Status of an update, where it is not the reading that failed.
-DONE, NOT_USABLE, REPEATED, NO_ROOM = -1, -2, -3, -4
-
-
-@jit
-def update_map(block: Array, readings: Array, ids: IntArray) -> int:
-    """Update the belief of a filter with one scan, in place.
-
-    Parameters
-    ----------
-    block : ndarray
-        The memory of the filter, see :class:`.kalman_gain.Parts`.  On return it also
-        holds the record of the scan.
-    readings : ndarray, shape (m, 2)
-        Rows (β, r) [rad, m].
-    ids : ndarray of int64, shape (m,)
-        The landmark of each reading.
-
-    Returns
-    -------
-    int
-        DONE; REPEATED, if a landmark has two readings; NO_ROOM, if the new landmarks
-        or the readings may not fit; or as of :func:`update_belief`.  Unless DONE, the
-        belief has not changed.
-    """
-    parts, count = parts_jit(block), len(ids)
-    numbers, slots = parts.numbers, parts.ledger[SLOT]
-    for k in range(count):
-        for j in range(k):
-            if ids[j] == ids[k]:
-                return REPEATED
-    mapped = numbers[LANDMARKS]
-    if count > len(parts.scan_ids):
-        return NO_ROOM
-    if mapped + find_slots(parts, ids) > (numbers[CAPACITY] - 4) // 2:
-        return NO_ROOM
-    status, used, nis = update_belief(
-        parts.mean,
-        parts.covariance,
-        parts.reference,
-        3 + 2 * mapped,
-        readings,
-        count,
-        parts.ledger,
-        parts.rows,
-        parts.before,
-        parts.values,
-    )
-    if status == DONE:
-        for k in range(count):
-            parts.scan_ids[k] = ids[k]
-            if parts.ledger[OUTCOME, k] == ADDED:
-                parts.ids[slots[k]] = ids[k]
-                numbers[LANDMARKS] += 1
-        numbers[SCANNED], numbers[IN_USE], parts.values[NIS] = count, used, nis
-        numbers[STEPS] += 1
-    return int(status)
-
-
-@njit_internal
-def find_slots(parts: Parts, ids: IntArray) -> int:
-    """Write the slots of landmarks to the ledger, -1 for new ones; count these.
-
-    The table holds slots + 1 and is at most half full.  A search begins at the hash of
-    an identity and ends at its slot or at an empty entry.
-    """
-    numbers, table, mask, new = parts.numbers, parts.table, len(parts.table) - 1, 0
-    for slot in range(numbers[TABLED], numbers[LANDMARKS]):  # not in the table yet
-        at = hash_of(parts.ids[slot]) & mask
-        while table[at] > 0:
-            at = (at + 1) & mask
-        table[at] = slot + 1
-    numbers[TABLED] = numbers[LANDMARKS]
-    for k in range(len(ids)):
-        at = hash_of(ids[k]) & mask
-        while table[at] > 0 and parts.ids[table[at] - 1] != ids[k]:
-            at = (at + 1) & mask
-        parts.ledger[SLOT, k] = table[at] - 1
-        new += table[at] == 0
-    return new
-
-
-@njit_internal
-def hash_of(landmark_id: int) -> int:
-    """Mix the bits of an identity (Fibonacci hashing of both halves)."""
-    low, high = landmark_id & 0xFFFFFFFF, (landmark_id >> 32) & 0xFFFFFFFF
-    return (low * 0x278DDE6D + high * 0x1F123BB5) >> 20
-
-
-@jit
-def move_pose(block: Array, distance: float, turn: float, weight: float) -> None:
-    """Move the belief of a filter by one odometry reading, in place.
-
-    Parameters
-    ----------
-    block : ndarray
-        The memory of the filter.
-    distance, turn : float
-        (d, α) [m, rad].
-    weight : float
-        Factor of the variances of the motion noise.
-    """
-    parts = parts_jit(block)
-    values, size = parts.values, 3 + 2 * parts.numbers[LANDMARKS]
-    for i in range(3):
-        values[MOVED + i] = weight * values[MOTION + i]
-    predict(
-        parts.mean,
-        parts.covariance,
-        parts.reference,
-        size,
-        distance,
-        turn,
-        values[MOVED : MOVED + 3],
-        int(values[0]),
-    )
-    parts.numbers[STEPS] += 1
+DONE, NOT_USABLE = -1, -2
 
 
 @jit
@@ -795,64 +664,3 @@ def add_landmark(
         if not correlated:
             x[j] = y[j] = 0.0
         P[j, c], P[j, c + 1] = x[j], y[j]
-
-
-# --------------------------------------------------------------------------------------
-# Prediction; symbols as in the motion model.
-
-
-@jit
-def predict(
-    mean: Array,
-    covariance: Array,
-    reference: Array,
-    size: int,
-    distance: float,
-    turn: float,
-    motion_variance: Array,
-    linearisation: int,
-) -> None:
-    """Move a belief by one odometry reading (d, α), in place; eqs. 1.1 and 1.2.
-
-    Linearised elsewhere than at the estimate, G is taken over the displacement between
-    the predicted positions, which the reference keeps.
-    """
-    x, y, heading, cos, sin = drive_jit(mean[0], mean[1], mean[2], distance, turn)
-    mean[0], mean[1], mean[2] = x, y, heading
-    turned_x, turned_y = -distance * sin, distance * cos
-    if linearisation != AT_ESTIMATE:
-        turned_x, turned_y = -(y - reference[1]), x - reference[0]
-        reference[0], reference[1], reference[2] = x, y, heading
-    propagate(covariance, size, turned_x, turned_y, cos, sin, motion_variance)
-
-
-@njit_internal
-def propagate(
-    covariance: Array,
-    size: int,
-    turned_x: float,
-    turned_y: float,
-    cos: float,
-    sin: float,
-    motion_variance: Array,
-) -> None:
-    """P ← G P Gᵀ + F R Fᵀ with G = I + (turned_x, turned_y, 0, …) e_θᵀ, in O(size).
-
-    F rotates the noise, whose covariance R is diagonal, by the heading (cos, sin).
-    """
-    P = covariance
-    for j in range(size):
-        P[0, j] += turned_x * P[2, j]
-        P[1, j] += turned_y * P[2, j]
-    for j in range(3, size):
-        P[j, 0] = P[0, j]
-        P[j, 1] = P[1, j]
-    for i in range(3):
-        P[i, 0] += turned_x * P[i, 2]
-        P[i, 1] += turned_y * P[i, 2]
-    along, across = motion_variance[0], motion_variance[1]
-    P[0, 0] += cos * cos * along + sin * sin * across
-    P[1, 1] += sin * sin * along + cos * cos * across
-    P[1, 0] += cos * sin * (along - across)
-    P[0, 1] = P[1, 0]
-    P[2, 2] += motion_variance[2]

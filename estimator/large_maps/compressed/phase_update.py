@@ -28,7 +28,7 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
-from ...kernels.kalman_gain import parts_of
+from ...kernels.filter_memory import parts_of
 from ..multifrontal import pairs, symmetric
 from .deferred_covariance import (
     BLOCK,
