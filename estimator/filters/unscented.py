@@ -36,6 +36,8 @@ class UnscentedSlam(EkfSlam):
     .. [2] I. Arasaratnam, S. Haykin, Cubature Kalman filters, IEEE TAC 54(6), 2009.
     """
 
+    _report = UpdateReport()
+
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], through the cubature points."""
         distance, turn = argument_checks.pair("odometry", odometry)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from comparison import digest
 
-from slamgym.estimator import make_estimator
+from slamgym.estimator import UpdateReport, make_estimator
 
 NOISE = {"motion_std": (0.05, 0.02, 0.01), "measurement_std": (0.03, 0.1)}
 FAMILY = (
@@ -102,6 +102,13 @@ def test_the_last_report_is_the_one_that_is_still_held():
     assert report.added_ids == (4,)
 
 
+@pytest.mark.parametrize("name", [*FAMILY, "compressed", "sparse_information"])
+def test_the_report_before_the_first_scan_is_empty(name):
+    slam = make_estimator(name, **NOISE)
+    slam.predict((1.0, 0.0))
+    assert slam.report().replace() == UpdateReport()
+
+
 def test_steps_count_what_the_belief_has_taken_in_and_nothing_else():
     slam = make_estimator("ekf", **NOISE)
     before = slam.steps
@@ -113,6 +120,20 @@ def test_steps_count_what_the_belief_has_taken_in_and_nothing_else():
     with pytest.raises(ValueError, match="twice"):
         slam.update([(0.1, 3.0), (0.2, 3.0)], [1, 1])
     assert slam.steps == before + 2
+
+
+def test_steps_and_report_go_on_where_a_dense_map_becomes_sparse():
+    slam = make_estimator("sparse_information", **NOISE, active_bound=2)
+    slam.predict((1.0, 0.0))
+    slam.update([(0.0, 2.0), (0.5, 3.0)], [1, 2])
+    assert (slam.steps, slam.report().added_ids) == (2, (1, 2))
+    report = slam.update([(0.0, 2.0), (1.0, 3.0)], [1, 3])
+    assert slam.steps == 3
+    assert slam.report() is report
+    assert report.added_ids == (3,)
+    slam.predict((1.0, 0.0))
+    slam.update([], [])
+    assert (slam.steps, slam.report().added_ids) == (5, ())
 
 
 @pytest.mark.parametrize("ids", [[7, 8, 7], [1, 9, 9], [9, 1, 9]])
