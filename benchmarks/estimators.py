@@ -89,8 +89,11 @@ EARLIER = "slamgym_earlier"
 def load_earlier(folder: Path) -> None:
     """Import slamgym from a checkout of an earlier commit, under another name."""
     package = folder / "src" / "slamgym"
-    search = {"submodule_search_locations": [str(package)]}
-    found = spec_from_file_location(EARLIER, package / "__init__.py", **search)
+    found = spec_from_file_location(
+        EARLIER,
+        package / "__init__.py",
+        submodule_search_locations=[str(package)],
+    )
     assert found is not None
     assert found.loader is not None
     sys.modules[EARLIER] = module = module_from_spec(found)

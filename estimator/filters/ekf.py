@@ -290,7 +290,7 @@ class EkfSlam(MapFilter):
         """
         distance, turn = argument_checks.pair("odometry", odometry)
         noise, weight = self._motion_noise, 1.0
-        if not (dt == 1.0 and type(dt) is float and noise.at_rest):
+        if not (type(dt) is float and dt == 1.0 and noise.at_rest):
             weight = noise.weight(distance, turn, dt)
         move_pose(self.map.block, distance, turn, weight)
 

@@ -140,7 +140,7 @@ def identity_array(
     return checked
 
 
-def _as_signed(array: AnyArray, given: LandmarkIds) -> AnyArray:
+def _as_signed(array: AnyArray, given: LandmarkIds | None) -> AnyArray:
     """Return ids that are unsigned or none at all, or refuse what is neither."""
     if array.size and (array.dtype.kind not in "iu" or array.ndim != 1):
         raise ValueError(f"landmark_ids must be integers, got {given!r}")
