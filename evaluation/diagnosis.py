@@ -20,8 +20,7 @@ from typing import NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import binom, chi2, mannwhitneyu, wilcoxon
-from scipy.stats import t as student
+from scipy.special import bdtrc, chdtri, stdtr
 
 from ..arrays import Array, BoolArray
 from ..estimator.support import argument_checks
@@ -391,7 +390,7 @@ def errors_of(pose: Array, heading: Array) -> Errors:
     averages = [score.mean(axis=1) for score in scores]
     lost = int(lost_runs(pose).sum())
     p_values = [_beyond_margin(average) for average in averages]
-    p_values.append(float(binom.sf(lost - 1, len(pose), LOST_RATE)))
+    p_values.append(float(bdtrc(lost - 1, len(pose), LOST_RATE)))
     ratios = [float(average.mean()) for average in averages]
     ratio = max(ratios, key=lambda x: abs(np.log(x)))
     of = ("pose", "heading")[ratios.index(ratio)]
@@ -405,7 +404,7 @@ def lost_runs(pose: Array) -> BoolArray:
     the distribution of one NEES.  Beyond its quantile 1 − 10⁻⁴, ten times as many runs
     are accepted as Gaussian errors would give.
     """
-    return np.asarray(pose.mean(axis=1) > chi2.isf(LOST_LEVEL, POSE))
+    return np.asarray(pose.mean(axis=1) > chdtri(POSE, LOST_LEVEL))
 
 
 def runs_to_repeat(pose: Array, heading: Array) -> int:
@@ -523,14 +522,14 @@ def _averages(pose: Array, heading: Array) -> Array:
 
 def _is_positive(values: Array) -> bool:
     spread = values.std(ddof=1) / np.sqrt(len(values))
-    return bool(student.sf(values.mean() / max(spread, 1e-300), len(values) - 1) < 0.05)
+    return bool(stdtr(len(values) - 1, -values.mean() / max(spread, 1e-300)) < 0.05)
 
 
 def spurious_knowledge(knowledge: Array) -> float:
     """Return the p-value of a variance that some filter can reach, from claims (M,)."""
     error = knowledge.std(ddof=1) / np.sqrt(len(knowledge))
     score = (knowledge.mean() - KNOWABLE) / max(error, 1e-12)
-    return float(student.cdf(score, len(knowledge) - 1))
+    return float(stdtr(len(knowledge) - 1, score))
 
 
 def blame_association(pose: Array, mistakes: Array, known: Array | None) -> Blame:
@@ -561,9 +560,13 @@ def blame_association(pose: Array, mistakes: Array, known: Array | None) -> Blam
     excess = (pose - known).mean(axis=1) / POSE
     ratio = float(known.mean()) / POSE
     matters = excess.mean() >= (LEAST_RATIO - 1) * max(1.0, ratio)
-    larger = float(wilcoxon(excess, alternative="greater").pvalue) if matters else 1.0
+    larger = 1.0
+    if matters:
+        from scipy.stats import wilcoxon  # noqa: PLC0415 (slow to import)
+
+        larger = float(wilcoxon(excess, alternative="greater").pvalue)
     more_lost = int(lost.sum()) - int(lost_runs(known).sum())
-    more = float(binom.sf(more_lost - 1, len(pose), LOST_RATE))
+    more = float(bdtrc(more_lost - 1, len(pose), LOST_RATE))
     text = f"its NEES would be {ratio:.3g} per degree with known identities"
     return Blame(min(1.0, 2 * min(larger, more)), share, text, is_paired=True)
 
@@ -572,6 +575,8 @@ def _larger(values: Array, chosen: BoolArray, fewest: int) -> float:
     """Return the p-value of the chosen values being no larger than the others."""
     if min(chosen.sum(), (~chosen).sum()) < fewest:
         return 1.0
+    from scipy.stats import mannwhitneyu  # noqa: PLC0415 (slow to import)
+
     test = mannwhitneyu(values[chosen], values[~chosen], alternative="greater")
     return float(test.pvalue)
 

@@ -75,7 +75,7 @@ def judge(
     align: str | Sequence[float] | None = None,
     command: str = "",
 ) -> xr.Dataset:
-    """Measure estimates that any program made, as :func:`monte_carlo` does its own.
+    """Measure estimates that any program made, as ``monte_carlo`` does its own.
 
     Parameters
     ----------

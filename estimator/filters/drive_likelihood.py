@@ -72,6 +72,7 @@ def drive_likelihood(
     Examples
     --------
     >>> from slamgym.estimator import EkfSlam
+    >>> from slamgym.estimator.kernels.drive_likelihood import DriveEvents
     >>> events = DriveEvents(
     ...     motions=np.array([[2.0, 0.0, 1.0]]),
     ...     first_motions=np.array([0, 0, 1]),

@@ -638,7 +638,7 @@ def test_the_command_judges_two_estimators(drives, beliefs, written, tmp_path):
     out = tmp_path / "out"
     done = slamgym("judge", mine, yours, "--drives", drives, "--out", out)
     assert done.exit_code == 0, done.stderr
-    assert "yours: not consistent: its squared errors are" in " ".join(
+    assert "yours: not consistent: the squared errors of the pose are" in " ".join(
         done.stdout.split()
     )
     summary = json.loads((out / "summary.json").read_text())

@@ -49,7 +49,7 @@ def test_results_summary_and_report_are_written_and_told(here):
     assert "ekf: not consistent" in result.stdout
     assert "report.html" in result.stdout
     with load_results("out") as results:
-        expected = monte_carlo("six_landmarks", "ekf,invariant", 40)
+        expected = monte_carlo("six_landmarks", "ekf,invariant", 40, small_noise=True)
         xr.testing.assert_equal(results.load(), expected)
     summary = json.loads((here / "out" / "summary.json").read_text())
     assert summary["estimators"]["ekf"]["verdict"] == "not consistent"

@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from slamgym.experiments import monte_carlo as package
-from slamgym.experiments.command_line.noise_study import effects_study, write_study
+from slamgym.experiments.command_line.noise_study import (
+    NoiseStudyOptions,
+    effects_study,
+    write_study,
+)
 from slamgym.experiments.command_line.reporter import Reporter
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.verdict import scores_of
@@ -124,7 +128,8 @@ def test_table_csv_and_summary_show_the_error_where_there_is_one(
     runs, tmp_path, capsys
 ):
     world = load_scenario("six_landmarks")
-    study = effects_study(world, "ekf", runs, seed=0, change="filter", jobs=None)
+    given = NoiseStudyOptions(estimator="ekf", runs=runs, seed=0, change="filter")
+    study = effects_study(world, given)
     write_study(study, tmp_path / "study", Reporter(as_json=True))
     with (tmp_path / "study" / "noise_study.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
