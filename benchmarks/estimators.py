@@ -2,6 +2,7 @@
 
     python benchmarks/estimators.py     # with filterpy and Stone Soup if installed
     pip install "slamgym[benchmark]"    # installs them
+    python benchmarks/estimators.py --earlier FOLDER    # a checkout to compare with
 
 Every case takes the same step: predict, then all readings. "kernels" are the compiled
 functions alone; "public" are ``predict`` and ``update`` with all checks and the report.
@@ -11,8 +12,13 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import sys
+import warnings
+from argparse import ArgumentParser
 from collections.abc import Callable
-from importlib.util import find_spec
+from importlib import import_module
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
 from time import perf_counter, thread_time
 from typing import Any
 
@@ -25,10 +31,7 @@ from rich.table import Table
 from second_core import two_processes
 
 from slamgym.estimator import EkfSlam, make_batch, make_estimator
-from slamgym.estimator.filters.gaussian_map import GaussianMap, workspace_for
-from slamgym.estimator.kernels.kalman_gain import SLOT, BeliefArrays, new_ledger
-from slamgym.estimator.kernels.scan_update import predict, update_belief
-from slamgym.estimator.support.memory_limit import aligned_zeros
+from slamgym.estimator.kernels.filter_memory import move_pose, update_map
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.05, 0.02, 0.02]), np.array([0.02, 0.08])
 NOISE: dict[str, Any] = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
@@ -43,17 +46,22 @@ def scene(landmarks: int) -> NDArray[np.float64]:
     return np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=1)
 
 
-def prepared(name: str, readings: NDArray[np.float64], **options: Any) -> EkfSlam:
+def prepared(
+    name: str,
+    readings: NDArray[np.float64],
+    make: Callable[..., Any] = make_estimator,
+    steps: int = 3,
+    **options: Any,
+) -> Any:
     """Make a filter that has all landmarks in its map."""
-    slam = make_estimator(name, **NOISE, **options)
-    assert isinstance(slam, EkfSlam)
-    for _ in range(3):
+    slam = make(name, **NOISE, **options)
+    for _ in range(steps):
         slam.predict(ODOMETRY)
         slam.update(readings, np.arange(len(readings)))
     return slam
 
 
-def public_step(slam: EkfSlam, readings: NDArray[np.float64]) -> Callable[[], object]:
+def public_step(slam: Any, readings: NDArray[np.float64]) -> Callable[[], object]:
     """One step by the public methods."""
     ids: Any = np.arange(len(readings))
 
@@ -65,27 +73,51 @@ def public_step(slam: EkfSlam, readings: NDArray[np.float64]) -> Callable[[], ob
 
 
 def kernel_step(slam: EkfSlam, readings: NDArray[np.float64]) -> Callable[[], object]:
-    """One step by the compiled functions alone."""
-    state = slam.state_dict()
-    size = len(state["mean"])
-    capacity = GaussianMap.capacity_for(len(readings))
-    mean, reference = np.zeros(capacity), np.zeros(capacity)
-    covariance = aligned_zeros(capacity, capacity)
-    mean[:size], covariance[:size, :size] = state["mean"], state["covariance"]
-    reference[:size] = state["reference"]
-    rules, variance = slam.rule_values, MOTION_STD**2
-    where = slam.rules.linearisation
-    count = len(readings)
-    work = workspace_for(slam.rules, count, capacity)
-    ledger = new_ledger(count)
-    ledger[SLOT] = np.arange(count)
-    belief = BeliefArrays(mean, covariance, reference)
+    """One step by the compiled functions alone, in the memory of a filter."""
+    block, ids = slam.map.block, np.arange(len(readings))
 
     def step() -> None:
-        predict(*belief, size, 0.0, 0.0, variance, where)
-        update_belief(*belief, size, readings, count, ledger, *work, rules)
+        move_pose(block, 0.0, 0.0, 1.0)
+        update_map(block, readings, ids)
 
     return step
+
+
+EARLIER = "slamgym_earlier"
+
+
+def load_earlier(folder: Path) -> None:
+    """Import slamgym from a checkout of an earlier commit, under another name."""
+    package = folder / "src" / "slamgym"
+    found = spec_from_file_location(
+        EARLIER,
+        package / "__init__.py",
+        submodule_search_locations=[str(package)],
+    )
+    assert found is not None
+    assert found.loader is not None
+    sys.modules[EARLIER] = module = module_from_spec(found)
+    found.loader.exec_module(module)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # both register the environments
+        import_module(f"{EARLIER}.estimator")
+
+
+def both(name: str, readings: NDArray[np.float64], **options: Any) -> dict[str, Any]:
+    """Return the public step of a filter, and of the same one of an earlier commit."""
+    makers = {"": make_estimator}
+    if EARLIER in sys.modules:
+        makers[", earlier"] = sys.modules[f"{EARLIER}.estimator"].make_estimator
+    slams = {
+        key: prepared(name, readings, make, 600, **options)
+        for key, make in makers.items()
+    }
+    beliefs = [slam.belief() for slam in slams.values()]
+    for belief in beliefs[1:]:  # equal to the bit, after the same steps
+        np.testing.assert_array_equal(belief.mean, beliefs[0].mean)
+        np.testing.assert_array_equal(belief.covariance, beliefs[0].covariance)
+    what = f"{name}{' managed' if options else ''} public"
+    return {f"{what}{key}": public_step(slam, readings) for key, slam in slams.items()}
 
 
 def single_cases(landmarks: int) -> dict[str, Callable[[], object]]:
@@ -99,8 +131,10 @@ def single_cases(landmarks: int) -> dict[str, Callable[[], object]]:
     data = (ODOMETRY, readings.ravel(), slots)
     cases: dict[str, Callable[[], object]] = {
         "stacked dense numpy": lambda: dense.step(*data),
-        "ekf kernels": kernel_step(ekf, readings),
-        "ekf public": public_step(ekf, readings),
+        "ekf kernels": kernel_step(prepared("ekf", readings), readings),
+        **both("ekf", readings),
+        **both("invariant", readings),
+        **both("ekf", readings, management=True),
         "invariant kernels": kernel_step(prepared("invariant", readings), readings),
         "iterated (3) kernels": kernel_step(
             prepared("iterated", readings, iterations=3), readings
@@ -114,16 +148,21 @@ def single_cases(landmarks: int) -> dict[str, Callable[[], object]]:
     return cases
 
 
-GOALS = {  # (slow, fast): at least, or (slow, fast): at most with a minus sign
+GAIN = ("ekf public, earlier", "ekf public")
+GOALS: dict[
+    int, dict[tuple[str, str], float]
+] = {  # (slow, fast): at least, or (slow, fast): at most with a minus sign
     6: {
         ("stacked dense numpy", "ekf kernels"): 20,
         ("stacked dense numpy", "ekf public"): 9,
         ("filterpy", "ekf public"): 5,
+        GAIN: 2.2,
     },
     20: {
         ("stacked dense numpy", "ekf kernels"): 15,
         ("stacked dense numpy", "ekf public"): 12,
         ("filterpy", "ekf public"): 5,
+        GAIN: 1.6,
     },
     50: {("stacked dense numpy", "ekf kernels"): 15},
 }
@@ -253,6 +292,11 @@ def wall_time(call: Callable[[], object]) -> float:
 
 
 if __name__ == "__main__":
+    parser = ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--earlier", type=Path, help="a checkout of an earlier commit")
+    earlier = parser.parse_args().earlier
+    if earlier is not None:
+        load_earlier(earlier)
     for count in (6, 20, 50):
         compare_single(count)
     compare_batch()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ from .models.rigid_motion import (
     invariant_covariance,
     invariant_error,
 )
-from .support.undo import Recall, Undo
+from .support.undo import Undo, to_the_end, undo_all, undone_on_error
 
 __all__ = [
     "Belief",
@@ -41,6 +41,10 @@ __all__ = [
     "optional_members",
     "restore",
 ]
+
+
+Result = TypeVar("Result")
+Answer = TypeVar("Answer")
 
 
 @runtime_checkable
@@ -339,26 +343,66 @@ def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
     return {name: getattr(estimator, name) for name in offered}
 
 
-def checkpoint(estimator: Any, *, motion: bool = False) -> Undo:
-    """Return what takes back later calls; ``motion``: only those of predict."""
-    if hasattr(estimator, "checkpoint"):
-        undo: Undo = estimator.checkpoint(motion=motion)
+def bookmark(estimator: Any) -> Undo:
+    """Return what takes back later calls, as far as no kernel changes arrays in place.
+
+    A foreign filter is restored from its saved state.
+    """
+    if hasattr(estimator, "bookmark"):
+        undo: Undo = estimator.bookmark()
         return undo
     return partial(restore, estimator, estimator.state_dict())
 
 
-def before_update(
-    estimator: SlamEstimator,
-) -> tuple[Undo, Recall[UpdateReport] | None]:
-    """Return what takes back the next update, and what returns its report when done.
+def advance(
+    estimator: Any,
+    step: Callable[[], Result],
+    then: Callable[[Result], Answer],
+    undo: Undo,
+    undo_then: Callable[[], Undo],
+) -> Answer:
+    """Return ``then(step())``; an interrupt finds nothing done, or both.
 
-    Without the latter the former takes back the update in any state.
+    A compiled kernel changes a covariance in one call.  To take this back would need a
+    copy of the covariance before every step; instead, what follows is brought to its
+    end before the interrupt is passed on.
+
+    Parameters
+    ----------
+    estimator
+        The filter that takes the step.  Its ``steps`` tell whether it has, and its
+        ``report()`` returns the report once more.  Without these it is restored.
+    step : callable
+        Its last change is the step of the filter.
+    then : callable
+        What follows, from the result of the step.
+    undo : callable
+        Takes back all that ``step`` changes before the filter takes its step.
+    undo_then : callable
+        Returns what takes back ``then``, which is called after the step.
     """
-    recall = estimator.recall() if hasattr(estimator, "recall") else None
-    if recall is None:
-        return checkpoint(estimator), None
-    undo: Undo = estimator.bookmark()  # type: ignore[attr-defined]
-    return undo, recall
+    if not hasattr(estimator, "steps"):
+        with undone_on_error(undo_all(bookmark(estimator), undo_then(), undo)):
+            return then(step())
+    steps = estimator.steps
+    taken_back: Undo | None = None
+
+    def settle() -> None:
+        nonlocal taken_back
+        if estimator.steps == steps:
+            undo()
+            return
+        taken_back = taken_back or undo_then()
+        taken_back()
+        then(estimator.report())
+
+    try:
+        result = step()
+        taken_back = undo_then()
+        return then(result)
+    except BaseException:
+        to_the_end(settle)
+        raise
 
 
 def restore(estimator: Any, state: Mapping[str, Any]) -> None:

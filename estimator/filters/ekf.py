@@ -7,37 +7,38 @@ subclasses differ in where they linearise and in their error frame: `InvariantEk
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import inf, log1p
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 from ..interface import Belief, MapView, UpdateReport, describe_filter
+from ..kernels.filter_memory import REPEATED, move_pose, update_map
 from ..kernels.kalman_gain import (
     ADDITIVE,
     AT_ESTIMATE,
     AT_REFERENCE,
     INVARIANT,
+    OUTCOME,
     PROJECTED,
+    USED,
     Rules,
 )
-from ..kernels.scan_update import DONE, NOT_USABLE, predict, update_belief
+from ..kernels.scan_update import DONE, NOT_USABLE
 from ..models.rigid_motion import ErrorFrame
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
-from ..support.undo import Recall, Undo
+from ..support.undo import Undo
 from .gaussian_map import (
     MAP_STATE,
     GaussianMap,
-    ScanWorkspace,
+    UpdateKernel,
     not_positive_definite,
 )
-
-UpdateKernel = Callable[..., tuple[int, int, float]]
 
 
 class MapFilter:
@@ -153,13 +154,18 @@ class MapFilter:
         """Continue from a state that this process has saved, without checks."""
         self.map.restore(state)
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
-        return self.map.checkpoint(motion=motion)
-
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         return self.map.bookmark()
+
+    @property
+    def steps(self) -> int:
+        """Number of steps taken; it changes at once with the belief."""
+        return self.map.steps
+
+    def report(self) -> UpdateReport:
+        """Return the report of the last update once more."""
+        return self.map.last_report()
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""
@@ -238,11 +244,8 @@ class EkfSlam(MapFilter):
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
 
-    _update_belief: ClassVar[UpdateKernel] = staticmethod(update_belief)
+    _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
     """The kernel: screen, correct, add new landmarks."""
-
-    rule_values: Array
-    """The rules as the kernels take them."""
 
     def __init__(
         self,
@@ -260,20 +263,18 @@ class EkfSlam(MapFilter):
         min_range: float = 1e-3,
     ) -> None:
         self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest)
-        self.map = GaussianMap()
-        self._adopt(
-            checked_rules(
-                measurement_std,
-                linearisation=self._linearisation,
-                frame=self._frame,
-                landmark_init=landmark_init,
-                range_std_per_metre=range_std_per_metre,
-                bearing_std_metres=bearing_std_metres,
-                range_noise_at=range_noise_at,
-                gate_probability=gate_probability,
-                min_range=min_range,
-            )
+        self.rules = checked_rules(
+            measurement_std,
+            linearisation=self._linearisation,
+            frame=self._frame,
+            landmark_init=landmark_init,
+            range_std_per_metre=range_std_per_metre,
+            bearing_std_metres=bearing_std_metres,
+            range_noise_at=range_noise_at,
+            gate_probability=gate_probability,
+            min_range=min_range,
         )
+        self.map = GaussianMap((*self.rules, *self._motion_noise.variance))
         self.reset(initial_pose, initial_pose_std)
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
@@ -288,9 +289,10 @@ class EkfSlam(MapFilter):
             dt, and dt = 0 adds none.
         """
         distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._motion_noise.over(distance, turn, dt)
-        where = self.rules.linearisation
-        predict(*self.map.arrays, self.map.size, distance, turn, variance, where)
+        noise, weight = self._motion_noise, 1.0
+        if not (type(dt) is float and dt == 1.0 and noise.at_rest):
+            weight = noise.weight(distance, turn, dt)
+        move_pose(self.map.block, distance, turn, weight)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -321,42 +323,35 @@ class EkfSlam(MapFilter):
             before.
         """
         readings = argument_checks.scan(measurements)
-        count, workspace = len(readings), self._workspace
-        ids = argument_checks.given_identities(landmark_ids, count, self)
-        size = workspace.place(self.map, ids)
-        status, used, nis = self._update_belief(  # the only change of the belief
-            *self.map.arrays,
-            size,
-            readings,
-            count,
-            workspace.ledger,
-            *workspace.arrays,
-            self.rule_values,
-        )
+        ids = argument_checks.identity_array(landmark_ids, len(readings), self)
+        status = self.map.take_in(self._update_map, readings, ids)
         if status != DONE:
             self._refuse(status, readings, ids)
-        return workspace.report(nis, ids, used)
-
-    def recall(self) -> Recall[UpdateReport] | None:
-        """Return a function that gives the report of the next update when done."""
-        return self._workspace.watch()
+        return self.map.report()
 
     @property
     def motion_values(self) -> Array:
         """(σx², σy², σα²) per step, and 1 where a robot at rest has noise too."""
         return np.append(*self._motion_noise)
 
+    @property
+    def rule_values(self) -> Array:
+        """The rules as the kernels take them."""
+        return np.array(self.rules)
+
     def _adopt(self, rules: Rules) -> None:
         self.rules = rules
-        self.rule_values = np.array(rules)
-        self._workspace = ScanWorkspace(rules)
+        self.map.adopt((*rules, *self._motion_noise.variance))
 
-    def _refuse(self, status: int, readings: Array, ids: list[int]) -> NoReturn:
+    def _refuse(self, status: int, readings: Array, ids: IntArray) -> NoReturn:
         """Raise the error of an update that failed."""
+        given = ids.tolist()
+        if status == REPEATED:
+            argument_checks.refuse_repeated(given)
         if status == NOT_USABLE:
-            argument_checks.refuse_unusable(readings, ids)
-        failed = self._workspace.failed_reading(status, len(ids))
-        raise not_positive_definite(ids[failed])
+            argument_checks.refuse_unusable(readings, given)
+        used = self.map.parts.ledger[OUTCOME, : len(ids)] == USED
+        raise not_positive_definite(given[np.flatnonzero(used)[status]])
 
 
 class InvariantEkfSlam(EkfSlam):
@@ -579,17 +574,17 @@ class MotionNoise(NamedTuple):
         at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
         return cls(std**2, at_rest)
 
-    def over(self, distance: float, turn: float, dt: float) -> Array:
-        """Return the variances (3,) of one odometry reading over dt steps.
+    def weight(self, distance: float, turn: float, dt: float) -> float:
+        """Return the factor of the variances for one odometry reading over dt steps.
 
         Raises
         ------
         ValueError
             If dt is no number, negative, or too large.
         """
-        if type(dt) is float and dt == 1.0 and self.at_rest:
-            return self.variance
         dt = argument_checks.duration(dt)
-        if not (self.at_rest or distance or turn):
-            return self.variance * 0.0
-        return self.variance * dt
+        return dt if self.at_rest or distance or turn else 0.0
+
+    def over(self, distance: float, turn: float, dt: float) -> Array:
+        """Return the variances (3,) of one odometry reading over dt steps."""
+        return self.variance * self.weight(distance, turn, dt)

@@ -1,22 +1,31 @@
 """A Gaussian over robot pose and landmarks, in arrays that grow with the map.
 
-`GaussianMap` adds, removes and merges landmarks, and saves its state. `ScanWorkspace`
-holds the arrays of one scan, and a `ScanReport` its results.
+`GaussianMap` holds the memory of a filter, and a `ScanReport` the results of a scan.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import compress, repeat
 from typing import Any, NamedTuple
+from weakref import ref
 
 import numpy as np
 
-from ...arrays import Array, IntArray
+from ...arrays import Array, BoolArray, IntArray
 from ..interface import Belief, MapView, UpdateReport
+from ..kernels.filter_memory import (
+    IN_USE,
+    LANDMARKS,
+    NIS,
+    NO_ROOM,
+    SCANNED,
+    STEPS,
+    Parts,
+    new_block,
+    parts_of,
+)
 from ..kernels.kalman_gain import (
-    ABSORBED,
     ADDED,
     BLOCK,
     COLUMN,
@@ -24,28 +33,28 @@ from ..kernels.kalman_gain import (
     GATED,
     INNOVATION,
     JACOBIAN,
-    MEAN_BEFORE,
     META_WIDTH,
     NEAR,
     OUTCOME,
     ROOT,
     SKIPPED,
-    SLOT,
     USED,
-    WHITE,
     BeliefArrays,
     Rules,
     Workspace,
-    new_ledger,
     new_workspace,
 )
 from ..models.rigid_motion import ErrorFrame
 from ..support.memory_limit import aligned_zeros, landmarks_that_fit
 from ..support.saved_states import COVARIANCE, IDS, NUMBERS, Table
-from ..support.undo import Recall, Undo
+from ..support.undo import Undo
 from .landmark_merging import coincide
 
-FIRST_ALLOCATION = 8  # landmarks
+set_attribute = object.__setattr__  # of frozen dataclasses
+FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for
+
+UpdateKernel = Callable[..., int]
+"""Takes block, readings and ids in; returns the status."""
 
 
 class GaussianMap:
@@ -54,63 +63,108 @@ class GaussianMap:
     The state is (x, y, θ, l1x, l1y, …), landmarks in the order of ``slots``.  The first
     ``size`` entries of every array are in use; the others are zero, room for more.
 
-    Arrays, ``slots`` and ``size`` are replaced at once, so that an interrupt finds the
-    map before a change or after it.  Kernels change the arrays in place, each in one
-    call; the landmarks that a kernel adds follow from the places that it has written.
+    All of it lies in one block of memory, with room for the work of an update.  Kernels
+    change the block in place, each in one call; all else replaces it at once.  An
+    interrupt therefore finds the map before a change or after it.
+
+    Parameters
+    ----------
+    values : sequence of float
+        The rules of the filter, and the variances of its motion noise.
 
     Examples
     --------
-    >>> gaussian = GaussianMap()
-    >>> gaussian.reset(np.zeros(3), np.eye(3))
-    >>> places = np.array([-1])
-    >>> gaussian.expect([7], places)
-    >>> places[0] = 0  # by a kernel that adds the landmark
-    >>> gaussian.size, gaussian.slots
-    (5, {7: 0})
+    >>> gaussian = GaussianMap((*Rules(), 0.1, 0.1, 0.1))
+    >>> gaussian.take_in(update_map, np.array([[0.0, 2.0]]), np.array([7])) == DONE
+    True
+    >>> gaussian.slots, gaussian.mean[3:5]
+    ({7: 0}, array([2., 0.]))
     """
 
-    arrays: BeliefArrays
-    """Mean, covariance and linearisation points, as kernels take them."""
+    block: Array
+    """The memory, as kernels take it."""
+    parts: Parts
+    """Its parts by name."""
+    _slots: dict[int, int]
+    _last: Callable[[], ScanReport | None]
 
-    def __init__(self) -> None:
-        self.reset(np.zeros(3), np.zeros((3, 3)))
+    def __init__(self, values: Sequence[float]) -> None:
+        capacity = self.capacity_for(FIRST_LANDMARKS)
+        self._become(new_block(capacity, FIRST_READINGS, np.array(values)))
+
+    def _become(self, block: Array) -> None:
+        parts, nobody = parts_of(block), type(None)
+        vars(self).update(block=block, parts=parts, _slots={}, _last=nobody)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the memory; its parts would be copied one by one."""
+        return {"block": self.block}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Continue with a memory, on cache lines again."""
+        block = aligned_zeros(len(state["block"]))
+        block[:] = state["block"]
+        self._become(block)
 
     def reset(self, pose: Array, pose_covariance: Array) -> None:
         """Start with an empty map at a pose (3,)."""
-        arrays = self._zeros(FIRST_ALLOCATION)
-        self._become(_filled(arrays, (pose, pose_covariance, pose)), {})
+        self.hold(BeliefArrays(pose, pose_covariance, pose), ())
 
-    @cached_property
+    def adopt(self, values: Sequence[float]) -> None:
+        """Continue by other rules and variances."""
+        rooms = self.capacity, len(self.parts.scan_ids)
+        block = new_block(*rooms, np.array(values))
+        self.hold(self.used, self.slots, block=block)
+
+    @property
     def slots(self) -> dict[int, int]:
         """Place of each landmark in the state: column 3 + 2 slot."""
-        before, ids, places = self._expected
-        pairs = zip(ids, places.tolist(), strict=True)
-        return before | {i: slot for i, slot in pairs if slot >= 0}
+        count = int(self.parts.numbers[LANDMARKS])
+        if len(self._slots) < count:  # a kernel has added landmarks
+            ids = self.parts.ids[:count].tolist()
+            self._slots = {i: slot for slot, i in enumerate(ids)}
+        return self._slots
 
-    @cached_property
+    @property
     def size(self) -> int:
         """Length of the state, 3 + 2n."""
-        return 3 + 2 * len(self.slots)
+        return 3 + 2 * int(self.parts.numbers[LANDMARKS])
+
+    @property
+    def steps(self) -> int:
+        """Number of steps taken; it changes at once with the belief."""
+        return int(self.parts.numbers[STEPS])
+
+    @property
+    def arrays(self) -> BeliefArrays:
+        """Mean, covariance and linearisation points."""
+        parts = self.parts
+        return BeliefArrays(parts.mean, parts.covariance, parts.reference)
 
     @property
     def mean(self) -> Array:
         """Shape (capacity,); the heading is not wrapped."""
-        return self.arrays.mean
+        return self.parts.mean
 
     @property
     def covariance(self) -> Array:
         """Shape (capacity, capacity), of the additive error."""
-        return self.arrays.covariance
+        return self.parts.covariance
 
     @property
     def reference(self) -> Array:
         """Shape (capacity,): linearisation points, for filters that fix them."""
-        return self.arrays.reference
+        return self.parts.reference
 
     @property
     def capacity(self) -> int:
         """Length of the arrays."""
-        return len(self.arrays.mean)
+        return len(self.parts.mean)
+
+    @property
+    def room(self) -> int:
+        """Number of landmarks that the arrays have room for."""
+        return (self.capacity - 4) // 2
 
     @staticmethod
     def capacity_for(landmarks: int) -> int:
@@ -120,8 +174,8 @@ class GaussianMap:
         """
         return (3 + 2 * landmarks) // 4 * 4 + 4
 
-    def allocate(self, landmarks: int, more: int = 0) -> None:
-        """Replace the arrays by zeros with room for landmarks.
+    def blank(self, landmarks: int, more: int = 0, readings: int = 0) -> Array:
+        """Return the memory of an empty map, for :meth:`hold`.
 
         Parameters
         ----------
@@ -129,60 +183,99 @@ class GaussianMap:
             Landmarks that must have room.
         more : int
             Landmarks to come, as far as memory allows.
+        readings : int
+            Readings of a scan that must have room.
         """
-        self.arrays = self._zeros(landmarks, more)
+        fitting = landmarks_that_fit(landmarks, landmarks + more)
+        most = len(self.parts.scan_ids)
+        if readings > most:
+            most = 8 + 2 * readings
+        capacity = self.capacity_for(fitting) // 8 * 8  # it is rounded up
+        capacity = max(capacity, self.capacity_for(landmarks))
+        return new_block(capacity, most, self.parts.values)
 
-    def make_room(self, landmarks: int) -> None:
-        """Grow the arrays if this many more landmarks do not fit."""
-        n = self.size
-        if n + 2 * landmarks < len(self.arrays.mean):
-            return
-        grown = self._zeros(len(self.slots) + landmarks, more=len(self.slots))
-        self.arrays = _filled(grown, self.used)
-
-    def expect(self, ids: Sequence[int], places: IntArray) -> None:
-        """Let the next kernel add landmarks.
+    def hold(
+        self,
+        belief: BeliefArrays | None,
+        ids: Collection[int],
+        *,
+        block: Array | None = None,
+        steps: int = 0,
+    ) -> None:
+        """Continue with another belief.
 
         Parameters
         ----------
-        ids : sequence of int, length m
-            The landmarks of a scan.
-        places : ndarray, shape (m,)
-            Their slots, negative for landmarks that are not mapped.  The kernel writes
-            the slots of those that it adds.
+        belief : BeliefArrays or None
+            Of the length 3 + 2n; None if the block holds it.
+        ids : collection of int
+            The n landmarks, in their order.
+        block : ndarray, optional
+            The memory to use.
+        steps : int
+            Number of steps that have led to this belief.
         """
-        self._expected = self.slots, ids, places
-        del self.size, self.slots  # they follow from what the kernel writes
+        if block is None:
+            block = self.blank(max(FIRST_LANDMARKS, len(ids)))
+        parts = parts_of(block)
+        for array, content in zip(parts[2:5], belief or (), strict=belief is not None):
+            array[tuple(slice(size) for size in content.shape)] = content
+        parts.ids[: len(ids)] = [*ids]
+        parts.numbers[LANDMARKS], parts.numbers[STEPS] = len(ids), self.steps + steps
+        self._become(block)
 
-    def relabel(self, ids: Iterable[int]) -> None:
-        """Take the arrays to hold these landmarks instead, in this order."""
-        self._become(self.arrays, {i: slot for slot, i in enumerate(ids)})
+    def make_room(self, readings: int) -> None:
+        """Grow the arrays where a scan of new landmarks could overflow them."""
+        room, more = self.room, 0
+        if len(self.slots) + readings > room:
+            room, more = len(self.slots) + readings, len(self.slots)
+        elif readings <= len(self.parts.scan_ids):
+            return
+        self.hold(self.used, self.slots, block=self.blank(room, more, readings))
+
+    def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
+        """Update the map with a scan; return the status.
+
+        Parameters
+        ----------
+        update : callable
+            The kernel.
+        readings : ndarray, shape (m, 2)
+            Rows (β, r) [rad, m].
+        ids : ndarray of int64, shape (m,)
+            The landmark of each reading.
+        """
+        last = self._last()
+        if last is not None:  # somebody still holds it
+            last.detach()
+        status = update(self.block, readings, ids)
+        if status == NO_ROOM:
+            self.make_room(len(ids))
+            status = update(self.block, readings, ids)
+        return status
+
+    def report(self) -> ScanReport:
+        """Return the report of the scan that has just been taken in."""
+        report = ScanReport(self.parts)
+        self._last = ref(report)
+        return report
+
+    def last_report(self) -> ScanReport:
+        """Return the report of the last scan once more."""
+        last = self._last()
+        return self.report() if last is None or last.is_detached else last
+
+    def rename(self, names: Mapping[int, int]) -> None:
+        """Give landmarks other identities."""
+        self.hold(self.used, [names.get(i, i) for i in self.slots])
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks; all other numbers keep their last bit."""
         self._keep_without(self.used, ids)
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later changes; ``motion``: only those of the pose."""
-        undo_places, arrays, n = self.bookmark(), self.arrays, self.size
-        mean, P, reference = arrays
-        parts: Sequence[Array] = (mean[:3], reference[:3], P[:3, :n], P[:n, :3])
-        if not motion:
-            parts = self.used
-        saved = [part.copy() for part in parts]
-
-        def undo() -> None:
-            undo_places()
-            for array in arrays:
-                array[n:] = array.T[n:] = 0.0
-            for part, before in zip(parts, saved, strict=True):
-                part[...] = before
-
-        return undo
-
     def bookmark(self) -> Undo:
         """Return what takes back later changes, but for those made by kernels."""
-        return partial(self._become, self.arrays, self.slots)
+        return partial(vars(self).update, vars(self).copy())
 
     @property
     def used(self) -> BeliefArrays:
@@ -191,23 +284,11 @@ class GaussianMap:
         mean, covariance, reference = self.arrays
         return BeliefArrays(mean[:n], covariance[:n, :n], reference[:n])
 
-    def _refill(self, capacity: int, used: BeliefArrays, slots: dict[int, int]) -> None:
-        """Continue with new arrays of this capacity."""
-        self._become(_filled(_zeros(capacity), used), slots)
-
     def _keep_without(self, used: BeliefArrays, ids: Sequence[int]) -> None:
         gone, slots = set(ids), [self.slots[i] for i in ids]
         kept = BeliefArrays(*(without_landmarks(array, slots) for array in used))
         left = [i for i in self.slots if i not in gone]
-        self._refill(self.capacity, kept, {i: slot for slot, i in enumerate(left)})
-
-    def _zeros(self, landmarks: int, more: int = 0) -> BeliefArrays:
-        fitting = landmarks_that_fit(landmarks, landmarks + more)
-        return _zeros(self.capacity_for(fitting))
-
-    def _become(self, arrays: BeliefArrays, slots: dict[int, int]) -> None:
-        """Replace all at once."""
-        vars(self).update(arrays=arrays, slots=slots, size=3 + 2 * len(slots))
+        self.hold(kept, left, block=self.blank(self.room))
 
     def merge(
         self,
@@ -239,14 +320,6 @@ class GaussianMap:
         )
         self._keep_without(BeliefArrays(*merged, reference), gone)
 
-    def slots_of(self, ids: Iterable[int]) -> list[int]:
-        """Return the places of landmarks, -1 for those not in the map."""
-        return list(map(self.slots.get, ids, repeat(-1)))
-
-    def rename(self, names: Mapping[int, int]) -> None:
-        """Give landmarks other identities."""
-        self.slots = {names.get(i, i): slot for i, slot in self.slots.items()}
-
     def view(self) -> MapView:
         """Return the whole map without a copy."""
         return MapView(self.mean, self.covariance, list(self.slots))
@@ -272,10 +345,8 @@ class GaussianMap:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned, without checks."""
-        ids: list[int] = np.asarray(state["landmark_ids"]).tolist()
         saved = state["mean"], state["covariance"], state["reference"]
-        arrays = _filled(self._zeros(max(FIRST_ALLOCATION, len(ids))), saved)
-        self._become(arrays, {i: slot for slot, i in enumerate(ids)})
+        self.hold(BeliefArrays(*saved), np.asarray(state["landmark_ids"]).tolist())
 
 
 MAP_STATE: Table = {
@@ -310,93 +381,6 @@ def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
     return array
 
 
-def _zeros(capacity: int) -> BeliefArrays:
-    """Return arrays of zeros of this length."""
-    covariance = aligned_zeros(capacity, capacity)
-    return BeliefArrays(np.zeros(capacity), covariance, np.zeros(capacity))
-
-
-def _filled(arrays: BeliefArrays, contents: Sequence[Array]) -> BeliefArrays:
-    """Put smaller arrays into zeros, and return these."""
-    for array, content in zip(arrays, contents, strict=True):
-        array[tuple(slice(size) for size in content.shape)] = content
-    return arrays
-
-
-class ScanWorkspace:
-    """Ledger and intermediate results of one update.
-
-    Parameters
-    ----------
-    rules : Rules
-        They decide which arrays an update needs.
-    """
-
-    def __init__(self, rules: Rules) -> None:
-        self._rules = rules
-        self.readings = self.capacity = 0
-        """Most readings in a scan, and length of the mean."""
-
-    def make_room(self, readings: int, capacity: int) -> None:
-        """Grow the arrays where a scan could overflow them."""
-        if readings < self.readings and capacity == self.capacity:
-            return
-        room = 8 + 2 * readings
-        self.arrays = workspace_for(self._rules, room, capacity)
-        self.ledger = new_ledger(room)
-        self.readings, self.capacity = room, capacity
-
-    def place(self, gaussian: GaussianMap, ids: Sequence[int]) -> int:
-        """Write the slots of a scan's landmarks to the ledger, with room for new ones.
-
-        Parameters
-        ----------
-        gaussian : GaussianMap
-            The map that the next update changes; it expects the new landmarks.
-        ids : sequence of int
-            The landmark of each reading.
-
-        Returns
-        -------
-        int
-            Length of the state.
-        """
-        slots, size = gaussian.slots_of(ids), gaussian.size
-        new = slots.count(-1)
-        gaussian.make_room(new)
-        self.make_room(len(ids), gaussian.capacity)
-        places = self.ledger[SLOT, : len(ids)]
-        places[:] = slots
-        if new:
-            gaussian.expect(ids, places)
-        self._ids = ids
-        return size
-
-    def watch(self) -> Recall[ScanReport]:
-        """Return a function that gives the report of the next update when done."""
-        if self.readings:
-            self.arrays.rows[MEAN_BEFORE, ABSORBED] = 0.0
-        return self._recalled
-
-    def _recalled(self) -> ScanReport | None:
-        if not (self.readings and self.arrays.rows[MEAN_BEFORE, ABSORBED]):
-            return None
-        ids = list(self._ids)
-        used = int((self.ledger[OUTCOME, : len(ids)] == USED).sum())
-        white = self.arrays.rows[FIRST : FIRST + 2 * used, WHITE]
-        return self.report(float(white @ white), ids, used)
-
-    def report(self, nis: float, ids: list[int], used: int) -> ScanReport:
-        """Return the report of the last update, on copies of what it has left."""
-        left = copy_scan(self.arrays.rows, self.ledger[:, : len(ids)], used)
-        return ScanReport(nis, ids, left)
-
-    def failed_reading(self, status: int, readings: int) -> int:
-        """Return the reading whose innovation covariance could not be factored."""
-        used = np.flatnonzero(self.ledger[OUTCOME, :readings] == USED)
-        return int(used[status])
-
-
 def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
     """Allocate what updates by these rules need, with this many readings at most."""
     return new_workspace(
@@ -416,15 +400,38 @@ def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:
 
 
 class ScanRecord(NamedTuple):
-    """The stacked system of one scan, copied out of the workspace."""
+    """What an update has left of one scan, copied."""
 
-    rows: Array  # (2m, at least 3 + 2m + META_WIDTH)
+    scan_ids: IntArray  # the landmark of each reading
+    rows: Array  # (2m, at least 3 + 2m + META_WIDTH), the stacked system
     ledger: IntArray  # (LEDGER_HEIGHT, readings), its columns counted in these rows
+
+    @classmethod
+    def copied(cls, parts: Parts) -> ScanRecord:
+        """Copy the record of the last scan.
+
+        Where the map is much larger than the scan, the copy has only the columns of
+        the pose and of the landmarks read.
+        """
+        count, used = parts.numbers[SCANNED : IN_USE + 1].tolist()
+        ids, ledger = parts.scan_ids[:count].copy(), parts.ledger[:, :count].copy()
+        found = parts.rows[FIRST : FIRST + 2 * used]
+        if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
+            return cls(ids, found.copy(), ledger)
+        columns = ledger[COLUMN, :used]
+        landmarks = np.stack([columns, columns + 1], axis=1).ravel()
+        chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-META_WIDTH, 0)])
+        ledger[COLUMN, :used] = 3 + 2 * np.arange(used)
+        return cls(ids, found[:, chosen], ledger)
 
     @property
     def innovation(self) -> Array:
         """Innovations ν, shape (m, 2)."""
         return self.rows[:, INNOVATION].reshape(-1, 2)
+
+    def ids_where(self, chosen: BoolArray) -> tuple[int, ...]:
+        """Return the landmarks of some readings."""
+        return tuple(self.scan_ids[chosen].tolist())
 
     def joint_factor(self) -> Array:
         """Return L of S = L Lᵀ, shape (2m, 2m), lower triangular.
@@ -444,56 +451,49 @@ class ScanRecord(NamedTuple):
         return factor
 
 
-def copy_scan(rows: Array, ledger: IntArray, used: int) -> tuple[Array, IntArray]:
-    """Copy the parts of a :class:`ScanRecord` out of the workspace.
-
-    Where the map is much larger than the scan, the copy has only the columns of the
-    pose and of the landmarks read.
-
-    Parameters
-    ----------
-    rows : ndarray
-        Of the workspace.
-    ledger : ndarray of int64
-        One column for each reading of the scan.
-    used : int
-        Number of readings in use.
-    """
-    found, kept = rows[FIRST : FIRST + 2 * used], ledger.copy()
-    if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
-        return found.copy(), kept
-    columns = ledger[COLUMN, :used]
-    landmarks = np.stack([columns, columns + 1], axis=1).ravel()
-    chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-META_WIDTH, 0)])
-    kept[COLUMN, :used] = 3 + 2 * np.arange(used)
-    return found[:, chosen], kept
-
-
 class ScanReport(UpdateReport):
-    """The results of one scan, from the arrays that its kernel has left; a snapshot.
+    """The results of one scan, read from the memory of the filter when asked for.
 
     Parameters
     ----------
-    nis : float
-        νᵀ S⁻¹ ν.
-    ids : list of int
-        Landmark of each reading.
-    copies : tuple of ndarray
-        The parts of a :class:`ScanRecord`.
+    parts : Parts
+        The memory, until :meth:`detach` is called.
     """
 
-    _ids: list[int]
-    _copies: tuple[Array, IntArray]
+    _parts: Parts
 
-    def __init__(
-        self, nis: float, ids: list[int], copies: tuple[Array, IntArray]
-    ) -> None:
-        parts = self.__dict__
-        parts["nis"], parts["_ids"], parts["_copies"] = nis, ids, copies
+    def __init__(self, parts: Parts) -> None:
+        set_attribute(self, "_parts", parts)
+
+    def detach(self) -> None:
+        """Copy the results: the next update is about to overwrite them."""
+        if not self.is_detached:
+            _ = self.nis, self._record
+            del self.__dict__["_parts"]
 
     @property
+    def is_detached(self) -> bool:
+        """Whether the results are copies."""
+        return "_parts" not in self.__dict__
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the results."""
+        self.detach()
+        return self.__dict__
+
+    @cached_property
+    def nis(self) -> float:
+        """νᵀ S⁻¹ ν, χ² distributed when the filter is consistent."""
+        return float(self._parts.values[NIS])
+
+    @property
+    def factor(self) -> Callable[[], Array]:
+        """The function that returns L, shape (2m, 2m), L Lᵀ = S."""
+        return self._record.joint_factor
+
+    @cached_property
     def _record(self) -> ScanRecord:
-        return ScanRecord(*self._copies)
+        return ScanRecord.copied(self._parts)
 
     @cached_property
     def degrees_of_freedom(self) -> int:
@@ -523,18 +523,12 @@ class ScanReport(UpdateReport):
     @cached_property
     def near_ids(self) -> tuple[int, ...]:
         """Mapped landmarks within 10 σ of the robot."""
-        return tuple(compress(self._ids, self._record.ledger[NEAR].tolist()))
+        return self._record.ids_where(self._record.ledger[NEAR] > 0)
 
     @cached_property
     def innovation(self) -> Array:
         """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
         return self._record.innovation
 
-    @property
-    def factor(self) -> Callable[[], Array]:
-        """The function that returns L, shape (2m, 2m), L Lᵀ = S."""
-        return self._record.joint_factor
-
     def _with_outcome(self, outcome: int) -> tuple[int, ...]:
-        chosen = self._record.ledger[OUTCOME] == outcome
-        return tuple(compress(self._ids, chosen.tolist()))
+        return self._record.ids_where(self._record.ledger[OUTCOME] == outcome)

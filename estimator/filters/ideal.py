@@ -15,7 +15,7 @@ from ..models.rigid_motion import pose_rotation
 from ..models.unicycle_motion import drive
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
-from ..support.undo import Undo, undone_on_error
+from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .ekf import EkfSlam
 
 
@@ -38,7 +38,7 @@ class IdealEkfSlam(EkfSlam):
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run; it linearises at the estimate until the truth is given."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             super().reset(pose, pose_std)
             self._linearise_at(AT_ESTIMATE)
 
@@ -51,7 +51,7 @@ class IdealEkfSlam(EkfSlam):
         """Continue from a saved state; the truth of each further step must be given."""
         saved_states.refuse_other_state(state, ())
         at_truth = saved_states.flag("at_truth", state.get("at_truth", False))
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             super().load_state_dict(state)
             self._linearise_at(AT_TRUTH if at_truth else AT_ESTIMATE)
 
@@ -60,15 +60,9 @@ class IdealEkfSlam(EkfSlam):
         super().restore(state)
         self._linearise_at(AT_TRUTH if state["at_truth"] else AT_ESTIMATE)
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls."""
-        undo_map, where = super().checkpoint(), self.rules.linearisation
-
-        def undo() -> None:
-            undo_map()
-            self._linearise_at(where)
-
-        return undo
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls, as far as no kernel has run."""
+        return undo_all(super().bookmark(), attributes(self))
 
     def _linearise_at(self, where: int) -> None:
         self._adopt(self.rules._replace(linearisation=where))
@@ -104,13 +98,17 @@ class IdealEkfSlam(EkfSlam):
             for i, xy in landmarks.items()
         }
         self._check_told(self.map.slots, told)
-        with undone_on_error(self.checkpoint()):
+        mean, covariance, reference = self.map.used
+        reference = reference.copy()
+        if self.rules.linearisation != AT_TRUTH:
+            reference[:3] = truth
+        for i, slot in self.map.slots.items():
+            reference[3 + 2 * slot : 5 + 2 * slot] = told[i]
+        with undone_on_error(self.bookmark()):
             if self.rules.linearisation != AT_TRUTH:
                 self._linearise_at(AT_TRUTH)
-                self.map.reference[:3] = truth
-            for i, slot in self.map.slots.items():
-                self.map.reference[3 + 2 * slot : 5 + 2 * slot] = told[i]
             self._true_pose, self._true_landmarks = truth, told
+            self.map.hold(BeliefArrays(mean, covariance, reference), self.map.slots)
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad]; the covariance follows the true motion."""
@@ -119,18 +117,18 @@ class IdealEkfSlam(EkfSlam):
             return
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._motion_noise.over(distance, turn, dt)
-        mean, covariance, reference = (each.copy() for each in self.map.arrays)
+        mean, covariance, reference = (each.copy() for each in self.map.used)
         mean[:3] = drive(mean[0], mean[1], mean[2], distance, turn)[:3]
-        n, heading = self.map.size, reference[2]
+        heading = reference[2]
         dx, dy = self._true_pose[:2] - reference[:2]
-        G = np.eye(n)
+        G = np.eye(len(mean))
         G[:2, 2] = -dy, dx
         F = pose_rotation(heading)
-        moved = G @ covariance[:n, :n] @ G.T
+        moved = G @ covariance @ G.T
         moved[:3, :3] += F @ np.diag(variance) @ F.T
-        covariance[:n, :n] = (moved + moved.T) / 2
         reference[:3] = self._true_pose
-        self.map.arrays = BeliefArrays(mean, covariance, reference)
+        belief = BeliefArrays(mean, (moved + moved.T) / 2, reference)
+        self.map.hold(belief, self.map.slots, steps=1)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None

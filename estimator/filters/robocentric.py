@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..interface import Belief, MapView, UpdateReport
-from ..kernels.kalman_gain import SLOT
-from ..kernels.scan_update import DONE, update_belief
+from ..kernels.filter_memory import LANDMARKS, parts_jit, update_map
+from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
@@ -26,16 +26,14 @@ RESERVED = (-(2**63), 1 - 2**63)  # ids of these two places
 
 
 @jit
-def update_and_move(*arguments: Any) -> tuple[int, int, float]:
-    """Update a belief with a scan as `update_belief`, then move the frame."""
-    mean, covariance, size = arguments[0], arguments[1], arguments[3]
-    count, ledger = arguments[5], arguments[6]
-    status, used, nis = update_belief(*arguments)
-    if status == DONE and count > 0:
-        for k in range(count):
-            size = max(size, 5 + 2 * ledger[SLOT, k])
-        move_frame(mean, covariance, size)
-    return status, used, nis
+def update_and_move(block: Array, readings: Array, ids: IntArray) -> int:
+    """Update a map with a scan as `update_map`, then move the frame."""
+    status = update_map(block, readings, ids)
+    if status == DONE and len(ids) > 0:
+        parts = parts_jit(block)
+        size = 3 + 2 * parts.numbers[LANDMARKS]
+        move_frame(parts.mean, parts.covariance, size)
+    return status
 
 
 class RobocentricEkfSlam(EkfSlam):
@@ -62,7 +60,7 @@ class RobocentricEkfSlam(EkfSlam):
        55(1), 2007.
     """
 
-    _update_belief = staticmethod(update_and_move)
+    _update_map = staticmethod(update_and_move)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
@@ -83,8 +81,8 @@ class RobocentricEkfSlam(EkfSlam):
     ) -> UpdateReport:
         """Correct map and motion with one scan, then move the frame to the robot."""
         readings = argument_checks.scan(measurements)
-        given = argument_checks.given_identities(landmark_ids, len(readings), self)
-        if not set(RESERVED).isdisjoint(given):
+        given = argument_checks.identity_array(landmark_ids, len(readings), self)
+        if len(given) and given.min() <= max(RESERVED):
             raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
         return super().update(readings, given)
 

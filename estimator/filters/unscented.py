@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, BoolArray, IntArray
 from ..interface import UpdateReport
+from ..kernels.kalman_gain import BeliefArrays
 from ..models.bearing_range import wrap_angle
 from ..models.unicycle_motion import drive
 from ..support import argument_checks
@@ -35,14 +36,16 @@ class UnscentedSlam(EkfSlam):
     .. [2] I. Arasaratnam, S. Haykin, Cubature Kalman filters, IEEE TAC 54(6), 2009.
     """
 
+    _report = UpdateReport()
+
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], through the cubature points."""
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._motion_noise.over(distance, turn, dt)
-        n, arrays = self.map.size, self.map.arrays
-        mean, P = arrays.mean.copy(), arrays.covariance.copy()
+        mean, P, reference = (array.copy() for array in self.map.used)
+        n = len(mean)
         root = np.zeros((n + 3, n + 3))
-        root[:n, :n] = _square_root(P[:n, :n])
+        root[:n, :n] = _square_root(P)
         root[n:, n:] = np.diag(np.sqrt(variance))
         deviations = np.sqrt(n + 3) * np.concatenate([root, -root], axis=1)
         x, y, heading = mean[:3, None] + deviations[:3]
@@ -53,9 +56,9 @@ class UnscentedSlam(EkfSlam):
         moved = poses - mean[:3, None]
         share = deviations.shape[1]
         P[:3, :3] = moved @ moved.T / share
-        P[:3, 3:n] = moved @ deviations[3:n].T / share
-        P[3:n, :3] = P[:3, 3:n].T
-        self.map.arrays = arrays._replace(mean=mean, covariance=P)
+        P[:3, 3:] = moved @ deviations[3:n].T / share
+        P[3:, :3] = P[:3, 3:].T
+        self.map.hold(BeliefArrays(mean, P, reference), self.map.slots, steps=1)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -75,17 +78,20 @@ class UnscentedSlam(EkfSlam):
         known, skipped = mapped & usable, mapped & ~usable
         self.map.make_room(len(ids))  # it may raise: before anything changes
         corrected, others = UpdateReport(), list(compress(ids, ~mapped))
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
+            self.map.hold(self.map.used, self.map.slots)  # what follows changes a copy
             if known.any():
                 corrected = self._correct(readings[known], list(compress(ids, known)))
             added = super().update(readings[~mapped], others)
-        return corrected.replace(
-            added_ids=added.added_ids,
-            skipped_ids=(*compress(ids, skipped), *added.skipped_ids),
-        )
+            self._report = corrected.replace(
+                added_ids=added.added_ids,
+                skipped_ids=(*compress(ids, skipped), *added.skipped_ids),
+            )
+        return self._report
 
-    def recall(self) -> None:
-        """Return nothing: no kernel absorbs the whole scan."""
+    def report(self) -> UpdateReport:
+        """Return the report of the last update once more."""
+        return self._report
 
     def _expected_range(self, landmark_id: int) -> float:
         """Return the expected range of a landmark [m]; infinite for a new one."""

@@ -7,7 +7,8 @@ import numpy as np
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
 from .kalman_gain import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT
-from .scan_update import DONE, as_rules, predict, update_belief, usable
+from .prediction import predict
+from .scan_update import DONE, as_rules, update_belief, usable
 
 NEVER = -1
 

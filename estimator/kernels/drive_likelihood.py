@@ -23,13 +23,13 @@ from .kalman_gain import (
     Rules,
     Workspace,
 )
+from .prediction import predict
 from .scan_update import (
     DONE,
     as_rules,
     bearing_variance,
     linearise,
     own_covariance,
-    predict,
     range_variance,
     update_belief,
 )

@@ -16,7 +16,8 @@ from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..models.bearing_range import wrap_angle_jit
 from .kalman_gain import LEDGER_HEIGHT, SLOT, half_log_det, largest_variance
-from .scan_update import DONE, as_rules, predict, update_belief
+from .prediction import predict
+from .scan_update import DONE, as_rules, update_belief
 
 
 class Settings(NamedTuple):

@@ -454,6 +454,7 @@ class Rules(NamedTuple):
     noise_as_read: bool = False  # take noise at the range as read, not as expected
 
 
+ITERATIONS = Rules._fields.index("iterations")
 FIRST_STD = Rules._fields.index("bearing_std")
 """Column of the first of the four standard deviations of a reading in the rules."""
 AFTER_STDS = Rules._fields.index("min_range")
@@ -469,8 +470,7 @@ CORRECTION = 0  # δ
 TRANSPORT = 1  # v of the transport T = I + v e_θᵀ
 ITERATE = 2  # where the readings are linearised again
 HEADING = 3  # P[:, θ]
-MEAN_BEFORE = 4  # the prior mean; its last entry is the next one
-ABSORBED = -1  # 1 once the belief has taken in the scan
+MEAN_BEFORE = 4  # the prior mean
 
 # The stacked system follows: two rows (bearing, range) for each reading in use.  Such a
 # row begins with its row of A and ends with META_WIDTH more columns, which are counted

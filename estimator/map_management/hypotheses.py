@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, BoolArray
 from ..association.scan_assignments import SAME
 from ..association.scan_association import ScanAssociation
-from ..interface import Belief, MapView, ScanDecisions, SlamEstimator, UpdateReport
+from ..interface import (
+    Answer,
+    Belief,
+    MapView,
+    ScanDecisions,
+    SlamEstimator,
+    UpdateReport,
+)
 from ..models.bearing_range import wrap_angle
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
@@ -21,8 +28,8 @@ from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import (
     Undo,
     attributes,
-    carried_out,
     contents,
+    to_the_end,
     undo_all,
     undone_on_error,
 )
@@ -69,10 +76,6 @@ class Hypothesis:
     cost: float
     """−2 ln of its probability, relative to the best hypothesis."""
     slam: ManagedSlam
-
-
-Step = tuple[UpdateReport, list[Hypothesis], list[ManagedSlam]]
-"""Report of the best hypothesis, the hypotheses after a scan, and all their filters."""
 
 
 def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
@@ -168,6 +171,9 @@ class HypothesisSlam:
         self._pool = FilterPool(partial(make, **options))
         self.hypotheses = [Hypothesis(0.0, self._pool.fresh())]
         """The hypotheses, the most probable first."""
+        self.steps = 0
+        """Number of steps taken."""
+        self._report: UpdateReport | None = None
 
     @property
     def best(self) -> ManagedSlam:
@@ -208,9 +214,16 @@ class HypothesisSlam:
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
         motion = argument_checks.pair("odometry", odometry)
-        with undone_on_error(self.checkpoint(motion=True)):
-            for hypothesis in self.hypotheses:
-                hypothesis.slam.predict(motion, dt)
+        slams = [hypothesis.slam for hypothesis in self.hypotheses]
+        begun, steps = [slam.steps for slam in slams], self.steps + 1
+
+        def finish() -> None:
+            for slam, before in zip(slams, begun, strict=True):
+                if slam.steps == before:
+                    slam.predict(motion, dt)
+            self.steps = steps
+
+        self._carry_out(finish, slams)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -226,11 +239,14 @@ class HypothesisSlam:
             That of the most probable hypothesis.
         """
         readings = argument_checks.scan(measurements)
-        recall, one = self.best.recall(), len(self.hypotheses) == 1
-        begun = [self.bookmark() if recall and one else self.checkpoint()]
+        views = (h.slam.bookmark_views() for h in self.hypotheses)
+        undo, steps = undo_all(*views, self._pool.bookmark()), self.steps
 
-        def advance() -> Step:
-            nonlocal one
+        def undo_options() -> None:
+            if self.steps == steps:
+                undo()
+
+        with undone_on_error(undo_options):
             if landmark_ids is None:
                 options = self._options(readings)
             else:
@@ -239,27 +255,46 @@ class HypothesisSlam:
                     (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
                     for k, h in enumerate(self.hypotheses)
                 ]
-            if one and len(options) > 1:
-                begun.insert(0, self.checkpoint())
-                one = False
-            return self._advance(readings, options)
+            plans = [complete() for _, _, complete in options]
+            slams = self._branches([k for _, k, _ in options])
+            return self._take(readings, [cost for cost, *_ in options], plans, slams)
 
-        def undo() -> None:
-            undo_all(*begun)()
+    def _take(
+        self,
+        readings: Array,
+        costs: Sequence[float],
+        plans: Sequence[ScanAssociation],
+        slams: Sequence[ManagedSlam],
+    ) -> UpdateReport:
+        """Update filters by their associations, and continue with the best of them."""
+        begun, steps = [slam.steps for slam in slams], self.steps + 1
+        taken: tuple[UpdateReport, list[Hypothesis]] | None = None
 
-        def absorbed() -> Step | None:
-            report = recall() if recall and one else None
-            return None if report is None else (report, self.hypotheses, [])
+        def finish() -> UpdateReport:
+            nonlocal taken
+            if taken is None:
+                branches = zip(costs, plans, slams, begun, strict=True)
+                taken = self._advance(readings, branches)
+            self._report, hypotheses = taken
+            least = hypotheses[0].cost
+            kept = [Hypothesis(h.cost - least, h.slam) for h in hypotheses]
+            self._keep(kept, slams)
+            self.steps = steps
+            return self._report
 
-        told = recall and absorbed
-        return carried_out(advance, self._follow, undo, told, self._undo_own)
+        return self._carry_out(finish, slams)
 
-    def _follow(self, step: Step) -> UpdateReport:
-        """Continue with the hypotheses of a step; return its report."""
-        report, hypotheses, slams = step
-        least = hypotheses[0].cost
-        self._keep([Hypothesis(h.cost - least, h.slam) for h in hypotheses], slams)
-        return report
+    def _carry_out(
+        self, finish: Callable[[], Answer], slams: Sequence[ManagedSlam]
+    ) -> Answer:
+        """Return the result of a function that continues where it was interrupted."""
+        begun = [slam.steps for slam in slams]
+        try:
+            return finish()
+        except BaseException:
+            if begun != [slam.steps for slam in slams]:
+                to_the_end(finish)
+            raise
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise landmarks on request; only the best hypothesis continues."""
@@ -311,17 +346,14 @@ class HypothesisSlam:
                 hypothesis.slam.load_state_dict(without_prefix(state, str(k)))
             self._keep(loaded)
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
-        undo_slams = [h.slam.checkpoint(motion=motion) for h in self.hypotheses]
-        return undo_all(*undo_slams, self._undo_own())
-
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
-        return undo_all(*(h.slam.bookmark() for h in self.hypotheses), self._undo_own())
+        slams = (h.slam.bookmark() for h in self.hypotheses)
+        return undo_all(*slams, attributes(self), self._pool.bookmark())
 
-    def _undo_own(self) -> Undo:
-        return undo_all(attributes(self), self._pool.checkpoint())
+    def report(self) -> UpdateReport | None:
+        """Return the report of the last update once more."""
+        return self._report
 
     def _options(self, readings: Array) -> list[Option]:
         """Return cost, hypothesis and association of the best, the cheapest first."""
@@ -346,21 +378,24 @@ class HypothesisSlam:
             for slam, is_first in zip(slams, first, strict=True)
         ]
 
-    def _advance(self, readings: Array, options: Sequence[Option]) -> Step:
-        """Return the hypotheses of the options whose filter succeeds."""
-        plans = [complete() for _, _, complete in options]
-        slams = self._branches([k for _, k, _ in options])
+    def _advance(
+        self,
+        readings: Array,
+        branches: Iterable[tuple[float, ScanAssociation, ManagedSlam, int]],
+    ) -> tuple[UpdateReport, list[Hypothesis]]:
+        """Update the filters that have not taken a step since; drop those that fail."""
         reports, kept, errors = [], [], []
-        for (cost, *_), plan, slam in zip(options, plans, slams, strict=True):
+        for cost, plan, slam, steps in branches:
             try:
-                reports.append(slam.take(readings, partial(_the_plan, plan)))
+                if slam.steps == steps:
+                    slam.take(readings, partial(_the_plan, plan))
+                reports.append(slam.report() or UpdateReport())
                 kept.append(Hypothesis(cost, slam))
             except (np.linalg.LinAlgError, MemoryError) as error:
                 errors.append(error)
         if not kept:
             raise errors[0]
-        chosen = distinct(kept, self._policy.hypotheses)
-        return reports[0], chosen, slams
+        return reports[0], distinct(kept, self._policy.hypotheses)
 
     def _keep(
         self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()
@@ -404,7 +439,7 @@ class FilterPool:
         copied.copy_from(slam)
         return copied
 
-    def checkpoint(self) -> Undo:
+    def bookmark(self) -> Undo:
         """Return what takes back which filters nobody uses."""
         return contents(self)
 
@@ -412,4 +447,5 @@ class FilterPool:
         """Take filters back."""
         for slam in slams:
             slam.reset(np.zeros(3), np.zeros(3))  # frees its scans
-            self._spare.append(slam)
+            if all(slam is not other for other in self._spare):
+                self._spare.append(slam)

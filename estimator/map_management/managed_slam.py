@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,8 @@ from ..interface import (
     ScanDecisions,
     SlamEstimator,
     UpdateReport,
-    before_update,
-    checkpoint,
+    advance,
+    bookmark,
     optional_members,
     restore,
 )
@@ -38,7 +39,7 @@ from ..models.rigid_motion import rotation
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
-from ..support.undo import Recall, Undo, carried_out, undo_all, undone_on_error
+from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .map_editor import MapEditor, is_near, mapped_ids, marginal, view_map
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
@@ -113,6 +114,8 @@ class ManagedSlam:
         self._pruner = MapPruner(self._policy, self._editor, self._sensor.noise)
         self.candidates = Candidates()
         """Landmarks that are not in the map yet."""
+        self.steps = 0
+        """Number of steps taken."""
         self._report: UpdateReport | None = None
         window = self._policy.confirm[1] if self._policy.backdate else 0
         self._recent = RecentScans(
@@ -156,12 +159,17 @@ class ManagedSlam:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._motion_noise.over(distance, turn, dt)
-        with undone_on_error(self.checkpoint(motion=True)):
-            self._filter.predict((distance, turn), dt)
+        moved = self.candidates.tentative.moved(distance, turn, variance)
+
+        def follow(_: object) -> None:
             self._editor.expire()
-            moved = self.candidates.tentative.moved(distance, turn, variance)
             self.candidates = replace(self.candidates, tentative=moved)
             self._recent.note_motion(distance, turn, dt)
+            self.steps += 1
+
+        step = partial(self._filter.predict, (distance, turn), dt)
+        undo = attributes(self, self._recent)
+        advance(self._filter, step, follow, undo, lambda: undo)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -222,45 +230,52 @@ class ManagedSlam:
         self, readings: Array, associate: Callable[[], ScanAssociation]
     ) -> UpdateReport:
         """Correct the belief with readings (m, 2) as associated, then prune the map."""
-        undo_filter, recall = before_update(self._filter)
-        undo = self._editor.checkpoint() if recall else self._undo_records()
-        noted: tuple[ScanAssociation, set[int], list[RecentScan], int | None]
-        repeats = False
+        undo, steps = self.bookmark_views(), self.steps
 
-        def correct() -> UpdateReport:
-            nonlocal noted, repeats
+        def undo_views() -> None:
+            if self.steps == steps:
+                undo()
+
+        with undone_on_error(undo_views):
             plan = associate()
             missed = self._pruner.expected(readings) - plan.explained
             scans, first = self._recent.with_scan(readings, plan)
-            noted = plan, missed, scans, first
-            repeats = first is not None
-            return self._recent.feed(scans, first, plan)
+            step = partial(self._recent.feed, scans, first, plan)
+            follow = partial(self._follow, readings, plan, missed, scans, first)
+            if first is None:
+                return advance(self._filter, step, follow, undo_all(), self.bookmark)
+            # The filter repeats its steps since a saved state, in new arrays.
+            with undone_on_error(self.bookmark()):
+                return follow(step())
 
-        def absorbed() -> UpdateReport | None:
-            return recall() if recall and not repeats else None
-
-        def follow(report: UpdateReport) -> UpdateReport:
-            plan, missed, scans, first = noted
-            self._recent.note_scan(plan, scans, first, report)
-            self._editor.expire()
-            self.candidates = plan.candidates
-            seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
-            seen -= {*report.rejected_ids, *report.skipped_ids}
-            removed, merged = self._pruner.prune(readings, plan, seen, missed)
-            self._recent.note_edits(removed, merged)
-            made = self.decisions[-1]
-            self._report = report.replace(
-                removed_ids=tuple(removed),
-                merged_ids=tuple(merged),
-                confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
-                row_ids=tuple(plan.row_ids),
-                tentative_rows=tuple(plan.tentative_rows),
-                ambiguous_rows=tuple(plan.ambiguous_rows),
-            )
-            return self._report
-
-        undo, told = undo_all(undo_filter, undo), recall and absorbed
-        return carried_out(correct, follow, undo, told, self.bookmark)
+    def _follow(
+        self,
+        readings: Array,
+        plan: ScanAssociation,
+        missed: set[int],
+        scans: list[RecentScan],
+        first: int | None,
+        report: UpdateReport,
+    ) -> UpdateReport:
+        """Do what follows an update of the filter; return the whole report."""
+        self._recent.note_scan(plan, scans, first, report)
+        self._editor.expire()
+        self.candidates = plan.candidates
+        seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
+        seen -= {*report.rejected_ids, *report.skipped_ids}
+        removed, merged = self._pruner.prune(readings, plan, seen, missed)
+        self._recent.note_edits(removed, merged)
+        made = self.decisions[-1]
+        self._report = report.replace(
+            removed_ids=tuple(removed),
+            merged_ids=tuple(merged),
+            confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
+            row_ids=tuple(plan.row_ids),
+            tentative_rows=tuple(plan.tentative_rows),
+            ambiguous_rows=tuple(plan.ambiguous_rows),
+        )
+        self.steps += 1
+        return self._report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise mapped landmarks by hand, shape (n,); all else stays."""
@@ -313,43 +328,19 @@ class ManagedSlam:
             self._editor.expire()
             self.candidates = candidates
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
-        undo_filter = checkpoint(self._filter, motion=motion)
-        if not motion:
-            return undo_all(undo_filter, self._undo_records())
-        records = self.candidates, self._recent.motions
-
-        def undo() -> None:
-            undo_filter()
-            self._editor.expire()
-            self.candidates, self._recent.motions = records
-
-        return undo
-
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
-        return undo_all(before_update(self._filter)[0], self._undo_records())
+        parts = self._pruner, self._recent, self._editor
+        undos = (part.bookmark() for part in parts)
+        return undo_all(*undos, bookmark(self._filter), attributes(self))
 
-    def recall(self) -> Recall[UpdateReport] | None:
-        """Return a function that gives the report of the next update when done."""
-        self._report = None
-        return before_update(self._filter)[1] and (lambda: self._report)
+    def bookmark_views(self) -> Undo:
+        """Return what takes back that associations have looked at the map."""
+        return self._editor.bookmark()
 
-    def _undo_records(self) -> Undo:
-        """Return what takes back later changes of all but the filter."""
-        candidates, report = self.candidates, self._report
-        undo_parts = undo_all(
-            self._pruner.checkpoint(),
-            self._recent.checkpoint(),
-            self._editor.checkpoint(),
-        )
-
-        def undo() -> None:
-            undo_parts()
-            self.candidates, self._report = candidates, report
-
-        return undo
+    def report(self) -> UpdateReport | None:
+        """Return the report of the last update once more."""
+        return self._report
 
     def copy_from(self, other: ManagedSlam) -> None:
         """Continue as another filter of the same settings, decisions included."""

@@ -28,7 +28,7 @@ import numpy as np
 from ..filters.ekf import EkfSlam
 from ..filters.gaussian_map import without_landmarks
 from ..filters.landmark_merging import coincide
-from ..interface import Belief, MapView, SlamEstimator, SupportsJoin
+from ..interface import Belief, MapView, SlamEstimator, SupportsJoin, bookmark
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame
 from ..support.undo import Undo
@@ -84,12 +84,15 @@ class MapEditor:
         self._within = reach
         return self._view
 
-    def checkpoint(self) -> Undo:
-        """Return what takes back later views, but for those of the filter."""
+    def bookmark(self) -> Undo:
+        """Return what takes back later views, also where the filter notes them."""
         within = self._within
+        undo_slam = bookmark(self._slam) if hasattr(self._slam, "local_view") else None
 
         def undo() -> None:
             self._view, self._within = None, within
+            if undo_slam is not None:
+                undo_slam()
 
         return undo
 

@@ -152,7 +152,7 @@ class MapPruner:
             self.merger.forget(ids)
         return ids
 
-    def checkpoint(self) -> Undo:
+    def bookmark(self) -> Undo:
         """Return what takes back later changes of what is remembered."""
         return contents(self, self._records, self.merger, self._closer)
 
@@ -338,8 +338,8 @@ class LandmarkRecords:
             after = np.zeros((len(rows), *before.shape[1:]), dtype=before.dtype)
             after[~fresh] = before[rows[~fresh]]
             setattr(self, name, after)
-        self.ids = tuple(ids)
-        self._slots = {i: k for k, i in enumerate(self.ids)}
+        self._slots = {i: k for k, i in enumerate(ids)}
+        self.ids = tuple(ids)  # last: an interrupted call begins anew
 
     def note_sightings(
         self, ids: Sequence[int], bearings: Array, along: Array, across: Array

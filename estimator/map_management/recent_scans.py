@@ -75,7 +75,7 @@ class RecentScans:
         self.scans, self.motions = list(other.scans), other.motions
         self.decisions = list(other.decisions)
 
-    def checkpoint(self) -> Undo:
+    def bookmark(self) -> Undo:
         """Return what takes back later changes of what is remembered."""
         scans, motions, decisions = list(self.scans), self.motions, self.decisions
         count, newest = len(decisions), decisions[-self._window - 1 :]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ..filters.ekf import MotionNoise, checked_rules
 from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE
-from ..kernels.scan_update import predict
+from ..kernels.prediction import predict
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import pose_rotation
 from ..support import argument_checks

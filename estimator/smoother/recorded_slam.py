@@ -14,21 +14,14 @@ from ..interface import (
     MapView,
     SlamEstimator,
     UpdateReport,
-    before_update,
-    checkpoint,
+    advance,
+    bookmark,
     optional_members,
 )
 from ..map_management.map_editor import MapEditor, mapped_ids, marginal, view_map
 from ..registry import accepted_options, find_estimator, make_estimator, read_label
 from ..support import argument_checks, saved_states
-from ..support.undo import (
-    Undo,
-    attributes,
-    carried_out,
-    contents,
-    undo_all,
-    undone_on_error,
-)
+from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .batch_smoother import SmoothedDrive, robust_kernel, smooth
 from .drive import Drive
 
@@ -75,6 +68,9 @@ class RecordedSlam:
         self._slam, self._noise = slam, noise
         self._editor = MapEditor(slam)
         self._last: Event | None = None
+        self.steps = 0
+        """Number of steps taken."""
+        self._report: UpdateReport | None = None
         for name, member in optional_members(slam).items():
             setattr(self, name, member)
 
@@ -88,28 +84,31 @@ class RecordedSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run and a new drive, at a pose (3,) known to (3,) [m, m, rad]."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._slam.reset(pose, pose_std)
             first, std = np.array(pose, dtype=float), np.array(pose_std, dtype=float)
-            self._noise |= {"initial_pose": first, "initial_pose_std": std}
+            start = {"initial_pose": first, "initial_pose_std": std}
+            self._noise = self._noise | start
             self._last = None
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
         motion = argument_checks.pair("odometry", odometry)
-        with undone_on_error(self.checkpoint(motion=True)):
-            self._slam.predict(motion, dt)
+        step = partial(self._slam.predict, motion, dt)
+
+        def record(_: object) -> None:
             self._record("predict", motion, dt)
+            self.steps += 1
+
+        advance(self._slam, step, record, undo_all(), self.bookmark)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
     ) -> UpdateReport:
         """Update the filter with one scan, and record the readings that it used."""
-        undo_slam, recall = before_update(self._slam)
         step = partial(self._slam.update, measurements, landmark_ids)
         then = partial(self._record_scan, measurements, landmark_ids)
-        undo = undo_all(undo_slam, attributes(self))
-        return carried_out(step, then, undo, recall, partial(attributes, self))
+        return advance(self._slam, step, then, undo_all(), self.bookmark)
 
     def _record_scan(
         self,
@@ -128,11 +127,13 @@ class RecordedSlam:
             self._record("merge", kept, gone)
         if report.removed_ids:
             self._record("forget", report.removed_ids)
+        self._report = report
+        self.steps += 1
         return report
 
     def remove(self, landmark_ids: Sequence[int]) -> None:
         """Marginalise landmarks, and drop their readings from the drive."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._editor.remove(landmark_ids)
             self._record("forget", tuple(landmark_ids))
 
@@ -142,7 +143,7 @@ class RecordedSlam:
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Merge pairs (kept, gone) of landmarks, in the filter and in the drive."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._editor.merge_pairs(pairs)
             for kept, gone in pairs:
                 self._record("merge", kept, gone)
@@ -182,13 +183,17 @@ class RecordedSlam:
             raise ValueError(
                 f"state['{HISTORY}'] must be the events of a drive, got {history!r}"
             )
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._slam.load_state_dict(state)
             self._last = history.item()
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
-        return undo_all(checkpoint(self._slam, motion=motion), contents(self))
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls, as far as no kernel has run."""
+        return undo_all(bookmark(self._slam), attributes(self))
+
+    def report(self) -> UpdateReport | None:
+        """Return the report of the last update once more."""
+        return self._report
 
     def __repr__(self) -> str:
         return f"Recorded {self._slam!r}"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...arrays import LARGEST, LARGEST_RANGE_GROWTH, SMALLEST, AnyArray, Array
+from ...arrays import LARGEST, LARGEST_RANGE_GROWTH, SMALLEST, AnyArray, Array, IntArray
 from .memory_limit import covariance_bytes
 
 LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
@@ -20,7 +20,8 @@ LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 # The lowest identity that 64 bits hold, and how many from there on are no landmarks.
 LOWEST_ID, RESERVED_IDS = -(2**63), 2**20
 
-_FLOAT64 = np.dtype(np.float64)
+_PAIR = (2,)
+_FLOAT64, _INT64 = np.dtype(np.float64), np.dtype(np.int64)
 
 
 def finite_vector(name: str, value: ArrayLike, size: int) -> Array:
@@ -66,7 +67,12 @@ def as_floats(name: str, value: ArrayLike) -> Array:
 
 def scan(measurements: ArrayLike) -> Array:
     """Return ``measurements`` as a writeable float64 array (m, 2), or refuse them."""
-    if type(measurements) is np.ndarray and _is_plain_scan(measurements):
+    if (  # kernels can take them as they are
+        type(measurements) is np.ndarray
+        and measurements.dtype is _FLOAT64
+        and measurements.flags.carray
+        and measurements.shape[1:] == _PAIR
+    ):
         return measurements
     readings = as_floats("measurements", measurements)
     if not readings.flags.writeable:  # another type to numba: it would compile anew
@@ -81,36 +87,60 @@ def scan(measurements: ArrayLike) -> Array:
     )
 
 
-def _is_plain_scan(readings: AnyArray) -> bool:
-    """Return whether kernels can take the readings as they are."""
-    is_plain = readings.dtype is _FLOAT64 and readings.flags.carray
-    return is_plain and readings.shape[1:] == (2,)
-
-
 def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
     """Return ids as Python integers: one for each of ``count`` readings, no repeats."""
-    try:
-        array = np.asarray(landmark_ids)
-    except ValueError:  # a list of lists of several lengths
-        raise ValueError(
-            f"landmark_ids must be integers, got {landmark_ids!r}"
-        ) from None
-    if array.dtype.kind != "i" or array.ndim != 1:
-        array = _as_signed(array, landmark_ids)
-    ids: list[int] = array.tolist()
-    if len(ids) != count:
-        raise ValueError(
-            f"measurements has {count} rows but landmark_ids has {len(ids)} entries"
-        )
-    if len(set(ids)) < count:
+    ids: list[int] = identity_array(landmark_ids, count, None).tolist()
+    refuse_repeated(ids)
+    return ids
+
+
+def refuse_repeated(ids: Sequence[int]) -> None:
+    """Refuse an identity that a scan holds twice."""
+    if len(set(ids)) < len(ids):
         twice = next(i for i in ids if ids.count(i) > 1)
         raise ValueError(
             f"landmark_ids must not repeat within a scan, got {twice} twice"
         )
-    return ids
 
 
-def _as_signed(array: AnyArray, given: LandmarkIds) -> AnyArray:
+def identity_array(
+    landmark_ids: LandmarkIds | None, count: int, estimator: object
+) -> IntArray:
+    """Return ids as kernels take them: one for each reading; they refuse repetition.
+
+    Parameters
+    ----------
+    landmark_ids : sequence of int
+    count : int
+        Number of readings.
+    estimator
+        The filter that needs the ids, which may be None where there are no readings;
+        None if ids are always needed.
+    """
+    array: Any = landmark_ids
+    if landmark_ids is None and estimator is not None:
+        if count:
+            name = type(estimator).__name__
+            raise ValueError(f"landmark_ids must be given: {name} does not associate")
+        return np.empty(0, dtype=np.int64)
+    if type(array) is not np.ndarray:
+        try:
+            array = np.asarray(landmark_ids)
+        except ValueError:  # a list of lists of several lengths
+            raise ValueError(
+                f"landmark_ids must be integers, got {landmark_ids!r}"
+            ) from None
+    if array.dtype is not _INT64 or not array.flags.carray or array.ndim != 1:
+        array = np.array(_as_signed(array, landmark_ids), dtype=np.int64)
+    if len(array) != count:
+        raise ValueError(
+            f"measurements has {count} rows but landmark_ids has {len(array)} entries"
+        )
+    checked: IntArray = array
+    return checked
+
+
+def _as_signed(array: AnyArray, given: LandmarkIds | None) -> AnyArray:
     """Return ids that are unsigned or none at all, or refuse what is neither."""
     if array.size and (array.dtype.kind not in "iu" or array.ndim != 1):
         raise ValueError(f"landmark_ids must be integers, got {given!r}")
@@ -132,13 +162,9 @@ def given_identities(
     landmark_ids: LandmarkIds | None, count: int, estimator: object
 ) -> list[int]:
     """Return the ids of ``count`` readings for an estimator that needs them."""
-    if landmark_ids is not None:
-        return identities(landmark_ids, count)
-    if count:
-        raise ValueError(
-            f"landmark_ids must be given: {type(estimator).__name__} does not associate"
-        )
-    return []
+    ids: list[int] = identity_array(landmark_ids, count, estimator).tolist()
+    refuse_repeated(ids)
+    return ids
 
 
 def asked_identities(
@@ -203,9 +229,11 @@ def refuse_large_belief(landmarks: int, limit: int, instead: str) -> None:
 def pair(name: str, value: ArrayLike) -> tuple[float, float]:
     """Return ``value`` as two finite floats of a usable size, or refuse it."""
     given: Any = value
-    if isinstance(given, np.ndarray):
-        _refuse_masked_and_complex(name, given)
+    if type(given) is np.ndarray and given.dtype is _FLOAT64:
         given = given.tolist()  # in half the time that numpy's own numbers take
+    elif isinstance(given, np.ndarray):
+        _refuse_masked_and_complex(name, given)
+        given = given.tolist()
     try:
         first, second = given
         a, b = float(first), float(second)

@@ -1,80 +1,35 @@
 """Calls that change all of a state or nothing, also where an interrupt ends them."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from copy import copy
-from typing import TypeVar
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-Result = TypeVar("Result")
-Answer = TypeVar("Answer")
-
 Undo = Callable[[], None]
 """What takes back later changes; it may be called more than once."""
-Recall = Callable[[], Result | None]
-"""Returns the result of a step, or None as long as the step is not done."""
 
 
-@contextmanager
-def undone_on_error(undo: Undo) -> Iterator[None]:
+class undone_on_error:  # noqa: N801 (reads as a verb, in a with statement)
     """Take back what the block has changed if it raises, even `KeyboardInterrupt`."""
+
+    def __init__(self, undo: Undo) -> None:
+        self._undo = undo
+
+    def __enter__(self) -> None:
+        """Begin the block."""
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Take back the changes if there is an error."""
+        if kind is not None:
+            to_the_end(self._undo)
+
+
+def to_the_end(call: Callable[[], object]) -> None:
+    """Call a function, once more if an interrupt ends it."""
     try:
-        yield
-    except BaseException:
-        _to_the_end(undo)
-        raise
-
-
-def carried_out(
-    step: Callable[[], Result],
-    then: Callable[[Result], Answer],
-    undo: Undo,
-    recall: Recall[Result] | None,
-    bookmark: Callable[[], Undo],
-) -> Answer:
-    """Return ``then(step())``; an interrupt finds nothing done, or both.
-
-    A compiled kernel changes a covariance in one call.  To take this back would need a
-    copy of the covariance before every step; instead, what follows is brought to its
-    end before the interrupt is passed on.
-
-    Parameters
-    ----------
-    step : callable
-        Its last change is made by a kernel.
-    then : callable
-        What follows, from the result of the step.
-    undo : callable
-        Takes back the step, as long as the kernel has not run.
-    recall : callable or None
-        Returns the result of the step once the kernel has run; None: ``undo`` can take
-        back all.
-    bookmark : callable
-        Returns what takes back ``then``.
-    """
-    result: Result | None = None
-    undo_then: Undo | None = None
-
-    def settle() -> None:
-        nonlocal result, undo_then
-        if result is None and recall is not None:
-            result = recall()
-        if result is None or recall is None:
-            undo()
-            return
-        if undo_then is None:
-            undo_then = bookmark()
-        undo_then()
-        then(result)
-
-    try:
-        result = step()
-        if recall is not None:
-            undo_then = bookmark()
-        return then(result)
-    except BaseException:
-        _to_the_end(settle)
+        call()
+    except KeyboardInterrupt:
+        to_the_end(call)
         raise
 
 
@@ -93,11 +48,11 @@ def attributes(*objects: object) -> Undo:
 
     Arrays, lists, dicts and sets must not be changed in place; see :func:`contents`.
     """
-    before = [(each, dict(vars(each))) for each in objects]
+    before = [(vars(each), vars(each).copy()) for each in objects]
 
     def undo() -> None:
-        for each, values in before:
-            vars(each).update(values)
+        for values, old in before:
+            values.update(old)
 
     return undo
 
@@ -117,14 +72,11 @@ def contents(*objects: object) -> Undo:
     >>> count.numbers
     [1]
     """
-    before = [
-        (each, {name: _kept(value) for name, value in vars(each).items()})
-        for each in objects
-    ]
+    before = [(vars(each), _kept(vars(each))) for each in objects]
 
     def undo() -> None:
-        for each, values in before:
-            vars(each).update(values)
+        for values, old in before:
+            values.update(_kept(old))
 
     return undo
 
@@ -132,14 +84,8 @@ def contents(*objects: object) -> Undo:
 _CHANGED_IN_PLACE = frozenset((np.ndarray, list, dict, set))
 
 
-def _kept(value: object) -> object:
-    return copy(value) if type(value) in _CHANGED_IN_PLACE else value
-
-
-def _to_the_end(undo: Undo) -> None:
-    """Call a function once more if an interrupt ends it."""
-    try:
-        undo()
-    except KeyboardInterrupt:
-        _to_the_end(undo)
-        raise
+def _kept(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: value.copy() if type(value) in _CHANGED_IN_PLACE else value
+        for name, value in values.items()
+    }

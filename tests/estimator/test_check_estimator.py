@@ -132,7 +132,7 @@ class SavesALiveReference(EkfSlam):
 class LoadsTheMeanItself(EkfSlam):
     def load_state_dict(self, state):
         super().load_state_dict({k: v for k, v in state.items() if k != "own"})
-        self.map.arrays = self.map.arrays._replace(mean=state["own"])
+        self.map.parts = self.map.parts._replace(mean=state["own"])
 
     def state_dict(self):
         return super().state_dict() | {"own": self.map.mean.copy()}

@@ -373,10 +373,13 @@ def test_read_only_readings_are_taken_without_compiling_anew():
     slam = make()
     readings = np.array([(0.1, 4.0)])
     readings.flags.writeable = False
-    slam.update(readings, [0])
-    from slamgym.estimator.kernels.scan_update import update_belief
+    ids = np.array([0])
+    ids.flags.writeable = False
+    slam.update(readings, ids)
+    slam.update(np.array([(0.1, 4.0)]), [0])
+    from slamgym.estimator.kernels.filter_memory import update_map
 
-    signatures = getattr(update_belief, "signatures", [None])  # plain without JIT
+    signatures = getattr(update_map, "signatures", [None])  # plain without JIT
     assert len(signatures) == 1
 
 

@@ -22,7 +22,11 @@ NOISES = [
     {"motion_std": (0.01, 0.0, 0.3), "measurement_std": (0.3, 0.01)},
     {"motion_std": (5.0, 5.0, 1.0), "measurement_std": (1.0, 2.0)},
 ]
-OPTIONS = {"submaps": {"submap_size": 6}, "compressed": {"local_size": 6}}
+OPTIONS = {
+    "submaps": {"submap_size": 6},
+    "compressed": {"local_size": 6},
+    "sparse_information": {"active_bound": 4},  # dense while the map holds no more
+}
 POLICIES = [
     None,
     True,

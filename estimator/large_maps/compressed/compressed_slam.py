@@ -17,18 +17,11 @@ from ...filters.ekf import (
     IteratedEkfSlam,
     ObservabilityConstrainedEkfSlam,
 )
-from ...interface import Belief, MapView, UpdateReport, describe_filter
+from ...interface import Belief, MapView, UpdateReport, advance, describe_filter
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
-from ...support.undo import (
-    Recall,
-    Undo,
-    attributes,
-    carried_out,
-    undo_all,
-    undone_on_error,
-)
+from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from .compressed_map import (
     SHORT_PHASE,
     SMALLEST_LOCAL_MAP,
@@ -152,13 +145,17 @@ class CompressedEkfSlam:
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_reserved(ids)
 
+        required = [i for i in ids if i in self._map.slots]
+        is_usable = bool((np.abs(readings) <= LARGEST).all())  # otherwise refused
+        changes = is_usable and not self._is_adequate(required)
+
         def correct() -> UpdateReport:
-            if (np.abs(readings) <= LARGEST).all():  # otherwise refused
-                self._choose_local_map([i for i in ids if i in self._map.slots])
+            if changes:
+                self._choose_local_map(required)
             return self._map.filter.update(readings, ids)
 
-        undo, recall = self.bookmark(), self.recall()
-        return carried_out(correct, self._follow, undo, recall, self.bookmark)
+        undo = self.bookmark() if changes else undo_all()
+        return advance(self._map.filter, correct, self._follow, undo, self.bookmark)
 
     def _follow(self, report: UpdateReport) -> UpdateReport:
         """Do what follows an update of the filter; return its report."""
@@ -279,28 +276,26 @@ class CompressedEkfSlam:
         saved_states.refuse_indefinite("the covariance of state", some.covariance)
         self._map, self._extra, self._age, self._rests = loaded, extra, age, rests
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
-        undo_filter = self._map.filter.checkpoint(motion=motion)
-        return undo_filter if motion else undo_all(self.bookmark(), undo_filter)
-
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         return undo_all(self._map.bookmark(), attributes(self))
 
-    def recall(self) -> Recall[UpdateReport] | None:
-        """Return a function that gives the report of the next update when done."""
-        return self._map.filter.recall()
+    @property
+    def steps(self) -> int:
+        """Number of steps taken; it changes at once with the belief."""
+        return self._map.filter.steps
+
+    def report(self) -> UpdateReport:
+        """Return the report of the last update once more."""
+        return self._map.filter.report()
 
     def _choose_local_map(self, required: Sequence[int]) -> None:
-        """Begin a new phase if the scan needs it or the local map is too large."""
+        """Begin a new phase, with a local map that holds these landmarks."""
         if self._local_size is not None and len(required) > self._local_size:
             raise ValueError(
                 f"local_size must be >= {len(required)}, the mapped landmarks of one "
                 f"scan, got {self._local_size}"
             )
-        if self._is_adequate(required):
-            return
         rests, extra = max(self._rests - 1, 0), self._extra
         if self._age >= SHORT_PHASE and self._map.deferred.is_up_to_date:
             rests = 2  # one short phase does not matter, several leave too much work
@@ -316,6 +311,8 @@ class CompressedEkfSlam:
         """Return whether the local map holds these landmarks and is not too large."""
         local, mapped = self._map.local, len(self._map.slots)
         is_free = self._local_size is None
+        if self._local_size is not None and len(required) > self._local_size:
+            return False
         if is_free and self._map.is_small and len(local) == mapped:
             return True
         size = len(required) + self._extra

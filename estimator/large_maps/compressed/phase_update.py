@@ -28,6 +28,7 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
+from ...kernels.filter_memory import parts_of
 from ..multifrontal import pairs, symmetric
 from .deferred_covariance import (
     BLOCK,
@@ -71,18 +72,16 @@ def begin_phase(
         Identities of the virtual landmarks, if any, then of the local ones.
     """
     gaussian, size = slam.map, 3 + 2 * len(ids)
-    pose, pose_mean = gaussian.covariance[:3, :3].copy(), gaussian.mean[:3].copy()
-    fixed = gaussian.reference[:3].copy()
-    gaussian.allocate(len(ids), more=len(ids) // 2)
-    virtual = size - len(rows)
+    block = gaussian.blank(len(ids), more=len(ids) // 2)
+    parts, virtual = parts_of(block), size - len(rows)
     step = 2 if virtual == 2 * len(rows) else 1
     for array, head, tail in (
-        (gaussian.mean, pose_mean, mean),
-        (gaussian.reference, fixed, reference),
+        (parts.mean, gaussian.mean[:3], mean),
+        (parts.reference, gaussian.reference[:3], reference),
     ):
         array[:3], array[3 + virtual : size] = head, tail
-    fill_extended(gaussian.covariance, pose, rows, virtual, step)
-    gaussian.relabel(ids)
+    fill_extended(parts.covariance, gaussian.covariance[:3, :3], rows, virtual, step)
+    gaussian.hold(None, ids, block=block)
 
 
 def end_phase(slam: EkfSlam, virtual: int) -> Phase:

@@ -13,6 +13,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...filters.ekf import EkfSlam
+from ...interface import UpdateReport
 from ...models.rigid_motion import as_covariance
 from ...support.undo import Undo, attributes, contents, undone_on_error
 from ..elimination import RestFactor
@@ -45,6 +46,8 @@ class SparseBelief:
     origin: Array  # position of the robot when the local map was chosen, shape (2,) [m]
     count: float = FIRST_COUNT  # number of landmarks to eliminate around the local map
     enlarged: bool = False  # whether the first number was too small
+    steps: int = 0  # number of steps taken
+    report: UpdateReport = field(default_factory=UpdateReport, repr=False)  # the last
     # What takes back the update under way: the last of these.
     saved: list[Undo] = field(default_factory=list, repr=False)
     # Factor of all landmarks except the local ones, if known.
@@ -79,6 +82,7 @@ class SparseBelief:
         belief.pose = ConditionalPose(
             mean[:3].copy(), gain, as_covariance(rest), reference[:2].copy()
         )
+        belief.steps = slam.steps
         return belief
 
     def free_slots(self, count: int) -> IntArray:

@@ -142,12 +142,13 @@ range_noise_at, gate_probability, noise_at_rest, min_range
             return
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._scan_rules.motion_noise.over(distance, turn, dt)
-        self._held.pose = move(
+        pose = move(
             self._held.pose,
             np.array([distance, turn]),
             variance,
             from_mean=self._scan_rules.base == ESTIMATE,
         )
+        vars(self._held).update(pose=pose, steps=self.steps + 1)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -168,21 +169,24 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         readings = argument_checks.scan(measurements)
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
-        if not ids:
-            return UpdateReport()
         if isinstance(self._held, EkfSlam) and self._stays_dense(ids):
             return self._held.update(readings, ids)
         belief = self._belief
-        with belief.undone_on_error():
-            belief.choose_local_map(ids, exact=self._is_exact)
-            result = self._process(belief, readings, ids)
-            while result.largest_residual > self._tolerance:
-                belief.enlarge_elimination()
+        if not ids:
+            vars(belief).update(report=UpdateReport(), steps=belief.steps + 1)
+        else:
+            with belief.undone_on_error():
+                belief.choose_local_map(ids, exact=self._is_exact)
                 result = self._process(belief, readings, ids)
-            belief.add(result.report.added_ids, result.added_slots)
-            belief.pose, belief.local = result.pose, result.local
-            self._held = belief
-        return result.report
+                while result.largest_residual > self._tolerance:
+                    belief.enlarge_elimination()
+                    result = self._process(belief, readings, ids)
+                belief.add(result.report.added_ids, result.added_slots)
+                belief.pose, belief.local = result.pose, result.local
+                belief.report = result.report
+                belief.steps += 1
+        self._held = belief
+        return belief.report
 
     @property
     def _belief(self) -> SparseBelief:
@@ -338,13 +342,21 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         else:
             self._held = checked_state(state, name, base)
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls, as far as no kernel has run."""
         held = self._held
-        if isinstance(held, EkfSlam):
-            return undo_all(held.checkpoint(motion=motion), attributes(self))
-        undo_belief = attributes(held) if motion else held.checkpoint()
-        return undo_all(undo_belief, attributes(self))
+        undo = held.bookmark() if isinstance(held, EkfSlam) else held.checkpoint()
+        return undo_all(attributes(self), undo)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps taken; it changes at once with the belief."""
+        return self._held.steps
+
+    def report(self) -> UpdateReport:
+        """Return the report of the last update once more."""
+        held = self._held
+        return held.report() if isinstance(held, EkfSlam) else held.report
 
     @property
     def _is_exact(self) -> bool:

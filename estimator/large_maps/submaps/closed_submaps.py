@@ -272,10 +272,11 @@ class Neighbourhood:
         self.forget()
         if saved is not None:
             self._copy, self._reaches = saved
+            self._steps = self._copy.slam.steps
 
     def forget(self) -> None:
         """Discard the copy, for a new run."""
-        self._copy = None
+        self._copy, self._steps = None, 0
         # Largest distance asked for or measured with each recent scan; the last entry
         # is for the time since the last scan [m].
         self._reaches = RECENT_SCANS * [0.0]
@@ -299,11 +300,14 @@ class Neighbourhood:
         self._reaches = [*self._reaches[:-1], max(within, self._reaches[-1])]
         return copy.slam.map_view()
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
+    def bookmark(self) -> Undo:
+        """Return what takes back later changes, but for the steps of the filter.
+
+        A step that has been taken is not taken again.
+        """
         if self._copy is None:
             return attributes(self)
-        return undo_all(self._copy.slam.checkpoint(motion=motion), attributes(self))
+        return undo_all(self._copy.slam.bookmark(), attributes(self))
 
     def renew(self) -> None:
         """Replace the copy, if there is one and the submaps can be joined."""
@@ -314,7 +318,14 @@ class Neighbourhood:
     def predict(self, odometry: ArrayLike, dt: float) -> None:
         """Move the robot."""
         if self._copy is not None:
-            self._copy.slam.predict(odometry, dt)
+            step = partial(self._copy.slam.predict, odometry, dt)
+            self._take(self._copy.slam, step)
+
+    def _take(self, slam: InvariantEkfSlam, step: Callable[[], object]) -> None:
+        """Take a step of the filter, unless an interrupted call has taken it."""
+        if slam.steps == self._steps:
+            step()
+        self._steps = slam.steps
 
     @property
     def is_empty(self) -> bool:
@@ -355,7 +366,7 @@ class Neighbourhood:
             self.renew()
         if self._copy is before:  # a new copy contains the scan already
             try:
-                before.slam.update(readings, ids)
+                self._take(before.slam, partial(before.slam.update, readings, ids))
             except np.linalg.LinAlgError:
                 self.renew()
 
@@ -423,8 +434,9 @@ class Neighbourhood:
             "landmark_ids": np.array(belief.landmark_ids, dtype=np.int64),
         }
         slam.restore(state)
-        self._copy = _Copy(slam, region)
-        return self._copy
+        copy = _Copy(slam, region)
+        vars(self).update(_copy=copy, _steps=slam.steps)
+        return copy
 
 
 def _is_extent(numbers: Array) -> bool:

@@ -16,18 +16,11 @@ from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
-from ...interface import Belief, MapView, UpdateReport, describe_map
+from ...interface import Belief, MapView, UpdateReport, advance, describe_map
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.saved_states import with_prefix, without_prefix
-from ...support.undo import (
-    Recall,
-    Undo,
-    attributes,
-    carried_out,
-    undo_all,
-    undone_on_error,
-)
+from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from .closed_submaps import ClosedSubmaps, Neighbourhood, Region, merged
 from .graph import ORIGIN, ActiveSubmap, Chain, ClosingRule, SubmapGraph
 from .joining import summarise
@@ -205,7 +198,7 @@ class SubmapSlam(SubmapQueries):
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map, as `EkfSlam.reset`."""
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._begin(pose, pose_std)
 
     def _begin(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
@@ -226,12 +219,16 @@ class SubmapSlam(SubmapQueries):
         motion = argument_checks.pair("odometry", odometry)
         argument_checks.duration(dt)
         self._claim_folder()
-        if self._neighbourhood.is_empty:
-            self._active.filter.predict(motion, dt)
+        slam, near = self._active.filter, self._neighbourhood
+        if near.is_empty:
+            slam.predict(motion, dt)
             return
-        with undone_on_error(self.checkpoint(motion=True)):
-            self._active.filter.predict(motion, dt)
-            self._neighbourhood.predict(motion, dt)
+
+        def follow(_: object) -> None:
+            near.predict(motion, dt)
+
+        step = partial(slam.predict, motion, dt)
+        advance(slam, step, follow, undo_all(), near.bookmark)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -272,8 +269,8 @@ class SubmapSlam(SubmapQueries):
             return self._active.filter.update(readings, ids)
 
         slam, then = self._active.filter, partial(self._follow, readings, ids)
-        undo = self.bookmark() if self._graph.is_overdue else slam.bookmark()
-        return carried_out(correct, then, undo, slam.recall(), self.bookmark)
+        undo = self.bookmark() if self._graph.is_overdue else undo_all()
+        return advance(slam, correct, then, undo, self.bookmark)
 
     def _follow(
         self, readings: Array, ids: list[int], report: UpdateReport
@@ -304,7 +301,7 @@ class SubmapSlam(SubmapQueries):
         """
         ids = argument_checks.mapped_identities(landmark_ids, self._graph.index)
         self._claim_folder()
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._graph.remove(ids)
             self._neighbourhood.remove(ids)
 
@@ -329,7 +326,7 @@ class SubmapSlam(SubmapQueries):
         kept, gone = argument_checks.landmark_pairs(pairs, self._graph.index)
         pairs = list(zip(kept, gone, strict=True))
         self._claim_folder()
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._graph.merge_pairs(pairs)
             self._neighbourhood.merge_pairs(pairs)
 
@@ -366,28 +363,23 @@ class SubmapSlam(SubmapQueries):
         reach = argument_checks.distance("within", within)
         return self._neighbourhood.view(reach)._replace(whole=self.landmark_ids)
 
-    def checkpoint(self, *, motion: bool = False) -> Undo:
-        """Return what takes back later calls; ``motion``: only those of predict."""
-        return undo_all(
-            self._active.filter.checkpoint(motion=motion),
-            self._neighbourhood.checkpoint(motion=motion),
-            *(() if motion else (self._graph.checkpoint(),)),
-            attributes(self),
-        )
-
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         return undo_all(
             self._active.filter.bookmark(),
-            self._neighbourhood.checkpoint(),
+            self._neighbourhood.bookmark(),
             self._graph.checkpoint(),
             attributes(self),
         )
 
-    def recall(self) -> Recall[UpdateReport] | None:
-        """Return a function that gives the report of the next update when done."""
-        self._report = None
-        return lambda: self._report
+    @property
+    def steps(self) -> int:
+        """Number of steps taken; it changes at once with the belief."""
+        return self._active.filter.steps
+
+    def report(self) -> UpdateReport | None:
+        """Return the report of the last update once more."""
+        return self._report
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state as arrays, without submaps in a folder.
@@ -408,7 +400,7 @@ class SubmapSlam(SubmapQueries):
         """
         graph = saved_graph(state, type(self).__name__, self._active, self._folder)
         near = self._neighbourhood.restored(without_prefix(state, "vicinity", "_"))
-        with undone_on_error(self.checkpoint()):
+        with undone_on_error(self.bookmark()):
             self._active.filter.load_state_dict(without_prefix(state, "local", "_"))
             self._graph, self._neighbourhood = graph, near
             if isinstance(graph.closed.store, FolderStore):

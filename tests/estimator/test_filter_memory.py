@@ -1,0 +1,146 @@
+"""The memory of a filter: growth, identities, copies, pickles, reports."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from comparison import digest
+
+from slamgym.estimator import UpdateReport, make_estimator
+
+NOISE = {"motion_std": (0.05, 0.02, 0.01), "measurement_std": (0.03, 0.1)}
+FAMILY = (
+    *("ekf", "invariant", "first_estimates", "observability_constrained"),
+    *("iterated", "ideal", "robocentric", "unscented"),
+)
+
+
+def scans(seed, identities, steps=60, most=6):
+    """Odometry and scans of random landmarks on a plane, seen from a circle."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-8, 8, (len(identities), 2))
+    for k in range(steps):
+        heading = 0.1 * k
+        offset = places - (5 * np.sin(heading), 5 - 5 * np.cos(heading))
+        seen = rng.permutation(len(places))[: rng.integers(most + 1)]
+        bearing = np.arctan2(*offset[seen].T[::-1]) - heading
+        readings = np.column_stack([bearing, np.hypot(*offset[seen].T)])
+        yield (0.5, 0.1), readings + rng.normal(0, 0.02, readings.shape), seen
+
+
+IDENTITIES = {
+    "in order": list(range(40)),
+    "negative": [-1 - 7 * k for k in range(40)],
+    "far apart": [k << 32 for k in range(20)] + [k * 2**20 for k in range(21, 41)],
+    "at the ends": [2**63 - 1 - k for k in range(20)]
+    + [2**20 - 2**63 + k for k in range(20)],
+}
+
+
+@pytest.mark.parametrize("label", IDENTITIES)
+def test_the_belief_does_not_depend_on_the_identities(label):
+    identities = IDENTITIES[label]
+    slam, plain = make_estimator("ekf", **NOISE), make_estimator("ekf", **NOISE)
+    for k, (u, z, seen) in enumerate(scans(0, identities)):
+        ids = [identities[i] for i in seen]
+        for each in (slam, plain):
+            each.predict(u)
+        report, expected = slam.update(z, ids), plain.update(z, seen)
+        assert report.added_ids == tuple(identities[i] for i in expected.added_ids)
+        if k % 20 == 10:  # the table is made anew
+            slam.remove(slam.landmark_ids[:3])
+            plain.remove(plain.landmark_ids[:3])
+    assert slam.landmark_ids == tuple(identities[i] for i in plain.landmark_ids)
+    np.testing.assert_array_equal(slam.belief().mean, plain.belief().mean)
+
+
+@pytest.mark.parametrize("name", FAMILY)
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda slam: pickle.loads(pickle.dumps(slam))]
+)
+def test_a_copy_continues_alone_bit_for_bit(name, copied):
+    steps = list(scans(1, range(30), steps=12))
+    slam = make_estimator(name, **NOISE)
+    for u, z, seen in steps[:6]:
+        slam.predict(u)
+        slam.update(z, seen)
+    twin, before = copied(slam), digest(slam)
+    for u, z, seen in steps[6:]:
+        twin.predict(u)
+        twin.update(z, seen)
+    assert digest(slam) == before
+    for u, z, seen in steps[6:]:
+        slam.predict(u)
+        slam.update(z, seen)
+    assert digest(twin) == digest(slam)
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_a_report_keeps_its_results_while_the_filter_goes_on(name):
+    slam, twin = make_estimator(name, **NOISE), make_estimator(name, **NOISE)
+    kept, read = [], []
+    for u, z, seen in scans(2, range(40), steps=25, most=12):
+        for each in (slam, twin):
+            each.predict(u)
+        kept.append(slam.update(z, seen))
+        report = twin.update(z, seen)
+        read.append(report.replace())  # reads all of it at once
+    for late, early in zip(kept, read, strict=True):
+        assert late == early
+    assert pickle.loads(pickle.dumps(kept[-1])) == copy.deepcopy(kept[-1]) == read[-1]
+
+
+def test_the_last_report_is_the_one_that_is_still_held():
+    slam = make_estimator("ekf", **NOISE)
+    report = slam.update([(0.1, 3.0)], [4])
+    assert slam.report() is report
+    slam.predict((1.0, 0.0))
+    assert slam.report() is report
+    slam.update([(0.2, 4.0)], [5])
+    assert slam.report().added_ids == (5,)
+    assert report.added_ids == (4,)
+
+
+@pytest.mark.parametrize("name", [*FAMILY, "compressed", "sparse_information"])
+def test_the_report_before_the_first_scan_is_empty(name):
+    slam = make_estimator(name, **NOISE)
+    slam.predict((1.0, 0.0))
+    assert slam.report().replace() == UpdateReport()
+
+
+def test_steps_count_what_the_belief_has_taken_in_and_nothing_else():
+    slam = make_estimator("ekf", **NOISE)
+    before = slam.steps
+    slam.predict((1.0, 0.0))
+    slam.update([(0.1 * k, 3.0) for k in range(30)], range(30))  # grows
+    assert slam.steps == before + 2
+    slam.remove([3])
+    slam.merge(4, 5)
+    with pytest.raises(ValueError, match="twice"):
+        slam.update([(0.1, 3.0), (0.2, 3.0)], [1, 1])
+    assert slam.steps == before + 2
+
+
+def test_steps_and_report_go_on_where_a_dense_map_becomes_sparse():
+    slam = make_estimator("sparse_information", **NOISE, active_bound=2)
+    slam.predict((1.0, 0.0))
+    slam.update([(0.0, 2.0), (0.5, 3.0)], [1, 2])
+    assert (slam.steps, slam.report().added_ids) == (2, (1, 2))
+    report = slam.update([(0.0, 2.0), (1.0, 3.0)], [1, 3])
+    assert slam.steps == 3
+    assert slam.report() is report
+    assert report.added_ids == (3,)
+    slam.predict((1.0, 0.0))
+    slam.update([], [])
+    assert (slam.steps, slam.report().added_ids) == (5, ())
+
+
+@pytest.mark.parametrize("ids", [[7, 8, 7], [1, 9, 9], [9, 1, 9]])
+def test_a_repeated_landmark_is_refused_mapped_or_not(ids):
+    slam = make_estimator("ekf", **NOISE)
+    slam.update([(0.0, 2.0), (0.5, 3.0)], [1, 7])
+    before = digest(slam)
+    with pytest.raises(ValueError, match="must not repeat within a scan, got"):
+        slam.update([(0.0, 2.0), (0.1, 3.0), (0.2, 4.0)], ids)
+    assert digest(slam) == before
