@@ -11,7 +11,7 @@ and compare it with two filters of the package on 100 drives.
 # ------------------------
 # A filter is any class with the methods of ``SlamEstimator``; :doc:`/own_filter` shows a whole one. Here, an existing filter is changed.
 # ``check_estimator`` runs it in a small world and lists what it lacks to run, wrong beliefs, and recommendations. It notices that this
-# filter assumes more noise than it was told, which is intended here. Such a filter runs in all commands.
+# filter assumes more noise than it is given, which is intended here. Such a filter runs in all commands.
 
 from slamgym import EkfSlam, check_estimator
 from slamgym.estimator import EstimatorContractError
