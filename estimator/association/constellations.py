@@ -58,7 +58,7 @@ class Constellations:
     """A second place is a rival if it matches almost as many landmarks: fewer by less
     than this number, or more than three quarters of them.  The constellation is then
     not used."""
-    lost_std: float = 1.0
+    lost_std: float = 2.0
     """A landmark whose position relative to the robot is less certain than this is not
     associated with single readings [m]."""
     search_nodes: int = 20_000

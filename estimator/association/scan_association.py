@@ -382,7 +382,7 @@ CANDIDATES: saved_states.Table = {
 NODES = np.array([3 / 4, 1 / 8, 1 / 8])
 """Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance."""
 
-HIDDEN = 0.003
+HIDDEN = 0.0003
 """Probability that something hides a landmark until it is seen again."""
 
 SUREST = 0.95
