@@ -169,7 +169,6 @@ GOALS: dict[
 COMMON_GOALS = {
     ("invariant kernels", "ekf kernels"): -1.3,
     ("iterated (3) kernels", "ekf kernels"): -4,
-    ("invariant (3) kernels", "ekf kernels"): -4,
 }
 
 
