@@ -74,6 +74,8 @@ class GaussianMap:
 
     Examples
     --------
+    >>> from slamgym.estimator.kernels.filter_memory import update_map
+    >>> from slamgym.estimator.kernels.scan_update import DONE
     >>> gaussian = GaussianMap((*Rules(), 0.1, 0.1, 0.1))
     >>> gaussian.take_in(update_map, np.array([[0.0, 2.0]]), np.array([7])) == DONE
     True
