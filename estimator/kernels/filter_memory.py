@@ -118,7 +118,7 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
     Parameters
     ----------
     block : ndarray
-        The memory of the filter, see :class:`.kalman_gain.Parts`.  On return it also
+        The memory of the filter, see :class:`Parts`.  On return it also
         holds the record of the scan.
     readings : ndarray, shape (m, 2)
         Rows (β, r) [rad, m].

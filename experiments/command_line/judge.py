@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.text import Text
-
 from . import options
-from .program import FAILURE, BadInputError, command
+from .monte_carlo import show_study
+from .program import BadInputError, command
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,11 +72,9 @@ def judge(files: options.FilesOfEstimates, *, given: JudgeOptions) -> int:
     from ...estimator.models.rigid_motion import ERROR_FRAMES
     from .. import judging
     from ..monte_carlo import summarise_monte_carlo
-    from ..monte_carlo.report import monte_carlo_table, write_html_report
+    from ..monte_carlo.report import write_html_report
     from ..monte_carlo.results import REPORT, RESULTS
-    from ..monte_carlo.verdict import diagnosis_lines
     from .output_folder import default_folder, output_folder, write_summary
-    from .tables import written
 
     if given.frame not in ERROR_FRAMES:
         raise BadInputError(
@@ -100,18 +97,7 @@ def judge(files: options.FilesOfEstimates, *, given: JudgeOptions) -> int:
         results.to_netcdf(folder / RESULTS)
         write_html_report(results, summary, folder / REPORT)
         summary = write_summary(folder, summary)
-    sentences = [
-        Text(sentence)
-        for label, entry in summary["estimators"].items()
-        for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
-    ]
-    reporter.show(monte_carlo_table(summary), "", *sentences, "")
-    if summary["notes"]:
-        reporter.show(*map(Text, summary["notes"]), "")
-    reporter.show(written(str(place), summary["files"]))
-    reporter.finish({**summary, "out": str(place)})
-    went_well = any(entry["good_runs"] for entry in summary["estimators"].values())
-    return 0 if went_well else FAILURE
+    return show_study(reporter, summary, place)
 
 
 def _motion(text: str | None) -> str | list[float] | None:

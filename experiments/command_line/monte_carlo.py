@@ -14,6 +14,7 @@ from rich.text import Text
 from ...sim_configs import load_scenario
 from . import options
 from .program import FAILURE, BadInputError, command, interruptible
+from .reporter import Reporter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,12 +85,10 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     """  # noqa: D400 (the list of commands shows the question)
     from .. import monte_carlo
     from ..jobs import replace_own
-    from ..monte_carlo.report import monte_carlo_table, write_html_report
+    from ..monte_carlo.report import write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
     from ..monte_carlo.runner import SMALL_NOISE_SHARE
-    from ..monte_carlo.verdict import diagnosis_lines
     from .output_folder import as_json_text, default_folder
-    from .tables import written
 
     world = given.scenario(scenario)
     assumed = options.changes("--assume", given.assume)
@@ -133,15 +132,27 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
             write_html_report(results, summary, partial)
         with replace_own(place / SUMMARY) as partial:
             partial.write_text(as_json_text(summary), encoding="utf-8")
+    more = []
+    if share := results.attrs.get(SMALL_NOISE_SHARE):
+        text = f"Runs with less noise, which show causes, took {share:.0%} of the time."
+        more.append(text)
+    return show_study(reporter, summary, place, *more)
+
+
+def show_study(
+    reporter: Reporter, summary: dict[str, Any], place: Path, *more: str
+) -> int:
+    """Print what a study has found, with further sentences; return the exit code."""
+    from ..monte_carlo.report import monte_carlo_table
+    from ..monte_carlo.verdict import diagnosis_lines
+    from .tables import written
+
     sentences = [
-        Text(sentence)
+        sentence
         for label, entry in summary["estimators"].items()
         for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
     ]
-    if share := results.attrs.get(SMALL_NOISE_SHARE):
-        text = f"Runs with less noise, which show causes, took {share:.0%} of the time."
-        sentences.append(Text(text))
-    reporter.show(monte_carlo_table(summary), "", *sentences, "")
+    reporter.show(monte_carlo_table(summary), "", *map(Text, [*sentences, *more]), "")
     if summary["notes"]:
         reporter.show(*map(Text, summary["notes"]), "")
     reporter.show(written(str(place), summary["files"]))
