@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ..kernels.imagine import Imagined, as_view, imagine_plans
 from ..kernels.kalman_gain import AFTER_STDS, FIRST_STD
+from ..models.sensors import for_sensor
 from ..support import argument_checks
 from .batch import BatchSlam, can_batch
 from .ekf import EkfSlam
@@ -129,7 +130,7 @@ def imagine(
         np.full((count, plans_each, steps), np.nan),
     )
     workspace = workspace_for(filters.rules, landmarks, means.shape[1])
-    imagine_plans(
+    for_sensor(imagine_plans, filters.sensor)(
         (means, covariances, references, slots),
         driven,
         ending,

@@ -452,12 +452,14 @@ class Rules(NamedTuple):
     min_range: float = 1e-3  # [m]
     gate: float = np.inf  # largest NIS of one reading
     noise_as_read: bool = False  # take noise at the range as read, not as expected
+    numbers: int = 2  # that a reading has; of one, the second row is void
 
 
 ITERATIONS = Rules._fields.index("iterations")
 FIRST_STD = Rules._fields.index("bearing_std")
 """Column of the first of the four standard deviations of a reading in the rules."""
 AFTER_STDS = Rules._fields.index("min_range")
+NUMBERS_READ = Rules._fields.index("numbers")
 
 
 # --------------------------------------------------------------------------------------

@@ -144,7 +144,7 @@ def add_landmarks(
 def as_rules(values: Array) -> Rules:
     """Read rules from the array ``numpy.array(rules)``.
 
-    Python passes one array faster than a tuple of twelve numbers.
+    Python passes one array faster than a tuple of thirteen numbers.
     """
     return Rules(
         int(values[0]),
@@ -159,6 +159,7 @@ def as_rules(values: Array) -> Rules:
         values[9],
         values[10],
         values[11] > 0,
+        int(values[12]),
     )
 
 
