@@ -20,8 +20,10 @@ from ..interface import Belief, MapView, UpdateReport, describe_filter
 from ..kernels.filter_memory import REPEATED, move_pose, update_map
 from ..kernels.kalman_gain import (
     ADDITIVE,
+    AFTER_STDS,
     AT_ESTIMATE,
     AT_REFERENCE,
+    FIRST_STD,
     INVARIANT,
     OUTCOME,
     PROJECTED,
@@ -332,9 +334,11 @@ class EkfSlam(MapFilter):
             If the landmarks would be more than memory holds; the belief is then as
             before.
         """
-        readings = argument_checks.scan(measurements, self.sensor.columns)
+        sensor, kernel = self.sensor, self._update_map
+        readings = argument_checks.scan(measurements, sensor.columns)
         ids = argument_checks.identity_array(landmark_ids, len(readings), self)
-        kernel = for_sensor(self._update_map, self.sensor)
+        if sensor is not BEARING_RANGE:
+            kernel = for_sensor(kernel, sensor)
         status = self.map.take_in(kernel, readings, ids)
         if status != DONE:
             self._refuse(status, readings, ids)
@@ -565,12 +569,13 @@ def checked_rules(
     )
 
 
-def reading_variances(rules: Rules, ranges: Array) -> Array:
-    """Return (σβ², σr²) of readings at these ranges [m], shape (m, 2)."""
-    range_std = rules.range_std + rules.range_std_per_metre * ranges
-    away = np.maximum(ranges, rules.min_range)
-    bearing_std = rules.bearing_std + rules.bearing_std_metres / away
-    return np.column_stack([bearing_std, range_std]) ** 2
+def reading_variances(
+    rules: Rules, ranges: Array, sensor: Sensor = BEARING_RANGE
+) -> Array:
+    """Return (σβ², σr²) of readings at these ranges [m], or another sensor's, (m, 2)."""
+    noise = rules[FIRST_STD:AFTER_STDS]
+    std = sensor.std(noise, np.maximum(ranges, rules.min_range))
+    return np.stack(np.broadcast_arrays(*std), axis=1) ** 2
 
 
 def _gate(probability: float | None, numbers: int) -> float:
