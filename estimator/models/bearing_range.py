@@ -213,7 +213,7 @@ located_jit = njit_inlined(located)
 # these functions.
 
 
-def pose_slopes(dx: float, dy: float, heading: float) -> tuple[float, ...]:  # noqa: ARG001
+def pose_slopes(dx: float, dy: float, heading: float) -> tuple[float, ...]:
     """Return Hl entry by entry, as `reading_slopes`, and then ∂h/∂θ = (−1, 0)."""
     bearing_x, bearing_y, range_x, range_y = reading_slopes_jit(dx, dy)
     return bearing_x, bearing_y, range_x, range_y, -1.0, 0.0
@@ -226,7 +226,7 @@ def difference(
     return wrap_angle_jit(bearing - expected), distance - expected_distance
 
 
-def read_distance(bearing: float, distance: float) -> float:  # noqa: ARG001
+def read_distance(bearing: float, distance: float) -> float:
     """Return the distance of the landmark by its reading, infinite if unknown [m]."""
     return distance
 
