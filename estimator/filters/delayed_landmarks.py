@@ -285,9 +285,9 @@ class _Seen(NamedTuple):
             Hc = Hc.reshape(2 * k, -1)[rows]
             apart = state[self.columns[:, :2]] - point
             std = self.stds(np.linalg.norm(apart, axis=1)).ravel()[rows]
-            W: Array = np.linalg.inv(Hc @ own @ Hc.T + np.diag(std**2))
+            W = np.asarray(np.linalg.inv(Hc @ own @ Hc.T + np.diag(std**2)))
             Hl = Hl.reshape(2 * k, 2)[rows]
-            M: Array = np.linalg.inv(Hl.T @ W @ Hl)
+            M = np.asarray(np.linalg.inv(Hl.T @ W @ Hl))
             G = M @ Hl.T @ W
             best = _Fit(point, nu, Hc, W, M, G, Hl)
             point = point + G @ nu

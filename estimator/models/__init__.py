@@ -10,6 +10,10 @@ if TYPE_CHECKING:
     from .bearing_range import locate_landmark as locate_landmark
     from .bearing_range import predict_measurement as predict_measurement
     from .bearing_range import wrap_angle as wrap_angle
+    from .sensors import Sensor as Sensor
+    from .sensors import check_sensor as check_sensor
+    from .sensors import find_sensor as find_sensor
+    from .sensors import register_sensor as register_sensor
     from .unicycle_motion import MotionPrediction as MotionPrediction
     from .unicycle_motion import predict_pose as predict_pose
 else:
