@@ -27,6 +27,7 @@ from ..kernels.batch import (
 from ..kernels.kalman_gain import Workspace
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame
+from ..models.sensors import for_sensor
 from ..support import argument_checks, saved_states
 from ..support.memory_limit import aligned_zeros, share_out, usable_cores
 from .ekf import FRAMES, EkfSlam
@@ -223,7 +224,12 @@ class BatchSlam(BatchOfBeliefs):
             raise ValueError(f"{type(estimator).__name__} cannot run in batches")
         self.runs = argument_checks.whole("runs", runs, 1)
         self.landmarks = argument_checks.whole("landmarks", landmarks, 0)
-        self.rules = estimator.rules
+        if not estimator.sensor.places:
+            raise ValueError(
+                f"readings of sensor '{estimator.sensor.name}' do not place a landmark "
+                "one by one, and batches do not collect them"
+            )
+        self.sensor, self.rules = estimator.sensor, estimator.rules
         """What distinguishes this filter's updates from another's."""
         self.rule_values = estimator.rule_values.copy()
         self.motion_values = estimator.motion_values
@@ -317,7 +323,7 @@ class BatchSlam(BatchOfBeliefs):
         failed_at: IntArray,
         part: slice,
     ) -> None:
-        drive_runs(
+        for_sensor(drive_runs, self.sensor)(
             _of(part, self._arrays()),
             _of(part, data),
             dt,
@@ -329,7 +335,7 @@ class BatchSlam(BatchOfBeliefs):
         )
 
     def _step(self, scans: tuple[Any, ...], chosen: BoolArray, part: slice) -> None:
-        step_runs(
+        for_sensor(step_runs, self.sensor)(
             _of(part, self._arrays()),
             _of(part, scans),
             chosen[part],
