@@ -20,12 +20,15 @@ from ..interface import Belief, MapView, UpdateReport, describe_filter
 from ..kernels.filter_memory import REPEATED, move_pose, update_map
 from ..kernels.kalman_gain import (
     ADDITIVE,
+    AFTER_STDS,
     AT_ESTIMATE,
     AT_REFERENCE,
+    FIRST_STD,
     INVARIANT,
     OUTCOME,
     PROJECTED,
     USED,
+    WAITING,
     Rules,
 )
 from ..kernels.scan_update import DONE, NOT_USABLE
@@ -41,7 +44,15 @@ from ..models.sensors import (
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
-from ..support.undo import Undo
+from ..support.saved_states import with_prefix, without_prefix
+from ..support.undo import Undo, attributes, undo_all, undone_on_error
+from .delayed_landmarks import (
+    WAITING_STATE,
+    Waiting,
+    collect,
+    is_landmark,
+    refuse_unknown_poses,
+)
 from .gaussian_map import (
     MAP_STATE,
     GaussianMap,
@@ -57,6 +68,8 @@ class MapFilter:
     """The belief, in the arrays that steps change."""
     rules: Rules
     """What distinguishes this filter's updates from another's."""
+    waiting: Waiting | None = None
+    """Readings that wait, of a sensor that does not place landmarks one by one."""
 
     __repr__ = describe_filter
 
@@ -78,6 +91,8 @@ class MapFilter:
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         self.map.reset(first, np.diag(std**2))
+        if self.waiting is not None:
+            self.waiting = Waiting()
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise landmarks; the remaining belief is unchanged to the last bit.
@@ -87,7 +102,7 @@ class MapFilter:
         ValueError
             If one is not in the map; nothing is removed.
         """
-        self.map.remove(argument_checks.mapped_identities(landmark_ids, self.map.slots))
+        self.map.remove(argument_checks.mapped_identities(landmark_ids, self.slots))
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two mapped landmarks being one, and remove the second.
@@ -111,7 +126,7 @@ class MapFilter:
         numpy.linalg.LinAlgError
             If a distance has no uncertainty; nothing is merged.
         """
-        kept, gone = landmark_pairs(pairs, self.map.slots)
+        kept, gone = landmark_pairs(pairs, self.slots)
         at_reference = self.rules.linearisation != AT_ESTIMATE
         self.map.merge(kept, gone, frame=self.frame, at_reference=at_reference)
 
@@ -124,23 +139,37 @@ class MapFilter:
             Return the marginal of the pose and these landmarks only, in this order.
         """
         if landmark_ids is not None:
-            landmark_ids = argument_checks.mapped_identities(
-                landmark_ids, self.map.slots
-            )
+            landmark_ids = argument_checks.mapped_identities(landmark_ids, self.slots)
+        elif self.waiting is not None:
+            landmark_ids = self.landmark_ids
         return self.map.belief(self.frame, landmark_ids)
 
     def map_view(self) -> MapView:
         """Return pose and map without a copy; it is valid until the next step."""
-        return self.map.view()
+        if self.waiting is None:
+            return self.map.view()
+        belief = self.belief()
+        return MapView(belief.mean, belief.covariance, belief.landmark_ids)
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The mapped landmarks, in the order of the belief."""
-        return tuple(self.map.slots)
+        return tuple(self.slots)
+
+    @property
+    def slots(self) -> Mapping[int, int]:
+        """Place of each landmark in the state: column 3 + 2 slot."""
+        slots = self.map.slots
+        if self.waiting is None:
+            return slots
+        return {i: slot for i, slot in slots.items() if is_landmark(i)}
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of mean, covariance, ids and linearisation points."""
-        return {"estimator": np.array(type(self).__name__), **self.map.state_dict()}
+        state = {"estimator": np.array(type(self).__name__), **self.map.state_dict()}
+        if self.waiting is not None:
+            state |= with_prefix("waiting", self.waiting._asdict(), "_")
+        return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit in a filter of the same settings.
@@ -157,15 +186,23 @@ class MapFilter:
             together; the belief is then as before.
         """
         name = {"estimator": type(self).__name__}
-        self.map.restore(saved_states.read(state, MAP_STATE, of=name))
+        checked = saved_states.read(state, MAP_STATE, of=name)
+        if self.waiting is not None:
+            checked |= read_waiting(state, checked["landmark_ids"])
+        self.restore(checked)
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that this process has saved, without checks."""
-        self.map.restore(state)
+        with undone_on_error(self.bookmark()):
+            self.map.restore(state)
+            if self.waiting is not None:
+                self.waiting = Waiting(state["waiting_ids"], state["waiting_readings"])
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
-        return self.map.bookmark()
+        if self.waiting is None:
+            return self.map.bookmark()
+        return undo_all(self.map.bookmark(), attributes(self))
 
     @property
     def steps(self) -> int:
@@ -174,7 +211,10 @@ class MapFilter:
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
-        return self.map.last_report()
+        return self.map.last_report() if self._report is None else self._report
+
+    _report: UpdateReport | None = None
+    """That of the last update, where the map has changed since."""
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""
@@ -281,6 +321,7 @@ class EkfSlam(MapFilter):
     ) -> None:
         self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         self.sensor = find_sensor(sensor)
+        self.waiting = None if self.sensor.places else Waiting()
         self.rules = checked_rules(
             measurement_std,
             sensor=self.sensor,
@@ -343,13 +384,36 @@ class EkfSlam(MapFilter):
             If the landmarks would be more than memory holds; the belief is then as
             before.
         """
-        readings = argument_checks.scan(measurements, self.sensor.columns)
+        sensor, kernel = self.sensor, self._update_map
+        readings = argument_checks.scan(measurements, sensor.columns)
         ids = argument_checks.identity_array(landmark_ids, len(readings), self)
-        kernel = for_sensor(self._update_map, self.sensor)
+        if sensor is not BEARING_RANGE:
+            kernel = for_sensor(kernel, sensor)
+            if self.waiting is not None:
+                return self._update_and_collect(kernel, readings, ids)
         status = self.map.take_in(kernel, readings, ids)
         if status != DONE:
             self._refuse(status, readings, ids)
         return self.map.report()
+
+    def _update_and_collect(
+        self, kernel: UpdateKernel, readings: Array, ids: IntArray
+    ) -> UpdateReport:
+        """Update with readings of mapped landmarks; let those of others wait."""
+        argument_checks.refuse_reserved(ids.tolist())
+        with undone_on_error(self.bookmark()):
+            self.map.hold(self.map.used, self.map.slots)  # what follows changes a copy
+            status = self.map.take_in(kernel, readings, ids)
+            if status != DONE:
+                self._refuse(status, readings, ids)
+            report = self.map.report()
+            left = self.map.parts.ledger[OUTCOME, : len(ids)] == WAITING
+            new = Waiting(np.column_stack([ids, ids])[left], readings[left])
+            self.waiting, placed = collect(
+                self.map, self.sensor, self.rules, self.waiting or Waiting(), new
+            )
+            self._report = report.replace(added_ids=placed)
+        return self._report
 
     @property
     def motion_values(self) -> Array:
@@ -528,6 +592,23 @@ class IteratedEkfSlam(EkfSlam):
         self._adopt(self.rules._replace(iterations=count))
 
 
+def read_waiting(state: Mapping[str, Any], mapped: Sequence[int]) -> dict[str, Any]:
+    """Return saved readings that wait, checked; none where the state has none.
+
+    Raises
+    ------
+    ValueError
+        If one names a past pose that is not in the map.
+    """
+    if "waiting_ids" not in state:
+        return with_prefix("waiting", Waiting()._asdict(), "_")
+    own = saved_states.read(
+        without_prefix(state, "waiting", "_"), WAITING_STATE, "waiting_"
+    )
+    refuse_unknown_poses(own["ids"], mapped)
+    return with_prefix("waiting", own, "_")
+
+
 FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 
 
@@ -581,12 +662,13 @@ def checked_rules(
     )
 
 
-def reading_variances(rules: Rules, ranges: Array) -> Array:
-    """Return (σβ², σr²) of readings at these ranges [m], shape (m, 2)."""
-    range_std = rules.range_std + rules.range_std_per_metre * ranges
-    away = np.maximum(ranges, rules.min_range)
-    bearing_std = rules.bearing_std + rules.bearing_std_metres / away
-    return np.column_stack([bearing_std, range_std]) ** 2
+def reading_variances(
+    rules: Rules, ranges: Array, sensor: Sensor = BEARING_RANGE
+) -> Array:
+    """Return (σβ², σr²) of readings at these ranges [m], or another sensor's, (m, 2)."""
+    noise = rules[FIRST_STD:AFTER_STDS]
+    std = sensor.std(noise, np.maximum(ranges, rules.min_range))
+    return np.stack(np.broadcast_arrays(*std), axis=1) ** 2
 
 
 def _gate(probability: float | None, numbers: int) -> float:

@@ -140,7 +140,7 @@ def coincide(
     if frame == "additive":
         return ConditionedMap(mean - gains.T @ np.linalg.solve(L, offset), P)
     shift = _turned_shift(L, gains, offset)
-    return _composed(mean, P, shift)
+    return composed(mean, P, shift)
 
 
 def _turned_shift(
@@ -164,7 +164,7 @@ def _columns(slots: int | Sequence[int]) -> IntArray:
     return np.asarray((first[:, None] + np.arange(2)).ravel())
 
 
-def _composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
+def composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
     """Compose an invariant correction with the state, and transform P to match.
 
     ::
