@@ -324,12 +324,7 @@ def _guesses(seen: _Seen, state: Array) -> list[Array]:
     cost = (nu**2).sum(axis=1)
     least = cost.reshape(DIRECTIONS, -1).argmin(axis=1)
     chosen = np.arange(DIRECTIONS) * len(DISTANCES) + least
-    points, nu, H, cost = (
-        grid.reshape(-1, 2)[chosen],
-        nu[chosen],
-        H[chosen],
-        cost[chosen],
-    )
+    points, nu, H, cost = grid.reshape(-1, 2)[chosen], nu[chosen], H[chosen], cost[chosen]
     damping = np.full(DIRECTIONS, 1e-2)
     for _ in range(15):
         N = H.transpose(0, 2, 1) @ H
@@ -361,7 +356,9 @@ def _conditioned(
     left = fit.left()
     shift = np.concatenate([cross.T @ (left @ fit.nu), fit.G @ fit.nu])
     to_landmark = -cross.T @ fit.G.T
-    P = np.block([[P - cross.T @ left @ cross, to_landmark], [to_landmark.T, fit.M]])
+    P = np.block(
+        [[P - cross.T @ left @ cross, to_landmark], [to_landmark.T, fit.M]]
+    )
     P = (P + P.T) / 2
     mean = np.concatenate([mean, fit.point])
     if rules.frame == INVARIANT:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import inf, log1p
 from statistics import NormalDist
-from typing import Any, ClassVar, NamedTuple, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,7 +32,7 @@ from ..kernels.kalman_gain import (
     Rules,
 )
 from ..kernels.scan_update import DONE, NOT_USABLE
-from ..models.motions import UNICYCLE, Motion, find_motion
+from ..models.motions import UNICYCLE, Motion, MotionNoise
 from ..models.rigid_motion import ErrorFrame
 from ..models.sensors import (
     BEARING_RANGE,
@@ -682,40 +682,3 @@ def _gate(probability: float | None, numbers: int) -> float:
     if numbers == 1:
         return NormalDist().inv_cdf((1 + probability) / 2) ** 2
     return -2 * log1p(-probability)  # P(χ²₂ > g) = e^{−g/2}
-
-
-class MotionNoise(NamedTuple):
-    """A drive with the variances of its noise, and whether there is noise at rest."""
-
-    variance: Array
-    """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
-    at_rest: bool = True
-    """False: odometry that moves nothing adds no noise."""
-    motion: Motion = UNICYCLE
-
-    @classmethod
-    def checked(
-        cls,
-        motion_std: ArrayLike,
-        noise_at_rest: bool,
-        motion: str | Motion = UNICYCLE,
-    ) -> MotionNoise:
-        """Return the noise of these standard deviations (3,), or refuse them."""
-        std = argument_checks.standard_deviations("motion_std", motion_std, 3)
-        at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
-        return cls(std**2, at_rest, find_motion(motion))
-
-    def weight(self, moved: tuple[float, float, float], dt: float) -> float:
-        """Return the factor of the variances for a displacement over dt steps.
-
-        Raises
-        ------
-        ValueError
-            If dt is no number, negative, or too large.
-        """
-        dt = argument_checks.duration(dt)
-        return dt if self.at_rest or any(moved) else 0.0
-
-    def over(self, moved: tuple[float, float, float], dt: float) -> Array:
-        """Return the variances (3,) of a displacement over dt steps."""
-        return self.variance * self.weight(moved, dt)

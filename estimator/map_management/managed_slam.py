@@ -23,7 +23,6 @@ from ..association.scan_association import (
     Sensor,
     associate,
 )
-from ..filters.ekf import MotionNoise
 from ..interface import (
     Belief,
     MapView,
@@ -35,7 +34,7 @@ from ..interface import (
     optional_members,
     restore,
 )
-from ..models.motions import UNICYCLE
+from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds

@@ -237,6 +237,43 @@ def find_motion(motion: str | Motion) -> Motion:
         ) from None
 
 
+class MotionNoise(NamedTuple):
+    """A drive with the variances of its noise, and whether there is noise at rest."""
+
+    variance: Array
+    """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
+    at_rest: bool = True
+    """False: odometry that moves nothing adds no noise."""
+    motion: Motion = UNICYCLE
+
+    @classmethod
+    def checked(
+        cls,
+        motion_std: ArrayLike,
+        noise_at_rest: bool,
+        motion: str | Motion = UNICYCLE,
+    ) -> "MotionNoise":
+        """Return the noise of these standard deviations (3,), or refuse them."""
+        std = argument_checks.standard_deviations("motion_std", motion_std, 3)
+        at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
+        return cls(std**2, at_rest, find_motion(motion))
+
+    def weight(self, moved: tuple[float, float, float], dt: float) -> float:
+        """Return the factor of the variances for a displacement over dt steps.
+
+        Raises
+        ------
+        ValueError
+            If dt is no number, negative, or too large.
+        """
+        dt = argument_checks.duration(dt)
+        return dt if self.at_rest or any(moved) else 0.0
+
+    def over(self, moved: tuple[float, float, float], dt: float) -> Array:
+        """Return the variances (3,) of a displacement over dt steps."""
+        return self.variance * self.weight(moved, dt)
+
+
 def only_unicycle(motion: Motion, part: str) -> None:
     """Refuse other drives where a part takes the unicycle's odometry only."""
     if motion != UNICYCLE:

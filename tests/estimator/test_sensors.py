@@ -95,9 +95,7 @@ def test_the_compiled_parts_equal_the_jacobians(sensor):
         np.testing.assert_allclose([a_turn, b_turn], turned, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "sensor", [BEARING_RANGE, POSITION, COPY], ids=lambda s: s.name
-)
+@pytest.mark.parametrize("sensor", [BEARING_RANGE, POSITION, COPY], ids=lambda s: s.name)
 def test_one_reading_places_a_landmark(sensor):
     rng = np.random.default_rng(3)
     placed = kernel_parts(sensor)[bearing_range.placed_jit]
@@ -108,9 +106,7 @@ def test_one_reading_places_a_landmark(sensor):
         np.testing.assert_allclose(slow.position[0], point, atol=1e-12)
         numeric = numeric_jacobian(lambda p, z=z: sensor.locate(p, z).position, pose)
         np.testing.assert_allclose(slow.jacobian_pose, numeric, atol=1e-7)
-        x, y, tx, ty, xx, more_xx, xy, yy, more_yy = placed(
-            tuple(pose), *z[0], *variances
-        )
+        x, y, tx, ty, xx, more_xx, xy, yy, more_yy = placed(tuple(pose), *z[0], *variances)
         np.testing.assert_allclose([x, y], point, atol=1e-12)
         np.testing.assert_allclose([tx, ty], slow.jacobian_pose[0, :, 2], atol=1e-12)
         Fz = slow.jacobian_measurement[0]
@@ -228,9 +224,7 @@ def test_imagined_plans_expect_the_readings_of_the_sensor():
     for _ in range(3):
         slam.predict((0.3, 0.1))
         belief = slam.belief()
-        slam.update(
-            POSITION.predict(belief.pose, belief.landmarks).measurement, range(5)
-        )
+        slam.update(POSITION.predict(belief.pose, belief.landmarks).measurement, range(5))
     np.testing.assert_allclose(
         imagined.pose_covariances[0, 0, -1], slam.belief().pose_covariance, atol=1e-12
     )
