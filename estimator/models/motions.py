@@ -18,6 +18,8 @@ b = (dx, dy, α)  displacement in the robot's frame, then turn [m, m, rad]
 ε = (εx, εy, εα) motion noise in the robot's own frame [m, m, rad], ε ~ N(0, R)
 """
 
+from __future__ import annotations
+
 import re
 import tomllib
 from collections.abc import Callable
@@ -252,7 +254,7 @@ class MotionNoise(NamedTuple):
         motion_std: ArrayLike,
         noise_at_rest: bool,
         motion: str | Motion = UNICYCLE,
-    ) -> "MotionNoise":
+    ) -> MotionNoise:
         """Return the noise of these standard deviations (3,), or refuse them."""
         std = argument_checks.standard_deviations("motion_std", motion_std, 3)
         at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
