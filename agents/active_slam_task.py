@@ -111,6 +111,7 @@ class ActiveSlamTask(Restorable):
         count: int = 1,
         form: ObservationForm | None = None,
     ) -> None:
+        scenario.refuse_models("active SLAM")
         self.scenario, self.weights = scenario, weights
         self._form = form or ObservationForm()
         self.grid = CoverageGrid(scenario)

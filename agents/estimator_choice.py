@@ -117,12 +117,19 @@ def _bounded(management: Any, rows: int | None) -> LandmarkPolicy | Literal[Fals
 
 
 def noise_options(factory: Callable[..., Any], scenario: Scenario) -> dict[str, Any]:
-    """Return the noise settings of a world that a factory accepts."""
+    """Return the noise settings of a world that a factory accepts, and its models.
+
+    Raises
+    ------
+    ValueError
+        If the factory does not take the world's sensor or drive.
+    """
     settings = {
         "range_std_per_metre": scenario.sensor.range_std_per_metre,
         "noise_at_rest": scenario.motion.noise_at_rest,
     }
-    return registry.accepted_options(factory, settings)
+    accepted = registry.accepted_options(factory, settings)
+    return {**accepted, **registry.accepted_models(factory, scenario.models)}
 
 
 def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import inf, log1p
 from statistics import NormalDist
-from typing import Any, ClassVar, NamedTuple, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,7 @@ from ..kernels.kalman_gain import (
     Rules,
 )
 from ..kernels.scan_update import DONE, NOT_USABLE
+from ..models.motions import UNICYCLE, Motion, MotionNoise
 from ..models.rigid_motion import ErrorFrame
 from ..models.sensors import (
     BEARING_RANGE,
@@ -261,6 +262,8 @@ class EkfSlam(MapFilter):
     min_range : float
         Readings below this range [m], and those of landmarks expected below it, are
         skipped, because they have no usable bearing.
+    motion : str or Motion
+        The drive whose odometry `predict` takes, see :func:`~slamgym.find_motion`.
 
     Raises
     ------
@@ -308,8 +311,9 @@ class EkfSlam(MapFilter):
         gate_probability: float | None = None,
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
+        motion: str | Motion = UNICYCLE,
     ) -> None:
-        self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest)
+        self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         self.sensor = find_sensor(sensor)
         self.waiting = None if self.sensor.places else Waiting()
         self.rules = checked_rules(
@@ -333,16 +337,17 @@ class EkfSlam(MapFilter):
         Parameters
         ----------
         odometry : array_like, shape (2,)
-            u = (d, α): distance driven, then heading turned [m, rad].
+            u = (d, α): distance driven, then heading turned [m, rad]; or the
+            columns of another drive.
         dt : float
             Duration that the motion noise counts, in steps: its variance grows with
             dt, and dt = 0 adds none.
         """
-        distance, turn = argument_checks.pair("odometry", odometry)
         noise, weight = self._motion_noise, 1.0
+        moved = noise.motion.moved(odometry)
         if not (type(dt) is float and dt == 1.0 and noise.at_rest):
-            weight = noise.weight(distance, turn, dt)
-        move_pose(self.map.block, distance, turn, weight)
+            weight = noise.weight(moved, dt)
+        move_pose(self.map.block, *moved, weight)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -407,7 +412,12 @@ class EkfSlam(MapFilter):
     @property
     def motion_values(self) -> Array:
         """(σx², σy², σα²) per step, and 1 where a robot at rest has noise too."""
-        return np.append(*self._motion_noise)
+        return np.append(self._motion_noise.variance, self._motion_noise.at_rest)
+
+    @property
+    def motion(self) -> Motion:
+        """The drive whose odometry `predict` takes."""
+        return self._motion_noise.motion
 
     @property
     def rule_values(self) -> Array:
@@ -649,34 +659,3 @@ def _gate(probability: float | None, numbers: int) -> float:
     if numbers == 1:
         return NormalDist().inv_cdf((1 + probability) / 2) ** 2
     return -2 * log1p(-probability)  # P(χ²₂ > g) = e^{−g/2}
-
-
-class MotionNoise(NamedTuple):
-    """Variances of the motion noise, and whether it acts on a robot at rest."""
-
-    variance: Array
-    """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
-    at_rest: bool = True
-    """False: odometry of exactly (0, 0) adds no noise."""
-
-    @classmethod
-    def checked(cls, motion_std: ArrayLike, noise_at_rest: bool) -> MotionNoise:
-        """Return the noise of these standard deviations (3,), or refuse them."""
-        std = argument_checks.standard_deviations("motion_std", motion_std, 3)
-        at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
-        return cls(std**2, at_rest)
-
-    def weight(self, distance: float, turn: float, dt: float) -> float:
-        """Return the factor of the variances for one odometry reading over dt steps.
-
-        Raises
-        ------
-        ValueError
-            If dt is no number, negative, or too large.
-        """
-        dt = argument_checks.duration(dt)
-        return dt if self.at_rest or distance or turn else 0.0
-
-    def over(self, distance: float, turn: float, dt: float) -> Array:
-        """Return the variances (3,) of one odometry reading over dt steps."""
-        return self.variance * self.weight(distance, turn, dt)

@@ -37,7 +37,8 @@ infinite information, and optimisers do not converge with 1e-6."""
 
 
 def check(scenario: Scenario) -> None:
-    """Refuse scenarios that hide identities, which a graph needs."""
+    """Refuse hidden identities, and sensors and drives that the edges do not hold."""
+    scenario.refuse_models("format 'g2o'")
     if not scenario.sensor.identities:
         raise ValueError(
             f"format 'g2o' needs sensor.identities = true, scenario '{scenario.name}' "

@@ -8,7 +8,7 @@ import numpy as np
 from dense_ekf import DenseEkf
 from scipy.linalg import block_diag, expm, sqrtm
 
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 
 J = np.array([[0.0, -1.0], [1.0, 0.0]])
 
