@@ -35,11 +35,13 @@ __all__ = [
     "SupportsJoin",
     "SupportsLocalView",
     "SupportsMemoryEstimate",
+    "SupportsPoses",
     "SupportsSmoothing",
     "SupportsTruth",
     "UpdateReport",
     "optional_members",
     "restore",
+    "taking_poses",
 ]
 
 
@@ -87,6 +89,25 @@ class SupportsTruth(Protocol):
         self, pose: ArrayLike, landmarks: Mapping[int, ArrayLike]
     ) -> None:
         """Pass the true pose (3,) and landmarks before the predict of a step."""
+
+
+@runtime_checkable
+class SupportsPoses(Protocol):
+    """An estimator that takes readings of the pose, such as compass or GPS."""
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Take in z = H (x, y, θ) + w, w of covariance R, from z, H and R."""
+        ...
+
+
+def taking_poses(estimator: object) -> SupportsPoses:
+    """Return an estimator that takes readings of the pose; refuse any other."""
+    if not isinstance(estimator, SupportsPoses):
+        name = type(estimator).__name__
+        raise ValueError(f"{name} does not take readings of the pose")
+    return estimator
 
 
 @runtime_checkable

@@ -8,7 +8,7 @@ subclasses differ in where they linearise and in their error frame: `InvariantEk
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import inf, log1p
+from math import expm1, inf, log1p
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import numpy as np
@@ -25,6 +25,7 @@ from ..kernels.kalman_gain import (
     OUTCOME,
     PROJECTED,
     USED,
+    BeliefArrays,
     Rules,
 )
 from ..kernels.scan_update import DONE, NOT_USABLE
@@ -33,6 +34,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
 from ..support.undo import Undo
+from .conditioning import ObservedMap, PoseReading
 from .gaussian_map import (
     MAP_STATE,
     GaussianMap,
@@ -105,6 +107,63 @@ class MapFilter:
         kept, gone = landmark_pairs(pairs, self.map.slots)
         at_reference = self.rules.linearisation != AT_ESTIMATE
         self.map.merge(kept, gone, frame=self.frame, at_reference=at_reference)
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Correct the belief with a reading of the pose, such as compass or GPS.
+
+        The reading is z = H (x, y, θ) + w.  A compass has H = [0 0 1], a GPS
+        H = [1 0 0; 0 1 0].
+
+        Parameters
+        ----------
+        reading : array_like, shape (k,)
+            z [m or rad]; a component that depends on the heading alone is an angle.
+        matrix : array_like, shape (k, 3)
+            H.
+        covariance : array_like, shape (k, k)
+            R, of the noise w; positive definite.
+
+        Returns
+        -------
+        UpdateReport
+            NIS, innovation (k,) and its covariance.  It has no degrees of freedom where
+            the gate of the filter, if any, rejects the reading.
+
+        Raises
+        ------
+        ValueError
+            If an argument is malformed; the belief is then as before.
+
+        Examples
+        --------
+        >>> slam = InvariantEkfSlam((0, 0, 0), (0.1, 0.1), initial_pose_std=(1, 1, 1))
+        >>> slam.observe_pose(0.5, [0, 0, 1], 1.0).degrees_of_freedom
+        1
+        >>> slam.belief().pose
+        array([0.  , 0.  , 0.25])
+        """
+        given = PoseReading.checked(reading, matrix, covariance)
+        (mean, P, reference), map_ = self.map.used, self.map
+        found = self._observe(given, mean, P)
+        size = found.innovation.size
+        if not found.nis <= gate_of(self.rules.gate, size):
+            return UpdateReport()
+        after = BeliefArrays(found.mean, found.covariance, reference)
+        map_.hold(after, map_.slots, block=map_.blank(map_.room), steps=1)
+        return UpdateReport(
+            nis=float(found.nis),
+            degrees_of_freedom=size,
+            innovation=found.innovation,
+            factor=found.factor,
+        )
+
+    def _observe(
+        self, given: PoseReading, mean: Array, covariance: Array
+    ) -> ObservedMap:
+        once = self.rules.iterations == 1
+        return given.correct(mean, covariance, frame=self.frame, once=once)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return the belief as a snapshot, of the whole map or of a part of it.
@@ -557,6 +616,15 @@ def _gate(probability: float | None) -> float:
             f"gate_probability must lie between 0 and 1, got {probability!r}"
         )
     return -2 * log1p(-probability)  # P(χ²₂ > g) = e^{−g/2}
+
+
+def gate_of(gate: float, size: int) -> float:
+    """Return the χ²(size) quantile of the probability of a χ²(2) quantile."""
+    if gate == inf:
+        return inf
+    from scipy.special import gammaincinv  # noqa: PLC0415 (slow to import)
+
+    return 2 * float(gammaincinv(size / 2, -expm1(-gate / 2)))
 
 
 class MotionNoise(NamedTuple):
