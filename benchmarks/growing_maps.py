@@ -47,7 +47,7 @@ from scipy.linalg.blas import dsyrk
 from slamgym.estimator import EkfSlam
 from slamgym.estimator.large_maps.compressed.compressed_slam import CompressedEkfSlam
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from slamgym.estimator import make_batch
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.smoother import Drive, smooth
 from slamgym.estimator.smoother.optimiser import start_of
 

@@ -28,6 +28,8 @@ _PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
 _UNSEEN = np.array(0.0)
 _LAST = np.array(np.inf)  # sorts after every other row
 
+_ONE_NUMBER = ("bearing", "range")
+
 Limit = float | Array | None
 
 
@@ -59,12 +61,14 @@ class BearingRangeSensor:
         self._half_view: Limit = _limit(sensor.field_of_view / 2, above=math.pi)
         self._grows = sensor.range_std_per_metre > 0
         self._settings = SensorSettings.of(sensor)
+        self._kind = sensor.kind
         faults = scenario.present_faults
         biases = np.array([faults.bearing_bias, faults.range_bias])
         self._bias = biases if biases.any() else None
         largest = largest_noise(faults.sensor_dof) * sensor.std[0]
         largest += abs(faults.bearing_bias)
         self._may_wrap = sensor.field_of_view / 2 + largest >= math.pi
+        self._may_wrap &= "bearing" in sensor.kind
         hides = sensor.occlusion and scenario.walls
         self._sight = LineOfSight(scenario.walls) if hides else None
 
@@ -98,7 +102,8 @@ class BearingRangeSensor:
         Returns
         -------
         readings : ndarray, shape (2, …, N)
-            (β in [-π, π), r), zeros where unseen [rad, m].
+            (β in [-π, π), r) [rad, m], or the numbers of another kind of sensor, zeros
+            where unseen.
         mask : bool ndarray, shape (…, N)
             Landmarks that the sensor reads.
         """
@@ -116,6 +121,8 @@ class BearingRangeSensor:
         mask = _in_view(readings, nearest, max_range, half_view)
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
+        if self._kind == "position":
+            readings[0], readings[1] = x, y
         if self._grows:
             settings = settings or self._settings
             std = settings.range_std + settings.growth * readings[1]
@@ -126,6 +133,10 @@ class BearingRangeSensor:
             readings[1] += self._bias[1]
         if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
             wrap_bearings(bearings)
+        if self._kind == "range":
+            readings[0] = readings[1]
+        if self._kind in _ONE_NUMBER:
+            readings[1] = 0.0
         if np.count_nonzero(mask) < mask.size:
             readings = np.where(mask, readings, _UNSEEN)
         return readings, mask

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from ..sim_configs import Robot, Scenario, action_sequence
 from ..sim_configs.field_types import unknown_choice
-from .robot import displacement, wrap_angle
+from .robot import displacement, drive_of, wrap_angle
 
 __all__ = [
     "CONTROLLERS",
@@ -67,6 +67,11 @@ def make_controller(
         case "open_loop":
             return OpenLoop.for_scenario(scenario)
         case "waypoints":
+            if scenario.robot.drive == "bicycle":
+                raise ValueError(
+                    "controller 'waypoints' turns at rest, which robot.drive = "
+                    "'bicycle' cannot: use 'open_loop' or 'random'"
+                )
             return Waypoints.for_scenario(scenario)
         case "random":
             return RandomWalk.for_scenario(scenario, rng)
@@ -572,5 +577,9 @@ def planned_path(scenario: Scenario) -> Array:
     x, y, heading = scenario.start.pose
     headings = np.cumsum([heading, *turns])
     cos, sin = np.cos(headings[:-1]), np.sin(headings[:-1])
-    dx, dy = displacement(distances, np.zeros(len(distances)), cos, sin)
+    drive = drive_of(scenario.robot)
+    path = (distances, np.zeros(len(distances)))
+    if drive is not None:
+        path = drive.path(distances, turns)
+    dx, dy = displacement(*path, cos, sin)
     return np.column_stack([np.cumsum([x, *dx]), np.cumsum([y, *dy]), headings])

@@ -20,7 +20,7 @@ from .bearing_range import BearingRangeSensor, hide_identities
 from .noise_streams import NoiseRows, WorldNoise
 from .rendering.episode_renderer import EpisodeRenderer
 from .rendering.render_state import RENDER_MODES, BeliefLike
-from .robot import OdometrySensor, UnicycleBody
+from .robot import OdometrySensor, UnicycleBody, drive_of
 from .spaces import action_space, clipped_action, observation_space
 from .streams import EpisodeStarts, drawn_scenarios, episode_keys
 
@@ -120,7 +120,8 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
             self._renderer = EpisodeRenderer(self.scenario, render_mode, fps=_FPS)
         robot, self._dt = self.scenario.robot, self.scenario.dt
         self._limits = robot.max_speed, robot.max_turn_rate
-        self._body = UnicycleBody(robot.radius, self.scenario.walls)
+        self._drive = drive_of(robot)
+        self._body = UnicycleBody(robot.radius, self.scenario.walls, self._drive)
         self._odometer = OdometrySensor(self.scenario)
         self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
@@ -192,6 +193,8 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         """
         speed, turn_rate = clipped_action(action, self._limits)
         command = speed * self._dt, turn_rate * self._dt
+        if self._drive is not None:
+            command = self._drive.feasible(*command)
         slip, error = self._odometer.split_noise(command, next(self._motion_noise))
         share = self._body.drive(command, slip)
         odometry = self._odometer.read(command, share, error)

@@ -99,11 +99,13 @@ class SensorSettings(NamedTuple):
     @classmethod
     def of(cls, sensor: Sensor) -> "SensorSettings":
         """Return the settings of one world."""
-        bearing_std, std = sensor.std
-        range_std = 1.0 if sensor.range_std_per_metre else std
+        first, std = sensor.std
+        if sensor.kind == "range":
+            first, std = std, first  # its noise is that of the range
+        scale = np.array([[first, 1.0 if sensor.range_std_per_metre else std]])
         return cls(
-            np.array([[bearing_std, range_std]]),
-            std,
+            scale,
+            0.0 if sensor.kind == "position" else std,
             sensor.range_std_per_metre,
             sensor.dropout,
             _poisson_cdf(sensor.clutter, sensor.max_clutter)[None],

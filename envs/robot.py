@@ -1,4 +1,4 @@
-"""The simulated robot: its body, its walls, its odometry and the drive equation.
+"""The simulated robot: its body, its walls, its odometry and its drive.
 
 `UnicycleBody` drives, turns and stops at walls in the physics engine; `UnicycleBodies`
 moves many robots in numpy. `OdometrySensor` decides which noise disturbs the motion,
@@ -16,6 +16,9 @@ u = (d, α)        command: distance driven, then heading turned [m, rad]
     y' = y + (d + εx) sin θ + εy cos θ
     θ' = θ + (α + εα)
 
+This is the unicycle. `DifferentialDrive` and `BicycleDrive` replace (d, 0) by the
+displacement of an arc, and convert (d, α) to what their odometry reports.
+
 The filters' motion model and their arithmetic on angles are separate code in
 `estimator`, which `envs` does not import. A simulator that shared the filter's model
 could not reveal an error in it.
@@ -25,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import pymunk
@@ -33,7 +36,8 @@ import pymunk
 from ..arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ..jit import jit, njit_internal
 from ..restorable import Restorable, State
-from ..sim_configs import Scenario
+from ..sim_configs import Robot, Scenario
+from ..sim_configs.scenario import largest_curvature
 
 _NO_SLIP = (0.0, 0.0, 0.0)
 
@@ -52,6 +56,8 @@ class UnicycleBody(Restorable):
         Of the body [m].
     walls : sequence of (x0, y0, x1, y1)
         Ends of straight walls [m].
+    drive : Drive, optional
+        How it moves (a unicycle).
 
     Attributes
     ----------
@@ -69,9 +75,12 @@ class UnicycleBody(Restorable):
     array([1. , 0. , 0.3])
     """
 
-    def __init__(self, radius: float, walls: Sequence[Wall] = ()) -> None:
+    def __init__(
+        self, radius: float, walls: Sequence[Wall] = (), drive: Drive | None = None
+    ) -> None:
         self._radius = radius
         self._walls = tuple(walls)
+        self._drive = drive
         self._space = pymunk.Space()
         self._body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self._space.add(self._body)
@@ -116,7 +125,12 @@ class UnicycleBody(Restorable):
             Share of the displacement, in [0, 1], that the walls allowed. Walls do not
             affect the turn.
         """
-        dx, dy = displacement(command[0] + slip[0], slip[1], self._cos, self._sin)
+        if self._drive is None:
+            forward, sideways = command[0] + slip[0], slip[1]
+        else:
+            forward, sideways = self._drive.path(command[0], command[1])
+            forward, sideways = forward + slip[0], sideways + slip[1]
+        dx, dy = displacement(forward, sideways, self._cos, self._sin)
         share = 1.0
         if self._walls:
             x, y, _ = self._pose
@@ -138,10 +152,15 @@ class UnicycleBody(Restorable):
         self.inverse_heading[()] = complex(cos, -sin)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"radius": self._radius, "walls": self._walls, "pose": self._pose}
+        return {
+            "radius": self._radius,
+            "walls": self._walls,
+            "drive": self._drive,
+            "pose": self._pose,
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        UnicycleBody.__init__(self, state["radius"], state["walls"])
+        UnicycleBody.__init__(self, state["radius"], state["walls"], state["drive"])
         self.place(state["pose"])
 
 
@@ -328,6 +347,8 @@ class UnicycleBodies(Restorable):
         Of every body [m].
     walls : sequence of (x0, y0, x1, y1)
         Ends of straight walls, the same in every world [m].
+    drive : Drive, optional
+        How they move (unicycles).
 
     Attributes
     ----------
@@ -346,7 +367,14 @@ class UnicycleBodies(Restorable):
            [1.5, 0. , 0. ]])
     """
 
-    def __init__(self, count: int, radius: float, walls: Sequence[Wall] = ()) -> None:
+    def __init__(
+        self,
+        count: int,
+        radius: float,
+        walls: Sequence[Wall] = (),
+        drive: Drive | None = None,
+    ) -> None:
+        self._drive = drive
         self._contacts = WallContacts(radius, walls) if walls else None
         self._pose = np.zeros((3, count))  # rows x, y, θ
         self.position = np.zeros((count, 1), dtype=np.complex128)
@@ -392,7 +420,11 @@ class UnicycleBodies(Restorable):
             that do not move; None without walls.
         """
         change = np.empty(self._pose.shape)
-        forward, sideways = commands[:, 0] + slip[:, 0], slip[:, 1]
+        if self._drive is None:
+            forward, sideways = commands[:, 0] + slip[:, 0], slip[:, 1]
+        else:
+            forward, sideways = self._drive.path(commands[:, 0], commands[:, 1])
+            forward, sideways = forward + slip[:, 0], sideways + slip[:, 1]
         change[0], change[1] = displacement(forward, sideways, self._cos, self._sin)
         if moving is not None:
             change[:2] *= moving  # no wall is asked about those that stay
@@ -448,6 +480,130 @@ def displacement(
 
 
 # --------------------------------------------------------------------------------------
+# Drives other than the unicycle.
+#
+# Commands stay (d, α), so that every controller drives every robot: the distance of
+# the axle, and the turn. The robot follows the arc of both, of length d and angle α.
+# The same numpy functions serve one robot and many, so both give the same bits.
+
+
+class Drive(Protocol):
+    """How a robot executes a command, and what its odometry reports."""
+
+    def feasible(self, distance: Any, turn: Any) -> tuple[Any, Any]:
+        """Return the command (d, α) that the robot executes; numbers or arrays."""
+        ...
+
+    def path(self, distance: Any, turn: Any) -> tuple[Any, Any]:
+        """Return the displacement (forward, sideways) in the frame of the start [m]."""
+        ...
+
+    def reading(self, distance: Any, turn: Any) -> tuple[Any, Any]:
+        """Return what the encoders report of a step (d, α)."""
+        ...
+
+
+def drive_of(robot: Robot) -> Drive | None:
+    """Return the drive of a robot, None for a unicycle."""
+    match robot.drive:
+        case "differential":
+            assert robot.track_width is not None
+            return DifferentialDrive(robot.track_width)
+        case "bicycle":
+            assert robot.wheelbase is not None
+            curvature, ahead = largest_curvature(robot), robot.reference or (0.0, 0.0)
+            return BicycleDrive(robot.wheelbase, curvature, ahead)
+    return None
+
+
+class DifferentialDrive(NamedTuple):
+    """Two wheels on one axle; the odometry reports (left, right), their travel [m].
+
+    ::
+
+        left = d - α w / 2,    right = d + α w / 2
+
+    Examples
+    --------
+    >>> left, right = DifferentialDrive(track_width=0.5).reading(1.0, 0.2)
+    >>> round(left, 9), round(right, 9)
+    (0.95, 1.05)
+    """
+
+    track_width: float  # w [m]
+
+    def feasible(self, distance: Any, turn: Any) -> tuple[Any, Any]:
+        """Return the command: every one is possible."""
+        return distance, turn
+
+    def path(self, distance: Any, turn: Any) -> tuple[Any, Any]:
+        """Return the chord of the arc."""
+        return arc(distance, turn)
+
+    def reading(self, distance: Any, turn: Any) -> tuple[Any, Any]:
+        """Return the travel of the wheels."""
+        half = turn * (self.track_width / 2)
+        return distance - half, distance + half
+
+
+class BicycleDrive(NamedTuple):
+    """A car; the odometry reports (d, φ), distance and steering angle [m, rad].
+
+    With the wheelbase L, its rear axle follows an arc of the curvature tan φ / L, which
+    the largest steering angle limits. At rest it cannot turn and reports φ = 0. The
+    pose is that of the reference point.
+
+    Examples
+    --------
+    >>> car = BicycleDrive(2.0, largest_curvature=0.5, reference=(1.0, 0.0))
+    >>> car.feasible(1.0, 0.8)
+    (1.0, np.float64(0.5))
+    """
+
+    wheelbase: float  # L [m]
+    largest_curvature: float  # [1/m]
+    reference: tuple[float, float]  # ahead and to the left of the rear axle [m]
+
+    def feasible(self, distance: Any, turn: Any) -> tuple[Any, Any]:
+        """Return the command with the turn within the steering."""
+        most = abs(distance) * self.largest_curvature
+        return distance, np.minimum(np.maximum(turn, -most), most)
+
+    def path(self, distance: Any, turn: Any) -> tuple[Any, Any]:
+        """Return the displacement of the reference point, which turns with the car."""
+        (forward, sideways), (ahead, left) = arc(distance, turn), self.reference
+        sin, versed = np.sin(turn), 2 * np.sin(turn / 2) ** 2
+        return (
+            forward - versed * ahead - sin * left,
+            sideways + sin * ahead - versed * left,
+        )
+
+    def reading(self, distance: Any, turn: Any) -> tuple[Any, Any]:
+        """Return distance and steering angle."""
+        moves = distance != 0.0
+        ratio = self.wheelbase * turn / np.where(moves, distance, 1.0)
+        return distance, np.where(moves, np.arctan(ratio), 0.0)
+
+
+def arc(distance: Any, turn: Any) -> tuple[Any, Any]:
+    """Return the chord (forward, sideways) of an arc, in the frame of its start [m].
+
+    ::
+
+        d sin(α/2) / (α/2) (cos(α/2), sin(α/2))
+
+    Examples
+    --------
+    >>> forward, left = arc(np.pi, np.pi)
+    >>> round(float(forward), 9), round(float(left), 9)
+    (0.0, 2.0)
+    """
+    half = turn / 2
+    chord = distance * np.sinc(half / np.pi)
+    return chord * np.cos(half), chord * np.sin(half)
+
+
+# --------------------------------------------------------------------------------------
 # The odometry.
 #
 # With ``noise_in = "motion"`` the robot slips and the odometry reports the command.
@@ -484,6 +640,7 @@ class OdometrySensor:
         self._noise_at_rest = scenario.motion.noise_at_rest
         faults = scenario.present_faults
         self._gain, self._turn = 1.0 + faults.odometry_scale, faults.odometry_turn
+        self._drive = drive_of(scenario.robot)
 
     def split_noise(
         self, command: Command, noise: Sequence[float]
@@ -526,14 +683,15 @@ class OdometrySensor:
         Returns
         -------
         ndarray, shape (2,)
-            Odometry ((1 + s) share d + εd, α + b + εα) [m, rad]. Walls do not affect
-            the turn.
+            Odometry ((1 + s) share d + εd, α + b + εα) [m, rad], or what the drive
+            reports of it. Walls do not affect the turn.
         """
         distance, turn = command
         bias = self._turn if command != (0.0, 0.0) else 0.0
-        return np.array(
-            [self._gain * (share * distance) + error[0], turn + bias + error[1]]
-        )
+        driven, turned = self._gain * (share * distance) + error[0], turn + bias
+        if self._drive is not None:
+            return np.array(self._drive.reading(driven, turned))
+        return np.array([driven, turned + error[1]])
 
 
 class VectorOdometrySensor:
@@ -553,6 +711,7 @@ class VectorOdometrySensor:
         self._no_slip = np.zeros((count, 3))
         faults = scenario.present_faults
         self._gain, self._turn = 1.0 + faults.odometry_scale, faults.odometry_turn
+        self._drive = drive_of(scenario.robot)
 
     def split_noise(self, commands: Array, noise: Array) -> tuple[Array, Array]:
         """Split noise, (B, 3), into slip, (B, 3), and odometry error, (B, 2) or ().
@@ -577,6 +736,8 @@ class VectorOdometrySensor:
         if self._gain != 1.0:
             commands[:, 0] *= self._gain
         odometry: Array = commands + error
+        if self._drive is not None:
+            odometry = np.column_stack(self._drive.reading(*odometry.T))
         return odometry
 
 

@@ -36,10 +36,8 @@ def observation_space(scenario: Scenario) -> spaces.Dict:
     """
     rows, family = count_rows(scenario), scenario
     scenario = widest_scenario(family)
-    highest = np.tile(
-        [np.pi, _longest_reading(scenario, _displacement(family))], (rows, 1)
-    )
-    lowest = np.tile([-np.pi, 0.0], (rows, 1))
+    longest = _longest_reading(scenario, _displacement(family))
+    lowest, highest = (np.tile(ends, (rows, 1)) for ends in _ends(scenario, longest))
     odometry = np.array(_largest_odometry(scenario))
     return spaces.Dict(
         {
@@ -48,6 +46,18 @@ def observation_space(scenario: Scenario) -> spaces.Dict:
             "odometry": spaces.Box(-odometry, odometry, dtype=np.float64),
         }
     )
+
+
+def _ends(scenario: Scenario, longest: float) -> tuple[Array, Array]:
+    """Return the least and the largest reading; a void second number is 0 of [0, 1]."""
+    match scenario.sensor.kind:
+        case "position":
+            return np.array([-longest, -longest]), np.array([longest, longest])
+        case "bearing":
+            return np.array([-np.pi, 0.0]), np.array([np.pi, 1.0])
+        case "range":
+            return np.zeros(2), np.array([longest, 1.0])
+    return np.array([-np.pi, 0.0]), np.array([np.pi, longest])
 
 
 def count_rows(scenario: Scenario) -> int:
@@ -60,12 +70,16 @@ def _largest_odometry(scenario: Scenario) -> tuple[float, float]:
     robot, motion, faults = scenario.robot, scenario.motion, scenario.present_faults
     errs = largest_noise(faults.motion_dof) * (motion.noise_in == "odometry")
     gain = max(1.0, 1.0 + faults.odometry_scale)
-    return (
-        gain * robot.max_speed * scenario.dt + errs * motion.std[0],
-        robot.max_turn_rate * scenario.dt
-        + abs(faults.odometry_turn)
-        + errs * motion.std[2],
-    )
+    distance = gain * robot.max_speed * scenario.dt + errs * motion.std[0]
+    turn = robot.max_turn_rate * scenario.dt + abs(faults.odometry_turn)
+    turn += errs * motion.std[2]
+    match robot.drive:
+        case "differential":
+            assert robot.track_width is not None
+            return (distance + turn * robot.track_width / 2,) * 2
+        case "bicycle":
+            return distance, math.pi / 2
+    return distance, turn
 
 
 def _displacement(family: Scenario) -> float:
@@ -84,7 +98,8 @@ def _longest_reading(scenario: Scenario, displacement: float) -> float:
         reach = _farthest_landmark(scenario) + displacement
     faults = scenario.present_faults
     largest = largest_noise(faults.sensor_dof)
-    noise = largest * (sensor.std[1] + sensor.range_std_per_metre * reach)
+    std = sensor.std[1] if sensor.kind == "bearing_range" else max(sensor.std)
+    noise = largest * (std + sensor.range_std_per_metre * reach)
     return reach + noise + max(0.0, faults.range_bias)
 
 
@@ -92,7 +107,9 @@ def _farthest_landmark(scenario: Scenario) -> float:
     """Bound the distance from the robot to any landmark during an episode [m]."""
     start, motion = scenario.start, scenario.motion
     away = possible_positions(scenario.landmarks) - start.pose[:2]
-    step = scenario.robot.max_speed * scenario.dt
+    robot = scenario.robot
+    lever = math.hypot(*(robot.reference or (0.0, 0.0)))
+    step = (robot.max_speed + robot.max_turn_rate * lever) * scenario.dt
     if motion.noise_in == "motion":
         largest = largest_noise(scenario.present_faults.motion_dof)
         step += largest * math.hypot(*motion.std[:2])

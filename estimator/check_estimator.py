@@ -20,7 +20,7 @@ from ..arrays import Array
 from .covariance_checks import step_mistakes
 from .interface import Belief, SlamEstimator, UpdateReport
 from .models.bearing_range import predict_measurement, wrap_angle
-from .models.unicycle_motion import predict_pose
+from .models.motions import predict_pose
 
 __all__ = ["EstimatorContractError", "Finding", "check_estimator"]
 

@@ -24,7 +24,7 @@ import numpy as np
 from ..arrays import Array
 from .interface import Belief, UpdateReport
 from .models.bearing_range import locate_landmark, predict_measurement, wrap_angle
-from .models.unicycle_motion import predict_pose
+from .models.motions import predict_pose
 
 _MOTION_STD, _SENSOR_STD = (0.002, 0.001, 0.0015), (0.001, 0.003)
 _START = {"initial_pose": (1.0, -2.0, 0.6), "initial_pose_std": (5e-4, 1e-3, 1e-3)}

@@ -30,6 +30,7 @@ from .field_types import (
     NotNegative,
     Number,
     Part,
+    Point,
     Pose,
     PoseStd,
     Positive,
@@ -127,9 +128,22 @@ _RangeGrowth = Annotated[
 
 
 class Sensor(Part):
-    """The bearing-range sensor: its noise, its field of view and its failures."""
+    """The sensor: what it reads, its noise, its field of view and its failures.
 
-    std: MeasurementStd = Field(description="(σβ, σr) of one reading [rad, m]")
+    A sensor of one number has (σ, 0) as its `std`, and 0 as the second number of its
+    readings.
+    """
+
+    kind: Annotated[
+        Literal["bearing_range", "position", "bearing", "range"],
+        expect("'bearing_range', 'position', 'bearing' or 'range'"),
+    ] = setting(
+        "bearing_range",
+        "what one reading holds: (β, r), (x, y) in the robot's frame, β or r",
+    )
+    std: MeasurementStd = Field(
+        description="of one reading: (σβ, σr) [rad, m], (σx, σy) [m], (σβ, 0) or (σr, 0)"
+    )
     range_std_per_metre: _RangeGrowth = setting(0.0, "k in σr(r) = σr + k r [m/m]")
     min_range: NotNegative = setting(0.05, "nearest visible landmark [m]")
     max_range: PositiveOrInfinite = setting(
@@ -163,6 +177,20 @@ class Sensor(Part):
             yield (
                 f"max_clutter must be >= clutter = {self.clutter} "
                 f"(better mean + 4 √mean), got {self.max_clutter}"
+            )
+        yield from self._broken_kind()
+
+    def _broken_kind(self) -> Iterator[str]:
+        """Check what only some kinds of sensors have."""
+        kind = self.kind
+        if not (self.identities or kind == "bearing_range"):
+            yield f"identities must be true with kind = '{kind}', got false"
+        if kind in ("bearing", "range") and self.std[1] != 0:
+            yield f"std must be (σ, 0) with kind = '{kind}', got {self.std}"
+        if kind in ("position", "bearing") and self.range_std_per_metre:
+            yield (
+                f"range_std_per_metre must be 0 with kind = '{kind}', "
+                f"got {self.range_std_per_metre}"
             )
 
 
@@ -253,12 +281,49 @@ class Randomise(Part):
         return changes
 
 
+_Steering = Annotated[
+    Number, Field(gt=0, lt=math.pi / 2), DIVISIBLE, expect("a number in (0, π/2) [rad]")
+]
+_OF_DRIVE = {
+    "track_width": "differential",
+    "wheelbase": "bicycle",
+    "max_steering": "bicycle",
+    "reference": "bicycle",
+}
+
+
 class Robot(Part):
     """The body of the robot and the limits of its actions."""
 
     radius: Positive = setting(0.2, "radius of the round body [m]")
     max_speed: Positive = setting(1.0, "limit of |v| [m/s]")
     max_turn_rate: Positive = setting(1.0, "limit of |ω| [rad/s]")
+    drive: Annotated[
+        Literal["unicycle", "differential", "bicycle"],
+        expect("'unicycle', 'differential' or 'bicycle'"),
+    ] = setting("unicycle", "how the robot moves, and what its odometry reports")
+    track_width: Positive | None = setting(
+        None, "distance of the wheels of a differential drive [m]"
+    )
+    wheelbase: Positive | None = setting(
+        None, "distance of the axles of a bicycle drive [m]"
+    )
+    max_steering: _Steering | None = setting(
+        None, "limit of the steering angle of a bicycle drive [rad]"
+    )
+    reference: Point | None = setting(
+        None,
+        "position of the robot's pose and sensor on a bicycle, from the middle of the "
+        "rear axle: ahead and to the left [m]",
+    )
+
+    def _broken_rules(self) -> Iterator[str]:
+        for name, drive in _OF_DRIVE.items():
+            given, needed = getattr(self, name), self.drive == drive
+            if given is None and needed and name != "reference":
+                yield f"{name} must be given with drive = '{drive}'"
+            if given is not None and not needed:
+                yield f"{name} must be left out with drive = '{self.drive}', got {given}"
 
 
 class Scenario(Part):
@@ -282,7 +347,7 @@ class Scenario(Part):
     start: Start = setting(Start(), "start pose of the robot")
     robot: Robot = setting(Robot(), "body and limits of the robot")
     motion: Motion = Field(description="noise of the motion")
-    sensor: Sensor = Field(description="bearing-range sensor")
+    sensor: Sensor = Field(description="sensor of the landmarks")
     landmarks: LandmarkLayout = Field(description="positions of the landmarks")
     walls: tuple[Wall, ...] = setting((), "(x0, y0, x1, y1) of each [m]")
     controls: ControlSequence = setting(
@@ -304,6 +369,7 @@ class Scenario(Part):
     def _broken_rules(self) -> Iterator[str]:
         yield from self._broken_sizes()
         yield from self._broken_limits()
+        yield from self._broken_models()
         yield from self._broken_ranges()
 
     def _broken_sizes(self) -> Iterator[str]:
@@ -335,6 +401,27 @@ class Scenario(Part):
                 yield (
                     f"controls must stay within robot.{name} = {limit} {unit}, "
                     f"got {asked:.6g} {unit}"
+                )
+
+    def _broken_models(self) -> Iterator[str]:
+        """Check what only some drives and sensors can do."""
+        drive, kind, faults = self.robot.drive, self.sensor.kind, self.present_faults
+        if drive != "unicycle" and self.motion.noise_in == "odometry":
+            yield f"motion.noise_in must be 'motion' with robot.drive = '{drive}'"
+        if drive == "bicycle" and self.walls:
+            yield "walls must be empty with robot.drive = 'bicycle'"
+        for name, kinds in (("bearing_bias", "bearing"), ("range_bias", "range")):
+            if getattr(faults, name) and kinds not in kind:
+                yield f"faults.{name} must be 0 with sensor.kind = '{kind}'"
+        if drive == "bicycle":
+            distances, turns = np.abs(command_cycle(self.controls, self.dt)).T
+            most = distances * largest_curvature(self.robot)
+            if (turns > most * (1 + 1e-9)).any():
+                worst = int(np.argmax(turns - most))
+                yield (
+                    "controls must turn by at most d tan(max_steering) / wheelbase = "
+                    f"{most[worst]:.6g} rad in a step of {distances[worst]:.6g} m, "
+                    f"got {turns[worst]:.6g} rad"
                 )
 
     def _broken_ranges(self) -> Iterator[str]:
@@ -418,6 +505,19 @@ class Scenario(Part):
             return cls.model_validate(_plain(table))
         except ValidationError as error:
             raise ScenarioError("\n".join(error_lines(error))) from None
+
+
+def largest_curvature(robot: Robot) -> float:
+    """Return tan(max_steering) / wheelbase of a bicycle [1/m], inf for other drives.
+
+    Examples
+    --------
+    >>> largest_curvature(Robot())
+    inf
+    """
+    if robot.max_steering is None or robot.wheelbase is None:
+        return math.inf
+    return math.tan(robot.max_steering) / robot.wheelbase
 
 
 def action_sequence(scenario: Scenario) -> Array:

@@ -51,9 +51,9 @@ def _of(folder: str, names: str, *, plain: bool = False) -> Tests:
 FILTERS = "ekf_slam filter_family"
 SCANS = "association decisions map_management hypotheses loop_closing"
 TESTS = {
-    "estimator/models/bearing_range": "unicycle_motion bearing_range ekf_slam",
+    "estimator/models/bearing_range": "motions bearing_range ekf_slam",
     "estimator/models/rigid_motion": "error_frames submaps joining ekf_slam",
-    "estimator/models/unicycle_motion": "unicycle_motion ekf_slam",
+    "estimator/models/motions": "motions ekf_slam",
     "estimator/kernels/assignment_search": "joint_assignment constellations",
     "estimator/kernels/batch": "batch",
     "estimator/kernels/drive_likelihood": "drive_likelihood",

@@ -27,7 +27,7 @@ from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import widest_scenario
 from ..bearing_range import BearingRangeSensor, hide_identities
 from ..noise_streams import SensorSettings, WorldNoise
-from ..robot import UnicycleBodies, VectorOdometrySensor
+from ..robot import UnicycleBodies, VectorOdometrySensor, drive_of
 from ..spaces import clipped_actions, count_rows
 from ..streams import EpisodeStarts, drawn_scenarios, episode_keys
 
@@ -108,7 +108,10 @@ class WorldBatch(Restorable):
         self._sensor = BearingRangeSensor(widest)
         self._odometer = VectorOdometrySensor(scenario, count)
         robot = scenario.robot
-        self._bodies = UnicycleBodies(count, robot.radius, scenario.walls)
+        self._robot_drive = drive_of(robot)
+        self._bodies = UnicycleBodies(
+            count, robot.radius, scenario.walls, self._robot_drive
+        )
         limits = robot.max_speed, robot.max_turn_rate
         self._limits = np.tile(limits, (count, 1))  # tiled: numpy runs one loop
         self._hides_identities = not scenario.sensor.identities
@@ -229,7 +232,10 @@ class WorldBatch(Restorable):
             self._check_number(generators)
         clipped = clipped_actions(actions, self._limits, moving)
         self._steps += 1 if moving is None else moving
-        self._drive(clipped * self.scenario.dt, moving)
+        commands = clipped * self.scenario.dt
+        if self._robot_drive is not None:
+            commands = np.column_stack(self._robot_drive.feasible(*commands.T))
+        self._drive(commands, moving)
         if moving is not None and generators is not None:
             self._begin(np.flatnonzero(~moving), generators)
         self.measurements, self.mask, self.landmark_ids = self._scan_all()

@@ -65,13 +65,14 @@ class TentativeLandmarks(NamedTuple):
         return np.bitwise_count(self.seen).astype(np.int64)
 
     def moved(
-        self, distance: float, turn: float, variance: Array
+        self, displacement: tuple[float, float, float], variance: Array
     ) -> "TentativeLandmarks":
-        """Follow the robot along odometry (d, α) with noise (σx², σy², σα²)."""
+        """Follow the robot by (dx, dy, α) in its frame, with noise (σx², σy², σα²)."""
         if not len(self.seen):
             return self
+        *shift, turn = displacement
         back = rotation(-turn)
-        places = (self.places - (distance, 0.0)) @ back.T
+        places = (self.places - shift) @ back.T
         spread = back @ (self.covariances + np.diag(variance[:2])) @ back.T
         lever = places[:, ::-1] * (-1.0, 1.0)
         spread += variance[2] * lever[:, :, None] * lever[:, None, :]

@@ -229,6 +229,7 @@ class BatchSlam(BatchOfBeliefs):
         """What distinguishes this filter's updates from another's."""
         self.rule_values = estimator.rule_values.copy()
         self.motion_values = estimator.motion_values
+        self.motion = estimator.motion
         self._threads = argument_checks.whole("threads", threads or usable_cores(), 1)
         std = argument_checks.standard_deviations(
             "initial_pose_std", initial_pose_std, 3
@@ -270,6 +271,7 @@ class BatchSlam(BatchOfBeliefs):
         data, durations = step_data(
             odometry, measurements, visible, dt, (self.runs, self.landmarks)
         )
+        data = data._replace(odometry=self.motion.displacements(data.odometry))
         trace = BatchTrace.empty(*data.odometry.shape[:2])
         chosen = chosen_runs(runs, self.runs)
         failed_at = np.where(chosen, self.failed_at, 0)  # the kernel passes these over
@@ -298,7 +300,8 @@ class BatchSlam(BatchOfBeliefs):
             Duration of the step of each run.
         """
         shape = self.runs, self.landmarks
-        scans = step_scans(odometry, measurements, visible, dt, shape)
+        moved, *rest = step_scans(odometry, measurements, visible, dt, shape)
+        scans = self.motion.displacements(moved), *rest
         drive = partial(self._step, scans, chosen_runs(runs, self.runs))
         share_out(drive, self.runs, self._threads)
 

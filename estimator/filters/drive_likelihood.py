@@ -175,6 +175,9 @@ def _follow(
     belief = np.zeros(capacity), aligned_zeros(capacity, capacity), np.zeros(capacity)
     first, motion = estimator.map, estimator.motion_values
     rules = estimator.rules._replace(gate=gate)
+    *odometry, dt = events.motions.T
+    moved = estimator.motion.displacements(np.column_stack(odometry))
+    events = events._replace(motions=np.column_stack([moved, dt]))
     kernel.follow_drive(
         tuple(events),  # numba checks the type of a named one at every call
         noises[part],

@@ -29,6 +29,7 @@ from ..kernels.kalman_gain import (
     Rules,
 )
 from ..kernels.scan_update import DONE, NOT_USABLE
+from ..models.motions import UNICYCLE, Motion, find_motion
 from ..models.rigid_motion import ErrorFrame
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
@@ -274,6 +275,8 @@ class EkfSlam(MapFilter):
     min_range : float
         Readings below this range [m], and those of landmarks expected below it, are
         skipped, because they have no usable bearing.
+    motion : str or Motion
+        The drive whose odometry `predict` takes, see :func:`~slamgym.find_motion`.
 
     Raises
     ------
@@ -320,8 +323,9 @@ class EkfSlam(MapFilter):
         gate_probability: float | None = None,
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
+        motion: str | Motion = UNICYCLE,
     ) -> None:
-        self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest)
+        self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         self.rules = checked_rules(
             measurement_std,
             linearisation=self._linearisation,
@@ -342,16 +346,17 @@ class EkfSlam(MapFilter):
         Parameters
         ----------
         odometry : array_like, shape (2,)
-            u = (d, α): distance driven, then heading turned [m, rad].
+            u = (d, α): distance driven, then heading turned [m, rad]; or the
+            columns of another drive.
         dt : float
             Duration that the motion noise counts, in steps: its variance grows with
             dt, and dt = 0 adds none.
         """
-        distance, turn = argument_checks.pair("odometry", odometry)
         noise, weight = self._motion_noise, 1.0
+        moved = noise.motion.moved(odometry)
         if not (type(dt) is float and dt == 1.0 and noise.at_rest):
-            weight = noise.weight(distance, turn, dt)
-        move_pose(self.map.block, distance, turn, weight)
+            weight = noise.weight(moved, dt)
+        move_pose(self.map.block, *moved, weight)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -391,7 +396,12 @@ class EkfSlam(MapFilter):
     @property
     def motion_values(self) -> Array:
         """(σx², σy², σα²) per step, and 1 where a robot at rest has noise too."""
-        return np.append(*self._motion_noise)
+        return np.append(self._motion_noise.variance, self._motion_noise.at_rest)
+
+    @property
+    def motion(self) -> Motion:
+        """The drive whose odometry `predict` takes."""
+        return self._motion_noise.motion
 
     @property
     def rule_values(self) -> Array:
@@ -628,22 +638,28 @@ def gate_of(gate: float, size: int) -> float:
 
 
 class MotionNoise(NamedTuple):
-    """Variances of the motion noise, and whether it acts on a robot at rest."""
+    """A drive with the variances of its noise, and whether a robot at rest has noise."""
 
     variance: Array
     """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
     at_rest: bool = True
-    """False: odometry of exactly (0, 0) adds no noise."""
+    """False: odometry that moves nothing adds no noise."""
+    motion: Motion = UNICYCLE
 
     @classmethod
-    def checked(cls, motion_std: ArrayLike, noise_at_rest: bool) -> MotionNoise:
+    def checked(
+        cls,
+        motion_std: ArrayLike,
+        noise_at_rest: bool,
+        motion: str | Motion = UNICYCLE,
+    ) -> MotionNoise:
         """Return the noise of these standard deviations (3,), or refuse them."""
         std = argument_checks.standard_deviations("motion_std", motion_std, 3)
         at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
-        return cls(std**2, at_rest)
+        return cls(std**2, at_rest, find_motion(motion))
 
-    def weight(self, distance: float, turn: float, dt: float) -> float:
-        """Return the factor of the variances for one odometry reading over dt steps.
+    def weight(self, moved: tuple[float, float, float], dt: float) -> float:
+        """Return the factor of the variances for a displacement over dt steps.
 
         Raises
         ------
@@ -651,8 +667,8 @@ class MotionNoise(NamedTuple):
             If dt is no number, negative, or too large.
         """
         dt = argument_checks.duration(dt)
-        return dt if self.at_rest or distance or turn else 0.0
+        return dt if self.at_rest or any(moved) else 0.0
 
-    def over(self, distance: float, turn: float, dt: float) -> Array:
-        """Return the variances (3,) of one odometry reading over dt steps."""
-        return self.variance * self.weight(distance, turn, dt)
+    def over(self, moved: tuple[float, float, float], dt: float) -> Array:
+        """Return the variances (3,) of a displacement over dt steps."""
+        return self.variance * self.weight(moved, dt)

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array
 from ..interface import UpdateReport
 from ..kernels.kalman_gain import AT_ESTIMATE, AT_TRUTH, BeliefArrays
-from ..models.rigid_motion import pose_rotation
-from ..models.unicycle_motion import drive
+from ..models.rigid_motion import composed, pose_rotation
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
@@ -115,10 +114,10 @@ class IdealEkfSlam(EkfSlam):
         if self.rules.linearisation != AT_TRUTH:
             super().predict(odometry, dt)
             return
-        distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._motion_noise.over(distance, turn, dt)
+        displacement = self.motion.moved(odometry)
+        variance = self._motion_noise.over(displacement, dt)
         mean, covariance, reference = (each.copy() for each in self.map.used)
-        mean[:3] = drive(mean[0], mean[1], mean[2], distance, turn)[:3]
+        mean[:3] = composed(mean[0], mean[1], mean[2], *displacement)[:3]
         heading = reference[2]
         dx, dy = self._true_pose[:2] - reference[:2]
         G = np.eye(len(mean))

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ..kernels.imagine import Imagined, as_view, imagine_plans
 from ..kernels.kalman_gain import AFTER_STDS, FIRST_STD
+from ..models.motions import only_unicycle
 from ..support import argument_checks
 from .batch import BatchSlam, can_batch
 from .ekf import EkfSlam
@@ -106,6 +107,7 @@ def imagine(
     True
     """
     means, covariances, references, slots = _beliefs(filters)
+    only_unicycle(filters.motion, "imagine")
     count, landmarks = slots.shape
     driven = _checked_plans(plans, count)
     ends = _checked_walls(walls)

@@ -11,7 +11,7 @@ from ...arrays import Array, BoolArray, IntArray
 from ..interface import UpdateReport
 from ..kernels.kalman_gain import BeliefArrays
 from ..models.bearing_range import wrap_angle
-from ..models.unicycle_motion import drive
+from ..models.rigid_motion import composed
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.undo import undone_on_error
@@ -40,8 +40,8 @@ class UnscentedSlam(EkfSlam):
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], through the cubature points."""
-        distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._motion_noise.over(distance, turn, dt)
+        forward, sideways, turn = moved = self.motion.moved(odometry)
+        variance = self._motion_noise.over(moved, dt)
         mean, P, reference = (array.copy() for array in self.map.used)
         n = len(mean)
         root = np.zeros((n + 3, n + 3))
@@ -50,13 +50,13 @@ class UnscentedSlam(EkfSlam):
         deviations = np.sqrt(n + 3) * np.concatenate([root, -root], axis=1)
         x, y, heading = mean[:3, None] + deviations[:3]
         along, across, turned = deviations[n:]
-        x, y, heading, cos, sin = drive(x, y, heading, distance + along, turn)
-        poses = np.stack([x - across * sin, y + across * cos, heading + turned])
+        moves = forward + along, sideways + across, turn + turned
+        poses = np.stack(composed(x, y, heading, *moves)[:3])
         mean[:3] = poses.mean(axis=1)
-        moved = poses - mean[:3, None]
+        spread = poses - mean[:3, None]
         share = deviations.shape[1]
-        P[:3, :3] = moved @ moved.T / share
-        P[:3, 3:] = moved @ deviations[3:n].T / share
+        P[:3, :3] = spread @ spread.T / share
+        P[:3, 3:] = spread @ deviations[3:n].T / share
         P[3:, :3] = P[:3, 3:].T
         self.map.hold(BeliefArrays(mean, P, reference), self.map.slots, steps=1)
 

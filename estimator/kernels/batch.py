@@ -28,7 +28,7 @@ class RunArrays(NamedTuple):
 class StepData(NamedTuple):
     """The data of T steps of B runs."""
 
-    odometry: Array  # (B, T, 2)
+    odometry: Array  # (B, T, 3), displacements (dx, dy, α) in the robot's frame
     measurements: Array  # (B, T, L, 2)
     visible: Bool  # (B, T, L)
 
@@ -104,7 +104,7 @@ def step_runs(
     Parameters
     ----------
     scans
-        Odometry (B, 2), measurements (B, L, 2), which are visible (B, L), and the
+        Displacements (B, 3), measurements (B, L, 2), which are visible (B, L), and the
         duration of the step of each run (B,).
     failed_at : ndarray, shape (B,)
         On return 0 for a chosen run that failed, now or before.
@@ -187,15 +187,16 @@ def step_run(
     ledger, readings, ids, variance, workspace = room
     rows, before = workspace
     odometry, measurements, visible = scan
-    d, turn = odometry[0], odometry[1]
+    dx, dy, turn = odometry[0], odometry[1], odometry[2]
     m = gather(measurements, visible, slots, readings, ids, ledger)
-    if not (usable(d) and usable(turn) and m >= 0):
+    if not (usable(dx) and usable(dy) and usable(turn) and m >= 0):
         return -1, np.nan
-    share = dt if motion_values[3] > 0 or d != 0 or turn != 0 else 0.0
+    moves = dx != 0 or dy != 0 or turn != 0
+    share = dt if motion_values[3] > 0 or moves else 0.0
     for i in range(3):
         variance[i] = motion_values[i] * share
     size, linearisation = 3 + 2 * runs.mapped[b], as_rules(rule_values).linearisation
-    predict(mean, covariance, reference, size, d, turn, variance, linearisation)
+    predict(mean, covariance, reference, size, dx, dy, turn, variance, linearisation)
     status, used, nis = update_belief(
         mean,
         covariance,

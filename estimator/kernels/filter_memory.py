@@ -197,15 +197,17 @@ def hash_of(landmark_id: int) -> int:
 
 
 @jit
-def move_pose(block: Array, distance: float, turn: float, weight: float) -> None:
-    """Move the belief of a filter by one odometry reading, in place.
+def move_pose(
+    block: Array, forward: float, sideways: float, turn: float, weight: float
+) -> None:
+    """Move the belief of a filter by a displacement in the robot's frame, in place.
 
     Parameters
     ----------
     block : ndarray
         The memory of the filter.
-    distance, turn : float
-        (d, α) [m, rad].
+    forward, sideways, turn : float
+        (dx, dy, α) [m, m, rad].
     weight : float
         Factor of the variances of the motion noise.
     """
@@ -218,7 +220,8 @@ def move_pose(block: Array, distance: float, turn: float, weight: float) -> None
         parts.covariance,
         parts.reference,
         size,
-        distance,
+        forward,
+        sideways,
         turn,
         values[MOVED : MOVED + 3],
         int(values[0]),

@@ -147,7 +147,9 @@ def imagine_step(
     variance = settings.no_noise if at_rest else noise
     linearisation = as_rules(settings.rule_values).linearisation
     mean, covariance, reference = room.mean, room.covariance, room.reference
-    predict(mean, covariance, reference, size, distance, turn, variance, linearisation)
+    predict(
+        mean, covariance, reference, size, distance, 0.0, turn, variance, linearisation
+    )
     count = expect_readings(mean, size, settings, room.readings, room.ledger)
     if count == 0:
         return True

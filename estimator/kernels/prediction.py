@@ -5,7 +5,7 @@ Symbols are those of the motion model.
 
 from ...arrays import Array
 from ...jit import jit, njit_internal
-from ..models.unicycle_motion import drive_jit
+from ..models.rigid_motion import composed_jit
 from .kalman_gain import AT_ESTIMATE
 
 
@@ -15,19 +15,23 @@ def predict(
     covariance: Array,
     reference: Array,
     size: int,
-    distance: float,
+    forward: float,
+    sideways: float,
     turn: float,
     motion_variance: Array,
     linearisation: int,
 ) -> None:
-    """Move a belief by one odometry reading (d, α), in place; eqs. 1.1 and 1.2.
+    """Move a belief by a displacement in the robot's frame, in place; eqs. 1.1 and 1.2.
 
     Linearised elsewhere than at the estimate, G is taken over the displacement between
     the predicted positions, which the reference keeps.
     """
-    x, y, heading, cos, sin = drive_jit(mean[0], mean[1], mean[2], distance, turn)
+    x, y, heading, cos, sin = composed_jit(
+        mean[0], mean[1], mean[2], forward, sideways, turn
+    )
     mean[0], mean[1], mean[2] = x, y, heading
-    turned_x, turned_y = -distance * sin, distance * cos
+    turned_x = -(forward * sin + sideways * cos)
+    turned_y = forward * cos - sideways * sin
     if linearisation != AT_ESTIMATE:
         turned_x, turned_y = -(y - reference[1]), x - reference[0]
         reference[0], reference[1], reference[2] = x, y, heading

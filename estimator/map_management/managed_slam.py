@@ -37,6 +37,7 @@ from ..interface import (
     restore,
     taking_poses,
 )
+from ..models.motions import UNICYCLE
 from ..models.rigid_motion import rotation
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
@@ -109,7 +110,9 @@ class ManagedSlam:
         )
         self._sensor = Sensor.checked(measurement_std, options)
         self._motion_noise = MotionNoise.checked(
-            motion_std, options.get("noise_at_rest", True)
+            motion_std,
+            options.get("noise_at_rest", True),
+            options.get("motion", UNICYCLE),
         )
         merging = self._policy.merge_within is not None
         self._editor = MapEditor(self._filter, merging=merging)
@@ -159,17 +162,18 @@ class ManagedSlam:
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
-        distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._motion_noise.over(distance, turn, dt)
-        moved = self.candidates.tentative.moved(distance, turn, variance)
+        reading = argument_checks.pair("odometry", odometry)
+        displacement = self._motion_noise.motion.moved(reading)
+        variance = self._motion_noise.over(displacement, dt)
+        moved = self.candidates.tentative.moved(displacement, variance)
 
         def follow(_: object) -> None:
             self._editor.expire()
             self.candidates = replace(self.candidates, tentative=moved)
-            self._recent.note_motion(distance, turn, dt)
+            self._recent.note_motion(*reading, dt)
             self.steps += 1
 
-        step = partial(self._filter.predict, (distance, turn), dt)
+        step = partial(self._filter.predict, reading, dt)
         undo = attributes(self, self._recent)
         advance(self._filter, step, follow, undo, lambda: undo)
 

@@ -10,7 +10,12 @@ if TYPE_CHECKING:
     from .bearing_range import locate_landmark as locate_landmark
     from .bearing_range import predict_measurement as predict_measurement
     from .bearing_range import wrap_angle as wrap_angle
-    from .unicycle_motion import MotionPrediction as MotionPrediction
-    from .unicycle_motion import predict_pose as predict_pose
+    from .motions import Motion as Motion
+    from .motions import MotionPrediction as MotionPrediction
+    from .motions import bicycle as bicycle
+    from .motions import check_motion as check_motion
+    from .motions import differential as differential
+    from .motions import find_motion as find_motion
+    from .motions import predict_pose as predict_pose
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -86,10 +86,10 @@ class GtsamSlam(PeerSlam):
     def _move(self, odometry: Array, variance: Array) -> None:
         self._events.append((MOVE, *odometry, *variance))
         self._moves.append((odometry, variance))
-        turned = pose_rotation(odometry[1])
+        turned = pose_rotation(odometry[2])
         covariance = (turned.T * np.maximum(variance, LEAST_VARIANCE)) @ turned
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        between = gtsam.Pose2(odometry[0], 0.0, odometry[1])
+        between = gtsam.Pose2(*odometry)
         before, now = X(self._k), X(self._k + 1)
         self._graph.add(gtsam.BetweenFactorPose2(before, now, between, noise))
         self._k += 1

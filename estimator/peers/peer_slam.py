@@ -17,7 +17,7 @@ from ..association.scan_assignments import Noise
 from ..filters.ekf import MotionNoise
 from ..interface import Belief, UpdateReport
 from ..models.bearing_range import locate_landmark, predict_measurement, wrap_angle
-from ..models.unicycle_motion import predict_pose
+from ..models.motions import UNICYCLE, Motion, predict_pose
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 
@@ -68,8 +68,9 @@ class PeerSlam(ABC):
         range_std_per_metre: float = 0.0,
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
+        motion: str | Motion = UNICYCLE,
     ) -> None:
-        self._noise = MotionNoise.checked(motion_std, noise_at_rest)
+        self._noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         std = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
         growth = argument_checks.range_growth(range_std_per_metre)
         self._sensor = Noise(float(std[0]), float(std[1]), growth)
@@ -91,9 +92,8 @@ class PeerSlam(ABC):
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
-        distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._noise.over(distance, turn, dt)
-        self._move(np.array([distance, turn]), variance)
+        moved = self._noise.motion.moved(odometry)
+        self._move(np.array(moved), self._noise.over(moved, dt))
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -144,7 +144,7 @@ class PeerSlam(ABC):
 
     @abstractmethod
     def _move(self, odometry: Array, variance: Array) -> None:
-        """Move by (d, α), with the variances (3,) of the noise in the robot's frame."""
+        """Move by (dx, dy, α) in the robot's frame, with the variances (3,) of the noise in the robot's frame."""
 
     @abstractmethod
     def _take_in(self, known: Readings, new: Readings) -> Innovation | None:

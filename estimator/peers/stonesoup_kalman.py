@@ -39,7 +39,7 @@ from .peer_slam import (
 class _Motion(GaussianTransitionModel):  # type: ignore[misc]
     """The unicycle over the whole state, for one odometry reading."""
 
-    odometry: Array = Property(doc="(d, α) [m, rad]")
+    odometry: Array = Property(doc="(dx, dy, α) [m, m, rad]")
     noise: Array = Property(doc="covariance of the whole state")
 
     @property

@@ -16,6 +16,8 @@ from ..filters.ekf import MotionNoise, checked_rules
 from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE
 from ..kernels.prediction import predict
 from ..models.bearing_range import wrap_angle
+from ..models.motions import UNICYCLE
+from ..models.motions import Motion as DriveMotion
 from ..models.rigid_motion import pose_rotation
 from ..support import argument_checks
 
@@ -85,8 +87,9 @@ class Drive:
         range_noise_at: str = "expected",
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
+        motion: str | DriveMotion = UNICYCLE,
     ) -> None:
-        self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest)
+        self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         self.rules = rules = checked_rules(
             measurement_std,
             linearisation=AT_ESTIMATE,
@@ -140,9 +143,10 @@ class Drive:
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
-        distance, turn = argument_checks.pair("odometry", odometry)
-        self.motion_noise.over(distance, turn, dt)  # refuses a wrong dt
-        self._pending.append((distance, turn, float(dt)))
+        reading = argument_checks.pair("odometry", odometry)
+        noise = self.motion_noise
+        noise.over(noise.motion.moved(reading), dt)  # refuses a wrong dt
+        self._pending.append((*reading, float(dt)))
 
     def update(
         self, measurements: ArrayLike, landmark_ids: argument_checks.LandmarkIds
@@ -234,9 +238,10 @@ class Drive:
     def _composed(self, steps: Sequence[tuple[float, float, float]]) -> Motion:
         """Compose readings of odometry as a filter predicts from a certain pose 0."""
         pose, covariance = np.zeros(3), np.zeros((3, 3))
-        for distance, turn, dt in steps:
-            variance = self.motion_noise.over(distance, turn, dt)
-            predict(pose, covariance, pose, 3, distance, turn, variance, AT_ESTIMATE)
+        for *odometry, dt in steps:
+            moved = self.motion_noise.motion.moved(odometry)
+            variance = self.motion_noise.over(moved, dt)
+            predict(pose, covariance, pose, 3, *moved, variance, AT_ESTIMATE)
         return Motion(tuple(steps), pose, covariance)
 
     def __repr__(self) -> str:
@@ -387,9 +392,10 @@ def _between(first: Array, last: Array, motion: Motion, noise: MotionNoise) -> A
     pull = np.linalg.pinv(motion.covariance, hermitian=True) @ gap
     path = np.empty((len(motion.steps), 3))
     pose, covariance = np.zeros(3), np.zeros((3, 3))
-    for i, (distance, angle, dt) in enumerate(motion.steps):
-        variance = noise.over(distance, angle, dt)
-        predict(pose, covariance, pose, 3, distance, angle, variance, AT_ESTIMATE)
+    for i, (*odometry, dt) in enumerate(motion.steps):
+        moved = noise.motion.moved(odometry)
+        variance = noise.over(moved, dt)
+        predict(pose, covariance, pose, 3, *moved, variance, AT_ESTIMATE)
         onward = np.eye(3)
         onward[0, 2] = -(motion.increment[1] - pose[1])
         onward[1, 2] = motion.increment[0] - pose[0]

@@ -394,6 +394,7 @@ def filter_drive(
         range_noise_at="reading" if rules.noise_as_read else "expected",
         noise_at_rest=noise.at_rest,
         min_range=rules.min_range,
+        motion=noise.motion,
         iterations=iterations,
     )
     if known is not None:

@@ -20,7 +20,7 @@ from ...envs.spaces import count_rows
 from ...estimator.filters.batch import BatchSlam
 from ...estimator.filters.ekf import EkfSlam
 from ...estimator.models.bearing_range import wrap_angle
-from ...estimator.models.unicycle_motion import drive
+from ...estimator.models.rigid_motion import composed
 from ...sim_configs import Scenario
 from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import scenario_text
@@ -282,7 +282,7 @@ def dead_reckoning(start: Array, odometry: Array) -> Array:
     x, y, heading = start.tolist()
     distances, turns = odometry.T
     headings = np.cumsum([heading, *turns])
-    along_x, along_y, *_ = drive(0.0, 0.0, headings[:-1], distances, turns)
+    along_x, along_y, *_ = composed(0.0, 0.0, headings[:-1], distances, 0.0, turns)
     return np.column_stack(
         [np.cumsum([x, *along_x]), np.cumsum([y, *along_y]), headings]
     )

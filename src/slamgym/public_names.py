@@ -66,6 +66,7 @@ MOVED = {
     "estimator.filters.invariant": "estimator.filters",
     "estimator.filters.iterated": "estimator.filters",
     "estimator.filters.observability_constrained": "estimator.filters",
+    "estimator.models.unicycle_motion": "estimator.models.motions",
     "estimator.update_report": "estimator.interface",
     "evaluation.chi_square": "evaluation.hypothesis_tests",
     "evaluation.error_findings": "evaluation.diagnosis",

@@ -31,7 +31,7 @@ from slamgym.estimator.kernels.kalman_gain import (
     Rules,
 )
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 from slamgym.sim_configs import action_sequence, load_scenario
 
 NOISE = Noise(0.02, 0.1, 0.01, 0.05)

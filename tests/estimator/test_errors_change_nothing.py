@@ -8,7 +8,7 @@ from slamgym.estimator import list_estimators, make_estimator
 from slamgym.estimator.large_maps.sparse_information.sparse_belief import SparseBelief
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.smoother.recorded_slam import SmoothingSlam
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}

@@ -15,7 +15,7 @@ from slamgym.estimator import (
     smooth,
 )
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.registry import find_estimator
 from slamgym.estimator.smoother import RecordedSlam
 from slamgym.experiments.monte_carlo import monte_carlo

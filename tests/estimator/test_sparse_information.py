@@ -38,7 +38,7 @@ from slamgym.estimator.large_maps.sparse_information.sparse_information_slam imp
     SparseInformationSlam,
 )
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 

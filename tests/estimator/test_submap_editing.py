@@ -28,7 +28,7 @@ from slamgym.estimator.large_maps.submaps import closed_submaps as neighbourhood
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 
 # By the names that it has in some steps: landmark 4 is also 104, and so on.
 ALIAS = 100

@@ -23,8 +23,8 @@ from slamgym.estimator.large_maps.submaps.graph import fuse
 from slamgym.estimator.large_maps.submaps.store import CACHE_SIZE, MARKER
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
+from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.models.rigid_motion import invariant_covariance
-from slamgym.estimator.models.unicycle_motion import predict_pose
 from slamgym.evaluation.nees import pose_nees
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario

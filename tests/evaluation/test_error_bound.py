@@ -7,7 +7,7 @@ import pytest
 
 from slamgym.estimator import make_estimator
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 from slamgym.evaluation.error_bound import (
     efficiency,
     invariant_squares,

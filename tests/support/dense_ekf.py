@@ -11,7 +11,7 @@ from slamgym.estimator.models.bearing_range import (
     predict_measurement,
     wrap_angle,
 )
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 
 
 class DenseEkf:

@@ -13,7 +13,7 @@ from slamgym.estimator.models.bearing_range import (
     predict_measurement,
     wrap_angle,
 )
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 
 J = np.array([[0.0, -1.0], [1.0, 0.0]])
 

@@ -4,7 +4,7 @@ import numpy as np
 from numeric_jacobian import numeric_jacobian
 
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 
 
 class DenseSmoother:

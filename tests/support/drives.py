@@ -3,7 +3,7 @@
 import numpy as np
 
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 
 MOTION_STD = np.array([0.05, 0.02, 0.02])
 MEASUREMENT_STD = np.array([0.02, 0.08])

@@ -4,7 +4,7 @@ import numpy as np
 from drives import MEASUREMENT_STD
 
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.models.motions import predict_pose
 
 TOWN_MOTION_STD = (0.02, 0.01, 0.01)
 

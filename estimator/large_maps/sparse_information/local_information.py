@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import cho_solve, lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
-from ...models.unicycle_motion import predict_pose
+from ...models.motions import predict_pose
 from ..elimination import LandmarkElimination, RestFactor
 from ..multifrontal import InformationMatrix, SchurComplement, eliminate_subset, pairs
 
@@ -306,7 +306,7 @@ class MapMeasurement(NamedTuple):
 
 
 def move(
-    pose: ConditionalPose, odometry: Array, variance: Array, *, from_mean: bool = True
+    pose: ConditionalPose, moved: Array, variance: Array, *, from_mean: bool = True
 ) -> ConditionalPose:
     """Predict the pose: K ← G K, Ω ← G Ω Gᵀ + F R Fᵀ; Λ does not change.
 
@@ -314,7 +314,7 @@ def move(
     evaluated from x̄ to the predicted position x̂⁻, which then becomes the new x̄:
     G = I + (J (x̂⁻ − x̄), 0) e_θᵀ.
     """
-    motion = predict_pose(pose.mean, odometry)
+    motion = predict_pose(pose.mean, moved)
     G, F = motion.jacobian_pose, motion.jacobian_noise
     if not from_mean:
         way = motion.pose[:2] - pose.reference

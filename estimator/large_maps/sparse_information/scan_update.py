@@ -25,6 +25,7 @@ from ...filters.ekf import (
 from ...filters.gaussian_map import not_positive_definite
 from ...interface import UpdateReport
 from ...models.bearing_range import locate_landmark, predict_measurement, wrap_angle
+from ...models.motions import UNICYCLE
 from ...support import argument_checks
 from .local_information import (
     ConditionalPose,
@@ -183,6 +184,7 @@ class ScanRules:
             "gate_probability",
             "noise_at_rest",
             "min_range",
+            "motion",
         }
         if unknown:
             raise TypeError(f"SparseInformationSlam has no option {min(unknown)!r}")
@@ -191,7 +193,8 @@ class ScanRules:
         """Makes the filter of the same belief in dense form."""
         self.rules = self.dense().rules
         at_rest = settings.get("noise_at_rest", True)
-        self.motion_noise = MotionNoise.checked(motion_std, at_rest)
+        motion = settings.get("motion", UNICYCLE)
+        self.motion_noise = MotionNoise.checked(motion_std, at_rest, motion)
         bearing_std = self.rules.bearing_std + self.rules.bearing_std_metres
         if min(bearing_std, self.rules.range_std) <= 0:
             raise ValueError(

@@ -140,12 +140,12 @@ range_noise_at, gate_probability, noise_at_rest, min_range
         if isinstance(self._held, EkfSlam):
             self._held.predict(odometry, dt)
             return
-        distance, turn = argument_checks.pair("odometry", odometry)
-        variance = self._scan_rules.motion_noise.over(distance, turn, dt)
+        noise = self._scan_rules.motion_noise
+        moved = noise.motion.moved(odometry)
         pose = move(
             self._held.pose,
-            np.array([distance, turn]),
-            variance,
+            np.array(moved),
+            noise.over(moved, dt),
             from_mean=self._scan_rules.base == ESTIMATE,
         )
         vars(self._held).update(pose=pose, steps=self.steps + 1)
