@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import slamlog
-from . import course, graph, utias
+from . import course, graph, utias, victoria_park
 
 EXPECTED = (
     "a log: slamlog 1, a course data.txt, a Freiburg sensor.dat, "
-    "iSAM or g2o text, or a UTIAS MR.CLAM folder"
+    "iSAM or g2o text, or a folder of UTIAS MR.CLAM or Victoria Park"
 )
 READERS = {
     "slamlog": slamlog.read_slamlog,
@@ -38,7 +38,8 @@ def read_log(
     path : path
         A file in the format ``slamlog 1``, a course ``data.txt``, a Freiburg
         ``sensor.dat`` (with ``world.dat`` beside it), an iSAM or g2o text, or the
-        folder of a UTIAS MR.CLAM data set.
+        folder of a UTIAS MR.CLAM data set, or that of Victoria Park, with
+        ``aa3_dr.mat``, ``aa3_gpsx.mat``, and the trees as ``victoria_park.csv``.
     landmarks : array_like, shape (n, 2), optional
         True positions of the landmarks 0, 1, …, n - 1 [m], in place of those in the
         log.
@@ -69,7 +70,7 @@ def read_log(
     """
     source = Path(path)
     if source.is_dir():
-        kind = "utias"
+        kind = "victoria" if (source / victoria_park.DRIVE).is_file() else "utias"
     else:
         path = slamlog.ReadFile(path)
         kind = _format_of(slamlog.read_lines(path)[0])
@@ -79,7 +80,9 @@ def read_log(
         raise ValueError(f"truth must be None for a log that is no graph, got {truth}")
     if noise_from_file and kind != "isam":
         raise ValueError("noise_from_file needs a graph, iSAM or g2o text")
-    if kind == "utias":
+    if kind == "victoria":
+        log = victoria_park.read_victoria_park(source)
+    elif kind == "utias":
         log = utias.read_utias(source, robot=robot)
     elif kind == "isam":
         log = graph.read_isam(path, truth=truth, noise_from_file=noise_from_file)
