@@ -353,6 +353,13 @@ class BatchSlam(BatchOfBeliefs):
         nis[rows], freedom[rows] = found.nis, size
         return nis, freedom
 
+    def write_poses(self, trace: BatchTrace, step: int) -> None:
+        """Replace the poses of a step of a trace by the present ones."""
+        going = self.failed_at == NEVER
+        trace.poses[going, step] = self._means[going, :3]
+        trace.poses[going, step, 2] = wrap_angle(trace.poses[going, step, 2])
+        trace.pose_covariances[going, step] = self._covariances[going, :3, :3]
+
     def __repr__(self) -> str:
         few, most = self._mapped.min(), self._mapped.max()
         landmarks = f"{few} to {most} of {self.landmarks} landmarks"

@@ -20,6 +20,7 @@ READERS = {
     "slamlog": slamlog.read_slamlog,
     "course": course.read_course,
     "freiburg": course.read_freiburg,
+    "victoria": victoria_park.read_victoria_park,
 }
 
 
@@ -70,7 +71,7 @@ def read_log(
     """
     source = Path(path)
     if source.is_dir():
-        kind = "victoria" if (source / victoria_park.DRIVE).is_file() else "utias"
+        kind = _folder_of(source)
     else:
         path = slamlog.ReadFile(path)
         kind = _format_of(slamlog.read_lines(path)[0])
@@ -80,9 +81,7 @@ def read_log(
         raise ValueError(f"truth must be None for a log that is no graph, got {truth}")
     if noise_from_file and kind != "isam":
         raise ValueError("noise_from_file needs a graph, iSAM or g2o text")
-    if kind == "victoria":
-        log = victoria_park.read_victoria_park(source)
-    elif kind == "utias":
+    if kind == "utias":
         log = utias.read_utias(source, robot=robot)
     elif kind == "isam":
         log = graph.read_isam(path, truth=truth, noise_from_file=noise_from_file)
@@ -97,6 +96,11 @@ def read_log(
         landmark_ids=np.arange(len(positions)),
         landmarks=positions,
     )
+
+
+def _folder_of(folder: Path) -> str:
+    is_park = (folder / victoria_park.DRIVE).is_file()
+    return "victoria" if is_park else "utias"
 
 
 def _format_of(line: slamlog.LogLine) -> str:

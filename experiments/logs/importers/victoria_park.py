@@ -11,6 +11,7 @@ J. Guivant, E. Nebot, Optimization of the simultaneous localization and map-buil
 algorithm for real-time implementation, IEEE T-RA 17(3), 2001.
 """
 
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ WHEELBASE = 2.83  # [m]
 ANTENNA = "3.78,0.5"  # ahead and to the left of it [m]
 
 
-def read_victoria_park(folder: Path) -> slamlog.SlamLog:
+def read_victoria_park(path: str | PathLike[str]) -> slamlog.SlamLog:
     """Read the drive from the folder of the three files.
 
     Speed and steering are constant between their stamps. With the distance H of the
@@ -39,7 +40,7 @@ def read_victoria_park(folder: Path) -> slamlog.SlamLog:
 
     Parameters
     ----------
-    folder : Path
+    path : path
         The folder.
 
     Returns
@@ -52,6 +53,7 @@ def read_victoria_park(folder: Path) -> slamlog.SlamLog:
     LogError
         If a file is missing or malformed.
     """
+    folder = Path(path)
     stamps, speed, steering = _columns(folder / DRIVE, "time", "speed", "steering")
     times, x, y = _columns(folder / GPS, "timeGps", "Lo_m", "La_m")
     if not (folder / TREES).is_file():
