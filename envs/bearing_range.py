@@ -116,15 +116,24 @@ class BearingRangeSensor:
         y, x = relative.imag, relative.real
         if y.ndim > 1:  # contiguous copies are twice as fast for many
             y, x = y.copy(), x.copy()
-        bearings = np.arctan2(y, x, readings[0])
+        np.arctan2(y, x, readings[0])
         np.abs(relative, readings[1])
         mask = _in_view(readings, nearest, max_range, half_view)
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
         if self._kind == "position":
             readings[0], readings[1] = x, y
+            readings += error
+        else:
+            self._disturb(readings, error, settings or self._settings)
+        if np.count_nonzero(mask) < mask.size:
+            readings = np.where(mask, readings, _UNSEEN)
+        return readings, mask
+
+    def _disturb(self, readings: Array, error: Array, settings: SensorSettings) -> None:
+        """Turn true bearings and ranges into what the sensor reads, in place."""
+        bearings = readings[0]
         if self._grows:
-            settings = settings or self._settings
             std = settings.range_std + settings.growth * readings[1]
             error = np.stack([error[0], error[1] * std])
         readings += error
@@ -134,12 +143,9 @@ class BearingRangeSensor:
         if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
             wrap_bearings(bearings)
         if self._kind == "range":
-            readings[0] = readings[1]
+            bearings[...] = readings[1]
         if self._kind in _ONE_NUMBER:
             readings[1] = 0.0
-        if np.count_nonzero(mask) < mask.size:
-            readings = np.where(mask, readings, _UNSEEN)
-        return readings, mask
 
 
 def _in_view(

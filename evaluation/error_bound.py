@@ -65,6 +65,7 @@ def posterior_bound(
     start_std: ArrayLike,
     range_std_per_metre: float = 0.0,
     pose_std: ArrayLike = (np.inf, np.inf, np.inf),
+    sensor: str = "bearing_range",
 ) -> PosteriorBound:
     """Return the bound of many runs, each along its own true path.
 
@@ -87,6 +88,9 @@ def posterior_bound(
     pose_std : array_like, shape (3,), (T, 3) or (B, T, 3)
         Of readings of (x, y, θ) after each scan [m, m, rad]; infinite where there is
         none.
+    sensor : str
+        ``"bearing_range"``, or ``"position"`` with `measurement_std` (σx, σy) [m].  The
+        bound of other sensors is nan: their first reading of a landmark is no bound.
 
     Raises
     ------
@@ -106,13 +110,16 @@ def posterior_bound(
         if array.shape != shape:
             raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     check = argument_checks.standard_deviations
-    sensor = check("measurement_std", measurement_std, 2)
-    noise = np.array([*sensor, float(range_std_per_metre)])
+    stds = check("measurement_std", measurement_std, 2)
+    reads_positions = float(sensor == "position")
+    noise = np.array([*stds, float(range_std_per_metre), reads_positions])
     motion = check("motion_std", motion_std, 3) ** 2
     start = check("start_std", start_std, 3)
     durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps)).copy()
     fixes = np.broadcast_to(np.square(pose_std), (count, steps, 3)).astype(np.float64)
-    position, heading, raw = (np.empty((count, steps)) for _ in range(3))
+    position, heading, raw = (np.full((count, steps), np.nan) for _ in range(3))
+    if sensor not in ("bearing_range", "position"):
+        return PosteriorBound(position, heading, raw, np.full(count, np.nan), ())
     starts = _invariant_start(poses[:, :1], start)
     runs = zip(poses, places, seen, durations, fixes, strict=True)
     rows = zip(position, heading, raw, strict=True)
@@ -261,6 +268,9 @@ def _follow(
             distance = np.sqrt(dx * dx + dy * dy)
             across = noise[0] ** 2
             along = (noise[1] + noise[2] * distance) ** 2
+            if noise[3] > 0:  # (x, y) in the robot's frame
+                ry, rx = np.cos(poses[t, 2]), -np.sin(poses[t, 2])
+                bx, by, distance = ry, -rx, 1.0
             c = 3 + 2 * i
             if c < size:
                 _read(P, size, pending, count, c, bx, by, across)

@@ -261,8 +261,9 @@ def noise_sums(
         At each scan [m, m, rad].
     landmarks : array_like, shape (B, L, 2)
         True positions [m].
-    odometry : array_like, shape (B, T, 2)
-        (d, α) before each scan [m, rad]; that before the first is not used.
+    odometry : array_like, shape (B, T, 2) or (B, T, 3)
+        (d, α) before each scan [m, rad], or the displacement (dx, dy, α) of a drive;
+        that before the first is not used.
     measurements : array_like, shape (B, T, L, 2)
         Rows (β, r) [rad, m].
     visible : array_like of bool, shape (B, T, L)
@@ -292,7 +293,10 @@ def noise_sums(
     shape = poses.shape[:2]
     points = argument_checks.as_floats("landmarks", landmarks)
     seen = np.asarray(visible, dtype=np.bool_)
-    moved = _shaped("odometry", odometry, (*shape, 2))
+    moved = argument_checks.as_floats("odometry", odometry)
+    if moved.shape == (*shape, 2):
+        moved = np.insert(moved, 1, 0.0, axis=2)
+    moved = _shaped("odometry", moved, (*shape, 3))
     if seen.shape != (*shape, points.shape[1]) or len(points) != len(poses):
         raise ValueError(
             f"visible must be shape {(*shape, points.shape[1])}, got {seen.shape}"
@@ -320,13 +324,13 @@ def _motion_noise(
 ) -> list[_Noise]:
     run, step = np.nonzero(steps[:, 1:])
     before, after = poses[run, step], poses[run, step + 1]
-    driven, turned = odometry[run, step + 1].T
+    driven, aside, turned = odometry[run, step + 1].T
     dx, dy = (after - before)[:, :2].T
     cos, sin = np.cos(before[:, 2]), np.sin(before[:, 2])
     ahead = cos * dx + sin * dy
     errors = (
         ahead - driven,
-        cos * dy - sin * dx,
+        cos * dy - sin * dx - aside,
         wrap_angle(after[:, 2] - before[:, 2] - turned),
     )
     levers = driven if slips else ahead, 1.0, 1.0

@@ -139,10 +139,10 @@ class Sensor(Part):
         expect("'bearing_range', 'position', 'bearing' or 'range'"),
     ] = setting(
         "bearing_range",
-        "what one reading holds: (β, r), (x, y) in the robot's frame, β or r",
+        "what one reading holds: (β, r), (x, y) in the robot's frame, β, or r",
     )
     std: MeasurementStd = Field(
-        description="of one reading: (σβ, σr) [rad, m], (σx, σy) [m], (σβ, 0) or (σr, 0)"
+        description="of one reading: (σβ, σr) [rad, m], (σx, σy) [m], (σβ, 0), (σr, 0)"
     )
     range_std_per_metre: _RangeGrowth = setting(0.0, "k in σr(r) = σr + k r [m/m]")
     min_range: NotNegative = setting(0.05, "nearest visible landmark [m]")
@@ -340,7 +340,7 @@ class Robot(Part):
             if given is None and needed and name != "reference":
                 yield f"{name} must be given with drive = '{drive}'"
             if given is not None and not needed:
-                yield f"{name} must be left out with drive = '{self.drive}', got {given}"
+                yield f"{name} must not be given with drive = '{self.drive}'"
 
 
 class Scenario(Part):

@@ -7,7 +7,13 @@ import numpy as np
 from ...arrays import Array, BoolArray, ImageArray
 from ...restorable import Restorable, State
 from ...sim_configs import Scenario
-from .render_state import RENDER_MODES, BeliefLike, RenderMode, RenderState
+from .render_state import (
+    RENDER_MODES,
+    BeliefLike,
+    RenderMode,
+    RenderState,
+    drawn_readings,
+)
 
 if TYPE_CHECKING:
     from .renderer import WorldRenderer
@@ -70,7 +76,7 @@ class EpisodeRenderer(Restorable):
         self._path.append(pose[:2].tolist())
         self._present = {
             "pose": pose,
-            "measurements": measurements,
+            "measurements": drawn_readings(self._scenario.sensor.kind, measurements),
             "collision": collision,
             "clutter": clutter,
         }

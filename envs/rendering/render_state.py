@@ -49,7 +49,7 @@ class RenderState(NamedTuple):
     path: Array
     """True positions up to the present one, shape (k, 2) [m]."""
     measurements: Array
-    """Readings of this step, rows (bearing, range), shape (m, 2) [rad, m]."""
+    """Readings of this step as `drawn_readings`, shape (m, 2) [rad, m]."""
     collision: bool
     """Whether a wall stopped the robot in this step."""
     belief: BeliefLike | None
@@ -305,3 +305,38 @@ def _check(P: Array, sigmas: float) -> None:
         )
     if not sigmas > 0:
         raise ValueError(f"sigmas must be > 0, got {sigmas}")
+
+
+_RAY = 2.0  # length of a reading without a range [m]
+
+
+def drawn_readings(kind: str, readings: Array) -> Array:
+    """Return readings as rays (bearing, length) from the robot, for pictures.
+
+    Parameters
+    ----------
+    kind : str
+        Of the sensor.  A bearing becomes a ray of 2 m.  A range, or a reading of a
+        sensor of your own, has no direction and becomes a ray of length 0.
+    readings : ndarray, shape (m, 2)
+        Of the sensor.
+
+    Returns
+    -------
+    ndarray, shape (m, 2)
+        [rad, m].
+
+    Examples
+    --------
+    >>> drawn_readings("position", np.array([[0.0, 3.0]])).round(3)
+    array([[1.571, 3.   ]])
+    """
+    if kind == "bearing_range":
+        return readings
+    first, second = readings.T
+    match kind:
+        case "position":
+            return np.column_stack([np.arctan2(second, first), np.hypot(first, second)])
+        case "bearing":
+            return np.column_stack([first, np.full(len(first), _RAY)])
+    return np.zeros(readings.shape)

@@ -27,6 +27,7 @@ from ..kernels.batch import (
 from ..kernels.kalman_gain import Workspace
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame
+from ..models.sensors import for_sensor
 from ..support import argument_checks, saved_states
 from ..support.memory_limit import aligned_zeros, share_out, usable_cores
 from .conditioning import ObservedMap, PoseReading
@@ -225,7 +226,12 @@ class BatchSlam(BatchOfBeliefs):
             raise ValueError(f"{type(estimator).__name__} cannot run in batches")
         self.runs = argument_checks.whole("runs", runs, 1)
         self.landmarks = argument_checks.whole("landmarks", landmarks, 0)
-        self.rules = estimator.rules
+        if not estimator.sensor.places:
+            raise ValueError(
+                f"readings of sensor '{estimator.sensor.name}' do not place a landmark "
+                "one by one, and batches do not collect them"
+            )
+        self.sensor, self.rules = estimator.sensor, estimator.rules
         """What distinguishes this filter's updates from another's."""
         self.rule_values = estimator.rule_values.copy()
         self.motion_values = estimator.motion_values
@@ -346,7 +352,7 @@ class BatchSlam(BatchOfBeliefs):
             frame=self._frame,
             once=self.rules.iterations == 1,
         )
-        used = found.nis <= gate_of(self.rules.gate, size)
+        used = found.nis <= gate_of(self.rules, size)
         rows, found = rows[used], ObservedMap(*(part[used] for part in found))
         self._means[rows, :n], self._covariances[rows, :n, :n] = found[:2]
         nis, freedom = np.zeros(self.runs), np.zeros(self.runs, dtype=np.int64)
@@ -374,7 +380,7 @@ class BatchSlam(BatchOfBeliefs):
         failed_at: IntArray,
         part: slice,
     ) -> None:
-        drive_runs(
+        for_sensor(drive_runs, self.sensor)(
             _of(part, self._arrays()),
             _of(part, data),
             dt,
@@ -386,7 +392,7 @@ class BatchSlam(BatchOfBeliefs):
         )
 
     def _step(self, scans: tuple[Any, ...], chosen: BoolArray, part: slice) -> None:
-        step_runs(
+        for_sensor(step_runs, self.sensor)(
             _of(part, self._arrays()),
             _of(part, scans),
             chosen[part],

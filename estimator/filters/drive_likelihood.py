@@ -11,6 +11,7 @@ from ...arrays import LARGEST, Array, IntArray
 from ..kernels import drive_likelihood as kernel
 from ..kernels.kalman_gain import SKIPPED
 from ..models.bearing_range import wrap_angle
+from ..models.sensors import only_bearing_range
 from ..support import argument_checks
 from ..support.memory_limit import aligned_zeros, share_out, usable_cores
 from .batch import can_batch
@@ -91,6 +92,7 @@ def drive_likelihood(
             f"{type(estimator).__name__} is not one of the filters on the shared "
             "kernels, which can compute innovations for many noises at once"
         )
+    only_bearing_range(estimator.sensor, "drive_likelihood")
     values = argument_checks.as_floats("noises", noises)
     if values.ndim != 2 or values.shape[1] != kernel.NOISE_WIDTH:
         raise ValueError(

@@ -8,7 +8,8 @@ subclasses differ in where they linearise and in their error frame: `InvariantEk
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import expm1, inf, log1p
+from math import inf, log1p
+from statistics import NormalDist
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import numpy as np
@@ -31,6 +32,13 @@ from ..kernels.kalman_gain import (
 from ..kernels.scan_update import DONE, NOT_USABLE
 from ..models.motions import UNICYCLE, Motion, find_motion
 from ..models.rigid_motion import ErrorFrame
+from ..models.sensors import (
+    BEARING_RANGE,
+    Sensor,
+    constant_std,
+    find_sensor,
+    for_sensor,
+)
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
@@ -149,7 +157,7 @@ class MapFilter:
         (mean, P, reference), map_ = self.map.used, self.map
         found = self._observe(given, mean, P)
         size = found.innovation.size
-        if not found.nis <= gate_of(self.rules.gate, size):
+        if not found.nis <= gate_of(self.rules, size):
             return UpdateReport()
         after = BeliefArrays(found.mean, found.covariance, reference)
         map_.hold(after, map_.slots, block=map_.blank(map_.room), steps=1)
@@ -249,7 +257,11 @@ class EkfSlam(MapFilter):
         (σx, σy, σα) of the motion noise in the robot frame [m, m, rad], per step of
         dt = 1.
     measurement_std : array_like, shape (2,)
-        (σβ, σr) of the measurement noise [rad, m].
+        (σβ, σr) of the measurement noise [rad, m], or that of another sensor in its
+        units; one number suffices for a sensor that reads one.
+    sensor : str or Sensor
+        What a reading is: "bearing_range", "position", "bearing", "range", or a
+        :class:`~slamgym.estimator.Sensor` of your own.
     initial_pose : array_like, shape (3,)
         Mean of the first pose (x, y, θ) [m, m, rad].
     initial_pose_std : array_like, shape (3,)
@@ -314,6 +326,7 @@ class EkfSlam(MapFilter):
         motion_std: ArrayLike,
         measurement_std: ArrayLike,
         *,
+        sensor: str | Sensor = "bearing_range",
         initial_pose: ArrayLike = (0.0, 0.0, 0.0),
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
         landmark_init: str = "full",
@@ -326,8 +339,10 @@ class EkfSlam(MapFilter):
         motion: str | Motion = UNICYCLE,
     ) -> None:
         self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
+        self.sensor = find_sensor(sensor)
         self.rules = checked_rules(
             measurement_std,
+            sensor=self.sensor,
             linearisation=self._linearisation,
             frame=self._frame,
             landmark_init=landmark_init,
@@ -366,7 +381,8 @@ class EkfSlam(MapFilter):
         Parameters
         ----------
         measurements : array_like, shape (m, 2)
-            Rows (β, r) [rad, m], all seen at once: their order does not matter.
+            Rows (β, r) [rad, m], or those of the filter's sensor, all seen at once:
+            their order does not matter.
         landmark_ids : sequence of int, length m
             Identity of the landmark behind each row, without repetition.
 
@@ -386,9 +402,10 @@ class EkfSlam(MapFilter):
             If the landmarks would be more than memory holds; the belief is then as
             before.
         """
-        readings = argument_checks.scan(measurements)
+        readings = argument_checks.scan(measurements, self.sensor.columns)
         ids = argument_checks.identity_array(landmark_ids, len(readings), self)
-        status = self.map.take_in(self._update_map, readings, ids)
+        kernel = for_sensor(self._update_map, self.sensor)
+        status = self.map.take_in(kernel, readings, ids)
         if status != DONE:
             self._refuse(status, readings, ids)
         return self.map.report()
@@ -580,6 +597,7 @@ FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 def checked_rules(
     measurement_std: ArrayLike,
     *,
+    sensor: Sensor = BEARING_RANGE,
     linearisation: int,
     frame: int,
     landmark_init: str,
@@ -590,22 +608,35 @@ def checked_rules(
     min_range: float,
 ) -> Rules:
     """Return the rules of an update, from the arguments of :class:`.ekf.EkfSlam`."""
-    sensor = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
+    if sensor.size == 1 and np.size(measurement_std) == 1:
+        measurement_std = float(np.ravel(measurement_std)[0]), 1.0
+    std = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
     argument_checks.one_of("landmark_init", landmark_init, ("full", "independent"))
     argument_checks.one_of("range_noise_at", range_noise_at, ("expected", "reading"))
+    as_read = range_noise_at == "reading"
+    if as_read and not sensor.places:
+        raise ValueError(
+            f"range_noise_at must be 'expected': sensor '{sensor.name}' reads no place"
+        )
+    if sensor.std is constant_std and (range_std_per_metre or bearing_std_metres):
+        raise ValueError(
+            "range_std_per_metre and bearing_std_metres must be 0: the noise of sensor "
+            f"'{sensor.name}' is the same at every distance"
+        )
     return Rules(
         linearisation=linearisation,
         frame=frame,
         correlated=landmark_init == "full",
-        bearing_std=float(sensor[0]),
-        range_std=float(sensor[1]),
+        bearing_std=float(std[0]),
+        range_std=float(std[1]) if sensor.size == 2 else 1.0,
         range_std_per_metre=argument_checks.range_growth(range_std_per_metre),
         min_range=argument_checks.positive("min_range", min_range),
-        gate=_gate(gate_probability),
-        noise_as_read=range_noise_at == "reading",
+        gate=_gate(gate_probability, sensor.size),
+        noise_as_read=as_read,
         bearing_std_metres=argument_checks.at_least(
             "bearing_std_metres", bearing_std_metres, 0.0
         ),
+        numbers=sensor.size,
     )
 
 
@@ -617,28 +648,31 @@ def reading_variances(rules: Rules, ranges: Array) -> Array:
     return np.column_stack([bearing_std, range_std]) ** 2
 
 
-def _gate(probability: float | None) -> float:
-    """Return the χ²(2) quantile of the gate."""
+def _gate(probability: float | None, numbers: int) -> float:
+    """Return the χ² quantile of the gate for readings of one or two numbers."""
     if probability is None:
         return inf
     if not (isinstance(probability, float) and 0 < probability < 1):
         raise ValueError(
             f"gate_probability must lie between 0 and 1, got {probability!r}"
         )
+    if numbers == 1:
+        return NormalDist().inv_cdf((1 + probability) / 2) ** 2
     return -2 * log1p(-probability)  # P(χ²₂ > g) = e^{−g/2}
 
 
-def gate_of(gate: float, size: int) -> float:
-    """Return the χ²(size) quantile of the probability of a χ²(2) quantile."""
-    if gate == inf:
+def gate_of(rules: Rules, size: int) -> float:
+    """Return the χ² quantile of the gate for another number of components."""
+    if rules.gate == inf:
         return inf
-    from scipy.special import gammaincinv  # noqa: PLC0415 (slow to import)
+    from scipy.special import gammainc, gammaincinv  # noqa: PLC0415 (slow to import)
 
-    return 2 * float(gammaincinv(size / 2, -expm1(-gate / 2)))
+    probability = gammainc(rules.numbers / 2, rules.gate / 2)
+    return 2 * float(gammaincinv(size / 2, probability))
 
 
 class MotionNoise(NamedTuple):
-    """A drive with the variances of its noise, and whether a robot at rest has noise."""
+    """A drive with the variances of its noise, and whether there is noise at rest."""
 
     variance: Array
     """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""

@@ -35,6 +35,7 @@ from ..kernels.kalman_gain import (
     JACOBIAN,
     META_WIDTH,
     NEAR,
+    NUMBERS_READ,
     OUTCOME,
     ROOT,
     SKIPPED,
@@ -470,7 +471,7 @@ class ScanReport(UpdateReport):
     def detach(self) -> None:
         """Copy the results: the next update is about to overwrite them."""
         if not self.is_detached:
-            _ = self.nis, self._record
+            _ = self.nis, self._record, self._numbers
             del self.__dict__["_parts"]
 
     @property
@@ -498,9 +499,13 @@ class ScanReport(UpdateReport):
         return ScanRecord.copied(self._parts)
 
     @cached_property
+    def _numbers(self) -> int:
+        return int(self._parts.values[NUMBERS_READ])
+
+    @cached_property
     def degrees_of_freedom(self) -> int:
-        """Of the NIS: twice the number of associated readings."""
-        return len(self._record.rows)
+        """Of the NIS: how many numbers the associated readings have."""
+        return len(self._record.rows) * self._numbers // 2
 
     @cached_property
     def associated_ids(self) -> tuple[int, ...]:

@@ -11,6 +11,7 @@ from ...arrays import Array, IntArray
 from ..kernels.imagine import Imagined, as_view, imagine_plans
 from ..kernels.kalman_gain import AFTER_STDS, FIRST_STD
 from ..models.motions import only_unicycle
+from ..models.sensors import for_sensor
 from ..support import argument_checks
 from .batch import BatchSlam, can_batch
 from .ekf import EkfSlam
@@ -131,7 +132,7 @@ def imagine(
         np.full((count, plans_each, steps), np.nan),
     )
     workspace = workspace_for(filters.rules, landmarks, means.shape[1])
-    imagine_plans(
+    for_sensor(imagine_plans, filters.sensor)(
         (means, covariances, references, slots),
         driven,
         ending,

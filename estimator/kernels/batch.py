@@ -82,7 +82,7 @@ def drive_runs(
             if used < 0:
                 failed_at[b] = t
                 break
-            degrees_of_freedom[b, t] = 2 * used
+            degrees_of_freedom[b, t] = used * as_rules(rule_values).numbers
             for i in range(3):
                 poses[b, t, i] = mean[i]
                 for j in range(3):

@@ -27,11 +27,10 @@ from .prediction import predict
 from .scan_update import (
     DONE,
     as_rules,
-    bearing_variance,
     linearise,
     own_covariance,
-    range_variance,
     update_belief,
+    variances,
 )
 
 LOG_TURN = math.log(2 * math.pi)
@@ -254,8 +253,7 @@ def examine(
         at = readings[k, 1] if rules.noise_as_read else expected
         row, below = 2 * k, 2 * k + 1
         system[row, READING], system[below, READING] = readings[k, 0], readings[k, 1]
-        system[row, VARIANCE] = bearing_variance(rules, at)
-        system[below, VARIANCE] = range_variance(rules, at)
+        system[row, VARIANCE], system[below, VARIANCE] = variances(rules, at)
         linearise(mean, belief.reference, rules.linearisation, system, row, c)
         s00, s10, s11 = own_covariance(P, system, row, c)
         own[k, 0] = system[row, INNOVATION] / math.sqrt(s00)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
-from ..models.bearing_range import wrap_angle_jit
+from ..models.bearing_range import difference_jit, expected_reading_jit
 from .kalman_gain import LEDGER_HEIGHT, SLOT, half_log_det, largest_variance
 from .prediction import predict
 from .scan_update import DONE, as_rules, update_belief
@@ -179,8 +179,9 @@ def expect_readings(
             continue
         if is_hidden(x, y, dx, dy, sight.walls):
             continue
-        readings[count, 0] = wrap_angle_jit(math.atan2(dy, dx) - mean[2])
-        readings[count, 1], ledger[SLOT, count] = distance, slot
+        z0, z1 = expected_reading_jit(dx, dy, mean[2])
+        readings[count, 0], readings[count, 1] = difference_jit(z0, z1, 0.0, 0.0)
+        ledger[SLOT, count] = slot
         count += 1
     return count
 

@@ -452,12 +452,14 @@ class Rules(NamedTuple):
     min_range: float = 1e-3  # [m]
     gate: float = np.inf  # largest NIS of one reading
     noise_as_read: bool = False  # take noise at the range as read, not as expected
+    numbers: int = 2  # that a reading has; of one, the second row is void
 
 
 ITERATIONS = Rules._fields.index("iterations")
 FIRST_STD = Rules._fields.index("bearing_std")
 """Column of the first of the four standard deviations of a reading in the rules."""
 AFTER_STDS = Rules._fields.index("min_range")
+NUMBERS_READ = Rules._fields.index("numbers")
 
 
 # --------------------------------------------------------------------------------------
@@ -483,11 +485,12 @@ INNOVATION = -3  # ν
 WHITE = -4  # w = L⁻¹ ν
 ROOT = -6  # and the next: row of the diagonal block of L
 JACOBIAN = -11  # and the next four: row of H, by x, y, θ, landmark x, landmark y
+LANDMARK_X, LANDMARK_Y = JACOBIAN + 3, JACOBIAN + 4
 META_WIDTH = 16
 
 # Rows of the ledger of one scan.
 SLOT = 0  # of each reading: place of its landmark in the map, negative for a new one
-OUTCOME = 1  # of each reading: USED, ADDED, GATED or SKIPPED
+OUTCOME = 1  # of each reading: USED, ADDED, GATED, SKIPPED or WAITING
 NEAR = 2  # of each reading: 1 where the robot is too near its landmark to linearise
 COLUMN = 3  # of each reading in use: its landmark's first column in the state
 ORDER = 4  # the readings in use in the order in which they are taken one by one
@@ -495,6 +498,7 @@ LEDGER_HEIGHT = 5
 
 # Outcomes of a reading.
 USED, ADDED, GATED, SKIPPED = 0, 1, 2, 3
+WAITING = 4  # of a new landmark that one reading does not place
 
 
 class Workspace(NamedTuple):

@@ -7,10 +7,13 @@ import numpy as np
 from ...arrays import LARGEST, Array, IntArray
 from ...jit import jit, njit_inlined, njit_internal
 from ..models.bearing_range import (
+    difference_jit,
     expected_reading_jit,
-    located_jit,
-    reading_slopes_jit,
-    wrap_angle_jit,
+    placed_jit,
+    places_at_once_jit,
+    pose_slopes_jit,
+    read_distance_jit,
+    reading_variances_jit,
 )
 from ..models.rigid_motion import turn_coefficients_jit
 from .kalman_gain import (
@@ -27,6 +30,8 @@ from .kalman_gain import (
     INVARIANT,
     ITERATE,
     JACOBIAN,
+    LANDMARK_X,
+    LANDMARK_Y,
     LARGE,
     MEAN_BEFORE,
     NEAR,
@@ -38,6 +43,7 @@ from .kalman_gain import (
     SLOT,
     USED,
     VARIANCE,
+    WAITING,
     WHITE,
     BeliefArrays,
     Rules,
@@ -129,16 +135,7 @@ def add_landmarks(
     """Append the landmarks seen first, and write their slots to the ledger."""
     for k in range(count):
         if ledger[OUTCOME, k] == ADDED:
-            add_landmark(
-                belief,
-                size,
-                readings[k, 0],
-                readings[k, 1],
-                bearing_variance(rules, readings[k, 1]),
-                range_variance(rules, readings[k, 1]),
-                rules.linearisation,
-                rules.correlated,
-            )
+            add_landmark(belief, size, readings[k, 0], readings[k, 1], rules)
             ledger[SLOT, k] = (size - 3) // 2
             size += 2
 
@@ -147,7 +144,7 @@ def add_landmarks(
 def as_rules(values: Array) -> Rules:
     """Read rules from the array ``numpy.array(rules)``.
 
-    Python passes one array faster than a tuple of twelve numbers.
+    Python passes one array faster than a tuple of thirteen numbers.
     """
     return Rules(
         int(values[0]),
@@ -162,6 +159,7 @@ def as_rules(values: Array) -> Rules:
         values[9],
         values[10],
         values[11] > 0,
+        int(values[12]),
     )
 
 
@@ -190,9 +188,11 @@ def screen(
     """
     mean, system, used = belief.mean, rows[FIRST:], 0
     for k in range(count):
-        bearing, distance = readings[k, 0], readings[k, 1]
+        z0, z1 = readings[k, 0], readings[k, 1]
+        distance = read_distance_jit(z0, z1)
         column = 3 + 2 * ledger[SLOT, k]
-        ledger[OUTCOME, k] = ADDED if ledger[SLOT, k] < 0 else USED
+        new = ADDED if places_at_once_jit() else WAITING
+        ledger[OUTCOME, k] = new if ledger[SLOT, k] < 0 else USED
         ledger[NEAR, k] = 0
         if distance < rules.min_range:
             ledger[OUTCOME, k] = SKIPPED
@@ -205,7 +205,7 @@ def screen(
             continue
         row = 2 * used
         ledger[COLUMN, used] = column
-        system[row, READING], system[row + 1, READING] = bearing, distance
+        system[row, READING], system[row + 1, READING] = z0, z1
         # The range as read makes σr small just where its error is negative.
         set_noise(system, row, rules, distance if rules.noise_as_read else expected)
         ledger[NEAR, k] = is_too_near(mean, belief.covariance, column)
@@ -223,20 +223,19 @@ def screen(
 @njit_internal
 def set_noise(system: Array, row: int, rules: Rules, distance: float) -> None:
     """Fill the variances of the reading in ``row`` and the next, at that range [m]."""
-    system[row, VARIANCE] = bearing_variance(rules, distance)
-    system[row + 1, VARIANCE] = range_variance(rules, distance)
+    system[row, VARIANCE], system[row + 1, VARIANCE] = variances(rules, distance)
 
 
 @njit_internal
-def bearing_variance(rules: Rules, distance: float) -> float:
-    """Return σβ² of a reading at that range [m], which is at least the minimum."""
-    return (rules.bearing_std + rules.bearing_std_metres / distance) ** 2
-
-
-@njit_internal
-def range_variance(rules: Rules, distance: float) -> float:
-    """Return σr² of a reading at that range [m]."""
-    return (rules.range_std + rules.range_std_per_metre * distance) ** 2
+def variances(rules: Rules, distance: float) -> tuple[float, float]:
+    """Return the two variances of a reading at that distance [m], above 0."""
+    return reading_variances_jit(
+        rules.bearing_std,
+        rules.range_std,
+        rules.range_std_per_metre,
+        rules.bearing_std_metres,
+        distance,
+    )
 
 
 @njit_internal
@@ -513,10 +512,15 @@ def squared_range(mean: Array, c: int) -> float:
 
 @njit_internal
 def is_far_off(mean: Array, system: Array, row: int, c: int) -> bool:
-    """Whether a reading differs from its prediction by more than FAR of the range."""
-    bearing, distance = system[row, INNOVATION], system[row + 1, INNOVATION]
-    far = distance * distance > FAR * FAR * squared_range(mean, c)
-    return bool(far or abs(bearing) > FAR)
+    """Whether a reading differs from its prediction by more than FAR of the range.
+
+    A difference ν counts as the shift of the landmark by ν / ‖∂h/∂l‖.
+    """
+    least, far = FAR * FAR * squared_range(mean, c), False
+    for i in range(row, row + 2):
+        nu, x, y = system[i, INNOVATION], system[i, LANDMARK_X], system[i, LANDMARK_Y]
+        far |= nu * nu > least * (x * x + y * y)
+    return far
 
 
 @njit_internal
@@ -586,16 +590,18 @@ def linearise(
     H = system[row : row + 2, JACOBIAN : JACOBIAN + 5]
     z, nu = system[row : row + 2, READING], system[row : row + 2, INNOVATION]
     dx, dy = mean[column] - mean[0], mean[column + 1] - mean[1]
-    bearing, distance = expected_reading_jit(dx, dy, mean[2])
-    nu[0], nu[1] = wrap_angle_jit(z[0] - bearing), z[1] - distance
+    e0, e1 = expected_reading_jit(dx, dy, mean[2])
+    nu[0], nu[1] = difference_jit(z[0], z[1], e0, e1)
+    heading = mean[2]
     if linearisation in (AT_REFERENCE, AT_TRUTH):
         dx = reference[column] - reference[0]
         dy = reference[column + 1] - reference[1]
-    bearing_x, bearing_y, range_x, range_y = reading_slopes_jit(dx, dy)
-    H[0, 0], H[0, 1], H[0, 2] = -bearing_x, -bearing_y, -1.0
-    H[1, 0], H[1, 1], H[1, 2] = -range_x, -range_y, 0.0
-    H[0, 3], H[0, 4] = bearing_x, bearing_y
-    H[1, 3], H[1, 4] = range_x, range_y
+        heading = reference[2]
+    ax, ay, bx, by, a_turn, b_turn = pose_slopes_jit(dx, dy, heading)
+    H[0, 0], H[0, 1], H[0, 2] = -ax, -ay, a_turn
+    H[1, 0], H[1, 1], H[1, 2] = -bx, -by, b_turn
+    H[0, 3], H[0, 4] = ax, ay
+    H[1, 3], H[1, 4] = bx, by
     if linearisation == PROJECTED:
         _project(reference, column, H)
 
@@ -626,12 +632,9 @@ def _project(reference: Array, column: int, H: Array) -> None:
 def add_landmark(
     belief: BeliefArrays,
     size: int,
-    bearing: float,
-    distance: float,
-    bearing_variance: float,
-    range_variance: float,
-    linearisation: int,
-    correlated: bool,
+    z0: float,
+    z1: float,
+    rules: Rules,
 ) -> None:
     """Append the landmark of one reading, eq. 1.3, with its correlation to all else.
 
@@ -642,10 +645,13 @@ def add_landmark(
     Not ``correlated``: P_l* = 0, the initialisation that makes a filter overconfident.
     """
     mean, P, reference = belief
-    r, c = distance, size
-    lx, ly, cos, sin = located_jit(mean[0], mean[1], mean[2], bearing, r)
+    linearisation, c = rules.linearisation, size
+    v0, v1 = variances(rules, read_distance_jit(z0, z1))
+    pose = mean[0], mean[1], mean[2]
+    lx, ly, turned_x, turned_y, xx, more_xx, xy, yy, more_yy = placed_jit(
+        pose, z0, z1, v0, v1
+    )
     mean[c], mean[c + 1] = lx, ly
-    turned_x, turned_y = -r * sin, r * cos
     if linearisation in (AT_REFERENCE, PROJECTED):
         reference[c], reference[c + 1] = lx, ly
     if linearisation != AT_ESTIMATE:
@@ -655,12 +661,11 @@ def add_landmark(
     for j in range(size):
         x[j] = P[0, j] + turned_x * P[2, j]
         y[j] = P[1, j] + turned_y * P[2, j]
-    across, along = bearing_variance * r * r, range_variance
-    x[c] = x[0] + turned_x * x[2] + cos * cos * along + sin * sin * across
-    y[c] = y[0] + turned_x * y[2] + cos * sin * (along - across)
-    y[c + 1] = y[1] + turned_y * y[2] + sin * sin * along + cos * cos * across
+    x[c] = x[0] + turned_x * x[2] + xx + more_xx
+    y[c] = y[0] + turned_x * y[2] + xy
+    y[c + 1] = y[1] + turned_y * y[2] + yy + more_yy
     x[c + 1] = y[c]
     for j in range(size):
-        if not correlated:
+        if not rules.correlated:
             x[j] = y[j] = 0.0
         P[j, c], P[j, c + 1] = x[j], y[j]

@@ -206,3 +206,93 @@ def located(
 expected_reading_jit = njit_inlined(expected_reading)
 reading_slopes_jit = njit_inlined(reading_slopes)
 located_jit = njit_inlined(located)
+
+
+# --------------------------------------------------------------------------------------
+# What kernels need of a sensor; for others than bearing and range, `sensors` replaces
+# these functions.
+
+
+def pose_slopes(dx: float, dy: float, heading: float) -> tuple[float, ...]:
+    """Return Hl entry by entry, as `reading_slopes`, and then ∂h/∂θ = (−1, 0)."""
+    bearing_x, bearing_y, range_x, range_y = reading_slopes_jit(dx, dy)
+    return bearing_x, bearing_y, range_x, range_y, -1.0, 0.0
+
+
+def difference(
+    bearing: float, distance: float, expected: float, expected_distance: float
+) -> tuple[float, float]:
+    """Return a reading minus another, the bearing wrapped."""
+    return wrap_angle_jit(bearing - expected), distance - expected_distance
+
+
+def read_distance(bearing: float, distance: float) -> float:
+    """Return the distance of the landmark by its reading, infinite if unknown [m]."""
+    return distance
+
+
+def reading_variances(
+    bearing_std: float,
+    range_std: float,
+    range_std_per_metre: float,
+    bearing_std_metres: float,
+    distance: float,
+) -> tuple[float, float]:
+    """Return (σβ², σr²) of a reading at that distance [m], which is above 0."""
+    return (
+        (bearing_std + bearing_std_metres / distance) ** 2,
+        (range_std + range_std_per_metre * distance) ** 2,
+    )
+
+
+def placed(
+    pose: tuple[float, float, float],
+    bearing: float,
+    distance: float,
+    bearing_variance: float,
+    range_variance: float,
+) -> tuple[float, ...]:
+    """Return where one measured landmark lies, and how it depends on all else.
+
+    ::
+
+        l = (x + r cos, y + r sin)  of  θ + β
+        ∂l/∂p = [1 0 −r sin; 0 1 r cos],    ∂l/∂z = [−r sin, cos; r cos, sin]
+
+    Parameters
+    ----------
+    pose
+        p [m, m, rad].
+    bearing, distance : float
+        z = (β, r) [rad, m].
+    bearing_variance, range_variance : float
+        The diagonal of Q.
+
+    Returns
+    -------
+    x, y
+        l.
+    turned_x, turned_y
+        ∂l/∂θ.
+    xx, more_xx, xy, yy, more_yy
+        ∂l/∂z Q (∂l/∂z)ᵀ; its variances in two parts, which are to be added up.
+    """
+    x, y, cos, sin = located_jit(pose[0], pose[1], pose[2], bearing, distance)
+    across, along = bearing_variance * distance * distance, range_variance
+    xx, more_xx = cos * cos * along, sin * sin * across
+    yy, more_yy = sin * sin * along, cos * cos * across
+    xy = cos * sin * (along - across)
+    return x, y, -distance * sin, distance * cos, xx, more_xx, xy, yy, more_yy
+
+
+def places_at_once() -> bool:
+    """Return whether one reading determines where a landmark is."""
+    return True
+
+
+pose_slopes_jit = njit_inlined(pose_slopes)
+difference_jit = njit_inlined(difference)
+read_distance_jit = njit_inlined(read_distance)
+reading_variances_jit = njit_inlined(reading_variances)
+placed_jit = njit_inlined(placed)
+places_at_once_jit = njit_inlined(places_at_once)

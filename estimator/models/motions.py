@@ -224,7 +224,7 @@ def find_motion(motion: str | Motion) -> Motion:
     name = match[1] if match else motion
     if match is None or name not in MOTIONS:
         raise ValueError(
-            f"motion must be one of {', '.join(MOTIONS)}, with its lengths in brackets, "
+            f"motion must be one of {', '.join(MOTIONS)} with its lengths in brackets, "
             f"got '{motion}'{closest(name, MOTIONS)}"
         )
     try:

@@ -144,7 +144,7 @@ class PeerSlam(ABC):
 
     @abstractmethod
     def _move(self, odometry: Array, variance: Array) -> None:
-        """Move by (dx, dy, α) in the robot's frame, with the variances (3,) of the noise in the robot's frame."""
+        """Move by (dx, dy, α) in the robot's frame, with the noise's variances (3,)."""
 
     @abstractmethod
     def _take_in(self, known: Readings, new: Readings) -> Innovation | None:

@@ -33,7 +33,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...jit import jit, njit_internal
-from ..kernels.scan_update import as_rules, bearing_variance, range_variance
+from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import (
     expected_reading_jit,
     reading_slopes_jit,
@@ -444,8 +444,8 @@ def reading_stds(
             if rules.noise_as_read:
                 distance = drive.readings[j, 1]
             distance = max(distance, rules.min_range)
-            stds[j, 0] = np.sqrt(bearing_variance(rules, distance))
-            stds[j, 1] = np.sqrt(range_variance(rules, distance))
+            variance, below = variances(rules, distance)
+            stds[j, 0], stds[j, 1] = np.sqrt(variance), np.sqrt(below)
     return stds
 
 

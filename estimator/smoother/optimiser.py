@@ -16,7 +16,7 @@ from ...jit import jit, njit_internal
 from ..filters.ekf import InvariantEkfSlam
 from ..interface import Belief
 from ..kernels.kalman_gain import Rules
-from ..kernels.scan_update import as_rules, bearing_variance, range_variance
+from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import (
     expected_reading_jit,
     located_jit,
@@ -358,8 +358,9 @@ def _cost_at(
             place[0] - pose[0], place[1] - pose[1], pose[2]
         )
         to_bearing = wrap_angle_jit(z[0] - bearing)
-        squared = to_bearing**2 / bearing_variance(rules, z[1])
-        squared += (z[1] - distance) ** 2 / range_variance(rules, z[1])
+        bearing_variance, range_variance = variances(rules, z[1])
+        squared = to_bearing**2 / bearing_variance
+        squared += (z[1] - distance) ** 2 / range_variance
         total += elimination.robust_loss(squared, robust[0], robust[1])
     return total
 

@@ -65,8 +65,13 @@ def as_floats(name: str, value: ArrayLike) -> Array:
         raise ValueError(f"{name} must be numbers, got {value!r}") from None
 
 
-def scan(measurements: ArrayLike) -> Array:
-    """Return ``measurements`` as a writeable float64 array (m, 2), or refuse them."""
+def scan(
+    measurements: ArrayLike, columns: tuple[str, ...] = ("bearing", "range")
+) -> Array:
+    """Return ``measurements`` as a writeable float64 array (m, 2), or refuse them.
+
+    The rows of a sensor of one number get a void second number.
+    """
     if (  # kernels can take them as they are
         type(measurements) is np.ndarray
         and measurements.dtype is _FLOAT64
@@ -79,10 +84,12 @@ def scan(measurements: ArrayLike) -> Array:
         readings = readings.copy()
     if readings.ndim == 2 and readings.shape[1] == 2:
         return readings
+    if len(columns) == 1 and readings.shape[1:] == (1,):
+        return np.pad(readings, ((0, 0), (0, 1)))
     if readings.size == 0:
         return readings.reshape(0, 2)
     raise ValueError(
-        "measurements must have shape (m, 2), rows (bearing, range), "
+        f"measurements must have shape (m, 2), rows ({', '.join(columns)}), "
         f"got shape {readings.shape}"
     )
 

@@ -15,12 +15,15 @@ from typing import Any, NamedTuple, cast
 import gymnasium
 import numpy as np
 
+from ...agents.estimator_choice import model_labels
 from ...arrays import Array
 from ...envs.controllers import Controller
 from ...envs.landmark_world import LandmarkWorldEnv, Observation
+from ...estimator.models.motions import find_motion
+from ...estimator.models.sensors import find_sensor
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_files import refuse_ranges
-from .slamlog import Motion, OdometryRow, Scan, SlamLog, numbers
+from .slamlog import OdometryRow, Scan, SlamLog, numbers
 
 
 def record_episode(
@@ -110,6 +113,7 @@ def _log(
     return SlamLog(
         name=scenario.name,
         header=log_header(scenario, seed),
+        motion=model_labels(scenario).get("motion", "turn-last"),
         start=world.start_estimate,
         landmark_ids=np.arange(len(world.landmarks)),
         landmarks=world.landmarks,
@@ -141,6 +145,12 @@ def log_header(scenario: Scenario, seed: int) -> dict[str, str]:
     if not sensor.identities:
         header["identities"] = "false"
     header["noise_at_rest"] = str(motion.noise_at_rest).lower()
+    models = model_labels(scenario)
+    if "sensor" in models:
+        header["sensor"] = models["sensor"]
+        header["measurement_columns"] = ",".join(find_sensor(models["sensor"]).columns)
+    if "motion" in models:
+        header["odometry_columns"] = ",".join(find_motion(models["motion"]).columns)
     return header
 
 
@@ -204,17 +214,18 @@ def steps_of(log: SlamLog) -> Iterator[Step]:
     yield step
 
 
-def predictions(row: OdometryRow, motion: Motion) -> tuple[Prediction, ...]:
-    """Convert an odometry row to the motion model: drive d, then turn α.
+def predictions(row: OdometryRow, motion: str) -> tuple[Prediction, ...]:
+    """Convert an odometry row to calls of a filter that has the log's drive.
 
-    A midpoint row, an arc driven along the heading θ + α/2, is exactly two of them.
+    A midpoint row, an arc driven along the heading θ + α/2, is exactly two moves of a
+    unicycle.
 
     Parameters
     ----------
     row : OdometryRow
         The row.
-    motion : "turn-last" or "midpoint"
-        Motion model of the log.
+    motion : str
+        Motion model of the log: ``"turn-last"``, ``"midpoint"`` or a drive.
 
     Examples
     --------
@@ -223,7 +234,7 @@ def predictions(row: OdometryRow, motion: Motion) -> tuple[Prediction, ...]:
     (0.0, 0.2) 0.0
     (2.0, 0.2) 1.0
     """
-    if motion == "turn-last":
+    if motion != "midpoint":
         return (Prediction((row.d, row.alpha), row.dt),)
     half = row.alpha / 2
     return Prediction((0.0, half), 0.0), Prediction((row.d, half), row.dt)

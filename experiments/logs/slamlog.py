@@ -27,13 +27,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ...estimator.models.bearing_range import wrap_angle
+from ...estimator.models.motions import find_motion
 from ...sim_configs.atomic_file import replace_when_written
 
 __all__ = [
@@ -45,7 +46,8 @@ __all__ = [
     "write_slamlog",
 ]
 
-Motion = Literal["turn-last", "midpoint"]
+UNICYCLES = ("turn-last", "midpoint")
+"""Meanings of the odometry of a unicycle."""
 FORMAT_LINE = "# format: slamlog 1"
 ROW_FORMS = {
     "landmark": "landmark,id,x,y",
@@ -65,9 +67,10 @@ class SlamLog:
         Name of the log.
     header : dict of str to str
         Further notes on the log, such as ``source`` or ``groundtruth_offset``.
-    motion : "turn-last" or "midpoint"
-        Meaning of an odometry row: drive d, then turn α; or an arc, driven by d along
-        the heading θ + α/2.
+    motion : str
+        Meaning of an odometry row: ``"turn-last"``, drive d, then turn α;
+        ``"midpoint"``, an arc, driven by d along the heading θ + α/2; or a drive, as
+        ``"differential[track_width=0.4]"``, whose columns then stand for d and α.
     start : ndarray, shape (3,)
         Pose (x, y, θ) before the first event [m, m, rad].
     landmark_ids : ndarray of int64, shape (n,)
@@ -87,7 +90,7 @@ class SlamLog:
 
     name: str
     header: dict[str, str] = field(default_factory=dict)
-    motion: Motion = "turn-last"
+    motion: str = "turn-last"
     start: Array = field(default_factory=lambda: np.zeros(3))
     landmark_ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     landmarks: Array = field(default_factory=lambda: np.empty((0, 2)))
@@ -254,12 +257,17 @@ def _value(line: LogLine) -> str:
     return line.text.partition(":")[2].strip()
 
 
-def _motion(line: LogLine | None) -> Motion:
+def _motion(line: LogLine | None) -> str:
     if line is None:
         return "turn-last"
-    if _value(line) not in get_args(Motion):
-        raise line.error(" or ".join(get_args(Motion)), shown(_value(line)))
-    return cast(Motion, _value(line))
+    motion = _value(line)
+    if motion not in UNICYCLES:
+        try:
+            find_motion(motion)
+        except (ValueError, ImportError, AttributeError):
+            expected = f"{', '.join(UNICYCLES)} or a drive"
+            raise line.error(expected, shown(motion)) from None
+    return motion
 
 
 def _start(line: LogLine | None) -> Array:
@@ -322,7 +330,8 @@ class OdometryRow:
     t : float
         Time at the end of the motion [s, or steps].
     d, alpha : float
-        Distance driven [m] and heading turned, counter-clockwise [rad].
+        Distance driven [m] and heading turned, counter-clockwise [rad]; or the two
+        columns of another drive.
     dt : float
         Duration for the motion noise: noise variances grow with dt, and a row with
         dt = 0 has none.
@@ -343,7 +352,8 @@ class Scan:
     t : float
         Time of the readings [s, or steps].
     measurements : ndarray, shape (m, 2)
-        Rows (β, r): bearing from the heading, and range [rad, m].
+        Rows (β, r): bearing from the heading, and range [rad, m]; or the numbers of
+        another sensor, which the log's header names.
     landmark_ids : ndarray of int64, shape (m,), or None
         Landmark of each row, without repetition; None if unknown.
     sizes : ndarray, shape (m,), or None

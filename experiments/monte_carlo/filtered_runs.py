@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from ...agents.estimator_choice import model_labels
 from ...arrays import Array, BoolArray
 from ...envs.robot import wall_distances
 from ...estimator.filters.batch import BatchSlam, BatchTrace, can_batch
@@ -21,6 +22,7 @@ from ...estimator.interface import (
     SupportsTruth,
     taking_poses,
 )
+from ...estimator.models.motions import find_motion
 from ...estimator.smoother.batch_smoother import smoother_in
 from ...evaluation.error_bound import PosteriorBound, posterior_bound
 from ...evaluation.noise_findings import noise_sums
@@ -265,7 +267,8 @@ _MANY = 6  # deviations that a displacement hardly exceeds
 def bound_runs(scenario: Scenario, runs: SimulatedRuns) -> PosteriorBound:
     """Return the bound along each run's true path, with the noise of the world.
 
-    Where the world hides identities, it is that of a filter which knows them. The
+    Where the world hides identities, it is that of a filter which knows them. It is nan
+    for sensors of one number, whose first reading of a landmark bounds nothing. The
     covariances are left out: they take as much memory as the filters.
     """
     identified = runs.identified()
@@ -282,6 +285,7 @@ def bound_runs(scenario: Scenario, runs: SimulatedRuns) -> PosteriorBound:
         start_std=scenario.start.std,
         range_std_per_metre=scenario.sensor.range_std_per_metre,
         pose_std=runs.fix_std,
+        sensor=scenario.sensor.kind,
     )
     return bound._replace(covariances=())
 
@@ -290,18 +294,20 @@ def noise_of_runs(scenario: Scenario, assumed: Scenario, runs: SimulatedRuns) ->
     """Return sums over the noise of each run, in deviations that `assumed` has.
 
     Clutter does not count, nor motion at rest where no noise is assumed, nor motion
-    that begins near a wall: walls stop the longest displacements.
+    that begins near a wall: walls stop the longest displacements. Of the sensors,
+    bearing_range alone counts.
     """
     identified = runs.identified()
+    motion = find_motion(model_labels(scenario).get("motion", "unicycle"))
     noisy = ~_near_walls(scenario, runs.true_poses)
     if not assumed.motion.noise_at_rest:
         noisy &= runs.odometry.any(axis=2)
     return noise_sums(
         runs.true_poses,
         identified.landmarks_of_rows,
-        runs.odometry,
+        motion.displacements(runs.odometry),
         identified.measurements,
-        identified.visible,
+        identified.visible & (scenario.sensor.kind == "bearing_range"),
         motion_std=assumed.motion.std,
         measurement_std=assumed.sensor.std,
         range_std_per_metre=assumed.sensor.range_std_per_metre,

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
+from ...agents.estimator_choice import accepted_models, model_labels
 from ...estimator import interface, registry
 from ...estimator.support.argument_checks import refuse_large_belief
 from ...estimator.support.memory_limit import covariance_bytes, refuse_beyond_memory
@@ -27,7 +28,7 @@ from ...sim_configs import Scenario
 from ...suggestions import closest
 from ..logs.ground_truth import hides_identities
 from ..logs.recording import log_header
-from ..logs.slamlog import LogError, SlamLog
+from ..logs.slamlog import UNICYCLES, LogError, SlamLog
 
 if TYPE_CHECKING:
     from .simulated_runs import SimulatedRuns
@@ -176,6 +177,7 @@ def settings_for(
         ),
         options={
             **_header_options(log.name, header, factory),
+            **accepted_models(factory, _models(log)),
             **managed,
             **(options or {}),
             **own,
@@ -222,8 +224,17 @@ def settings_for_scenario(
     >>> settings_for_scenario(load_scenario("six_landmarks")).motion_std
     (0.25, 0.1, 0.1)
     """
-    log = SlamLog(scenario.name, log_header(scenario, seed=0))
+    motion = model_labels(scenario).get("motion", "turn-last")
+    log = SlamLog(scenario.name, log_header(scenario, seed=0), motion)
     return settings_for(log, estimator=estimator, options=options)
+
+
+def _models(log: SlamLog) -> dict[str, str]:
+    """Return the sensor and the drive of a log as filters take them."""
+    models = {} if log.motion in UNICYCLES else {"motion": log.motion}
+    if "sensor" in log.header:
+        models["sensor"] = log.header["sensor"]
+    return models
 
 
 def _noise_header(log: SlamLog) -> dict[str, str]:

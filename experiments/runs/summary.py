@@ -344,11 +344,11 @@ def abandoned_landmarks(replay: Replay) -> int:
     A landmark is abandoned if it was within the sensor's reach in `MANY_SCANS` scans
     since its last reading.  The reach is that of three quarters of all readings, and
     their widest bearing to either side but for 5 %.  Where all readings have
-    identities, no landmark is.
+    identities, or the sensor is another, no landmark is.
     """
     log, trace = replay.log, replay.trace
     scans = [event for event in log.events if isinstance(event, Scan)]
-    if not scans or not hides_identities(log):
+    if not scans or not hides_identities(log) or "sensor" in log.header:
         return 0
     bearings, ranges = np.concatenate([scan.measurements for scan in scans]).T
     reach = np.quantile(ranges, 0.75)

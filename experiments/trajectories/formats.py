@@ -15,11 +15,13 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from ...agents.estimator_choice import model_labels
 from ...arrays import Array
 from ...envs.spaces import count_rows
 from ...estimator.filters.batch import BatchSlam
 from ...estimator.filters.ekf import EkfSlam
 from ...estimator.models.bearing_range import wrap_angle
+from ...estimator.models.motions import UNICYCLE, Motion, find_motion, only_unicycle
 from ...estimator.models.rigid_motion import composed
 from ...sim_configs import Scenario
 from ...sim_configs.field_types import unknown_choice
@@ -220,6 +222,14 @@ def _write_tum(trajectories: Sequence[Trajectory], path: Path) -> None:
         write_lines(path / f"{name}_odometry.tum", _lines(path_by_odometry, dt))
 
 
+def _check_tum(scenario: Scenario) -> None:
+    """Refuse odometry that the increments of a path do not determine."""
+    only_unicycle(
+        find_motion(model_labels(scenario).get("motion", "unicycle")),
+        "the format 'tum'",
+    )
+
+
 def _read_tum(path: Path) -> Iterator[Trajectory]:
     """Yield the trajectories of a shard; see `TrajectoryFormat`."""
     for name, about in read_metadata(path):
@@ -254,10 +264,10 @@ def _increments(poses: Array) -> Array:
     return np.column_stack([dx * np.cos(heading) + dy * np.sin(heading), turns])
 
 
-def dead_reckoning(start: Array, odometry: Array) -> Array:
+def dead_reckoning(start: Array, odometry: Array, motion: Motion = UNICYCLE) -> Array:
     """Integrate odometry.
 
-    ::
+    For a unicycle::
 
         x' = x + d cos θ,    y' = y + d sin θ,    θ' = θ + α
 
@@ -266,7 +276,9 @@ def dead_reckoning(start: Array, odometry: Array) -> Array:
     start : ndarray, shape (3,)
         First pose [m, m, rad].
     odometry : ndarray, shape (T, 2)
-        Rows (d, α) [m, rad].
+        Rows (d, α) [m, rad], or the columns of the drive.
+    motion : Motion
+        The drive.
 
     Returns
     -------
@@ -280,9 +292,9 @@ def dead_reckoning(start: Array, odometry: Array) -> Array:
     [[0.0, 0.0, 0.0], [1.0, 0.0, 1.57], [1.0, 2.0, 1.57]]
     """
     x, y, heading = start.tolist()
-    distances, turns = odometry.T
+    dx, dy, turns = motion.displacements(odometry).T
     headings = np.cumsum([heading, *turns])
-    along_x, along_y, *_ = composed(0.0, 0.0, headings[:-1], distances, 0.0, turns)
+    along_x, along_y, *_ = composed(0.0, 0.0, headings[:-1], dx, dy, turns)
     return np.column_stack(
         [np.cumsum([x, *along_x]), np.cumsum([y, *along_y]), headings]
     )
@@ -322,7 +334,7 @@ def filtered_path(trajectory: Trajectory) -> tuple[Array, dict[int, Array]]:
     poses = batch.run(odometry, measurements, mask[None], durations).poses[0]
     belief = batch.belief(0)
     if not (np.isfinite(poses).all() and np.isfinite(belief.mean).all()):
-        return dead_reckoning(start, trajectory.odometry), {}
+        return dead_reckoning(start, trajectory.odometry, batch.motion), {}
     poses[0] = start
     pairs = zip(belief.landmark_ids, belief.landmarks, strict=True)
     return poses, dict(pairs)
@@ -380,6 +392,7 @@ def to_slamlog(trajectory: Trajectory) -> slamlog.SlamLog:
     return slamlog.SlamLog(
         name=trajectory.scenario.name,
         header=log_header(trajectory.scenario, trajectory.seed),
+        motion=model_labels(trajectory.scenario).get("motion", "turn-last"),
         start=trajectory.start_estimate,
         landmark_ids=np.arange(len(landmarks)),
         landmarks=landmarks,
@@ -423,7 +436,7 @@ FORMATS = {
     "npz": TrajectoryFormat(_write_npz, _read_npz, ENDING=".npz", HOLDS_BELIEFS=True),
     "parquet": "parquet",
     "minari": "minari_dataset",
-    "tum": TrajectoryFormat(_write_tum, _read_tum),
+    "tum": TrajectoryFormat(_write_tum, _read_tum, check=_check_tum),
     "g2o": "g2o",
 }
 """The formats, or the modules that define them and load a library."""

@@ -15,7 +15,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ...agents.estimator_choice import model_labels
 from ...arrays import AnyArray, Array
+from ...estimator.models.motions import find_motion
+from ...estimator.models.sensors import find_sensor
+from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import scenario_text
 from .trajectory import (
     BELIEFS,
@@ -67,6 +71,7 @@ def _episode_table(trajectories: Sequence[Trajectory]) -> Any:
 def _step_table(trajectory: Trajectory) -> Any:
     actions, odometry = array_of(trajectory, "actions"), trajectory.odometry
     measurements = array_of(trajectory, "measurements")
+    moves, numbers = _model_columns(trajectory.scenario)
     x, y, heading = trajectory.poses.T
     count = len(trajectory.poses)
     columns = {
@@ -74,21 +79,32 @@ def _step_table(trajectory: Trajectory) -> Any:
         "step": np.arange(count, dtype=np.int32),
         "speed": _later(actions[:, 0]),
         "turn_rate": _later(actions[:, 1]),
-        "odometry_distance": _later(odometry[:, 0]),
-        "odometry_turn": _later(odometry[:, 1]),
+        **{
+            name: _later(column) for name, column in zip(moves, odometry.T, strict=True)
+        },
         "collision": _later(array_of(trajectory, "collisions")),
         "x": x,
         "y": y,
         "heading": heading,
         "seen": _lists(array_of(trajectory, "mask")),
-        "bearings": _lists(measurements[..., 0]),
-        "ranges": _lists(measurements[..., 1]),
+        **{name: _lists(measurements[..., k]) for k, name in enumerate(numbers)},
     }
     if trajectory.landmark_ids is not None:
         columns["landmark_ids"] = _lists(trajectory.landmark_ids)
     for name, rows in belief_rows(trajectory).items():
         columns[name] = _lists(rows)
     return pa.table(columns)
+
+
+def _model_columns(scenario: Scenario) -> tuple[list[str], list[str]]:
+    """Return the columns of odometry and of readings, by drive and sensor."""
+    models = model_labels(scenario)
+    moves, numbers = ["odometry_distance", "odometry_turn"], ["bearings", "ranges"]
+    if "motion" in models:
+        moves = [f"odometry_{name}" for name in find_motion(models["motion"]).columns]
+    if "sensor" in models:
+        numbers = [f"reading_{name}" for name in find_sensor(models["sensor"]).columns]
+    return moves, numbers
 
 
 def _later(values: AnyArray) -> Any:
@@ -116,17 +132,22 @@ def _trajectory(episode: dict[str, Any], steps: Any) -> Trajectory:
         return np.column_stack([column(name)[1:] for name in names])
 
     hidden = "landmark_ids" in steps.column_names
+    scenario = scenario_from_text(episode["scenario"])
+    moves, numbers = _model_columns(scenario)
+    measurements = np.zeros((*rows("seen").shape, 2))
+    for k, name in enumerate(numbers):
+        measurements[..., k] = rows(name)
     beliefs = {name: rows(name) for name in BELIEFS if name in steps.column_names}
     return Trajectory(
-        scenario=scenario_from_text(episode["scenario"]),
+        scenario=scenario,
         controller=episode["controller"],
         seed=episode["seed"],
         start_estimate=np.array(episode["start_estimate"]),
-        odometry=pairs("odometry_distance", "odometry_turn"),
+        odometry=pairs(*moves),
         poses=np.column_stack([column(name) for name in ("x", "y", "heading")]),
         landmarks=np.array(episode["landmarks"]).reshape(-1, 2),
         actions=pairs("speed", "turn_rate"),
-        measurements=np.stack([rows("bearings"), rows("ranges")], axis=-1),
+        measurements=measurements,
         mask=rows("seen"),
         collisions=column("collision")[1:].astype(np.bool_),
         landmark_ids=rows("landmark_ids") if hidden else None,

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
+from ...envs.rendering.render_state import drawn_readings
 from ...sim_configs.atomic_file import replace_when_written
 from ..logs.recording import steps_of
-from ..logs.slamlog import Scan, SlamLog
+from ..logs.slamlog import SlamLog
 from ..runs.summary import pose_nees
 from . import run_page as run_frames
 from .run_page import ViewedRun, map_at, shown_steps
@@ -77,7 +78,11 @@ def write_rerun(
         recording.send_recording_name(log.name)
         recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         _log_world(rerun, recording, log, walls)
-        scans = [step.scan for step in steps_of(log)]
+        kind = log.header.get("sensor", "bearing_range")
+        scans = [
+            None if step.scan is None else drawn_readings(kind, step.scan.measurements)
+            for step in steps_of(log)
+        ]
         steps = shown_steps([run.frames for run in runs])
         for number, run in enumerate(runs):
             colour = _COLOURS[number % len(_COLOURS)]
@@ -108,7 +113,7 @@ class _Writer:
         self,
         rerun: Any,
         recording: Any,
-        scans: Sequence[Scan | None],
+        scans: Sequence[Array | None],
         run: ViewedRun,
         colour: Any,
     ) -> None:
@@ -155,7 +160,7 @@ class _Writer:
     def _log_readings(self, step: int) -> None:
         scan, frame = self._scans[step], map_at(self._run, step)
         pose = self._run.trace.poses[step]
-        readings = np.empty((0, 2)) if scan is None else scan.measurements
+        readings = np.empty((0, 2)) if scan is None else scan
         angles = pose[2] + readings[:, 0]
         directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         ends = pose[:2] + readings[:, 1:] * directions

@@ -19,6 +19,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ...arrays import AnyArray, Array, IntArray
+from ...envs.rendering.render_state import drawn_readings
 from ...estimator.interface import MapView, SlamEstimator, SupportsJoin, UpdateReport
 from ...estimator.map_management.map_editor import view_map
 from ...evaluation.hypothesis_tests import chi_square_limits
@@ -120,6 +121,7 @@ def _pack_world(
     packed.put("landmark.x", log.landmarks[:, 0], "float32")
     packed.put("landmark.y", log.landmarks[:, 1], "float32")
     rows, ids = zip(*(_readings(scans[step]) for step in steps), strict=True)
+    rows = [drawn_readings(log.header.get("sensor", "bearing_range"), r) for r in rows]
     packed.put_frames("reading.true", ids, "int32")
     bearings = [np.round(readings[:, 0] * 1e4) for readings in rows]
     packed.put_frames("reading.bearing", bearings, "int32")

@@ -13,7 +13,7 @@ import tempfile
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, cached_property
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
@@ -79,6 +79,59 @@ def _compile(
     if hasattr(kernel, "py_func"):  # else compilation is turned off
         kernel._cache = KernelCache(kernel)
     return cast("Kernel", kernel)
+
+
+def specialised(
+    kernel: Kernel, changes: Mapping[Callable[..., Any], Callable[..., Any]], name: str
+) -> Kernel:
+    """Return a kernel that calls other functions in place of some, however deep.
+
+    It is compiled and cached like the kernel itself.  What does not depend on the
+    functions is shared with it.
+
+    Parameters
+    ----------
+    kernel : callable
+        The kernel.
+    changes : mapping
+        Compiled functions that it calls, directly or not, and what replaces them.
+    name : str
+        Distinguishes the new kernel from others made from this one.
+    """
+    parts = [code_fingerprint(part) for part in changes.values() if not _PLAIN]
+    digest = hashlib.sha256("".join(parts).encode()).hexdigest()[:16]
+    known: dict[int, Any] = {id(old): new for old, new in changes.items()}
+
+    def remade(value: Any) -> Any:
+        function = getattr(value, "py_func", value)
+        if id(value) in known or not isinstance(function, FunctionType):
+            return known.get(id(value), value)
+        known[id(value)] = value  # inside itself, should it be recursive
+        own = function.__globals__
+        used = {each: own[each] for each in function.__code__.co_names if each in own}
+        if _library(function) in LIBRARIES:
+            return value
+        new = {each: remade(part) for each, part in used.items()}
+        if all(new[each] is part for each, part in used.items()):
+            return value
+        copy = FunctionType(
+            *(function.__code__, own | new, f"{function.__name__}_{name}_{digest}"),
+            *(function.__defaults__, function.__closure__),
+        )
+        copy.__qualname__, copy.__module__ = copy.__name__, function.__module__
+        copy.__kwdefaults__ = function.__kwdefaults__
+        known[id(value)] = copy if value is function else _recompiled(copy, value)
+        return known[id(value)]
+
+    return cast("Kernel", remade(kernel))
+
+
+def _recompiled(function: Any, like: Any) -> Any:
+    """Compile a function as another one was."""
+    kernel = njit(**like.targetoptions)(function)
+    if isinstance(like._cache, KernelCache):
+        kernel._cache = KernelCache(kernel)
+    return kernel
 
 
 def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:

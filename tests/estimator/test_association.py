@@ -276,7 +276,7 @@ def test_a_landmark_is_too_near_within_ten_standard_deviations(seed, share):
 
 
 def test_a_reading_is_screened_at_the_expected_distance(monkeypatch):
-    for name in ("is_too_near", "set_noise", "bearing_variance", "range_variance"):
+    for name in ("is_too_near", "set_noise", "variances"):
         monkeypatch.setattr(screening, name, plain(getattr(screening, name)))
     rules = Rules(
         bearing_std=0.1, range_std=0.2, range_std_per_metre=0.1, bearing_std_metres=0.3

@@ -91,7 +91,7 @@ DRIVES = [find_motion("unicycle"), differential(0.4), bicycle(0.6), CAR]
 
 
 def rolled(wheel_speeds, point, steps=20_000):
-    """Integrate a rolling body: (v, ω) of the axle for unit time; where a point goes."""
+    """Integrate a body that rolls at (v, ω) of its axle; return where a point goes."""
     speed, rate = wheel_speeds
     x = y = heading = 0.0
     for _ in range(steps):

@@ -184,15 +184,16 @@ def test_the_gate_rejects_what_is_outside_its_region():
     assert slam.observe_pose([0.0, 4.0], GPS, np.eye(2)).degrees_of_freedom == 2
 
 
-def test_the_gate_has_the_same_probability_in_any_dimension():
+@pytest.mark.parametrize("sensor", ["bearing_range", "bearing"])
+def test_the_gate_has_the_same_probability_in_any_dimension(sensor):
     rng = np.random.default_rng(0)
-    gate = -2 * np.log(0.05)
+    rules = make("ekf", gate_probability=0.95, sensor=sensor).rules
     for size in (1, 2, 3):
         inside = (rng.standard_normal((200_000, size)) ** 2).sum(axis=1)
-        share = (inside <= gate_of(gate, size)).mean()
+        share = (inside <= gate_of(rules, size)).mean()
         np.testing.assert_allclose(share, 0.95, atol=0.003)
-    np.testing.assert_allclose(gate_of(gate, 2), gate)
-    assert gate_of(np.inf, 1) == np.inf
+    np.testing.assert_allclose(gate_of(rules, rules.numbers), rules.gate)
+    assert gate_of(make("ekf").rules, 1) == np.inf
 
 
 @pytest.mark.parametrize("label", ["ekf", "invariant", "first_estimates"])

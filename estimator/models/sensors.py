@@ -1,0 +1,502 @@
+"""Sensors as values: what a reading of a landmark is, for filters and their kernels.
+
+A `Sensor` holds a measurement function of the landmark in the robot's frame, with its
+slopes, in plain Python. From it the library derives the Jacobians, compiles kernels,
+and computes in numpy.  `SENSORS` lists the shipped ones: ``bearing_range``,
+``position``, ``bearing`` and ``range``.  `check_sensor` tests one of your own.
+
+Symbols
+-------
+(x, y)         landmark in the robot's frame, ahead and to the left [m, m]
+h(x, y)        expected reading (z0, z1), in the units of the sensor
+D              [∂z0/∂x ∂z0/∂y; ∂z1/∂x ∂z1/∂y]
+R              rotation by the heading θ, so that (x, y) = Rᵀ (l − p)
+
+Since the robot's frame moves with the pose::
+
+    ∂h/∂l = D Rᵀ,    ∂h/∂(px, py) = −D Rᵀ,    ∂h/∂θ = D (y, −x)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...arrays import Array
+from ...jit import njit_inlined, njit_internal, specialised
+from ...suggestions import closest
+from . import bearing_range
+from .bearing_range import LandmarkLocation, MeasurementPrediction, wrap_angle_jit
+
+Real = Any  # a number, or an array of any shape
+Numbers = tuple[Real, Real]
+Slopes = tuple[Real, Real, Real, Real]
+
+
+def constant_std(noise: tuple[float, float, float, float], distance: Real) -> Numbers:
+    """Return the two standard deviations as given, at any distance."""
+    return noise[0] + 0.0 * distance, noise[1] + 0.0 * distance
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A sensor that reads one or two numbers of each landmark.
+
+    The functions are plain Python, of numbers or arrays, within what numba compiles.
+    A reading is always a row of two numbers.  The second of a sensor that reads one is
+    void: it is 0, with slopes of 0, and filters ignore it.
+
+    Parameters
+    ----------
+    name : str
+        Name to call the sensor by.
+    columns, units : tuple of str
+        Name and unit of each number.
+    h : callable
+        ``h(x, y)`` returns the expected reading and its slopes, ((z0, z1), (∂z0/∂x,
+        ∂z0/∂y, ∂z1/∂x, ∂z1/∂y)), of a landmark at (x, y) in the robot's frame.
+    inverse : callable or None
+        ``inverse(z0, z1)`` returns the landmark (x, y) in the robot's frame.  None if
+        a reading does not determine it; filters then wait for readings from several
+        poses.
+    angles : tuple of bool
+        Which numbers are angles, whose differences filters wrap; by default none.
+    std : callable
+        ``std(noise, distance)`` returns the two standard deviations of the reading of a
+        landmark at a distance [m].  ``noise`` holds the numbers of the filter:
+        ``measurement_std`` (two), ``range_std_per_metre`` and ``bearing_std_metres``.
+        By default, ``measurement_std`` at every distance.
+
+    Examples
+    --------
+    >>> BEARING.predict(np.zeros(3), np.array([[0.0, 2.0]])).measurement
+    array([[1.57079633, 0.        ]])
+    """
+
+    name: str
+    columns: tuple[str, ...]
+    units: tuple[str, ...]
+    h: Callable[[Real, Real], tuple[Numbers, Slopes]]
+    inverse: Callable[[Real, Real], Numbers] | None = None
+    angles: tuple[bool, ...] = ()
+    std: Callable[[tuple[float, float, float, float], Real], Numbers] = constant_std
+
+    @property
+    def size(self) -> int:
+        """How many numbers the sensor reads of a landmark, 1 or 2."""
+        return len(self.columns)
+
+    @property
+    def places(self) -> bool:
+        """Whether one reading determines where the landmark is."""
+        return self.inverse is not None
+
+    @property
+    def wraps(self) -> tuple[bool, bool]:
+        """Whether each of the two numbers is an angle."""
+        first, second, *_ = (*self.angles, False, False)
+        return first, second
+
+    def predict(self, pose: Array, landmarks: Array) -> MeasurementPrediction:
+        """Predict the readings of landmarks (m, 2) from a pose (3,), in numpy.
+
+        Returns
+        -------
+        MeasurementPrediction
+            Readings (m, 2), not wrapped, and the Jacobians (m, 2, 3) and (m, 2, 2).
+        """
+        R = _rotation(pose[2])
+        x, y = ((landmarks - pose[:2]) @ R).T
+        D, measurement = self.slopes(x, y), self._values(x, y)
+        by_landmark = D @ R.T
+        by_heading = D @ np.stack([y, -x], axis=1)[..., None]
+        by_pose = np.concatenate([-by_landmark, by_heading], axis=2)
+        return MeasurementPrediction(measurement, by_pose, by_landmark)
+
+    def locate(self, pose: Array, readings: Array) -> LandmarkLocation:
+        """Locate landmarks by one reading (m, 2) each, from a pose (3,), in numpy."""
+        if self.inverse is None:
+            raise ValueError(f"one reading of {self.name} does not locate a landmark")
+        R, z = _rotation(pose[2]), readings.T
+        x, y = self.inverse(z[0], z[1])
+        offset = np.stack([x, y], axis=1) @ R.T
+        by_pose = np.tile(np.eye(2, 3), (len(readings), 1, 1))
+        by_pose[:, 0, 2], by_pose[:, 1, 2] = -offset[:, 1], offset[:, 0]
+        return LandmarkLocation(
+            pose[:2] + offset, by_pose, R @ np.linalg.inv(self.slopes(x, y))
+        )
+
+    def difference(self, readings: Array, expected: Array) -> Array:
+        """Return readings − expected, shape (..., 2), wrapped where an angle."""
+        apart = np.asarray(readings) - expected
+        for column, wraps in enumerate(self.wraps):
+            if wraps:
+                apart[..., column] = bearing_range.wrap_angle(apart[..., column])
+        if self.size == 1:
+            apart[..., 1] = 0.0
+        return apart
+
+    def slopes(self, x: Array, y: Array) -> Array:
+        """Return D of landmarks at (x, y) in the robot's frame, shape (m, 2, 2)."""
+        columns = np.broadcast_arrays(x, *self.h(x, y)[1])[1:]
+        return np.stack(columns, axis=-1).reshape(-1, 2, 2).astype(np.float64)
+
+    def _values(self, x: Array, y: Array) -> Array:
+        return np.stack(np.broadcast_arrays(x, *self.h(x, y)[0])[1:], axis=-1) * 1.0
+
+    def __reduce__(self) -> Any:
+        """Return the registered sensor itself in another process."""
+        if SENSORS.get(self.name) is self:
+            return find_sensor, (self.name,)
+        return super().__reduce__()
+
+
+def _rotation(angle: float) -> Array:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+# --------------------------------------------------------------------------------------
+# The shipped sensors.
+
+
+def read_bearing_range(x: Real, y: Real) -> tuple[Numbers, Slopes]:
+    """Read bearing [rad] and range [m]."""
+    squared = x * x + y * y
+    r = np.sqrt(squared)
+    return (np.arctan2(y, x), r), (-y / squared, x / squared, x / r, y / r)
+
+
+def from_bearing_range(bearing: Real, distance: Real) -> Numbers:
+    """Return the landmark at a bearing and range."""
+    return distance * np.cos(bearing), distance * np.sin(bearing)
+
+
+def bearing_range_std(
+    noise: tuple[float, float, float, float], distance: Real
+) -> Numbers:
+    """Return σβ + b / r and σr + k r."""
+    return noise[0] + noise[3] / distance, noise[1] + noise[2] * distance
+
+
+def read_position(x: Real, y: Real) -> tuple[Numbers, Slopes]:
+    """Read the position in the robot's frame [m, m]."""
+    return (x, y), (1.0, 0.0, 0.0, 1.0)
+
+
+def from_position(x: Real, y: Real) -> Numbers:
+    """Return the landmark where it was read."""
+    return x, y
+
+
+def read_bearing(x: Real, y: Real) -> tuple[Numbers, Slopes]:
+    """Read the bearing [rad]."""
+    squared = x * x + y * y
+    return (np.arctan2(y, x), 0.0), (-y / squared, x / squared, 0.0, 0.0)
+
+
+def read_range(x: Real, y: Real) -> tuple[Numbers, Slopes]:
+    """Read the range [m]."""
+    r = np.sqrt(x * x + y * y)
+    return (r, 0.0), (x / r, y / r, 0.0, 0.0)
+
+
+def range_std(noise: tuple[float, float, float, float], distance: Real) -> Numbers:
+    """Return σr + k r."""
+    return noise[0] + noise[2] * distance, 1.0
+
+
+BEARING_RANGE = Sensor(
+    "bearing_range",
+    ("bearing", "range"),
+    ("rad", "m"),
+    read_bearing_range,
+    from_bearing_range,
+    (True, False),
+    bearing_range_std,
+)
+POSITION = Sensor("position", ("x", "y"), ("m", "m"), read_position, from_position)
+BEARING = Sensor(
+    *("bearing", ("bearing",), ("rad",), read_bearing),
+    angles=(True,),
+    std=bearing_range_std,
+)
+RANGE = Sensor("range", ("range",), ("m",), read_range, std=range_std)
+
+SENSORS: dict[str, Sensor] = {
+    sensor.name: sensor for sensor in (BEARING_RANGE, POSITION, BEARING, RANGE)
+}
+"""The known sensors by name."""
+
+
+def register_sensor(sensor: Sensor) -> None:
+    """Make a sensor available by its name; an earlier one of that name is replaced."""
+    SENSORS[sensor.name] = sensor
+
+
+def find_sensor(sensor: str | Sensor) -> Sensor:
+    """Return a sensor: itself, by its name, or by an import path "module:NAME".
+
+    Raises
+    ------
+    ValueError
+        If there is no such sensor, with the nearest name.
+    """
+    if isinstance(sensor, Sensor):
+        return sensor
+    found: Any = SENSORS.get(str(sensor))
+    module, colon, name = str(sensor).partition(":")
+    if found is None and colon:
+        try:
+            found = getattr(import_module(module), name)
+        except Exception as error:
+            kind = type(error).__name__
+            raise ValueError(
+                f"cannot import sensor '{sensor}', {kind}: {error}"
+            ) from error
+    if not isinstance(found, Sensor):
+        hint, known = closest(str(sensor), SENSORS), ", ".join(SENSORS)
+        raise ValueError(f"unknown sensor '{sensor}'{hint} (there are {known})")
+    return found
+
+
+def only_bearing_range(sensor: str | Sensor, part: str) -> None:
+    """Refuse other sensors, for a part of the library that does not take them."""
+    found = find_sensor(sensor)
+    if found is not BEARING_RANGE:
+        raise ValueError(
+            f"{part} takes bearing_range readings only, got sensor '{found.name}'"
+        )
+
+
+# --------------------------------------------------------------------------------------
+# Kernels of a sensor.
+#
+# Kernels are written for bearing and range, entry by entry.  For another sensor they
+# are compiled again, with functions of that sensor in place of those of bearing and
+# range: `bearing_range` lists them.
+
+Kernel = Callable[..., Any]
+
+
+@cache
+def for_sensor(kernel: Any, sensor: Sensor) -> Any:
+    """Return a kernel as it is for another sensor than ``bearing_range``.
+
+    Parameters
+    ----------
+    kernel : callable
+        A kernel for bearing and range.
+    sensor : Sensor
+        The sensor of its readings.
+    """
+    if sensor is BEARING_RANGE:
+        return kernel
+    return specialised(kernel, kernel_parts(sensor), sensor.name)
+
+
+@cache
+def kernel_parts(sensor: Sensor) -> Mapping[Kernel, Kernel]:
+    """Return a sensor's counterpart of each function in a kernel that is for readings.
+
+    See :mod:`.bearing_range` for what each of them returns.
+    """
+    h, std, (first, second) = njit_internal(sensor.h), sensor.std, sensor.wraps
+    std, is_single, places = njit_internal(std), sensor.size == 1, sensor.places
+    inverse = njit_internal(sensor.inverse or _nowhere)
+
+    def expected(dx: float, dy: float, heading: float) -> Numbers:
+        cos, sin = np.cos(heading), np.sin(heading)
+        (z0, z1), _ = h(cos * dx + sin * dy, cos * dy - sin * dx)
+        return z0, z1
+
+    def slopes(dx: float, dy: float, heading: float) -> tuple[float, ...]:
+        cos, sin = np.cos(heading), np.sin(heading)
+        x, y = cos * dx + sin * dy, cos * dy - sin * dx
+        _, (ax, ay, bx, by) = h(x, y)
+        a = ax * cos - ay * sin, ax * sin + ay * cos
+        b = bx * cos - by * sin, bx * sin + by * cos
+        return a[0], a[1], b[0], b[1], ax * y - ay * x, bx * y - by * x
+
+    def difference(z0: float, z1: float, e0: float, e1: float) -> Numbers:
+        d0, d1 = z0 - e0, z1 - e1
+        d0 = wrap_angle_jit(d0) if first else d0
+        d1 = wrap_angle_jit(d1) if second else d1
+        return d0, 0.0 if is_single else d1
+
+    def distance(z0: float, z1: float) -> float:
+        x, y = inverse(z0, z1)
+        return float(np.sqrt(x * x + y * y))
+
+    def variances(
+        std0: float, std1: float, per_metre: float, metres: float, distance: float
+    ) -> Numbers:
+        s0, s1 = std((std0, std1, per_metre, metres), distance)
+        return s0 * s0, 1.0 if is_single else s1 * s1
+
+    def placed(
+        pose: tuple[float, float, float], z0: float, z1: float, v0: float, v1: float
+    ) -> tuple[float, ...]:
+        cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        x, y = inverse(z0, z1)
+        _, (ax, ay, bx, by) = h(x, y)
+        per = 1 / (ax * by - ay * bx)
+        ux, uy, wx, wy = by * per, -bx * per, -ay * per, ax * per  # columns of D⁻¹
+        ux, uy, wx, wy = (
+            *(cos * ux - sin * uy, sin * ux + cos * uy),
+            *(cos * wx - sin * wy, sin * wx + cos * wy),
+        )
+        dx, dy = cos * x - sin * y, sin * x + cos * y
+        xy = ux * uy * v0 + wx * wy * v1
+        return (
+            *(pose[0] + dx, pose[1] + dy, -dy, dx),
+            *(ux * ux * v0, wx * wx * v1, xy, uy * uy * v0, wy * wy * v1),
+        )
+
+    def places_at_once() -> bool:
+        return places
+
+    return {
+        bearing_range.expected_reading_jit: njit_inlined(expected),
+        bearing_range.pose_slopes_jit: njit_inlined(slopes),
+        bearing_range.difference_jit: njit_inlined(difference),
+        bearing_range.read_distance_jit: njit_inlined(distance),
+        bearing_range.reading_variances_jit: njit_inlined(variances),
+        bearing_range.placed_jit: njit_inlined(placed),
+        bearing_range.places_at_once_jit: njit_inlined(places_at_once),
+    }
+
+
+def _nowhere(z0: float, z1: float) -> tuple[float, float]:
+    """Return infinity, in place of a landmark that a reading does not determine."""
+    return z0 + np.inf, z1 + np.inf
+
+
+# --------------------------------------------------------------------------------------
+# Check of a sensor that somebody has written.
+
+
+class SensorContractError(AssertionError):
+    """Raised for a sensor whose functions contradict each other."""
+
+
+def check_sensor(
+    sensor: str | Sensor, measurement_std: ArrayLike = (0.1, 0.1), places: int = 200
+) -> None:
+    """Check slopes, inverse, angles, noise and compiled code of a sensor.
+
+    Parameters
+    ----------
+    sensor : str or Sensor
+        The sensor.
+    measurement_std : array_like, shape (1,) or (2,)
+        Noise to try.
+    places : int
+        Number of landmarks to try, all around, from 0.1 to 100 m away.
+
+    Raises
+    ------
+    SensorContractError
+        At the first contradiction, naming the number and where it was seen.
+    """
+    checked = find_sensor(sensor)
+    rng = np.random.default_rng(0)
+    r, turn = 10 ** rng.uniform(-1, 2, places), rng.uniform(-np.pi, np.pi, places)
+    x, y = r * np.cos(turn), r * np.sin(turn)
+    _check_shape(checked)
+    _check_slopes(checked, x, y)
+    _check_angles(checked)
+    _check_inverse(checked, x, y)
+    _check_std(checked, np.resize(measurement_std, 2), r)
+    _check_compiled(checked, x, y)
+
+
+def _refuse(sensor: Sensor, what: str) -> None:
+    raise SensorContractError(f"sensor '{sensor.name}': {what}")
+
+
+def _check_shape(sensor: Sensor) -> None:
+    if sensor.size not in (1, 2) or len(sensor.units) != sensor.size:
+        _refuse(sensor, "columns and units must name the same one or two numbers")
+    if len(sensor.angles) not in (0, sensor.size):
+        _refuse(sensor, "angles must have one entry for each column")
+
+
+def _name(sensor: Sensor, column: int) -> str:
+    return sensor.columns[column] if column < sensor.size else "the void number"
+
+
+def _check_slopes(sensor: Sensor, x: Array, y: Array) -> None:
+    given, step = sensor.slopes(x, y), 1e-6 * np.hypot(x, y)
+    for axis, (mx, my) in enumerate(((step, 0.0), (0.0, step))):
+        ahead, behind = sensor._values(x + mx, y + my), sensor._values(x - mx, y - my)
+        numeric = sensor.difference(ahead, behind) / (2 * step[:, None])
+        scale = 1e-6 * (1 + np.abs(numeric)) + 1e-9 / step[:, None] * 1e-6
+        wrong = ~(np.abs(given[:, :, axis] - numeric) <= scale)
+        if sensor.size == 1:
+            wrong[:, 1] = given[:, 1, axis] != 0
+        if wrong.any():
+            k, column = np.argwhere(wrong)[0]
+            _refuse(
+                sensor,
+                f"∂{_name(sensor, column)}/∂{'xy'[axis]} at ({x[k]:.3g}, {y[k]:.3g}) "
+                f"is {numeric[k, column]:.6g} by differences, "
+                f"but h returns {given[k, column, axis]:.6g}",
+            )
+
+
+def _check_angles(sensor: Sensor) -> None:
+    """Look for a jump of 2π on a circle around the robot."""
+    turn = np.linspace(-np.pi, np.pi, 721)
+    z = sensor._values(3 * np.cos(turn), 3 * np.sin(turn))
+    jumps = np.abs(np.abs(np.diff(z, axis=0)) - 2 * np.pi) < 0.1
+    for column in range(sensor.size):
+        if jumps[:, column].any() and not sensor.wraps[column]:
+            _refuse(
+                sensor,
+                f"{_name(sensor, column)} jumps by 2π around the robot: "
+                "declare it in angles, so that differences are wrapped",
+            )
+
+
+def _check_inverse(sensor: Sensor, x: Array, y: Array) -> None:
+    if sensor.inverse is None:
+        return
+    if sensor.size == 1:
+        _refuse(sensor, "one number cannot determine a landmark: inverse must be None")
+    found = np.stack(sensor.inverse(*sensor._values(x, y).T), axis=-1)
+    off = np.hypot(found[:, 0] - x, found[:, 1] - y) / np.hypot(x, y)
+    if not (off <= 1e-6).all():
+        k = int(np.argmax(~(off <= 1e-6)))
+        _refuse(
+            sensor,
+            f"inverse of the reading of ({x[k]:.3g}, {y[k]:.3g}) is "
+            f"({found[k, 0]:.3g}, {found[k, 1]:.3g})",
+        )
+
+
+def _check_std(sensor: Sensor, noise: Array, distances: Array) -> None:
+    for distance in distances.tolist():
+        std = sensor.std((float(noise[0]), float(noise[1]), 0.0, 0.0), distance)
+        if len(std) != 2 or not all(np.isfinite(std)) or not min(std) > 0:
+            _refuse(
+                sensor,
+                f"std at {distance:.3g} m must be two finite numbers > 0 for "
+                f"measurement_std {noise.tolist()}, got {std}",
+            )
+
+
+def _check_compiled(sensor: Sensor, x: Array, y: Array) -> None:
+    parts = kernel_parts(sensor)
+    expected = parts[bearing_range.expected_reading_jit]
+    for k in range(len(x)):
+        compiled = expected(float(x[k]), float(y[k]), 0.0)
+        plain = sensor._values(x[k : k + 1], y[k : k + 1])[0]
+        if not np.allclose(sensor.difference(compiled, plain), 0, atol=1e-9):
+            _refuse(sensor, f"h compiled returns {compiled}, and {plain} in numpy")
