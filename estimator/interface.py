@@ -42,6 +42,7 @@ __all__ = [
     "optional_members",
     "restore",
     "taking_poses",
+    "with_fix",
 ]
 
 
@@ -108,6 +109,14 @@ def taking_poses(estimator: object) -> SupportsPoses:
         name = type(estimator).__name__
         raise ValueError(f"{name} does not take readings of the pose")
     return estimator
+
+
+def with_fix(report: UpdateReport, fix: UpdateReport) -> UpdateReport:
+    """Return the report of a scan with the NIS of a reading of the pose after it."""
+    return report.replace(
+        nis=report.nis + fix.nis,
+        degrees_of_freedom=report.degrees_of_freedom + fix.degrees_of_freedom,
+    )
 
 
 @runtime_checkable

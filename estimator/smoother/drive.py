@@ -256,11 +256,11 @@ class Drive:
             np.concatenate([scan.measurements for scan in scans]),
             2 * slots,
             widths,
-            *self._pose_arrays(),
+            self._pose_arrays(),
         )
         return arrays, order
 
-    def _pose_arrays(self) -> tuple[IntArray, Array, Array, Array]:
+    def _pose_arrays(self) -> PoseArrays:
         """Return the readings of the poses, filled up to three components."""
         owners = [k for k, given in self._observed.items() for _ in given]
         readings = chain.from_iterable(self._observed.values())
@@ -271,7 +271,7 @@ class Drive:
             values[j, :size], matrices[j, :size] = z, H
             roots[j, :size, :size] = np.linalg.inv(np.linalg.cholesky(R))
         firsts = np.searchsorted(owners, np.arange(self.poses + 1))
-        return firsts.astype(np.int64), values, matrices, roots
+        return PoseArrays(firsts.astype(np.int64), values, matrices, roots)
 
     def _composed(self, steps: Sequence[tuple[float, float, float]]) -> Motion:
         """Compose readings of odometry as a filter predicts from a certain pose 0."""
@@ -301,6 +301,15 @@ class Drive:
 NEGLIGIBLE = 1e-12
 
 
+class PoseArrays(NamedTuple):
+    """K readings z = H x_k of the poses themselves, filled up with zeros."""
+
+    firsts: IntArray  # those of pose k are rows firsts[k] … firsts[k + 1], (N + 1,)
+    values: Array  # z, shape (K, 3)
+    matrices: Array  # H, shape (K, 3, 3)
+    whiteners: Array  # L⁻¹ with L Lᵀ = R, shape (K, 3, 3)
+
+
 class DriveArrays(NamedTuple):
     """N poses, M readings of n landmarks; entry 0 of the motions is the prior."""
 
@@ -315,11 +324,7 @@ class DriveArrays(NamedTuple):
     columns: IntArray
     # Columns of the landmarks that pose k or a later one reads, shape (N,).
     widths: IntArray
-    # The readings z = H x_k of pose k itself are rows pose_firsts[k] and following.
-    pose_firsts: IntArray  # (N + 1,)
-    pose_values: Array  # z, shape (K, 3), filled up with zeros
-    pose_matrices: Array  # H, shape (K, 3, 3)
-    pose_whiteners: Array  # L⁻¹ with L Lᵀ = R, shape (K, 3, 3)
+    fixes: PoseArrays
 
 
 def noise_factors(covariances: Array) -> tuple[Array, Array]:

@@ -110,7 +110,7 @@ def eliminate(
         before = curvature[0, 0], curvature[1, 1], curvature[2, 2]
         for j in range(drive.firsts[k], drive.firsts[k + 1]):
             _absorb((k, j), poses, landmarks, drive, stds, robust, system, out)
-        for j in range(drive.pose_firsts[k], drive.pose_firsts[k + 1]):
+        for j in range(drive.fixes.firsts[k], drive.fixes.firsts[k + 1]):
             _absorb_pose(poses[k], drive, j, robust, system, room[0])
         for i in range(3):
             curvature[i, i] += damping * (curvature[i, i] - before[i])
@@ -193,7 +193,7 @@ def _absorb_pose(
     white = pose_innovation(pose, drive, j)
     squared = white[0] ** 2 + white[1] ** 2 + white[2] ** 2
     weight = robust_weight(squared, robust[0], robust[1])
-    multiply(drive.pose_whiteners[j], drive.pose_matrices[j], slopes)
+    multiply(drive.fixes.whiteners[j], drive.fixes.matrices[j], slopes)
     for i in range(3):
         for c in range(3):
             system.slope[c] += weight * slopes[i, c] * white[i]
@@ -485,8 +485,8 @@ def innovation(
 @njit_internal
 def pose_innovation(pose: Array, drive: DriveArrays, j: int) -> tuple[float, ...]:
     """Return L⁻¹ (z − H x) of reading j of a pose itself, angles wrapped."""
-    H, whitener = drive.pose_matrices[j], drive.pose_whiteners[j]
-    a, b, c = drive.pose_values[j]
+    H, whitener = drive.fixes.matrices[j], drive.fixes.whiteners[j]
+    a, b, c = drive.fixes.values[j]
     a -= H[0, 0] * pose[0] + H[0, 1] * pose[1] + H[0, 2] * pose[2]
     b -= H[1, 0] * pose[0] + H[1, 1] * pose[1] + H[1, 2] * pose[2]
     c -= H[2, 0] * pose[0] + H[2, 1] * pose[1] + H[2, 2] * pose[2]
@@ -521,7 +521,7 @@ def total_cost(
             bearing, distance = innovation(poses, landmarks, drive, k, j)
             squared = (bearing / stds[j, 0]) ** 2 + (distance / stds[j, 1]) ** 2
             total += robust_loss(squared, kind, scale)
-        for j in range(drive.pose_firsts[k], drive.pose_firsts[k + 1]):
+        for j in range(drive.fixes.firsts[k], drive.fixes.firsts[k + 1]):
             a, b, c = pose_innovation(poses[k], drive, j)
             total += robust_loss(a * a + b * b + c * c, kind, scale)
     return total

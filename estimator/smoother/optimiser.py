@@ -131,7 +131,7 @@ class Optimiser:
         reading of a pose.
         """
         freedom = 2 * len(self._drive.readings) - len(self._room.right)
-        freedom += np.count_nonzero(self._drive.pose_whiteners.any(axis=2))
+        freedom += int(self._drive.fixes.whiteners.any(axis=2).sum())
         return 0.6 * freedom + 6 * float(np.sqrt(freedom / 2)) + 1
 
     def minimise(self, start: Estimate, tolerance: float, most: int) -> Solution:

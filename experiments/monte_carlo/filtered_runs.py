@@ -21,6 +21,7 @@ from ...estimator.interface import (
     SmoothedPath,
     SupportsTruth,
     taking_poses,
+    with_fix,
 )
 from ...estimator.models.motions import find_motion
 from ...estimator.smoother.batch_smoother import smoother_in
@@ -128,8 +129,12 @@ def _run(batch: BatchSlam, runs: SimulatedRuns) -> BatchTrace:
     traces, begin = [], 0
     for end in sorted({*(t + 1 for t in due), steps}):
         part = slice(begin, end)
-        scans = runs.odometry, runs.measurements, runs.visible
-        trace = batch.run(*(array[:, part] for array in scans), runs.dt[part])
+        trace = batch.run(
+            runs.odometry[:, part],
+            runs.measurements[:, part],
+            runs.visible[:, part],
+            runs.dt[part],
+        )
         if (given := runs.pose_reading(end - 1)) is not None:
             nis, freedom = batch.observe_pose(*given)
             trace.nis[:, -1] += nis
@@ -212,10 +217,7 @@ def _step(
     if (given := runs.pose_reading(step)) is not None:
         z, H, R = given
         fix = taking_poses(slam).observe_pose(z[run], H, R)
-        report = report.replace(
-            nis=report.nis + fix.nis,
-            degrees_of_freedom=report.degrees_of_freedom + fix.degrees_of_freedom,
-        )
+        report = with_fix(report, fix)
     belief = slam.belief()
     trace.poses[run, step] = belief.pose
     trace.pose_covariances[run, step] = belief.pose_covariance

@@ -167,9 +167,7 @@ def _read_truth(path: Path, epoch: float) -> Array:
     return truth
 
 
-def _merge(
-    odometry: Array, readings: TimedReadings
-) -> tuple[slamlog.OdometryRow | slamlog.Scan, ...]:
+def _merge(odometry: Array, readings: TimedReadings) -> tuple[slamlog.Event, ...]:
     """Integrate the velocities between the times of grid and readings."""
     stamps = odometry[:, 0]
     moved = odometry[:-1, 1:] * np.diff(stamps)[:, None]

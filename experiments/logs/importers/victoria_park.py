@@ -73,7 +73,7 @@ def read_victoria_park(path: str | PathLike[str]) -> slamlog.SlamLog:
     end = float(stamps[-1])
     scans = {scan.t: scan for scan in trees.scans if 0 <= scan.t <= end}
     moved = np.column_stack([chords, turned])
-    events: list[slamlog.OdometryRow | slamlog.Scan] = []
+    events: list[slamlog.Event] = []
     for row in odometry_between(stamps, moved, list(scans)):
         events.append(row)
         if row.t in scans:
