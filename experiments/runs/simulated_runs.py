@@ -155,7 +155,7 @@ def simulate_runs(
         true_ids=found.get("landmark_ids"),
         ids=rows if named else None,
         pose_readings=record.get("pose_readings"),
-        pose_std=batch.pose_sensors.std,
+        pose_std=batch.pose_sensors.std if batch.pose_sensors.present else None,
     )
 
 

@@ -11,6 +11,7 @@ J. Guivant, E. Nebot, Optimization of the simultaneous localization and map-buil
 algorithm for real-time implementation, IEEE T-RA 17(3), 2001.
 """
 
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -68,14 +69,14 @@ def read_victoria_park(path: str | PathLike[str]) -> slamlog.SlamLog:
         )
     axle = speed / (1 - np.tan(steering) * ENCODER / WHEELBASE)
     driven = np.column_stack([axle[:-1] * np.diff(stamps), steering[:-1]])
-    dx, dy, turned = CAR.displacements(driven).T
-    chords = np.copysign(np.hypot(dx, dy), driven[:, 0])
+    turned = CAR.displacements(driven)[:, 2]
     end = float(stamps[-1])
     scans = {scan.t: scan for scan in trees.scans if 0 <= scan.t <= end}
-    moved = np.column_stack([chords, turned])
+    moved = np.column_stack([driven[:, 0], turned])
     events: list[slamlog.Event] = []
     for row in odometry_between(stamps, moved, list(scans)):
-        events.append(row)
+        chord = row.d * float(np.sinc(row.alpha / (2 * np.pi)))  # of the arc
+        events.append(replace(row, d=chord))
         if row.t in scans:
             events.append(scans[row.t])
     return slamlog.SlamLog(
@@ -102,7 +103,7 @@ def _columns(path: Path, time: str, *names: str) -> list[Array]:
         raise slamlog.LogError(f"{path.parent}: expected {path.name}, got no such file")
     try:
         found: dict[str, Any] = loadmat(str(path), variable_names=(time, *names))
-    except (ValueError, TypeError, NotImplementedError, OSError) as error:
+    except Exception as error:  # of many kinds
         raise slamlog.LogError(f"{path}: expected a MATLAB file, {error}") from None
     columns = []
     for name in (time, *names):
