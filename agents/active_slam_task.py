@@ -23,7 +23,6 @@ from ..restorable import Restorable
 from ..sim_configs import Scenario
 from .active_slam_kernels import Episodes, StepOutcome, advance
 from .belief_features import belief_space, empty_features
-from .estimator_choice import only_default_models
 from .information_reward import CRITERIA, check_criterion, landmark_prior_std
 from .landmark_set import FEATURES, ObservationForm, write_landmark_sets
 from .wall_routes import SECTORS, CoverageGrid
@@ -112,7 +111,7 @@ class ActiveSlamTask(Restorable):
         count: int = 1,
         form: ObservationForm | None = None,
     ) -> None:
-        only_default_models(scenario, "active SLAM")
+        scenario.refuse_models("active SLAM")
         self.scenario, self.weights = scenario, weights
         self._form = form or ObservationForm()
         self.grid = CoverageGrid(scenario)

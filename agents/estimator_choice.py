@@ -15,7 +15,6 @@ from ..arrays import AnyArray, BoolArray
 from ..envs.rendering import BeliefLike
 from ..estimator import registry
 from ..estimator.map_management.policy import LandmarkPolicy, as_policy
-from ..estimator.models.motions import bicycle, differential
 from ..sim_configs import Scenario
 
 
@@ -130,44 +129,7 @@ def noise_options(factory: Callable[..., Any], scenario: Scenario) -> dict[str, 
         "noise_at_rest": scenario.motion.noise_at_rest,
     }
     accepted = registry.accepted_options(factory, settings)
-    return {**accepted, **accepted_models(factory, model_labels(scenario))}
-
-
-def model_labels(scenario: Scenario) -> dict[str, str]:
-    """Return the ``sensor`` and ``motion`` of a world that are not the defaults.
-
-    Examples
-    --------
-    >>> from slamgym.sim_configs import load_scenario
-    >>> model_labels(load_scenario("differential"))
-    {'motion': 'differential[track_width=0.5]'}
-    """
-    labels, robot = {}, scenario.robot
-    if scenario.sensor.kind != "bearing_range":
-        labels["sensor"] = scenario.sensor.kind
-    if robot.drive == "differential":
-        labels["motion"] = differential(cast(float, robot.track_width)).name
-    if robot.drive == "bicycle":
-        reference = robot.reference or (0.0, 0.0)
-        labels["motion"] = bicycle(cast(float, robot.wheelbase), reference).name
-    return labels
-
-
-def accepted_models(
-    factory: Callable[..., Any], labels: Mapping[str, str]
-) -> dict[str, str]:
-    """Return the models ``sensor`` and ``motion``, or refuse a factory without them."""
-    accepted = registry.accepted_options(factory, labels)
-    for name in labels.keys() - accepted.keys():
-        raise ValueError(f"the estimator does not take {name} = '{labels[name]}'")
-    return accepted
-
-
-def only_default_models(scenario: Scenario, part: str) -> None:
-    """Refuse a world with another sensor or drive where a part takes the default."""
-    for name, label in model_labels(scenario).items():
-        usual = {"sensor": "bearing_range", "motion": "unicycle"}[name]
-        raise ValueError(f"{part} takes {name} = '{usual}' only, got '{label}'")
+    return {**accepted, **registry.accepted_models(factory, scenario.models)}
 
 
 def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:

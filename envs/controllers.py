@@ -21,7 +21,8 @@ from numpy.typing import ArrayLike
 from ..arrays import Array
 from ..sim_configs import Robot, Scenario, action_sequence
 from ..sim_configs.field_types import unknown_choice
-from .robot import displacement, drive_of, wrap_angle
+from .drives import drive_of
+from .robot import displacement, wrap_angle
 
 __all__ = [
     "CONTROLLERS",

@@ -16,8 +16,8 @@ u = (d, α)        command: distance driven, then heading turned [m, rad]
     y' = y + (d + εx) sin θ + εy cos θ
     θ' = θ + (α + εα)
 
-This is the unicycle. `DifferentialDrive` and `BicycleDrive` replace (d, 0) by the
-displacement of an arc, and convert (d, α) to what their odometry reports.
+This is the unicycle. Other `drives` replace (d, 0) by the displacement of an arc, and
+convert (d, α) to what their odometry reports.
 
 The filters' motion model and their arithmetic on angles are separate code in
 `estimator`, which `envs` does not import. A simulator that shared the filter's model
@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pymunk
@@ -36,8 +36,8 @@ import pymunk
 from ..arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ..jit import jit, njit_internal
 from ..restorable import Restorable, State
-from ..sim_configs import Robot, Scenario
-from ..sim_configs.scenario import largest_curvature
+from ..sim_configs import Scenario
+from .drives import Drive, drive_of
 
 _NO_SLIP = (0.0, 0.0, 0.0)
 
@@ -477,130 +477,6 @@ def displacement(
     (-0.5, 2.0)
     """
     return forward * cos - sideways * sin, forward * sin + sideways * cos
-
-
-# --------------------------------------------------------------------------------------
-# Drives other than the unicycle.
-#
-# Commands stay (d, α), so that every controller drives every robot: the distance of
-# the axle, and the turn. The robot follows the arc of both, of length d and angle α.
-# The same numpy functions serve one robot and many, so both give the same bits.
-
-
-class Drive(Protocol):
-    """How a robot executes a command, and what its odometry reports."""
-
-    def feasible(self, distance: Any, turn: Any) -> tuple[Any, Any]:
-        """Return the command (d, α) that the robot executes; numbers or arrays."""
-        ...
-
-    def path(self, distance: Any, turn: Any) -> tuple[Any, Any]:
-        """Return the displacement (forward, sideways) in the frame of the start [m]."""
-        ...
-
-    def reading(self, distance: Any, turn: Any) -> tuple[Any, Any]:
-        """Return what the encoders report of a step (d, α)."""
-        ...
-
-
-def drive_of(robot: Robot) -> Drive | None:
-    """Return the drive of a robot, None for a unicycle."""
-    match robot.drive:
-        case "differential":
-            assert robot.track_width is not None
-            return DifferentialDrive(robot.track_width)
-        case "bicycle":
-            assert robot.wheelbase is not None
-            curvature, ahead = largest_curvature(robot), robot.reference or (0.0, 0.0)
-            return BicycleDrive(robot.wheelbase, curvature, ahead)
-    return None
-
-
-class DifferentialDrive(NamedTuple):
-    """Two wheels on one axle; the odometry reports (left, right), their travel [m].
-
-    ::
-
-        left = d - α w / 2,    right = d + α w / 2
-
-    Examples
-    --------
-    >>> left, right = DifferentialDrive(track_width=0.5).reading(1.0, 0.2)
-    >>> round(left, 9), round(right, 9)
-    (0.95, 1.05)
-    """
-
-    track_width: float  # w [m]
-
-    def feasible(self, distance: Any, turn: Any) -> tuple[Any, Any]:
-        """Return the command: every one is possible."""
-        return distance, turn
-
-    def path(self, distance: Any, turn: Any) -> tuple[Any, Any]:
-        """Return the chord of the arc."""
-        return arc(distance, turn)
-
-    def reading(self, distance: Any, turn: Any) -> tuple[Any, Any]:
-        """Return the travel of the wheels."""
-        half = turn * (self.track_width / 2)
-        return distance - half, distance + half
-
-
-class BicycleDrive(NamedTuple):
-    """A car; the odometry reports (d, φ), distance and steering angle [m, rad].
-
-    With the wheelbase L, its rear axle follows an arc of the curvature tan φ / L, which
-    the largest steering angle limits. At rest it cannot turn and reports φ = 0. The
-    pose is that of the reference point.
-
-    Examples
-    --------
-    >>> car = BicycleDrive(2.0, largest_curvature=0.5, reference=(1.0, 0.0))
-    >>> car.feasible(1.0, 0.8)
-    (1.0, np.float64(0.5))
-    """
-
-    wheelbase: float  # L [m]
-    largest_curvature: float  # [1/m]
-    reference: tuple[float, float]  # ahead and to the left of the rear axle [m]
-
-    def feasible(self, distance: Any, turn: Any) -> tuple[Any, Any]:
-        """Return the command with the turn within the steering."""
-        most = abs(distance) * self.largest_curvature
-        return distance, np.minimum(np.maximum(turn, -most), most)
-
-    def path(self, distance: Any, turn: Any) -> tuple[Any, Any]:
-        """Return the displacement of the reference point, which turns with the car."""
-        (forward, sideways), (ahead, left) = arc(distance, turn), self.reference
-        sin, versed = np.sin(turn), 2 * np.sin(turn / 2) ** 2
-        return (
-            forward - versed * ahead - sin * left,
-            sideways + sin * ahead - versed * left,
-        )
-
-    def reading(self, distance: Any, turn: Any) -> tuple[Any, Any]:
-        """Return distance and steering angle."""
-        moves = distance != 0.0
-        ratio = self.wheelbase * turn / np.where(moves, distance, 1.0)
-        return distance, np.where(moves, np.arctan(ratio), 0.0)
-
-
-def arc(distance: Any, turn: Any) -> tuple[Any, Any]:
-    """Return the chord (forward, sideways) of an arc, in the frame of its start [m].
-
-    ::
-
-        d sin(α/2) / (α/2) (cos(α/2), sin(α/2))
-
-    Examples
-    --------
-    >>> forward, left = arc(np.pi, np.pi)
-    >>> round(float(forward), 9), round(float(left), 9)
-    (0.0, 2.0)
-    """
-    half = turn / 2
-    chord = distance * np.sinc(half / np.pi)
-    return chord * np.cos(half), chord * np.sin(half)
 
 
 # --------------------------------------------------------------------------------------

@@ -318,6 +318,22 @@ class FilterLabel(NamedTuple):
     options: dict[str, Any]  # arguments of its constructor other than the noise
 
 
+def accepted_models(
+    factory: EstimatorFactory, models: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the models ``sensor`` and ``motion`` of a world or log for an estimator.
+
+    Raises
+    ------
+    ValueError
+        If the estimator does not take one of them.
+    """
+    accepted = accepted_options(factory, models)
+    for name in models.keys() - accepted.keys():
+        raise ValueError(f"the estimator does not take {name} = '{models[name]}'")
+    return accepted
+
+
 def read_label(label: str) -> FilterLabel:
     """Read one filter: a name, and perhaps options as in TOML in brackets.
 

@@ -385,6 +385,33 @@ class Scenario(Part):
         """The faults of the world, all zero where the scenario has none."""
         return self.faults or _NO_FAULTS
 
+    @property
+    def models(self) -> dict[str, str]:
+        """Its sensor and drive as filters take them, but for the defaults.
+
+        Examples
+        --------
+        >>> from slamgym.sim_configs import load_scenario
+        >>> load_scenario("differential").models
+        {'motion': 'differential[track_width=0.5]'}
+        """
+        models, robot = {}, self.robot
+        if self.sensor.kind != "bearing_range":
+            models["sensor"] = self.sensor.kind
+        if robot.drive == "differential":
+            models["motion"] = f"differential[track_width={robot.track_width!r}]"
+        if robot.drive == "bicycle":
+            x, y = robot.reference or (0.0, 0.0)
+            where = f", reference=[{x!r}, {y!r}]" if x or y else ""
+            models["motion"] = f"bicycle[wheelbase={robot.wheelbase!r}{where}]"
+        return models
+
+    def refuse_models(self, part: str) -> None:
+        """Raise a `ScenarioError` if sensor or drive is not the default."""
+        for name, label in self.models.items():
+            usual = {"sensor": "bearing_range", "motion": "unicycle"}[name]
+            raise ScenarioError(f"{part} takes {name} = '{usual}' only, got '{label}'")
+
     def _broken_rules(self) -> Iterator[str]:
         yield from self._broken_sizes()
         yield from self._broken_limits()

@@ -26,8 +26,9 @@ from ...restorable import Restorable
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import widest_scenario
 from ..bearing_range import BearingRangeSensor, hide_identities
+from ..drives import drive_of
 from ..noise_streams import PoseSensors, SensorSettings, WorldNoise
-from ..robot import UnicycleBodies, VectorOdometrySensor, drive_of
+from ..robot import UnicycleBodies, VectorOdometrySensor
 from ..spaces import clipped_actions, count_rows
 from ..streams import EpisodeStarts, drawn_scenarios, episode_keys
 

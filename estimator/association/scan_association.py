@@ -23,6 +23,7 @@ from ..models.bearing_range import (
     reading_slopes_jit,
     wrap_angle_jit,
 )
+from ..models.sensors import only_bearing_range
 from ..support import saved_states
 from .scan_assignments import (
     AMBIGUOUS,
@@ -535,6 +536,7 @@ class Sensor(NamedTuple):
     @classmethod
     def checked(cls, measurement_std: ArrayLike, options: Mapping[str, Any]) -> Sensor:
         """Read a sensor from the arguments of a filter, which has checked them."""
+        only_bearing_range(options.get("sensor", "bearing_range"), "data association")
         bearing_std, range_std = np.asarray(measurement_std, dtype=np.float64).tolist()
         names = "range_std_per_metre", "bearing_std_metres"
         noise = Noise(

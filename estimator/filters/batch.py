@@ -27,11 +27,11 @@ from ..kernels.batch import (
 from ..kernels.kalman_gain import Workspace
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame
-from ..models.sensors import for_sensor
+from ..models.sensors import for_sensor, only_placing
 from ..support import argument_checks, saved_states
 from ..support.memory_limit import aligned_zeros, share_out, usable_cores
-from .conditioning import ObservedMap, PoseReading
-from .ekf import FRAMES, EkfSlam, gate_of
+from .conditioning import FRAMES, ObservedMap, PoseReading, gate_of
+from .ekf import EkfSlam
 from .gaussian_map import GaussianMap, workspace_for
 
 
@@ -226,11 +226,7 @@ class BatchSlam(BatchOfBeliefs):
             raise ValueError(f"{type(estimator).__name__} cannot run in batches")
         self.runs = argument_checks.whole("runs", runs, 1)
         self.landmarks = argument_checks.whole("landmarks", landmarks, 0)
-        if not estimator.sensor.places:
-            raise ValueError(
-                f"readings of sensor '{estimator.sensor.name}' do not place a landmark "
-                "one by one, and batches do not collect them"
-            )
+        only_placing(estimator.sensor, "a batch")
         self.sensor, self.rules = estimator.sensor, estimator.rules
         """What distinguishes this filter's updates from another's."""
         self.rule_values = estimator.rule_values.copy()

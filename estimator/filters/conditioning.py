@@ -7,15 +7,22 @@ Pure functions of mean (3 + 2n,) and covariance P (3 + 2n, 3 + 2n) in the order
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array, IntArray
+from ..interface import UpdateReport
+from ..kernels.kalman_gain import ADDITIVE, INVARIANT, BeliefArrays, Rules
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame, left_jacobian, points_of, state_of
 from ..support import argument_checks
+
+if TYPE_CHECKING:
+    from .gaussian_map import GaussianMap
+
+FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 
 MOST_ITERATIONS = 50
 STEP_TOLERANCE = 1e-10  # iterations of a pose end when it moves by less [m, rad]
@@ -115,6 +122,16 @@ class PoseReading(NamedTuple):
         return cls(table[0, :size], table[1 : 1 + size], table[1 + size :, :size])
 
 
+def gate_of(rules: Rules, size: int) -> float:
+    """Return the χ² quantile of the gate for another number of components."""
+    if rules.gate == np.inf:
+        return np.inf
+    from scipy.special import gammainc, gammaincinv  # noqa: PLC0415 (slow to import)
+
+    probability = gammainc(rules.numbers / 2, rules.gate / 2)
+    return 2 * float(gammaincinv(size / 2, probability))
+
+
 class ObservedMap(NamedTuple):
     """A belief after a reading of the pose; all may have leading axes."""
 
@@ -177,28 +194,29 @@ def observe(
     white = np.linalg.solve(L, nu[..., None])
     shift = (_turned(gains) @ white)[..., 0]
     nis = np.asarray((white**2).sum(axis=(-2, -1)))
-    moved = mean + shift
-    if frame == "invariant":
-        first, moves = (shift, gains), np.ones(nis.shape, dtype=np.bool_)
-        for _ in range(0 if once else MOST_ITERATIONS):
-            at = _composed(mean, shift)
-            slopes = slopes_at(H, at[..., :2] - mean[..., :2])
-            root, rows = _whitened(covariance, slopes, R)
-            again = innovation(at)[..., None] + slopes @ shift[..., :m, None]
-            after = (_turned(rows) @ np.linalg.solve(root, again))[..., 0]
-            way = np.abs(after[..., :3] - shift[..., :3]).max(axis=-1)
-            shift = np.where(moves[..., None], after, shift)
-            gains = np.where(moves[..., None, None], rows, gains)
-            moves = moves & (way > STEP_TOLERANCE)
-            if not moves.any():
-                break
-        shift = np.where(moves[..., None], first[0], shift)
-        gains = np.where(moves[..., None, None], first[1], gains)
-        moved = _composed(mean, shift)
-    P = covariance - _turned(gains) @ gains
-    if frame == "invariant":
-        P = _transported(P, moved - mean)
-    return ObservedMap(moved, P, nu, L, nis)
+    if frame == "additive":
+        return ObservedMap(mean + shift, _reduced(covariance, gains), nu, L, nis)
+    first, moves = (shift, gains), np.ones(nis.shape, dtype=np.bool_)
+    for _ in range(0 if once else MOST_ITERATIONS):
+        at = _moved(mean, shift)
+        slopes = slopes_at(H, at[..., :2] - mean[..., :2])
+        root, rows = _whitened(covariance, slopes, R)
+        again = innovation(at)[..., None] + slopes @ shift[..., :m, None]
+        after = (_turned(rows) @ np.linalg.solve(root, again))[..., 0]
+        way = np.abs(after[..., :3] - shift[..., :3]).max(axis=-1)
+        shift = np.where(moves[..., None], after, shift)
+        gains = np.where(moves[..., None, None], rows, gains)
+        moves = moves & (way > STEP_TOLERANCE)
+        if not moves.any():
+            break
+    shift = np.where(moves[..., None], first[0], shift)
+    gains = np.where(moves[..., None, None], first[1], gains)
+    return ObservedMap(*composed(mean, _reduced(covariance, gains), shift), nu, L, nis)
+
+
+def _reduced(covariance: Array, gains: Array) -> Array:
+    """Return P − Aᵀ A."""
+    return np.asarray(covariance - _turned(gains) @ gains)
 
 
 def _whitened(covariance: Array, H: Array, R: Array) -> tuple[Array, Array]:
@@ -209,16 +227,84 @@ def _whitened(covariance: Array, H: Array, R: Array) -> tuple[Array, Array]:
     return L, np.asarray(np.linalg.solve(L, rows))
 
 
-def _turned(matrices: Array) -> Array:
-    return np.swapaxes(matrices, -1, -2)
-
-
 def slopes_at(H: Array, moved: Array) -> Array:
     """Return H_δ where the position has moved (..., 2) from the prior [m]."""
     lever = moved[..., ::-1] * (-1.0, 1.0)  # J (p − p̂)
     slopes = np.broadcast_to(H, (*moved.shape[:-1], *H.shape)).copy()
     slopes[..., 2] += lever @ H[:, :2].T
     return slopes
+
+
+class ObservesPoses:
+    """A filter on a Gaussian map that takes readings of its pose."""
+
+    map: GaussianMap
+    """The belief, in the arrays that steps change."""
+    rules: Rules
+    """What distinguishes this filter's updates from another's."""
+
+    @property
+    def frame(self) -> ErrorFrame:
+        """Coordinates in which the filter takes its error to be Gaussian."""
+        return FRAMES[self.rules.frame]
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Correct the belief with a reading of the pose, such as compass or GPS.
+
+        The reading is z = H (x, y, θ) + w.  A compass has H = [0 0 1], a GPS
+        H = [1 0 0; 0 1 0].
+
+        Parameters
+        ----------
+        reading : array_like, shape (k,)
+            z [m or rad]; a component that depends on the heading alone is an angle.
+        matrix : array_like, shape (k, 3)
+            H.
+        covariance : array_like, shape (k, k)
+            R, of the noise w; positive definite.
+
+        Returns
+        -------
+        UpdateReport
+            NIS, innovation (k,) and its covariance.  It has no degrees of freedom where
+            the gate of the filter, if any, rejects the reading.
+
+        Raises
+        ------
+        ValueError
+            If an argument is malformed; the belief is then as before.
+
+        Examples
+        --------
+        >>> from slamgym.estimator import InvariantEkfSlam
+        >>> slam = InvariantEkfSlam((0, 0, 0), (0.1, 0.1), initial_pose_std=(1, 1, 1))
+        >>> slam.observe_pose(0.5, [0, 0, 1], 1.0).degrees_of_freedom
+        1
+        >>> slam.belief().pose
+        array([0.  , 0.  , 0.25])
+        """
+        given = PoseReading.checked(reading, matrix, covariance)
+        (mean, P, reference), map_ = self.map.used, self.map
+        found = self._observe(given, mean, P)
+        size = found.innovation.size
+        if not found.nis <= gate_of(self.rules, size):
+            return UpdateReport()
+        after = BeliefArrays(found.mean, found.covariance, reference)
+        map_.hold(after, map_.slots, block=map_.blank(map_.room), steps=1)
+        return UpdateReport(
+            nis=float(found.nis),
+            degrees_of_freedom=size,
+            innovation=found.innovation,
+            factor=found.factor,
+        )
+
+    def _observe(
+        self, given: PoseReading, mean: Array, covariance: Array
+    ) -> ObservedMap:
+        once = self.rules.iterations == 1
+        return given.correct(mean, covariance, frame=self.frame, once=once)
 
 
 # --------------------------------------------------------------------------------------
@@ -338,8 +424,7 @@ def coincide(
     P = covariance - gains.T @ gains
     if frame == "additive":
         return ConditionedMap(mean - gains.T @ np.linalg.solve(L, offset), P)
-    moved = _composed(mean, _turned_shift(L, gains, offset))
-    return ConditionedMap(moved, _transported(P, moved - mean))
+    return composed(mean, P, _turned_shift(L, gains, offset))
 
 
 def _turned_shift(
@@ -363,26 +448,27 @@ def _columns(slots: int | Sequence[int]) -> IntArray:
     return np.asarray((first[:, None] + np.arange(2)).ravel())
 
 
-def _composed(mean: Array, shift: Array) -> Array:
-    """Compose an invariant correction δ with states, over any leading axes.
+def composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
+    """Compose an invariant correction δ with states, and transform P to match.
 
     ::
 
-        q ← R(t) q + V(t) (δq − t J q) = q + V(t) δq,    θ ← θ + t = θ + δθ
+        q ← R(t) q + V(t) (δq − t J q) = q + V(t) δq,    θ ← θ + t,    t = δθ
+        P ← T P Tᵀ,    T = I + v e_θᵀ,    v = J (q⁺ − q)
     """
+    moved = _moved(mean, shift)
+    way = state_of(1j * points_of(moved - mean), np.zeros(mean.shape[:-1]))[..., None]
+    cross = way * covariance[..., 2:3, :]
+    square = covariance[..., 2:3, 2:3] * (way * _turned(way))
+    return ConditionedMap(moved, covariance + (cross + _turned(cross)) + square)
+
+
+def _moved(mean: Array, shift: Array) -> Array:
+    """Return the states after a correction, over any leading axes."""
     turn = shift[..., 2]
     moves = left_jacobian(turn)[..., None] * points_of(shift)
     return np.asarray(mean + state_of(moves, turn))
 
 
-def _transported(covariance: Array, moved: Array) -> Array:
-    """Transform P to match a composed correction that has moved the state.
-
-    ::
-
-        P ← T P Tᵀ,    T = I + v e_θᵀ,    v = J (q⁺ − q)
-    """
-    way = state_of(1j * points_of(moved), np.zeros(moved.shape[:-1]))[..., None]
-    cross = way * covariance[..., 2:3, :]
-    square = covariance[..., 2:3, 2:3] * (way * np.swapaxes(way, -1, -2))
-    return np.asarray(covariance + (cross + np.swapaxes(cross, -1, -2)) + square)
+def _turned(matrices: Array) -> Array:
+    return np.swapaxes(matrices, -1, -2)

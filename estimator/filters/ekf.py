@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import inf, log1p
 from statistics import NormalDist
-from typing import Any, ClassVar, NamedTuple, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,18 +20,19 @@ from ..interface import Belief, MapView, UpdateReport, describe_filter
 from ..kernels.filter_memory import REPEATED, move_pose, update_map
 from ..kernels.kalman_gain import (
     ADDITIVE,
+    AFTER_STDS,
     AT_ESTIMATE,
     AT_REFERENCE,
+    FIRST_STD,
     INVARIANT,
     OUTCOME,
     PROJECTED,
     USED,
-    BeliefArrays,
+    WAITING,
     Rules,
 )
 from ..kernels.scan_update import DONE, NOT_USABLE
-from ..models.motions import UNICYCLE, Motion, find_motion
-from ..models.rigid_motion import ErrorFrame
+from ..models.motions import UNICYCLE, Motion, MotionNoise
 from ..models.sensors import (
     BEARING_RANGE,
     Sensor,
@@ -42,8 +43,16 @@ from ..models.sensors import (
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
-from ..support.undo import Undo
-from .conditioning import ObservedMap, PoseReading
+from ..support.saved_states import with_prefix, without_prefix
+from ..support.undo import Undo, attributes, undo_all, undone_on_error
+from .conditioning import ObservesPoses
+from .delayed_landmarks import (
+    WAITING_STATE,
+    Waiting,
+    collect,
+    is_landmark,
+    refuse_unknown_poses,
+)
 from .gaussian_map import (
     MAP_STATE,
     GaussianMap,
@@ -52,20 +61,17 @@ from .gaussian_map import (
 )
 
 
-class MapFilter:
+class MapFilter(ObservesPoses):
     """A filter without its steps: reset, belief, saved state, map editing."""
 
     map: GaussianMap
     """The belief, in the arrays that steps change."""
     rules: Rules
     """What distinguishes this filter's updates from another's."""
+    waiting: Waiting | None = None
+    """Readings that wait, of a sensor that does not place landmarks one by one."""
 
     __repr__ = describe_filter
-
-    @property
-    def frame(self) -> ErrorFrame:
-        """Coordinates in which the filter takes its error to be Gaussian."""
-        return FRAMES[self.rules.frame]
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map.
@@ -80,6 +86,8 @@ class MapFilter:
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         self.map.reset(first, np.diag(std**2))
+        if self.waiting is not None:
+            self.waiting = Waiting()
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise landmarks; the remaining belief is unchanged to the last bit.
@@ -89,7 +97,7 @@ class MapFilter:
         ValueError
             If one is not in the map; nothing is removed.
         """
-        self.map.remove(argument_checks.mapped_identities(landmark_ids, self.map.slots))
+        self.map.remove(argument_checks.mapped_identities(landmark_ids, self.slots))
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two mapped landmarks being one, and remove the second.
@@ -113,66 +121,9 @@ class MapFilter:
         numpy.linalg.LinAlgError
             If a distance has no uncertainty; nothing is merged.
         """
-        kept, gone = landmark_pairs(pairs, self.map.slots)
+        kept, gone = landmark_pairs(pairs, self.slots)
         at_reference = self.rules.linearisation != AT_ESTIMATE
         self.map.merge(kept, gone, frame=self.frame, at_reference=at_reference)
-
-    def observe_pose(
-        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
-    ) -> UpdateReport:
-        """Correct the belief with a reading of the pose, such as compass or GPS.
-
-        The reading is z = H (x, y, θ) + w.  A compass has H = [0 0 1], a GPS
-        H = [1 0 0; 0 1 0].
-
-        Parameters
-        ----------
-        reading : array_like, shape (k,)
-            z [m or rad]; a component that depends on the heading alone is an angle.
-        matrix : array_like, shape (k, 3)
-            H.
-        covariance : array_like, shape (k, k)
-            R, of the noise w; positive definite.
-
-        Returns
-        -------
-        UpdateReport
-            NIS, innovation (k,) and its covariance.  It has no degrees of freedom where
-            the gate of the filter, if any, rejects the reading.
-
-        Raises
-        ------
-        ValueError
-            If an argument is malformed; the belief is then as before.
-
-        Examples
-        --------
-        >>> slam = InvariantEkfSlam((0, 0, 0), (0.1, 0.1), initial_pose_std=(1, 1, 1))
-        >>> slam.observe_pose(0.5, [0, 0, 1], 1.0).degrees_of_freedom
-        1
-        >>> slam.belief().pose
-        array([0.  , 0.  , 0.25])
-        """
-        given = PoseReading.checked(reading, matrix, covariance)
-        (mean, P, reference), map_ = self.map.used, self.map
-        found = self._observe(given, mean, P)
-        size = found.innovation.size
-        if not found.nis <= gate_of(self.rules, size):
-            return UpdateReport()
-        after = BeliefArrays(found.mean, found.covariance, reference)
-        map_.hold(after, map_.slots, block=map_.blank(map_.room), steps=1)
-        return UpdateReport(
-            nis=float(found.nis),
-            degrees_of_freedom=size,
-            innovation=found.innovation,
-            factor=found.factor,
-        )
-
-    def _observe(
-        self, given: PoseReading, mean: Array, covariance: Array
-    ) -> ObservedMap:
-        once = self.rules.iterations == 1
-        return given.correct(mean, covariance, frame=self.frame, once=once)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return the belief as a snapshot, of the whole map or of a part of it.
@@ -183,23 +134,37 @@ class MapFilter:
             Return the marginal of the pose and these landmarks only, in this order.
         """
         if landmark_ids is not None:
-            landmark_ids = argument_checks.mapped_identities(
-                landmark_ids, self.map.slots
-            )
+            landmark_ids = argument_checks.mapped_identities(landmark_ids, self.slots)
+        elif self.waiting is not None:
+            landmark_ids = self.landmark_ids
         return self.map.belief(self.frame, landmark_ids)
 
     def map_view(self) -> MapView:
         """Return pose and map without a copy; it is valid until the next step."""
-        return self.map.view()
+        if self.waiting is None:
+            return self.map.view()
+        belief = self.belief()
+        return MapView(belief.mean, belief.covariance, belief.landmark_ids)
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The mapped landmarks, in the order of the belief."""
-        return tuple(self.map.slots)
+        return tuple(self.slots)
+
+    @property
+    def slots(self) -> Mapping[int, int]:
+        """Place of each landmark in the state: column 3 + 2 slot."""
+        slots = self.map.slots
+        if self.waiting is None:
+            return slots
+        return {i: slot for i, slot in slots.items() if is_landmark(i)}
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of mean, covariance, ids and linearisation points."""
-        return {"estimator": np.array(type(self).__name__), **self.map.state_dict()}
+        state = {"estimator": np.array(type(self).__name__), **self.map.state_dict()}
+        if self.waiting is not None:
+            state |= with_prefix("waiting", self.waiting._asdict(), "_")
+        return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit in a filter of the same settings.
@@ -216,15 +181,23 @@ class MapFilter:
             together; the belief is then as before.
         """
         name = {"estimator": type(self).__name__}
-        self.map.restore(saved_states.read(state, MAP_STATE, of=name))
+        checked = saved_states.read(state, MAP_STATE, of=name)
+        if self.waiting is not None:
+            checked |= read_waiting(state, checked["landmark_ids"])
+        MapFilter.restore(self, checked)  # subclasses read what is theirs
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that this process has saved, without checks."""
-        self.map.restore(state)
+        with undone_on_error(self.bookmark()):
+            self.map.restore(state)
+            if self.waiting is not None:
+                self.waiting = Waiting(state["waiting_ids"], state["waiting_readings"])
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
-        return self.map.bookmark()
+        if self.waiting is None:
+            return self.map.bookmark()
+        return undo_all(self.map.bookmark(), attributes(self))
 
     @property
     def steps(self) -> int:
@@ -233,7 +206,10 @@ class MapFilter:
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
-        return self.map.last_report()
+        return self.map.last_report() if self._report is None else self._report
+
+    _report: UpdateReport | None = None
+    """That of the last update, where the map has changed since."""
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""
@@ -340,6 +316,7 @@ class EkfSlam(MapFilter):
     ) -> None:
         self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         self.sensor = find_sensor(sensor)
+        self.waiting = None if self.sensor.places else Waiting()
         self.rules = checked_rules(
             measurement_std,
             sensor=self.sensor,
@@ -402,13 +379,36 @@ class EkfSlam(MapFilter):
             If the landmarks would be more than memory holds; the belief is then as
             before.
         """
-        readings = argument_checks.scan(measurements, self.sensor.columns)
+        sensor, kernel = self.sensor, self._update_map
+        readings = argument_checks.scan(measurements, sensor.columns)
         ids = argument_checks.identity_array(landmark_ids, len(readings), self)
-        kernel = for_sensor(self._update_map, self.sensor)
+        if sensor is not BEARING_RANGE:
+            kernel = for_sensor(kernel, sensor)
+            if self.waiting is not None:
+                return self._update_and_collect(kernel, readings, ids)
         status = self.map.take_in(kernel, readings, ids)
         if status != DONE:
             self._refuse(status, readings, ids)
         return self.map.report()
+
+    def _update_and_collect(
+        self, kernel: UpdateKernel, readings: Array, ids: IntArray
+    ) -> UpdateReport:
+        """Update with readings of mapped landmarks; let those of others wait."""
+        argument_checks.refuse_reserved(ids.tolist())
+        with undone_on_error(self.bookmark()):
+            self.map.hold(self.map.used, self.map.slots)  # what follows changes a copy
+            status = self.map.take_in(kernel, readings, ids)
+            if status != DONE:
+                self._refuse(status, readings, ids)
+            report = self.map.report()
+            left = self.map.parts.ledger[OUTCOME, : len(ids)] == WAITING
+            new = Waiting(np.column_stack([ids, ids])[left], readings[left])
+            self.waiting, placed = collect(
+                self.map, self.sensor, self.rules, self.waiting or Waiting(), new
+            )
+            self._report = report.replace(added_ids=placed)
+        return self._report
 
     @property
     def motion_values(self) -> Array:
@@ -587,7 +587,21 @@ class IteratedEkfSlam(EkfSlam):
         self._adopt(self.rules._replace(iterations=count))
 
 
-FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
+def read_waiting(state: Mapping[str, Any], mapped: Sequence[int]) -> dict[str, Any]:
+    """Return saved readings that wait, checked; none where the state has none.
+
+    Raises
+    ------
+    ValueError
+        If one names a past pose that is not in the map.
+    """
+    if "waiting_ids" not in state:
+        return with_prefix("waiting", Waiting()._asdict(), "_")
+    own = saved_states.read(
+        without_prefix(state, "waiting", "_"), WAITING_STATE, "waiting_"
+    )
+    refuse_unknown_poses(own["ids"], mapped)
+    return with_prefix("waiting", own, "_")
 
 
 # --------------------------------------------------------------------------------------
@@ -640,12 +654,13 @@ def checked_rules(
     )
 
 
-def reading_variances(rules: Rules, ranges: Array) -> Array:
-    """Return (σβ², σr²) of readings at these ranges [m], shape (m, 2)."""
-    range_std = rules.range_std + rules.range_std_per_metre * ranges
-    away = np.maximum(ranges, rules.min_range)
-    bearing_std = rules.bearing_std + rules.bearing_std_metres / away
-    return np.column_stack([bearing_std, range_std]) ** 2
+def reading_variances(
+    rules: Rules, ranges: Array, sensor: Sensor = BEARING_RANGE
+) -> Array:
+    """Return (σβ², σr²) of readings at these ranges [m], or another sensor's, (m, 2)."""
+    noise = rules[FIRST_STD:AFTER_STDS]
+    std = sensor.std(noise, np.maximum(ranges, rules.min_range))
+    return np.stack(np.broadcast_arrays(*std), axis=1) ** 2
 
 
 def _gate(probability: float | None, numbers: int) -> float:
@@ -659,50 +674,3 @@ def _gate(probability: float | None, numbers: int) -> float:
     if numbers == 1:
         return NormalDist().inv_cdf((1 + probability) / 2) ** 2
     return -2 * log1p(-probability)  # P(χ²₂ > g) = e^{−g/2}
-
-
-def gate_of(rules: Rules, size: int) -> float:
-    """Return the χ² quantile of the gate for another number of components."""
-    if rules.gate == inf:
-        return inf
-    from scipy.special import gammainc, gammaincinv  # noqa: PLC0415 (slow to import)
-
-    probability = gammainc(rules.numbers / 2, rules.gate / 2)
-    return 2 * float(gammaincinv(size / 2, probability))
-
-
-class MotionNoise(NamedTuple):
-    """A drive with the variances of its noise, and whether there is noise at rest."""
-
-    variance: Array
-    """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
-    at_rest: bool = True
-    """False: odometry that moves nothing adds no noise."""
-    motion: Motion = UNICYCLE
-
-    @classmethod
-    def checked(
-        cls,
-        motion_std: ArrayLike,
-        noise_at_rest: bool,
-        motion: str | Motion = UNICYCLE,
-    ) -> MotionNoise:
-        """Return the noise of these standard deviations (3,), or refuse them."""
-        std = argument_checks.standard_deviations("motion_std", motion_std, 3)
-        at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
-        return cls(std**2, at_rest, find_motion(motion))
-
-    def weight(self, moved: tuple[float, float, float], dt: float) -> float:
-        """Return the factor of the variances for a displacement over dt steps.
-
-        Raises
-        ------
-        ValueError
-            If dt is no number, negative, or too large.
-        """
-        dt = argument_checks.duration(dt)
-        return dt if self.at_rest or any(moved) else 0.0
-
-    def over(self, moved: tuple[float, float, float], dt: float) -> Array:
-        """Return the variances (3,) of a displacement over dt steps."""
-        return self.variance * self.weight(moved, dt)

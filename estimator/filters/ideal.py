@@ -12,6 +12,7 @@ from ...arrays import Array
 from ..interface import UpdateReport
 from ..kernels.kalman_gain import AT_ESTIMATE, AT_TRUTH, BeliefArrays
 from ..models.rigid_motion import composed, pose_rotation
+from ..models.sensors import only_bearing_range
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
@@ -37,6 +38,7 @@ class IdealEkfSlam(EkfSlam):
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run; it linearises at the estimate until the truth is given."""
+        only_bearing_range(self.sensor, "the ideal filter")
         with undone_on_error(self.bookmark()):
             super().reset(pose, pose_std)
             self._linearise_at(AT_ESTIMATE)

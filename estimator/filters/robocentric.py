@@ -14,6 +14,7 @@ from ..interface import Belief, MapView, UpdateReport
 from ..kernels.filter_memory import LANDMARKS, parts_jit, update_map
 from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
+from ..models.sensors import only_placing
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from .conditioning import ObservedMap, PoseReading, observe
@@ -65,6 +66,7 @@ class RobocentricEkfSlam(EkfSlam):
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
+        only_placing(self.sensor, "the robocentric filter")
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         origin, jacobian = _inverse_pose(first)
@@ -81,7 +83,7 @@ class RobocentricEkfSlam(EkfSlam):
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct map and motion with one scan, then move the frame to the robot."""
-        readings = argument_checks.scan(measurements)
+        readings = argument_checks.scan(measurements, self.sensor.columns)
         given = argument_checks.identity_array(landmark_ids, len(readings), self)
         if len(given) and given.min() <= max(RESERVED):
             raise ValueError(f"landmark_ids must be above {max(RESERVED)}")

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, BoolArray, IntArray
 from ..interface import UpdateReport
 from ..kernels.kalman_gain import BeliefArrays
-from ..models.bearing_range import wrap_angle
+from ..models.bearing_range import read_distance_jit
 from ..models.rigid_motion import composed
+from ..models.sensors import Sensor, for_sensor
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.undo import undone_on_error
@@ -64,12 +65,13 @@ class UnscentedSlam(EkfSlam):
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Correct the belief with one scan, then add its new landmarks to the map."""
-        readings = argument_checks.scan(measurements)
+        readings = argument_checks.scan(measurements, self.sensor.columns)
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
         usable = np.array(
             [
-                min(reading[1], self._expected_range(i)) >= self.rules.min_range
+                min(self._read_distance(reading), self._expected_range(i))
+                >= self.rules.min_range
                 for i, reading in zip(ids, readings, strict=True)
             ],
             dtype=bool,
@@ -92,6 +94,10 @@ class UnscentedSlam(EkfSlam):
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
         return self._report
+
+    def _read_distance(self, reading: Array) -> float:
+        """Return the distance of a landmark by its reading [m]; infinite if unknown."""
+        return for_sensor(read_distance_jit, self.sensor)(reading[0], reading[1])
 
     def _expected_range(self, landmark_id: int) -> float:
         """Return the expected range of a landmark [m]; infinite for a new one."""
@@ -120,11 +126,12 @@ class UnscentedSlam(EkfSlam):
         columns = 3 + 2 * np.array([self.map.slots[i] for i in ids])
         root = _square_root(self.map.covariance[:n, :n])
         deviations = np.sqrt(n) * np.concatenate([root, -root], axis=1)
-        expected, spread = _through_sensor(self.map.mean[:n], deviations, columns)
-        innovation = readings - expected
-        innovation[:, 0] = wrap_angle(innovation[:, 0])
-        at = readings if self.rules.noise_as_read else expected
-        noise = reading_variances(self.rules, at[:, 1])
+        mean, sensor = self.map.mean[:n], self.sensor
+        expected, spread, distances = _through_sensor(sensor, mean, deviations, columns)
+        innovation = sensor.difference(readings, expected)
+        if self.rules.noise_as_read:
+            distances = np.array([self._read_distance(z) for z in readings])
+        noise = reading_variances(self.rules, distances, sensor)
         kept = self._within_gate(innovation, spread, noise)
         rows = np.repeat(kept, 2)
         spread, nu = spread[rows], innovation.ravel()[rows]
@@ -137,7 +144,7 @@ class UnscentedSlam(EkfSlam):
         self.map.covariance[:n, :n] -= gains.T @ gains
         return UpdateReport(
             nis=float(white @ white),
-            degrees_of_freedom=len(nu),
+            degrees_of_freedom=len(nu) * sensor.size // 2,
             associated_ids=tuple(i for i, k in zip(ids, kept, strict=True) if k),
             rejected_ids=tuple(i for i, k in zip(ids, kept, strict=True) if not k),
             near_ids=tuple(i for i in compress(ids, kept) if i in near),
@@ -156,25 +163,21 @@ class UnscentedSlam(EkfSlam):
 
 
 def _through_sensor(
-    mean: Array, deviations: Array, columns: IntArray
-) -> tuple[Array, Array]:
-    """Predict the readings of points (n, N): mean (m, 2) and deviations (2m, N)."""
+    sensor: Sensor, mean: Array, deviations: Array, columns: IntArray
+) -> tuple[Array, Array, Array]:
+    """Predict the readings of points (n, N): mean (m, 2) and deviations (2m, N).
+
+    The mean distance of the landmarks, (m,), follows.
+    """
     points = np.concatenate([mean[:, None], mean[:, None] + deviations], axis=1)
     dx, dy = points[columns] - points[0], points[columns + 1] - points[1]
-    bearing = np.arctan2(dy, dx) - points[2]
-    turned = wrap_angle(bearing[:, 1:] - bearing[:, :1])
-    distance = np.hypot(dx, dy)
-    centre = np.stack(
-        [bearing[:, 0] + turned.mean(axis=1), distance[:, 1:].mean(axis=1)]
-    )
-    spread = np.stack(
-        [
-            turned - turned.mean(axis=1, keepdims=True),
-            distance[:, 1:] - centre[1][:, None],
-        ],
-        axis=1,
-    )
-    return centre.T, spread.reshape(2 * len(columns), -1)
+    cos, sin = np.cos(points[2]), np.sin(points[2])
+    read = sensor.read(cos * dx + sin * dy, cos * dy - sin * dx)
+    apart = sensor.difference(read[:, 1:], read[:, :1])
+    average = apart.mean(axis=1)
+    spread = (apart - average[:, None]).transpose(0, 2, 1)
+    distances = np.hypot(dx, dy)[:, 1:].mean(axis=1)
+    return read[:, 0] + average, spread.reshape(2 * len(columns), -1), distances
 
 
 def _factor(S: Array, ids: list[int]) -> Array:

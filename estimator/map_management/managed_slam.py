@@ -24,7 +24,6 @@ from ..association.scan_association import (
     associate,
 )
 from ..filters.conditioning import PoseReading
-from ..filters.ekf import MotionNoise
 from ..interface import (
     Belief,
     MapView,
@@ -37,7 +36,7 @@ from ..interface import (
     restore,
     taking_poses,
 )
-from ..models.motions import UNICYCLE
+from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds

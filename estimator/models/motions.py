@@ -18,6 +18,8 @@ b = (dx, dy, α)  displacement in the robot's frame, then turn [m, m, rad]
 ε = (εx, εy, εα) motion noise in the robot's own frame [m, m, rad], ε ~ N(0, R)
 """
 
+from __future__ import annotations
+
 import re
 import tomllib
 from collections.abc import Callable
@@ -235,6 +237,43 @@ def find_motion(motion: str | Motion) -> Motion:
             "motion must be like differential[track_width=0.4] or "
             f"bicycle[wheelbase=2.8], got '{motion}': {error}"
         ) from None
+
+
+class MotionNoise(NamedTuple):
+    """A drive with the variances of its noise, and whether there is noise at rest."""
+
+    variance: Array
+    """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
+    at_rest: bool = True
+    """False: odometry that moves nothing adds no noise."""
+    motion: Motion = UNICYCLE
+
+    @classmethod
+    def checked(
+        cls,
+        motion_std: ArrayLike,
+        noise_at_rest: bool,
+        motion: str | Motion = UNICYCLE,
+    ) -> MotionNoise:
+        """Return the noise of these standard deviations (3,), or refuse them."""
+        std = argument_checks.standard_deviations("motion_std", motion_std, 3)
+        at_rest = argument_checks.flag("noise_at_rest", noise_at_rest)
+        return cls(std**2, at_rest, find_motion(motion))
+
+    def weight(self, moved: tuple[float, float, float], dt: float) -> float:
+        """Return the factor of the variances for a displacement over dt steps.
+
+        Raises
+        ------
+        ValueError
+            If dt is no number, negative, or too large.
+        """
+        dt = argument_checks.duration(dt)
+        return dt if self.at_rest or any(moved) else 0.0
+
+    def over(self, moved: tuple[float, float, float], dt: float) -> Array:
+        """Return the variances (3,) of a displacement over dt steps."""
+        return self.variance * self.weight(moved, dt)
 
 
 def only_unicycle(motion: Motion, part: str) -> None:

@@ -113,7 +113,7 @@ class Sensor:
         """
         R = _rotation(pose[2])
         x, y = ((landmarks - pose[:2]) @ R).T
-        D, measurement = self.slopes(x, y), self._values(x, y)
+        D, measurement = self.slopes(x, y), self.read(x, y)
         by_landmark = D @ R.T
         by_heading = D @ np.stack([y, -x], axis=1)[..., None]
         by_pose = np.concatenate([-by_landmark, by_heading], axis=2)
@@ -147,7 +147,8 @@ class Sensor:
         columns = np.broadcast_arrays(x, *self.h(x, y)[1])[1:]
         return np.stack(columns, axis=-1).reshape(-1, 2, 2).astype(np.float64)
 
-    def _values(self, x: Array, y: Array) -> Array:
+    def read(self, x: Array, y: Array) -> Array:
+        """Return the readings of landmarks at (x, y) in the robot's frame, (..., 2)."""
         return np.stack(np.broadcast_arrays(x, *self.h(x, y)[0])[1:], axis=-1) * 1.0
 
     def __reduce__(self) -> Any:
@@ -272,6 +273,15 @@ def only_bearing_range(sensor: str | Sensor, part: str) -> None:
     if found is not BEARING_RANGE:
         raise ValueError(
             f"{part} takes bearing_range readings only, got sensor '{found.name}'"
+        )
+
+
+def only_placing(sensor: Sensor, part: str) -> None:
+    """Refuse sensors whose readings do not place a landmark one by one."""
+    if not sensor.places:
+        raise ValueError(
+            f"{part} needs readings that place a landmark one by one, got sensor "
+            f"'{sensor.name}'"
         )
 
 
@@ -435,7 +445,7 @@ def _name(sensor: Sensor, column: int) -> str:
 def _check_slopes(sensor: Sensor, x: Array, y: Array) -> None:
     given, step = sensor.slopes(x, y), 1e-6 * np.hypot(x, y)
     for axis, (mx, my) in enumerate(((step, 0.0), (0.0, step))):
-        ahead, behind = sensor._values(x + mx, y + my), sensor._values(x - mx, y - my)
+        ahead, behind = sensor.read(x + mx, y + my), sensor.read(x - mx, y - my)
         numeric = sensor.difference(ahead, behind) / (2 * step[:, None])
         scale = 1e-6 * (1 + np.abs(numeric)) + 1e-9 / step[:, None] * 1e-6
         wrong = ~(np.abs(given[:, :, axis] - numeric) <= scale)
@@ -453,8 +463,8 @@ def _check_slopes(sensor: Sensor, x: Array, y: Array) -> None:
 
 def _check_angles(sensor: Sensor) -> None:
     """Look for a jump of 2π on a circle around the robot."""
-    turn = np.linspace(-np.pi, np.pi, 721)
-    z = sensor._values(3 * np.cos(turn), 3 * np.sin(turn))
+    turn = np.linspace(0.0, 2 * np.pi, 721)
+    z = sensor.read(3 * np.cos(turn), 3 * np.sin(turn))
     jumps = np.abs(np.abs(np.diff(z, axis=0)) - 2 * np.pi) < 0.1
     for column in range(sensor.size):
         if jumps[:, column].any() and not sensor.wraps[column]:
@@ -470,7 +480,7 @@ def _check_inverse(sensor: Sensor, x: Array, y: Array) -> None:
         return
     if sensor.size == 1:
         _refuse(sensor, "one number cannot determine a landmark: inverse must be None")
-    found = np.stack(sensor.inverse(*sensor._values(x, y).T), axis=-1)
+    found = np.stack(sensor.inverse(*sensor.read(x, y).T), axis=-1)
     off = np.hypot(found[:, 0] - x, found[:, 1] - y) / np.hypot(x, y)
     if not (off <= 1e-6).all():
         k = int(np.argmax(~(off <= 1e-6)))
@@ -497,6 +507,6 @@ def _check_compiled(sensor: Sensor, x: Array, y: Array) -> None:
     expected = parts[bearing_range.expected_reading_jit]
     for k in range(len(x)):
         compiled = expected(float(x[k]), float(y[k]), 0.0)
-        plain = sensor._values(x[k : k + 1], y[k : k + 1])[0]
+        plain = sensor.read(x[k : k + 1], y[k : k + 1])[0]
         if not np.allclose(sensor.difference(compiled, plain), 0, atol=1e-9):
             _refuse(sensor, f"h compiled returns {compiled}, and {plain} in numpy")

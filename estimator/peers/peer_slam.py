@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..association.scan_assignments import Noise
-from ..filters.ekf import MotionNoise
 from ..interface import Belief, UpdateReport
 from ..models.bearing_range import locate_landmark, predict_measurement, wrap_angle
-from ..models.motions import UNICYCLE, Motion, predict_pose
+from ..models.motions import UNICYCLE, Motion, MotionNoise, predict_pose
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, cast
 import gymnasium
 import numpy as np
 
-from ...agents.estimator_choice import model_labels
 from ...arrays import Array
 from ...envs.controllers import Controller
 from ...envs.landmark_world import LandmarkWorldEnv, Observation
@@ -126,7 +125,7 @@ def _log(
     return SlamLog(
         name=scenario.name,
         header=log_header(scenario, seed),
-        motion=model_labels(scenario).get("motion", "turn-last"),
+        motion=scenario.models.get("motion", "turn-last"),
         start=world.start_estimate,
         landmark_ids=np.arange(len(world.landmarks)),
         landmarks=world.landmarks,
@@ -158,7 +157,7 @@ def log_header(scenario: Scenario, seed: int) -> dict[str, str]:
     if not sensor.identities:
         header["identities"] = "false"
     header["noise_at_rest"] = str(motion.noise_at_rest).lower()
-    models = model_labels(scenario)
+    models = scenario.models
     if "sensor" in models:
         header["sensor"] = models["sensor"]
         header["measurement_columns"] = ",".join(find_sensor(models["sensor"]).columns)

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from ...agents.estimator_choice import model_labels
 from ...arrays import Array, BoolArray
 from ...envs.robot import wall_distances
 from ...estimator.filters.batch import BatchSlam, BatchTrace, can_batch
@@ -76,6 +75,7 @@ def filter_runs(
     """
     first = settings.make(runs.initial_poses[0])
     is_batch = can_batch(first) and runs.true_ids is None
+    is_batch = is_batch and cast(EkfSlam, first).sensor.places
     refuse_large_maps(runs, first, at_once=is_batch)
     if is_batch:
         return _in_a_batch(cast(EkfSlam, first), settings, runs, threads)
@@ -300,7 +300,7 @@ def noise_of_runs(scenario: Scenario, assumed: Scenario, runs: SimulatedRuns) ->
     bearing_range alone counts.
     """
     identified = runs.identified()
-    motion = find_motion(model_labels(scenario).get("motion", "unicycle"))
+    motion = find_motion(scenario.models.get("motion", "unicycle"))
     noisy = ~_near_walls(scenario, runs.true_poses)
     if not assumed.motion.noise_at_rest:
         noisy &= runs.odometry.any(axis=2)

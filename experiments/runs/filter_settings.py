@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from ...agents.estimator_choice import accepted_models, model_labels
 from ...estimator import interface, registry
 from ...estimator.support.argument_checks import refuse_large_belief
 from ...estimator.support.memory_limit import covariance_bytes, refuse_beyond_memory
@@ -177,7 +176,7 @@ def settings_for(
         ),
         options={
             **_header_options(log.name, header, factory),
-            **accepted_models(factory, _models(log)),
+            **registry.accepted_models(factory, _models(log)),
             **managed,
             **(options or {}),
             **own,
@@ -224,7 +223,7 @@ def settings_for_scenario(
     >>> settings_for_scenario(load_scenario("six_landmarks")).motion_std
     (0.25, 0.1, 0.1)
     """
-    motion = model_labels(scenario).get("motion", "turn-last")
+    motion = scenario.models.get("motion", "turn-last")
     log = SlamLog(scenario.name, log_header(scenario, seed=0), motion)
     return settings_for(log, estimator=estimator, options=options)
 

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from ...agents.estimator_choice import model_labels
 from ...arrays import Array
 from ...envs.spaces import count_rows
 from ...estimator.filters.batch import BatchSlam
@@ -225,7 +224,7 @@ def _write_tum(trajectories: Sequence[Trajectory], path: Path) -> None:
 def _check_tum(scenario: Scenario) -> None:
     """Refuse odometry that the increments of a path do not determine."""
     only_unicycle(
-        find_motion(model_labels(scenario).get("motion", "unicycle")),
+        find_motion(scenario.models.get("motion", "unicycle")),
         "the format 'tum'",
     )
 
@@ -392,7 +391,7 @@ def to_slamlog(trajectory: Trajectory) -> slamlog.SlamLog:
     return slamlog.SlamLog(
         name=trajectory.scenario.name,
         header=log_header(trajectory.scenario, trajectory.seed),
-        motion=model_labels(trajectory.scenario).get("motion", "turn-last"),
+        motion=trajectory.scenario.models.get("motion", "turn-last"),
         start=trajectory.start_estimate,
         landmark_ids=np.arange(len(landmarks)),
         landmarks=landmarks,

@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 
-from ...agents.estimator_choice import only_default_models
 from ...arrays import Array
 from ...sim_configs import Scenario
 from .formats import filtered_path, numbers, read_metadata, write_lines, write_metadata
@@ -39,7 +38,7 @@ infinite information, and optimisers do not converge with 1e-6."""
 
 def check(scenario: Scenario) -> None:
     """Refuse hidden identities, and sensors and drives that the edges do not hold."""
-    only_default_models(scenario, "format 'g2o'")
+    scenario.refuse_models("format 'g2o'")
     if not scenario.sensor.identities:
         raise ValueError(
             f"format 'g2o' needs sensor.identities = true, scenario '{scenario.name}' "

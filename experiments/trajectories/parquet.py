@@ -15,7 +15,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ...agents.estimator_choice import model_labels
 from ...arrays import AnyArray, Array
 from ...estimator.models.motions import find_motion
 from ...estimator.models.sensors import find_sensor
@@ -98,7 +97,7 @@ def _step_table(trajectory: Trajectory) -> Any:
 
 def _model_columns(scenario: Scenario) -> tuple[list[str], list[str]]:
     """Return the columns of odometry and of readings, by drive and sensor."""
-    models = model_labels(scenario)
+    models = scenario.models
     moves, numbers = ["odometry_distance", "odometry_turn"], ["bearings", "ranges"]
     if "motion" in models:
         moves = [f"odometry_{name}" for name in find_motion(models["motion"]).columns]

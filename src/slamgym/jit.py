@@ -128,7 +128,8 @@ def specialised(
 
 def _recompiled(function: Any, like: Any) -> Any:
     """Compile a function as another one was."""
-    kernel = njit(**like.targetoptions)(function)
+    options = {k: v for k, v in like.targetoptions.items() if k != "nopython"}
+    kernel = njit(**options)(function)
     if isinstance(like._cache, KernelCache):
         kernel._cache = KernelCache(kernel)
     return kernel

@@ -14,6 +14,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         experiments
     """,
     "envs": """
+        drives
         robot streams
         noise_streams controllers
         bearing_range

@@ -18,10 +18,10 @@ from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 from slamgym.estimator import make_batch, make_estimator
 from slamgym.estimator.filters.conditioning import (
     PoseReading,
+    gate_of,
     observe,
     slopes_at,
 )
-from slamgym.estimator.filters.ekf import gate_of
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 
 NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}

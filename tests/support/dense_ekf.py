@@ -15,9 +15,11 @@ from slamgym.estimator.models.motions import predict_pose
 
 
 class DenseEkf:
+    sensor = None  # another than bearing and range
+
     def __init__(self, motion_std, measurement_std, initial_pose_std=(0, 0, 0)):
         self.R = np.diag(np.square(motion_std))
-        self.Q = np.diag(np.square(measurement_std))
+        self.Q = np.diag(np.square(np.ravel(measurement_std)))
         self.mean = np.zeros(3)
         self.P = np.diag(np.square(np.asarray(initial_pose_std, dtype=float)))
         self.ids = []
@@ -35,16 +37,32 @@ class DenseEkf:
         """Return stacked ν (2m,) and H (2m, n) at the mean."""
         slots = [self.ids.index(i) for i in ids]
         landmarks = self.mean[3:].reshape(-1, 2)[slots]
-        expected = predict_measurement(self.mean[:3], landmarks)
+        expected = self.predict_readings(self.mean[:3], landmarks)
         H = np.zeros((2 * len(ids), len(self.mean)))
         for k, slot in enumerate(slots):
             H[2 * k : 2 * k + 2, :3] = expected.jacobian_pose[k]
             H[2 * k : 2 * k + 2, 3 + 2 * slot : 5 + 2 * slot] = (
                 expected.jacobian_landmark[k]
             )
-        innovation = np.asarray(readings) - expected.measurement
-        innovation[:, 0] = wrap_angle(innovation[:, 0])
-        return innovation.ravel(), H
+        innovation = self.difference(np.asarray(readings), expected.measurement)
+        rows = np.flatnonzero(np.arange(2 * len(ids)) % 2 < len(self.Q))
+        return innovation.ravel()[rows], H[rows]  # without void numbers
+
+    def predict_readings(self, pose, landmarks):
+        if self.sensor is None:
+            return predict_measurement(pose, landmarks)
+        return self.sensor.predict(pose, landmarks)
+
+    def difference(self, readings, expected):
+        if self.sensor is not None:
+            return self.sensor.difference(readings, expected)
+        innovation = readings - expected
+        innovation[..., 0] = wrap_angle(innovation[..., 0])
+        return innovation
+
+    def locate(self, reading):
+        where = locate_landmark if self.sensor is None else self.sensor.locate
+        return where(self.mean[:3], reading[None])
 
     def update(self, readings, ids):
         readings = np.asarray(readings, dtype=float)
@@ -82,7 +100,7 @@ class DenseEkf:
         return float(nu @ np.linalg.solve(S, nu))
 
     def add(self, reading, landmark_id):
-        located = locate_landmark(self.mean[:3], reading[None])
+        located = self.locate(reading)
         n = len(self.mean)
         extend = np.zeros((n + 2, n))
         extend[:n] = np.eye(n)

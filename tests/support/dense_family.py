@@ -8,11 +8,6 @@ import numpy as np
 from dense_ekf import DenseEkf
 from scipy.linalg import block_diag, expm, sqrtm
 
-from slamgym.estimator.models.bearing_range import (
-    locate_landmark,
-    predict_measurement,
-    wrap_angle,
-)
 from slamgym.estimator.models.motions import predict_pose
 
 J = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -101,7 +96,7 @@ class DenseInvariant(DenseEkf):
         return np.concatenate([moved[0], [mean[2] + xi[2]], moved[1:].ravel()])
 
     def noise(self, distance):
-        growth = np.array([0.0, self.range_std_per_metre * distance])
+        growth = np.array([0.0, self.range_std_per_metre * distance])[: len(self.Q)]
         return np.diag((np.sqrt(np.diag(self.Q)) + growth) ** 2)
 
     def seen(self, ids):
@@ -128,9 +123,10 @@ class DenseAdaptiveInvariant(DenseInvariant):
     def correct(self, readings, ids):
         prior, nothing = self.mean.copy(), np.zeros(len(self.mean))
         total, P, nis = self.gain(readings, ids, nothing)
-        nu = self.linearise(readings, ids)[0].reshape(-1, 2)
+        nu, H = self.linearise(readings, ids)
         ranges = np.linalg.norm(self.seen(ids), axis=1)
-        is_far = (np.abs(nu) > 0.1 * np.column_stack([ranges**0, ranges])).any()
+        per_metre = np.linalg.norm(H[:, 3:], axis=1)  # a bearing changes by 1 / range
+        is_far = (np.abs(nu) > 0.1 * np.repeat(ranges, len(self.Q)) * per_metre).any()
         for i in range(self.iterations):
             before = self.seen(ids)
             self.mean = self.exponential(total, prior)
@@ -212,7 +208,7 @@ class DenseFirstEstimates(DenseEkf):
         return nu, H
 
     def add(self, reading, landmark_id):
-        located = locate_landmark(self.mean[:3], reading[None])
+        located = self.locate(reading)
         position, Fz = located.position[0], located.jacobian_measurement[0]
         n = len(self.mean)
         extend = np.zeros((n + 2, n))
@@ -241,7 +237,7 @@ class DenseConstrained(DenseFirstEstimates):
             N[:2, :2] = N[3:, :2] = np.eye(2)
             N[:2, 2], N[2, 2] = J @ self.fixed[:2], 1.0
             N[3:, 2] = J @ self.fixed[c : c + 2]
-            rows = slice(2 * k, 2 * k + 2)
+            rows = slice(len(self.Q) * k, len(self.Q) * (k + 1))
             off = np.eye(5) - N @ np.linalg.solve(N.T @ N, N.T)
             H[rows, own] = H[rows][:, own] @ off
         return nu, H
@@ -295,19 +291,18 @@ class DenseUnscented(DenseEkf):
         slots = [self.ids.index(i) for i in ids]
 
         def sense(state):
-            return predict_measurement(
-                state[:3], state[3:].reshape(-1, 2)[slots]
-            ).measurement
+            landmarks = state[3:].reshape(-1, 2)[slots]
+            return self.predict_readings(state[:3], landmarks).measurement
 
         offsets = np.array(self.points(self.P))
         centre = sense(self.mean)
-        seen = np.array([sense(self.mean + offset) - centre for offset in offsets])
-        seen[..., 0] = wrap_angle(seen[..., 0])
-        average = seen.mean(axis=0)
+        seen = np.array([sense(self.mean + offset) for offset in offsets])
+        seen = self.difference(seen, centre)[..., : len(self.Q)]
+        average, centre = seen.mean(axis=0), centre[:, : len(self.Q)]
         spread = (seen - average).reshape(len(seen), -1)
-        nu = readings - centre - average
-        nu[:, 0] = wrap_angle(nu[:, 0])
-        nu = nu.ravel()
+        expected = np.zeros_like(readings)
+        expected[:, : len(self.Q)] = centre + average
+        nu = self.difference(readings, expected)[:, : len(self.Q)].ravel()
         S = spread.T @ spread / len(seen) + np.kron(np.eye(len(ids)), self.Q)
         C = offsets.T @ spread / len(seen)
         self.mean = self.mean + C @ np.linalg.solve(S, nu)

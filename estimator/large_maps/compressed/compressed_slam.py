@@ -18,6 +18,7 @@ from ...filters.ekf import (
     ObservabilityConstrainedEkfSlam,
 )
 from ...interface import Belief, MapView, UpdateReport, advance, describe_filter
+from ...models.sensors import only_placing
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.memory_limit import covariance_bytes
@@ -106,6 +107,7 @@ class CompressedEkfSlam:
         noise = np.array(motion_std), np.array(measurement_std)
         self._make = partial(base_filter, *noise, **settings)
         self._map = CompressedMap(self._make())
+        only_placing(self._map.filter.sensor, "the compressed filter")
         self._local_size = local_size
         if local_size is not None:
             argument_checks.whole("local_size", local_size, 1)

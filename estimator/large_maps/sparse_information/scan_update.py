@@ -18,14 +18,13 @@ from ....arrays import Array, BoolArray, IntArray
 from ...filters.ekf import (
     EkfSlam,
     FirstEstimatesEkfSlam,
-    MotionNoise,
     ObservabilityConstrainedEkfSlam,
     reading_variances,
 )
 from ...filters.gaussian_map import not_positive_definite
 from ...interface import UpdateReport
 from ...models.bearing_range import locate_landmark, predict_measurement, wrap_angle
-from ...models.motions import UNICYCLE
+from ...models.motions import UNICYCLE, MotionNoise
 from ...support import argument_checks
 from .local_information import (
     ConditionalPose,

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...interface import Belief, MapView, UpdateReport, advance, describe_map
+from ...models.sensors import only_placing
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.saved_states import with_prefix, without_prefix
@@ -186,6 +187,7 @@ class SubmapSlam(SubmapQueries):
     ) -> None:
         make = BASES[argument_checks.one_of("base", base, tuple(BASES))]
         self._active = ActiveSubmap(make(motion_std, measurement_std, **settings))
+        only_placing(self._active.filter.sensor, "a submap")
         noise = np.array(motion_std), np.array(measurement_std)
         ungated = settings | {"gate_probability": None}
         near = partial(InvariantEkfSlam, *noise, **ungated)

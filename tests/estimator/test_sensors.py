@@ -1,0 +1,391 @@
+"""Sensors as values: slopes, kernels against the dense oracle, and the check."""
+
+import pickle
+from dataclasses import replace
+
+import dense_family
+import numpy as np
+import pytest
+from dense_ekf import DenseEkf
+from numeric_jacobian import numeric_jacobian
+
+from slamgym.estimator import make_batch, make_estimator
+from slamgym.estimator.filters.imagine import imagine
+from slamgym.estimator.models import bearing_range
+from slamgym.estimator.models.sensors import (
+    BEARING,
+    BEARING_RANGE,
+    POSITION,
+    RANGE,
+    SENSORS,
+    Sensor,
+    SensorContractError,
+    check_sensor,
+    find_sensor,
+    kernel_parts,
+    read_bearing_range,
+)
+
+MOTION = 0.05, 0.03, 0.02
+STD = {
+    "bearing_range": (0.03, 0.1),
+    "position": (0.1, 0.2),
+    "bearing": (0.03,),
+    "range": (0.1,),
+}
+LANDMARKS = np.array([[4.0, 1.0], [-3.0, 2.0], [1.0, -5.0], [-6.0, -2.0], [3.0, 6.0]])
+ORACLES = {
+    "ekf": DenseEkf,
+    "invariant[iterations=1]": dense_family.DenseInvariant,
+    "invariant": dense_family.DenseAdaptiveInvariant,
+    "first_estimates": dense_family.DenseFirstEstimates,
+    "observability_constrained": dense_family.DenseConstrained,
+    "iterated": dense_family.DenseIterated,
+    "unscented": dense_family.DenseUnscented,
+}
+# a copy of the default sensor, for which kernels are made like for any other
+COPY = replace(BEARING_RANGE, name="copy")
+
+
+def reading(sensor, pose, landmarks, rng, noise=1.0):
+    z = sensor.predict(pose, landmarks).measurement
+    std = np.resize((*STD.get(sensor.name, (0.03, 0.1)), 0.0), 2)
+    return z + noise * rng.normal(size=z.shape) * std
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+def test_jacobians_equal_central_differences_in_1000_places(sensor):
+    rng = np.random.default_rng(1)
+    pose = np.array([1.0, -2.0, 2.5])
+    points = pose[:2] + rng.choice([-1, 1], (1000, 2)) * rng.uniform(0.3, 20, (1000, 2))
+    found, at = sensor.predict(pose, points), sensor.predict(pose, points).measurement
+    numeric = numeric_jacobian(
+        lambda p: sensor.difference(sensor.predict(p, points).measurement, at), pose
+    )
+    np.testing.assert_allclose(found.jacobian_pose, numeric, atol=1e-7)
+    for axis in (0, 1):
+        shift = 1e-6 * np.eye(2)[axis]
+        ahead, behind = sensor.predict(pose, points + shift), points - shift
+        apart = sensor.difference(
+            ahead.measurement, sensor.predict(pose, behind).measurement
+        )
+        numeric = apart / 2e-6
+        np.testing.assert_allclose(
+            found.jacobian_landmark[:, :, axis], numeric, atol=1e-7
+        )
+
+
+@pytest.mark.parametrize("sensor", [*SENSORS.values(), COPY], ids=lambda s: s.name)
+def test_the_compiled_parts_equal_the_jacobians(sensor):
+    rng, parts = np.random.default_rng(2), kernel_parts(sensor)
+    expected = parts[bearing_range.expected_reading_jit]
+    slopes = parts[bearing_range.pose_slopes_jit]
+    for _ in range(100):
+        pose, point = rng.normal(size=3) * 3, rng.normal(size=2) * 9
+        dx, dy = (point - pose[:2]).tolist()
+        slow = sensor.predict(pose, point[None])
+        fast = np.array(expected(dx, dy, pose[2]))
+        np.testing.assert_allclose(
+            sensor.difference(fast, slow.measurement[0]), 0, atol=1e-12
+        )
+        ax, ay, bx, by, a_turn, b_turn = slopes(dx, dy, pose[2])
+        Hl = slow.jacobian_landmark[0]
+        np.testing.assert_allclose([[ax, ay], [bx, by]], Hl, atol=1e-12)
+        turned = slow.jacobian_pose[0, :, 2]
+        np.testing.assert_allclose([a_turn, b_turn], turned, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "sensor", [BEARING_RANGE, POSITION, COPY], ids=lambda s: s.name
+)
+def test_one_reading_places_a_landmark(sensor):
+    rng = np.random.default_rng(3)
+    placed = kernel_parts(sensor)[bearing_range.placed_jit]
+    pose, variances = np.array([1.0, -2.0, 2.5]), (0.3, 0.7)
+    for point in rng.normal(size=(20, 2)) * 9:
+        z = sensor.predict(pose, point[None]).measurement
+        slow = sensor.locate(pose, z)
+        np.testing.assert_allclose(slow.position[0], point, atol=1e-12)
+        numeric = numeric_jacobian(lambda p, z=z: sensor.locate(p, z).position, pose)
+        np.testing.assert_allclose(slow.jacobian_pose, numeric, atol=1e-7)
+        x, y, tx, ty, xx, more_xx, xy, yy, more_yy = placed(
+            tuple(pose), *z[0], *variances
+        )
+        np.testing.assert_allclose([x, y], point, atol=1e-12)
+        np.testing.assert_allclose([tx, ty], slow.jacobian_pose[0, :, 2], atol=1e-12)
+        Fz = slow.jacobian_measurement[0]
+        noise = Fz @ np.diag(variances) @ Fz.T
+        found = [[xx + more_xx, xy], [xy, yy + more_yy]]
+        np.testing.assert_allclose(found, noise, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("sensor", SENSORS.values(), ids=SENSORS)
+@pytest.mark.parametrize("label", ORACLES)
+def test_every_filter_equals_the_dense_oracle(label, sensor):
+    """Begin with four mapped landmarks, so that no reading has to place one."""
+    rng = np.random.default_rng(4)
+    std = STD.get(sensor.name, STD["bearing_range"])
+    start = make_estimator(
+        label,
+        motion_std=MOTION,
+        measurement_std=(0.03, 0.1),
+        initial_pose_std=(0.1, 0.1, 0.1),
+    )
+    start.update(reading(BEARING_RANGE, np.zeros(3), LANDMARKS[:4], rng), range(4))
+    slam = make_estimator(label, motion_std=MOTION, measurement_std=std, sensor=sensor)
+    slam.load_state_dict(start.state_dict())
+    slow = ORACLES[label](MOTION, std)
+    slow.sensor, slow.ids = sensor, [0, 1, 2, 3]
+    slow.mean, slow.P = start.map.mean[:11].copy(), start.map.covariance[:11, :11]
+    slow.fixed = start.map.reference[:11].copy()
+    is_invariant = isinstance(slow, dense_family.DenseInvariant)
+    if is_invariant:
+        slow.P = slow.to_invariant() @ slow.P @ slow.to_invariant().T
+    pose, seen = np.zeros(3), 4
+    for step in range(8):
+        u = np.array([0.4, 0.5])
+        pose = pose + [u[0] * np.cos(pose[2]), u[0] * np.sin(pose[2]), u[1]]
+        for each in (slam, slow):
+            each.predict(u + 0.01)
+        if sensor.places and step == 4:
+            seen = 5
+        z = reading(sensor, pose, LANDMARKS[:seen], rng)
+        report = slam.update(z, range(seen))
+        nis = slow.update(z, list(range(seen)))
+        assert report.nis == pytest.approx(nis, rel=1e-7)
+        used = min(seen, 4) if step == 4 else seen
+        assert report.degrees_of_freedom == used * sensor.size
+    n = len(slow.mean)
+    np.testing.assert_allclose(slam.map.mean[:n], slow.mean, atol=1e-9)
+    P = slow.covariance if is_invariant else slow.P
+    np.testing.assert_allclose(slam.map.covariance[:n, :n], P, atol=1e-10)
+
+
+@pytest.mark.parametrize("label", ["ekf", "invariant", "robocentric", "submaps"])
+def test_a_copy_of_the_default_sensor_gives_the_same_belief(label):
+    rng = np.random.default_rng(5)
+    noise = {"motion_std": MOTION, "measurement_std": (0.03, 0.1), "min_range": 0.5}
+    noise |= {"range_std_per_metre": 0.02, "bearing_std_metres": 0.1}
+    both = [make_estimator(label, **noise, sensor=s) for s in (BEARING_RANGE, COPY)]
+    for _ in range(6):
+        z = reading(BEARING_RANGE, np.zeros(3), LANDMARKS, rng)
+        for slam in both:
+            slam.predict((0.1, 0.05))
+            slam.update(z, range(5))
+    one, other = (slam.belief() for slam in both)
+    np.testing.assert_allclose(one.mean, other.mean, atol=1e-11)
+    np.testing.assert_allclose(one.covariance, other.covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize("label", ["compressed", "submaps", "robocentric"])
+def test_filters_of_large_maps_take_positions(label):
+    rng, pose = np.random.default_rng(6), np.zeros(3)
+    slam, ekf = (
+        make_estimator(
+            name, motion_std=MOTION, measurement_std=(0.1, 0.2), sensor="position"
+        )
+        for name in (label, "ekf")
+    )
+    for _ in range(10):
+        pose = pose + [0.2 * np.cos(pose[2]), 0.2 * np.sin(pose[2]), 0.1]
+        z = reading(POSITION, pose, LANDMARKS, rng)
+        for each in (slam, ekf):
+            each.predict((0.2, 0.1))
+            each.update(z, range(5))
+    error = slam.belief().mean - ekf.belief().mean
+    tolerance = 1e-10 if label == "compressed" else 0.1  # others linearise elsewhere
+    assert np.abs(error).max() < tolerance
+
+
+def test_a_batch_has_the_bits_of_single_filters():
+    rng = np.random.default_rng(7)
+    noise = {"motion_std": MOTION, "measurement_std": (0.1, 0.2), "sensor": "position"}
+    batch = make_batch("invariant", runs=2, landmarks=5, **noise)
+    u = rng.normal(size=(2, 6, 2)) * 0.3
+    z = LANDMARKS + rng.normal(size=(2, 6, 5, 2)) * 0.1
+    visible = rng.random((2, 6, 5)) < 0.7
+    trace = batch.run(u, z, visible)
+    for run in (0, 1):
+        slam = make_estimator("invariant", **noise)
+        for t in range(6):
+            slam.predict(u[run, t])
+            seen = np.flatnonzero(visible[run, t])
+            report = slam.update(z[run, t, seen], seen)
+            assert trace.degrees_of_freedom[run, t] == report.degrees_of_freedom
+        np.testing.assert_array_equal(batch.belief(run).mean, slam.belief().mean)
+        covariance = slam.belief().covariance
+        np.testing.assert_array_equal(batch.belief(run).covariance, covariance)
+
+
+def test_imagined_plans_expect_the_readings_of_the_sensor():
+    slam = make_estimator(
+        "ekf", motion_std=MOTION, measurement_std=(0.1, 0.2), sensor="position"
+    )
+    slam.update(LANDMARKS, range(5))
+    world = type("World", (), {"min_range": 0.1, "max_range": 99.0, "dropout": 0.0})
+    world.field_of_view, world.occlusion = 7.0, False
+    imagined = imagine(slam, [[(0.3, 0.1)] * 3], world)
+    for _ in range(3):
+        slam.predict((0.3, 0.1))
+        belief = slam.belief()
+        slam.update(
+            POSITION.predict(belief.pose, belief.landmarks).measurement, range(5)
+        )
+    np.testing.assert_allclose(
+        imagined.pose_covariances[0, 0, -1], slam.belief().pose_covariance, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("sensor", [BEARING, RANGE], ids=lambda s: s.name)
+def test_the_void_number_changes_nothing(sensor):
+    """Whatever stands in it, and in one column or two."""
+    start = make_estimator("ekf", motion_std=MOTION, measurement_std=(0.03, 0.1))
+    start.update([(0.3, 4.0), (-2.0, 3.0)], [0, 1])
+    beliefs = []
+    for second in (0.0, 5.0, None):
+        slam = make_estimator(
+            "ekf", motion_std=MOTION, measurement_std=(0.1, 3.0), sensor=sensor
+        )
+        slam.load_state_dict(start.state_dict())
+        slam.predict((0.3, 0.2))
+        z = sensor.predict(np.zeros(3), np.array([[4.0, 1.0], [-1.0, -3.0]]))
+        z = z.measurement + 0.05
+        z = z[:, :1] if second is None else np.column_stack([z[:, 0], [second] * 2])
+        report = slam.update(z, [0, 1])
+        assert (report.innovation[:, 1] == 0).all()
+        beliefs.append(slam.belief())
+    for belief in beliefs[1:]:
+        np.testing.assert_array_equal(belief.mean, beliefs[0].mean)
+        np.testing.assert_array_equal(belief.covariance, beliefs[0].covariance)
+
+
+def test_bearings_are_wrapped_behind_the_robot():
+    start = make_estimator("ekf", motion_std=MOTION, measurement_std=(0.03, 0.1))
+    start.update([(np.pi - 0.001, 4.0)], [0])
+    for label in ("ekf", "unscented"):
+        slam = make_estimator(
+            label, motion_std=MOTION, measurement_std=(0.1,), sensor="bearing"
+        )
+        state = start.state_dict() | {"estimator": np.array(type(slam).__name__)}
+        slam.load_state_dict(state)
+        report = slam.update([(-np.pi + 0.001,)], [0])
+        assert report.innovation[0, 0] == pytest.approx(0.002, abs=1e-4)
+
+
+def test_the_gate_of_one_number_rejects_its_share():
+    rng, rejected = np.random.default_rng(8), 0
+    start = make_estimator("ekf", motion_std=MOTION, measurement_std=(1e-6, 1e-6))
+    start.update([(0.0, 4.0)], [0])
+    slam = make_estimator(
+        "ekf",
+        motion_std=MOTION,
+        measurement_std=(0.1,),
+        sensor="range",
+        gate_probability=0.9,
+    )
+    for _ in range(500):
+        slam.load_state_dict(start.state_dict())
+        rejected += len(slam.update([(4.0 + 0.1 * rng.normal(),)], [0]).rejected_ids)
+    assert 25 <= rejected <= 80  # 50 expected, σ = 6.7
+
+
+def test_a_registered_sensor_is_itself_after_pickling():
+    for sensor in SENSORS.values():
+        assert pickle.loads(pickle.dumps(sensor)) is sensor
+    slam = make_estimator(
+        "ekf", motion_std=MOTION, measurement_std=(0.1, 0.1), sensor="position"
+    )
+    slam.update(LANDMARKS, range(5))
+    copy = pickle.loads(pickle.dumps(slam))
+    for each in (slam, copy):
+        each.update(LANDMARKS + 0.1, range(5))
+    np.testing.assert_array_equal(copy.belief().mean, slam.belief().mean)
+
+
+def test_sensors_are_found_by_name_and_by_path():
+    path = "slamgym.estimator.models.sensors:POSITION"
+    assert find_sensor("position") is find_sensor(path) is find_sensor(POSITION)
+    with pytest.raises(ValueError, match="unknown sensor 'postion'; did you mean 'pos"):
+        find_sensor("postion")
+    with pytest.raises(ValueError, match="cannot import sensor 'nowhere:X', ModuleNot"):
+        find_sensor("nowhere:X")
+
+
+NOISE = {"motion_std": MOTION, "measurement_std": (0.1, 0.1)}
+
+
+@pytest.mark.parametrize("name", ["ideal"])
+def test_parts_without_sensors_refuse_them_in_a_sentence(name):
+    with pytest.raises(ValueError, match="takes bearing_range readings only"):
+        make_estimator(name, **NOISE, sensor="position")
+    with pytest.raises(ValueError, match="data association takes bearing_range"):
+        make_estimator("ekf", **NOISE, sensor="position", management=True)
+
+
+@pytest.mark.parametrize("name", ["robocentric", "compressed", "submaps"])
+def test_filters_that_do_not_wait_refuse_a_sensor_that_makes_them(name):
+    with pytest.raises(ValueError, match="place a landmark one by one, got sensor 'ra"):
+        make_estimator(name, **NOISE, sensor="range")
+    with pytest.raises(ValueError, match="a batch needs readings that place"):
+        make_batch("ekf", runs=1, landmarks=1, **NOISE, sensor="bearing")
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"range_noise_at": "reading"}, "must be 'expected': sensor 'range' reads no"),
+        ({"measurement_std": (0.1, 0.1, 0.1)}, "measurement_std must be 2 finite"),
+    ],
+)
+def test_noise_that_a_sensor_does_not_have_is_refused(option, message):
+    with pytest.raises(ValueError, match=message):
+        make_estimator("ekf", **(NOISE | option), sensor="range")
+    with pytest.raises(ValueError, match="of sensor 'position' is the same at every"):
+        make_estimator("ekf", **NOISE, sensor="position", range_std_per_metre=0.1)
+
+
+@pytest.mark.parametrize("sensor", [*SENSORS.values(), COPY], ids=lambda s: s.name)
+def test_the_shipped_sensors_pass_the_check(sensor):
+    check_sensor(sensor)
+
+
+def wrong_slope(x, y):
+    z, (ax, ay, bx, by) = read_bearing_range(x, y)
+    return z, (ax, ay, bx, -by)
+
+
+def void_slope(x, y):
+    z, (ax, ay, _, _) = read_bearing_range(x, y)
+    return (z[0], 0.0), (ax, ay, 1.0, 0.0)
+
+
+def mirrored(bearing, distance):
+    return distance * np.cos(bearing), -distance * np.sin(bearing)
+
+
+def negative_std(noise, distance):
+    return noise[0], noise[1] - distance
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"h": wrong_slope}, "∂range/∂y at .* but h returns"),
+        ({"inverse": mirrored}, "inverse of the reading of"),
+        ({"angles": ()}, "bearing jumps by 2π around the robot: declare it"),
+        ({"angles": (True,)}, "angles must have one entry for each column"),
+        ({"std": negative_std}, "std at .* m must be two finite numbers > 0"),
+        ({"units": ("rad",)}, "columns and units must name the same"),
+    ],
+)
+def test_check_sensor_names_what_is_wrong(change, message):
+    with pytest.raises(SensorContractError, match=message):
+        check_sensor(replace(COPY, **change))
+
+
+def test_check_sensor_refuses_slopes_of_the_void_number():
+    single = Sensor("odd", ("bearing",), ("rad",), void_slope, angles=(True,))
+    with pytest.raises(SensorContractError, match="∂the void number/∂x"):
+        check_sensor(single)
+    with pytest.raises(SensorContractError, match="inverse must be None"):
+        check_sensor(replace(BEARING, inverse=mirrored))
