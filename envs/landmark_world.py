@@ -13,12 +13,12 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
-from ..arrays import AnyArray, Array, ComplexArray, ImageArray
+from ..arrays import AnyArray, Array, ComplexArray, ImageArray, WordArray
 from ..restorable import Restorable, State
 from ..sim_configs import Scenario, load_scenario
 from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
-from .noise_streams import NoiseRows, WorldNoise
+from .noise_streams import NoiseRows, PoseSensors, WorldNoise
 from .rendering.episode_renderer import EpisodeRenderer
 from .rendering.render_state import RENDER_MODES, BeliefLike
 from .robot import OdometrySensor, UnicycleBody
@@ -101,7 +101,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
     _changing: ClassVar[tuple[str, ...]] = (
         *("_np_random", "_np_random_seed", "_drawn_scenario", "_sensor", "_starts"),
         *("_noise", "_landmarks", "_body", "_start_estimate", "_motion_noise"),
-        *("_sensor_noise", "_steps_left", "_renderer"),
+        *("_sensor_noise", "_steps_left", "_renderer", "_key"),
     )
     _spec: EnvSpec | None = None
 
@@ -124,6 +124,8 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self._drive = drive_of(robot)
         self._body = UnicycleBody(robot.radius, self.scenario.walls, self._drive)
         self._odometer = OdometrySensor(self.scenario)
+        self._pose_sensors = PoseSensors(self.scenario)
+        self._key: WordArray = np.zeros((1, 2), dtype=np.uint64)
         self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
         self._adopt(self.scenario)
@@ -160,7 +162,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         if options:
             raise ValueError(f"options must be empty, got {options!r}")
         super().reset(seed=seed)
-        key = episode_keys([self.np_random])
+        self._key = key = episode_keys([self.np_random])
         has_ranges = self.scenario.randomise is not None
         if has_ranges:
             self._adopt(drawn_scenarios(self.scenario, key)[0])
@@ -199,8 +201,8 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         slip, error = self._odometer.split_noise(command, next(self._motion_noise))
         share = self._body.drive(command, slip)
         odometry = self._odometer.read(command, share, error)
-        observation, info = self._observe(odometry, collision=share < 1.0)
         self._steps_left -= 1
+        observation, info = self._observe(odometry, collision=share < 1.0)
         return observation, 0.0, False, self._steps_left <= 0, info
 
     def state(self) -> State:
@@ -292,6 +294,10 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
             readings, mask, info["landmark_ids"] = hide_identities(
                 readings, mask, noise
             )
+        if self._pose_sensors.present:
+            step = np.array([self.scenario.steps - self._steps_left])
+            at = self._pose_sensors.read(self._key, step, body.pose[None])[0]
+            info |= self._pose_sensors.by_name(at)
         measurements = readings.T
         if self._renderer is not None:
             ids = info.get("landmark_ids")

@@ -226,6 +226,50 @@ class WorldNoise:
         return cast("Iterable[SensorNoise]", zip(*rows, strict=True))
 
 
+class PoseSensors:
+    """The compass and the GPS of a scenario.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Source of their noise and their rates.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        gps, compass = scenario.gps, scenario.compass
+        sensors = gps, gps, compass
+        self.present = gps is not None or compass is not None
+        self.std = np.array([0.0 if each is None else each.std for each in sensors])
+        """(σx, σy, σθ) [m, m, rad]; 0 where there is no sensor."""
+        self._every = np.array([0 if each is None else each.every for each in sensors])
+
+    def read(self, keys: WordArray, steps: IntArray, poses: Array) -> Array:
+        """Return readings (x, y, θ), shape (K, 3), nan where there is none.
+
+        Parameters
+        ----------
+        keys : uint64 ndarray, shape (K, 2)
+            Of the episodes.
+        steps : int64 ndarray, shape (K,)
+        poses : ndarray, shape (K, 3)
+            True poses [m, m, rad].
+        """
+        unit = np.empty((len(steps), 3))
+        streams.draw_normals(keys, steps, streams.POSE, unit[None])
+        readings = poses + unit * self.std
+        readings[:, 2] = (readings[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        is_due = (self._every > 0) & (steps[:, None] % np.maximum(self._every, 1) == 0)
+        return np.where(is_due, readings, np.nan)
+
+    def by_name(self, readings: Array) -> dict[str, Array]:
+        """Return readings (…, 3) as ``gps`` (…, 2) and ``compass`` (…), if present."""
+        found = {"gps": readings[..., :2], "compass": readings[..., 2]}
+        here = self.std[[0, 2]] > 0
+        return {
+            k: v for (k, v), is_here in zip(found.items(), here, strict=True) if is_here
+        }
+
+
 def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array | None:
     """Draw uniform numbers, shape (K, width), or None for no width."""
     if not width:

@@ -20,6 +20,7 @@ from ..sim_configs.scenario_files import copied_draw
 
 # the independent streams of an episode: plain integers, which numba takes quickly
 START, MAP, MOTION, MEASUREMENT, DROPOUT, CLUTTER, ORDER, DRAWN = range(8)
+POSE = 8
 
 
 def episode_keys(generators: Sequence[np.random.Generator]) -> WordArray:

@@ -35,11 +35,14 @@ __all__ = [
     "SupportsJoin",
     "SupportsLocalView",
     "SupportsMemoryEstimate",
+    "SupportsPoses",
     "SupportsSmoothing",
     "SupportsTruth",
     "UpdateReport",
     "optional_members",
     "restore",
+    "taking_poses",
+    "with_fix",
 ]
 
 
@@ -87,6 +90,33 @@ class SupportsTruth(Protocol):
         self, pose: ArrayLike, landmarks: Mapping[int, ArrayLike]
     ) -> None:
         """Pass the true pose (3,) and landmarks before the predict of a step."""
+
+
+@runtime_checkable
+class SupportsPoses(Protocol):
+    """An estimator that takes readings of the pose, such as compass or GPS."""
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Take in z = H (x, y, θ) + w, w of covariance R, from z, H and R."""
+        ...
+
+
+def taking_poses(estimator: object) -> SupportsPoses:
+    """Return an estimator that takes readings of the pose; refuse any other."""
+    if not isinstance(estimator, SupportsPoses):
+        name = type(estimator).__name__
+        raise ValueError(f"{name} does not take readings of the pose")
+    return estimator
+
+
+def with_fix(report: UpdateReport, fix: UpdateReport) -> UpdateReport:
+    """Return the report of a scan with the NIS of a reading of the pose after it."""
+    return report.replace(
+        nis=report.nis + fix.nis,
+        degrees_of_freedom=report.degrees_of_freedom + fix.degrees_of_freedom,
+    )
 
 
 @runtime_checkable

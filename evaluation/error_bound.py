@@ -64,6 +64,7 @@ def posterior_bound(
     measurement_std: ArrayLike,
     start_std: ArrayLike,
     range_std_per_metre: float = 0.0,
+    pose_std: ArrayLike = (np.inf, np.inf, np.inf),
     sensor: str = "bearing_range",
 ) -> PosteriorBound:
     """Return the bound of many runs, each along its own true path.
@@ -84,6 +85,9 @@ def posterior_bound(
         (σβ, σr) [rad, m].
     range_std_per_metre : float
         Part of σr that grows with the range.
+    pose_std : array_like, shape (3,), (T, 3) or (B, T, 3)
+        Of readings of (x, y, θ) after each scan [m, m, rad]; infinite where there is
+        none.
     sensor : str
         ``"bearing_range"``, or ``"position"`` with `measurement_std` (σx, σy) [m].  The
         bound of other sensors is nan: their first reading of a landmark is no bound.
@@ -112,11 +116,12 @@ def posterior_bound(
     motion = check("motion_std", motion_std, 3) ** 2
     start = check("start_std", start_std, 3)
     durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps)).copy()
+    fixes = np.broadcast_to(np.square(pose_std), (count, steps, 3)).astype(np.float64)
     position, heading, raw = (np.full((count, steps), np.nan) for _ in range(3))
     if sensor not in ("bearing_range", "position"):
         return PosteriorBound(position, heading, raw, np.full(count, np.nan), ())
     starts = _invariant_start(poses[:, :1], start)
-    runs = zip(poses, places, seen, durations, strict=True)
+    runs = zip(poses, places, seen, durations, fixes, strict=True)
     rows = zip(position, heading, raw, strict=True)
     covariances = tuple(
         _of_one_run(run, (motion, noise), start, out)
@@ -183,7 +188,7 @@ def _invariant_start(first: Array, std: Array) -> Array:
 
 
 def _of_one_run(
-    run: tuple[Array, Array, BoolArray, Array],
+    run: tuple[Array, Array, BoolArray, Array, Array],
     noise: tuple[Array, Array],
     start: Array,
     out: tuple[Array, Array, Array],
@@ -193,7 +198,7 @@ def _of_one_run(
     Landmarks enter in the order in which they are read, so that those still unread
     cost nothing.
     """
-    poses, landmarks, visible, dt = run
+    poses, landmarks, visible, dt, fixes = run
     rows = np.flatnonzero(visible.any(axis=0))
     rows = rows[np.argsort(visible[:, rows].argmax(axis=0), kind="stable")]
     P = np.zeros((3 + 2 * len(rows), 3 + 2 * len(rows)))
@@ -205,6 +210,7 @@ def _of_one_run(
         visible[:, rows],
         np.argsort(rows),  # the order within a scan
         dt,
+        fixes,
         *noise,
         np.empty((2, 2 * most, len(P))),
         P,
@@ -234,6 +240,7 @@ def _follow(
     visible: BoolArray,
     by_row: IntArray,
     dt: Array,
+    fixes: Array,
     motion: Array,
     noise: Array,
     pending: Array,
@@ -275,6 +282,8 @@ def _follow(
                 size += 2
                 _add(P, c, size, rx, ry, across * distance * distance, along)
         _subtract(P, size, pending, count)
+        for axis, lever in enumerate((-y, x, 1.0)):
+            _fix(P, size, axis, lever, fixes[t, axis])
         out[0][t], out[1][t] = P[0, 0] + P[1, 1], P[2, 2]
         lever = 2 * (x * P[1, 2] - y * P[0, 2]) + (x * x + y * y) * P[2, 2]
         out[2][t] = out[0][t] + lever
@@ -306,6 +315,22 @@ def _move(
         turned, row = turn[i] * variance[2], P[i]
         for j in range(size):
             row[j] += turned * turn[j]
+
+
+@njit_internal
+def _fix(P: Array, size: int, axis: int, lever: float, variance: float) -> None:
+    """Take in a reading of x, y or θ: of ξ along the axis, and `lever` times ξ_θ."""
+    if variance == np.inf:
+        return
+    row = lever * P[2, :size]
+    if axis < 2:
+        row += P[axis, :size]
+    total = lever * row[2] + variance
+    if axis < 2:
+        total += row[axis]
+    for i in range(size):
+        for j in range(size):
+            P[i, j] -= row[i] * row[j] / total
 
 
 @njit_internal

@@ -194,6 +194,23 @@ class Sensor(Part):
             )
 
 
+_Every = Annotated[Integer, Field(ge=1), expect("an integer >= 1")]
+
+
+class Compass(Part):
+    """A sensor of the heading, beside that of the landmarks."""
+
+    std: Positive = Field(description="σθ of one reading [rad]")
+    every: _Every = setting(1, "steps from one reading to the next, from step 0 on")
+
+
+class Gps(Part):
+    """A sensor of the position, beside that of the landmarks."""
+
+    std: Positive = Field(description="σ of one reading, along x and along y [m]")
+    every: _Every = setting(1, "steps from one reading to the next, from step 0 on")
+
+
 class Start(Part):
     """The start pose of the robot and its uncertainty.
 
@@ -348,6 +365,8 @@ class Scenario(Part):
     robot: Robot = setting(Robot(), "body and limits of the robot")
     motion: Motion = Field(description="noise of the motion")
     sensor: Sensor = Field(description="sensor of the landmarks")
+    compass: Compass | None = setting(None, "sensor of the heading")
+    gps: Gps | None = setting(None, "sensor of the position")
     landmarks: LandmarkLayout = Field(description="positions of the landmarks")
     walls: tuple[Wall, ...] = setting((), "(x0, y0, x1, y1) of each [m]")
     controls: ControlSequence = setting(

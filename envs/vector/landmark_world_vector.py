@@ -341,6 +341,8 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         infos: Infos = {"pose": worlds.poses, "collision": worlds.collisions}
         if worlds.landmark_ids is not None:
             infos["landmark_ids"] = worlds.landmark_ids
+        if worlds.pose_readings is not None:
+            infos |= worlds.pose_sensors.by_name(worlds.pose_readings)
         return infos
 
     def _begun_worlds(self) -> WorldBatch:

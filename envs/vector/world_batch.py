@@ -27,7 +27,7 @@ from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import widest_scenario
 from ..bearing_range import BearingRangeSensor, hide_identities
 from ..drives import drive_of
-from ..noise_streams import SensorSettings, WorldNoise
+from ..noise_streams import PoseSensors, SensorSettings, WorldNoise
 from ..robot import UnicycleBodies, VectorOdometrySensor
 from ..spaces import clipped_actions, count_rows
 from ..streams import EpisodeStarts, drawn_scenarios, episode_keys
@@ -65,6 +65,8 @@ class WorldBatch(Restorable):
         True (x, y, θ) [m, m, rad], θ not wrapped.
     collisions : bool ndarray, shape (B,)
         Whether a wall stopped the robot.
+    pose_readings : ndarray, shape (B, 3), or None without compass and GPS
+        Readings of (x, y, θ) [m, m, rad], nan where there is none.
     landmark_ids : int64 ndarray, shape (B, M), or None with identities
         The true landmark of each row, -1 for clutter and empty rows.
     begun : bool
@@ -89,6 +91,7 @@ class WorldBatch(Restorable):
 
     _changing = (
         *("measurements", "mask", "odometry", "poses", "collisions", "landmark_ids"),
+        "pose_readings",
         *("_drawn", "_keys", "_steps", "_bodies", "_start_estimates", "_landmarks"),
     )
 
@@ -104,6 +107,8 @@ class WorldBatch(Restorable):
             self._drawn = DrawnWorlds(scenario, count, drawn)
         self._starts, widest = EpisodeStarts(scenario), widest_scenario(scenario)
         self._noise = WorldNoise(widest)
+        self.pose_sensors = PoseSensors(scenario)
+        self.pose_readings: Array | None = None
         self._keys = np.zeros((count, 2), dtype=np.uint64)
         self._steps = np.zeros(count, dtype=np.int64)
         self._sensor = BearingRangeSensor(widest)
@@ -176,6 +181,13 @@ class WorldBatch(Restorable):
         chosen = self._chosen(worlds)
         self._begin(chosen, generators)
         self._measure_some(chosen)
+        self._read_poses()
+
+    def _read_poses(self) -> None:
+        """Read compass and GPS; worlds that did not move read the same again."""
+        if self.pose_sensors.present:
+            at = self._keys, self._steps, self.poses
+            self.pose_readings = self.pose_sensors.read(*at)
 
     def _begin(self, chosen: IndexArray, generators: Generators) -> None:
         """Start an episode in some worlds, without a scan."""
@@ -240,6 +252,7 @@ class WorldBatch(Restorable):
         if moving is not None and generators is not None:
             self._begin(np.flatnonzero(~moving), generators)
         self.measurements, self.mask, self.landmark_ids = self._scan_all()
+        self._read_poses()
 
     def _truth_values(self, value: BoolArray, name: str) -> BoolArray:
         array = np.asarray(value)

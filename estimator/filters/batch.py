@@ -30,7 +30,8 @@ from ..models.rigid_motion import ErrorFrame
 from ..models.sensors import for_sensor, only_placing
 from ..support import argument_checks, saved_states
 from ..support.memory_limit import aligned_zeros, share_out, usable_cores
-from .ekf import FRAMES, EkfSlam
+from .conditioning import FRAMES, ObservedMap, PoseReading, gate_of
+from .ekf import EkfSlam
 from .gaussian_map import GaussianMap, workspace_for
 
 
@@ -170,7 +171,8 @@ class BatchOfBeliefs(Restorable):
 class BatchSlam(BatchOfBeliefs):
     """B runs of one filter, each with its own data, visibility and map.
 
-    Run i has the same bits as a single filter with the data of run i.  Landmark ids
+    Run i has the same bits as a single filter with the data of run i, up to rounding
+    of readings of the pose.  Landmark ids
     are the rows 0 … L−1 of the measurement arrays.  The runs are distributed over
     threads.  A run fails if its data is not finite or exceeds 1e12, or if its
     innovation covariance is not positive definite.  It is nan from this step on, and
@@ -304,6 +306,61 @@ class BatchSlam(BatchOfBeliefs):
         scans = self.motion.displacements(moved), *rest
         drive = partial(self._step, scans, chosen_runs(runs, self.runs))
         share_out(drive, self.runs, self._threads)
+
+    def observe_pose(
+        self,
+        readings: ArrayLike,
+        matrix: ArrayLike,
+        covariance: ArrayLike,
+        *,
+        runs: ArrayLike | None = None,
+    ) -> tuple[Array, IntArray]:
+        """Correct the beliefs with a reading of each pose, such as compass or GPS.
+
+        Parameters
+        ----------
+        readings : array_like, shape (B, k)
+            z of every run; those of runs that do not take part are not read.
+        matrix, covariance : array_like, shape (k, 3) and (k, k)
+            H and R, as of :meth:`EkfSlam.observe_pose`.
+        runs : array_like of bool, shape (B,), optional
+            The runs that take part; all by default, without those that have stopped.
+
+        Returns
+        -------
+        nis : ndarray, shape (B,)
+            νᵀ S⁻¹ ν, 0 for a run that has not used its reading.
+        degrees_of_freedom : ndarray, shape (B,)
+            k, or 0 for such a run.
+        """
+        chosen = chosen_runs(runs, self.runs) & (self.failed_at == NEVER)
+        z = np.array(readings, dtype=np.float64)
+        z[~chosen] = 0.0
+        given = PoseReading.checked(z, matrix, covariance, (self.runs,))
+        size, n, rows = (
+            len(given.matrix),
+            3 + 2 * self.landmarks,
+            np.flatnonzero(chosen),
+        )
+        found = given.of(rows).correct(
+            self._means[rows, :n],
+            self._covariances[rows, :n, :n],
+            frame=self._frame,
+            once=self.rules.iterations == 1,
+        )
+        used = found.nis <= gate_of(self.rules, size)
+        rows, found = rows[used], ObservedMap(*(part[used] for part in found))
+        self._means[rows, :n], self._covariances[rows, :n, :n] = found[:2]
+        nis, freedom = np.zeros(self.runs), np.zeros(self.runs, dtype=np.int64)
+        nis[rows], freedom[rows] = found.nis, size
+        return nis, freedom
+
+    def write_poses(self, trace: BatchTrace, step: int) -> None:
+        """Replace the poses of a step of a trace by the present ones."""
+        going = self.failed_at == NEVER
+        trace.poses[going, step] = self._means[going, :3]
+        trace.poses[going, step, 2] = wrap_angle(trace.poses[going, step, 2])
+        trace.pose_covariances[going, step] = self._covariances[going, :3, :3]
 
     def __repr__(self) -> str:
         few, most = self._mapped.min(), self._mapped.max()

@@ -58,8 +58,8 @@ from ..support.saved_states import (
     with_prefix,
     without_prefix,
 )
+from .conditioning import composed
 from .gaussian_map import GaussianMap
-from .landmark_merging import composed
 
 MOST_POSES = 40
 """Past poses kept; beyond it, the one nearest to the pose before it goes."""

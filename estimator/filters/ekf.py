@@ -33,7 +33,6 @@ from ..kernels.kalman_gain import (
 )
 from ..kernels.scan_update import DONE, NOT_USABLE
 from ..models.motions import UNICYCLE, Motion, MotionNoise
-from ..models.rigid_motion import ErrorFrame
 from ..models.sensors import (
     BEARING_RANGE,
     Sensor,
@@ -46,6 +45,7 @@ from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
 from ..support.saved_states import with_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
+from .conditioning import ObservesPoses
 from .delayed_landmarks import Waiting, collect, is_landmark, read_waiting
 from .gaussian_map import (
     MAP_STATE,
@@ -55,7 +55,7 @@ from .gaussian_map import (
 )
 
 
-class MapFilter:
+class MapFilter(ObservesPoses):
     """A filter without its steps: reset, belief, saved state, map editing."""
 
     map: GaussianMap
@@ -66,11 +66,6 @@ class MapFilter:
     """Readings that wait, of a sensor that does not place landmarks one by one."""
 
     __repr__ = describe_filter
-
-    @property
-    def frame(self) -> ErrorFrame:
-        """Coordinates in which the filter takes its error to be Gaussian."""
-        return FRAMES[self.rules.frame]
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map.
@@ -183,7 +178,7 @@ class MapFilter:
         checked = saved_states.read(state, MAP_STATE, of=name)
         if self.waiting is not None:
             checked |= read_waiting(state, checked["landmark_ids"])
-        self.restore(checked)
+        MapFilter.restore(self, checked)  # subclasses read what is theirs
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that this process has saved, without checks."""
@@ -584,9 +579,6 @@ class IteratedEkfSlam(EkfSlam):
         super().__init__(motion_std, measurement_std, **settings)
         count = argument_checks.whole("iterations", iterations, 1)
         self._adopt(self.rules._replace(iterations=count))
-
-
-FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 
 
 # --------------------------------------------------------------------------------------

@@ -49,7 +49,7 @@ from ..models.rigid_motion import ErrorFrame
 from ..support.memory_limit import aligned_zeros, landmarks_that_fit
 from ..support.saved_states import COVARIANCE, IDS, NUMBERS, Table
 from ..support.undo import Undo
-from .landmark_merging import coincide
+from .conditioning import coincide
 
 set_attribute = object.__setattr__  # of frozen dataclasses
 FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for

@@ -17,6 +17,7 @@ from ..models.rigid_motion import as_covariance
 from ..models.sensors import only_placing
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
+from .conditioning import ObservedMap, PoseReading, observe
 from .ekf import EkfSlam
 
 # The state that the kernels see, in the robot's frame at the last scan: the motion
@@ -87,6 +88,17 @@ class RobocentricEkfSlam(EkfSlam):
         if len(given) and given.min() <= max(RESERVED):
             raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
         return super().update(readings, given)
+
+    def _observe(
+        self, given: PoseReading, mean: Array, covariance: Array
+    ) -> ObservedMap:
+        """Correct the state, a function of which is the pose in the world."""
+
+        def innovation(state: Array) -> Array:
+            return given.innovation(_in_world(state)[0][:3])
+
+        H = given.matrix @ _in_world(mean)[1][:3]
+        return observe(mean, covariance, H, given.covariance, innovation)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit in a filter of the same settings."""

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, BoolArray
 from ..association.scan_assignments import SAME
 from ..association.scan_association import ScanAssociation
+from ..filters.conditioning import PoseReading
 from ..interface import (
     Answer,
     Belief,
@@ -114,6 +115,13 @@ def _overlaps(views: Sequence[MapView]) -> BoolArray:
     apart = gap**2 / (4 * both)
     apart += np.log(both**2 / (4 * variance[:, None] * variance[None])) / 4
     return np.asarray((apart <= OVERLAP).all(axis=2))
+
+
+def cost_of(report: UpdateReport) -> float:
+    """Return νᵀ S⁻¹ ν + ln |S| of a reading, or SPREAD if it was rejected."""
+    if not report.degrees_of_freedom:
+        return SPREAD
+    return report.nis + 2 * float(np.log(report.innovation_factor.diagonal()).sum())
 
 
 def _the_plan(plan: ScanAssociation) -> ScanAssociation:
@@ -224,6 +232,35 @@ class HypothesisSlam:
             self.steps = steps
 
         self._carry_out(finish, slams)
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Correct every hypothesis with a reading of the pose.
+
+        Its cost, νᵀ S⁻¹ ν + ln |S|, is added to that of the hypothesis, unless the gate
+        of the best one rejects it.  Parameters and report as in `EkfSlam.observe_pose`.
+        """
+        given = PoseReading.checked(reading, matrix, covariance)
+        before, steps = self.hypotheses, self.steps + 1
+        slams = [h.slam for h in before]
+        begun = [slam.steps for slam in slams]
+
+        def finish() -> UpdateReport:
+            for slam, count in zip(slams, begun, strict=True):
+                if slam.steps == count:
+                    slam.observe_pose(*given)
+            reports = [slam.report() or UpdateReport() for slam in slams]
+            costs = [h.cost + cost_of(r) for h, r in zip(before, reports, strict=True)]
+            if not reports[0].degrees_of_freedom:
+                costs = [h.cost for h in before]
+            order = np.argsort(costs, kind="stable").tolist()
+            least = costs[order[0]]
+            self._keep([Hypothesis(costs[k] - least, slams[k]) for k in order])
+            self._report, self.steps = reports[order[0]], steps
+            return self._report
+
+        return self._carry_out(finish, slams)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None

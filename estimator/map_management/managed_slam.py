@@ -23,6 +23,7 @@ from ..association.scan_association import (
     Sensor,
     associate,
 )
+from ..filters.conditioning import PoseReading
 from ..interface import (
     Belief,
     MapView,
@@ -33,6 +34,7 @@ from ..interface import (
     bookmark,
     optional_members,
     restore,
+    taking_poses,
 )
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
@@ -205,6 +207,30 @@ class ManagedSlam:
             return self.as_given(readings, landmark_ids)
 
         return self.take(readings, associate)
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Correct the belief with a reading of the pose, as `EkfSlam.observe_pose`.
+
+        Raises
+        ------
+        ValueError
+            If an argument is malformed, or the filter does not take such readings;
+            all is then as before.
+        """
+        given = PoseReading.checked(reading, matrix, covariance)
+
+        def follow(report: UpdateReport) -> UpdateReport:
+            self._editor.expire()
+            self._recent.note_pose(given)
+            self._report = report
+            self.steps += 1
+            return report
+
+        step = partial(taking_poses(self._filter).observe_pose, *given)
+        undo = attributes(self, self._recent)
+        return advance(self._filter, step, follow, undo, lambda: undo)
 
     def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
         """Associate readings (m, 2) by their identities."""

@@ -25,9 +25,9 @@ from typing import Any
 
 import numpy as np
 
+from ..filters.conditioning import coincide
 from ..filters.ekf import EkfSlam
 from ..filters.gaussian_map import without_landmarks
-from ..filters.landmark_merging import coincide
 from ..interface import Belief, MapView, SlamEstimator, SupportsJoin, bookmark
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame

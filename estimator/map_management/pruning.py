@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Array, IntArray
 from ..association.scan_assignments import Noise
 from ..association.scan_association import ScanAssociation
-from ..filters.landmark_merging import separation
+from ..filters.conditioning import separation
 from ..interface import MapView
 from ..support import saved_states
 from ..support.undo import Undo, contents

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from ..association.scan_association import (
     NO_LABEL,
     ScanAssociation,
 )
+from ..filters.conditioning import PoseReading
 from ..interface import (
     ScanDecisions,
     SlamEstimator,
@@ -90,6 +92,11 @@ class RecentScans:
         """Remember a motion since the last scan."""
         if self._window:
             self.motions += ((distance, turn, dt),)
+
+    def note_pose(self, reading: PoseReading) -> None:
+        """Remember a reading of the pose since the last scan."""
+        if self._window:
+            self.motions += tuple(reading.rows())
 
     def note_edits(
         self, removed: Sequence[int], merged: Sequence[tuple[int, int]]
@@ -172,8 +179,7 @@ class RecentScans:
         reports = [scans[first].feed(self._slam)]
         for k in range(first + 1, len(scans)):
             scans[k - 1].edit(self._editor)
-            for distance, turn, dt in scans[k].motions:
-                self._slam.predict((distance, turn), dt)
+            move(self._slam, scans[k].motions)
             if scans[k].before is not None:
                 scans[k] = replace(scans[k], before=self._slam.state_dict())
             reports.append(scans[k].feed(self._slam))
@@ -296,7 +302,17 @@ WINDOW: saved_states.Table = {"motions": MOTIONS, "count": (saved_states.COUNTS,
 NO_LANDMARK = np.iinfo(np.int64).min
 
 Motion = tuple[float, float, float]
-"""(d, α) [m, rad] and dt."""
+"""(d, α) [m, rad] and dt; or one of the rows of a reading of the pose."""
+
+
+def move(slam: Any, motions: Sequence[Motion]) -> None:
+    """Feed a filter with odometry, and with the readings of the pose among it."""
+    rows = iter(motions)
+    for distance, turn, dt in rows:
+        if dt >= 0:
+            slam.predict((distance, turn), dt)
+        else:  # −k, of a reading of k components
+            slam.observe_pose(*PoseReading.of_rows([*islice(rows, int(1 - 2 * dt))]))
 
 
 @dataclass(frozen=True)
@@ -305,6 +321,7 @@ class RecentScan:
 
     number: int
     motions: tuple[Motion, ...]
+    """Odometry, and readings of the pose."""
     readings: Array
     """Rows (β, r), shape (m, 2)."""
     row_ids: tuple[int | None, ...]

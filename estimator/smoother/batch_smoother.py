@@ -235,6 +235,8 @@ class SmoothedDrive:
         self._motions, self._noise = tuple(drive.motions), drive.motion_noise
         self.readings = drive.readings
         """Number of readings of landmarks."""
+        self.pose_components = drive.pose_components
+        """Number of components of readings of the poses themselves."""
         self._slots = {i: slot for slot, i in enumerate(order)}
         self._all = estimate.landmarks
         self.landmarks = self._all[self._columns(self.landmark_ids)].reshape(-1, 2)
@@ -267,7 +269,7 @@ class SmoothedDrive:
 
         It is about 1 if the noise is as assumed, and the kernel not robust.
         """
-        freedom = 2 * self.readings - 2 * len(self.landmarks)
+        freedom = 2 * self.readings - 2 * len(self.landmarks) + self.pose_components
         return 2 * self.cost / freedom if freedom else float("nan")
 
     @property

@@ -6,12 +6,14 @@ A `Drive` is the input of the smoother, and `DriveArrays` is its form for kernel
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
+from ..filters.conditioning import PoseReading
 from ..filters.ekf import checked_rules
 from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE
 from ..kernels.prediction import predict
@@ -116,6 +118,7 @@ class Drive:
         self._motions: list[Motion] = [Motion((), np.zeros(3), np.zeros((3, 3)))]
         self._sightings: list[list[Sightings]] = [[]]
         self._pending: list[tuple[float, float, float]] = []
+        self._observed: dict[int, list[PoseReading]] = {}  # by the pose
 
     @property
     def poses(self) -> int:
@@ -172,6 +175,27 @@ class Drive:
         usable = readings[:, 1] >= self.rules.min_range
         chosen = np.array(ids, dtype=np.int64)[usable]
         self._sightings[-1].append(Sightings(readings[usable], chosen))
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> None:
+        """Add a reading z = H (x, y, θ) + w, w of covariance R, at the present pose.
+
+        Parameters as in :meth:`EkfSlam.observe_pose`.
+        """
+        given = PoseReading.checked(reading, matrix, covariance)
+        self.end_motion()
+        self._observed.setdefault(self.poses - 1, []).append(given)
+
+    def pose_readings(self, pose: int) -> list[PoseReading]:
+        """Return the readings of one pose itself, such as compass or GPS."""
+        return self._observed.get(pose, [])
+
+    @property
+    def pose_components(self) -> int:
+        """Number of components of all readings of the poses themselves."""
+        given = chain.from_iterable(self._observed.values())
+        return sum(len(reading.matrix) for reading in given)
 
     def end_motion(self) -> None:
         """Make the present position a pose of the drive, also without a scan."""
@@ -232,8 +256,22 @@ class Drive:
             np.concatenate([scan.measurements for scan in scans]),
             2 * slots,
             widths,
+            self._pose_arrays(),
         )
         return arrays, order
+
+    def _pose_arrays(self) -> PoseArrays:
+        """Return the readings of the poses, filled up to three components."""
+        owners = [k for k, given in self._observed.items() for _ in given]
+        readings = chain.from_iterable(self._observed.values())
+        values = np.zeros((len(owners), 3))
+        matrices, roots = np.zeros((2, len(owners), 3, 3))
+        for j, (z, H, R) in enumerate(readings):
+            size = len(H)
+            values[j, :size], matrices[j, :size] = z, H
+            roots[j, :size, :size] = np.linalg.inv(np.linalg.cholesky(R))
+        firsts = np.searchsorted(owners, np.arange(self.poses + 1))
+        return PoseArrays(firsts.astype(np.int64), values, matrices, roots)
 
     def _composed(self, steps: Sequence[tuple[float, float, float]]) -> Motion:
         """Compose readings of odometry as a filter predicts from a certain pose 0."""
@@ -263,6 +301,15 @@ class Drive:
 NEGLIGIBLE = 1e-12
 
 
+class PoseArrays(NamedTuple):
+    """K readings z = H x_k of the poses themselves, filled up with zeros."""
+
+    firsts: IntArray  # those of pose k are rows firsts[k] … firsts[k + 1], (N + 1,)
+    values: Array  # z, shape (K, 3)
+    matrices: Array  # H, shape (K, 3, 3)
+    whiteners: Array  # L⁻¹ with L Lᵀ = R, shape (K, 3, 3)
+
+
 class DriveArrays(NamedTuple):
     """N poses, M readings of n landmarks; entry 0 of the motions is the prior."""
 
@@ -277,6 +324,7 @@ class DriveArrays(NamedTuple):
     columns: IntArray
     # Columns of the landmarks that pose k or a later one reads, shape (N,).
     widths: IntArray
+    fixes: PoseArrays
 
 
 def noise_factors(covariances: Array) -> tuple[Array, Array]:

@@ -110,6 +110,8 @@ def eliminate(
         before = curvature[0, 0], curvature[1, 1], curvature[2, 2]
         for j in range(drive.firsts[k], drive.firsts[k + 1]):
             _absorb((k, j), poses, landmarks, drive, stds, robust, system, out)
+        for j in range(drive.fixes.firsts[k], drive.fixes.firsts[k + 1]):
+            _absorb_pose(poses[k], drive, j, robust, system, room[0])
         for i in range(3):
             curvature[i, i] += damping * (curvature[i, i] - before[i])
             out.slopes[k, i] = slope[i]
@@ -176,6 +178,27 @@ def _absorb(
     coupling[1, c + 1] -= yy
     coupling[2, c] -= b * bx
     coupling[2, c + 1] -= b * by
+
+
+@njit_internal
+def _absorb_pose(
+    pose: Array,
+    drive: DriveArrays,
+    j: int,
+    robust: tuple[float, float],
+    system: System,
+    slopes: Array,
+) -> None:
+    """Add reading j of a pose itself: Hᵀ R⁻¹ H and Hᵀ R⁻¹ ν, weighted likewise."""
+    white = pose_innovation(pose, drive, j)
+    squared = white[0] ** 2 + white[1] ** 2 + white[2] ** 2
+    weight = robust_weight(squared, robust[0], robust[1])
+    multiply(drive.fixes.whiteners[j], drive.fixes.matrices[j], slopes)
+    for i in range(3):
+        for c in range(3):
+            system.slope[c] += weight * slopes[i, c] * white[i]
+            for d in range(3):
+                system.curvature[c, d] += weight * slopes[i, c] * slopes[i, d]
 
 
 @njit_internal
@@ -459,6 +482,24 @@ def innovation(
     return wrap_angle_jit(z[0] - bearing), z[1] - distance
 
 
+@njit_internal
+def pose_innovation(pose: Array, drive: DriveArrays, j: int) -> tuple[float, ...]:
+    """Return L⁻¹ (z − H x) of reading j of a pose itself, angles wrapped."""
+    H, whitener = drive.fixes.matrices[j], drive.fixes.whiteners[j]
+    a, b, c = drive.fixes.values[j]
+    a -= H[0, 0] * pose[0] + H[0, 1] * pose[1] + H[0, 2] * pose[2]
+    b -= H[1, 0] * pose[0] + H[1, 1] * pose[1] + H[1, 2] * pose[2]
+    c -= H[2, 0] * pose[0] + H[2, 1] * pose[1] + H[2, 2] * pose[2]
+    a = a if H[0, 0] or H[0, 1] else wrap_angle_jit(a)
+    b = b if H[1, 0] or H[1, 1] else wrap_angle_jit(b)
+    c = c if H[2, 0] or H[2, 1] else wrap_angle_jit(c)
+    return (
+        whitener[0, 0] * a,
+        whitener[1, 0] * a + whitener[1, 1] * b,
+        whitener[2, 0] * a + whitener[2, 1] * b + whitener[2, 2] * c,
+    )
+
+
 @jit
 def total_cost(
     poses: Array,
@@ -480,6 +521,9 @@ def total_cost(
             bearing, distance = innovation(poses, landmarks, drive, k, j)
             squared = (bearing / stds[j, 0]) ** 2 + (distance / stds[j, 1]) ** 2
             total += robust_loss(squared, kind, scale)
+        for j in range(drive.fixes.firsts[k], drive.fixes.firsts[k + 1]):
+            a, b, c = pose_innovation(poses[k], drive, j)
+            total += robust_loss(a * a + b * b + c * c, kind, scale)
     return total
 
 

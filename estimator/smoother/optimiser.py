@@ -127,9 +127,11 @@ class Optimiser:
         """Largest cost that is plausible for a correct solution.
 
         Twice the cost of the correct solution is about χ², with two degrees of freedom
-        for each reading less two for each landmark.
+        for each reading less two for each landmark, and one for each component of a
+        reading of a pose.
         """
         freedom = 2 * len(self._drive.readings) - len(self._room.right)
+        freedom += int(self._drive.fixes.whiteners.any(axis=2).sum())
         return 0.6 * freedom + 6 * float(np.sqrt(freedom / 2)) + 1
 
     def minimise(self, start: Estimate, tolerance: float, most: int) -> Solution:
@@ -405,6 +407,8 @@ def filter_drive(
         for distance, turn, dt in motion.steps:
             slam.predict((distance, turn), dt)
         readings, ids = drive.sightings(k)
+        for given in drive.pose_readings(k):
+            slam.observe_pose(*given)
         slam.update(readings, ids)
         poses[k] = slam.map.mean[:3]
     return poses, slam.belief()

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..filters.conditioning import PoseReading
 from ..interface import (
     Belief,
     MapView,
@@ -17,6 +18,7 @@ from ..interface import (
     advance,
     bookmark,
     optional_members,
+    taking_poses,
 )
 from ..map_management.map_editor import MapEditor, mapped_ids, marginal, view_map
 from ..models.motions import UNICYCLE, Motion
@@ -111,6 +113,22 @@ class RecordedSlam:
         step = partial(self._slam.update, measurements, landmark_ids)
         then = partial(self._record_scan, measurements, landmark_ids)
         return advance(self._slam, step, then, undo_all(), self.bookmark)
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Update the filter with a reading of the pose, and record it if it is used."""
+        given = PoseReading.checked(reading, matrix, covariance)
+
+        def record(report: UpdateReport) -> UpdateReport:
+            if report.degrees_of_freedom:
+                self._record("observe_pose", *given)
+            self._report = report
+            self.steps += 1
+            return report
+
+        step = partial(taking_poses(self._slam).observe_pose, *given)
+        return advance(self._slam, step, record, undo_all(), self.bookmark)
 
     def _record_scan(
         self,

@@ -22,7 +22,7 @@ from ...estimator.models.motions import find_motion
 from ...estimator.models.sensors import find_sensor
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario_files import refuse_ranges
-from .slamlog import OdometryRow, Scan, SlamLog, numbers
+from .slamlog import Event, OdometryRow, PoseRow, Scan, SlamLog, numbers
 
 
 def record_episode(
@@ -72,7 +72,8 @@ def record_episode(
         "slamgym/LandmarkWorld-v0", scenario=world, disable_env_checker=True
     )
     observation, info = env.reset(seed=seed)
-    events: list[OdometryRow | Scan] = [*_scan(0.0, observation, info)]
+    events: list[Event] = [*_scan(0.0, observation, info)]
+    events += _fix(0.0, world, info)
     poses = [info["pose"]]
     for step in range(world.steps):
         action = controller.act(info["pose"], step)
@@ -81,6 +82,7 @@ def record_episode(
         t = float(step + 1)
         events.append(OdometryRow(t, distance, turn, dt=1.0))
         events += _scan(t, observation, info)
+        events += _fix(t, world, info)
         poses.append(info["pose"])
         if progress is not None:
             progress(step + 1, world.steps)
@@ -100,11 +102,22 @@ def _scan(t: float, observation: Observation, info: dict[str, Any]) -> list[Scan
     return [Scan(t, readings, np.flatnonzero(seen))]
 
 
+def _fix(t: float, scenario: Scenario, info: dict[str, Any]) -> list[PoseRow]:
+    """Return the reading of GPS and compass in one step, if there is one."""
+    position = info.get("gps", np.full(2, np.nan)).tolist()
+    heading = float(info.get("compass", np.nan))
+    if not np.isfinite([*position, heading]).any():
+        return []
+    gps, compass = scenario.gps, scenario.compass
+    std = gps.std if gps else np.nan, compass.std if compass else np.nan
+    return [PoseRow(t, (*position, heading), std)]
+
+
 def _log(
     scenario: Scenario,
     seed: int,
     env: gymnasium.Env[Any, Any],
-    events: list[OdometryRow | Scan],
+    events: list[Event],
     poses: Array,
 ) -> SlamLog:
     world = cast(LandmarkWorldEnv, env.unwrapped)
@@ -162,6 +175,8 @@ class Step(NamedTuple):
     """The motion; empty before the first scan, or between scans at rest."""
     scan: Scan | None
     """The scan at the end."""
+    fixes: tuple[PoseRow, ...] = ()
+    """The readings of the pose after it."""
 
 
 class Prediction(NamedTuple):
@@ -178,7 +193,7 @@ def steps_of(log: SlamLog) -> Iterator[Step]:
 
     Odometry rows that end at the same time, such as a turn and a drive, are one
     motion. A scan belongs to the motion that ends at its time; a scan at another time
-    is a step without motion.
+    is a step without motion.  So is a reading of the pose.
 
     Parameters
     ----------
@@ -200,16 +215,20 @@ def steps_of(log: SlamLog) -> Iterator[Step]:
     is_start = True
     for event in log.events:
         if isinstance(event, OdometryRow):
-            if is_start or step.scan is not None or step.t != event.t:
+            if is_start or step.scan or step.fixes or step.t != event.t:
                 yield step
                 step = Step(event.t, (), None)
             step = step._replace(motions=(*step.motions, event))
             is_start = False
         else:
-            if step.scan is not None or step.t != event.t:
+            is_scan = isinstance(event, Scan)
+            if step.t != event.t or (is_scan and (step.scan or step.fixes)):
                 yield step
                 step, is_start = Step(event.t, (), None), False
-            step = step._replace(scan=event)
+            if isinstance(event, Scan):
+                step = step._replace(scan=event)
+            else:
+                step = step._replace(fixes=(*step.fixes, event))
     yield step
 
 
@@ -244,7 +263,7 @@ def _start_time(log: SlamLog) -> float:
     if not log.events:
         return 0.0
     first = log.events[0]
-    if isinstance(first, Scan):
+    if not isinstance(first, OdometryRow):
         return first.t
     duration = 0.0
     for event in log.events:

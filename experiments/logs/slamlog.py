@@ -4,11 +4,12 @@ A `SlamLog` holds events, odometry rows and scans, and the truth if it is known;
 `read_slamlog` and `write_slamlog` read and write it. Every importer returns one.
 
 A CSV file with a header of ``# key: value`` lines, the first one
-``# format: slamlog 1``, and rows of four kinds, named by their first field::
+``# format: slamlog 1``, and rows of five kinds, named by their first field::
 
     landmark,id,x,y                             true position
     odometry,t,d,alpha,dt                       drive and turn until t
     measurement,t,id,bearing,range[,size[,true_id]]     id empty when unknown
+    pose,t,x,y,theta,std,std_theta              GPS or compass; empty what is not read
     groundtruth,t,x,y,theta                     theta empty when unknown
 
 A true id, -1 for a reading of no landmark, is for scores alone: no filter is given it.
@@ -40,6 +41,7 @@ from ...sim_configs.atomic_file import replace_when_written
 __all__ = [
     "LogError",
     "OdometryRow",
+    "PoseRow",
     "Scan",
     "SlamLog",
     "read_slamlog",
@@ -53,6 +55,7 @@ ROW_FORMS = {
     "landmark": "landmark,id,x,y",
     "odometry": "odometry,t,d,alpha,dt",
     "measurement": "measurement,t,id,bearing,range[,size[,true_id]]",
+    "pose": "pose,t,x,y,theta,std,std_theta",
     "groundtruth": "groundtruth,t,x,y,theta",
 }
 
@@ -77,7 +80,7 @@ class SlamLog:
         Landmarks with a known true position.
     landmarks : ndarray, shape (n, 2)
         These true positions [m].
-    events : tuple of OdometryRow and Scan
+    events : tuple of OdometryRow, Scan and PoseRow
         Input of a filter in order; times do not decrease.
     ground_truth : ndarray, shape (k, 4)
         Rows (t, x, y, θ) of the true path [s, m, m, rad]; θ is nan where unknown.
@@ -94,7 +97,7 @@ class SlamLog:
     start: Array = field(default_factory=lambda: np.zeros(3))
     landmark_ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     landmarks: Array = field(default_factory=lambda: np.empty((0, 2)))
-    events: tuple[OdometryRow | Scan, ...] = ()
+    events: tuple[Event, ...] = ()
     ground_truth: Array = field(default_factory=lambda: np.empty((0, 4)))
 
     def __post_init__(self) -> None:
@@ -224,6 +227,18 @@ class _SlamlogParser:
             line, Reading(t, landmark_id, bearing, distance, size, true_id)
         )
 
+    def _take_pose(self, line: LogLine, fields: list[str]) -> None:
+        t, *others = (line.to_real(f) if f else math.nan for f in fields)
+        x, y, heading, std, heading_std = others
+        here = math.isfinite(x), math.isfinite(heading)
+        if math.isnan(x) != math.isnan(y) or not any(here):
+            raise line.error("x and y, theta, or all", ",".join(fields[1:4]))
+        for is_here, each in zip(here, (std, heading_std), strict=True):
+            if is_here and not each > 0:
+                raise line.error("a standard deviation > 0 of what is read", str(each))
+        row = PoseRow(t, (x, y, heading), (std, heading_std))
+        self.recorder.add_pose(line, row)
+
     def _take_groundtruth(self, line: LogLine, fields: list[str]) -> None:
         t, x, y = map(line.to_real, fields[:3])
         heading = line.to_real(fields[3]) if fields[3] else math.nan
@@ -290,6 +305,9 @@ def _rendered(log: SlamLog) -> Iterator[str]:
     for event in log.events:
         if isinstance(event, OdometryRow):
             yield f"odometry,{numbers(event.t, event.d, event.alpha, event.dt)}"
+        elif isinstance(event, PoseRow):
+            values = ",".join(map(_known, (*event.reading, *event.std)))
+            yield f"pose,{numbers(event.t)},{values}"
         else:
             yield from _rendered_scan(event)
     for *position, heading in log.ground_truth:
@@ -343,6 +361,32 @@ class OdometryRow:
     dt: float
 
 
+@dataclass(frozen=True)
+class PoseRow:
+    """One reading of the pose, by GPS or compass or both.
+
+    Attributes
+    ----------
+    t : float
+        Time of the reading [s, or steps].
+    reading : (float, float, float)
+        (x, y, θ) [m, m, rad]; nan what is not read.
+    std : (float, float)
+        Standard deviations of x and of y, and of θ [m, rad].
+    """
+
+    t: float
+    reading: tuple[float, float, float]
+    std: tuple[float, float]
+
+    @property
+    def arguments(self) -> tuple[Array, Array, Array]:
+        """What :meth:`~slamgym.estimator.EkfSlam.observe_pose` takes: z, H and R."""
+        z, deviation = np.array(self.reading), np.array([self.std[0], *self.std])
+        here = np.isfinite(z)
+        return z[here], np.eye(3)[here], np.diag(deviation[here] ** 2)
+
+
 @dataclass(frozen=True, eq=False)
 class Scan:
     """Simultaneous readings of m >= 1 landmarks.
@@ -391,6 +435,10 @@ class Scan:
                     f"got shape {column.shape} for {len(readings)}"
                 )
             object.__setattr__(self, name, column)
+
+
+Event = OdometryRow | Scan | PoseRow
+"""What a log holds, in the order in which a filter takes it."""
 
 
 def float_array(name: str, value: ArrayLike, *, columns: int) -> Array:
@@ -447,7 +495,7 @@ class EventRecorder:
     """
 
     def __init__(self) -> None:
-        self._events: list[OdometryRow | Scan] = []
+        self._events: list[Event] = []
         self._readings: list[Reading] = []
         self._seen: set[int] = set()
         self._time = -math.inf
@@ -456,6 +504,12 @@ class EventRecorder:
         """Append an odometry row; raise LogError if t or dt runs backwards."""
         if row.dt < 0:
             raise line.error("dt >= 0", str(row.dt))
+        self._advance(line, row.t)
+        self._close_scan()
+        self._events.append(row)
+
+    def add_pose(self, line: LogLine, row: PoseRow) -> None:
+        """Append a reading of the pose; raise LogError if t runs backwards."""
         self._advance(line, row.t)
         self._close_scan()
         self._events.append(row)
@@ -482,7 +536,7 @@ class EventRecorder:
             self._seen.add(reading.landmark_id)
         self._readings.append(reading)
 
-    def finish(self) -> tuple[OdometryRow | Scan, ...]:
+    def finish(self) -> tuple[Event, ...]:
         """Return the events recorded so far."""
         self._close_scan()
         return tuple(self._events)

@@ -14,7 +14,14 @@ from ...arrays import Array, BoolArray
 from ...envs.robot import wall_distances
 from ...estimator.filters.batch import BatchSlam, BatchTrace, can_batch
 from ...estimator.filters.ekf import EkfSlam
-from ...estimator.interface import Belief, SlamEstimator, SmoothedPath, SupportsTruth
+from ...estimator.interface import (
+    Belief,
+    SlamEstimator,
+    SmoothedPath,
+    SupportsTruth,
+    taking_poses,
+    with_fix,
+)
 from ...estimator.models.motions import find_motion
 from ...estimator.smoother.batch_smoother import smoother_in
 from ...evaluation.error_bound import PosteriorBound, posterior_bound
@@ -101,7 +108,7 @@ def _in_a_batch(
         initial_pose_std=settings.initial_pose_std,
         threads=threads,
     )
-    trace = batch.run(runs.odometry, runs.measurements, runs.visible, runs.dt)
+    trace = _run(batch, runs)
     finite = _finite(trace)
     beliefs: list[Belief | None] = [
         _renamed(batch.belief(run), runs) for run in range(count)
@@ -113,6 +120,33 @@ def _in_a_batch(
         _erase(trace, run, failures[run].step)
         beliefs[run] = None
     return FilteredRuns(trace, beliefs, failures)
+
+
+def _run(batch: BatchSlam, runs: SimulatedRuns) -> BatchTrace:
+    """Run a batch, in pieces that end where the poses are read."""
+    steps = runs.visible.shape[1]
+    due = [t for t in range(steps) if runs.pose_reading(t) is not None]
+    traces, begin = [], 0
+    for end in sorted({*(t + 1 for t in due), steps}):
+        part = slice(begin, end)
+        trace = batch.run(
+            runs.odometry[:, part],
+            runs.measurements[:, part],
+            runs.visible[:, part],
+            runs.dt[part],
+        )
+        if (given := runs.pose_reading(end - 1)) is not None:
+            nis, freedom = batch.observe_pose(*given)
+            trace.nis[:, -1] += nis
+            trace.degrees_of_freedom[:, -1] += freedom
+            batch.write_poses(trace, -1)
+        traces.append(trace)
+        begin = end
+    if len(traces) == 1:
+        return traces[0]
+    return BatchTrace(
+        *(np.concatenate(parts, axis=1) for parts in zip(*traces, strict=True))
+    )
 
 
 def _renamed(belief: Belief, runs: SimulatedRuns) -> Belief:
@@ -180,6 +214,10 @@ def _step(
     else:
         report = slam.update(readings)
         recorder.add(report, runs.true_ids[run, step, seen])
+    if (given := runs.pose_reading(step)) is not None:
+        z, H, R = given
+        fix = taking_poses(slam).observe_pose(z[run], H, R)
+        report = with_fix(report, fix)
     belief = slam.belief()
     trace.poses[run, step] = belief.pose
     trace.pose_covariances[run, step] = belief.pose_covariance
@@ -248,6 +286,7 @@ def bound_runs(scenario: Scenario, runs: SimulatedRuns) -> PosteriorBound:
         measurement_std=scenario.sensor.std,
         start_std=scenario.start.std,
         range_std_per_metre=scenario.sensor.range_std_per_metre,
+        pose_std=runs.fix_std,
         sensor=scenario.sensor.kind,
     )
     return bound._replace(covariances=())

@@ -21,6 +21,8 @@ from ...estimator.interface import (
     SupportsJoin,
     SupportsTruth,
     UpdateReport,
+    taking_poses,
+    with_fix,
 )
 from ...estimator.map_management import hypotheses, managed_slam, map_editor
 from ..logs import ground_truth, recording, slamlog
@@ -148,6 +150,9 @@ def replay(
                 if step.scan is not None:
                     report = estimator.update(step.scan.measurements, _ids(step.scan))
                     decisions.add(report, ground_truth.true_ids_of(step.scan))
+                for fix_row in step.fixes:
+                    fix = taking_poses(estimator).observe_pose(*fix_row.arguments)
+                    report = with_fix(report or UpdateReport(), fix)
                 recorder.add(predicted, report)
             watch(number, estimator, report)
             progress(number + 1, len(steps))

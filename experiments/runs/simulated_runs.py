@@ -13,7 +13,7 @@ from ...estimator.support.memory_limit import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
 from ...sim_configs.scenario_files import refuse_ranges
 
-_EACH_SCAN = ("odometry", "poses")
+_EACH_SCAN = ("odometry", "poses", "pose_readings")
 _READINGS = ("measurements", "mask", "landmark_ids")
 
 
@@ -41,6 +41,10 @@ class SimulatedRuns(NamedTuple):
     and empty rows, shape (B, T, M); the rows are then not those of the landmarks."""
     ids: IntArray | None = None
     """The landmark of each row, ascending, shape (M,); None if row i is landmark i."""
+    pose_readings: Array | None = None
+    """Of (x, y, θ) by GPS and compass, nan where there is none, shape (B, T, 3)."""
+    pose_std: Array | None = None
+    """Their standard deviations, shape (3,) [m, m, rad]."""
 
     @property
     def dt(self) -> Array:
@@ -48,6 +52,26 @@ class SimulatedRuns(NamedTuple):
         durations = np.ones(self.odometry.shape[1])
         durations[0] = 0.0
         return durations
+
+    def pose_reading(self, step: int) -> tuple[Array, Array, Array] | None:
+        """Return what a filter takes of every pose: z (B, k), H (k, 3) and R (k, k).
+
+        None where there is no reading.
+        """
+        if self.pose_readings is None or self.pose_std is None:
+            return None
+        now = self.pose_readings[:, step]
+        here = np.isfinite(now[0])  # in all runs alike
+        if not here.any():
+            return None
+        return now[:, here], np.eye(3)[here], np.diag(self.pose_std[here] ** 2)
+
+    @property
+    def fix_std(self) -> Array:
+        """Deviations of the readings of the poses, inf without, shape (B, T, 3)."""
+        if self.pose_readings is None or self.pose_std is None:
+            return np.full((*self.odometry.shape[:2], 3), np.inf)
+        return np.where(np.isfinite(self.pose_readings), self.pose_std, np.inf)
 
     @property
     def landmarks_of_rows(self) -> Array:
@@ -130,6 +154,8 @@ def simulate_runs(
         initial_poses=batch.start_estimates,
         true_ids=found.get("landmark_ids"),
         ids=rows if named else None,
+        pose_readings=record.get("pose_readings"),
+        pose_std=batch.pose_sensors.std if batch.pose_sensors.present else None,
     )
 
 

@@ -374,7 +374,7 @@ def to_slamlog(trajectory: Trajectory) -> slamlog.SlamLog:
     measurements = array_of(trajectory, "measurements")
     mask = array_of(trajectory, "mask")
     true_ids = trajectory.landmark_ids
-    events: list[slamlog.OdometryRow | slamlog.Scan] = []
+    events: list[slamlog.Event] = []
     for step, seen in enumerate(mask):
         if step > 0:
             distance, turn = trajectory.odometry[step - 1].tolist()

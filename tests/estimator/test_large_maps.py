@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from slamgym.estimator import make_estimator
-from slamgym.estimator.filters.landmark_merging import separation
+from slamgym.estimator.filters.conditioning import separation
 from slamgym.estimator.map_management.map_editor import MapEditor
 from slamgym.estimator.map_management.policy import LandmarkPolicy
 from slamgym.evaluation.nees import normalised_squared_error, state_nees

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import check_estimator, list_estimators, make_estimator
-from slamgym.estimator.filters.landmark_merging import separation
+from slamgym.estimator.filters.conditioning import separation
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.estimator.map_management.policy import (
     FieldOfView,

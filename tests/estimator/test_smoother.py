@@ -55,6 +55,54 @@ def test_poses_and_landmarks_are_those_of_dense_least_squares(example):
     assert found == pytest.approx(state, abs=1e-7)  # differences are good to that
 
 
+def test_readings_of_poses_are_those_of_dense_least_squares():
+    """Compass and GPS, one of them turned by 2π, and several at one pose."""
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    result, fixes = Drive(**noise, initial_pose_std=START_STD), []
+    result.end_motion()
+    moves, scans = [], [(np.empty((0, 2)), np.empty(0, dtype=int))]
+    rng = np.random.default_rng(8)
+    for k, (odometry, readings, pose) in enumerate(drive(3, 12), start=1):
+        result.predict(odometry)
+        result.update(readings, range(6))
+        moves.append(odometry)
+        scans.append((readings, np.arange(6)))
+        for H in ((np.eye(3)[2:], np.eye(3)[:2]), (np.eye(3) + 0.1,), ())[k % 3]:
+            z, R = H @ pose + 0.05 * rng.standard_normal(len(H)), 0.01 * np.eye(len(H))
+            R[0, -1] += 0.002 * (len(H) > 1)
+            R = (R + R.T) / 2
+            z = z + 2 * np.pi * (len(H) == 1)
+            result.observe_pose(z, H, R)
+            fixes.append((k, z, H, R))
+    made = smooth(result)
+    twin, state, order = dense_twin(made, moves, scans)
+    twin.fixes = fixes
+    found, expected = twin.solve(state + 0.01 * rng.standard_normal(len(state)))
+    assert found == pytest.approx(state, abs=1e-7)
+    assert made.cost == pytest.approx((twin.residual(state) ** 2).sum() / 2)
+    joint = made.covariance(range(len(made.poses)), order)
+    assert joint == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    components = sum(len(H) for _, _, H, _ in fixes)
+    freedom = 2 * 6 * 12 - 2 * 6 + components
+    assert made.cost_per_degree == pytest.approx(2 * made.cost / freedom)
+
+
+def test_a_recorded_filter_smooths_its_readings_of_poses():
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    slam = SmoothingSlam(**noise, initial_pose_std=START_STD, gate_probability=0.99)
+    direct = Drive(**noise, initial_pose_std=START_STD)
+    for odometry, readings, pose in drive(3, 12):
+        for each in (slam, direct):
+            each.predict(odometry)
+            each.update(readings, range(6))
+            each.observe_pose(pose[2], [0, 0, 1], 1e-4)
+        report = slam.observe_pose(pose[2] + 1, [0, 0, 1], 1e-4)  # the gate rejects it
+        assert report.degrees_of_freedom == 0
+    found, expected = slam.smoothed(), smooth(direct)
+    assert found.poses == pytest.approx(expected.poses, abs=1e-8)
+    assert (found.pose_covariances[1:, 2, 2] < 1e-4).all()
+
+
 def test_cost_is_half_the_sum_of_squares(example):
     made, moves, scans = example
     twin, state, _ = dense_twin(made, moves, scans)

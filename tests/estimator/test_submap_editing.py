@@ -22,8 +22,8 @@ from test_submaps import (
     run,
 )
 
+from slamgym.estimator.filters.conditioning import coincide
 from slamgym.estimator.filters.gaussian_map import without_landmarks
-from slamgym.estimator.filters.landmark_merging import coincide
 from slamgym.estimator.large_maps.submaps import closed_submaps as neighbourhood
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam

@@ -32,11 +32,21 @@ def exact_drive(steps=25):
     return np.array(poses), visible
 
 
-def test_the_bound_is_the_invariant_filter_where_it_linearises_at_the_truth():
+@pytest.mark.parametrize("fixes", [False, True])
+def test_the_bound_is_the_invariant_filter_where_it_linearises_at_the_truth(fixes):
     poses, visible = exact_drive()
     dt = np.ones(len(poses))
+    pose_std = np.full((len(poses), 3), np.inf)
+    if fixes:
+        pose_std[3::3, :2], pose_std[1::2, 2] = (0.2, 0.1), 0.05
     bound = posterior_bound(
-        poses[None], PLACES[None], visible[None], dt, start_std=START_STD, **NOISE
+        poses[None],
+        PLACES[None],
+        visible[None],
+        dt,
+        start_std=START_STD,
+        pose_std=pose_std,
+        **NOISE,
     )
     slam = make_estimator(
         "invariant", initial_pose=poses[0], initial_pose_std=START_STD, **NOISE
@@ -46,6 +56,9 @@ def test_the_bound_is_the_invariant_filter_where_it_linearises_at_the_truth():
             slam.predict((0.3, 0.2))
         seen = np.flatnonzero(visible[t])
         slam.update(predict_measurement(pose, PLACES[seen]).measurement, seen)
+        if (here := np.isfinite(pose_std[t])).any():
+            R = np.diag(pose_std[t, here] ** 2)
+            slam.observe_pose(pose[here], np.eye(3)[here], R)
         claimed = slam.belief().error_covariance("invariant")
         assert bound.position[0, t] == pytest.approx(claimed[:2, :2].trace())
         assert bound.heading[0, t] == pytest.approx(claimed[2, 2])

@@ -1,7 +1,10 @@
 import math
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.slamlog import LogError, OdometryRow, Scan, write_slamlog
@@ -694,3 +697,116 @@ def test_missing_file_is_an_os_error(tmp_path):
 def test_robot_is_refused_for_a_log_in_one_file(file):
     with pytest.raises(ValueError, match="robot must be None"):
         read_log(file(FREIBURG), robot=3)
+
+
+# --------------------------------------------------------------------------------------
+# Victoria Park by its own drive.
+
+PARK = Path(os.environ.get("SLAMGYM_DATA") or ".")
+
+
+def write_park(folder, at=2.0, steered=0.3, **changes):
+    """Write a drive of 2 s at constant speed and steering, and one tree."""
+    time = np.arange(20967, 22968, 25)
+    drive = {
+        "time": time[:, None],
+        "speed": np.full((len(time), 1), at),
+        "steering": np.full((len(time), 1), steered),
+    }
+    gps = {
+        "timeGps": [[20967], [22000]],
+        "Lo_m": [[1.0], [2.0]],
+        "La_m": [[3.0], [5.0]],
+    }
+    folder.mkdir(exist_ok=True)
+    savemat(folder / "aa3_dr.mat", drive | changes)
+    savemat(folder / "aa3_gpsx.mat", gps)
+    (folder / "victoria_park.csv").write_text(
+        "# format: slamlog 1\nodometry,0.5,9,9,0.5\nmeasurement,0.512,,0.1,7\n"
+        "measurement,9,,0.1,7\n"
+    )
+    return folder
+
+
+def test_the_car_of_victoria_park_drives_a_circle_about_its_rear_axle(tmp_path):
+    """The encoder is on the left rear wheel, which turns on another radius."""
+    log = read_log(write_park(tmp_path / "park"))
+    rows = [event for event in log.events if isinstance(event, OdometryRow)]
+    assert [event.t for event in log.scans] == [0.512]
+    assert log.header["left_out"].startswith("1 scan")
+    x = y = heading = 0.0
+    for row in rows:  # chords of the circle
+        x += row.d * math.cos(heading + row.alpha / 2)
+        y += row.d * math.sin(heading + row.alpha / 2)
+        heading += row.alpha
+    radius = 2.83 / math.tan(0.3)  # of the middle of the axle, turning left
+    turned = 2.0 * 2.0 / (radius - 0.76)  # the left wheel runs inside
+    assert heading == pytest.approx(turned, rel=1e-12)
+    assert (x, y) == pytest.approx(
+        (radius * math.sin(turned), radius * (1 - math.cos(turned))), rel=1e-9
+    )
+    assert sum(row.dt for row in rows) == pytest.approx(2.0)
+    assert log.ground_truth[:, :3].tolist() == [[0, 1, 3], [1.033, 2, 5]]
+    before = [row for row in rows if row.t <= 0.512]
+    assert before[-1].t == 0.512
+    assert sum(row.alpha for row in before) == pytest.approx(turned * 0.512 / 2)
+
+
+def test_a_car_that_stands_or_backs_does_so(tmp_path):
+    still = read_log(write_park(tmp_path / "still", at=0.0))
+    assert all(e.d == 0 for e in still.events if isinstance(e, OdometryRow))
+    back = read_log(write_park(tmp_path / "back", at=-1.0, steered=0.0))
+    driven = sum(e.d for e in back.events if isinstance(e, OdometryRow))
+    assert driven == pytest.approx(-2.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"speed": np.ones((3, 1))}, "one length"),
+        ({"steering": np.full((81, 1), np.nan)}, "finite numbers as steering"),
+        ({"steering": np.full((81, 1), 1.2)}, "steering within"),
+        ({"time": np.arange(22968, 20967, -25)[:, None]}, "not to decrease"),
+    ],
+)
+def test_a_damaged_drive_of_victoria_park_is_named(tmp_path, changes, message):
+    with pytest.raises(LogError, match=message):
+        read_log(write_park(tmp_path / "park", **changes))
+
+
+@pytest.mark.parametrize("name", ["aa3_gpsx.mat", "victoria_park.csv"])
+def test_a_missing_file_of_victoria_park_is_named(tmp_path, name):
+    folder = write_park(tmp_path / "park")
+    (folder / name).unlink()
+    with pytest.raises(LogError, match=name):
+        read_log(folder)
+
+
+def test_a_file_that_is_no_matlab_file_is_named(tmp_path):
+    folder = write_park(tmp_path / "park")
+    (folder / "aa3_dr.mat").write_text("speed")
+    with pytest.raises(LogError, match="MATLAB"):
+        read_log(folder)
+
+
+@pytest.mark.skipif(
+    not (PARK / "raw" / "victoria_park").is_dir(),
+    reason="SLAMGYM_DATA names no folder with raw/victoria_park",
+)
+def test_the_drive_of_victoria_park_is_that_of_the_converted_log(tmp_path):
+    for file in (PARK / "raw" / "victoria_park").iterdir():
+        (tmp_path / file.name).symlink_to(file)
+    (tmp_path / "victoria_park.csv").symlink_to(PARK / "victoria_park.csv")
+    own, converted = read_log(tmp_path), read_log(PARK / "victoria_park.csv")
+    assert len(own.scans) == len(converted.scans) == 7230
+    paths = []
+    for log in (own, converted):
+        rows = [event for event in log.events if isinstance(event, OdometryRow)]
+        t, d, alpha = np.array([(row.t, row.d, row.alpha) for row in rows]).T
+        heading = np.cumsum(alpha)
+        steps = d * np.exp(1j * (heading - alpha / 2))
+        paths.append((t, np.cumsum(steps), heading))
+    at = np.arange(0, 1500, 10.0)
+    one, other = (np.interp(at, t, path) for t, path, _ in paths)
+    assert np.abs(one - other).max() < 1.0  # of 4 km
+    assert abs(paths[0][2][-1] - paths[1][2][-1]) < 1e-3

@@ -39,7 +39,7 @@ def one_by_one(scenario, runs, seed):
         )
         for column, row in zip(columns, rows, strict=True):
             column.append(row)
-    return [np.array(column) for column in columns] + ([] if hides else [None]) + [None]
+    return [np.array(column) for column in columns] + [None] * (3 if hides else 4)
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,23 @@ class DenseEkf:
 
     def correct(self, readings, ids):
         nu, H = self.linearise(readings, ids)
-        S = H @ self.P @ H.T + np.kron(np.eye(len(ids)), self.Q)
+        return self.condition(nu, H, np.kron(np.eye(len(ids)), self.Q))
+
+    def observe_pose(self, z, H, R):
+        """Take in z = H (x, y, θ) + w; rows of the heading alone are angles."""
+        columns = np.zeros((len(H), len(self.mean)))
+        columns[:, :3] = H
+        return self.condition(self.off(z, H, self.mean[:3]), columns, R)
+
+    @staticmethod
+    def off(z, H, pose):
+        nu = np.asarray(z) - H @ pose
+        angles = (H[:, :2] == 0).all(axis=1)
+        nu[angles] = wrap_angle(nu[angles])
+        return nu
+
+    def condition(self, nu, H, R):
+        S = H @ self.P @ H.T + R
         K = np.linalg.solve(S, H @ self.P).T
         self.mean = self.mean + K @ nu
         self.P = (np.eye(len(self.mean)) - K @ H) @ self.P

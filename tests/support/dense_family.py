@@ -63,6 +63,25 @@ class DenseInvariant(DenseEkf):
         P = (np.eye(len(self.mean)) - K @ H) @ self.P
         return K @ nu, (P + P.T) / 2, float(nu @ np.linalg.solve(S, nu))
 
+    settles = False
+
+    def observe_pose(self, z, H, R):
+        """H by ξ at the corrected mean, found by iteration where the filter may."""
+        prior, xi, nis = self.mean, np.zeros(len(self.mean)), None
+        for _ in range(100 if self.settles else 1):
+            self.mean = self.exponential(xi, prior)
+            columns = np.zeros((len(H), len(xi)))
+            columns[:, :3] = H
+            columns = columns @ np.linalg.inv(self.to_invariant())
+            S = columns @ self.P @ columns.T + R
+            K = np.linalg.solve(S, columns @ self.P).T
+            nu = self.off(z, H, self.mean[:3])
+            nis = float(nu @ np.linalg.solve(S, nu)) if nis is None else nis
+            xi = K @ (nu + columns @ xi)
+        self.mean = self.exponential(xi, prior)
+        self.P = self.P - K @ S @ K.T
+        return nis
+
     @staticmethod
     def exponential(xi, mean):
         """χ ← Exp(ξ) χ by the matrix exponential of SE_{1+n}(2)."""
@@ -99,7 +118,7 @@ class DenseAdaptiveInvariant(DenseInvariant):
     One by one, P becomes that of the corrected belief before the next reading.
     """
 
-    iterations = 10
+    iterations, settles = 10, True
 
     def correct(self, readings, ids):
         prior, nothing = self.mean.copy(), np.zeros(len(self.mean))
@@ -339,6 +358,10 @@ class DenseRobocentric(DenseEkf):
         robot = back @ (state[:2] - state[3:5])
         points = [back @ (q - state[3:5]) for q in state[6:].reshape(-1, 2)]
         return np.concatenate([robot, [state[2] - state[5]], *points])
+
+    def observe_pose(self, z, H, R):
+        M = complex_step(self.world, self.mean)[:3]
+        return self.condition(self.off(z, H, self.world(self.mean)[:3]), H @ M, R)
 
     def belief(self):
         M = complex_step(self.world, self.mean)

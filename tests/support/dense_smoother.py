@@ -20,6 +20,7 @@ class DenseSmoother:
         self.motion_std, self.measurement_std = motion_std, measurement_std
         self.bearing_std_metres = bearing_std_metres
         self.start_std = np.asarray(start_std, dtype=float)
+        self.fixes = []  # (pose, z, H, R) with z = H pose + noise of covariance R
 
     def residual(self, state):
         """Whitened residuals of the prior, the motions and the readings."""
@@ -38,6 +39,11 @@ class DenseSmoother:
             std = np.tile(self.measurement_std, (len(innovation), 1))
             std[:, 0] += self.bearing_std_metres / np.asarray(readings)[..., 1]
             parts.append((innovation / std).ravel())
+        for k, z, H, R in self.fixes:
+            off = np.asarray(z) - H @ poses[k]
+            angles = (H[:, :2] == 0).all(axis=1)
+            off[angles] = wrap_angle(off[angles])
+            parts.append(np.linalg.solve(np.linalg.cholesky(R), off))
         return np.concatenate(parts)
 
     def solve(self, state, iterations=8):

@@ -159,6 +159,12 @@ class CompressedEkfSlam:
         undo = self.bookmark() if changes else undo_all()
         return advance(self._map.filter, correct, self._follow, undo, self.bookmark)
 
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Correct the belief with a reading of the pose, as `EkfSlam.observe_pose`."""
+        return self._map.filter.observe_pose(reading, matrix, covariance)
+
     def _follow(self, report: UpdateReport) -> UpdateReport:
         """Do what follows an update of the filter; return its report."""
         self._map.add(report.added_ids)

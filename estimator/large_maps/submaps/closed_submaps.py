@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
+from ...filters.conditioning import coincide
 from ...filters.ekf import InvariantEkfSlam
 from ...filters.gaussian_map import without_landmarks
-from ...filters.landmark_merging import coincide
 from ...interface import Belief, MapView, UpdateReport
 from ...models.rigid_motion import ErrorFrame
 from ...support import argument_checks, saved_states

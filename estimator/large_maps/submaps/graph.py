@@ -15,7 +15,8 @@ from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.blas import dsyrk
 
 from ....arrays import Array, IntArray
-from ...filters.ekf import FRAMES, EkfSlam
+from ...filters.conditioning import FRAMES
+from ...filters.ekf import EkfSlam
 from ...interface import Belief
 from ...models.bearing_range import wrap_angle
 from ...models.rigid_motion import (

@@ -10,16 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import slamlog
-from . import course, graph, utias
+from . import course, graph, utias, victoria_park
 
 EXPECTED = (
     "a log: slamlog 1, a course data.txt, a Freiburg sensor.dat, "
-    "iSAM or g2o text, or a UTIAS MR.CLAM folder"
+    "iSAM or g2o text, or a folder of UTIAS MR.CLAM or Victoria Park"
 )
 READERS = {
     "slamlog": slamlog.read_slamlog,
     "course": course.read_course,
     "freiburg": course.read_freiburg,
+    "victoria": victoria_park.read_victoria_park,
 }
 
 
@@ -38,7 +39,8 @@ def read_log(
     path : path
         A file in the format ``slamlog 1``, a course ``data.txt``, a Freiburg
         ``sensor.dat`` (with ``world.dat`` beside it), an iSAM or g2o text, or the
-        folder of a UTIAS MR.CLAM data set.
+        folder of a UTIAS MR.CLAM data set, or that of Victoria Park, with
+        ``aa3_dr.mat``, ``aa3_gpsx.mat``, and the trees as ``victoria_park.csv``.
     landmarks : array_like, shape (n, 2), optional
         True positions of the landmarks 0, 1, …, n - 1 [m], in place of those in the
         log.
@@ -69,7 +71,7 @@ def read_log(
     """
     source = Path(path)
     if source.is_dir():
-        kind = "utias"
+        kind = _folder_of(source)
     else:
         path = slamlog.ReadFile(path)
         kind = _format_of(slamlog.read_lines(path)[0])
@@ -94,6 +96,11 @@ def read_log(
         landmark_ids=np.arange(len(positions)),
         landmarks=positions,
     )
+
+
+def _folder_of(folder: Path) -> str:
+    is_park = (folder / victoria_park.DRIVE).is_file()
+    return "victoria" if is_park else "utias"
 
 
 def _format_of(line: slamlog.LogLine) -> str:

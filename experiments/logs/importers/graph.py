@@ -19,12 +19,11 @@ import numpy as np
 
 from ....arrays import Array
 from ..slamlog import (
+    Event,
     EventRecorder,
     LogError,
     LogLine,
-    OdometryRow,
     Reading,
-    Scan,
     SlamLog,
     numbers,
     read_lines,
@@ -432,7 +431,7 @@ def read_isam(
 
 def _events(
     graph: Graph, chain: list[LogLine], steps: dict[int, int]
-) -> tuple[OdometryRow | Scan, ...]:
+) -> tuple[Event, ...]:
     """Follow the chain of poses, and record the readings of each pose."""
     for pose in graph.readings.keys() - steps.keys():
         raise graph.readings[pose][0].error("a pose of the odometry", f"pose {pose}")

@@ -12,6 +12,7 @@ and mapping dataset, International Journal of Robotics Research 30(8), 2011.
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -166,29 +167,44 @@ def _read_truth(path: Path, epoch: float) -> Array:
     return truth
 
 
-def _merge(
-    odometry: Array, readings: TimedReadings
-) -> tuple[slamlog.OdometryRow | slamlog.Scan, ...]:
+def _merge(odometry: Array, readings: TimedReadings) -> tuple[slamlog.Event, ...]:
     """Integrate the velocities between the times of grid and readings."""
-    stamps, end = odometry[:, 0], odometry[-1, 0]
+    stamps = odometry[:, 0]
     moved = odometry[:-1, 1:] * np.diff(stamps)[:, None]
-    travelled = np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
-    grid = np.round(np.arange(0, end, ODOMETRY_STEP), TIME_DIGITS)
-    times = np.unique([*grid, *(reading.t for _, reading in readings), end])
-    path = np.stack(
-        [np.interp(times, stamps, column) for column in travelled.T], axis=1
-    )
-    rows = np.column_stack([times, np.diff(path, axis=0, prepend=0)])
-    steps = np.diff(times, prepend=0)
     seen: dict[float, TimedReadings] = {}
     for line, reading in readings:
         seen.setdefault(reading.t, []).append((line, reading))
     recorder = slamlog.EventRecorder()
-    for (t, d, alpha), dt in zip(rows.tolist(), steps.tolist(), strict=True):
-        recorder.add_odometry(MERGED, slamlog.OdometryRow(t, d, alpha, dt))
-        for line, reading in seen.get(t, []):
+    for row in odometry_between(stamps, moved, [reading.t for _, reading in readings]):
+        recorder.add_odometry(MERGED, row)
+        for line, reading in seen.get(row.t, []):
             recorder.add_reading(line, reading)
     return recorder.finish()
+
+
+def odometry_between(
+    stamps: Array, moved: Array, others: Sequence[float]
+) -> list[slamlog.OdometryRow]:
+    """Return the odometry between the times of a grid of 10 Hz and other times.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n,)
+        Times of the odometry [s]; the last one is the end.
+    moved : ndarray, shape (n - 1, 2)
+        (d, α) between them [m, rad]; each is constant in time.
+    others : sequence of float
+        Further times at which a row must end, such as those of the scans.
+    """
+    end = float(stamps[-1])
+    travelled = np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
+    grid = np.round(np.arange(0, end, ODOMETRY_STEP), TIME_DIGITS)
+    times = np.unique([*grid, *others, end])
+    path = [np.interp(times, stamps, column) for column in travelled.T]
+    rows = np.stack(
+        [times, *np.diff(path, axis=1, prepend=0), np.diff(times, prepend=0)]
+    )
+    return [slamlog.OdometryRow(*row) for row in rows.T.tolist()]
 
 
 def _resample(truth: Array, end: float) -> Array:
