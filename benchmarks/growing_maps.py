@@ -18,6 +18,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
+import time
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -44,7 +45,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.linalg.blas import dsyrk
 
-from slamgym.estimator import EkfSlam
+from slamgym.estimator import EkfSlam, SubmapSlam
 from slamgym.estimator.large_maps.compressed.compressed_slam import CompressedEkfSlam
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
@@ -183,6 +184,20 @@ def judge(what: str, value: float, goal: float) -> None:
     CONSOLE.print(f"  {what}: {value:.2f} (<= {goal}: {said})")
 
 
+def judge_beliefs(count: int) -> None:
+    """Print the time of the whole belief of submaps, the first of which joins them."""
+    slam = mapped(SubmapSlam(*NOISE), count)
+    times = []
+    for now in drive(count, 10):
+        slam.predict(now.odometry)
+        slam.update(now.readings, now.ids)
+        began = time.thread_time()
+        slam.belief()
+        times.append(1e3 * (time.thread_time() - began))
+    CONSOLE.print(f"  {count} landmarks, first belief() of submaps: {times[0]:.0f} ms")
+    judge(f"{count} landmarks, further belief() of submaps in ms", median(times), 50)
+
+
 def judge_worst(near: dict[int, dict[str, Costs]]) -> None:
     """Print the slowest steps in steps of the full filter.
 
@@ -283,6 +298,7 @@ def main() -> None:
     title = "1000 landmarks, ten of them anywhere seen in each step"
     show(title, rows, markdown=chosen.markdown)
     judge_all(near, far)
+    judge_beliefs(REPEATED)
     if chosen.figure:
         draw(near, chosen.figure)
 

@@ -23,11 +23,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from ..arrays import AnyArray, Array
 from ..estimator.interface import ScanDecisions
@@ -174,6 +169,10 @@ def places_of(
     >>> places_of([3, 5, 8], [(0, 0), (0.4, 0), (2, 0)], resolution=0.5)
     {3: 3, 5: 3, 8: 8}
     """
+    from scipy.sparse import coo_array  # noqa: PLC0415 (slow to import)
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
     ids = np.asarray(landmark_ids, dtype=np.int64)
     positions = as_floats("landmarks", landmarks).reshape(-1, 2)
     if ids.shape != (len(positions),):
@@ -360,6 +359,9 @@ def gospa(
     >>> found.localisation, found.missed, found.false, round(found.distance, 3)
     (0.36, 0.0, 0.5, 0.927)
     """
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 (slow to import)
+    from scipy.spatial.distance import cdist  # noqa: PLC0415
+
     x, y = (
         as_floats(name, value).reshape(-1, 2)
         for name, value in (("estimate", estimate), ("truth", truth))

@@ -11,7 +11,6 @@ rejects even a consistent filter if the heading is uncertain.
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from ..arrays import Array
 from ..estimator.models.rigid_motion import (
@@ -202,6 +201,8 @@ def _whiten_few(errors: Array, correlations: Array) -> Array:
 
 def _whiten_each(errors: Array, correlations: Array) -> Array:
     """Solve L w = e, C = L Lᵀ, one by one; nan where C is singular."""
+    from scipy.linalg.lapack import dpotrf, dtrtrs  # noqa: PLC0415 (slow to import)
+
     n = errors.shape[-1]
     white = np.full((errors[..., 0].size, n), np.nan)
     pairs = zip(errors.reshape(-1, n), correlations.reshape(-1, n, n), strict=True)

@@ -12,7 +12,7 @@ from weakref import ref
 
 import numpy as np
 
-from ...arrays import Array, BoolArray, IntArray
+from ...arrays import Array, IntArray
 from ..interface import Belief, MapView, UpdateReport
 from ..kernels.filter_memory import (
     IN_USE,
@@ -432,10 +432,6 @@ class ScanRecord(NamedTuple):
         """Innovations ν, shape (m, 2)."""
         return self.rows[:, INNOVATION].reshape(-1, 2)
 
-    def ids_where(self, chosen: BoolArray) -> tuple[int, ...]:
-        """Return the landmarks of some readings."""
-        return tuple(self.scan_ids[chosen].tolist())
-
     def joint_factor(self) -> Array:
         """Return L of S = L Lᵀ, shape (2m, 2m), lower triangular.
 
@@ -471,7 +467,7 @@ class ScanReport(UpdateReport):
     def detach(self) -> None:
         """Copy the results: the next update is about to overwrite them."""
         if not self.is_detached:
-            _ = self.nis, self._record, self._numbers
+            _ = self.nis, self.degrees_of_freedom, self._record
             del self.__dict__["_parts"]
 
     @property
@@ -499,13 +495,10 @@ class ScanReport(UpdateReport):
         return ScanRecord.copied(self._parts)
 
     @cached_property
-    def _numbers(self) -> int:
-        return int(self._parts.values[NUMBERS_READ])
-
-    @cached_property
     def degrees_of_freedom(self) -> int:
         """Of the NIS: how many numbers the associated readings have."""
-        return len(self._record.rows) * self._numbers // 2
+        parts = self._parts
+        return int(parts.numbers[IN_USE]) * int(parts.values[NUMBERS_READ])
 
     @cached_property
     def associated_ids(self) -> tuple[int, ...]:
@@ -530,7 +523,8 @@ class ScanReport(UpdateReport):
     @cached_property
     def near_ids(self) -> tuple[int, ...]:
         """Mapped landmarks within 10 σ of the robot."""
-        return self._record.ids_where(self._record.ledger[NEAR] > 0)
+        ids, ledger = self._readings()
+        return tuple(ids[ledger[NEAR] > 0].tolist())
 
     @cached_property
     def innovation(self) -> Array:
@@ -538,4 +532,12 @@ class ScanReport(UpdateReport):
         return self._record.innovation
 
     def _with_outcome(self, outcome: int) -> tuple[int, ...]:
-        return self._record.ids_where(self._record.ledger[OUTCOME] == outcome)
+        ids, ledger = self._readings()
+        return tuple(ids[ledger[OUTCOME] == outcome].tolist())
+
+    def _readings(self) -> tuple[IntArray, IntArray]:
+        """Return landmarks and ledger without a copy of the rows, which are large."""
+        if self.is_detached:
+            return self._record.scan_ids, self._record.ledger
+        parts, count = self._parts, int(self._parts.numbers[SCANNED])
+        return parts.scan_ids[:count], parts.ledger[:, :count]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from math import inf, sqrt
+from math import inf, prod, sqrt
 from pathlib import Path
 
 import numpy as np
@@ -156,7 +156,7 @@ def aligned_zeros(*shape: int) -> Array:
     >>> aligned_zeros(3, 5).ctypes.data % CACHE_LINE
     0
     """
-    size = int(np.prod(shape))
+    size = prod(shape)
     room = np.zeros(size + CACHE_LINE // 8)
     skipped = -room.ctypes.data % CACHE_LINE // 8
     return room[skipped : skipped + size].reshape(shape)

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from ...arrays import AnyArray, Array, IntArray
 from ...estimator import interface
@@ -279,6 +278,8 @@ def mutual_nearest(
     """Pair mapped and true landmarks that are nearest to each other."""
     if not len(landmarks) or not len(truth.ids):
         return {}
+    from scipy.spatial.distance import cdist  # noqa: PLC0415 (slow to import)
+
     gaps = cdist(landmarks, truth.positions)
     nearest, back = gaps.argmin(axis=1), gaps.argmin(axis=0)
     return {

@@ -62,6 +62,24 @@ print(*sys.modules)
 
 
 @pytest.mark.slow
+def test_commands_load_optimisation_and_spatial_trees_only_to_match_landmarks():
+    code = """
+import sys
+import slamgym.experiments.command_line.run_files
+import slamgym.experiments.monte_carlo.report
+print(*sys.modules)
+from slamgym.evaluation import gospa
+gospa([(0.0, 0.0)], [(0.0, 0.0)])
+print(*sys.modules)
+"""
+    imported, matching = map(str.split, run_python(code).splitlines())
+    heavy = {"scipy.optimize", "scipy.spatial.distance"}
+    assert "scipy.special" in imported
+    assert not heavy & set(imported)
+    assert heavy <= set(matching)
+
+
+@pytest.mark.slow
 def test_the_tests_of_the_filter_pass_in_plain_python():
     """By the command of CONTRIBUTING, but for what takes many thousand steps."""
     text = (ROOT / "CONTRIBUTING.md").read_text()

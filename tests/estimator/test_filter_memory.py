@@ -91,6 +91,29 @@ def test_a_report_keeps_its_results_while_the_filter_goes_on(name):
     assert pickle.loads(pickle.dumps(kept[-1])) == copy.deepcopy(kept[-1]) == read[-1]
 
 
+def test_the_readings_of_a_report_are_read_without_a_copy_of_its_rows():
+    slam = make_estimator("ekf", gate_probability=0.99, min_range=0.5, **NOISE)
+    places = np.random.default_rng(5).uniform(2, 9, (40, 2))
+    for first in range(0, 40, 10):
+        slam.update(places[first : first + 10], range(first, first + 10))
+    scan = [places[3], places[7] + (1.0, 3.0), (0.0, 0.1), (0.4, 5.0)]
+    report = slam.update(scan, [3, 7, 8, 50])
+    found = (
+        report.degrees_of_freedom,
+        report.associated_ids,
+        report.rejected_ids,
+        report.skipped_ids,
+        report.added_ids,
+        report.near_ids,
+    )
+    assert found[:5] == (2, (3,), (7,), (8,), (50,))
+    assert "_record" not in vars(report)
+    held = slam.update(places[:4], range(4))
+    slam.update(places[:1], [0])
+    assert (held.degrees_of_freedom, held.associated_ids) == (8, (0, 1, 2, 3))
+    assert report.replace().near_ids == found[5]
+
+
 def test_the_last_report_is_the_one_that_is_still_held():
     slam = make_estimator("ekf", **NOISE)
     report = slam.update([(0.1, 3.0)], [4])

@@ -148,8 +148,9 @@ class CompressedEkfSlam:
         argument_checks.refuse_reserved(ids)
 
         required = [i for i in ids if i in self._map.slots]
-        is_usable = bool((np.abs(readings) <= LARGEST).all())  # otherwise refused
-        changes = is_usable and not self._is_adequate(required)
+        changes = not self._is_adequate(required) and bool(
+            (np.abs(readings) <= LARGEST).all()  # otherwise refused
+        )
 
         def correct() -> UpdateReport:
             if changes:
