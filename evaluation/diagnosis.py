@@ -160,7 +160,9 @@ def diagnose(
     runs = len(pose)
     if runs < FEWEST_RUNS:
         return Diagnosis(
-            CANNOT_TELL, 1.0, f"{runs} runs are too few; {FEWEST_RUNS} are needed."
+            CANNOT_TELL,
+            1.0,
+            f"cannot tell: {FEWEST_RUNS} runs must succeed, {runs} did.",
         )
     errors = errors_of(pose, heading)
     guilty = [] if sums is None else significant_findings(sums, NOISE_RATE)
@@ -457,16 +459,24 @@ def excess_of(
     sentence : str
     """
     errors, lost = errors_of(pose, heading), lost_runs(pose)
-    repeated = np.asarray(small.nees, float) / POSE
-    if errors.of == "heading":
-        repeated = np.asarray(small.heading_nees, float)
-    is_known = np.isfinite(repeated)
+    both = {
+        "pose": np.asarray(small.nees, float) / POSE,
+        "heading": np.asarray(small.heading_nees, float),
+    }
+    is_known = np.isfinite(both[errors.of])
     if is_known.sum() < _FEWEST_OF_A_KIND:
         return CANNOT_TELL, "Too few runs succeed with less noise."
-    many, few = _averages(pose, heading)[is_known], repeated[is_known]
+    many, few = _averages(pose, heading)[is_known], both[errors.of][is_known]
     change = _change(many, few, lost[is_known], 1.0 if errors.ratio > 1 else -1.0)
     ratio = float(few.mean())
-    remains = ratio > LEAST_RATIO and _beyond_margin(few) < _ERROR_RATE
+    rests = [
+        float(rest.mean())
+        for rest in (each[is_known] for each in both.values())
+        if rest.mean() > LEAST_RATIO and _beyond_margin(rest) < _ERROR_RATE / len(both)
+    ]
+    remains = bool(rests)
+    if remains and change == "shrinks":
+        ratio = max(rests)
     share = "a tenth" if small.factor == 0.1 else f"{100 * small.factor:.0f} %"
     found = f"With {share} of the noise, the squared errors are {ratio:.3g} times"
     if change == "grows":
