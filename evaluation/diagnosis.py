@@ -159,11 +159,8 @@ def diagnose(
     sums = None if noise is None else _checked_sums(noise, len(pose))
     runs = len(pose)
     if runs < FEWEST_RUNS:
-        return Diagnosis(
-            CANNOT_TELL,
-            1.0,
-            f"cannot tell: {FEWEST_RUNS} runs must succeed, {runs} did.",
-        )
+        text = f"cannot tell: {runs} runs succeeded, and {FEWEST_RUNS} are needed."
+        return Diagnosis(CANNOT_TELL, 1.0, text)
     errors = errors_of(pose, heading)
     guilty = [] if sums is None else significant_findings(sums, NOISE_RATE)
     if guilty:
@@ -191,6 +188,9 @@ def diagnose(
     else:
         cause, text = excess_of(pose, heading, small_noise, nis_ratio or 0.0)
     repeat = runs_to_repeat(pose, heading) if cause == CANNOT_TELL else 0
+    if cause == WRONG_COVARIANCE and p_value >= FILTER_RATE:
+        # The repeated runs have the same random numbers: what is chance stays, too.
+        cause, text = CANNOT_TELL, f"{text} Or it is chance: try another seed."
     return Diagnosis(cause, p_value, f"{cause}: {what}. {text}", repeat=repeat)
 
 
