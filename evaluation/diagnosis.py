@@ -159,9 +159,8 @@ def diagnose(
     sums = None if noise is None else _checked_sums(noise, len(pose))
     runs = len(pose)
     if runs < FEWEST_RUNS:
-        return Diagnosis(
-            CANNOT_TELL, 1.0, f"{runs} runs are too few; {FEWEST_RUNS} are needed."
-        )
+        text = f"cannot tell: {runs} runs succeeded, and {FEWEST_RUNS} are needed."
+        return Diagnosis(CANNOT_TELL, 1.0, text)
     errors = errors_of(pose, heading)
     guilty = [] if sums is None else significant_findings(sums, NOISE_RATE)
     if guilty:
@@ -189,6 +188,9 @@ def diagnose(
     else:
         cause, text = excess_of(pose, heading, small_noise, nis_ratio or 0.0)
     repeat = runs_to_repeat(pose, heading) if cause == CANNOT_TELL else 0
+    if cause == WRONG_COVARIANCE and p_value >= FILTER_RATE:
+        # The repeated runs have the same random numbers: what is chance stays, too.
+        cause, text = CANNOT_TELL, f"{text} Or it is chance: try another seed."
     return Diagnosis(cause, p_value, f"{cause}: {what}. {text}", repeat=repeat)
 
 
@@ -457,16 +459,24 @@ def excess_of(
     sentence : str
     """
     errors, lost = errors_of(pose, heading), lost_runs(pose)
-    repeated = np.asarray(small.nees, float) / POSE
-    if errors.of == "heading":
-        repeated = np.asarray(small.heading_nees, float)
-    is_known = np.isfinite(repeated)
+    both = {
+        "pose": np.asarray(small.nees, float) / POSE,
+        "heading": np.asarray(small.heading_nees, float),
+    }
+    is_known = np.isfinite(both[errors.of])
     if is_known.sum() < _FEWEST_OF_A_KIND:
         return CANNOT_TELL, "Too few runs succeed with less noise."
-    many, few = _averages(pose, heading)[is_known], repeated[is_known]
+    many, few = _averages(pose, heading)[is_known], both[errors.of][is_known]
     change = _change(many, few, lost[is_known], 1.0 if errors.ratio > 1 else -1.0)
     ratio = float(few.mean())
-    remains = ratio > LEAST_RATIO and _beyond_margin(few) < _ERROR_RATE
+    rests = [
+        float(rest.mean())
+        for rest in (each[is_known] for each in both.values())
+        if rest.mean() > LEAST_RATIO and _beyond_margin(rest) < _ERROR_RATE / len(both)
+    ]
+    remains = bool(rests)
+    if remains and change == "shrinks":
+        ratio = max(rests)
     share = "a tenth" if small.factor == 0.1 else f"{100 * small.factor:.0f} %"
     found = f"With {share} of the noise, the squared errors are {ratio:.3g} times"
     if change == "grows":

@@ -32,6 +32,8 @@ the factor _FAR."""
 _GAIN = 1.0  # of log-likelihood of a pose [nats]
 _LOST, _MOST_LOST = 10.0, 50
 """NEES / 3 of a drive that another truth may fit, and how many of them are compared."""
+_STRAY, _FEW = 100.0, 0.1
+"""NEES / 3 of a pose that is no error of a filter, and the largest share of such."""
 _SMALLER = 4.0  # by which errors fall in the right convention
 _TURN = np.diag([1.0, 1.0, np.pi / 180])  # of headings in degrees
 
@@ -137,17 +139,51 @@ def swapped_drives(
     """
     swaps = []
     with np.errstate(invalid="ignore"):  # drives without estimates
-        own = pose_nees(truth, poses, covariances, frame="invariant").mean(axis=1) / 3
+        own = _mean_ratio(truth, poses, covariances)
         bad = np.flatnonzero(own > _LOST)
         for k in bad[:_MOST_LOST]:
-            others = pose_nees(truth[bad], poses[k], covariances[k], frame="invariant")
-            ratios = others.mean(axis=1) / 3
-            if ratios.min() < min(own[k] / _LOST, _LOST):
-                swaps.append((names[k], names[bad[ratios.argmin()]]))
+            ratios = _mean_ratio(truth[bad], poses[k], covariances[k])
+            if np.nanmin(ratios) < min(own[k] / _LOST, _LOST):
+                swaps.append((names[k], names[bad[np.nanargmin(ratios)]]))
     if not swaps:
         return ""
-    said = " and ".join(f"that of {a} fits the truth of {b}" for a, b in swaps[:2])
+    fits = [f"that of drive {a} fits the truth of {b}" for a, b in swaps[:2]]
+    said = " and ".join(fits)
     return f"estimates or truths of {len(swaps)} drives are swapped: {said}."
+
+
+def _mean_ratio(truth: Array, poses: Array, covariances: Array) -> Array:
+    """Return NEES / 3 averaged over the steps that have one; nan if none has."""
+    ratios = pose_nees(truth, poses, covariances, frame="invariant") / 3
+    known = np.isfinite(ratios)
+    return np.asarray(np.where(known, ratios, 0).sum(axis=-1) / known.sum(axis=-1))
+
+
+def stray_poses(ratios: Array, names: Sequence[object]) -> str:
+    """Return a sentence if single poses between good ones make the errors large.
+
+    The errors of a filter last; those of rows that are swapped or damaged do not.
+
+    Parameters
+    ----------
+    ratios : ndarray, shape (B, T)
+        NEES / 3 of each pose; nan where there is none.
+    names : sequence
+        Of the drives.
+    """
+    far = ratios > _STRAY
+    good = np.pad(ratios < _LOST, ((0, 0), (2, 2)))
+    before, after = good[:, :-4] | good[:, 1:-3], good[:, 3:-1] | good[:, 4:]
+    lone = far & before & after
+    rest = ratios[np.isfinite(ratios) & ~lone]
+    if not lone.any() or lone.sum() > _FEW * lone.size or rest.mean() > _FAR:
+        return ""
+    run, step = np.argwhere(lone)[0]
+    return (
+        f"{lone.sum()} poses are far from the truth, between others that are not, as "
+        f"in swapped rows; the first is step {step} of drive {names[run]}: without "
+        f"them, NEES / 3 is {rest.mean():.2f}."
+    )
 
 
 def _honest(
@@ -247,7 +283,6 @@ _LINEAR = {
     "headings in degrees instead of radians": _TURN,
     "headings that grow clockwise": np.diag([1.0, 1.0, -1.0]),
     "positions in millimetres": np.diag([1e-3, 1e-3, 1.0]),
-    "positions in centimetres": np.diag([1e-2, 1e-2, 1.0]),
     **_ORDERS,
 }
 
@@ -332,8 +367,9 @@ def _readings(
     if name:
         following = jacobian @ claims @ np.swapaxes(jacobian, -1, -2)
         yield read("", following)
+    is_diagonal = not np.triu(claims, 1).any()  # as in no covariance of another error
     for kind, title in FRAMES.items():
-        if kind != frame:
+        if kind != frame and not is_diagonal:
             yield read(f"covariances of {title}", claims, kind)
     turned = "covariances with headings in degrees"
     yield read(turned, _TURN @ claims @ _TURN)
@@ -345,7 +381,6 @@ def _readings(
     yield read("the lower triangle of the covariance, row by row", by_rows)
     std = "standard deviations in place of variances"
     yield read(std, np.sign(claims) * claims**2)
-    yield read("a root of the covariance", claims @ np.swapaxes(claims, -1, -2))
     known = np.isfinite(claims).all(axis=(-2, -1)) & (np.linalg.det(claims) > 0)
     information = np.linalg.inv(np.where(known[..., None, None], claims, np.eye(3)))
     yield read("information matrices in place of covariances", information)

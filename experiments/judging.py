@@ -25,7 +25,13 @@ from ..evaluation.nees import normalised_squared_error
 from ..evaluation.noise_findings import CHANNELS, MOMENTS
 from ..evaluation.trajectory_error import Alignment, align_positions, poses_at
 from ..sim_configs.scenario_files import scenario_text
-from .conventions import MOST_DRIVES, additive_covariances, mistake_in, swapped_drives
+from .conventions import (
+    MOST_DRIVES,
+    additive_covariances,
+    mistake_in,
+    stray_poses,
+    swapped_drives,
+)
 from .estimate_files import (
     Estimate,
     beliefs_of,
@@ -417,27 +423,23 @@ def _unmatched(estimate: Estimate, steps: int, dt: float) -> str:
     count = len(estimate.poses)
     if estimate.times is None:
         return "" if count == steps else f"it has {count} poses, the drive {steps}"
-    times = estimate.times / (dt if estimate.in_seconds else 1.0)
-    due = np.arange(steps)
-    if count == steps and np.allclose(times, due, rtol=0, atol=_ON_TIME):
+    due, times = np.arange(steps), estimate.times / (dt if estimate.in_seconds else 1.0)
+
+    def on_time(found: Array) -> bool:
+        return count == steps and np.allclose(found, due, rtol=0, atol=_ON_TIME)
+
+    if on_time(times):
         return ""
-    unit, first, last = "steps", times[0], times[-1]
-    if estimate.in_seconds:
-        unit, first, last = "seconds", estimate.times[0], estimate.times[-1]
-    if count == steps and np.allclose(times - times[0], due, rtol=0, atol=_ON_TIME):
-        return (
-            f"its time stamps are shifted by {times[0]:.3g} steps: they begin at "
-            f"{first:.6g} {unit}, the drive at 0"
-        )
-    if count == steps and np.allclose(times, due * dt, rtol=0, atol=_ON_TIME * dt):
+    if on_time(times - times[0]):
+        return f"its time stamps begin at step {times[0]:.6g}, not at step 0"
+    if on_time(times / dt):
         return f"its time stamps are seconds, not steps of {dt:g} s"
-    if count != steps:
-        end = (steps - 1) * (dt if estimate.in_seconds else 1)
+    if missing := np.setdiff1d(due, times.round()).tolist():
         return (
-            f"it has {count} poses, from {first:.6g} to {last:.6g} {unit}, the drive "
-            f"has {steps}, from 0 to {end:g}"
+            f"it has no pose for {len(missing)} of the steps 0 to {steps - 1}, first "
+            f"for step {missing[0]}"
         )
-    row = int((abs(times - due) > _ON_TIME).argmax())
+    row = int((abs(times[:steps] - due) > _ON_TIME).argmax())
     return f"pose {row} is of step {times[row]:.6g}: every step must have one pose"
 
 
@@ -445,29 +447,17 @@ def _invalid(
     claims: Array, additive: Array, failures: Mapping[int, Failure]
 ) -> dict[int, Failure]:
     """Find runs with something else than covariances."""
-    found = {}
-    gap = abs(claims - np.swapaxes(claims, -1, -2)).max(axis=(1, 2, 3))
-    size = abs(claims).max(axis=(1, 2, 3))
-    variances = np.einsum("rsii->rsi", additive)
-    for run in range(len(claims)):
-        if run in failures:
-            continue
-        matrices = claims[run]
-        if not np.isfinite(size[run]):
-            step = int((~np.isfinite(matrices)).any(axis=(1, 2)).argmax())
-            found[run] = Failure(step, "an entry of the covariance is not finite")
-        elif gap[run] > _SYMMETRIC * size[run]:
-            differences = abs(matrices - np.swapaxes(matrices, -1, -2))
-            step, *entry = np.unravel_index(differences.argmax(), matrices.shape)
-            row, column = (int(k) for k in entry)
-            found[run] = Failure(
-                int(step),
-                f"the covariance is not symmetric: its entries ({row}, {column}) and "
-                f"({column}, {row}) differ",
-            )
-        elif (variances[run] < 0).any():
-            step = int((variances[run] < 0).any(axis=1).argmax())
-            found[run] = Failure(step, "a variance is negative")
+    gaps = abs(claims - np.swapaxes(claims, -1, -2)).max(axis=(2, 3))
+    sizes = abs(claims).max(axis=(1, 2, 3))[:, None]
+    negative = (np.einsum("rsii->rsi", additive) < 0).any(axis=2)
+    found: dict[int, Failure] = {}
+    for reason, wrong in (
+        ("an entry of the covariance is not finite", ~np.isfinite(gaps)),
+        ("the covariance is not symmetric", gaps > _SYMMETRIC * sizes),
+        ("a variance is negative", negative),
+    ):
+        for run in set(np.flatnonzero(wrong.any(axis=1)).tolist()) - set(failures):
+            found.setdefault(run, Failure(int(wrong[run].argmax()), reason))
     return found
 
 
@@ -527,8 +517,11 @@ def _mistakes(parts: Sequence[_Part], task: _Task, frame: str) -> str:
     counts = np.cumsum([len(part.arrays[0]) for part in parts])
     few = parts[: int(np.searchsorted(counts, MOST_DRIVES)) + 1]
     first = [np.concatenate([part.arrays[place] for part in few]) for place in range(4)]
-    return swapped_drives(truth, poses, additive, task.names) or mistake_in(
-        first[0], first[1], first[2], first[3], frame
+    ratios = np.concatenate([p.block["pose_nees_invariant"] for p in parts]) / 3
+    return (
+        swapped_drives(truth, poses, additive, task.names)
+        or mistake_in(first[0], first[1], first[2], first[3], frame)
+        or stray_poses(ratios, task.names)
     )
 
 

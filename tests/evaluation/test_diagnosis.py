@@ -235,6 +235,28 @@ def test_an_excess_of_which_a_part_remains_is_repeated_with_still_less_noise():
     assert "With 1 % of the noise" in last.sentence
 
 
+def test_an_excess_that_may_be_chance_is_no_wrong_covariance():
+    scores = wrong(14, 1.15, runs=30)
+    small = less_noise(scores, 1.0, runs=30)
+    found = diagnose(**scores, small_noise=small, rejected=True)
+    assert found.p_value > 0.02
+    assert found.cause == "cannot tell"
+    assert found.sentence.endswith("Or it is chance: try another seed.")
+
+
+def test_an_excess_that_remains_in_the_pose_alone_does_not_vanish():
+    scores = wrong(11, 3.0)
+    scores["heading_nees"] *= 8.0
+    small = less_noise(scores, 1.0, factor=0.01)
+    few = small._replace(heading_nees=small.heading_nees / 8)
+    found = diagnose(**scores, small_noise=few)
+    assert "the squared errors of the heading are 8" in found.sentence
+    assert found.cause == "wrong covariance"
+    assert "With 1 % of the noise, the squared errors are 3" in found.sentence
+    few = few._replace(nees=few.nees / 3)
+    assert diagnose(**scores, small_noise=few).cause == "linearisation"
+
+
 def test_an_excess_with_very_large_innovations_is_not_of_the_linearisation():
     scores = wrong(11, 40.0)
     small = less_noise(scores, 0.001)
