@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -41,23 +42,25 @@ from ..association.constellations import (
 )
 from ..kernels.assignment_search import compare_pairs
 from ..kernels.scan_update import as_rules, bearing_variance, range_variance
-from ..models.bearing_range import wrap_angle_jit
+from ..models.bearing_range import wrap_angle, wrap_angle_jit
 from .drive import Drive, DriveArrays, Sightings, landmark_order
 from .optimiser import Estimate, Noise, Optimiser, start_of
 
 NONE = -1  # the landmark of a reading that has none
 PRICE = 6.0
 """c: a reading costs no more; half of χ² with two degrees of freedom, 99.75 %."""
+MISS = 1.0
+"""What a landmark costs that is well in view of a scan, but not in it."""
 LEAST = 3
 """Readings of the smallest landmark."""
 SIGNIFICANT = 0.1
 """Least decrease of the score that counts."""
 ROUNDS, BIRTHS, SEEDS = 8, 10, 150  # of small changes
 GAP = 30  # scans without a landmark that end a visit
-PARTS = (8, 16, 12, 24)  # into which the drive is taken apart
+PARTS = (8, 12)  # into which the drive is taken apart
 LARGEST_TURN = 1.5  # of the later part of a drive [rad]
-MATCHES, SMALLEST_CLIQUE, NODES = 3, 3, 20_000
-TOLERANCE, ITERATIONS = 1e-3, 25  # of smoothing while searching
+MATCHES, SMALLEST_CLIQUE, NODES = 2, 3, 20_000
+TOLERANCE, ITERATIONS = 0.03, 30  # of smoothing while searching
 
 
 class Reassociation(NamedTuple):
@@ -149,6 +152,11 @@ class _Search:
         self.starts = np.cumsum([0, *lengths])[:-1][np.array(lengths) > 0]
         self.rows = np.arange(len(self.scans))
         self.rule_values = np.array(drive.rules)
+        poses_of = [[k] * len(drive.scans_at(k)) for k in range(drive.poses)]
+        self.scan_owners = np.array(list(chain.from_iterable(poses_of)))
+        bearings, ranges = self.data.readings.T
+        self.reach = np.quantile(ranges, 0.75)
+        self.width = np.quantile(np.abs(wrap_angle(bearings)), 0.95)
         self.per_landmark = float(np.log(len(self.scans)))
         self.log_area = 0.0
 
@@ -169,6 +177,16 @@ class _Search:
             raise np.linalg.LinAlgError("the drive as given cannot be smoothed")
         return state
 
+    def begun(self, labels: IntArray) -> _State | None:
+        """Smooth with associations that are far from those before; None if it fails."""
+        try:
+            poses, found = start_of(self.relabelled(labels))
+        except np.linalg.LinAlgError:
+            return None
+        places = np.zeros((max(found) + 1, 2))
+        places[list(found)] = list(found.values())
+        return self.smoothed(labels, poses, places)
+
     def smoothed(self, labels: IntArray, poses: Array, places: Array) -> _State | None:
         """Smooth with associations; None if that fails."""
         used = labels != NONE
@@ -188,18 +206,20 @@ class _Search:
         optimiser = Optimiser(DriveArrays(*arrays), self.noise)
         at = Estimate(poses.copy(), places[rows][order].ravel())
         try:
-            found = optimiser.minimise(at, TOLERANCE, ITERATIONS)
+            found = optimiser.minimise(at, TOLERANCE, ITERATIONS, strict=False)
             information = optimiser.linearised(found).information
             inverse = np.linalg.inv(information)
         except np.linalg.LinAlgError:
             return None
         entries = (columns[:, None] + np.arange(2)).ravel()
         places = found.estimate.landmarks[entries].reshape(-1, 2)
-        score = found.cost + PRICE * float((~used).sum())
-        score += len(rows) * (self.log_area - math.log(2 * math.pi))
-        score += float(np.linalg.slogdet(information)[1]) / 2
         labels = np.full_like(labels, NONE)
         labels[used] = slots
+        score = found.cost + PRICE * float((~used).sum())
+        at = found.estimate.poses
+        score += MISS * self.missed(at, places, labels)
+        score += len(rows) * (self.log_area - math.log(2 * math.pi))
+        score += float(np.linalg.slogdet(information)[1]) / 2
         covariance = inverse[np.ix_(entries, entries)]
         return _State(labels, found.estimate.poses, places, score, covariance)
 
@@ -306,9 +326,7 @@ class _Search:
         """
         scans = self.scans[-1] + 1
         labels, length = self.visits(state.labels), -(-scans // parts)
-        poses, found = start_of(self.relabelled(labels))
-        places = np.array([found[i] for i in range(len(found))])
-        now = self.smoothed(labels, poses, places)
+        now = self.begun(labels)
         for cut in range(length, scans, length):
             if now is None:
                 return None
@@ -321,8 +339,7 @@ class _Search:
             for pairs in self.matches(now, late, early):
                 rename = np.arange(len(now.places))
                 rename[pairs[:, 0]] = pairs[:, 1]
-                labels = _renamed(now.labels, rename)
-                trial = self.smoothed(labels, now.poses, now.places)
+                trial = self.begun(_renamed(now.labels, rename))
                 if trial is not None and trial.score < best.score:
                     best = trial
             while (trial := self.joined(best)) and trial.score < best.score:
@@ -351,8 +368,12 @@ class _Search:
         P = state.covariance[np.ix_(entries, entries)]
         places = TwoPlaces(state.places[late], state.places[early], P, LARGEST_TURN)
         squared = _offsets(state.places[rows], P)[0][: len(late), len(late) :]
+        squared[self.together(state.labels, len(state.places))[np.ix_(late, early)]] = (
+            np.inf
+        )
         nearest = np.argsort(squared, axis=None)[:LARGEST_GRAPH]
-        pairs = np.column_stack(np.unravel_index(np.sort(nearest), squared.shape))
+        nearest = np.sort(nearest[np.isfinite(squared.ravel()[nearest])])
+        pairs = np.column_stack(np.unravel_index(nearest, squared.shape))
         agree = np.zeros((len(pairs),) * 2, dtype=np.bool_)
         compare_pairs(pairs, *tables(places), DISTANCE_GATE, LARGEST_TURN, agree)
         for _ in range(MATCHES):
@@ -370,6 +391,26 @@ class _Search:
         ahead = at[:, 2] + bearing
         along = distance[:, None] * np.column_stack([np.cos(ahead), np.sin(ahead)])
         return np.asarray(at[:, :2] + along)
+
+    def missed(self, poses: Array, places: Array, labels: IntArray) -> int:
+        """Return how often scans do not show a landmark that is in view.
+
+        Only scans between its first and its last reading count.
+        """
+        at = poses[self.scan_owners]
+        d = places - at[:, None, :2]
+        ahead = np.arctan2(d[..., 1], d[..., 0]) - at[:, 2:]
+        in_view = np.hypot(d[..., 0], d[..., 1]) <= self.reach
+        in_view &= np.abs(wrap_angle(ahead)) <= self.width
+        used = np.flatnonzero(labels != NONE)
+        scans, own = self.scans[used], labels[used]
+        first, last = np.full((2, len(places)), [[len(in_view)], [-1]])
+        np.minimum.at(first, own, scans)
+        np.maximum.at(last, own, scans)
+        number = np.arange(len(in_view))[:, None]
+        in_view &= (number > first) & (number < last)
+        in_view[scans, own] = False
+        return int(in_view.sum())
 
     def costs(self, poses: Array, places: Array) -> Array:
         """Return ½ νᵀ Q⁻¹ ν of readings and landmarks, at most c, shape (M, m)."""
