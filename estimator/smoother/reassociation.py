@@ -57,7 +57,7 @@ SIGNIFICANT = 0.1
 """Least decrease of the score that counts."""
 ROUNDS, BIRTHS, SEEDS = 8, 10, 150  # of small changes
 GAP = 30  # scans without a landmark that end a visit
-PARTS = (8, 12)  # into which the drive is taken apart
+PARTS = (8, 12, 16)  # into which the drive is taken apart
 LARGEST_TURN = 1.5  # of the later part of a drive [rad]
 MATCHES, SMALLEST_CLIQUE, NODES = 2, 3, 20_000
 TOLERANCE, ITERATIONS = 0.03, 30  # of smoothing while searching
@@ -122,7 +122,7 @@ def reassociate(
     first = search.first(poses)
     best = search.settled(first)
     for done, parts in enumerate(PARTS, start=1):
-        trial = search.rebuilt(first, parts)
+        trial = search.rebuilt(best, parts)
         if trial is not None and trial.score < best.score:
             best = trial
         progress(done, len(PARTS))

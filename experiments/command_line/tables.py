@@ -260,6 +260,9 @@ def association_table(scores: dict[str, Any]) -> Table:
         ("map size", size),
         ("precision", shares),
     ]
+    if scores["oracle_errors"] is not None:
+        bar = f"{scores['oracle_errors']:.1%} of the readings would be wrong"
+        of_readings.append(("with the true pose and map", bar))
     return named_rows(of_readings + of_the_map, title)
 
 
