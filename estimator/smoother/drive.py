@@ -207,10 +207,6 @@ class Drive:
         made._sightings = [[next(kept) for _ in own] for own in self._sightings]
         return made
 
-    def scans_at(self, pose: int) -> Sequence[Sightings]:
-        """Return the scans of one pose."""
-        return self._sightings[pose]
-
     def sightings(self, pose: int) -> Sightings:
         """Return all readings of one pose."""
         scans = self._sightings[pose]

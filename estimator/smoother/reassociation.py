@@ -3,28 +3,30 @@
 `reassociate` alternates smoothing and association.  It accepts a change if that lowers
 the score of the whole drive ::
 
-    J = smoothed cost + m ln n + c u
+    J = smoothed cost + ½ ln det S + m ln (A / 2π) + c u + d v
 
-with m landmarks, n readings and u readings that are given to none.  The term m ln n is
-half of the Bayesian information criterion of two coordinates for each landmark [1]_; c
-is what a reading of clutter costs.
+with the information S of the m landmarks after the poses are eliminated, and the area A
+that the readings cover: together the negative logarithm of the evidence, by Laplace's
+approximation [1]_.  u readings are given to no landmark, each for the price c of
+clutter.  v times a scan does not show a landmark that is well in view, between its
+first and its last reading; without this price d, two landmarks for one would lower the
+cost, each of them with the nearer half of the readings.
 
 Small changes keep the poses: readings go to the landmarks that they fit, landmarks that
-do not pay for themselves leave, and others enter.  Large changes cut the drive in two
-where landmarks are seen again after a gap.  The later part then has landmarks of its
-own, and these are matched with those of the earlier part by one rigid motion, the
-largest clique of pairs of landmarks with equal distances.
+do not pay for themselves leave, and others enter.  Large changes
+take landmarks apart where they are seen again after a gap, and match the parts of the
+drive anew, by the largest cliques of pairs of landmarks with equal distances.
 
 References
 ----------
-.. [1] G. Schwarz, Estimating the dimension of a model, Annals of Statistics 6, 1978.
+.. [1] D. J. C. MacKay, Information Theory, Inference, and Learning Algorithms,
+   chapter 28, Cambridge University Press, 2003.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -146,18 +148,15 @@ class _Search:
         self.drive, (self.data, self.order) = drive, drive.arrays()
         self.noise = Noise(drive.rules, 0.0, 1.0)
         counts = np.diff(self.data.firsts)
-        self.owners = np.repeat(np.arange(len(counts)), counts)
-        lengths = [len(scan.ids) for scan in drive.scans]
-        self.scans = np.repeat(np.arange(len(lengths)), lengths)
-        self.starts = np.cumsum([0, *lengths])[:-1][np.array(lengths) > 0]
-        self.rows = np.arange(len(self.scans))
+        self.count = len(counts)
+        self.owners = np.repeat(np.arange(self.count), counts)
+        self.starts = self.data.firsts[:-1][counts > 0]
+        self.rows = np.arange(len(self.owners))
         self.rule_values = np.array(drive.rules)
-        poses_of = [[k] * len(drive.scans_at(k)) for k in range(drive.poses)]
-        self.scan_owners = np.array(list(chain.from_iterable(poses_of)))
         bearings, ranges = self.data.readings.T
         self.reach = np.quantile(ranges, 0.75)
         self.width = np.quantile(np.abs(wrap_angle(bearings)), 0.95)
-        self.per_landmark = float(np.log(len(self.scans)))
+        self.per_landmark = float(np.log(len(self.owners)))  # about, in J
         self.log_area = 0.0
 
     def first(self, poses: Array) -> _State:
@@ -170,12 +169,13 @@ class _Search:
         labels = np.where(counts[labels] >= LEAST, labels, NONE)
         if (labels == NONE).all():
             raise ValueError(f"no landmark has {LEAST} readings, got {self.drive}")
-        sides = np.ptp(located, axis=0)
+        sides = np.maximum(np.ptp(located, axis=0), 1.0)
         self.log_area = float(np.log(sides).sum())
-        state = self.smoothed(labels, poses, places)
-        if state is None:
+        starts = self.smoothed(labels, poses, places), self.begun(labels)
+        states = [state for state in starts if state is not None]
+        if not states:
             raise np.linalg.LinAlgError("the drive as given cannot be smoothed")
-        return state
+        return min(states, key=lambda state: state.score)
 
     def begun(self, labels: IntArray) -> _State | None:
         """Smooth with associations that are far from those before; None if it fails."""
@@ -256,10 +256,10 @@ class _Search:
         """Return the landmark of each reading by costs (M, m), one to one in a scan."""
         m = costs.shape[1]
         labels = np.where(costs.min(axis=1) < PRICE, costs.argmin(axis=1), m)
-        keys, counts = np.unique(self.scans * (m + 1) + labels, return_counts=True)
+        keys, counts = np.unique(self.owners * (m + 1) + labels, return_counts=True)
         twice = np.unique(keys[(counts > 1) & (keys % (m + 1) < m)] // (m + 1))
         for scan in twice.tolist():
-            first, last = np.searchsorted(self.scans, [scan, scan + 1])
+            first, last = np.searchsorted(self.owners, [scan, scan + 1])
             spare = np.full((last - first,) * 2, PRICE)
             table = np.hstack([costs[first:last], spare])
             labels[first:last] = np.minimum(linear_sum_assignment(table)[1], m)
@@ -284,8 +284,8 @@ class _Search:
     def death(self, labels: IntArray, costs: Array) -> int | None:
         """Return a landmark whose readings cost little more without it, if any."""
         m, used = costs.shape[1], labels != NONE
-        scans, own = self.scans[used], labels[used]
-        taken = np.zeros((self.scans[-1] + 1, m), dtype=np.bool_)
+        scans, own = self.owners[used], labels[used]
+        taken = np.zeros((self.count, m), dtype=np.bool_)
         taken[scans, own] = True
         others = np.where(taken[scans], PRICE, costs[used]).min(axis=1)
         loss = np.minimum(others, PRICE) - costs[used, own]
@@ -313,9 +313,9 @@ class _Search:
 
     def together(self, labels: IntArray, m: int) -> BoolArray:
         """Return which landmarks a scan has shown together, shape (m, m)."""
-        shown = np.zeros((self.scans[-1] + 1, m), dtype=np.float32)
+        shown = np.zeros((self.count, m), dtype=np.float32)
         used = labels != NONE
-        shown[self.scans[used], labels[used]] = 1
+        shown[self.owners[used], labels[used]] = 1
         return np.asarray(shown.T @ shown > 0)
 
     def rebuilt(self, state: _State, parts: int) -> _State | None:
@@ -324,7 +324,7 @@ class _Search:
         The drive is taken in successive parts.  The landmarks that a part shows first
         are matched with those before it.
         """
-        scans = self.scans[-1] + 1
+        scans = self.count
         labels, length = self.visits(state.labels), -(-scans // parts)
         now = self.begun(labels)
         for cut in range(length, scans, length):
@@ -332,7 +332,7 @@ class _Search:
                 return None
             used = now.labels != NONE
             first = np.full(len(now.places), scans)
-            np.minimum.at(first, now.labels[used], self.scans[used])
+            np.minimum.at(first, now.labels[used], self.owners[used])
             late = np.flatnonzero((first >= cut) & (first < cut + length))
             early = np.flatnonzero(first < cut)
             best = now
@@ -350,9 +350,9 @@ class _Search:
     def visits(self, labels: IntArray) -> IntArray:
         """Return a label for each series of readings of a landmark without a gap."""
         used = np.flatnonzero(labels != NONE)
-        order = used[np.lexsort([self.scans[used], labels[used]])]
+        order = used[np.lexsort([self.owners[used], labels[used]])]
         new = np.diff(labels[order]) != 0
-        new |= np.diff(self.scans[order]) > GAP
+        new |= np.diff(self.owners[order]) > GAP
         found = np.full(len(labels), NONE)
         found[order] = np.append(0, np.cumsum(new))
         return found
@@ -397,13 +397,12 @@ class _Search:
 
         Only scans between its first and its last reading count.
         """
-        at = poses[self.scan_owners]
-        d = places - at[:, None, :2]
-        ahead = np.arctan2(d[..., 1], d[..., 0]) - at[:, 2:]
+        d = places - poses[:, None, :2]
+        ahead = np.arctan2(d[..., 1], d[..., 0]) - poses[:, 2:]
         in_view = np.hypot(d[..., 0], d[..., 1]) <= self.reach
         in_view &= np.abs(wrap_angle(ahead)) <= self.width
         used = np.flatnonzero(labels != NONE)
-        scans, own = self.scans[used], labels[used]
+        scans, own = self.owners[used], labels[used]
         first, last = np.full((2, len(places)), [[len(in_view)], [-1]])
         np.minimum.at(first, own, scans)
         np.maximum.at(last, own, scans)
