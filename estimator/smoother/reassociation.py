@@ -156,7 +156,6 @@ class _Search:
         bearings, ranges = self.data.readings.T
         self.reach = np.quantile(ranges, 0.75)
         self.width = np.quantile(np.abs(wrap_angle(bearings)), 0.95)
-        self.per_landmark = float(np.log(len(self.owners)))  # about, in J
         self.log_area = 0.0
 
     def first(self, poses: Array) -> _State:
@@ -237,15 +236,19 @@ class _Search:
     def rearranged(self, state: _State) -> _State | None:
         """Add and remove landmarks, and give readings to those that they fit."""
         places, costs = state.places, self.costs(state.poses, state.places)
+        m = len(places)
+        own = state.covariance.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)]
+        information = -float(np.linalg.slogdet(own)[1].mean()) / 2  # of one, at least
+        price = self.log_area - math.log(2 * math.pi) + information
         for _ in range(BIRTHS):
-            born = self.birth(state.poses, costs)
+            born = self.birth(state.poses, costs, price)
             if born is None:
                 break
             places = np.vstack([places, born])
             costs = np.hstack([costs, self.costs(state.poses, born[None])])
         labels = self.assigned(costs)
         while len(places) > 1:
-            worst = self.death(labels, costs)
+            worst = self.death(labels, costs, price)
             if worst is None:
                 break
             places, costs = np.delete(places, worst, 0), np.delete(costs, worst, 1)
@@ -265,8 +268,8 @@ class _Search:
             labels[first:last] = np.minimum(linear_sum_assignment(table)[1], m)
         return np.where(labels == m, NONE, labels)
 
-    def birth(self, poses: Array, costs: Array) -> Array | None:
-        """Return the place of a new landmark that lowers the score, if there is one."""
+    def birth(self, poses: Array, costs: Array, price: float) -> Array | None:
+        """Return the place of a new landmark worth its price, if there is one."""
         labels = self.assigned(costs)
         paid = np.where(labels == NONE, PRICE, costs[self.rows, labels])
         dear = np.flatnonzero(paid > PRICE / 2)
@@ -278,11 +281,11 @@ class _Search:
         gains = np.maximum.reduceat(saved, self.starts, axis=0)
         best = int(gains.sum(axis=0).argmax())
         enough = (gains[:, best] > 0).sum() >= LEAST
-        worth = gains[:, best].sum() > self.per_landmark
+        worth = gains[:, best].sum() > price
         return located[best] if enough and worth else None
 
-    def death(self, labels: IntArray, costs: Array) -> int | None:
-        """Return a landmark whose readings cost little more without it, if any."""
+    def death(self, labels: IntArray, costs: Array, price: float) -> int | None:
+        """Return a landmark that is not worth its price, if there is one."""
         m, used = costs.shape[1], labels != NONE
         scans, own = self.owners[used], labels[used]
         taken = np.zeros((self.count, m), dtype=np.bool_)
@@ -292,7 +295,7 @@ class _Search:
         losses, counts = np.bincount(own, loss, m), np.bincount(own, minlength=m)
         losses[counts < LEAST] = -np.inf
         worst = int(losses.argmin())
-        return worst if losses[worst] < self.per_landmark else None
+        return worst if losses[worst] < price else None
 
     def joined(self, state: _State) -> _State | None:
         """Merge the landmarks that are likely to be the same, and not in one scan."""

@@ -214,13 +214,15 @@ def smoothing_figures(summary: dict[str, Any]) -> Table:
     first, last = significant(cost["first"]), significant(cost["last"])
     ratio = significant(cost["per_degree"])
     sizes = "{readings} of {landmarks} landmarks, from {poses} poses"
-    return named_rows(
-        [
-            ("readings", sizes.format(**summary)),
-            ("cost", f"{first}, then {last} after {summary['iterations']} steps"),
-            ("misfit", f"{ratio} per degree of freedom; 1 is expected"),
-        ]
-    )
+    rows = [
+        ("readings", sizes.format(**summary)),
+        ("cost", f"{first}, then {last} after {summary['iterations']} steps"),
+        ("misfit", f"{ratio} per degree of freedom; 1 is expected"),
+    ]
+    if (repair := summary["repair"]) is not None:
+        scores = f"score {repair['first']:.1f}, then {repair['last']:.1f}"
+        rows.append(("association", f"{scores}; {repair['unused']} readings of none"))
+    return named_rows(rows)
 
 
 # --------------------------------------------------------------------------------------

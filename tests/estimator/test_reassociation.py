@@ -63,25 +63,27 @@ def as_one(k, ids):
     return np.where((ids == 6) & ~both, 3, ids)
 
 
-def errors(ids, truth):
-    """Count readings that are not with the others of their landmark."""
+def outcome(ids, truth):
+    """Count misplaced readings, those of no landmark, and landmarks."""
     found, true = (
         np.concatenate(ids),
         np.concatenate([scan.ids for scan in truth.scans]),
     )
     labels = np.unique(found[found != NONE])
     right = sum(np.bincount(true[found == i]).max() for i in labels)
-    return len(true) - right, len(labels)
+    unused = np.count_nonzero(found == NONE)
+    return len(true) - right - unused, unused, len(labels)
 
 
 @pytest.mark.parametrize("spoil", [twice, swapped, dropped, as_one])
 def test_a_spoilt_association_is_repaired(spoil):
-    path, right = two_laps(1)
+    _, right = two_laps(1)
     wrong = renamed(right, spoil)
     found = reassociate(wrong)
     assert found.score < found.first_score - 10
-    wrongly, landmarks = errors(found.ids, right)
-    assert wrongly <= 0.01 * right.readings
+    misplaced, unused, landmarks = outcome(found.ids, right)
+    assert misplaced == 0
+    assert unused <= 0.01 * right.readings
     assert landmarks == len(right.landmark_ids)
     best = smooth(right)
     repaired = smooth(wrong, associate=True)
@@ -91,8 +93,9 @@ def test_a_spoilt_association_is_repaired(spoil):
 def test_a_right_association_is_left_alone():
     _, right = two_laps(2)
     found = reassociate(right)
-    assert errors(found.ids, right)[0] <= 0.002 * right.readings
-    assert found.drive.landmark_ids and len(found.drive.landmark_ids) == len(WORLD)
+    misplaced, unused, landmarks = outcome(found.ids, right)
+    assert (misplaced, landmarks) == (0, len(WORLD))
+    assert unused <= 0.01 * right.readings
     assert found.score <= found.first_score
 
 
@@ -129,7 +132,8 @@ def test_progress_and_refusals():
     _, right = two_laps(5)
     seen = []
     reassociate(right, progress=lambda done, steps: seen.append((done, steps)))
-    assert seen and seen[-1][0] == seen[-1][1]
+    done, steps = zip(*seen, strict=True)
+    assert done == tuple(range(1, steps[0] + 1))
     single = renamed(right, lambda k, ids: 1000 * (k + 1) + ids)
     with pytest.raises(ValueError, match="no landmark has 3 readings"):
         reassociate(single)
